@@ -127,7 +127,7 @@ pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
 mod tests {
     use std::path::PathBuf;
 
-    use dataset::Format;
+    use dataset::{Format, Turn};
     use scene::Intrinsics;
 
     use super::*;
@@ -141,7 +141,7 @@ mod tests {
         Frame {
             name: format!("r_{i}"),
             image: PathBuf::from(format!("r_{i}.png")),
-            turned: false,
+            turn: Turn::Stored,
             mask: None,
             depth: None,
             taken_with: Intrinsics::from_angle_x(80, 60, 0.7),

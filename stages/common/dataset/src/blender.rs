@@ -1,28 +1,39 @@
 use std::path::Path;
 
-use artifact::counted;
+use artifact::{WARNING, counted};
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
+use crate::file_reason::FileReason;
 use crate::format::Format;
 use crate::found::is_file;
+use crate::frame_file::{FrameFile, Missing, lookup_of};
+use crate::nearby::misspelt_test_file;
 use crate::split::Split;
-use crate::transforms::{self, Missing};
 
 /// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic
 /// scenes. An image that isn't there is an error, and names may leave out `.png`. Without test
 /// views the folder doesn't say which views are for testing.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
-    let path = folder.join("transforms_train.json");
-    let mut frames =
-        transforms::read_file(folder, &path, Missing::Refused)?.not_empty(&path)?.frames;
-    let train = frames.len();
-    let path = folder.join("transforms_test.json");
-    if is_file(&path)? {
-        frames.extend(transforms::read_file(folder, &path, Missing::Refused)?.frames);
+    let train_file = FrameFile::read(&folder.join("transforms_train.json"))?;
+    let test_path = folder.join("transforms_test.json");
+    let test_file = is_file(&test_path)?.then(|| FrameFile::read(&test_path)).transpose()?;
+    let files: Vec<&FrameFile> =
+        [Some(&train_file), test_file.as_ref()].into_iter().flatten().collect();
+    let mut lookup = lookup_of(folder, &files);
+    let (mut frames, mut sides, mut absent_depths) = (Vec::new(), Vec::new(), Vec::new());
+    for file in &files {
+        let read = file.frames(&mut lookup, Missing::Refused)?;
+        absent_depths.extend(read.depth_note());
+        sides.push(read.frames.len());
+        frames.extend(read.frames);
+    }
+    let train = sides[0];
+    if train == 0 {
+        return Err(DatasetError::format(train_file.path(), FileReason::NoFrames));
     }
     let (train, test) = (0..train, train..frames.len());
-    let notes = vec![if test.is_empty() {
+    let mut notes = vec![if test.is_empty() {
         format!("Blender's form: {}; none is said to be for testing", counted(train.len(), "view"))
     } else {
         format!(
@@ -31,6 +42,13 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
             counted(test.len(), "test view")
         )
     }];
+    notes.extend(lookup.notes());
+    notes.extend(absent_depths);
+    if let Some(found) = misspelt_test_file(folder).filter(|_| test_file.is_none()) {
+        notes.push(format!(
+            "{WARNING}found {found}, which is not read; did you mean transforms_test.json?"
+        ));
+    }
     let split = (!test.is_empty()).then(|| Split { train: train.collect(), test: test.collect() });
     Ok(Dataset { format: Format::Blender, frames, split, notes })
 }

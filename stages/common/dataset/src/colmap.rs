@@ -1,7 +1,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use artifact::{counted, relative_path};
+use artifact::counted;
 use glam::{DMat3, DQuat, DVec3};
 use scene::{Distortion, Intrinsics};
 
@@ -10,9 +10,10 @@ use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::file_reason::FileReason;
 use crate::format::Format;
-use crate::found::{Found, find};
+use crate::found::is_hidden;
 use crate::frame::{Frame, names, pose_from_world_to_camera};
 use crate::frame_reason::FrameReason;
+use crate::lookup::{Listings, Located, Lookup, reduced_copies};
 use crate::photograph::{fitted, look};
 use crate::text::read_text;
 
@@ -35,9 +36,33 @@ struct Image {
     points: Vec<u64>,
 }
 
-/// Folders below `sparse` that hold a model, by name.
+/// Returns the folders below `sparse` that contain a model, by name. Where there are none, and the
+/// data set's folder has images, those below `sparse` in its sub-folders without images: nerfstudio
+/// writes `colmap/sparse/0`.
 pub(crate) fn models(folder: &Path) -> Vec<PathBuf> {
-    with_list(folder, "images")
+    let found = with_list(folder, "images");
+    if !found.is_empty() || !has_images(folder) {
+        return found;
+    }
+    let mut below: Vec<PathBuf> =
+        std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()).collect();
+    below.retain(|path| !is_hidden(path) && !has_images(path));
+    below.sort();
+    below.iter().flat_map(|path| with_list(path, "images")).collect()
+}
+
+/// True if a folder has photographs as COLMAP's users keep them: `images` or a reduced copy.
+fn has_images(folder: &Path) -> bool {
+    folder.join("images").is_dir() || !reduced_copies(&mut Listings::new(folder)).is_empty()
+}
+
+/// Returns the names of the images of the first model below `sparse`, if there is one.
+pub(crate) fn image_names(folder: &Path) -> Result<Vec<String>, DatasetError> {
+    let mut model = Model::default();
+    if let Some(first) = with_list(folder, "images").first() {
+        model.read_images(first)?;
+    }
+    Ok(model.images.into_iter().map(|image| image.name).collect())
 }
 
 /// The camera of the first model below `sparse`, where that has one alone. What images the model
@@ -56,6 +81,7 @@ fn with_list(folder: &Path, things: &str) -> Vec<PathBuf> {
     let sparse = folder.join("sparse");
     let mut found: Vec<PathBuf> =
         std::fs::read_dir(&sparse).into_iter().flatten().flatten().map(|e| e.path()).collect();
+    found.retain(|path| !is_hidden(path));
     found.sort();
     found.insert(0, sparse);
     found.retain(|p| ["bin", "txt"].iter().any(|e| p.join(things).with_extension(e).is_file()));
@@ -70,31 +96,28 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     model.images.sort_by(|a, b| a.name.cmp(&b.name));
     let list =
         path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
-    let root =
-        if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
-    let (mut frames, mut files, mut missing) = (Vec::new(), Vec::new(), Vec::new());
+    let named: Vec<&str> = model.images.iter().map(|image| image.name.as_str()).collect();
+    let mut lookup = Lookup::in_images(folder, &named);
+    let (mut frames, mut labels, mut missing) = (Vec::new(), Vec::new(), Vec::new());
     for (index, image) in model.images.iter().enumerate() {
         let of_frame = |reason| DatasetError::frame(&list, index, &image.name, reason);
-        let file = relative_path(&image.name).map_err(|e| of_frame(e.into()))?;
-        match find(&root.join(&file), "an image") {
-            Found::File => {}
-            Found::Nothing(_) => {
-                missing.push(&image.name);
-                continue;
+        match lookup.find(&image.name).map_err(|e| of_frame(e.into()))? {
+            Located::File(file) => {
+                frames.push(model.frame(image, folder.join(&file.path)).map_err(of_frame)?);
+                labels.push(lookup.without_base(&file.label));
             }
-            Found::Other(found) => {
+            Located::Nothing(_) => missing.push(&image.name),
+            Located::Other(found) => {
                 let remedy = "put the photograph there";
                 return Err(of_frame(FrameReason::Place { found, remedy }));
             }
         }
-        frames.push(model.frame(image, root.join(&file)).map_err(of_frame)?);
-        files.push(file);
     }
     if frames.is_empty() {
         let reason = match missing.first() {
             Some(first) => FileReason::ImagesMissing {
                 count: missing.len(),
-                folder: Some(root),
+                folder: Some(lookup.base()),
                 first: first.to_string(),
             },
             None => FileReason::NoImages,
@@ -108,7 +131,8 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
             model.images.len()
         ));
     }
-    for (frame, name) in frames.iter_mut().zip(names(&list, &files)?) {
+    notes.extend(lookup.notes());
+    for (frame, name) in frames.iter_mut().zip(names(&list, &labels)?) {
         frame.name = name;
     }
     Ok(Dataset { format: Format::Colmap, frames, split: None, notes })
@@ -129,8 +153,8 @@ fn largest_model<'a>(
             largest = Some((path, model));
         }
     }
-    let (path, model) =
-        largest.ok_or_else(|| DatasetError::Unknown { path: folder.to_path_buf() })?;
+    let (path, model) = largest
+        .ok_or_else(|| DatasetError::Unknown { path: folder.to_path_buf(), nearby: None })?;
     let photographs = counted(model.images.len(), "photograph");
     let name = path.strip_prefix(folder).unwrap_or(path).display();
     let mut notes = vec![format!("COLMAP: {photographs} of {name}")];
@@ -159,10 +183,7 @@ impl Model {
     fn read(folder: &Path) -> Result<Self, DatasetError> {
         let mut model = Self::default();
         model.read_cameras(folder)?;
-        match bytes_of(folder, "images.bin")? {
-            Some((path, images)) => model.binary_images(&mut Bytes::new(&path, &images))?,
-            None => model.text_images(&folder.join("images.txt"))?,
-        }
+        model.read_images(folder)?;
         if let Some((path, points)) = bytes_of(folder, "points3D.bin")? {
             model.binary_points(&mut Bytes::new(&path, &points))?;
         } else if folder.join("points3D.txt").is_file() {
@@ -175,6 +196,13 @@ impl Model {
         match bytes_of(folder, "cameras.bin")? {
             Some((path, cameras)) => self.binary_cameras(&mut Bytes::new(&path, &cameras)),
             None => self.text_cameras(&folder.join("cameras.txt")),
+        }
+    }
+
+    fn read_images(&mut self, folder: &Path) -> Result<(), DatasetError> {
+        match bytes_of(folder, "images.bin")? {
+            Some((path, images)) => self.binary_images(&mut Bytes::new(&path, &images)),
+            None => self.text_images(&folder.join("images.txt")),
         }
     }
 
@@ -265,15 +293,17 @@ impl Model {
             if line.words.len() < 10 {
                 return Err(line.error(FileReason::Missing { what: "an image's name" }));
             }
-            let name = line.words[9..].join(" ");
-            let mut points = Vec::new();
-            if let Some(second) = lines.next() {
-                for i in (2..second.words.len()).step_by(3) {
-                    // -1 where no point of the model is seen.
-                    let id: i64 = second.number(i, "point id")?;
-                    points.extend(u64::try_from(id).ok());
-                }
-            }
+            let name = line.after(9).to_owned();
+            let points = match lines.next() {
+                None => Vec::new(),
+                Some(second) => second.points().ok_or_else(|| {
+                    let reason = FileReason::PointsExpected {
+                        line: second.number,
+                        image: line.words[0].to_owned(),
+                    };
+                    DatasetError::format(path, reason)
+                })?,
+            };
             self.images.push(Image { rotation, translation, camera, name, points });
         }
         Ok(())
@@ -291,14 +321,14 @@ impl Model {
     fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, FrameReason> {
         let id = image.camera;
         let camera = self.cameras.get(&id).ok_or(FrameReason::NoCamera { id })?;
-        let (taken_with, turned) = fitted(*camera, look(&file)?)
+        let (taken_with, turn) = fitted(*camera, look(&file)?)
             .map_err(|reason| FrameReason::OfCamera { id, reason: Box::new(reason) })?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
         let depths = depths(image, &self.points);
         let frame = Frame {
             name: String::new(),
             image: file,
-            turned,
+            turn,
             mask: None,
             depth: None,
             taken_with,
@@ -392,6 +422,7 @@ fn end(bytes: &Bytes<'_>, what: &'static str) -> Result<(), DatasetError> {
 struct Line<'a> {
     path: &'a Path,
     number: usize,
+    text: &'a str,
     words: Vec<&'a str>,
 }
 
@@ -401,12 +432,35 @@ impl<'a> Line<'a> {
         lines.map(move |(i, line)| Self {
             path,
             number: i + 1,
+            text: line,
             words: line.split_whitespace().collect(),
         })
     }
 
     fn error(&self, reason: FileReason) -> DatasetError {
         DatasetError::format(self.path, reason.on_line(self.number))
+    }
+
+    /// Returns the rest of the line after a number of words, with the spaces in it: a file's name.
+    fn after(&self, words: usize) -> &'a str {
+        let mut rest = self.text.trim();
+        for word in &self.words[..words.min(self.words.len())] {
+            rest = rest[word.len()..].trim_start();
+        }
+        rest
+    }
+
+    /// Returns the numbers of an image's points, listed as x, y and number; nothing where the line
+    /// is something else. -1 is no point of the model.
+    fn points(&self) -> Option<Vec<u64>> {
+        let mut points = Vec::new();
+        for point in self.words.chunks(3) {
+            let [x, y, id] = point else { return None };
+            x.parse::<f64>().ok()?;
+            y.parse::<f64>().ok()?;
+            points.extend(u64::try_from(id.parse::<i64>().ok()?).ok());
+        }
+        Some(points)
     }
 
     fn number<T: std::str::FromStr>(
@@ -604,7 +658,7 @@ mod tests {
                 "SIMPLE_RADIAL_FISHEYE 80 60 70 40 30 -0.1",
                 "not supported",
             ),
-            ("SIMPLE_RADIAL", "ROUND", "none of COLMAP's"),
+            ("SIMPLE_RADIAL", "ROUND", "camera model \"ROUND\" is unknown"),
             ("1 SIMPLE_RADIAL", "9 SIMPLE_RADIAL", "frame 1 (b 1.png): there is no camera 1"),
             ("80 60 70 40", "0 60 70 40", "its size is 0×60"),
             ("80 60 70 40", "80 80 70 40", "another shape"),
@@ -633,7 +687,7 @@ mod tests {
         let forged = read_texts(CAMERAS, &IMAGES.replace("a.png", "\u{1b}[31m.png")).unwrap();
         assert!(forged.notes[1].ends_with(r"first \u{1b}[31m.png"), "{:?}", forged.notes);
         let none = read_texts(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();
-        assert!(none.contains("not one of its 2 images"), "{none}");
+        assert!(none.contains("none of the 2 images exists in "), "{none}");
         assert!(
             read_texts(CAMERAS, "# nothing\n")
                 .unwrap_err()

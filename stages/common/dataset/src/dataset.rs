@@ -5,6 +5,7 @@ use crate::file_reason::FileReason;
 use crate::format::Format;
 use crate::frame::Frame;
 use crate::split::Split;
+use crate::turn::Turn;
 
 /// Posed photographs.
 #[derive(Clone, Debug, PartialEq)]
@@ -74,7 +75,8 @@ impl Dataset {
     pub(crate) fn note_what_is_special(&mut self) {
         let count = |is: &dyn Fn(&Frame) -> bool| self.frames.iter().filter(|f| is(f)).count();
         let (distorted, turned) =
-            (count(&|f| !f.taken_with.distortion.is_none()), count(&|f| f.turned));
+            (count(&|f| !f.taken_with.distortion.is_none()), count(&|f| f.turn == Turn::Upright));
+        let assumed = count(&|f| f.turn == Turn::Assumed);
         let size = |f: &Frame| (f.taken_with.width, f.taken_with.height);
         let sizes: std::collections::BTreeSet<_> = self.frames.iter().map(size).collect();
         if distorted > 0 {
@@ -86,6 +88,14 @@ impl Dataset {
             self.notes.push(format!(
                 "{} {are} turned upright, as EXIF data ask",
                 counted(turned, "photograph")
+            ));
+        }
+        if assumed > 0 {
+            let have = if assumed == 1 { "has" } else { "have" };
+            self.notes.push(format!(
+                "{} {have} an EXIF orientation that the camera's width and height neither confirm \
+                nor contradict; assumed: poses are those of the image as stored",
+                counted(assumed, "photograph")
             ));
         }
         if let (Some(first), Some(last), true) = (sizes.first(), sizes.last(), sizes.len() > 1) {

@@ -7,6 +7,7 @@ use crate::file_reason::FileReason;
 use crate::format::signs;
 use crate::frame_reason::FrameReason;
 use crate::misplaced::{Misplaced, shown};
+use crate::nearby::Nearby;
 
 /// A data set that can't be used.
 ///
@@ -14,10 +15,12 @@ use crate::misplaced::{Misplaced, shown};
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {
     /// The folder has none of the forms.
-    #[error("{}: no data set; expected {}", shown(path), signs())]
+    #[error("{}: no data set; {}", shown(path), instead(nearby.as_ref()))]
     Unknown {
         /// The folder.
         path: PathBuf,
+        /// What the folder contains instead.
+        nearby: Option<Nearby>,
     },
     /// A file can't be read.
     #[error("{}: {source}", shown(path))]
@@ -55,6 +58,14 @@ pub enum DatasetError {
     /// An image that can't be read.
     #[error("{}", printable(&.0.to_string()))]
     Pixels(pixels::PixelError),
+}
+
+/// Returns what was found instead of a data set, or what was expected.
+fn instead(nearby: Option<&Nearby>) -> String {
+    match nearby {
+        Some(nearby) => printable(&nearby.to_string()).into_owned(),
+        None => format!("expected {}", signs()),
+    }
 }
 
 impl From<pixels::PixelError> for DatasetError {

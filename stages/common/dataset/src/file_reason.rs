@@ -1,7 +1,9 @@
 use std::path::{Path, PathBuf};
 
+use artifact::counted;
 use scene::Distortion;
 
+use crate::lookup::LookupError;
 use crate::misplaced::{Misplaced, shown};
 use crate::npy::ArrayReason;
 
@@ -115,7 +117,10 @@ pub enum FileReason {
         what: &'static str,
     },
     /// A number of no camera model.
-    #[error("camera {id} has model {model}, which COLMAP doesn't have")]
+    #[error(
+        "camera {id} has model {model}, which this program doesn't know (a newer COLMAP's?); \
+        undistort with colmap image_undistorter"
+    )]
     ModelNumber {
         /// The camera.
         id: u32,
@@ -123,7 +128,10 @@ pub enum FileReason {
         model: u32,
     },
     /// A name of no camera model.
-    #[error("camera model {model:?} is none of COLMAP's")]
+    #[error(
+        "camera model {model:?} is unknown (a newer COLMAP's?); undistort with colmap \
+        image_undistorter"
+    )]
     ModelName {
         /// The name.
         model: String,
@@ -162,7 +170,9 @@ pub enum FileReason {
     #[error("it has no images; at least one is needed")]
     NoImages,
     /// None of the images that it names is there.
-    #[error("not one of its {count} images is {}, first {first}", place(folder.as_deref()))]
+    #[error(
+        "none of the {count} images exists{} (first missing: {first})", place(folder.as_deref())
+    )]
     ImagesMissing {
         /// How many it names.
         count: usize,
@@ -171,8 +181,29 @@ pub enum FileReason {
         /// The first.
         first: String,
     },
+    /// A list of file names for a split has no name of a frame.
+    #[error("none of the {count} names in {list} is that of a frame (first: {first})")]
+    NoFrameListed {
+        /// Key of the list.
+        list: &'static str,
+        /// Number of names in the list.
+        count: usize,
+        /// First name.
+        first: String,
+    },
+    /// A name leads to no single file inside the folder.
+    #[error(transparent)]
+    Lookup(#[from] LookupError),
+    /// The second line of an image in a text file is missing.
+    #[error("line {line} should be the points of image {image} (an empty line if there are none)")]
+    PointsExpected {
+        /// Line, counted from 1.
+        line: usize,
+        /// Number of the image, as the file writes it.
+        image: String,
+    },
     /// No folder has an image for every pose.
-    #[error("{poses} poses, but {}; images and poses must be as many", listed(folders))]
+    #[error("{poses} poses {}", listed(folders))]
     Counts {
         /// How many poses there are.
         poses: usize,
@@ -207,19 +238,27 @@ pub struct ImageFolder {
     pub images: usize,
     /// The first thing in it that is named like an image and can't be read.
     pub odd: Option<Misplaced>,
+    /// Number and format of its images in a format that isn't read, with the remedy.
+    pub unread: Option<String>,
 }
 
 fn place(folder: Option<&Path>) -> String {
-    folder.map_or_else(|| "there".to_owned(), |folder| format!("in {}", shown(folder)))
+    folder.map(|folder| format!(" in {}", shown(folder))).unwrap_or_default()
 }
 
 fn listed(folders: &[ImageFolder]) -> String {
     if folders.is_empty() {
-        return "there is no folder images".to_owned();
+        return "without a folder images next to them".to_owned();
     }
-    let one = |ImageFolder { name, images, odd }: &ImageFolder| {
-        let odd = odd.as_ref().map(|odd| format!(" ({odd})")).unwrap_or_default();
-        format!("{name} has {images}{odd}")
+    let one = |ImageFolder { name, images, odd, unread }: &ImageFolder| {
+        let remark = odd.as_ref().map(ToString::to_string).or_else(|| unread.clone());
+        let remark = remark.map(|remark| format!(" ({remark})")).unwrap_or_default();
+        format!("{} in {name}/{remark}", counted(*images, "image"))
     };
-    folders.iter().map(one).collect::<Vec<_>>().join(", ")
+    let each: Vec<String> = folders.iter().map(one).collect();
+    format!(
+        "for {}; counts must match: remove the other images, or list the images with poses in \
+        view_imgs.txt",
+        each.join(" and ")
+    )
 }

@@ -63,6 +63,12 @@ fn kind(of: FileType) -> &'static str {
     }
 }
 
+/// True if a file's name begins with a dot: `.DS_Store` and macOS's `._IMG_0000.png` are nobody's
+/// photographs.
+pub(crate) fn is_hidden(path: &Path) -> bool {
+    path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
+}
+
 /// Whether a file is there; something else in its place is refused.
 pub(crate) fn is_file(path: &Path) -> Result<bool, DatasetError> {
     match find(path, "a file") {

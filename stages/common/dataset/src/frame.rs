@@ -7,7 +7,9 @@ use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of};
 
 use crate::error::DatasetError;
 use crate::frame_reason::FrameReason;
+use crate::mask_file::MaskFile;
 use crate::misplaced::shown;
+use crate::turn::Turn;
 
 /// A posed photograph.
 #[derive(Clone, Debug, PartialEq)]
@@ -16,10 +18,10 @@ pub struct Frame {
     pub name: String,
     /// The image: PNG, JPEG or EXR.
     pub image: PathBuf,
-    /// Whether it has to be turned as its EXIF data ask to be what its camera saw.
-    pub turned: bool,
-    /// What is to be left out of it: an image of its size, black there, white elsewhere.
-    pub mask: Option<PathBuf>,
+    /// Treatment of its EXIF orientation.
+    pub turn: Turn,
+    /// Mask of the pixels that count.
+    pub mask: Option<MaskFile>,
     /// True depth (EXR, channels `Z` and `A`), where the data has it.
     pub depth: Option<PathBuf>,
     /// What it was taken with; its size is the stored image's.

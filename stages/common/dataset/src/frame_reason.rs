@@ -1,6 +1,6 @@
-use artifact::PathError;
 use scene::CameraError;
 
+use crate::lookup::LookupError;
 use crate::misplaced::Misplaced;
 
 /// Why a frame can't be used. Text of a file is as it is there; [`DatasetError`] escapes it.
@@ -8,9 +8,9 @@ use crate::misplaced::Misplaced;
 /// [`DatasetError`]: crate::DatasetError
 #[derive(Debug, thiserror::Error)]
 pub enum FrameReason {
-    /// The path of its image, mask or depth.
+    /// The name of its image, mask or depth.
     #[error(transparent)]
-    Path(#[from] PathError),
+    Lookup(#[from] LookupError),
     /// Its image can't be read.
     #[error(transparent)]
     Pixels(#[from] pixels::PixelError),
@@ -65,7 +65,11 @@ pub enum FrameReason {
         value: f64,
     },
     /// Depths that contradict each other.
-    #[error("its bounds are {near} and {far}; 0 < near < far is expected")]
+    #[error(
+        "bounds {near} and {far}, expected 0 < near < far; LLFF's imgs2poses orders views otherwise \
+        than their names where COLMAP registered them in another order: run COLMAP again on images \
+        sorted by name, or give COLMAP's model without poses_bounds.npy"
+    )]
     Depths {
         /// Of the nearest point.
         near: f64,

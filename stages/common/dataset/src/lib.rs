@@ -23,6 +23,7 @@
 
 mod blender;
 mod bytes;
+mod clipping;
 mod colmap;
 mod dataset;
 mod error;
@@ -30,20 +31,30 @@ mod file_reason;
 mod format;
 mod found;
 mod frame;
+mod frame_file;
 mod frame_reason;
 mod llff;
+mod lookup;
+mod mask_file;
+mod masks;
 mod misplaced;
+mod nearby;
 mod npy;
 mod number;
 mod photograph;
 mod split;
+mod split_lists;
 mod text;
 mod transforms;
+mod turn;
+mod unread;
+mod unused_masks;
 
 use std::path::Path;
 
 use artifact::printable;
 
+pub use clipping::Clipping;
 pub use dataset::Dataset;
 pub use error::DatasetError;
 pub use file_reason::{FileReason, ImageFolder};
@@ -51,14 +62,22 @@ pub use format::Format;
 use found::is_file;
 pub use frame::Frame;
 pub use frame_reason::FrameReason;
+pub use lookup::LookupError;
+pub use mask_file::{MaskFile, MaskKind};
+use masks::add_masks;
 pub use misplaced::Misplaced;
+pub use nearby::Nearby;
 pub use npy::ArrayReason;
+pub use photograph::is_image_name;
 pub use split::Split;
+pub use turn::Turn;
+pub use unread::{is_unread_name, unread_images};
 
 impl Dataset {
     /// Reads a folder, whichever form it has. Images are looked at for their size alone.
     pub fn read(folder: &Path) -> Result<Self, DatasetError> {
         let mut set = read_as(format_of(folder)?, folder)?;
+        add_masks(folder, &mut set)?;
         set.note_what_is_special();
         for note in &mut set.notes {
             *note = printable(note).into_owned();
@@ -67,14 +86,22 @@ impl Dataset {
     }
 }
 
-/// The first form that a folder has.
+/// Returns the first form that a folder has.
 fn format_of(folder: &Path) -> Result<Format, DatasetError> {
+    present_format(folder)?.ok_or_else(|| DatasetError::Unknown {
+        path: folder.to_path_buf(),
+        nearby: Nearby::of(folder),
+    })
+}
+
+/// Returns the first form that a folder has, if any.
+fn present_format(folder: &Path) -> Result<Option<Format>, DatasetError> {
     for format in Format::ALL {
         if is_present(format, folder)? {
-            return Ok(format);
+            return Ok(Some(format));
         }
     }
-    Err(DatasetError::Unknown { path: folder.to_path_buf() })
+    Ok(None)
 }
 
 /// Whether a folder has a form.

@@ -9,12 +9,16 @@ use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::file_reason::{FileReason, ImageFolder};
 use crate::format::Format;
-use crate::found::{Found, find};
+use crate::found::{Found, find, is_file, is_hidden};
 use crate::frame::{Frame, names};
 use crate::frame_reason::FrameReason;
-use crate::misplaced::Misplaced;
+use crate::lookup::{Located, Lookup};
+use crate::masks::without_dynamic_masks;
+use crate::misplaced::shown;
 use crate::npy::{ArrayReason, read_matrix};
 use crate::photograph::{Stored, fitted, is_image_name, look};
+use crate::text::read_text;
+use crate::unread::unread_images;
 
 /// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal
 /// length), near and far.
@@ -24,11 +28,8 @@ const NUMBERS: usize = 17;
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("poses_bounds.npy");
     let rows = read_numbers(&path)?;
-    let (images, from) =
-        images(folder, rows.len()).map_err(|reason| DatasetError::format(&path, reason))?;
-    let files: Vec<PathBuf> =
-        images.iter().filter_map(|p| p.strip_prefix(folder).ok().map(Path::to_path_buf)).collect();
-    let names = names(&path, &files)?;
+    let Photographs { images, labels, notes } = photographs(folder, &path, rows.len())?;
+    let names = names(&path, &labels)?;
     let (distortion, note) = distortion(folder, &rows);
     let mut frames = Vec::with_capacity(rows.len());
     for (index, ((row, image), name)) in rows.iter().zip(images).zip(names).enumerate() {
@@ -39,10 +40,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
             .and_then(|stored| frame(row, distortion, stored, name, image));
         frames.push(frame.map_err(of_frame)?);
     }
-    let mut notes = vec![format!(
-        "LLFF (poses_bounds.npy): {} from {from}",
-        counted(frames.len(), "photograph")
-    )];
+    let mut notes = notes;
     notes.extend(note);
     Ok(Dataset { format: Format::Llff, frames, split: None, notes })
 }
@@ -89,7 +87,7 @@ fn frame(
     let [height, width, focal] = inside.to_array();
     let (width, height) = (whole(width, "width")?, whole(height, "height")?);
     let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
-    let (taken_with, turned) =
+    let (taken_with, turn) =
         fitted(Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion }, stored)?;
     let (near, far) = (row[15], row[16]);
     if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
@@ -99,7 +97,7 @@ fn frame(
     let frame = Frame {
         name,
         image,
-        turned,
+        turn,
         mask: None,
         depth: None,
         taken_with,
@@ -119,12 +117,54 @@ fn whole(value: f64, name: &'static str) -> Result<u32, FrameReason> {
     }
 }
 
-/// Images of a folder by name, and the first that is named like one but can't be read.
-fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<Misplaced>)> {
-    let named =
-        std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| is_image_name(p));
-    let mut named: Vec<PathBuf> = named.collect();
+/// Photographs of the poses, in the poses' order.
+struct Photographs {
+    images: Vec<PathBuf>,
+    /// Paths whose stems name the views, inside the data set's folder.
+    labels: Vec<PathBuf>,
+    notes: Vec<String>,
+}
+
+impl Photographs {
+    fn new(images: Vec<PathBuf>, labels: Vec<PathBuf>, from: &str) -> Self {
+        let count = counted(images.len(), "photograph");
+        let notes = vec![format!("LLFF (poses_bounds.npy): {count} from {from}")];
+        Self { images, labels, notes }
+    }
+}
+
+/// Returns all images of `images`, or of the largest of `images_2`, `images_4` … that has one for
+/// every pose. Where none has, a list may name the images with poses.
+fn photographs(folder: &Path, path: &Path, poses: usize) -> Result<Photographs, DatasetError> {
+    let mut names = vec!["images".to_owned()];
+    names.extend((2..=64).map(|n| format!("images_{n}")));
+    let mut folders = Vec::new();
+    for name in names {
+        let Some((files, mut folder_of_images)) = images_of(folder, &name) else { continue };
+        if files.len() == poses {
+            let inside = files.iter().filter_map(|p| p.strip_prefix(folder).ok());
+            let labels = inside.map(Path::to_path_buf).collect();
+            return Ok(Photographs::new(files, labels, &name));
+        }
+        folder_of_images.images = files.len();
+        folders.push(folder_of_images);
+    }
+    match listed_photographs(folder, path, poses)? {
+        Some(found) => Ok(found),
+        None => Err(DatasetError::format(path, FileReason::Counts { poses, folders })),
+    }
+}
+
+/// Returns a folder's images by name, and what else is named like an image. Names that begin with a
+/// dot and instant-ngp's masks are no images.
+fn images_of(folder: &Path, name: &str) -> Option<(Vec<PathBuf>, ImageFolder)> {
+    let path = folder.join(name);
+    let entries = std::fs::read_dir(&path).ok()?.flatten().map(|entry| entry.path());
+    let mut named: Vec<PathBuf> = entries.filter(|path| !is_hidden(path)).collect();
     named.sort();
+    let unread = unread_images(&named);
+    named.retain(|path| is_image_name(path));
+    let mut named = without_dynamic_masks(named);
     let mut odd = None;
     named.retain(|path| match find(path, "an image") {
         Found::File => true,
@@ -133,23 +173,51 @@ fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<Misplaced>)> {
             false
         }
     });
-    Some((named, odd))
+    Some((named, ImageFolder { name: name.to_owned(), images: 0, odd, unread }))
 }
 
-/// All images of `images`, or of the largest of `images_2`, `images_4` … that has one for every
-/// pose.
-fn images(folder: &Path, poses: usize) -> Result<(Vec<PathBuf>, String), FileReason> {
-    let mut names = vec!["images".to_owned()];
-    names.extend((2..=64).map(|n| format!("images_{n}")));
-    let mut folders = Vec::new();
-    for name in names {
-        let Some((files, odd)) = images_of(&folder.join(&name)) else { continue };
-        if files.len() == poses {
-            return Ok((files, name));
-        }
-        folders.push(ImageFolder { name, images: files.len(), odd });
+/// Returns the images that `view_imgs.txt` (imgs2poses) or COLMAP's model next to the poses names,
+/// if one of them has a name for every pose. Poses are in the order of names.
+fn listed_photographs(
+    folder: &Path,
+    path: &Path,
+    poses: usize,
+) -> Result<Option<Photographs>, DatasetError> {
+    let list = folder.join("view_imgs.txt");
+    let mut lists = Vec::new();
+    if is_file(&list)? {
+        let text = read_text(&list)?;
+        let names = text.lines().map(|line| line.trim().to_owned());
+        lists.push(("view_imgs.txt", names.filter(|name| !name.is_empty()).collect()));
     }
-    Err(FileReason::Counts { poses, folders })
+    // A model that can't be read names no images.
+    lists.push(("sparse", colmap::image_names(folder).unwrap_or_default()));
+    let Some((source, mut names)) = lists.into_iter().find(|(_, names)| names.len() == poses)
+    else {
+        return Ok(None);
+    };
+    names.sort();
+    let named: Vec<&str> = names.iter().map(String::as_str).collect();
+    let mut lookup = Lookup::in_images(folder, &named);
+    let (mut images, mut labels) = (Vec::new(), Vec::new());
+    for (index, name) in named.iter().enumerate() {
+        let of_frame = |reason| DatasetError::frame(path, index, name, reason);
+        match lookup.find(name).map_err(|e| of_frame(e.into()))? {
+            Located::File(file) => {
+                images.push(folder.join(&file.path));
+                labels.push(file.label);
+            }
+            Located::Nothing(found) | Located::Other(found) => {
+                let remedy = "restore the photograph";
+                return Err(of_frame(FrameReason::Place { found, remedy }));
+            }
+        }
+    }
+    let from = lookup.base().strip_prefix(folder).map(shown).unwrap_or_default();
+    let mut found = Photographs::new(images, labels, &from);
+    found.notes.push(format!("{source} names the photographs with poses"));
+    found.notes.extend(lookup.notes());
+    Ok(Some(found))
 }
 
 /// The array's rows.
@@ -270,11 +338,11 @@ mod tests {
         let mut bad_width = ROW;
         bad_width[9] = -3.0;
         for (bytes, images, words) in [
-            (npy(&[ROW, ROW]), 3, "2 poses, but images has 3"),
+            (npy(&[ROW, ROW]), 3, "2 poses for 3 images in images/; counts must match"),
             (npy(&[ROW, ROW])[..200].to_vec(), 2, "not a NumPy array"),
             (b"nothing of the kind".to_vec(), 2, "not a NumPy array"),
             (npy(&[ROW, bad_pose]), 2, "frame 1 (IMG_1): camera_to_world[0][1] is NaN"),
-            (npy(&[bad_range, ROW]), 2, "frame 0 (IMG_0): its bounds are 10 and 9"),
+            (npy(&[bad_range, ROW]), 2, "frame 0 (IMG_0): bounds 10 and 9, expected"),
             (npy(&[bad_width, ROW]), 2, "width is -3"),
         ] {
             let message = Dataset::read(folder(&bytes, &[("images", images)]).path())
@@ -286,7 +354,7 @@ mod tests {
         std::fs::create_dir(dir.path().join("images/IMG_9.png")).unwrap();
         let message = Dataset::read(dir.path()).unwrap_err().to_string();
         assert!(
-            message.contains("2 poses, but images has 1 (")
+            message.contains("2 poses for 1 image in images/ (")
                 && message.contains("IMG_9.png is a folder, not an image)"),
             "{message}"
         );

@@ -12,6 +12,12 @@ pub enum Misplaced {
         /// The place.
         path: PathBuf,
     },
+    /// Absolute path of another machine, no tail of which is a file of the data set.
+    #[error("no file of the data set is at the end of the absolute path {}", shown(path))]
+    Elsewhere {
+        /// The path.
+        path: PathBuf,
+    },
     /// Something that is no file.
     #[error("{} is {kind}, not {wanted}", shown(path))]
     Kind {

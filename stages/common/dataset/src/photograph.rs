@@ -1,8 +1,7 @@
 use std::fs::File;
 use std::io::BufReader;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use artifact::{PathError, relative_path};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
 use pixels::{
@@ -10,28 +9,24 @@ use pixels::{
 };
 use scene::Intrinsics;
 
+use crate::clipping::Clipping;
 use crate::error::DatasetError;
 use crate::frame::Frame;
 use crate::frame_reason::FrameReason;
+use crate::turn::Turn;
+use crate::unread::refusal;
 
-/// Whether a file's name is that of an image.
-pub(crate) fn is_image_name(path: &Path) -> bool {
+/// Extensions of the images that are read.
+pub(crate) const IMAGE_EXTENSIONS: [&str; 4] = [".png", ".jpg", ".jpeg", ".exr"];
+
+/// True if a file's name is that of an image.
+pub fn is_image_name(path: &Path) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "exr"))
 }
 
 pub(crate) fn is_exr(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
-}
-
-/// The path inside the folder of an image that a file names. NeRF's files leave `.png` out.
-pub(crate) fn image_file(folder: &Path, text: &str) -> Result<PathBuf, PathError> {
-    let mut file = relative_path(text)?;
-    if !is_image_name(&file) && !folder.join(&file).is_file() {
-        // `set_extension` would cut a name like `r.0`.
-        file.as_mut_os_string().push(".png");
-    }
-    Ok(file)
 }
 
 /// A PNG or JPEG whose header has been read, by what it is, whatever its name says.
@@ -44,10 +39,10 @@ fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PixelError> {
     reader.limits(limits);
     match reader.format() {
         Some(ImageFormat::Png | ImageFormat::Jpeg) => Ok(reader),
-        _ => Err(PixelError::Format {
+        _ => Err(refusal(path).unwrap_or_else(|| PixelError::Format {
             path: path.to_path_buf(),
             reason: "neither PNG, JPEG nor EXR".to_owned(),
-        }),
+        })),
     }
 }
 
@@ -56,8 +51,21 @@ fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PixelError> {
 pub(crate) struct Stored {
     /// Columns and rows.
     pub(crate) size: (u32, u32),
-    /// Whether its EXIF data ask for a quarter turn.
-    pub(crate) is_sideways: bool,
+    /// Turn that its EXIF data ask for.
+    pub(crate) orientation: Orientation,
+}
+
+impl Stored {
+    /// True if EXIF asks for a quarter turn.
+    pub(crate) fn is_sideways(self) -> bool {
+        use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+        matches!(self.orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
+    }
+
+    /// Treatment of the image where its camera's shape doesn't settle that.
+    pub(crate) fn assumed_turn(self) -> Turn {
+        if self.orientation == Orientation::NoTransforms { Turn::Stored } else { Turn::Assumed }
+    }
 }
 
 /// Looks at an image's header.
@@ -65,7 +73,8 @@ pub(crate) fn look(path: &Path) -> Result<Stored, PixelError> {
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     if is_exr(path) {
         let (width, height) = exr_size(path)?;
-        return Ok(Stored { size: (width as u32, height as u32), is_sideways: false });
+        let size = (width as u32, height as u32);
+        return Ok(Stored { size, orientation: Orientation::NoTransforms });
     }
     let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
     let (width, height) = decoder.dimensions();
@@ -76,31 +85,32 @@ pub(crate) fn look(path: &Path) -> Result<Stored, PixelError> {
         let (width, height) = (width as usize, height as usize);
         return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
     }
-    Ok(Stored { size: (width, height), is_sideways: decoder.orientation().is_ok_and(is_sideways) })
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    Ok(Stored { size: (width, height), orientation })
 }
 
-fn is_sideways(turn: Orientation) -> bool {
-    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
-    matches!(turn, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
-}
-
-/// The intrinsics for the stored image, whose size may differ from what was said of it, but not in
-/// shape; and whether the image has to be turned as its EXIF data ask. Poses are commonly found for
-/// images as they are stored, so it is turned only where its shape fits no other way.
-pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool), FrameReason> {
+/// Returns the intrinsics for the stored image, whose size may differ from the camera's, but not in
+/// shape, and the treatment of its EXIF orientation.
+pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, Turn), FrameReason> {
     let (width, height) = stored.size;
+    let is_turned_fit = stored.is_sideways() && has_shape_of(&k, height, width);
+    let is_turned_exactly = stored.is_sideways() && (k.height, k.width) == stored.size;
     if (k.width, k.height) == stored.size {
-        Ok((k, false))
-    } else if has_shape_of(&k, width, height) {
-        Ok((k.resized(width, height), false))
-    } else if stored.is_sideways && has_shape_of(&k, height, width) {
-        Ok((k.resized(height, width), true))
+        let is_settled = stored.is_sideways() && width != height;
+        Ok((k, if is_settled { Turn::Stored } else { stored.assumed_turn() }))
+    } else if has_shape_of(&k, width, height) && !is_turned_exactly {
+        let is_settled = stored.is_sideways() && !is_turned_fit;
+        let turn = if is_settled { Turn::Stored } else { stored.assumed_turn() };
+        Ok((k.resized(width, height), turn))
+    } else if is_turned_fit {
+        Ok((k.resized(height, width), Turn::Upright))
     } else {
         Err(FrameReason::Shape { image: stored.size, camera: (k.width, k.height) })
     }
 }
 
-fn has_shape_of(k: &Intrinsics, width: u32, height: u32) -> bool {
+/// True if an image of a size may be a smaller copy of the camera's.
+pub(crate) fn has_shape_of(k: &Intrinsics, width: u32, height: u32) -> bool {
     let (across, down) = (
         f64::from(width) / f64::from(k.width.max(1)),
         f64::from(height) / f64::from(k.height.max(1)),
@@ -110,7 +120,7 @@ fn has_shape_of(k: &Intrinsics, width: u32, height: u32) -> bool {
 }
 
 /// The image as it is stored, or turned as its EXIF data ask.
-fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
+fn read(path: &Path, turned: bool) -> Result<(Rgba8, Clipping), PixelError> {
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     if is_exr(path) {
         return encoded(path);
@@ -122,19 +132,22 @@ fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
     if turned {
         image.apply_orientation(turn);
     }
-    Ok(image.into())
+    Ok((image.into(), Clipping::default()))
 }
 
 /// An EXR's linear light, display-encoded.
-fn encoded(path: &Path) -> Result<Rgba8, PixelError> {
+fn encoded(path: &Path) -> Result<(Rgba8, Clipping), PixelError> {
     let image = read_exr(path)?;
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     let [r, g, b] = ["R", "G", "B"]
         .map(|name| image.channel(name).ok_or_else(|| format(format!("no channel {name}"))));
     let (r, g, b, a) = (r?, g?, b?, image.channel("A"));
-    let pixels = (0..image.width * image.height)
-        .flat_map(|i| encoded_pixel([r[i], g[i], b[i]], a.map_or(1.0, |a| a[i])));
-    Ok(Rgba8::new(image.width, image.height, pixels.collect()))
+    let pixel = |i: usize| ([r[i], g[i], b[i]], a.map_or(1.0, |a| a[i]));
+    let count = image.width * image.height;
+    let pixels = (0..count).map(pixel).flat_map(|(colour, alpha)| encoded_pixel(colour, alpha));
+    let encoded = Rgba8::new(image.width, image.height, pixels.collect());
+    let clipping = (0..count).map(pixel).map(|(colour, alpha)| Clipping::of_pixel(colour, alpha));
+    Ok((encoded, clipping.sum()))
 }
 
 /// EXR files keep premultiplied colours, ours straight ones.
@@ -148,27 +161,57 @@ impl Frame {
     /// The image that [`Frame::camera`] sees: as it was taken, or with its distortion undone, as
     /// sharp as it was.
     pub fn photograph(&self) -> Result<Rgba8, DatasetError> {
-        self.seen(&self.image)
+        Ok(self.photograph_and_clipping()?.0)
     }
 
-    /// Which of [`Frame::photograph`]'s pixels count, where the data say so.
-    pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
-        self.mask.as_ref().map(|path| Ok(Mask::of(&self.seen(path)?))).transpose()
-    }
-
-    /// An image of the photograph's pixels as the camera sees it.
-    fn seen(&self, path: &Path) -> Result<Rgba8, DatasetError> {
-        let image = read(path, self.turned)?;
+    /// Returns [`Frame::photograph`], and how many of its pixels were brighter than white.
+    pub fn photograph_and_clipping(&self) -> Result<(Rgba8, Clipping), DatasetError> {
+        let (image, clipping) = read(&self.image, self.turn == Turn::Upright)?;
         let k = self.taken_with;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
             let reason = format!(
-                "{}×{} pixels where its photograph has {}×{}",
+                "{}×{} pixels where its camera has {}×{}",
                 image.width, image.height, k.width, k.height
             );
-            return Err(PixelError::Format { path: path.to_path_buf(), reason }.into());
+            return Err(PixelError::Format { path: self.image.clone(), reason }.into());
         }
-        Ok(self.pinhole.map(|pinhole| undistorted(&image, &k, &pinhole)).unwrap_or(image))
+        Ok((self.seen(image), clipping))
     }
+
+    /// Which of [`Frame::photograph`]'s pixels count, where the data say so. A mask of another size
+    /// than the photograph's is resampled by nearest neighbour.
+    pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
+        let Some(file) = &self.mask else { return Ok(None) };
+        let (image, _) = read(&file.path, self.turn == Turn::Upright)?;
+        let size = (self.taken_with.width as usize, self.taken_with.height as usize);
+        let mut mask = Mask::of(&self.seen(nearest(&image, size)));
+        if file.kind.is_inverted() {
+            mask.counts.iter_mut().for_each(|counts| *counts = !*counts);
+        }
+        Ok(Some(mask))
+    }
+
+    /// Returns an image of the photograph's pixels as the camera sees it.
+    fn seen(&self, image: Rgba8) -> Rgba8 {
+        match &self.pinhole {
+            Some(pinhole) => undistorted(&image, &self.taken_with, pinhole),
+            None => image,
+        }
+    }
+}
+
+/// Returns an image at another size: each pixel is that of the nearest pixel centre.
+fn nearest(image: &Rgba8, (width, height): (usize, usize)) -> Rgba8 {
+    let mut data = Vec::with_capacity(4 * width * height);
+    for y in 0..height {
+        let row = (2 * y + 1) * image.height / (2 * height);
+        for x in 0..width {
+            let column = (2 * x + 1) * image.width / (2 * width);
+            let at = 4 * (row * image.width + column);
+            data.extend_from_slice(&image.data[at..at + 4]);
+        }
+    }
+    Rgba8::new(width, height, data)
 }
 
 /// The image that a pinhole camera would have taken, by cubic interpolation.
@@ -214,8 +257,11 @@ pub(crate) mod tests {
             .encode(&rgb, 32, 16, image::ExtendedColorType::Rgb8)
             .unwrap();
         std::fs::write(&path, &bytes).unwrap();
-        assert_eq!(look(&path).unwrap(), Stored { size: (32, 16), is_sideways: false });
-        let read = super::read(&path, false).unwrap();
+        assert_eq!(
+            look(&path).unwrap(),
+            Stored { size: (32, 16), orientation: Orientation::NoTransforms }
+        );
+        let read = super::read(&path, false).unwrap().0;
         let worst = read.data.iter().zip(&image.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst < 12, "{worst}");
         for end in 0..bytes.len() {
@@ -246,13 +292,13 @@ pub(crate) mod tests {
         turned.extend(&bytes[2..]);
         std::fs::write(&path, &turned).unwrap();
         let stored = look(&path).unwrap();
-        assert_eq!(stored, Stored { size: (32, 16), is_sideways: true });
+        assert!(stored.size == (32, 16) && stored.is_sideways());
         let of = |width, height| Intrinsics::from_angle_x(width, height, 0.5);
-        assert_eq!(fitted(of(32, 16), stored).unwrap(), (of(32, 16), false));
-        assert_eq!(fitted(of(64, 32), stored).unwrap(), (of(64, 32).resized(32, 16), false));
-        assert_eq!(fitted(of(16, 32), stored).unwrap(), (of(16, 32), true));
+        assert_eq!(fitted(of(32, 16), stored).unwrap(), (of(32, 16), Turn::Stored));
+        assert_eq!(fitted(of(64, 32), stored).unwrap(), (of(64, 32).resized(32, 16), Turn::Stored));
+        assert_eq!(fitted(of(16, 32), stored).unwrap(), (of(16, 32), Turn::Upright));
         assert!(fitted(of(32, 32), stored).unwrap_err().to_string().contains("another shape"));
-        let upright = super::read(&path, true).unwrap();
+        let upright = super::read(&path, true).unwrap().0;
         assert_eq!((upright.width, upright.height), (16, 32));
         assert!(
             upright.data[0] < 20 && upright.data[1] > 200,
@@ -260,7 +306,7 @@ pub(crate) mod tests {
         );
         std::fs::write(&path, "no image").unwrap();
         assert!(look(&path).unwrap_err().to_string().contains("a.png"));
-        let other = dir.path().join("a.tiff");
+        let other = dir.path().join("a.dat");
         std::fs::write(&other, "no image").unwrap();
         assert!(look(&other).unwrap_err().to_string().contains("neither PNG, JPEG nor EXR"));
     }

@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use artifact::{counted, relative_path};
+use artifact::counted;
 use scene::{CameraError, Distortion, Intrinsics};
 use serde::Deserialize;
 
@@ -8,28 +8,27 @@ use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::file_reason::FileReason;
 use crate::format::Format;
-use crate::found::{Found, find};
-use crate::frame::{Frame, names};
+use crate::frame::Frame;
+use crate::frame_file::{FrameFile, Missing, lookup_of};
 use crate::frame_reason::FrameReason;
-use crate::number::{Number, words_as_text};
-use crate::photograph::{Stored, fitted, image_file, is_exr, look};
-use crate::split::Split;
-use crate::text::read_text;
+use crate::number::Number;
+use crate::photograph::{Stored, fitted, look};
+use crate::turn::Turn;
 
 /// `transforms.json`. What a frame doesn't say for itself holds for all.
 #[derive(Deserialize)]
-struct Transforms {
+pub(crate) struct Transforms {
     #[serde(flatten)]
-    shared: LensEntry,
-    frames: Vec<FrameEntry>,
+    pub(crate) shared: LensEntry,
+    pub(crate) frames: Vec<FrameEntry>,
     /// nerfstudio's own split, by file name.
-    train_filenames: Option<Vec<String>>,
-    test_filenames: Option<Vec<String>>,
-    val_filenames: Option<Vec<String>>,
+    pub(crate) train_filenames: Option<Vec<String>>,
+    pub(crate) test_filenames: Option<Vec<String>>,
+    pub(crate) val_filenames: Option<Vec<String>>,
 }
 
 #[derive(Clone, Default, Deserialize)]
-struct LensEntry {
+pub(crate) struct LensEntry {
     camera_model: Option<String>,
     camera_angle_x: Option<Number>,
     camera_angle_y: Option<Number>,
@@ -49,137 +48,42 @@ struct LensEntry {
 }
 
 #[derive(Deserialize)]
-struct FrameEntry {
-    file_path: String,
-    mask_path: Option<String>,
-    depth_file_path: Option<String>,
+pub(crate) struct FrameEntry {
+    pub(crate) file_path: String,
+    pub(crate) mask_path: Option<String>,
+    pub(crate) depth_file_path: Option<String>,
     /// `None` is `null`: what some programs write for a NaN.
     transform_matrix: Vec<Vec<Option<Number>>>,
     #[serde(flatten)]
     own: LensEntry,
 }
 
-/// What to do about an image that isn't there.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Missing {
-    /// It is an error.
-    Refused,
-    /// The frame is left out, and that is said.
-    LeftOut,
-}
-
-/// A file's frames.
-pub(crate) struct Read {
-    pub(crate) frames: Vec<Frame>,
-    /// The first of the frames whose image isn't there, and how many there are.
-    missing: (Option<String>, usize),
-    split: Option<Split>,
-}
-
 /// Reads `transforms.json`: instant-ngp's form and nerfstudio's.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
-    let path = folder.join("transforms.json");
-    let Read { frames, missing, split } =
-        read_file(folder, &path, Missing::LeftOut)?.not_empty(&path)?;
+    let file = FrameFile::read(&folder.join("transforms.json"))?;
+    let mut lookup = lookup_of(folder, &[&file]);
+    let read = file.frames(&mut lookup, Missing::LeftOut)?;
+    if read.frames.is_empty() {
+        return Err(DatasetError::format(file.path(), FileReason::NoFrames));
+    }
+    let (split, split_notes) = file
+        .split_lists()
+        .split(read.frames.len(), &read.names, &mut lookup)
+        .map_err(|reason| DatasetError::format(file.path(), reason))?;
     let mut notes = vec![format!(
         "transforms.json (instant-ngp, nerfstudio): {}",
-        counted(frames.len(), "photograph")
+        counted(read.frames.len(), "photograph")
     )];
-    if let (Some(first), count) = missing {
-        notes.push(format!(
-            "{count} of {} frames have no picture and are left out, first {first}",
-            frames.len() + count
-        ));
-    }
-    let masked = frames.iter().filter(|f| f.mask.is_some()).count();
-    if masked > 0 {
-        let have = if masked == 1 { "has" } else { "have" };
-        notes.push(format!(
-            "{} {have} a mask: what is black there is neither trained on nor scored",
-            counted(masked, "frame")
-        ));
-    }
-    Ok(Dataset { format: Format::Transforms, frames, split, notes })
+    notes.extend(read.missing_note());
+    notes.extend(lookup.notes());
+    notes.extend(split_notes);
+    notes.extend(read.depth_note());
+    Ok(Dataset { format: Format::Transforms, frames: read.frames, split, notes })
 }
 
-impl Read {
-    /// Refuses a file without frames.
-    pub(crate) fn not_empty(self, path: &Path) -> Result<Self, DatasetError> {
-        if self.frames.is_empty() {
-            return Err(DatasetError::format(path, FileReason::NoFrames));
-        }
-        Ok(self)
-    }
-}
-
-/// Reads a file of frames; there may be none.
-pub(crate) fn read_file(
-    folder: &Path,
-    path: &Path,
-    on_missing: Missing,
-) -> Result<Read, DatasetError> {
-    let transforms = parse(&read_text(path)?).map_err(|e| DatasetError::format(path, e))?;
-    let (mut frames, mut files) = (Vec::new(), Vec::new());
-    let (mut first_missing, mut missing) = (None, 0);
-    for (index, entry) in transforms.frames.iter().enumerate() {
-        let of_frame = |reason| DatasetError::frame(path, index, &entry.file_path, reason);
-        let file = image_file(folder, &entry.file_path).map_err(|e| of_frame(e.into()))?;
-        match find(&folder.join(&file), "an image") {
-            Found::File => {}
-            Found::Nothing(found) if on_missing == Missing::Refused => {
-                let remedy = "remove the frame or restore the file";
-                return Err(of_frame(FrameReason::Place { found, remedy }));
-            }
-            Found::Nothing(_) => {
-                first_missing.get_or_insert_with(|| entry.file_path.clone());
-                missing += 1;
-                continue;
-            }
-            Found::Other(found) => {
-                let remedy = "remove the frame or name its image";
-                return Err(of_frame(FrameReason::Place { found, remedy }));
-            }
-        }
-        frames.push(read_frame(folder, &file, entry, &transforms.shared).map_err(of_frame)?);
-        files.push(file);
-    }
-    if let Some(first) = first_missing.clone().filter(|_| frames.is_empty()) {
-        let reason = FileReason::ImagesMissing { count: missing, folder: None, first };
-        return Err(DatasetError::format(path, reason));
-    }
-    for (frame, name) in frames.iter_mut().zip(names(path, &files)?) {
-        frame.name = name;
-    }
-    let split = given_split(&transforms, &files);
-    Ok(Read { frames, missing: (first_missing, missing), split })
-}
-
-/// The split by file names, where there is one for both. What is for validation is for testing
-/// where nothing else is.
-fn given_split(transforms: &Transforms, files: &[PathBuf]) -> Option<Split> {
-    let test = transforms.test_filenames.as_ref().or(transforms.val_filenames.as_ref());
-    let train = numbers_of(transforms.train_filenames.as_ref()?, files);
-    let test = numbers_of(test?, files);
-    (!train.is_empty() && !test.is_empty()).then_some(Split { train, test })
-}
-
-fn numbers_of(names: &[String], files: &[PathBuf]) -> Vec<usize> {
-    let named: Vec<PathBuf> = names.iter().filter_map(|n| relative_path(n).ok()).collect();
-    files.iter().enumerate().filter(|(_, f)| named.contains(f)).map(|(i, _)| i).collect()
-}
-
-/// Parses the JSON; where it fails on Python's `NaN` and `Infinity`, those are taken for numbers,
-/// so that the frame can be named.
-fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
-    serde_json::from_str(text).or_else(|error| match words_as_text(text) {
-        Some(readable) => serde_json::from_str(&readable).map_err(|_| error),
-        None => Err(error),
-    })
-}
-
-fn read_frame(
-    folder: &Path,
-    file: &Path,
+/// Reads a frame without its mask and depth.
+pub(crate) fn read_frame(
+    image: PathBuf,
     entry: &FrameEntry,
     shared: &LensEntry,
 ) -> Result<Frame, FrameReason> {
@@ -193,18 +97,13 @@ fn read_frame(
             *value = matrix[row][column].map_or(f64::NAN, |number| number.0);
         }
     }
-    let image = folder.join(file);
-    let mask = image_beside(folder, entry.mask_path.as_deref())?;
-    let depth = image_beside(folder, entry.depth_file_path.as_deref())?;
-    // nerfstudio's depth, 16-bit PNG of an estimate, is no true depth.
-    let depth = depth.filter(|path| is_exr(path));
-    let (taken_with, turned) = intrinsics(&entry.own.or(shared), look(&image)?)?;
+    let (taken_with, turn) = intrinsics(&entry.own.or(shared), look(&image)?)?;
     let frame = Frame {
         name: String::new(),
         image,
-        turned,
-        mask,
-        depth,
+        turn,
+        mask: None,
+        depth: None,
         taken_with,
         pinhole: None,
         camera_to_world,
@@ -218,18 +117,6 @@ fn read_frame(
             | CameraError::Empty { .. }),
         ) => Err(e.into()),
         Err(e) => Err(FrameReason::Pose(e)),
-    }
-}
-
-/// The mask or depth that a frame names, if it names one.
-fn image_beside(folder: &Path, text: Option<&str>) -> Result<Option<PathBuf>, FrameReason> {
-    let Some(text) = text else { return Ok(None) };
-    let path = folder.join(relative_path(text)?);
-    match find(&path, "an image") {
-        Found::File => Ok(Some(path)),
-        Found::Nothing(found) | Found::Other(found) => {
-            Err(FrameReason::Place { found, remedy: "remove the entry or restore the file" })
-        }
     }
 }
 
@@ -263,7 +150,7 @@ impl LensEntry {
 }
 
 /// What an image was taken with, and whether it has to be turned.
-fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), FrameReason> {
+fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, Turn), FrameReason> {
     let model = entry.camera_model.as_deref().unwrap_or("OPENCV");
     if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"]
         .contains(&model)
@@ -287,7 +174,10 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), F
         radial: [entry.k1, entry.k2, entry.k3].map(|k| or(k, 0.0)),
         tangential: [entry.p1, entry.p2].map(|p| or(p, 0.0)),
     };
-    fitted(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)
+    let (k, turn) = fitted(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)?;
+    // A size that the file doesn't give is the stored image's, which proves nothing.
+    let is_assumed = turn == Turn::Stored && (entry.w.is_none() || entry.h.is_none());
+    Ok((k, if is_assumed { stored.assumed_turn() } else { turn }))
 }
 
 fn whole(value: Option<Number>, name: &'static str, stored: u32) -> Result<u32, FrameReason> {
@@ -322,6 +212,7 @@ fn focal(
 mod tests {
     use super::*;
     use crate::photograph::tests::write_png;
+    use crate::split::Split;
 
     const POSE: &str = r#""transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]"#;
 
@@ -425,6 +316,11 @@ mod tests {
             );
         }
         let nothing = r#"{"fl_x": 50, "frames": [{"file_path": "x.png", "transform_matrix": []}]}"#;
-        assert!(set(nothing).unwrap_err().to_string().contains("not one of its 1 images is there"));
+        assert!(
+            set(nothing)
+                .unwrap_err()
+                .to_string()
+                .contains("none of the 1 images exists (first missing: x.png)")
+        );
     }
 }

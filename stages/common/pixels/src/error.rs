@@ -19,6 +19,16 @@ pub enum PixelError {
         /// What is wrong.
         reason: String,
     },
+    /// The file is an image of a format that isn't read.
+    #[error("{path} is a {format} image, which is not read; convert: {command}")]
+    Unread {
+        /// The file.
+        path: PathBuf,
+        /// Name of the format.
+        format: &'static str,
+        /// Shell command that converts the file.
+        command: String,
+    },
     /// An image that is larger than any that is read.
     #[error(
         "{path}: {width}×{height} pixels; at most {MAX_PIXELS} are read (16384×16384, for \

@@ -223,12 +223,12 @@ fn images(set: &Dataset) -> String {
 /// What to say of a folder without a data set: where it holds images, how to find their cameras.
 fn without_cameras(folder: &Path, error: DatasetError) -> StarterError {
     let pictures = Pictures::of(folder);
-    if !matches!(error, DatasetError::Unknown { .. }) || pictures.count == 0 {
+    if !matches!(error, DatasetError::Unknown { nearby: None, .. }) || pictures.count() == 0 {
         return StarterError::Dataset(error);
     }
     StarterError::NoCameras {
         folder: folder.to_path_buf(),
-        found: counted(pictures.count, "image"),
+        found: pictures.found(),
         command: pictures.command(folder),
     }
 }

@@ -1,4 +1,4 @@
-use dataset::{Format, Split};
+use dataset::{Format, Split, Turn};
 use scene::Intrinsics;
 
 use super::*;
@@ -7,7 +7,7 @@ fn set(format: Format, sizes: &[(u32, u32)]) -> Dataset {
     let frames = sizes.iter().map(|&(width, height)| Frame {
         name: String::new(),
         image: PathBuf::new(),
-        turned: false,
+        turn: Turn::Stored,
         mask: None,
         depth: None,
         taken_with: Intrinsics::from_angle_x(width, height, 0.7),

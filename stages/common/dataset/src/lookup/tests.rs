@@ -1,0 +1,150 @@
+use super::*;
+
+/// A folder with empty files.
+fn folder(files: &[&str]) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    for file in files {
+        let path = dir.path().join(file);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, "").unwrap();
+    }
+    dir
+}
+
+fn found(lookup: &mut Lookup, name: &str) -> String {
+    match lookup.find(name) {
+        Ok(Located::File(file)) => shown(&file.path),
+        Ok(Located::Nothing(found) | Located::Other(found)) => found.to_string(),
+        Err(error) => error.to_string(),
+    }
+}
+
+#[test]
+fn steps_are_taken_in_order_and_combine() {
+    let dir = folder(&[
+        "images/a.png",
+        r"images\b.png",
+        "images/b.png",
+        "images/c.JPG",
+        "images/d.png.png",
+        "Images2/E.Jpeg",
+        "images/f.png",
+        "images/f.exr",
+        "images/g.png",
+        "images/G.png",
+        "images/.h.png",
+        "images/i.jpg",
+    ]);
+    for (name, file) in [
+        ("images/a.png", "images/a.png"),
+        ("./images/a", "images/a.png"),
+        (r"images\a.png", "images/a.png"),
+        (r"images\b.png", r"images\b.png"),
+        (r".\images\A", "images/a.png"),
+        ("images/c", "images/c.JPG"),
+        ("images/c.jpg", "images/c.JPG"),
+        ("images/c.jpg.jpg", "images/c.JPG"),
+        ("images/d.png", "images/d.png.png"),
+        ("images/a.png.png", "images/a.png"),
+        ("images2/e.jpeg", "Images2/E.Jpeg"),
+        ("images2/e", "Images2/E.Jpeg"),
+        ("images/i.heic", "images/i.jpg"),
+        (r"C:\x\images\a.png", "images/a.png"),
+        ("/home/y/images/A.PNG", "images/a.png"),
+        ("images/g.png", "images/g.png"),
+        ("images/f.png", "images/f.png"),
+    ] {
+        let mut lookup = Lookup::in_folder(dir.path(), &[name], &[]);
+        assert_eq!(found(&mut lookup, name), file, "{name}");
+        assert_eq!(lookup.notes().is_empty(), name == file || name == "./images/a", "{name}");
+    }
+    for (name, words) in [
+        ("images/f", r#"images/f.exr and images/f.png both match "images/f"; remove one"#),
+        ("images/G.PNG", r#"images/G.png and images/g.png both match "images/G.PNG""#),
+        ("images/h.png", "images/h.png is not there"),
+        ("images/i.png", "images/i.png is not there"),
+        ("images/x", "images/x.png is not there"),
+        ("../images/a.png", "\"../images/a.png\" is not a path inside the folder"),
+        (r"..\images\a.png", r"..\images\a.png is not there"),
+        ("/home/x.png", "no file of the data set is at the end of the absolute path"),
+        ("", "\"\" is not a path inside the folder"),
+    ] {
+        let message = found(&mut Lookup::in_folder(dir.path(), &[name], &[]), name);
+        assert!(message.contains(words), "{message}");
+    }
+    // A name's own file is not another's: depth next to a photograph, one of two in another case.
+    for (name, other, file) in [
+        ("images/f", "images/f.exr", "images/f.png"),
+        ("images/i", "images/i.jpg", "images/i.png is not there"),
+        ("images/A.png", "images/a.png", "images/A.png is not there"),
+    ] {
+        let mut lookup = Lookup::in_folder(dir.path(), &[name, other], &[]);
+        assert!(found(&mut lookup, name).ends_with(file), "{name}");
+        assert_eq!(found(&mut lookup, other), other);
+    }
+}
+
+/// Equally many parts are removed for all names: what finds most, the longest tail first.
+#[test]
+fn tails_are_the_same_for_all() {
+    let dir = folder(&["scene/images/a.png", "images/a.png", "images/b.png", "b.png"]);
+    let names = ["/x/scene/images/a.png", "/x/scene/images/b.png", "/x/scene/images/c.png"];
+    let mut lookup = Lookup::in_folder(dir.path(), &names, &[]);
+    assert_eq!(found(&mut lookup, names[0]), "images/a.png");
+    assert_eq!(found(&mut lookup, names[1]), "images/b.png");
+    assert!(found(&mut lookup, names[2]).contains("no file of the data set"));
+    assert_eq!(
+        lookup.notes(),
+        ["2 file names are absolute paths, read without the first 2 parts \
+            (/x/scene/images/a.png is images/a.png)"]
+    );
+    let mut one = Lookup::in_folder(dir.path(), &names[..1], &[]);
+    assert_eq!(found(&mut one, names[0]), "scene/images/a.png");
+}
+
+/// Reduced copies may have another format; the largest that has most names is taken.
+#[test]
+fn reduced_copies_stand_in_for_missing_images() {
+    let files =
+        ["images_8/a.png", "images_8/b.png", "images_4/a.PNG", "images_4/b.png", "images_2/a.png"];
+    let dir = folder(&files);
+    for (base, mut lookup) in [
+        ("", Lookup::in_images(dir.path(), &["a.jpg", "b.jpg"])),
+        ("images/", Lookup::in_folder(dir.path(), &["images/a.jpg", "images/b.jpg"], &[])),
+    ] {
+        assert_eq!(found(&mut lookup, &format!("{base}a.jpg")), "images_4/a.PNG");
+        assert_eq!(found(&mut lookup, &format!("{base}b.jpg")), "images_4/b.png");
+        let note = format!(
+            "2 file names are read from images_4, because images is missing or empty ({base}a.jpg \
+            is images_4/a.PNG)"
+        );
+        assert_eq!(lookup.notes(), [note]);
+        assert_eq!(
+            lookup.without_base(Path::new("images_4/x/a.png")),
+            match base {
+                "" => Path::new("x/a.png"),
+                _ => Path::new("images_4/x/a.png"),
+            }
+        );
+    }
+    std::fs::create_dir(dir.path().join("images")).unwrap();
+    let mut lookup = Lookup::in_images(dir.path(), &["a.jpg"]);
+    assert_eq!(found(&mut lookup, "a.jpg"), "images_2/a.png");
+    std::fs::write(dir.path().join("images/b.jpg"), "").unwrap();
+    let mut lookup = Lookup::in_images(dir.path(), &["a.jpg"]);
+    assert!(found(&mut lookup, "a.jpg").contains("images/a.jpg is not there"));
+}
+
+/// COLMAP's names may start from the data set's folder.
+#[test]
+fn names_of_models_start_from_images_or_from_the_folder() {
+    let dir = folder(&["images/x/a  b.png", "c.png"]);
+    for (name, file) in [
+        ("x/a  b.png", "images/x/a  b.png"),
+        ("images/x/a  b.png", "images/x/a  b.png"),
+        ("c.png", "c.png"),
+    ] {
+        assert_eq!(found(&mut Lookup::in_images(dir.path(), &[name]), name), file);
+    }
+    assert!(Lookup::in_images(dir.path(), &["d.png"]).base().ends_with("images"));
+}

@@ -1,0 +1,130 @@
+//! Formats of images that aren't read, and the commands that convert them.
+
+use std::fs::File;
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+
+use pixels::PixelError;
+
+/// Format of images that isn't read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct UnreadFormat {
+    name: &'static str,
+    extensions: &'static [&'static str],
+    /// Format to convert to: JPEG where images are photographs of a telephone.
+    target: &'static str,
+}
+
+const HEIC: UnreadFormat =
+    UnreadFormat { name: "HEIC", extensions: &["heic", "heif", "hif"], target: "jpg -quality 98" };
+const AVIF: UnreadFormat = UnreadFormat { name: "AVIF", extensions: &["avif"], target: "png" };
+const WEBP: UnreadFormat = UnreadFormat { name: "WebP", extensions: &["webp"], target: "png" };
+const TIFF: UnreadFormat =
+    UnreadFormat { name: "TIFF", extensions: &["tif", "tiff"], target: "png" };
+const BMP: UnreadFormat = UnreadFormat { name: "BMP", extensions: &["bmp"], target: "png" };
+const GIF: UnreadFormat = UnreadFormat { name: "GIF", extensions: &["gif"], target: "png" };
+const FORMATS: [UnreadFormat; 6] = [HEIC, AVIF, WEBP, TIFF, BMP, GIF];
+
+/// Bytes at a file's start that tell its format.
+const SIGNATURE_BYTES: usize = 12;
+
+impl UnreadFormat {
+    fn of_name(path: &Path) -> Option<Self> {
+        let extension = path.extension()?.to_str()?.to_ascii_lowercase();
+        FORMATS.into_iter().find(|format| format.extensions.contains(&extension.as_str()))
+    }
+
+    fn of_signature(bytes: &[u8; SIGNATURE_BYTES]) -> Option<Self> {
+        match bytes {
+            [_, _, _, _, b'f', b't', b'y', b'p', b'a', b'v', b'i', _] => Some(AVIF),
+            [_, _, _, _, b'f', b't', b'y', b'p', b'h' | b'm', ..] => Some(HEIC),
+            [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P'] => Some(WEBP),
+            [b'I', b'I', b'*', 0, ..] | [b'M', b'M', 0, b'*', ..] => Some(TIFF),
+            [b'B', b'M', ..] => Some(BMP),
+            [b'G', b'I', b'F', b'8', ..] => Some(GIF),
+            _ => None,
+        }
+    }
+
+    /// Returns the command that converts all files with a file's extension, next to that file.
+    fn command(self, path: &Path) -> String {
+        let folder = path.parent().unwrap_or(Path::new(".")).display().to_string();
+        let files = match path.extension().and_then(|extension| extension.to_str()) {
+            Some(extension) => format!("*.{extension}"),
+            None => "*".to_owned(),
+        };
+        let folder = folder.replace('\'', r"'\''");
+        format!("magick mogrify -format {} '{folder}'/{files}", self.target)
+    }
+}
+
+/// True if a file's name is that of an image whose format isn't read.
+pub fn is_unread_name(path: &Path) -> bool {
+    UnreadFormat::of_name(path).is_some()
+}
+
+/// Returns the refusal of a file whose content, or else name, is an image of a format that isn't
+/// read.
+pub(crate) fn refusal(path: &Path) -> Option<PixelError> {
+    let mut bytes = [0; SIGNATURE_BYTES];
+    let is_read = File::open(path).and_then(|mut file| file.read_exact(&mut bytes)).is_ok();
+    let format = UnreadFormat::of_signature(&bytes).filter(|_| is_read);
+    let format = format.or_else(|| UnreadFormat::of_name(path))?;
+    Some(PixelError::Unread {
+        path: path.to_path_buf(),
+        format: format.name,
+        command: format.command(path),
+    })
+}
+
+/// Returns the number and format of unread images among files, with the command that converts them;
+/// nothing where there are none.
+pub fn unread_images(files: &[PathBuf]) -> Option<String> {
+    let mut unread = files.iter().filter(|path| is_unread_name(path));
+    let first = unread.next()?;
+    let format = UnreadFormat::of_name(first)?;
+    let count = 1 + unread.count();
+    Some(format!(
+        "{count} in {}, which is not read; convert: {}",
+        format.name,
+        format.command(first)
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn formats_are_told_by_content_and_by_name() {
+        let dir = tempfile::tempdir().unwrap();
+        for (name, bytes, format) in [
+            ("a.png", &b"RIFF\x10\0\0\0WEBPVP8 "[..], "WebP"),
+            ("a.heic", b"\0\0\0\x18ftypheic\0\0\0\0", "HEIC"),
+            ("b", b"\0\0\0\x18ftypmif1\0\0\0\0", "HEIC"),
+            ("c.avif", b"\0\0\0\x18ftypavif\0\0\0\0", "AVIF"),
+            ("a.tif", b"II*\0\x08\0\0\0\0\0\0\0", "TIFF"),
+            ("b.tiff", b"MM\0*\0\0\0\x08\0\0\0\0", "TIFF"),
+            ("a.bmp", b"BM\x46\0\0\0\0\0\0\0\x36\0", "BMP"),
+            ("a.gif", b"GIF89a\0\0\0\0\0\0", "GIF"),
+            ("short.WEBP", b"", "WebP"),
+        ] {
+            let path = dir.path().join(name);
+            std::fs::write(&path, bytes).unwrap();
+            let message = refusal(&path).unwrap().to_string();
+            assert!(message.contains(&format!("{name} is a {format} image")), "{message}");
+        }
+        let png = dir.path().join("d.png");
+        std::fs::write(&png, b"\x89PNG\r\n\x1a\n\0\0\0\0").unwrap();
+        assert!(refusal(&png).is_none());
+        assert!(refusal(&dir.path().join("gone.png")).is_none());
+    }
+
+    #[test]
+    fn commands_are_quoted() {
+        assert_eq!(
+            HEIC.command(Path::new("/data/Tom's set/IMG 1.HEIC")),
+            r"magick mogrify -format jpg -quality 98 '/data/Tom'\''s set'/*.HEIC"
+        );
+    }
+}

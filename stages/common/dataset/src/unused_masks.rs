@@ -1,0 +1,118 @@
+//! Warnings of files that look like masks and that no view uses.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use artifact::{WARNING, counted};
+
+use crate::format::Format;
+use crate::frame::Frame;
+use crate::lookup::Listings;
+use crate::misplaced::shown;
+use crate::photograph::is_image_name;
+
+/// Folders inside a folder of masks that are searched, in levels.
+const MAX_DEPTH: usize = 4;
+
+/// Returns a warning for each folder with images that look like masks and are not used: folders
+/// such as `masks` next to the images' folders, and files such as `a_mask.png` next to images.
+pub(crate) fn unused_masks(
+    listings: &mut Listings,
+    format: Format,
+    frames: &[Frame],
+) -> Vec<String> {
+    let root = listings.root().to_path_buf();
+    let inside = |path: &Path| path.strip_prefix(&root).unwrap_or(path).to_path_buf();
+    let images: BTreeSet<PathBuf> = frames.iter().map(|frame| inside(&frame.image)).collect();
+    let masks = frames.iter().filter_map(|frame| frame.mask.as_ref());
+    let used: BTreeSet<PathBuf> = masks.map(|mask| inside(&mask.path)).collect();
+    let parents: BTreeSet<&Path> = images.iter().filter_map(|image| image.parent()).collect();
+    let mut above: BTreeSet<&Path> = parents.iter().filter_map(|parent| parent.parent()).collect();
+    above.insert(Path::new(""));
+    let mut places: Vec<(PathBuf, Vec<PathBuf>)> = Vec::new();
+    for folder in above {
+        for name in listings.names(folder) {
+            let path = folder.join(&name);
+            let is_copy = !used.is_empty() && is_reduced_copy(&name);
+            if looks_like_mask(&name) && !is_copy && listings.is_folder(&path) {
+                places.push((path.clone(), images_below(listings, &path, MAX_DEPTH)));
+            }
+        }
+    }
+    for folder in parents {
+        let mut files = images_in(listings, folder);
+        files
+            .retain(|file| file.file_stem().is_some_and(|s| looks_like_mask(&s.to_string_lossy())));
+        places.push((folder.to_path_buf(), files));
+    }
+    let mut warnings = Vec::new();
+    for (folder, mut files) in places {
+        files.retain(|file| !used.contains(file) && !images.contains(file));
+        warnings.extend(warning(format, &folder, &files));
+    }
+    warnings
+}
+
+fn warning(format: Format, folder: &Path, files: &[PathBuf]) -> Option<String> {
+    let first = files.first()?;
+    let count = counted(files.len(), "file");
+    let (looks, is) = if files.len() == 1 { ("looks", "is") } else { ("look", "are") };
+    let like = if files.len() == 1 { "a mask" } else { "masks" };
+    let place = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    let remedy = match format {
+        Format::Blender | Format::Transforms => "name masks in their frames' mask_path",
+        Format::Llff | Format::Colmap => {
+            "masks are named masks/NAME.png or masks/NAME.EXT.png after their photographs"
+        }
+    };
+    Some(format!(
+        "{WARNING}{count} in {} {looks} like {like} and {is} not used, first {}; {remedy}",
+        shown(place),
+        shown(first)
+    ))
+}
+
+/// True if one of a name's words is that of a mask.
+fn looks_like_mask(name: &str) -> bool {
+    let lower = name.to_lowercase();
+    let mut words = lower.split(|c: char| !c.is_alphabetic());
+    words.any(|word| matches!(word, "mask" | "masks" | "segmentation" | "segmentations"))
+}
+
+/// True for nerfstudio's `masks_2`, `masks_4` …: smaller copies of `masks`.
+fn is_reduced_copy(name: &str) -> bool {
+    name.strip_prefix("masks_").is_some_and(|factor| factor.parse::<u32>().is_ok())
+}
+
+fn images_in(listings: &mut Listings, folder: &Path) -> Vec<PathBuf> {
+    let paths = listings.names(folder).into_iter().map(|name| folder.join(name));
+    paths.filter(|path| is_image_name(path)).collect()
+}
+
+fn images_below(listings: &mut Listings, folder: &Path, depth: usize) -> Vec<PathBuf> {
+    let mut found = images_in(listings, folder);
+    if depth > 0 {
+        for name in listings.names(folder) {
+            let path = folder.join(name);
+            if listings.is_folder(&path) {
+                found.extend(images_below(listings, &path, depth - 1));
+            }
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_masks_are_told_from_others() {
+        for name in ["masks", "Mask", "a_mask", "a.mask", "mask001", "dynamic_mask_a", "masks_4"] {
+            assert!(looks_like_mask(name), "{name}");
+        }
+        for name in ["unmasked", "masked_ball", "images", "a", "damask"] {
+            assert!(!looks_like_mask(name), "{name}");
+        }
+    }
+}
