@@ -2,13 +2,14 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use artifact::FailureExt as _;
+use artifact::{FailureExt as _, WARNING};
 use dataset::Frame;
 use pixels::Rgba8;
 use rayon::prelude::*;
 use scene::Background;
 
 use crate::frame_name::frame_name;
+use crate::strips::Strips;
 
 /// Views that are looked at, spread evenly: enough to tell nine of ten.
 pub(crate) const MOST_VIEWS: usize = 20;
@@ -62,6 +63,17 @@ pub(crate) struct Borders {
     /// Views whose borders are the flat colour, and views looked at.
     flat: usize,
     views: usize,
+    strips: Option<CommonStrips>,
+}
+
+/// Strips that views have in common.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct CommonStrips {
+    strips: Strips,
+    /// Number of views that have them.
+    views: usize,
+    /// True if all views' masks leave them out.
+    are_masked: bool,
 }
 
 impl Borders {
@@ -70,7 +82,7 @@ impl Borders {
     pub(crate) fn new(borders: &[Border]) -> Self {
         let views = borders.len();
         if borders.contains(&Border::Transparent) {
-            return Self { behind: Behind::Transparent, flat: 0, views };
+            return Self { behind: Behind::Transparent, flat: 0, views, strips: None };
         }
         let colour = |b: &Border| if let Border::Flat(c) = b { Some(*c) } else { None };
         let known: Vec<[u8; 3]> = borders.iter().filter_map(colour).collect();
@@ -78,7 +90,44 @@ impl Borders {
         let flat = known.iter().filter(|colour| is_like(**colour, common)).count();
         let behind =
             if views > 0 && 10 * flat >= 9 * views { Behind::Flat(common) } else { Behind::Scene };
-        Self { behind, flat, views }
+        Self { behind, flat, views, strips: None }
+    }
+
+    /// Takes in the strips of the views, and whether masks leave these out. A frame of strips is no
+    /// background.
+    fn with_strips(mut self, views: &[(Option<Strips>, bool)]) -> Self {
+        let strips: Vec<Option<Strips>> = views.iter().map(|(strips, _)| *strips).collect();
+        let common = Strips::common(&strips).filter(|_| self.behind != Behind::Transparent);
+        if let Some((strips, count)) = common {
+            let are_masked = views.iter().all(|(strips, is_masked)| strips.is_none() || *is_masked);
+            self.strips = Some(CommonStrips { strips, views: count, are_masked });
+            if strips.is_frame() {
+                self.behind = Behind::Scene;
+            }
+        }
+        self
+    }
+
+    /// Returns the signs by which the background is known, a line each, with what to do about
+    /// strips.
+    pub(crate) fn signs(&self) -> Vec<String> {
+        let mut signs = Vec::new();
+        let is_frame = self.strips.as_ref().is_some_and(|common| common.strips.is_frame());
+        if self.behind != Behind::Transparent && !is_frame {
+            signs.push(self.to_string());
+        }
+        if let Some(CommonStrips { strips, views, are_masked }) = &self.strips {
+            let place = format!("{strips} in {views} of {} views looked at", self.views);
+            signs.push(if *are_masked {
+                format!("{place} are masked out and are not a background")
+            } else {
+                format!(
+                    "{WARNING}{place}, as undistortion and letterboxing leave them, are not a \
+                    background: mask them out (masks/NAME.png, mask_path) or crop the photographs"
+                )
+            });
+        }
+        signs
     }
 
     /// What rays see behind everything. A flat colour that is neither white nor black counts as a
@@ -139,15 +188,34 @@ fn median(colours: &[[u8; 3]]) -> [u8; 3] {
 /// No more images than threads are held at once.
 pub(crate) fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
     let count = frames.len().min(MOST_VIEWS);
-    if count > 0 && look(frames[0])? == Border::Transparent {
+    if count > 0 && look(frames[0])?.border == Border::Transparent {
         return Ok(Borders::new(&[Border::Transparent]));
     }
     let chosen = (0..count).into_par_iter().map(|i| look(frames[i * frames.len() / count]));
-    Ok(Borders::new(&chosen.collect::<anyhow::Result<Vec<Border>>>()?))
+    let views = chosen.collect::<anyhow::Result<Vec<View>>>()?;
+    let borders: Vec<Border> = views.iter().map(|view| view.border).collect();
+    let strips: Vec<_> = views.iter().map(|view| (view.strips, view.are_masked)).collect();
+    Ok(Borders::new(&borders).with_strips(&strips))
 }
 
-fn look(frame: &Frame) -> anyhow::Result<Border> {
-    Ok(Border::of(&frame.photograph().bad_input(frame_name(frame))?))
+/// Border of a view's image.
+struct View {
+    border: Border,
+    strips: Option<Strips>,
+    /// True if the view's mask leaves the strips out.
+    are_masked: bool,
+}
+
+fn look(frame: &Frame) -> anyhow::Result<View> {
+    let image = frame.photograph().bad_input(frame_name(frame))?;
+    let border = Border::of(&image);
+    let strips = if border == Border::Transparent { None } else { Strips::of(&image) };
+    let mut are_masked = false;
+    if let Some(strips) = &strips {
+        let mask = frame.mask().bad_input(frame_name(frame))?;
+        are_masked = mask.is_some_and(|mask| strips.are_masked(&mask));
+    }
+    Ok(View { border, strips, are_masked })
 }
 
 #[cfg(test)]

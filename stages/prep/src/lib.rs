@@ -28,6 +28,7 @@ mod references;
 mod scene_plan;
 mod sizes;
 mod split;
+mod strips;
 mod summary;
 mod writer;
 
@@ -38,7 +39,7 @@ use scene::Background;
 use serde_json::json;
 use stage::{Context, Stage};
 
-use borders::{Behind, borders};
+use borders::borders;
 pub use bounds::{SeenDepths, SpaceError, SpaceKind, place};
 pub use degrade::{LrImage, degrade};
 use frame_name::frame_name;
@@ -96,13 +97,18 @@ impl Stage for Prep {
             set.notes.iter().cloned().chain([images.choice(&split)]).chain(warnings).collect();
         notes.iter().for_each(|note| context.say(note));
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
-        let (background, sign) = background(params, &training)?;
+        let (background, signs) = background(params, &training)?;
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
-        for note in sign.into_iter().chain([space_note(&plan.bounds, background)]) {
+        let writer = SceneWriter::new(context, &plan);
+        for note in signs.into_iter().chain([space_note(&plan.bounds, background)]) {
             context.say(&note);
             notes.push(note);
         }
-        SceneWriter::new(context, &plan).write()?;
+        writer.write()?;
+        if let Some(note) = writer.clipping_note() {
+            context.say(&note);
+            notes.push(note);
+        }
         let summary = SceneSummary::new(&set, &plan, notes);
         context.write_json("scene.json", &summary)?;
         context.write_summary(&summary.in_words())
@@ -134,12 +140,11 @@ fn dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
     Ok(if is_own { set } else { set.merged() })
 }
 
-/// What lies behind the scene, and by which sign that is known where it wasn't given.
-fn background(params: &Params, train: &[&Frame]) -> anyhow::Result<(Background, Option<String>)> {
+/// Returns what lies behind the scene, and the signs by which that is known where it wasn't given.
+fn background(params: &Params, train: &[&Frame]) -> anyhow::Result<(Background, Vec<String>)> {
     if let Some(given) = params.background {
-        return Ok((given, None));
+        return Ok((given, Vec::new()));
     }
     let borders = borders(train)?;
-    let sign = (borders.behind != Behind::Transparent).then(|| borders.to_string());
-    Ok((borders.background(), sign))
+    Ok((borders.background(), borders.signs()))
 }

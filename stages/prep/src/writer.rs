@@ -1,8 +1,10 @@
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context as _;
-use artifact::{FailureExt as _, printable};
-use dataset::Frame;
+use artifact::{FailureExt as _, WARNING, counted, printable};
+use dataset::{Clipping, Frame};
 use pixels::{
     Channel, DEGRADATION_FILE, Degradation, DepthMap, Kernel, Mask, Rgba8, SampleType, read_exr,
     write_exr, write_png,
@@ -20,12 +22,14 @@ pub(crate) struct SceneWriter<'a> {
     context: &'a Context,
     plan: &'a ScenePlan<'a>,
     progress: Progress,
+    /// Names and clipped pixels of EXR photographs, by file.
+    clipping: Mutex<BTreeMap<PathBuf, (String, Clipping)>>,
 }
 
 impl<'a> SceneWriter<'a> {
     pub(crate) fn new(context: &'a Context, plan: &'a ScenePlan<'a>) -> Self {
         let progress = context.progress("preparing", (plan.train.len() + plan.test.len()) as u64);
-        Self { context, plan, progress }
+        Self { context, plan, progress, clipping: Mutex::default() }
     }
 
     /// Writes everything.
@@ -36,6 +40,23 @@ impl<'a> SceneWriter<'a> {
         self.write_references()?;
         self.write_truth_images()?;
         self.write_truth_and_cameras()
+    }
+
+    /// Returns a warning of the pixels that are brighter than white, if there are any.
+    pub(crate) fn clipping_note(&self) -> Option<String> {
+        let all = self.clipping.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut with_clipped = all.values().filter(|(_, clipping)| clipping.clipped > 0);
+        let (first, _) = with_clipped.next()?;
+        let count = 1 + with_clipped.count();
+        let sum: Clipping = all.values().map(|(_, clipping)| *clipping).sum();
+        Some(format!(
+            "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and are clipped to 1, in {count} of \
+            {}, first frame {first}",
+            sum.clipped,
+            sum.pixels,
+            100.0 * sum.clipped as f64 / sum.pixels as f64,
+            counted(all.len(), "EXR photograph"),
+        ))
     }
 
     fn write_views(&self, subtree: &str, views: Vec<View>) -> anyhow::Result<()> {
@@ -205,7 +226,11 @@ impl<'a> SceneWriter<'a> {
 
     /// The HR image, where there is one, and the LR image.
     fn images(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LrImage)> {
-        let image = frame.photograph().bad_input(frame_name(frame))?;
+        let (image, clipping) = frame.photograph_and_clipping().bad_input(frame_name(frame))?;
+        if clipping.pixels > 0 {
+            let mut all = self.clipping.lock().unwrap_or_else(PoisonError::into_inner);
+            all.insert(frame.image.clone(), (frame.name.clone(), clipping));
+        }
         if !self.plan.images.has_truth {
             return Ok((None, LrImage::Bytes(image)));
         }
