@@ -1,0 +1,286 @@
+//! Pixels: EXR, EXIF orientation, strips at the border, and formats that aren't read.
+
+use std::path::Path;
+
+use pixels::{Channel, PixelError, Rgba8, SampleType, write_exr};
+use serde_json::json;
+
+use super::kit::{
+    CAMERA, Case, Expected, SIDE, Scene, case, held_out, jpeg, photograph, transforms, write,
+    write_colmap, write_image, write_llff, write_mask, write_photographs, write_transforms,
+};
+
+const THREE: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
+const COLMAP: &str = "COLMAP: 10 photographs of sparse/0";
+
+/// EXR photographs; the second has 16 pixels of 40.
+fn exr(folder: &Path) {
+    std::fs::create_dir_all(folder.join("images")).unwrap();
+    for number in 0..3 {
+        let channels = ["R", "G", "B"].map(|name| Channel { name, sample_type: SampleType::Half });
+        let size = (SIDE as usize, SIDE as usize);
+        let bright = if number == 1 { 3 * SIDE as usize } else { 0 };
+        let path = folder.join(format!("images/a{number}.exr"));
+        write_exr(&path, size, &channels, "", |first, _, samples| {
+            for (i, sample) in samples.iter_mut().enumerate() {
+                let at = 3 * first * size.0 + i;
+                *sample = if at < bright { 40.0 } else { (at % 97) as f32 / 97.0 };
+            }
+            Ok::<(), PixelError>(())
+        })
+        .unwrap();
+    }
+    write_transforms(folder, &transforms("images/a#.exr", 3));
+}
+
+/// JPEGs with an EXIF orientation, and cameras of a size.
+fn oriented(folder: &Path, stored: (u32, u32), orientation: u8, camera: (u32, u32)) {
+    for number in 0..3 {
+        let image = jpeg(&photograph(stored.0, stored.1, number), Some(orientation));
+        write(folder.join(format!("images/a{number}.jpg")), image);
+    }
+    let mut list = transforms("images/a#.jpg", 3);
+    (list["w"], list["h"]) = (json!(camera.0), json!(camera.1));
+    write_transforms(folder, &list);
+}
+
+fn of_size(mut scene: Scene, width: f64, height: f64) -> Expected {
+    for view in scene.train.iter_mut().chain(&mut scene.test) {
+        (view.inside[0], view.inside[1]) = (width, height);
+    }
+    Expected::Scene(scene)
+}
+
+/// Ten photographs with black strips of some widths: top, right, bottom, left.
+fn strips(folder: &Path, [top, right, bottom, left]: [u32; 4]) {
+    write_colmap(&folder.join("sparse/0"), CAMERA, "a#.png", 10);
+    for number in 0..10 {
+        let mut image = photograph(SIDE, SIDE, number);
+        for at in 0..SIDE * SIDE {
+            let (x, y) = (at % SIDE, at / SIDE);
+            if x < left || x >= SIDE - right || y < top || y >= SIDE - bottom {
+                image.data[4 * at as usize..][..3].fill(2);
+            }
+        }
+        write_image(&folder.join(format!("images/a{number}.png")), &image);
+    }
+}
+
+fn is_inside(x: u32, y: u32) -> bool {
+    (3..SIDE - 3).contains(&x) && (3..SIDE - 3).contains(&y)
+}
+
+fn masked_strips(folder: &Path) {
+    strips(folder, [3; 4]);
+    for number in 0..10 {
+        write_mask(&folder.join(format!("masks/a{number}.png")), (SIDE, SIDE), is_inside);
+    }
+}
+
+fn with_lines(mut scene: Scene, further: &[&'static str]) -> Scene {
+    scene.further = further.to_vec();
+    scene
+}
+
+/// Objects on black: views of a disc of several sizes.
+fn discs(folder: &Path) {
+    write_colmap(&folder.join("sparse/0"), CAMERA, "a#.png", 10);
+    for number in 0..10 {
+        let radius = 24 + 3 * number as i64;
+        let mut image = photograph(SIDE, SIDE, number);
+        for at in 0..(SIDE * SIDE) as usize {
+            let (x, y) = (at as i64 % 16 - 8, at as i64 / 16 - 8);
+            if x * x + y * y > radius {
+                image.data[4 * at..][..3].fill(0);
+            }
+        }
+        write_image(&folder.join(format!("images/a{number}.png")), &image);
+    }
+}
+
+fn unread(folder: &Path, name: &str, content: &[u8]) {
+    let mut list = transforms("images/a#.png", 3);
+    list["frames"][1]["file_path"] = json!(name);
+    write_photographs(folder, "images/a#.png", 3);
+    write(folder.join(name), content);
+    write_transforms(folder, &list);
+}
+
+fn exif_cases() -> Vec<Case> {
+    const ASSUMED: &str = "3 photographs have an EXIF orientation that the camera's width and height neither confirm nor contradict; assumed: poses are those of the image as stored";
+    vec![
+        case(
+            "colmap#1456: a square, turned by 90°",
+            |folder| oriented(folder, (SIDE, SIDE), 6, (SIDE, SIDE)),
+            Expected::Scene(held_out("a#", 3, &[THREE, ASSUMED])),
+        ),
+        case(
+            "colmap#2104: turned by 180°",
+            |folder| oriented(folder, (SIDE, 12), 3, (SIDE, 12)),
+            of_size(held_out("a#", 3, &[THREE, ASSUMED]), 16.0, 12.0),
+        ),
+        case(
+            "the camera has the stored shape",
+            |folder| oriented(folder, (SIDE, 12), 6, (SIDE, 12)),
+            of_size(held_out("a#", 3, &[THREE]), 16.0, 12.0),
+        ),
+        case(
+            "the camera has the turned shape",
+            |folder| oriented(folder, (SIDE, 12), 6, (12, SIDE)),
+            of_size(
+                held_out("a#", 3, &[THREE, "3 photographs are turned upright, as EXIF data ask"]),
+                12.0,
+                16.0,
+            ),
+        ),
+    ]
+}
+
+fn border_cases() -> Vec<Case> {
+    vec![
+        case(
+            "f2-nerf#33: strips around every photograph",
+            |folder| strips(folder, [3; 4]),
+            Expected::Scene(with_lines(
+                held_out("a#", 10, &[COLMAP]),
+                &[
+                    "warning: uniform strips at the border (colour 2 2 2; top 3, right 3, bottom 3, left 3 pixels) in 8 of 8 views looked at, as undistortion and letterboxing leave them, are not a background: mask them out (masks/NAME.png, mask_path) or crop the photographs",
+                ],
+            )),
+        ),
+        case(
+            "letterboxing",
+            |folder| strips(folder, [2, 0, 3, 0]),
+            Expected::Scene(with_lines(
+                held_out("a#", 10, &[COLMAP]),
+                &[
+                    "warning: uniform strips at the border (colour 2 2 2; top 2, bottom 3 pixels) in 8 of 8 views looked at, as undistortion and letterboxing leave them, are not a background: mask them out (masks/NAME.png, mask_path) or crop the photographs",
+                ],
+            )),
+        ),
+        case("strips that are masked out", masked_strips, {
+            let mut scene = held_out(
+                "a#",
+                10,
+                &[COLMAP, "10 of 10 views have masks (masks/NAME.png for 10: black is left out)"],
+            );
+            for view in scene.train.iter_mut().chain(&mut scene.test) {
+                view.mask = Some(is_inside);
+            }
+            Expected::Scene(with_lines(
+                scene,
+                &[
+                    "uniform strips at the border (colour 2 2 2; top 3, right 3, bottom 3, left 3 pixels) in 8 of 8 views looked at are masked out and are not a background",
+                ],
+            ))
+        }),
+        case(
+            "objects on black are on black",
+            discs,
+            Expected::Scene(with_lines(
+                held_out("a#", 10, &[COLMAP]),
+                &[
+                    "images have no alpha; borders are one flat colour (0 0 0) in 8 of 8 views looked at",
+                ],
+            )),
+        ),
+    ]
+}
+
+fn format_cases() -> Vec<Case> {
+    vec![
+        case(
+            "HEIC",
+            |folder| unread(folder, "images/b.HEIC", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"),
+            Expected::Refused(
+                "dataset: DIR/transforms.json: frame 1 (images/b.HEIC): DIR/images/b.HEIC is a HEIC image, which is not read; convert: magick mogrify -format jpg -quality 98 'DIR/images'/*.HEIC",
+            ),
+        ),
+        case(
+            "WebP that is named PNG",
+            |folder| unread(folder, "images/b.png", b"RIFF\x10\0\0\0WEBPVP8 \0\0\0\0"),
+            Expected::Refused(
+                "dataset: DIR/transforms.json: frame 1 (images/b.png): DIR/images/b.png is a WebP image, which is not read; convert: magick mogrify -format png 'DIR/images'/*.png",
+            ),
+        ),
+        case(
+            "TIFF",
+            |folder| unread(folder, "images/b.tif", b"II*\0\x08\0\0\0\0\0\0\0"),
+            Expected::Refused(
+                "dataset: DIR/transforms.json: frame 1 (images/b.tif): DIR/images/b.tif is a TIFF image, which is not read; convert: magick mogrify -format png 'DIR/images'/*.tif",
+            ),
+        ),
+        case(
+            "BMP",
+            |folder| unread(folder, "images/b.bmp", b"BM\x46\0\0\0\0\0\0\0\x36\0\0\0"),
+            Expected::Refused(
+                "dataset: DIR/transforms.json: frame 1 (images/b.bmp): DIR/images/b.bmp is a BMP image, which is not read; convert: magick mogrify -format png 'DIR/images'/*.bmp",
+            ),
+        ),
+        case(
+            "HEIC that was converted",
+            |folder| {
+                unread(folder, "images/b.HEIC", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic");
+                write_image(&folder.join("images/b.jpg"), &photograph(SIDE, SIDE, 1));
+            },
+            {
+                let mut scene = held_out(
+                    "a#",
+                    3,
+                    &[
+                        THREE,
+                        "1 file name differs from its file in the extension (images/b.HEIC is images/b.jpg)",
+                    ],
+                );
+                scene.train[0].name = "b".to_owned();
+                Expected::Scene(scene)
+            },
+        ),
+        case(
+            "LLFF of WebP",
+            |folder| {
+                write_llff(folder, &[0, 1], [2.0, 6.0]);
+                for name in ["images/a.webp", "images/b.webp"] {
+                    write(folder.join(name), b"RIFF\x10\0\0\0WEBPVP8 \0\0\0\0");
+                }
+            },
+            Expected::Refused(
+                "dataset: DIR/poses_bounds.npy: 2 poses for 0 images in images/ (2 in WebP, which is not read; convert: magick mogrify -format png 'DIR/images'/*.webp); counts must match: remove the other images, or list the images with poses in view_imgs.txt",
+            ),
+        ),
+    ]
+}
+
+pub(crate) fn cases() -> Vec<Case> {
+    let mut cases = vec![
+        case("ns#1097, LFS#1011: EXR above 1", exr, {
+            Expected::Scene(with_lines(
+                held_out("a#", 3, &[THREE]),
+                &[
+                    "warning: 16 of 768 pixels (2.08 %) are brighter than 1 and are clipped to 1, in 1 of 3 EXR photographs, first frame a1",
+                ],
+            ))
+        }),
+        case(
+            "ns#1213, EasyVolcap#31: several sizes",
+            |folder| {
+                let mut list = transforms("images/a#.png", 3);
+                let image = Rgba8 { ..photograph(12, SIDE, 1) };
+                write_photographs(folder, "images/a#.png", 3);
+                write_image(&folder.join("images/a1.png"), &image);
+                (list["frames"][1]["w"], list["frames"][1]["cx"]) = (json!(12), json!(6));
+                write_transforms(folder, &list);
+            },
+            {
+                let mut scene =
+                    held_out("a#", 3, &[THREE, "photographs of 2 sizes, from 12×16 to 16×16"]);
+                scene.train[0].inside = [12.0, 16.0, 20.0, 20.0, 6.0, 8.0];
+                Expected::Scene(scene)
+            },
+        ),
+    ];
+    cases.extend(exif_cases());
+    cases.extend(border_cases());
+    cases.extend(format_cases());
+    cases
+}

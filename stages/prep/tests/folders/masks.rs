@@ -1,0 +1,277 @@
+//! Masks of every convention.
+
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use super::kit::{
+    CAMERA, Case, Expected, SIDE, Scene, case, held_out, left_half, transforms, write_colmap,
+    write_llff, write_mask, write_photograph, write_photographs, write_transforms,
+};
+
+fn right_half(x: u32, y: u32) -> bool {
+    !left_half(x, y)
+}
+
+fn colmap(folder: &Path, names: &str, count: usize) {
+    write_colmap(&folder.join("sparse/0"), CAMERA, names, count);
+    write_photographs(&folder.join("images"), names, count);
+}
+
+fn masks(folder: &Path, names: &str, numbers: impl IntoIterator<Item = usize>) {
+    for number in numbers {
+        let path = folder.join(names.replace('#', &number.to_string()));
+        write_mask(&path, (SIDE, SIDE), left_half);
+    }
+}
+
+/// Transforms with a mask for some frames.
+fn listed(folder: &Path, size: (u32, u32), counts: fn(u32, u32) -> bool) {
+    write_photographs(folder, "images/a#.png", 3);
+    let mut list: Value = transforms("images/a#.png", 3);
+    for number in [0, 2] {
+        write_mask(&folder.join(format!("masks/m{number}.png")), size, counts);
+        list["frames"][number]["mask_path"] = json!(format!("masks/m{number}.png"));
+    }
+    write_transforms(folder, &list);
+}
+
+fn masked(mut scene: Scene, numbers: &[usize], counts: fn(u32, u32) -> bool) -> Expected {
+    for view in scene.train.iter_mut().chain(&mut scene.test) {
+        if numbers.contains(&view.pose) {
+            view.mask = Some(counts);
+        }
+    }
+    Expected::Scene(scene)
+}
+
+const TEN: &str = "COLMAP: 10 photographs of sparse/0";
+const THREE: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
+
+fn colmap_cases() -> Vec<Case> {
+    vec![
+        case(
+            "LFS#1612: masks/NAME.png",
+            |folder| {
+                colmap(folder, "a#.jpg", 10);
+                masks(folder, "masks/a#.png", 3..6);
+            },
+            masked(
+                held_out(
+                    "a#",
+                    10,
+                    &[
+                        TEN,
+                        "3 of 10 views have masks; 7 are used whole (masks/NAME.png for 3: black is left out)",
+                    ],
+                ),
+                &[3, 4, 5],
+                left_half,
+            ),
+        ),
+        case(
+            "ns PR#2115: masks/NAME.EXT.png, in folders",
+            |folder| {
+                colmap(folder, "x/a#.JPG", 10);
+                masks(folder, "masks/x/a#.JPG.png", 0..10);
+            },
+            masked(
+                held_out(
+                    "a#",
+                    10,
+                    &[
+                        TEN,
+                        "10 of 10 views have masks (masks/NAME.EXT.png for 10: black is left out)",
+                    ],
+                ),
+                &Vec::from_iter(0..10),
+                left_half,
+            ),
+        ),
+        case(
+            "both conventions for one photograph",
+            |folder| {
+                colmap(folder, "a#.jpg", 2);
+                masks(folder, "masks/a#.png", [1]);
+                masks(folder, "masks/a#.jpg.png", [1]);
+            },
+            Expected::Refused(
+                "dataset: DIR/images/a1.jpg: masks/a1.jpg.png and masks/a1.png both match \"masks/a1.png\"; remove one of the two, or name it exactly",
+            ),
+        ),
+        case(
+            "masks of other names",
+            |folder| {
+                colmap(folder, "a#.jpg", 10);
+                masks(folder, "masks/b#.png", 0..2);
+                masks(folder, "segmentation/a#.png", 0..1);
+            },
+            Expected::Scene(held_out(
+                "a#",
+                10,
+                &[
+                    TEN,
+                    "warning: 2 files in masks look like masks and are not used, first masks/b0.png; masks are named masks/NAME.png or masks/NAME.EXT.png after their photographs",
+                    "warning: 1 file in segmentation looks like a mask and is not used, first segmentation/a0.png; masks are named masks/NAME.png or masks/NAME.EXT.png after their photographs",
+                ],
+            )),
+        ),
+    ]
+}
+
+fn llff_cases() -> Vec<Case> {
+    vec![
+        case(
+            "LLFF with masks",
+            |folder| {
+                write_photographs(folder, "images/a#.png", 9);
+                write_llff(folder, &Vec::from_iter(0..9), [2.0, 6.0]);
+                masks(folder, "masks/A#.png", [1]);
+            },
+            masked(
+                held_out(
+                    "a#",
+                    9,
+                    &[
+                        "LLFF (poses_bounds.npy): 9 photographs from images",
+                        "1 of 9 views has a mask; 8 are used whole (masks/NAME.png for 1: black is left out)",
+                    ],
+                ),
+                &[1],
+                left_half,
+            ),
+        ),
+        case(
+            "LLFF with instant-ngp's masks",
+            |folder| {
+                write_photographs(folder, "images/a#.png", 9);
+                write_llff(folder, &Vec::from_iter(0..9), [2.0, 6.0]);
+                masks(folder, "images/dynamic_mask_a#.png", 0..9);
+            },
+            masked(
+                held_out(
+                    "a#",
+                    9,
+                    &[
+                        "LLFF (poses_bounds.npy): 9 photographs from images",
+                        "9 of 9 views have masks (dynamic_mask_NAME.png for 9: white is left out)",
+                    ],
+                ),
+                &Vec::from_iter(0..9),
+                right_half,
+            ),
+        ),
+    ]
+}
+
+fn transforms_cases() -> Vec<Case> {
+    vec![
+        case(
+            "mask_path",
+            |folder| listed(folder, (SIDE, SIDE), left_half),
+            masked(
+                held_out(
+                    "a#",
+                    3,
+                    &[
+                        THREE,
+                        "2 of 3 views have masks; 1 is used whole (mask_path for 2: black is left out)",
+                    ],
+                ),
+                &[0, 2],
+                left_half,
+            ),
+        ),
+        case(
+            "ns#2020, ns#3659: masks of another size",
+            |folder| listed(folder, (SIDE / 2, SIDE / 2), |x, _| x < SIDE / 4),
+            masked(
+                held_out(
+                    "a#",
+                    3,
+                    &[
+                        THREE,
+                        "2 of 3 views have masks; 1 is used whole (mask_path for 2: black is left out)",
+                        "2 masks have another size than the photograph; resampled by nearest neighbour (masks/m0.png: 8×8 for 16×16)",
+                    ],
+                ),
+                &[0, 2],
+                left_half,
+            ),
+        ),
+        case(
+            "masks of another shape",
+            |folder| listed(folder, (2, SIDE), |x, _| x < 1),
+            masked(
+                held_out(
+                    "a#",
+                    3,
+                    &[
+                        THREE,
+                        "2 of 3 views have masks; 1 is used whole (mask_path for 2: black is left out)",
+                        "warning: 2 masks have another shape than the photograph; resampled by nearest neighbour (masks/m0.png: 2×16 for 16×16)",
+                    ],
+                ),
+                &[0, 2],
+                left_half,
+            ),
+        ),
+        case(
+            "ngp#1049, ns#1052: white is masked away",
+            |folder| {
+                write_photographs(folder, "images/a#.png", 3);
+                write_transforms(folder, &transforms("images/a#.png", 3));
+                masks(folder, "images/dynamic_mask_a#.png", 0..2);
+                write_photograph(&folder.join("images/b_mask.png"), 9);
+            },
+            masked(
+                held_out(
+                    "a#",
+                    3,
+                    &[
+                        THREE,
+                        "2 of 3 views have masks; 1 is used whole (dynamic_mask_NAME.png for 2: white is left out)",
+                        "warning: 1 file in images looks like a mask and is not used, first images/b_mask.png; name masks in their frames' mask_path",
+                    ],
+                ),
+                &[0, 1],
+                right_half,
+            ),
+        ),
+        case(
+            "masks that no frame names",
+            |folder| {
+                write_photographs(folder, "images/a#.png", 3);
+                write_transforms(folder, &transforms("images/a#.png", 3));
+                masks(folder, "masks/a#.png", 0..3);
+            },
+            Expected::Scene(held_out(
+                "a#",
+                3,
+                &[
+                    THREE,
+                    "warning: 3 files in masks look like masks and are not used, first masks/a0.png; name masks in their frames' mask_path",
+                ],
+            )),
+        ),
+        case(
+            "a mask that is missing",
+            |folder| {
+                write_photographs(folder, "images/a#.png", 3);
+                let mut list = transforms("images/a#.png", 3);
+                list["frames"][1]["mask_path"] = json!("masks/a1.png");
+                write_transforms(folder, &list);
+            },
+            Expected::Refused(
+                "dataset: DIR/transforms.json: frame 1 (images/a1.png): DIR/masks/a1.png is not there; remove the entry or restore the file",
+            ),
+        ),
+    ]
+}
+
+pub(crate) fn cases() -> Vec<Case> {
+    let mut cases = colmap_cases();
+    cases.extend(llff_cases());
+    cases.extend(transforms_cases());
+    cases
+}

@@ -1,0 +1,245 @@
+//! Folders that are almost data sets, and data sets that are almost whole.
+
+use std::path::Path;
+
+use serde_json::json;
+
+use super::kit::{
+    CAMERA, Case, Expected, Scene, case, colmap_line, held_out, transforms, write, write_colmap,
+    write_llff, write_photographs, write_transforms,
+};
+
+fn colmap(folder: &Path, model: &str, images: &str) {
+    write_colmap(&folder.join(model), CAMERA, "a#.png", 3);
+    write_photographs(&folder.join(images), "a#.png", 3);
+}
+
+fn whole(folder: &Path) {
+    write_photographs(folder, "images/a#.png", 3);
+    write_transforms(folder, &transforms("images/a#.png", 3));
+}
+
+/// Ten photographs, eight poses, and what names the photographs of the poses.
+fn llff(folder: &Path) {
+    write_photographs(folder, "images/a#.png", 10);
+    write_llff(folder, &[0, 1, 2, 4, 5, 6, 7, 9], [2.0, 6.0]);
+}
+
+/// Names of the eight in COLMAP's order, which isn't that of names.
+const EIGHT: [usize; 8] = [9, 1, 0, 2, 7, 4, 5, 6];
+
+fn paired(source: &'static str) -> Expected {
+    let of = |numbers: &[usize]| super::kit::views("a#", numbers.iter().copied());
+    let note = "LLFF (poses_bounds.npy): 8 photographs from images";
+    Expected::Scene(Scene {
+        train: of(&[1, 2, 4, 5, 6, 7, 9]),
+        test: of(&[0]),
+        notes: vec![note, source],
+        further: Vec::new(),
+    })
+}
+
+fn binary_images(folder: &Path) {
+    let mut bytes = (EIGHT.len() as u64).to_le_bytes().to_vec();
+    for number in EIGHT {
+        bytes.extend((number as u32 + 1).to_le_bytes());
+        bytes.extend([1.0f64, 0.0, 0.0, 0.0, 0.0, 0.0, 3.0].iter().flat_map(|v| v.to_le_bytes()));
+        bytes.extend(1u32.to_le_bytes());
+        bytes.extend(format!("a{number}.png\0").bytes());
+        bytes.extend(0u64.to_le_bytes());
+    }
+    write(folder.join("sparse/0/images.bin"), bytes);
+}
+
+fn model_cases() -> Vec<Case> {
+    vec![
+        case(
+            "nerfstudio's colmap/sparse/0",
+            |folder| colmap(folder, "colmap/sparse/0", "images"),
+            Expected::Scene(held_out("a#", 3, &["COLMAP: 3 photographs of colmap/sparse/0"])),
+        ),
+        case(
+            "3DGS#272: dense/0/sparse",
+            |folder| colmap(folder, "dense/0/sparse", "dense/0/images"),
+            Expected::Refused(
+                "dataset: DIR: no data set; found COLMAP (sparse) in DIR/dense/0; give that folder",
+            ),
+        ),
+        case(
+            "fvdb-reality-capture PR#177, colmap#1902: no second lines",
+            |folder| {
+                write_photographs(folder, "images/a#.png", 3);
+                write(folder.join("sparse/0/cameras.txt"), CAMERA);
+                let lines: String =
+                    (0..3).map(|number| colmap_line(number, &format!("a{number}.png"))).collect();
+                write(folder.join("sparse/0/images.txt"), format!("# list\n{lines}"));
+            },
+            Expected::Refused(
+                "dataset: DIR/sparse/0/images.txt: line 3 should be the points of image 1 (an empty line if there are none)",
+            ),
+        ),
+        case(
+            "a camera model of a newer COLMAP",
+            |folder| {
+                write_colmap(&folder.join("sparse/0"), "1 HOLOGRAM 16 16 20 8 8\n", "a#.png", 3);
+                write_photographs(folder, "images/a#.png", 3);
+            },
+            Expected::Refused(
+                "dataset: DIR/sparse/0/cameras.txt: line 1: camera model \"HOLOGRAM\" is unknown (a newer COLMAP's?); undistort with colmap image_undistorter",
+            ),
+        ),
+        case(
+            "colmap#3570, colmap PR#4470: model 99",
+            |folder| {
+                let mut bytes = 1u64.to_le_bytes().to_vec();
+                bytes.extend([1u32.to_le_bytes(), 99u32.to_le_bytes()].concat());
+                bytes.extend([16u64.to_le_bytes(); 6].concat());
+                write(folder.join("sparse/0/cameras.bin"), bytes);
+                binary_images(folder);
+            },
+            Expected::Refused(
+                "dataset: DIR/sparse/0/cameras.bin: byte 32: camera 1 has model 99, which this program doesn't know (a newer COLMAP's?); undistort with colmap image_undistorter",
+            ),
+        ),
+    ]
+}
+
+fn llff_cases() -> Vec<Case> {
+    vec![
+        case(
+            "LLFF#69: fewer poses than photographs",
+            llff,
+            Expected::Refused(
+                "dataset: DIR/poses_bounds.npy: 8 poses for 10 images in images/; counts must match: remove the other images, or list the images with poses in view_imgs.txt",
+            ),
+        ),
+        case(
+            "colmap#1487: paired by view_imgs.txt",
+            |folder| {
+                llff(folder);
+                let names: String = EIGHT.iter().map(|i| format!("a{i}.png\r\n")).collect();
+                write(folder.join("view_imgs.txt"), names);
+            },
+            paired("view_imgs.txt names the photographs with poses"),
+        ),
+        case(
+            "nerf_pl#33: paired by COLMAP's model",
+            |folder| {
+                llff(folder);
+                binary_images(folder);
+            },
+            paired("sparse names the photographs with poses"),
+        ),
+        case(
+            "DSNeRF#101: bounds of other views",
+            |folder| {
+                write_photographs(folder, "images/a#.png", 2);
+                write_llff(folder, &[0, 1], [-12.3, 85.1]);
+            },
+            Expected::Refused(
+                "dataset: DIR/poses_bounds.npy: frame 0 (a0): bounds -12.3 and 85.1, expected 0 < near < far; LLFF's imgs2poses orders views otherwise than their names where COLMAP registered them in another order: run COLMAP again on images sorted by name, or give COLMAP's model without poses_bounds.npy",
+            ),
+        ),
+    ]
+}
+
+fn name_cases() -> Vec<Case> {
+    vec![
+        case(
+            "brush#41: transform_train.json",
+            |folder| write(folder.join("transform_train.json"), "{}"),
+            Expected::Refused(
+                "dataset: DIR: no data set; found transform_train.json; did you mean transforms_train.json?",
+            ),
+        ),
+        case(
+            "test views alone",
+            |folder| write(folder.join("transforms_test.json"), "{}"),
+            Expected::Refused(
+                "dataset: DIR: no data set; found transforms_test.json, but no transforms_train.json with the training views",
+            ),
+        ),
+        case(
+            "transform_test.json next to the training views",
+            |folder| {
+                whole(folder);
+                std::fs::rename(
+                    folder.join("transforms.json"),
+                    folder.join("transforms_train.json"),
+                )
+                .unwrap();
+                write(folder.join("transform_test.json"), "{}");
+            },
+            Expected::Scene(held_out(
+                "a#",
+                3,
+                &[
+                    "Blender's form: 3 views; none is said to be for testing",
+                    "warning: found transform_test.json, which is not read; did you mean transforms_test.json?",
+                ],
+            )),
+        ),
+        case(
+            "a single sub-folder",
+            |folder| whole(&folder.join("scene")),
+            Expected::Refused(
+                "dataset: DIR: no data set; found transforms.json (instant-ngp, nerfstudio) in DIR/scene; give that folder",
+            ),
+        ),
+        case(
+            "several data sets",
+            |folder| {
+                for name in ["a", "b", "c", "d"] {
+                    whole(&folder.join(name));
+                }
+            },
+            Expected::Refused(
+                "dataset: DIR: no data set; found transforms.json (instant-ngp, nerfstudio) in DIR/a, transforms.json (instant-ngp, nerfstudio) in DIR/b, transforms.json (instant-ngp, nerfstudio) in DIR/c and 1 more; give one of these folders",
+            ),
+        ),
+        case(
+            "openmask3d#16: Polycam",
+            |folder| {
+                write(folder.join("keyframes/cameras/1.json"), "{}");
+                write(folder.join("keyframes/images/1.jpg"), "");
+            },
+            Expected::Refused(
+                "dataset: DIR: no data set; found Polycam's own export (DIR/keyframes/cameras), which is not read; convert: ns-process-data polycam --data 'DIR' --output-dir 'DIR-nerfstudio'",
+            ),
+        ),
+        case(
+            "Record3D",
+            |folder| {
+                write(folder.join("x/EXR_RGBD/metadata.json"), "{}");
+                write(folder.join("x/EXR_RGBD/rgb/0.jpg"), "");
+            },
+            Expected::Refused(
+                "dataset: DIR: no data set; found Record3D's own export (DIR/x/EXR_RGBD), which is not read; convert: ns-process-data record3d --data 'DIR/x/EXR_RGBD' --output-dir 'DIR/x/EXR_RGBD-nerfstudio'",
+            ),
+        ),
+    ]
+}
+
+pub(crate) fn cases() -> Vec<Case> {
+    let mut cases = vec![case(
+        "depth images that are missing",
+        |folder| {
+            let mut list = transforms("images/a#.png", 3);
+            list["frames"][1]["depth_file_path"] = json!("depth/a1.png");
+            write_photographs(folder, "images/a#.png", 3);
+            write_transforms(folder, &list);
+        },
+        Expected::Scene(held_out(
+            "a#",
+            3,
+            &[
+                "transforms.json (instant-ngp, nerfstudio): 3 photographs",
+                "1 depth image (depth_file_path) does not exist, first depth/a1.png; only EXR depth is used",
+            ],
+        )),
+    )];
+    cases.extend(model_cases());
+    cases.extend(llff_cases());
+    cases.extend(name_cases());
+    cases
+}
