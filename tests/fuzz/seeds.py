@@ -55,6 +55,16 @@ pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]"
 frame = f'{{"file_path": "images/a.png", "transform_matrix": {pose}, "fl_x": 5, "k1": 0.1, "mask_path": "images/b.png"}}'
 seed("transforms", "one", f'{{"camera_angle_x": 0.7, "w": 4, "h": 3, "frames": [{frame}]}}'.encode())
 
+names = [
+    "images/a.png\tmasks/a.png\tdepth/a.png\nimages\\b.png\n\nimages/a.png\n\nimages\\b.png",
+    "C:\\x\\images\\c\n/home/x/images/A.png\nimages/d.png.png\n\n/y/images/c\n\n\n\nimages/a.png.png",
+    "images/a\tmasks/B\nx/b.png\n../images/a.png\n.\\images\\.e.png",
+]
+for which, text in enumerate(names):
+    seed("names", f"transforms-{which}", b"\0" + text.encode())
+seed("names", "colmap", b"\1a.png\nx/b.png\nA  b.png\nimages/c.jpg\n/x/images/x/b.png")
+seed("names", "llff", b"\2b.png\r\na\r\n")
+
 chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 for bits, size in ((8, 4), (16, 8)):
     pixels = zlib.compress((b"\0" + bytes(range(4 * size))) * 3)

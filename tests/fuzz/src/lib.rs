@@ -39,17 +39,24 @@ impl Folder {
     /// much memory isn't.
     pub fn read(&self) {
         if let Ok(set) = Dataset::read(self.0.path()) {
+            for frame in &set.frames {
+                let mask = frame.mask.as_ref().map(|mask| &mask.path);
+                for file in [Some(&frame.image), mask, frame.depth.as_ref()].into_iter().flatten() {
+                    self.check_inside(file);
+                }
+            }
             for frame in set.frames.iter().take(2) {
-                // Nothing that a file names may lie outside the folder.
-                let image = frame.image.canonicalize().expect("an image that was looked at");
-                assert!(
-                    image.starts_with(self.0.path().canonicalize().expect("the folder")),
-                    "{}",
-                    image.display()
-                );
                 frame.photograph().ok();
+                frame.mask().ok();
             }
         }
+    }
+
+    /// Nothing that a file names may lie outside the folder.
+    fn check_inside(&self, file: &Path) {
+        let found = file.canonicalize().expect("a file that was looked at");
+        let folder = self.0.path().canonicalize().expect("the folder");
+        assert!(found.starts_with(folder), "{}", found.display());
     }
 }
 
@@ -68,4 +75,9 @@ pub fn colmap_model() -> [(&'static str, &'static [u8]); 3] {
         };
     }
     [("cameras.bin", seed!("0")), ("images.bin", seed!("1")), ("points3D.bin", seed!("2"))]
+}
+
+/// An array of LLFF of two views: the seed that `seeds.py` writes.
+pub fn poses_of_llff() -> &'static [u8] {
+    include_bytes!(concat!(env!("FUZZ_SEEDS"), "/llff/two"))
 }
