@@ -8,9 +8,11 @@ use pixels::{Mask, Rgba8};
 const MAX_NOISE_LEVELS: u8 = 16;
 /// Percentage of a line's pixels that have a strip's colour.
 const MIN_FLAT_PERCENT: usize = 95;
-/// Maximum percentage of pixels with the strip's colour right inside a strip. Beside an object on a
-/// background there are more.
+/// Maximum percentage of pixels with the strip's colour right inside a strip, and in the corners
+/// inside all strips. Next to an object on a background there are more: its corners are empty.
 const MAX_INSIDE_PERCENT: usize = 50;
+/// Part of the image inside the strips that a corner takes along each side, as its denominator.
+const CORNER_PART: usize = 8;
 /// Lines that interpolation blends at a strip's edge.
 const BLENDED_LINES: usize = 1;
 /// Maximum part of a side that a strip takes, as its denominator, where all four sides have one:
@@ -19,8 +21,6 @@ const FRAME_PART: usize = 5;
 /// Maximum part of a side, as its denominator, where other sides have no strip: upright photographs
 /// in a wide format have wide ones.
 const PAIR_PART: usize = 2;
-/// Pixels by which a strip's width may differ between views.
-const MAX_WIDTH_DIFFERENCE: usize = 1;
 
 /// Widths of an image's uniform strips in pixels: top, right, bottom, left.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,8 +48,7 @@ impl Strips {
             let [top, right, bottom, left] = widths;
             let ends = if side.is_multiple_of(2) { [left, right] } else { [top, bottom] };
             let inside = line(image, side, widths[side] + BLENDED_LINES, ends);
-            let alike = inside.iter().filter(|pixel| is_like(**pixel, colour)).count();
-            if inside.is_empty() || 100 * alike > MAX_INSIDE_PERCENT * inside.len() {
+            if !is_content(&inside, colour) || !is_content(&corners(image, widths), colour) {
                 return None;
             }
         }
@@ -60,21 +59,13 @@ impl Strips {
         (!(is_frame && is_wide)).then_some(Self { widths, colour })
     }
 
-    /// Returns the strips that nine in ten views have in common, and the number of these views.
+    /// Returns the strips that nine in ten views have on the same sides, with their median widths,
+    /// and the number of these views.
     pub(crate) fn common(views: &[Option<Self>]) -> Option<(Self, usize)> {
         let found: Vec<Self> = views.iter().flatten().copied().collect();
-        let middle = |side: usize| {
-            let mut widths: Vec<usize> = found.iter().map(|strips| strips.widths[side]).collect();
-            widths.sort_unstable();
-            widths.get(widths.len() / 2).copied().unwrap_or(0)
-        };
-        let widths = [0, 1, 2, 3].map(middle);
-        let has_these = |strips: &&Self| {
-            (0..4).all(|side| {
-                let is_strip = (strips.widths[side] > 0) == (widths[side] > 0);
-                is_strip && strips.widths[side].abs_diff(widths[side]) <= MAX_WIDTH_DIFFERENCE
-            })
-        };
+        let widths = median_widths(&found);
+        let sides = widths.map(|width| width > 0);
+        let has_these = |strips: &&Self| strips.widths.map(|width| width > 0) == sides;
         let first = found.iter().find(has_these)?;
         let count = found.iter().filter(has_these).count();
         (10 * count >= 9 * views.len()).then_some((Self { widths, ..*first }, count))
@@ -109,6 +100,14 @@ impl Display for Strips {
     }
 }
 
+fn median_widths(strips: &[Strips]) -> [usize; 4] {
+    std::array::from_fn(|side| {
+        let mut widths: Vec<usize> = strips.iter().map(|strips| strips.widths[side]).collect();
+        widths.sort_unstable();
+        widths.get(widths.len() / 2).copied().unwrap_or(0)
+    })
+}
+
 /// Lines from a side to the opposite one.
 fn depth(image: &Rgba8, side: usize) -> usize {
     if side.is_multiple_of(2) { image.height } else { image.width }
@@ -123,10 +122,36 @@ fn line(image: &Rgba8, side: usize, at: usize, ends: [usize; 2]) -> Vec<[u8; 3]>
     }
     let at = if side == 1 || side == 2 { across - 1 - at } else { at };
     let pixel = |i: usize| {
-        let (x, y) = if side.is_multiple_of(2) { (i, at) } else { (at, i) };
-        std::array::from_fn(|c| image.data[4 * (y * image.width + x) + c])
+        if side.is_multiple_of(2) { colour(image, i, at) } else { colour(image, at, i) }
     };
     (ends[0]..along.saturating_sub(ends[1])).map(pixel).collect()
+}
+
+/// Returns the colours of the four corners inside strips.
+fn corners(image: &Rgba8, [top, right, bottom, left]: [usize; 4]) -> Vec<[u8; 3]> {
+    let near_ends = |first: usize, end: usize| {
+        let (first, end) = (first + BLENDED_LINES, end.saturating_sub(BLENDED_LINES));
+        let length = (end.saturating_sub(first) / CORNER_PART).max(1);
+        let near = first..(first + length).min(end);
+        near.chain(end.saturating_sub(length).max(first)..end)
+    };
+    let mut colours = Vec::new();
+    for y in near_ends(top, image.height - bottom) {
+        for x in near_ends(left, image.width - right) {
+            colours.push(colour(image, x, y));
+        }
+    }
+    colours
+}
+
+/// True if pixels show more than a strip's colour.
+fn is_content(pixels: &[[u8; 3]], strip: [u8; 3]) -> bool {
+    let alike = pixels.iter().filter(|pixel| is_like(**pixel, strip)).count();
+    !pixels.is_empty() && 100 * alike <= MAX_INSIDE_PERCENT * pixels.len()
+}
+
+fn colour(image: &Rgba8, x: usize, y: usize) -> [u8; 3] {
+    std::array::from_fn(|c| image.data[4 * (y * image.width + x) + c])
 }
 
 /// Returns the colour of a line that has one.
@@ -192,15 +217,26 @@ mod tests {
         all.push(None);
         assert_eq!(Strips::common(&all), None);
         let varied: Vec<_> = (1..6).flat_map(|w| views([w, 3, 3, 3], [0; 3], 2)).collect();
-        assert_eq!(Strips::common(&varied), None);
+        assert_eq!(
+            Strips::common(&varied).map(|(strips, count)| (strips.widths[0], count)),
+            Some((3, 10))
+        );
+        let sides: Vec<_> = (0..4).flat_map(|w| views([w, 3, 3, 3], [0; 3], 2)).collect();
+        assert_eq!(Strips::common(&sides), None);
         assert_eq!(Strips::of(&photograph([9; 4], [0; 3], 0)), None);
-        // A disc on black: little of it is near its bounding box.
-        let disc = |i: usize| {
-            let (x, y) = ((i % 40) as f64 - 19.5, (i / 40) as f64 - 14.5);
-            if x * x / 1.8 + y * y < 150.0 { [200, 90, 40, 255] } else { [0, 0, 0, 255] }
-        };
-        let disc = Rgba8::new(40, 30, (0..40 * 30).flat_map(disc).collect());
-        assert_eq!(Strips::of(&disc), None);
+        // Ellipses on black that nearly fill the image: the corners around them are empty.
+        for (width, height) in [(40, 30), (16, 16), (200, 150)] {
+            for margin in 0..width / 5 {
+                let radius = |side: usize| 0.5 * (side - 2 * margin.min(side / 3)) as f64;
+                let pixel = |i: usize| {
+                    let x = ((i % width) as f64 + 0.5 - 0.5 * width as f64) / radius(width);
+                    let y = ((i / width) as f64 + 0.5 - 0.5 * height as f64) / radius(height);
+                    if x * x + y * y < 1.0 { [200, 90, 40, 255] } else { [0, 0, 0, 255] }
+                };
+                let data = (0..width * height).flat_map(pixel).collect();
+                assert_eq!(Strips::of(&Rgba8::new(width, height, data)), None, "{width} {margin}");
+            }
+        }
         let flat = Rgba8::new(4, 3, [7, 7, 7, 255].repeat(12));
         assert_eq!(Strips::of(&flat), None);
     }

@@ -35,7 +35,7 @@ impl FrameNames {
         if let Some(frames) = self.by_name.get(&written) {
             return Ok(frames);
         }
-        let frames = match lookup.find(name) {
+        let frames = match lookup.find_again(name) {
             Ok(Located::File(file)) => self.by_name.get(&file.path),
             Err(ambiguous @ LookupError::Ambiguous { .. }) => return Err(ambiguous.into()),
             _ => None,

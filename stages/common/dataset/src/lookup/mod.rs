@@ -69,6 +69,15 @@ pub(crate) struct LocatedFile {
     pub(crate) label: PathBuf,
 }
 
+/// Treatment of files that other names mean literally.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Claims {
+    /// They are not found by tolerance.
+    Respected,
+    /// They are found.
+    Ignored,
+}
+
 /// Path that a name may mean.
 struct Form {
     path: PathBuf,
@@ -157,6 +166,15 @@ impl Lookup {
 
     /// Finds the file of a name, and counts the steps that led there.
     pub(crate) fn find(&mut self, name: &str) -> Result<Located, LookupError> {
+        self.locate(name, Claims::Respected)
+    }
+
+    /// Finds the file of a name in a list that repeats names: a file that another name means.
+    pub(crate) fn find_again(&mut self, name: &str) -> Result<Located, LookupError> {
+        self.locate(name, Claims::Ignored)
+    }
+
+    fn locate(&mut self, name: &str, claims: Claims) -> Result<Located, LookupError> {
         let expected = self.expected(name);
         let mut missing = None;
         if let Ok(path) = &expected {
@@ -170,7 +188,7 @@ impl Lookup {
                 Found::Other(found) => return Ok(Located::Other(found)),
             }
         }
-        if let Some((file, taken)) = self.search(name)? {
+        if let Some((file, taken)) = self.search(name, claims)? {
             self.steps.record(name, &file.path, taken);
             return Ok(Located::File(file));
         }
@@ -192,11 +210,15 @@ impl Lookup {
     }
 
     /// Finds the one file that a name means, and the steps that lead there.
-    fn search(&mut self, name: &str) -> Result<Option<(LocatedFile, Taken)>, LookupError> {
+    fn search(
+        &mut self,
+        name: &str,
+        claims: Claims,
+    ) -> Result<Option<(LocatedFile, Taken)>, LookupError> {
         let forms = self.forms(name);
         for tolerance in Tolerance::STEPS {
             for form in &forms {
-                match &self.matches(form, tolerance)[..] {
+                match &self.matches(form, tolerance, claims)[..] {
                     [] => {}
                     [file] => return Ok(Some(self.located(form, tolerance, file))),
                     [first, second, ..] => {
@@ -243,14 +265,14 @@ impl Lookup {
         }
     }
 
-    fn matches(&mut self, form: &Form, tolerance: Tolerance) -> Vec<PathBuf> {
+    fn matches(&mut self, form: &Form, tolerance: Tolerance, claims: Claims) -> Vec<PathBuf> {
         let mut files = candidates(&mut self.listings, &form.path, tolerance, form.extensions);
         if tolerance == Tolerance::NONE && !files.is_empty() && is_unread_name(&form.path) {
             let converted = Tolerance { extension: true, ..tolerance };
             let found = candidates(&mut self.listings, &form.path, converted, form.extensions);
             files = if found.is_empty() { files } else { found };
         }
-        if tolerance != Tolerance::NONE {
+        if tolerance != Tolerance::NONE && claims == Claims::Respected {
             files.retain(|file| !self.claimed.contains(file));
         }
         files
@@ -314,7 +336,7 @@ impl Lookup {
 
     /// True if a name has a file, or several.
     fn has(&mut self, name: &str) -> bool {
-        !matches!(self.search(name), Ok(None))
+        !matches!(self.search(name, Claims::Ignored), Ok(None))
     }
 }
 
