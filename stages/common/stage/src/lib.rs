@@ -42,6 +42,9 @@
 
 mod arguments;
 mod context;
+mod deadline;
+#[cfg(test)]
+mod deadline_tests;
 mod device;
 mod help;
 mod hooks;

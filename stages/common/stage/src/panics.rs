@@ -1,6 +1,6 @@
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::fs::File;
-use std::io::Write;
+use std::io::{IsTerminal as _, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::panic::PanicHookInfo;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -34,8 +34,15 @@ fn end(name: &str, panic: &PanicHookInfo<'_>) -> ! {
     if backtrace.status() == BacktraceStatus::Captured {
         write(std::io::stderr().as_fd(), &format!("{backtrace}"));
     }
-    write(std::io::stderr().as_fd(), &format!("{name}: {message}\n"));
-    if let Some(event) = failed_event(&message) {
+    end_process(name, &message, code)
+}
+
+/// Ends the process from any thread, with the reason on stderr and, for a runner, as an event.
+pub(crate) fn end_process(name: &str, message: &str, code: i32) -> ! {
+    // The line of a progress bar may be there.
+    let clear = if std::io::stderr().is_terminal() { "\r\x1b[K" } else { "" };
+    write(std::io::stderr().as_fd(), &format!("{clear}{name}: {message}\n"));
+    if let Some(event) = failed_event(message) {
         write(std::io::stdout().as_fd(), &event);
     }
     signal_hook::low_level::exit(code)
@@ -52,7 +59,7 @@ fn told(panic: &PanicHookInfo<'_>) -> (String, i32) {
     (format!("internal error: {}{place}; please report it", printable(&said)), INTERNAL_ERROR)
 }
 
-/// Past the locks of `std::io::stdout` and `stderr`, which the panicking thread may hold.
+/// Writes past the locks of `std::io::stdout` and `stderr`, which this or another thread may hold.
 fn write(to: BorrowedFd<'_>, text: &str) {
     if let Ok(own) = to.try_clone_to_owned() {
         File::from(own).write_all(text.as_bytes()).ok();

@@ -12,6 +12,7 @@ use contract::Description;
 
 use crate::arguments::{Arguments, Command, input_folders, read_params};
 use crate::context::Context;
+use crate::deadline::End;
 use crate::help::help_of;
 use crate::panics::install_panic_hook;
 use crate::progress::{ProgressMode, emit_events, failed_event};
@@ -110,6 +111,8 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     }
     let output = arguments.output.expect("clap requires --output");
     let staging = Staging::new(&output)?;
+    let end = End::default();
+    end.enforce(S::NAME, &interrupted, staging.folder())?;
     if let Some(work) = &arguments.work {
         fs::create_dir_all(work)
             .with_context(|| format!("--work {}: cannot be made", work.display()))?;
@@ -130,9 +133,12 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
         identity,
         goes_on: AtomicBool::new(false),
     };
-    S::run(&context, &params)?;
-    context.check_interrupt()?;
-    staging.publish(&description.output.kind, &output)
+    let done = S::run(&context, &params)
+        .and_then(|()| context.check_interrupt())
+        .and_then(|()| staging.complete(&description.output.kind));
+    end.claim();
+    done?;
+    staging.publish(&output)
 }
 
 /// Lets the stage end as if interrupted, with a checkpoint, when the runner is killed, rather than

@@ -38,6 +38,9 @@ pub trait Stage {
     }
 
     /// Does the work: reads inputs and writes outputs through `context`.
+    ///
+    /// After a signal the stage has a second to write a checkpoint and to return; then its process
+    /// is ended. So every file outside the output must be complete whenever it has its final name.
     fn run(context: &Context, params: &Self::Params) -> anyhow::Result<()>;
 
     /// What `describe` prints; `code` is the build's fingerprint.

@@ -37,12 +37,17 @@ impl Staging {
         &self.folder
     }
 
-    /// Adds the manifest, and gives the folder its final name.
-    pub(crate) fn publish(self, kind: &str, output: &Path) -> anyhow::Result<()> {
+    /// Adds the manifest, after which the folder is complete.
+    pub(crate) fn complete(&self, kind: &str) -> anyhow::Result<()> {
         let manifest = Manifest::of_folder(kind, &self.folder).context("cannot hash the output")?;
-        let place = || format!("cannot write {}", output.display());
-        write_json(&self.folder.join(MANIFEST_FILE), &manifest).with_context(place)?;
-        fs::rename(&self.folder, output).with_context(place)
+        let path = self.folder.join(MANIFEST_FILE);
+        write_json(&path, &manifest).with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    /// Gives the folder its final name.
+    pub(crate) fn publish(self, output: &Path) -> anyhow::Result<()> {
+        fs::rename(&self.folder, output)
+            .with_context(|| format!("cannot write {}", output.display()))
     }
 }
 
