@@ -29,6 +29,12 @@ use written::Written;
 /// Distance of every camera from the scene's centre.
 const DISTANCE: f64 = 4.0;
 
+/// Bytes of a pixel while its image is rendered and written: colour and depth, and a copy of the
+/// colour that PNG's or JPEG's encoder takes.
+const BYTES_PER_PIXEL: u64 = 16;
+/// Remedy for short memory, as a sentence fragment.
+const REMEDY: &str = "choose a smaller size, or end other programs";
+
 /// The stage.
 pub struct DemoScene;
 
@@ -45,8 +51,12 @@ impl Stage for DemoScene {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let world = World::new(params.seed);
         let world = if params.backdrop { world.with_backdrop() } else { world };
-        let total = u64::from(params.train + params.test);
-        let progress = context.progress("rendering", total);
+        let views = u64::from(params.train + params.test);
+        let [width, height] = params.sides();
+        let at_once = views.min(context.threads as u64);
+        let pixels = u64::from(width) * u64::from(height);
+        context.check_memory("rendering", BYTES_PER_PIXEL * pixels * at_once, REMEDY)?;
+        let progress = context.progress("rendering", views * u64::from(height));
         let mut written = Written::new(params);
         for (split, count) in [("train", params.train), ("test", params.test)] {
             let poses: Vec<[[f64; 4]; 4]> =
@@ -63,16 +73,14 @@ impl Stage for DemoScene {
                         params.angle_x(),
                         params.sides(),
                         params.samples_per_axis,
+                        &progress,
                     );
-                    params.form.write_view(context, split, i, &frame)?;
-                    progress.add(1);
-                    Ok(())
+                    params.form.write_view(context, split, i, &frame)
                 })
                 .collect::<anyhow::Result<Vec<()>>>()?;
             written.add(context, split, &poses)?;
         }
         written.end(context)?;
-        let [width, height] = params.sides();
         context.write_summary(&format!(
             "{}, {}, {width}×{height}",
             artifact::counted(params.train as usize, "training view"),
@@ -119,6 +127,8 @@ fn matrix(r: DMat3, centre: DVec3) -> [[f64; 4]; 4] {
 
 #[cfg(test)]
 mod tests {
+    use stage::Progress;
+
     use super::*;
     use crate::params::CAMERA_ANGLE;
 
@@ -126,7 +136,7 @@ mod tests {
     fn depth_is_that_of_the_surface() {
         let world = World::new(0);
         let pose = pose(Layout::Around, "test", 3, 10);
-        let frame = render::render(&world, &pose, CAMERA_ANGLE, [64, 64], 2);
+        let frame = render::render(&world, &pose, CAMERA_ANGLE, [64, 64], 2, &Progress::silent());
         let seen: Vec<f32> = frame.depth.iter().flatten().copied().collect();
         assert!(seen.len() > 64 * 64 / 8, "{} pixels see something", seen.len());
         assert!(seen.iter().all(|z| (2.0..6.0).contains(z)));
@@ -182,6 +192,7 @@ mod tests {
                     params.angle_x(),
                     [width, height],
                     1,
+                    &Progress::silent(),
                 );
                 let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
                 for (x, y) in rows.chain((0..height).flat_map(|y| [(0, y), (width - 1, y)])) {
@@ -199,6 +210,7 @@ mod tests {
             CAMERA_ANGLE,
             [32, 32],
             1,
+            &Progress::silent(),
         )
         .colour
     }

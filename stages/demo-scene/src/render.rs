@@ -1,5 +1,6 @@
 use glam::DVec3;
 use pixels::{Rgba8, srgb_from_linear};
+use stage::Progress;
 
 use crate::material::surface;
 use crate::world::World;
@@ -23,6 +24,7 @@ pub(crate) fn render(
     angle_x: f64,
     [width, height]: [u32; 2],
     samples: u32,
+    progress: &Progress,
 ) -> RenderedImage {
     let [half_x, half_y] = [width, height].map(|side| 0.5 * f64::from(side));
     let focal = half_x / libm::tan(0.5 * angle_x);
@@ -58,6 +60,7 @@ pub(crate) fn render(
             let d = direction(f64::from(i) + 0.5, f64::from(j) + 0.5);
             depth.push(world.first_hit(centre, d).map(|hit| (hit.t * -d.dot(back)) as f32));
         }
+        progress.add(1);
     }
     RenderedImage { colour: Rgba8::new(width as usize, height as usize, colour), depth }
 }

@@ -1,4 +1,5 @@
 use rayon::prelude::*;
+use stage::Progress;
 
 use crate::seen::{SeenView, Sight};
 
@@ -10,10 +11,14 @@ const MERGED_SIDE_COSINE: f64 = 0.7;
 
 /// Moves what each view sees to the mean of what all views see of the same surface, and drops what
 /// more than a third of them look through: floaters, and fringes of edges.
-pub(crate) fn agree(views: &mut [SeenView]) {
+pub(crate) fn agree(views: &mut [SeenView], progress: &Progress) {
     let agreed: Vec<Vec<(usize, Option<f32>)>> = views
         .par_iter()
-        .map(|view| view.surface().map(|(at, _)| (at, shift(views, view, at))).collect())
+        .map(|view| {
+            let shifts = view.surface().map(|(at, _)| (at, shift(views, view, at))).collect();
+            progress.add(1);
+            shifts
+        })
         .collect();
     for (view, agreed) in views.iter_mut().zip(agreed) {
         for (at, shift) in agreed {

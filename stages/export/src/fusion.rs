@@ -1,5 +1,6 @@
 use glam::DVec3;
 use rayon::prelude::*;
+use stage::Progress;
 
 use crate::lattice::Lattice;
 use crate::seen::{SeenView, Sight};
@@ -10,7 +11,7 @@ const REACH_SPACINGS: f64 = 2.5;
 /// Signed distances from the surface at a lattice's places, in shares of the reach: below 0 inside,
 /// 1 where nothing is near. Each is the mean of what the views say (Curless and Levoy 1996), NaN
 /// where no view sees anything.
-pub(crate) fn fuse(views: &[SeenView], lattice: &Lattice) -> Vec<f32> {
+pub(crate) fn fuse(views: &[SeenView], lattice: &Lattice, progress: &Progress) -> Vec<f32> {
     let [nx, ny, _] = lattice.counts;
     let occupied = occupied_box(views);
     let mut values = vec![f32::NAN; lattice.len()];
@@ -18,6 +19,7 @@ pub(crate) fn fuse(views: &[SeenView], lattice: &Lattice) -> Vec<f32> {
         for (i, value) in values.iter_mut().enumerate() {
             *value = value_at(views, occupied, lattice, [i, row % ny, row / ny]);
         }
+        progress.add(1);
     });
     values
 }

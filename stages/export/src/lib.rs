@@ -55,6 +55,11 @@ const MOST_PIXELS: f64 = 16e6;
 /// Size of the rendered views over the cameras': a supersampled field has more than these show.
 const MOST_SCALE: f64 = 2.0;
 
+/// Bytes per place of the lattice: a distance.
+const BYTES_PER_PLACE: u64 = size_of::<f32>() as u64;
+/// Remedy for short memory, as a sentence fragment.
+const REMEDY: &str = "choose a smaller resolution or size, or end other programs";
+
 /// Parameters of `export`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -142,8 +147,12 @@ impl Stage for Export {
         let field = Members::read(context.input("field")?, &context.device)?;
         let given = Views::read(context.input("cameras")?)?;
         let cameras: Vec<Camera> = given.views.into_iter().map(|view| view.camera).collect();
-        let mut views = render(context, &field, &cameras, params.size)?;
-        consensus::agree(&mut views);
+        let resized = resized(&cameras, params.size);
+        let lattice = params.mesh.then(|| Lattice::new(&field.file.bounds, params.resolution));
+        context.check_memory("the export", memory_need(&resized, lattice.as_ref()), REMEDY)?;
+        let mut views = render(context, &field, &resized)?;
+        let progress = context.progress("comparing", views.len() as u64);
+        consensus::agree(&mut views, &progress);
         let job = ExportJob { context, params, field, cameras, views };
         let mut summary = ExportSummary {
             coordinates: COORDINATES.to_owned(),
@@ -154,9 +163,9 @@ impl Stage for Export {
             triangles: 0,
         };
         job.write_surfels(&mut summary)?;
-        if params.mesh {
+        if let Some(lattice) = &lattice {
             context.check_interrupt()?;
-            job.write_mesh(&mut summary)?;
+            job.write_mesh(lattice, &mut summary)?;
         }
         context.write_json(EXPORT_FILE, &summary)?;
         context.write_summary(&in_words(&summary))
@@ -173,30 +182,41 @@ fn in_words(summary: &ExportSummary) -> String {
     words.join(", ")
 }
 
-/// Renders the field from every camera.
-fn render(
-    context: &Context,
-    field: &Members,
-    cameras: &[Camera],
-    width: Option<u32>,
-) -> anyhow::Result<Vec<SeenView>> {
-    let progress = context.progress("rendering", cameras.len() as u64);
+/// Cameras at the size at which the field is rendered.
+fn resized(cameras: &[Camera], width: Option<u32>) -> Vec<Camera> {
     let pixels = |c: &Camera| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height);
     let most = (MOST_PIXELS / cameras.iter().map(pixels).sum::<f64>()).sqrt().min(MOST_SCALE);
-    cameras
-        .iter()
-        .map(|camera| {
-            context.check_interrupt()?;
-            let own = f64::from(camera.intrinsics.width);
-            let scale = width.map_or(most, |width| f64::from(width) / own);
-            let side = |pixels: u32| (scale * f64::from(pixels)).round().max(1.0) as u32;
-            let resized =
-                camera.resized(side(camera.intrinsics.width), side(camera.intrinsics.height));
-            let view = SeenView::render(field, &resized, field.file.background)?;
-            progress.add(1);
-            Ok(view)
-        })
-        .collect()
+    let mut resized = Vec::with_capacity(cameras.len());
+    for camera in cameras {
+        let k = &camera.intrinsics;
+        let scale = width.map_or(most, |width| f64::from(width) / f64::from(k.width));
+        let side = |pixels: u32| (scale * f64::from(pixels)).round().max(1.0) as u32;
+        resized.push(camera.resized(side(k.width), side(k.height)));
+    }
+    resized
+}
+
+fn pixel_count(camera: &Camera) -> u64 {
+    u64::from(camera.intrinsics.width) * u64::from(camera.intrinsics.height)
+}
+
+/// Renders the field from every camera.
+fn render(context: &Context, field: &Members, cameras: &[Camera]) -> anyhow::Result<Vec<SeenView>> {
+    let progress = context.progress("rendering", cameras.iter().map(pixel_count).sum());
+    let mut views = Vec::with_capacity(cameras.len());
+    for camera in cameras {
+        context.check_interrupt()?;
+        views.push(SeenView::render(field, camera, field.file.background, &progress)?);
+    }
+    Ok(views)
+}
+
+/// Maximum bytes that an export needs: all pixels, together with either the samples that are merged
+/// or the mesh's lattice.
+fn memory_need(cameras: &[Camera], lattice: Option<&Lattice>) -> u64 {
+    let pixels: u64 = cameras.iter().map(pixel_count).sum();
+    let values = lattice.map_or(0, |lattice| BYTES_PER_PLACE * lattice.len() as u64);
+    SeenView::BYTES_PER_PIXEL * pixels + values.max(surfel::BYTES_PER_PIXEL * pixels)
 }
 
 struct ExportJob<'a> {
@@ -237,21 +257,28 @@ impl ExportJob<'_> {
         Ok(())
     }
 
-    fn write_mesh(&self, summary: &mut ExportSummary) -> anyhow::Result<()> {
-        let lattice = Lattice::new(&self.field.file.bounds, self.params.resolution);
-        let values = fusion::fuse(&self.views, &lattice);
-        let mut mesh: Mesh = surface_nets::extract(&lattice, &values);
+    fn write_mesh(&self, lattice: &Lattice, summary: &mut ExportSummary) -> anyhow::Result<()> {
+        let mut mesh = self.surface(lattice);
         mesh.find_normals();
-        unseen::drop_unseen(&self.views, &lattice, &mut mesh);
+        unseen::drop_unseen(&self.views, lattice, &mut mesh);
         mesh.drop_small_pieces();
         mesh.find_normals();
         if mesh.triangles.is_empty() {
             return Err(no_surface());
         }
-        let colours = colour::colours(&self.field, &self.views, &mesh, &lattice)?;
+        let colours = colour::colours(&self.field, &self.views, &mesh, lattice)?;
         self.write("mesh.glb", |file| glb::write(file, &mesh, &colours))?;
         (summary.vertices, summary.triangles) = (mesh.positions.len(), mesh.triangles.len());
         Ok(())
+    }
+
+    /// Extracts the surface that the views see, through a lattice of distances from it.
+    fn surface(&self, lattice: &Lattice) -> Mesh {
+        let [_, ny, nz] = lattice.counts;
+        let progress = self.context.progress("fusing", (ny * nz) as u64);
+        let values = fusion::fuse(&self.views, lattice, &progress);
+        let progress = self.context.progress("meshing", nz as u64 - 1);
+        surface_nets::extract(lattice, &values, &progress)
     }
 
     /// Writes a file of the output.

@@ -3,6 +3,7 @@ use std::ops::Range;
 use glam::{DMat3, DVec3, Mat3, Vec3};
 use radiance::{Pixel, Ray, RayField};
 use scene::{Background, Camera, Intrinsics};
+use stage::Progress;
 
 /// Rays that are cast at once.
 const RAYS_AT_ONCE: usize = 1 << 16;
@@ -63,25 +64,31 @@ pub(crate) enum Sight {
 }
 
 impl SeenView {
+    /// Bytes of a pixel.
+    pub(crate) const BYTES_PER_PIXEL: u64 = size_of::<SeenPixel>() as u64;
+
     /// Casts a ray through each pixel's centre of a camera without its lens's distortion.
     pub(crate) fn render(
         field: &dyn RayField,
         camera: &Camera,
         background: Background,
+        progress: &Progress,
     ) -> anyhow::Result<Self> {
         let intrinsics = camera.intrinsics.pinhole().unwrap_or(camera.intrinsics);
         let camera = Camera { intrinsics, ..camera.clone() };
+        let count = intrinsics.width as usize * intrinsics.height as usize;
         let mut seen = Self {
             intrinsics,
             axes: camera.rotation(),
             centre: camera.centre(),
             to_camera: camera.rotation().transpose().as_mat3(),
             lens: [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy].map(|v| v as f32),
-            pixels: Vec::with_capacity((intrinsics.width * intrinsics.height) as usize),
+            pixels: Vec::with_capacity(count),
         };
-        let count = intrinsics.width as usize * intrinsics.height as usize;
         for first in (0..count).step_by(RAYS_AT_ONCE) {
-            seen.cast(field, &camera, background, first..(first + RAYS_AT_ONCE).min(count))?;
+            let pixels = first..(first + RAYS_AT_ONCE).min(count);
+            progress.add(pixels.len() as u64);
+            seen.cast(field, &camera, background, pixels)?;
         }
         seen.find_normals();
         Ok(seen)

@@ -1,4 +1,5 @@
 use glam::{DVec3, Vec3};
+use stage::Progress;
 
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
@@ -7,22 +8,22 @@ use crate::mesh::Mesh;
 /// Gibson 1998). Each cell that the surface passes gets a vertex, at the mean of its crossings with
 /// the cell's edges. Each crossed edge of the lattice gets a quad around it. NaN is unknown: no
 /// surface ends there.
-pub(crate) fn extract(lattice: &Lattice, values: &[f32]) -> Mesh {
+pub(crate) fn extract(lattice: &Lattice, values: &[f32], progress: &Progress) -> Mesh {
     let cells = Cells { lattice, values, strides: lattice.strides() };
     let mut mesh = Mesh::default();
     let [nx, ny, nz] = lattice.counts;
-    let mut vertices = vec![u32::MAX; values.len()];
+    // A quad lies among cells of two neighbouring layers, so the vertices of two are kept in turn.
+    let mut vertices = vec![u32::MAX; 2 * nx * ny];
+    let kept = vertices.len();
     for k in 0..nz - 1 {
         for j in 0..ny - 1 {
             for i in 0..nx - 1 {
                 if let Some(place) = cells.vertex([i, j, k]) {
-                    vertices[cells.index([i, j, k])] = mesh.positions.len() as u32;
+                    vertices[cells.index([i, j, k]) % kept] = mesh.positions.len() as u32;
                     mesh.positions.push(place);
                 }
             }
         }
-    }
-    for k in 0..nz {
         for j in 0..ny {
             for i in 0..nx {
                 for axis in 0..3 {
@@ -30,6 +31,7 @@ pub(crate) fn extract(lattice: &Lattice, values: &[f32]) -> Mesh {
                 }
             }
         }
+        progress.add(1);
     }
     mesh
 }
@@ -99,7 +101,7 @@ impl Cells<'_> {
             at,
             at - self.strides[u],
         ];
-        let [a, b, c, d] = around.map(|cell| vertices[cell]);
+        let [a, b, c, d] = around.map(|cell| vertices[cell % vertices.len()]);
         let is_outwards = (self.values[at] < 0.0) != self.lattice.is_mirrored();
         triangles.extend(if is_outwards { [[a, b, c], [a, c, d]] } else { [[a, c, b], [a, d, c]] });
     }

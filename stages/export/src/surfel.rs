@@ -23,6 +23,8 @@ pub(crate) struct Surfel {
 
 /// A pixel that shows a surface: the cell of its point, then view and pixel, which order them.
 type Sample = ([u32; 3], u32, u32);
+/// Maximum bytes per pixel that [`merge`] needs: a sample, twice while samples are collected.
+pub(crate) const BYTES_PER_PIXEL: u64 = 2 * size_of::<Sample>() as u64;
 
 /// Merges what all views see: one surfel for each cell of a grid over the field's unit cube. The
 /// cells are as large as half of the views' pixels, or larger where there would be more than

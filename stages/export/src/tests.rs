@@ -4,6 +4,7 @@ use dataset::Dataset;
 use glam::{DMat3, DVec3};
 use radiance::{Pixel, Ray, RayField, RenderError};
 use scene::{Background, Bounds, Camera, Distortion, Frustum, Intrinsics, Space};
+use stage::Progress;
 
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
@@ -59,12 +60,15 @@ fn around(count: u32, lowest: f64) -> Vec<Camera> {
 }
 
 fn views(cameras: &[Camera]) -> Vec<SeenView> {
-    cameras.iter().map(|c| SeenView::render(&Ball, c, Background::White).unwrap()).collect()
+    let view =
+        |c: &Camera| SeenView::render(&Ball, c, Background::White, &Progress::silent()).unwrap();
+    cameras.iter().map(view).collect()
 }
 
 fn fused(views: &[SeenView], cells: u32) -> Mesh {
     let lattice = Lattice::new(&BOX, cells);
-    let mut mesh = surface_nets::extract(&lattice, &fusion::fuse(views, &lattice));
+    let values = fusion::fuse(views, &lattice, &Progress::silent());
+    let mut mesh = surface_nets::extract(&lattice, &values, &Progress::silent());
     mesh.drop_small_pieces();
     mesh.find_normals();
     mesh
@@ -97,7 +101,7 @@ fn surface_nets_close_a_ball_in_a_box_and_in_a_frustum() {
     for space in [Space::Box, Space::Ndc(frustum)] {
         let lattice = Lattice::new(&Bounds { space, ..BOX }, 48);
         let values: Vec<f32> = (0..lattice.len()).map(|i| beyond_the_ball(&lattice, i)).collect();
-        let mut mesh = surface_nets::extract(&lattice, &values);
+        let mut mesh = surface_nets::extract(&lattice, &values, &Progress::silent());
         mesh.find_normals();
         assert_eq!(mesh.open_edges().len(), 0, "{space:?}");
         assert!((volume(&mesh) / BALL_VOLUME - 1.0).abs() < 0.02, "{space:?}: {}", volume(&mesh));

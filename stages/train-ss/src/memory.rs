@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use artifact::{Failure, sized};
 use scene::{Background, View, Views};
-use stage::MEMORY_REMEDY;
+use stage::{MEMORY_REMEDY, remaining_memory};
 
 use crate::packed::PixelMemory;
 use crate::resolve::{Resolved, ResolvedField};
@@ -78,14 +78,7 @@ impl MemoryNeed {
     /// Where pixels go when so much memory is free: into memory as far as there is place, and then
     /// into a file in `folder`.
     pub(crate) fn plan(&self, free: Option<u64>, folder: PathBuf) -> Result<PixelMemory, Failure> {
-        let least = self.least();
-        let free = free.unwrap_or(u64::MAX);
-        let left = free.checked_sub(least).ok_or_else(|| {
-            let (least, free) = (sized(least), sized(free));
-            Failure::Usage(format!(
-                "the training needs {least} of memory, and {free} are free; {MEMORY_REMEDY}"
-            ))
-        })?;
+        let left = remaining_memory("the training", self.least(), free, MEMORY_REMEDY)?;
         Ok(PixelMemory::new(MOST_PIXEL_BYTES.min(left), folder))
     }
 

@@ -8,6 +8,7 @@
 use std::io::Write as _;
 
 use flate2::{Compression, write::ZlibEncoder};
+use stage::Progress;
 
 use crate::bake::Volume;
 use crate::bricks::{Bricks, SIDE, VOXELS};
@@ -17,6 +18,9 @@ use crate::view::Components;
 pub(crate) const COMPONENTS: usize = 4;
 /// Channels of a voxel.
 const CHANNELS: usize = 4 + COMPONENTS;
+
+/// Bytes that are deflated at once.
+const BYTES_PER_STEP: usize = 1 << 20;
 
 /// A volume, packed.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,8 +33,11 @@ pub(crate) struct Atlas {
 }
 
 impl Atlas {
-    /// Packs a volume.
-    pub(crate) fn pack(volume: &Volume) -> std::io::Result<Self> {
+    /// Packs a volume; `progress_of` starts the progress over the given number of bytes.
+    pub(crate) fn pack(
+        volume: &Volume,
+        progress_of: impl FnOnce(u64) -> Progress,
+    ) -> std::io::Result<Self> {
         let side = volume.resolution / SIDE;
         let mut is_kept = vec![false; side * side * side];
         for voxel in &volume.voxels {
@@ -42,7 +49,12 @@ impl Atlas {
             Components::of(volume.voxels.iter().map(|v| (&v.view, v.opacity)), COMPONENTS);
         let mut encoder = ZlibEncoder::new(Vec::new(), Compression::best());
         encoder.write_all(&bricks.distances())?;
-        encoder.write_all(&planes(volume, &bricks, &components))?;
+        let planes = planes(volume, &bricks, &components);
+        let progress = progress_of(planes.len() as u64);
+        for part in planes.chunks(BYTES_PER_STEP) {
+            encoder.write_all(part)?;
+            progress.add(part.len() as u64);
+        }
         Ok(Self {
             resolution: volume.resolution,
             bricks: bricks.len(),
@@ -76,13 +88,12 @@ mod tests {
     use std::io::Read as _;
 
     use super::*;
-    use crate::bake::bake;
-    use crate::bake::tests::{Ball, bounds, cameras};
+    use crate::bake::tests::{Ball, bake, bounds, cameras};
 
     fn packed() -> (Volume, Atlas) {
         let ball = Ball { radius: 0.3, density: 200.0 };
         let volume = bake(&[ball], &bounds(), &cameras(), 64);
-        let atlas = Atlas::pack(&volume).unwrap();
+        let atlas = Atlas::pack(&volume, |_| Progress::silent()).unwrap();
         (volume, atlas)
     }
 

@@ -5,6 +5,7 @@ use glam::DVec3;
 use radiance::{PointSample, spec::VIEW_FEATURES};
 use rayon::prelude::*;
 use scene::{Bounds, Camera};
+use stage::Progress;
 
 use crate::bricks::{Bricks, SIDE, VOXELS};
 use crate::source::Source;
@@ -39,40 +40,142 @@ pub(crate) struct Voxel {
     pub(crate) view: [f32; NUMBERS],
 }
 
+/// Voxels of some bricks: their opacities, and the cameras that see them as bits. They have no
+/// colours yet.
+pub(crate) struct Shape {
+    bricks: Bricks,
+    opacity: Vec<f32>,
+    seen: Vec<u64>,
+}
+
+impl Shape {
+    /// Bytes that [`Baker::shape`] needs for some bricks.
+    pub(crate) fn memory_need(bricks: &Bricks) -> u64 {
+        // An opacity, cameras that see the voxel, and cameras that see its neighbours.
+        const BYTES_PER_VOXEL: usize = size_of::<f32>() + 2 * size_of::<u64>();
+        (BYTES_PER_VOXEL * VOXELS * bricks.len()) as u64
+    }
+
+    /// Bytes that [`Baker::volume`] needs: visible voxels, twice while they are collected.
+    pub(crate) fn volume_memory_need(&self) -> u64 {
+        let count = (0..self.seen.len()).into_par_iter().filter(|&voxel| self.keeps(voxel)).count();
+        (2 * size_of::<Voxel>() * count) as u64
+    }
+
+    /// True if a voxel is visible.
+    fn keeps(&self, voxel: usize) -> bool {
+        self.opacity[voxel] >= LEAST_OPACITY && self.seen[voxel] != 0
+    }
+}
+
 /// Bakes sources, whose mean is shown, as far as cameras see them.
-pub(crate) fn bake<S: Source>(
-    sources: &[S],
-    bounds: &Bounds,
-    cameras: &[Camera],
-    resolution: usize,
-) -> Volume {
-    let bricks = Bricks::new(resolution, |brick| {
-        let corner = |more: usize| brick.map(|c| ((c + more) * SIDE) as f32 / resolution as f32);
-        // The upper corner itself belongs to the next brick.
-        let high = corner(1).map(|c| c - 1e-6);
-        sources.iter().any(|source| source.may_hold(corner(0), high))
-    });
-    let opacity: Vec<f32> =
-        bricks.places().par_iter().flat_map_iter(|&b| opacities(sources, b, resolution)).collect();
-    let seen = with_neighbours(&bricks, &seen_by(&bricks, &opacity, cameras, bounds));
-    let kept = |voxel: usize| opacity[voxel] >= LEAST_OPACITY && seen[voxel] != 0;
-    let colours = Colours { sources, bounds, cameras, resolution };
-    let voxels = (0..bricks.len())
-        .into_par_iter()
-        .flat_map_iter(|slot| {
-            let wanted: Vec<usize> =
-                (slot * VOXELS..(slot + 1) * VOXELS).filter(|&v| kept(v)).collect();
-            let found = colours.of_brick(bricks.places()[slot], &wanted, &seen);
-            let voxels = wanted.into_iter().zip(found).map(|(v, (colour, view))| Voxel {
-                place: bricks.place_of(v).map(|c| c as u16),
-                opacity: opacity[v],
-                colour,
-                view,
-            });
-            voxels.collect::<Vec<_>>()
+pub(crate) struct Baker<'a, S> {
+    pub(crate) sources: &'a [S],
+    pub(crate) bounds: &'a Bounds,
+    pub(crate) cameras: &'a [Camera],
+    pub(crate) resolution: usize,
+}
+
+impl<S: Source> Baker<'_, S> {
+    /// Returns the bricks in which a source may have something.
+    pub(crate) fn bricks(&self) -> Bricks {
+        Bricks::new(self.resolution, |brick| {
+            let corner =
+                |more: usize| brick.map(|c| ((c + more) * SIDE) as f32 / self.resolution as f32);
+            // The upper corner itself belongs to the next brick.
+            let high = corner(1).map(|c| c - 1e-6);
+            self.sources.iter().any(|source| source.may_hold(corner(0), high))
         })
-        .collect();
-    Volume { resolution, voxels }
+    }
+
+    /// Steps of progress that baking takes.
+    pub(crate) fn steps(&self, bricks: &Bricks) -> u64 {
+        (2 * bricks.len() + self.cameras.len()) as u64
+    }
+
+    /// Finds the voxels' opacities and the cameras that see them.
+    pub(crate) fn shape(&self, bricks: Bricks, progress: &Progress) -> Shape {
+        let opacity: Vec<f32> = bricks
+            .places()
+            .par_iter()
+            .flat_map_iter(|&brick| {
+                progress.add(1);
+                opacities(self.sources, brick, self.resolution)
+            })
+            .collect();
+        let seen = seen_by(&bricks, &opacity, (self.cameras, self.bounds), progress);
+        Shape { seen: with_neighbours(&bricks, &seen), bricks, opacity }
+    }
+
+    /// Finds the colours of the visible voxels.
+    pub(crate) fn volume(&self, shape: &Shape, progress: &Progress) -> Volume {
+        let bricks = &shape.bricks;
+        let voxels = (0..bricks.len())
+            .into_par_iter()
+            .flat_map_iter(|slot| {
+                progress.add(1);
+                let wanted: Vec<usize> =
+                    (slot * VOXELS..(slot + 1) * VOXELS).filter(|&v| shape.keeps(v)).collect();
+                let found = self.of_brick(bricks.places()[slot], &wanted, &shape.seen);
+                let voxels = wanted.into_iter().zip(found).map(|(v, (colour, view))| Voxel {
+                    place: bricks.place_of(v).map(|c| c as u16),
+                    opacity: shape.opacity[v],
+                    colour,
+                    view,
+                });
+                voxels.collect::<Vec<_>>()
+            })
+            .collect();
+        Volume { resolution: self.resolution, voxels }
+    }
+
+    /// Colour and view dependence of some of a brick's voxels; each source counts as much as it is
+    /// opaque.
+    fn of_brick(
+        &self,
+        brick: [usize; 3],
+        voxels: &[usize],
+        seen: &[u64],
+    ) -> Vec<([f32; 3], [f32; NUMBERS])> {
+        let places = places(brick, voxels.iter().copied(), self.resolution);
+        let directions: Vec<Vec<[f32; 3]>> = voxels
+            .iter()
+            .zip(places.chunks_exact(PLACES_PER_VOXEL))
+            .map(|(&voxel, places)| self.directions(places[PLACES_PER_VOXEL / 2], seen[voxel]))
+            .collect();
+        let mut sums = vec![([0.0f32; 3], [0.0f32; NUMBERS], 0.0f32); voxels.len()];
+        for source in self.sources {
+            let samples = source.sample(&places);
+            let voxels = samples.chunks_exact(PLACES_PER_VOXEL).zip(&directions);
+            for ((samples, directions), (colour, view, weight)) in voxels.zip(&mut sums) {
+                let own = opacity_of(samples, self.resolution);
+                let (c, v) = shade(source, samples, directions, self.resolution);
+                colour.iter_mut().zip(c).for_each(|(sum, c)| *sum += own * c);
+                view.iter_mut().zip(v).for_each(|(sum, v)| *sum += own * v);
+                *weight += own;
+            }
+        }
+        sums.into_iter()
+            .map(|(colour, view, weight)| (colour.map(|c| c / weight), view.map(|v| v / weight)))
+            .collect()
+    }
+
+    /// Directions from some of the cameras that see a place to it, unit length in the world.
+    fn directions(&self, place: [f32; 3], seen: u64) -> Vec<[f32; 3]> {
+        let point = in_box(self.bounds, DVec3::from(place.map(f64::from)));
+        let seeing: Vec<&Camera> = self
+            .cameras
+            .iter()
+            .enumerate()
+            .filter(|(i, _)| seen >> i & 1 == 1)
+            .map(|c| c.1)
+            .collect();
+        let count = seeing.len().min(MOST_DIRECTIONS);
+        (0..count)
+            .filter_map(|k| (point - seeing[k * seeing.len() / count].centre()).try_normalize())
+            .map(|direction| direction.as_vec3().to_array())
+            .collect()
+    }
 }
 
 /// The places at which a brick's voxels are looked at: voxel by voxel, x fastest.
@@ -157,64 +260,6 @@ fn with_neighbours(bricks: &Bricks, seen: &[u64]) -> Vec<u64> {
         .collect()
 }
 
-/// What colours are made of.
-struct Colours<'a, S> {
-    sources: &'a [S],
-    bounds: &'a Bounds,
-    cameras: &'a [Camera],
-    resolution: usize,
-}
-
-impl<S: Source> Colours<'_, S> {
-    /// Colour and view dependence of some of a brick's voxels; each source counts as much as it is
-    /// opaque.
-    fn of_brick(
-        &self,
-        brick: [usize; 3],
-        voxels: &[usize],
-        seen: &[u64],
-    ) -> Vec<([f32; 3], [f32; NUMBERS])> {
-        let places = places(brick, voxels.iter().copied(), self.resolution);
-        let directions: Vec<Vec<[f32; 3]>> = voxels
-            .iter()
-            .zip(places.chunks_exact(PLACES_PER_VOXEL))
-            .map(|(&voxel, places)| self.directions(places[PLACES_PER_VOXEL / 2], seen[voxel]))
-            .collect();
-        let mut sums = vec![([0.0f32; 3], [0.0f32; NUMBERS], 0.0f32); voxels.len()];
-        for source in self.sources {
-            let samples = source.sample(&places);
-            let voxels = samples.chunks_exact(PLACES_PER_VOXEL).zip(&directions);
-            for ((samples, directions), (colour, view, weight)) in voxels.zip(&mut sums) {
-                let own = opacity_of(samples, self.resolution);
-                let (c, v) = shade(source, samples, directions, self.resolution);
-                colour.iter_mut().zip(c).for_each(|(sum, c)| *sum += own * c);
-                view.iter_mut().zip(v).for_each(|(sum, v)| *sum += own * v);
-                *weight += own;
-            }
-        }
-        sums.into_iter()
-            .map(|(colour, view, weight)| (colour.map(|c| c / weight), view.map(|v| v / weight)))
-            .collect()
-    }
-
-    /// Directions from some of the cameras that see a place to it, unit length in the world.
-    fn directions(&self, place: [f32; 3], seen: u64) -> Vec<[f32; 3]> {
-        let point = in_box(self.bounds, DVec3::from(place.map(f64::from)));
-        let seeing: Vec<&Camera> = self
-            .cameras
-            .iter()
-            .enumerate()
-            .filter(|(i, _)| seen >> i & 1 == 1)
-            .map(|c| c.1)
-            .collect();
-        let count = seeing.len().min(MOST_DIRECTIONS);
-        (0..count)
-            .filter_map(|k| (point - seeing[k * seeing.len() / count].centre()).try_normalize())
-            .map(|direction| direction.as_vec3().to_array())
-            .collect()
-    }
-}
-
 /// Mean colour of a voxel's samples, and how it changes with the direction.
 fn shade<S: Source>(
     source: &S,
@@ -247,6 +292,17 @@ pub(crate) mod tests {
     use super::*;
     use radiance::spherical_harmonics;
     use scene::Intrinsics;
+
+    pub(crate) fn bake<S: Source>(
+        sources: &[S],
+        bounds: &Bounds,
+        cameras: &[Camera],
+        resolution: usize,
+    ) -> Volume {
+        let baker = Baker { sources, bounds, cameras, resolution };
+        let progress = Progress::silent();
+        baker.volume(&baker.shape(baker.bricks(), &progress), &progress)
+    }
 
     /// A solid ball in the middle of the cube, red to the right, whose green grows with the
     /// direction's z.

@@ -38,6 +38,7 @@ use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
 
 use crate::atlas::Atlas;
+use crate::bake::{Baker, Shape, Volume};
 use crate::page::{ImageSize, PageCamera, PageScene};
 
 /// Parameters of `viewer`.
@@ -61,6 +62,9 @@ impl Default for Params {
         Self { resolution: 256, photographs: 100, photograph_width: 400 }
     }
 }
+
+/// Remedy for short memory, as a sentence fragment.
+const REMEDY: &str = "choose a smaller resolution, or end other programs";
 
 /// The stage.
 pub struct Viewer;
@@ -114,12 +118,10 @@ fn show(
     let views = Views::of_folder(&scene)?;
     let cameras: Vec<&Camera> = views.views.iter().map(|view| &view.camera).collect();
     let resolution = params.resolution as usize;
-    let progress = context.progress("baking", 2);
     let looking = visibility::looking(&cameras, resolution);
-    let volume = bake::bake(&fields, &file.bounds, &looking, resolution);
-    progress.add(1);
-    let atlas = Atlas::pack(&volume)?;
-    progress.add(1);
+    let baker = Baker { sources: &fields, bounds: &file.bounds, cameras: &looking, resolution };
+    let volume = bake(context, &baker)?;
+    let atlas = Atlas::pack(&volume, |bytes| context.progress("packing", bytes))?;
     let (centre, size) = overview::middle(&file.bounds, &volume);
     let up = overview::up(&cameras);
     let described = PageScene {
@@ -138,6 +140,16 @@ fn show(
     let html = page::page(&described, &atlas)?.into_string();
     let path = context.output_path(&format!("{prefix}index.html"))?;
     std::fs::write(&path, html).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Bakes a field as far as memory suffices.
+fn bake(context: &Context, baker: &Baker<'_, Field>) -> anyhow::Result<Volume> {
+    let bricks = baker.bricks();
+    context.check_memory("baking", Shape::memory_need(&bricks), REMEDY)?;
+    let progress = context.progress("baking", baker.steps(&bricks));
+    let shape = baker.shape(bricks, &progress);
+    context.check_memory("baking", shape.volume_memory_need(), REMEDY)?;
+    Ok(baker.volume(&shape, &progress))
 }
 
 /// Refuses the spaces of scenes without end. Their fields are hazy: a voxel's own view features say

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use radiance::{Ray, clip};
 use rayon::prelude::*;
 use scene::{Bounds, Camera};
+use stage::Progress;
 
 use crate::bricks::{Bricks, SIDE};
 
@@ -33,8 +34,8 @@ pub(crate) fn looking(cameras: &[&Camera], resolution: usize) -> Vec<Camera> {
 pub(crate) fn seen_by(
     bricks: &Bricks,
     opacity: &[f32],
-    cameras: &[Camera],
-    bounds: &Bounds,
+    (cameras, bounds): (&[Camera], &Bounds),
+    progress: &Progress,
 ) -> Vec<u64> {
     let seen: Vec<AtomicU64> = opacity.iter().map(|_| AtomicU64::new(0)).collect();
     let distances = bricks.distances();
@@ -51,6 +52,7 @@ pub(crate) fn seen_by(
                 });
             }
         });
+        progress.add(1);
     }
     seen.into_iter().map(AtomicU64::into_inner).collect()
 }
@@ -135,11 +137,12 @@ mod tests {
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() };
         let cameras = [camera_at(4.0), camera_at(-4.0)];
-        let seen = seen_by(&bricks, &opacity, &cameras, &bounds);
+        let look = || seen_by(&bricks, &opacity, (&cameras, &bounds), &Progress::silent());
+        let seen = look();
         let at = |z: usize| seen[bricks.voxel([16, 16, z]).unwrap()];
         assert_eq!([at(20), at(10), at(15)], [0b01, 0b10, 0]);
         let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-        assert!(alone.install(|| seen_by(&bricks, &opacity, &cameras, &bounds)) == seen);
+        assert!(alone.install(look) == seen);
     }
 
     fn camera(i: usize) -> Camera {

@@ -5,15 +5,19 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
-use artifact::{Failure, GivenInput, report_text, write_json};
+use artifact::{Failure, GivenInput, report_text, sized, write_json};
 use serde::Serialize;
 
 use crate::hooks::TestHooks;
+use crate::memory::{available_memory, remaining_memory};
 use crate::progress::{Progress, ProgressMode};
 
 /// A file that a stage may leave in its output: a few words on the result, which the runner prints
 /// at the end.
 pub const SUMMARY_FILE: &str = "summary.txt";
+
+/// Minimum amount that [`Context::check_memory`] logs: small scenes need less.
+const LOGGED_BYTES: u64 = 1_000_000_000;
 
 /// What a running stage has at hand.
 pub struct Context {
@@ -95,6 +99,18 @@ impl Context {
         if self.progress != ProgressMode::None {
             report_text(&text.to_string());
         }
+    }
+
+    /// Logs the memory that some work needs, in bytes, if that is at least [`LOGGED_BYTES`].
+    ///
+    /// # Errors
+    /// [`Failure::Usage`] with the remedy if less is free.
+    pub fn check_memory(&self, work: &str, need: u64, remedy: &str) -> Result<(), Failure> {
+        remaining_memory(work, need, available_memory()?, remedy)?;
+        if need >= LOGGED_BYTES {
+            self.say(format!("memory: about {} for {work}", sized(need)));
+        }
+        Ok(())
     }
 
     /// Whether a signal asked the stage to stop.

@@ -62,7 +62,10 @@ mod staging;
 pub use context::{Context, SUMMARY_FILE};
 pub use device::{DeviceError, check_device};
 pub use hooks::{SLOW_VARIABLE, STOP_VARIABLE};
-pub use memory::{MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory};
+pub use memory::{
+    MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory,
+    remaining_memory,
+};
 pub use panics::install_panic_hook;
 pub use progress::{Event, Pace, Progress, ProgressMode};
 pub use run::{RUNNER_VARIABLE, run_stage};

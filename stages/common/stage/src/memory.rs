@@ -52,6 +52,24 @@ fn free_memory() -> Option<u64> {
     Some(container.map_or(system.available_memory(), |left| left.min(system.available_memory())))
 }
 
+/// Returns the free bytes that remain when some work has its `need`; `u64::MAX` if it isn't known
+/// how many are free.
+///
+/// # Errors
+/// [`Failure::Usage`] with both numbers and the remedy if fewer are free.
+pub fn remaining_memory(
+    work: &str,
+    need: u64,
+    free: Option<u64>,
+    remedy: &str,
+) -> Result<u64, Failure> {
+    let Some(free) = free else { return Ok(u64::MAX) };
+    free.checked_sub(need).ok_or_else(|| {
+        let (need, free) = (sized(need), sized(free));
+        Failure::Usage(format!("{work} needs {need} of memory, and {free} are free; {remedy}"))
+    })
+}
+
 /// What helps where memory is short.
 pub const MEMORY_REMEDY: &str = "end other programs, run one stage at a time (`nerf-sr run --jobs \
     1`), or give it fewer or smaller images";
@@ -90,6 +108,15 @@ mod tests {
             said,
             "NERF_SR_MEMORY: \"4GB\" is no number of bytes; for 4 GB write 4000000000"
         );
+    }
+
+    #[test]
+    fn work_that_needs_more_than_is_free_is_refused() {
+        let remaining = |need, free| remaining_memory("a mesh", need, free, "make it smaller");
+        assert_eq!(remaining(3, Some(10)).unwrap(), 7);
+        assert_eq!(remaining(3, None).unwrap(), u64::MAX);
+        let said = remaining(2_000_000, Some(1_000_000)).unwrap_err().to_string();
+        assert_eq!(said, "a mesh needs 2.0 MB of memory, and 1.0 MB are free; make it smaller");
     }
 
     #[test]

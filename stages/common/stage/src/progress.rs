@@ -113,6 +113,11 @@ impl Progress {
         }
     }
 
+    /// Creates progress that nobody sees, for tests.
+    pub fn silent() -> Self {
+        Self::new("", 0, ProgressMode::None)
+    }
+
     pub(crate) fn with_hooks(mut self, hooks: TestHooks) -> Self {
         self.hooks = hooks;
         self
