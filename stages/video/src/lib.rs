@@ -3,11 +3,13 @@
 //! A sink: it writes one PNG a frame and, where `ffmpeg` is installed, `video.mp4`; without it the
 //! frames are the film. A sweep's points get a folder each.
 
+use std::io::{self, Read as _};
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{self, Command, Stdio};
+use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::{Failure, RunNode, RunRecord, folders_of};
+use artifact::{Failure, RunNode, RunRecord, folders_of, label};
 use contract::{Input, Output};
 use pixels::{DepthMap, Rgba8, common_range, read_exr, write_png};
 use rayon::prelude::*;
@@ -30,6 +32,9 @@ impl Default for Params {
         Self { frames_per_second: 30 }
     }
 }
+
+/// Time between two checks whether ffmpeg has ended.
+const INTERVAL: Duration = Duration::from_millis(20);
 
 /// The stage.
 pub struct Video;
@@ -65,7 +70,7 @@ impl Stage for Video {
         }
         for (node, prefix) in rendered.iter().zip(folders_of(&rendered)) {
             film(context, params, &node.folder, &prefix)
-                .with_context(|| format!("{} {}", node.stage, node.point))?;
+                .with_context(|| label(&node.stage, &node.point))?;
         }
         Ok(())
     }
@@ -147,7 +152,9 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
     command.args(["-loglevel", "error", "-nostdin", "-y", "-framerate", &rate, "-i"]).arg(frames);
     command.args(["-pix_fmt", "yuv420p", "-movflags", "+faststart"]).arg(film).stdin(Stdio::null());
     let folder = frames.parent().unwrap_or(frames).display();
-    match command.output() {
+    let output = output_of(context, &mut command);
+    context.check_interrupt()?;
+    match output {
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
             let said = String::from_utf8_lossy(&output.stderr);
@@ -167,6 +174,27 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
         }
         Err(e) => Err(e).with_context(|| format!("cannot start ffmpeg for {folder}")),
     }
+}
+
+/// Runs a program that says little, and kills it when a signal asks the stage to stop.
+fn output_of(context: &Context, command: &mut Command) -> io::Result<process::Output> {
+    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn()?;
+    let pipe = child.stderr.take();
+    let words = std::thread::spawn(|| {
+        let mut bytes = Vec::new();
+        pipe.map_or(Ok(0), |mut pipe| pipe.read_to_end(&mut bytes)).map(|_| bytes)
+    });
+    let status = loop {
+        if let Some(status) = child.try_wait()? {
+            break status;
+        }
+        if context.interrupted() {
+            child.kill()?;
+        }
+        std::thread::sleep(INTERVAL);
+    };
+    let stderr = words.join().unwrap_or_else(|_| Ok(Vec::new()))?;
+    Ok(process::Output { status, stdout: Vec::new(), stderr })
 }
 
 #[cfg(test)]
