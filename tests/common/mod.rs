@@ -5,6 +5,7 @@
 #![allow(unreachable_pub, reason = "shared by several test binaries")]
 
 pub mod browser;
+pub mod large;
 pub mod splats;
 pub mod surfaces;
 
