@@ -169,7 +169,6 @@ fn wrong_and_foreign_names_are_refused() {
         (&["n_level=4"], "-p n_level: no stage has such a parameter; did you mean n_levels?"),
         (&["train-ss.n_level=4"], "train-ss has no such parameter; did you mean n_levels?"),
         (&["grid.n_levels=4"], "no stage \"grid\""),
-        ("-p train-ss.levels: train-ss has no such parameter; did you mean n_levels?",),
         (&["hidden_dim=200"], "200 is greater than the maximum of 128"),
         (&["n_levels=0"], "0 is less than the minimum of 1"),
         (&["field="], "parameter field: null is not one of"),
