@@ -69,5 +69,5 @@ pub use memory::{
 pub use panics::install_panic_hook;
 pub use progress::{Event, Pace, Progress, ProgressMode};
 pub use run::{RUNNER_VARIABLE, run_stage};
-pub use signals::stop_on_signals;
+pub use signals::{stop_on_signals, stop_signals};
 pub use stage::Stage;

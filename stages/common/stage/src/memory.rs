@@ -1,12 +1,21 @@
 use artifact::{Failure, sized};
 use sysinfo::{MemoryRefreshKind, System};
 
-/// How allocators name what they didn't get: that of Rust, of libtorch, of CUDA, and of NumPy.
+/// Words of allocators before the amount that they didn't get: of Rust, libtorch, CUDA and NumPy.
 const MARKS: [&str; 4] =
     ["memory allocation of ", "tried to allocate ", "Tried to allocate ", "Unable to allocate "];
+/// Words that name no amount: of C++, of libtorch, of the system for a call and for a library that
+/// is loaded, of Python.
+const MARKS_WITHOUT_AMOUNT: [&str; 5] = [
+    "std::bad_alloc",
+    "can't allocate memory",
+    "Cannot allocate memory",
+    "failed to map segment from shared object",
+    "MemoryError",
+];
 
-/// What an allocator's last words mean, with the amount that was asked for and what to do; nothing
-/// for other words.
+/// What an allocator's last words mean, with the amount that was asked for, where they name it, and
+/// what to do; nothing for other words.
 ///
 /// ```
 /// let said = stage::out_of_memory("memory allocation of 99532800 bytes failed").unwrap();
@@ -14,8 +23,12 @@ const MARKS: [&str; 4] =
 /// assert_eq!(stage::out_of_memory("lost memory of it"), None);
 /// ```
 pub fn out_of_memory(text: &str) -> Option<String> {
-    let amount = MARKS.iter().find_map(|mark| amount(text.split_once(mark)?.1))?;
-    Some(format!("out of memory: {amount} more were asked for; {MEMORY_REMEDY}"))
+    let amount = MARKS.iter().find_map(|mark| amount(text.split_once(mark)?.1));
+    let amount = amount.map(|amount| format!(": {amount} more were asked for"));
+    if amount.is_none() && !MARKS_WITHOUT_AMOUNT.iter().any(|mark| text.contains(mark)) {
+        return None;
+    }
+    Some(format!("out of memory{}; {MEMORY_REMEDY}", amount.unwrap_or_default()))
 }
 
 /// Memory of this machine in bytes, or of its container where that has less; none where the system
@@ -146,6 +159,17 @@ mod tests {
                 format!("out of memory: {amount} more were asked for; {MEMORY_REMEDY}")
             });
             assert_eq!(found, expected, "{said}");
+        }
+        for said in [
+            "terminate called after throwing an instance of 'std::bad_alloc'",
+            "  what():  std::bad_alloc",
+            "train-refine: error while loading shared libraries: libtorch_cpu.so: failed to map \
+            segment from shared object",
+            "MemoryError",
+            "cannot fork: Cannot allocate memory (os error 12)",
+        ] {
+            let expected = format!("out of memory; {MEMORY_REMEDY}");
+            assert_eq!(out_of_memory(said), Some(expected), "{said}");
         }
     }
 }

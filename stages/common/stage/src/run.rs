@@ -1,14 +1,17 @@
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs;
-use std::io::Write as _;
+use std::io::{self, Write as _};
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
 use artifact::{Failure, GivenInput, exit_code, hash_json, one_line, print_lines, report_line};
 use clap::CommandFactory as _;
 use contract::Description;
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::io::Errno;
 
 use crate::arguments::{Arguments, Command, input_folders, read_params};
 use crate::context::Context;
@@ -43,7 +46,7 @@ pub(crate) fn run_stage_with<S: Stage>(
             let message = one_line(&error);
             report_line!("{}: {message}", S::NAME);
             if let Some(event) = failed_event(&message) {
-                std::io::stdout().write_all(event.as_bytes()).ok();
+                io::stdout().write_all(event.as_bytes()).ok();
             }
             ExitCode::from(exit_code(&error))
         }
@@ -107,7 +110,7 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     }
     let interrupted = stop_on_signals()?;
     if for_runner {
-        end_with_runner(&interrupted)?;
+        end_with_runner(Arc::clone(&interrupted))?;
     }
     let output = arguments.output.expect("clap requires --output");
     let staging = Staging::new(&output)?;
@@ -142,14 +145,20 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
 }
 
 /// Lets the stage end as if interrupted, with a checkpoint, when the runner is killed, rather than
-/// work on unseen.
-fn end_with_runner(interrupted: &AtomicBool) -> anyhow::Result<()> {
-    rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))?;
-    // It may have been killed before that, while this process was being loaded.
-    let runner = std::env::var(RUNNER_VARIABLE).ok().and_then(|pid| pid.parse::<i32>().ok());
-    let parent = rustix::process::getppid().map_or(0, rustix::process::Pid::as_raw_pid);
-    if runner.is_some_and(|pid| pid != parent) {
-        interrupted.store(true, Ordering::SeqCst);
+/// work on unseen: nobody reads its stdout then. A wrapper script between runner and stage passes
+/// that on, while the parent process would be the wrapper.
+fn end_with_runner(interrupted: Arc<AtomicBool>) -> io::Result<()> {
+    if std::env::var_os(RUNNER_VARIABLE).is_none() {
+        return Ok(());
     }
+    std::thread::Builder::new().spawn(move || {
+        let stdout = io::stdout();
+        // No event is asked for: the kernel reports by itself that a pipe has lost its reader.
+        let mut pipe = [PollFd::new(&stdout, PollFlags::empty())];
+        while poll(&mut pipe, None) == Err(Errno::INTR) {}
+        if pipe[0].revents().contains(PollFlags::ERR) {
+            interrupted.store(true, Ordering::SeqCst);
+        }
+    })?;
     Ok(())
 }

@@ -5,21 +5,25 @@ use std::sync::atomic::AtomicBool;
 use artifact::Failure;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-/// A flag that SIGINT, SIGTERM and SIGHUP set. The second of them ends the process at once, with
+/// Returns a flag that the [`stop_signals`] set. The second of them ends the process at once, with
 /// exit code 130.
-///
-/// SIGHUP stays ignored where it is (`nohup`): such a process shall outlive its terminal.
 pub fn stop_on_signals() -> io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let hangup = (!ignores(&status, SIGHUP)).then_some(SIGHUP);
-    for signal in [SIGINT, SIGTERM].into_iter().chain(hangup) {
+    for signal in stop_signals() {
         let code = i32::from(Failure::Interrupted.exit_code());
         // The order matters: this looks at the flag before that sets it.
         signal_hook::flag::register_conditional_shutdown(signal, code, Arc::clone(&stop))?;
         signal_hook::flag::register(signal, Arc::clone(&stop))?;
     }
     Ok(stop)
+}
+
+/// Returns the signals that ask a program to end: SIGINT, SIGTERM and SIGHUP. SIGHUP is left out
+/// where it is ignored (`nohup`): such a process shall outlive its terminal.
+pub fn stop_signals() -> Vec<i32> {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let hangup = (!ignores(&status, SIGHUP)).then_some(SIGHUP);
+    [SIGINT, SIGTERM].into_iter().chain(hangup).collect()
 }
 
 /// Whether a process ignores a signal, by the kernel's text on it.
