@@ -3,23 +3,20 @@
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
-use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{counted, printable, sized};
 use contract::Description;
-use rustix::process::{
-    Pid, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group, waitid,
-};
 use stage::{Event, SUMMARY_FILE};
-use wait4::{ResUse, Wait4 as _};
+use wait4::ResUse;
 
 use crate::clock::seconds;
+use crate::group::Group;
 use crate::log::{StageLog, Tenths};
-use crate::verdict::{End, StageFailure, is_noise};
+use crate::verdict::{End, StageFailure, is_noise, memory_kills};
 
 /// Environment that a stage gets; what else changes its result must be declared in its description.
 const ENVIRONMENT: [&str; 12] = [
@@ -39,6 +36,11 @@ const ENVIRONMENT: [&str; 12] = [
 
 /// Last lines of a stage's stderr in which the reason of a failure is looked for.
 const TAIL_LINES: usize = 8;
+/// Interval between two looks at a running stage.
+const LOOK_INTERVAL: Duration = Duration::from_millis(10);
+/// Time to write a checkpoint for a stage that was asked to end, if the wrapper script that it runs
+/// in has ended at once.
+const GRACE: Duration = Duration::from_secs(10);
 
 /// One call of a stage by the contract.
 pub struct Call<'a> {
@@ -155,13 +157,13 @@ impl Call<'_> {
             Some(lock) => Stdio::from(lock.try_clone().map_err(fail)?),
             None => Stdio::null(),
         };
-        let mut child = self.command().stdin(stdin).spawn().map_err(fail)?;
+        let kills_before = memory_kills();
+        let (group, (stdout, stderr)) = Group::start(self.command().stdin(stdin)).map_err(fail)?;
         let ear = Ear { log, watcher };
-        let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
         let (end, stated, tail) = std::thread::scope(|scope| {
             let events = scope.spawn(|| ear.hear_events(stdout));
             let words = scope.spawn(|| ear.hear_words(stderr));
-            let end = wait(&mut child, stop, watcher);
+            let end = wait(group, stop, watcher, &|| events.is_finished() && words.is_finished());
             (end, events.join().ok().flatten(), words.join().unwrap_or_default())
         });
         let ResUse { status, rusage } = end.map_err(fail)?;
@@ -170,7 +172,13 @@ impl Call<'_> {
             let processor_seconds = (rusage.utime + rusage.stime).as_secs_f64();
             Ok(Usage { peak_memory: rusage.maxrss, processor_seconds })
         } else {
-            let end = End { status, stated, tail, asked: stop.load(Ordering::Relaxed) };
+            let end = End {
+                status,
+                stated,
+                tail,
+                asked: stop.load(Ordering::Relaxed),
+                memory_ran_out: memory_kills() > kills_before,
+            };
             Err(end.failure(&self.description.name))
         };
         // Not twice: as what it said, and as the reason.
@@ -213,9 +221,7 @@ impl Call<'_> {
             .env_clear()
             .envs(passed)
             .env(stage::RUNNER_VARIABLE, std::process::id().to_string());
-        // A group of its own: Ctrl-C reaches the runner alone, which then asks its stages to end,
-        // once.
-        command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
         command
     }
 }
@@ -269,35 +275,29 @@ impl Ear<'_> {
     }
 }
 
-/// Waits for the end of a stage, and ends what it has left running: that would hold its pipes open
-/// and write unseen.
-fn wait(child: &mut Child, stop: &AtomicBool, watcher: &dyn Watcher) -> std::io::Result<ResUse> {
-    let pid = i32::try_from(child.id())
-        .ok()
-        .and_then(Pid::from_raw)
-        .ok_or(std::io::ErrorKind::InvalidInput)?;
+/// Waits for the end of a stage, and kills what it has left running. `is_silent` says whether
+/// nobody holds its pipes any more.
+fn wait(
+    group: Group,
+    stop: &AtomicBool,
+    watcher: &dyn Watcher,
+    is_silent: &dyn Fn() -> bool,
+) -> std::io::Result<ResUse> {
     let mut asked = false;
-    // It is looked at and not taken yet, so that its number remains its own until its group is
-    // ended.
-    while waitid(
-        WaitId::Pid(pid),
-        WaitIdOptions::EXITED | WaitIdOptions::NOWAIT | WaitIdOptions::NOHANG,
-    )?
-    .is_none()
-    {
+    while !group.is_over()? {
         if stop.load(Ordering::Relaxed) && !asked {
-            // It may just have ended by itself.
-            kill_process(pid, Signal::TERM).ok();
+            group.ask_to_end();
             asked = true;
         }
         watcher.alive();
-        std::thread::sleep(Duration::from_millis(10));
+        std::thread::sleep(LOOK_INTERVAL);
     }
-    // Mostly there is nothing left of its group.
-    kill_process_group(pid, Signal::KILL).ok();
-    child
-        .try_wait4()?
-        .ok_or_else(|| std::io::Error::other("a process that has ended is still there"))
+    let over = Instant::now();
+    while asked && !is_silent() && over.elapsed() < GRACE {
+        watcher.alive();
+        std::thread::sleep(LOOK_INTERVAL);
+    }
+    group.end()
 }
 
 /// Lines of a pipe that hold something; bytes that aren't UTF-8 are replaced, and control

@@ -2,14 +2,16 @@
 
 use std::collections::BTreeMap;
 use std::io::Read;
-use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use contract::Description;
+use stage::out_of_memory;
+
+use crate::group::Group;
 
 /// After so long a program that has said nothing is taken to hang.
 const LONGEST_ANSWER: Duration = Duration::from_secs(120);
@@ -118,31 +120,24 @@ fn ask(
 ) -> Result<Description, DescribeError> {
     let program = || path.to_path_buf();
     let fail = |problem| cannot_start(path, &problem);
-    // A group of its own: Ctrl-C reaches the runner alone, which then ends it, and with it whatever
-    // it has started.
-    let mut child = Command::new(path)
-        .arg("describe")
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .process_group(0)
-        .spawn()
-        .map_err(fail)?;
-    let (stdout, stderr) = (read(child.stdout.take()), read(child.stderr.take()));
+    let mut command = Command::new(path);
+    command.arg("describe").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let (group, (stdout, stderr)) = Group::start(&mut command).map_err(fail)?;
+    let (stdout, stderr) = (read(stdout), read(stderr));
     let deadline = Instant::now() + longest;
-    let ended = wait(&mut child, deadline, is_stopped).map_err(fail)?;
+    let is_over = wait(&group, deadline, is_stopped).map_err(fail)?;
     let left = || deadline.saturating_duration_since(Instant::now());
-    let answer = ended.and_then(|status| {
-        Some((status, stdout.recv_timeout(left()).ok()?, stderr.recv_timeout(left()).ok()?))
-    });
-    let Some((status, stdout, stderr)) = answer else {
-        end(&mut child);
+    let answer = is_over
+        .then(|| Some((stdout.recv_timeout(left()).ok()?, stderr.recv_timeout(left()).ok()?)));
+    let status = group.end().map_err(fail)?.status;
+    let Some((stdout, stderr)) = answer.flatten() else {
         return Err(DescribeError::Silent { program: program(), longest });
     };
     if !status.success() {
-        let said = String::from_utf8_lossy(&stderr);
-        let said =
-            said.trim_end().lines().last().unwrap_or_default().replace(char::is_control, " ");
+        let stderr = String::from_utf8_lossy(&stderr);
+        let last = || stderr.trim_end().lines().last().unwrap_or_default();
+        let said = stderr.lines().rev().find_map(out_of_memory);
+        let said = said.unwrap_or_else(|| last().replace(char::is_control, " "));
         return Err(DescribeError::Failed { program: program(), status, said });
     }
     serde_json::from_slice(&stdout)
@@ -153,28 +148,15 @@ fn cannot_start(program: &Path, problem: &std::io::Error) -> DescribeError {
     DescribeError::Start { program: program.to_path_buf(), problem: problem.to_string() }
 }
 
-/// Waits for a program to end; `None` where it is too late or nobody waits any more.
-fn wait(
-    child: &mut Child,
-    deadline: Instant,
-    is_stopped: &dyn Fn() -> bool,
-) -> std::io::Result<Option<ExitStatus>> {
+/// Waits for a program to end. Returns false where it is too late or nobody waits any more.
+fn wait(group: &Group, deadline: Instant, is_stopped: &dyn Fn() -> bool) -> std::io::Result<bool> {
     while Instant::now() < deadline && !is_stopped() {
-        if let Some(status) = child.try_wait()? {
-            return Ok(Some(status));
+        if group.is_over()? {
+            return Ok(true);
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    Ok(None)
-}
-
-/// Ends a program and all that it has started.
-fn end(child: &mut Child) {
-    if let Some(group) = rustix::process::Pid::from_raw(child.id() as i32) {
-        // It may have ended by itself.
-        rustix::process::kill_process_group(group, rustix::process::Signal::KILL).ok();
-    }
-    child.wait().ok();
+    Ok(false)
 }
 
 /// Reads a pipe to its end, beside; nobody has to wait for that.
@@ -222,6 +204,11 @@ mod tests {
                 "#!/bin/sh\necho one >&2\nprintf 'two\\033[31m\\n' >&2\nexit 3\n",
                 LONGEST_ANSWER,
                 "failed (exit status: 3): two [31m",
+            ),
+            (
+                "#!/bin/sh\necho '  what():  std::bad_alloc' >&2\nkill -ABRT $$\n",
+                LONGEST_ANSWER,
+                "failed (signal: 6 (SIGABRT)): out of memory; end other programs",
             ),
             ("#!/bin/sh\necho '{}'\n", LONGEST_ANSWER, "gave no description: missing field"),
             ("#!/nowhere/at/all\n", LONGEST_ANSWER, "describe`: No such file"),

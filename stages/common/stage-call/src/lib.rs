@@ -5,6 +5,7 @@
 //!   end, so that it leaves a checkpoint.
 //! * [`StageFailure`]: why a stage failed, by what it says, by its allocator, by the signal that
 //!   ended it.
+//! * [`stop_on_signals`]: the first signal sets a flag, the second kills all that was started.
 //! * [`Display`]: what a person sees meanwhile; any [`Watcher`] may watch.
 //! * [`seconds`], [`utc`]: times as people say them.
 //!
@@ -46,6 +47,7 @@ mod call;
 mod clock;
 mod describing;
 mod display;
+mod group;
 mod log;
 mod verdict;
 
@@ -53,4 +55,5 @@ pub use call::{Call, Usage, Watcher};
 pub use clock::{seconds, utc};
 pub use describing::{Answers, DescribeError, Interrupted, ask_all};
 pub use display::{Display, StageView};
+pub use group::stop_on_signals;
 pub use verdict::StageFailure;

@@ -33,6 +33,17 @@ pub(crate) struct End {
     pub(crate) tail: Vec<String>,
     /// Whether it was asked to end.
     pub(crate) asked: bool,
+    /// Whether the kernel ended some process meanwhile because memory ran out.
+    pub(crate) memory_ran_out: bool,
+}
+
+/// Exit code of a shell whose program was ended by SIGKILL.
+const KILLED_IN_SHELL: i32 = 128 + 9;
+
+/// Number of processes that the kernel has ended because memory ran out; none where it counts none.
+pub(crate) fn memory_kills() -> Option<u64> {
+    let counts = std::fs::read_to_string("/proc/vmstat").ok()?;
+    counts.lines().find_map(|line| line.strip_prefix("oom_kill "))?.parse().ok()
 }
 
 impl End {
@@ -51,6 +62,11 @@ impl End {
         }
         if let Some(said) = self.tail.iter().rev().find_map(|line| out_of_memory(line)) {
             return said;
+        }
+        let is_killed =
+            self.status.signal() == Some(9) || self.status.code() == Some(KILLED_IN_SHELL);
+        if is_killed && self.memory_ran_out {
+            return format!("out of memory: the kernel ended it; {MEMORY_REMEDY}");
         }
         let words = self
             .tail
@@ -107,7 +123,8 @@ mod tests {
     /// Exit codes stand in the second byte of a status, signals in the first.
     fn end(status: i32, tail: &[&str]) -> End {
         let tail = tail.iter().map(|line| (*line).to_owned()).collect();
-        End { status: ExitStatus::from_raw(status), stated: None, tail, asked: false }
+        let status = ExitStatus::from_raw(status);
+        End { status, stated: None, tail, asked: false, memory_ran_out: false }
     }
 
     #[test]
@@ -122,6 +139,13 @@ mod tests {
                 &["memory allocation of 99532800 bytes failed"],
                 1,
                 "out of memory: 99.5 MB more were asked for;",
+                "images",
+            ),
+            (
+                6,
+                &["terminate called after throwing an instance of 'std::bad_alloc'", "  what():"],
+                1,
+                "out of memory; end other programs",
                 "images",
             ),
             (
@@ -148,6 +172,15 @@ mod tests {
                 "{tail:?}: {}",
                 failure.message
             );
+        }
+    }
+
+    #[test]
+    fn what_the_kernel_ended_was_out_of_memory() {
+        for (status, is_said) in [(9, true), (137 << 8, true), (1 << 8, false), (15, false)] {
+            let end = End { memory_ran_out: true, ..end(status, &["Killed"]) };
+            let said = end.failure("eval").message.starts_with("out of memory: the kernel");
+            assert_eq!(said, is_said, "{status}");
         }
     }
 
