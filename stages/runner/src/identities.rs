@@ -1,10 +1,16 @@
+use std::sync::atomic::AtomicBool;
+
 use artifact::hash_json;
-use planning::{Origin, Plan, PlanError, source_hash};
+use planning::{Origin, Plan, PlanError, read_source};
 use store::Store;
 
 /// By what nodes are known before their keys are: a key's parts, with what a parent is in the place
-/// of what it made.
-pub(crate) fn identities(plan: &Plan, store: &Store) -> Result<Vec<String>, PlanError> {
+/// of what it made. Ends soon after `stop` is set.
+pub(crate) fn identities(
+    plan: &Plan,
+    store: &Store,
+    stop: Option<&AtomicBool>,
+) -> Result<Vec<String>, PlanError> {
     let mut identities: Vec<String> = Vec::with_capacity(plan.nodes.len());
     for node in &plan.nodes {
         let mut inputs = Vec::new();
@@ -13,7 +19,9 @@ pub(crate) fn identities(plan: &Plan, store: &Store) -> Result<Vec<String>, Plan
                 Origin::Node { index, subtree } => {
                     format!("{}/{}", identities[*index], subtree.as_deref().unwrap_or_default())
                 }
-                Origin::Folder(folder) => source_hash(store, node, &input.name, folder)?,
+                Origin::Folder(folder) => {
+                    read_source(store, node, &input.name, folder, stop)?.content()
+                }
             };
             inputs.push((input.name.clone(), from));
         }

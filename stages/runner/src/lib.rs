@@ -7,6 +7,7 @@
 //!   that they were made of.
 //! * `identities`: what nodes are known by before their keys are.
 //! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
+//! * `unchanged`: whether programs and inputs stay what a key was made of while a stage runs.
 //! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: hands the run's record (`recorded`) to stages that show it (the report), and puts what
 //!   they make in its place (`publish`, `owned`, `aside`).
@@ -27,6 +28,7 @@ mod recorded;
 mod remedy;
 mod session;
 mod sink;
+mod unchanged;
 mod verbs;
 mod waiting;
 mod watch;

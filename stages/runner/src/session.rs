@@ -1,10 +1,10 @@
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::report_text;
-use planning::{Asking, Devices, Pipeline, Plan, PlanError, Request, State};
+use artifact::{Failure, report_text};
+use planning::{Asking, Devices, Origin, Pipeline, Plan, PlanError, Request, State};
 use slurm::{Job, Queue, Slurm};
 use stage::check_device;
 use store::Store;
@@ -26,7 +26,9 @@ impl Session {
     ) -> anyhow::Result<Self> {
         check_device(&devices.given).map_err(|e| PlanError::Usage(e.to_string()))?;
         let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
+        check_name("the pipeline's folder", &pipeline.home())?;
         let root = store.map_or_else(|| pipeline.home().join(".nerf-sr"), Path::to_path_buf);
+        check_name("the store", &root)?;
         std::fs::create_dir_all(&root).with_context(|| {
             format!("cannot open the store {}; name another with --store", root.display())
         })?;
@@ -51,6 +53,7 @@ impl Session {
         let (pipeline, targets) = planning::find(&self.pipeline, &what.targets)?;
         let plan = Plan::new(&pipeline, &self.store, &Request { targets, ..what.clone() }, asking)?;
         let plan = Plan { devices: self.devices.clone(), ..plan };
+        check_apart(&plan, "the store", self.store.root())?;
         plan.notes.iter().for_each(|note| report_text(note));
         Ok(plan)
     }
@@ -65,7 +68,7 @@ impl Session {
         if queue.jobs.is_empty() {
             return (Vec::new(), 0);
         }
-        let identities = identities(plan, &self.store).unwrap_or_default();
+        let identities = identities(plan, &self.store, None).unwrap_or_default();
         let jobs: Vec<Option<Job>> =
             identities.iter().map(|identity| queue.job_of(identity).cloned()).collect();
         let besides = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
@@ -73,7 +76,63 @@ impl Session {
     }
 
     pub(crate) fn states(&self, plan: &Plan) -> anyhow::Result<Vec<State>> {
-        Ok(plan.states(&self.store)?)
+        Ok(plan.states(&self.store, None)?)
+    }
+}
+
+/// Refuses a folder whose name isn't UTF-8: the records of runs, which are JSON, name folders.
+pub(crate) fn check_name(what: &str, folder: &Path) -> Result<(), Failure> {
+    let (named, real) = (absolute(folder), real(folder));
+    if named.to_str().is_some() && real.to_str().is_some() {
+        return Ok(());
+    }
+    Err(Failure::BadInput(format!(
+        "{real:?}: {what} must have a name in UTF-8; rename the folder, or use another"
+    )))
+}
+
+/// Refuses a plan that reads a folder in which it writes: each run would change its own input.
+/// `written` is the store or the folder of pages, as `what` says.
+pub(crate) fn check_apart(plan: &Plan, what: &str, written: &Path) -> Result<(), PlanError> {
+    let written = real(written);
+    for node in &plan.nodes {
+        for input in &node.inputs {
+            let Origin::Folder(folder) = &input.from else { continue };
+            if written.starts_with(real(folder)) {
+                return Err(PlanError::Usage(format!(
+                    "stage {}: input {}: {} contains {what}, {}, which runs write to; name a \
+                    folder without results",
+                    node.stage,
+                    input.name,
+                    folder.display(),
+                    written.display()
+                )));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The absolute path of a file; the empty path means the current folder.
+fn absolute(path: &Path) -> PathBuf {
+    let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
+    std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
+}
+
+/// The absolute path of a file without links, as far as the file exists.
+fn real(path: &Path) -> PathBuf {
+    let absolute = absolute(path);
+    let mut existing = absolute.as_path();
+    loop {
+        match (existing.canonicalize(), existing.parent()) {
+            (Ok(found), _) => {
+                let rest = absolute.strip_prefix(existing).unwrap_or(Path::new(""));
+                // Joined by parts: an empty rest would leave a slash at the end.
+                return found.components().chain(rest.components()).collect();
+            }
+            (Err(_), Some(parent)) => existing = parent,
+            (Err(_), None) => return absolute,
+        }
     }
 }
 

@@ -13,6 +13,7 @@ use store::{Record, RunFile, Store};
 use crate::aside::Mark;
 use crate::publish;
 use crate::recorded::{Course, record, with_details};
+use crate::unchanged::ConfirmedProgram;
 
 /// By what a page is known to show a record: what scenes decide follows from the rest.
 fn identity(sink: &Sink, record: &RunRecord) -> String {
@@ -74,6 +75,7 @@ pub(crate) fn show(
         .and_then(|()| write_json(&folder.join("run.json"), &record))
         .and_then(|()| write_json(&params, &sink.parameters))
         .map_err(|e| StageFailure::at(&scratch, &e))?;
+    let program = ConfirmedProgram::new(&sink.program, store, stop)?;
     let display = Display::new();
     let view = display.start(&sink.stage);
     let inputs = [("run".to_owned(), folder)];
@@ -94,6 +96,7 @@ pub(crate) fn show(
     let result = call.run(&scratch.join("log"), &view, stop);
     view.end();
     result?;
+    program.confirm_again()?;
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
     if !manifest.exists() {

@@ -192,7 +192,8 @@ impl Manifest {
 }
 
 /// Every file below a folder with its path inside it, in the order of names. Symbolic links are
-/// followed; one that leads back up is an error that names it.
+/// followed; one that leads back up is an error that names it, and so is a FIFO, socket or device:
+/// who reads one may wait for ever.
 pub fn list_files(folder: &Path) -> io::Result<Vec<(PathBuf, PathBuf)>> {
     let mut found = Vec::new();
     for entry in walkdir::WalkDir::new(folder).follow_links(true).sort_by_file_name() {
@@ -206,13 +207,18 @@ pub fn list_files(folder: &Path) -> io::Result<Vec<(PathBuf, PathBuf)>> {
             let relative =
                 entry.path().strip_prefix(folder).map_err(io::Error::other)?.to_path_buf();
             found.push((relative, entry.into_path()));
+        } else if !entry.file_type().is_dir() {
+            let path = entry.path();
+            return Err(io::Error::other(format!(
+                "{path:?} is a FIFO, socket or device, which nobody can hash; remove it"
+            )));
         }
     }
     Ok(found)
 }
 
 /// Path, size and blake3 of files, sorted by path.
-pub fn hash_files(files: Vec<(String, PathBuf)>) -> io::Result<Vec<FileEntry>> {
+fn hash_files(files: Vec<(String, PathBuf)>) -> io::Result<Vec<FileEntry>> {
     let mut entries: Vec<FileEntry> =
         files.into_par_iter().map(|(path, file)| entry(path, &file)).collect::<io::Result<_>>()?;
     entries.sort();
@@ -334,6 +340,14 @@ mod tests {
         std::os::unix::fs::symlink(dir.path(), dir.path().join("train/loop")).unwrap();
         let message = list_files(dir.path()).unwrap_err().to_string();
         assert!(message.contains("train/loop") && message.contains("leads back"), "{message}");
+    }
+
+    #[test]
+    fn what_is_neither_file_nor_folder_is_named() {
+        let (dir, _) = example();
+        let _socket = std::os::unix::net::UnixListener::bind(dir.path().join("train/s")).unwrap();
+        let message = list_files(dir.path()).unwrap_err().to_string();
+        assert!(message.contains("train/s") && message.contains("remove it"), "{message}");
     }
 
     #[test]

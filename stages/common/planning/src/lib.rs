@@ -7,6 +7,8 @@
 //! * [`Plan`]: stages × swept values as nodes in an order that works, and what of them is cached,
 //!   will run, or waits. `check` looks at the whole file, `arguments` and `axes` at the command
 //!   line, `expand` makes the nodes.
+//! * [`Source`]: a folder outside the store, its content hash and what was done to it since.
+//!   [`StageProgram::confirm`]: whether a program is still the planned one.
 //! * [`parts`]: the parts of an action's key; one list feeds both the hash and `why` ([`changes`]).
 //!
 //! ```no_run
@@ -22,6 +24,7 @@ mod arguments;
 mod axes;
 mod changes;
 mod check;
+mod confirm;
 mod expand;
 mod experiment;
 mod experiment_axes;
@@ -37,9 +40,11 @@ mod plan;
 mod request;
 mod sources;
 mod stages;
+mod stamp;
 mod targets;
 
 pub use changes::{Change, changes, short};
+pub use confirm::Unconfirmed;
 pub use experiment::{Experiment, Selection, Variant};
 pub use extend::JoinError;
 pub use file::{PipelineFile, StageBlock};
@@ -48,8 +53,9 @@ pub use key::{explain, nearest, nearest_changes, parts};
 pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
 pub use part::{Part, PipelineError};
 pub use pipeline::Pipeline;
-pub use plan::{input_hashes, source_hash};
+pub use plan::{FoundInputs, find_inputs, read_source};
 pub use request::{PlanError, Request};
-pub use sources::SourceError;
+pub use sources::{Source, SourceError};
 pub use stages::{Asking, ProgramError, Programs, StageProgram, executable};
+pub use stamp::Stamp;
 pub use targets::find;

@@ -1,5 +1,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 use artifact::{hash_json, known_names};
 use contract::Description;
@@ -14,7 +15,7 @@ use crate::key;
 use crate::node::{Node, NodeInput, Origin, Plan, State};
 use crate::pipeline::Pipeline;
 use crate::request::{PlanError, Request};
-use crate::sources::hash_source;
+use crate::sources::{Source, SourceError};
 use crate::stages::{Asking, Programs};
 
 impl Plan {
@@ -47,7 +48,12 @@ impl Plan {
     }
 
     /// What is known of each node before a run.
-    pub fn states(&self, store: &Store) -> Result<Vec<State>, PlanError> {
+    /// Ends soon after `stop` is set.
+    pub fn states(
+        &self,
+        store: &Store,
+        stop: Option<&AtomicBool>,
+    ) -> Result<Vec<State>, PlanError> {
         let mut states: Vec<State> = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {
             let on: BTreeSet<usize> =
@@ -56,8 +62,8 @@ impl Plan {
                 states.push(State::Waits { on: on.into_iter().collect() });
                 continue;
             }
-            let hashes = input_hashes(node, store, |index| cached_output(&states[index]))?;
-            let key_parts = key::parts(node, &hashes, self.device(&node.stage));
+            let inputs = find_inputs(node, store, stop, |index| cached_output(&states[index]))?;
+            let key_parts = key::parts(node, &inputs.hashes, self.device(&node.stage));
             states.push(match store.hit(&hash_json(&key_parts))? {
                 Some(record) => State::Cached(Box::new(record)),
                 None => State::WillRun { key_parts },
@@ -115,46 +121,54 @@ impl<'a> Goal<'a> {
     }
 }
 
-/// Content hashes of a node's inputs, given its parents' outputs.
-pub fn input_hashes(
-    node: &Node,
-    store: &Store,
-    output_of: impl Fn(usize) -> String,
-) -> Result<Vec<(String, String)>, PlanError> {
-    let hashes = node
-        .inputs
-        .iter()
-        .map(|input| Ok((input.name.clone(), input_hash(node, store, input, &output_of)?)));
-    hashes.collect()
+/// A node's inputs as they are now.
+pub struct FoundInputs {
+    /// Their content hashes, by name.
+    pub hashes: Vec<(String, String)>,
+    /// Those that are folders outside the store, by name.
+    pub sources: BTreeMap<String, Source>,
 }
 
-fn input_hash(
+/// Reads a node's inputs, given its parents' outputs. Ends soon after `stop` is set.
+pub fn find_inputs(
     node: &Node,
     store: &Store,
-    input: &NodeInput,
+    stop: Option<&AtomicBool>,
     output_of: impl Fn(usize) -> String,
-) -> Result<String, PlanError> {
-    match &input.from {
-        Origin::Node { index, subtree: None } => Ok(output_of(*index)),
-        Origin::Node { index, subtree: Some(folder) } => {
-            let manifest = store.manifest(&output_of(*index)).map_err(PlanError::Artifact)?;
-            Ok(manifest.subtree(folder).identity())
-        }
-        Origin::Folder(folder) => source_hash(store, node, &input.name, folder),
+) -> Result<FoundInputs, PlanError> {
+    let mut found = FoundInputs { hashes: Vec::new(), sources: BTreeMap::new() };
+    for NodeInput { name, from } in &node.inputs {
+        let hash = match from {
+            Origin::Node { index, subtree: None } => output_of(*index),
+            Origin::Node { index, subtree: Some(folder) } => {
+                let manifest = store.manifest(&output_of(*index)).map_err(PlanError::Artifact)?;
+                manifest.subtree(folder).identity()
+            }
+            Origin::Folder(folder) => {
+                let source = read_source(store, node, name, folder, stop)?;
+                let content = source.content();
+                found.sources.insert(name.clone(), source);
+                content
+            }
+        };
+        found.hashes.push((name.clone(), hash));
     }
+    Ok(found)
 }
 
-/// Content hash of a folder outside the store, an input of a node.
-pub fn source_hash(
+/// Reads a folder outside the store, an input of a node. Ends soon after `stop` is set.
+pub fn read_source(
     store: &Store,
     node: &Node,
     input: &str,
     folder: &Path,
-) -> Result<String, PlanError> {
-    hash_source(store, folder).map_err(|problem| PlanError::Source {
-        stage: node.stage.clone(),
-        input: input.to_owned(),
-        problem,
+    stop: Option<&AtomicBool>,
+) -> Result<Source, PlanError> {
+    Source::read(store, folder, stop).map_err(|problem| match problem {
+        SourceError::Interrupted => PlanError::Interrupted,
+        problem => {
+            PlanError::Source { stage: node.stage.clone(), input: input.to_owned(), problem }
+        }
     })
 }
 

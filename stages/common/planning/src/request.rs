@@ -44,7 +44,7 @@ pub enum PlanError {
     /// The store can't be read: whether an artifact is there isn't known.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// A signal came while stages were asked what they are.
+    /// A signal came while stages were asked what they are, or inputs were hashed.
     #[error("interrupted")]
     Interrupted,
 }

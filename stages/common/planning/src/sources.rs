@@ -1,24 +1,25 @@
-//! Content hashes of folders outside the store.
+//! Folders outside the store: content hashes of their files, and whether they stay as they were.
 
 use std::collections::BTreeMap;
-use std::io;
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::time::{Duration, Instant};
 
-use artifact::{hash_files, hash_json, list_files, write_atomically};
+use artifact::{FileEntry, hash_json, list_files, report_line, sized, write_atomically};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use store::Store;
 
-/// Hashes by the folder's path, kept as long as the files' paths, sizes and modification times
-/// stay.
-#[derive(Default, Serialize, Deserialize)]
-struct HashCache(BTreeMap<String, Entry>);
+use crate::stamp::Stamp;
 
-#[derive(Serialize, Deserialize)]
-struct Entry {
-    listing: String,
-    content: String,
-}
+/// Interval between two looks at the signals' flag.
+const LOOK_INTERVAL: Duration = Duration::from_millis(20);
+/// Reading that takes longer than this is reported; again after twice the time, and so on.
+const NOTICE_AFTER: Duration = Duration::from_secs(2);
 
 /// A folder outside the store that has no content hash.
 #[derive(Debug, thiserror::Error)]
@@ -42,54 +43,267 @@ pub enum SourceError {
         /// Why.
         problem: io::Error,
     },
+    /// A file changed while it was read.
+    #[error("{folder:?}: {change} while it was hashed; run again when nothing writes there")]
+    Changing {
+        /// The folder.
+        folder: PathBuf,
+        /// What happened to which file.
+        change: String,
+    },
+    /// A signal came.
+    #[error("interrupted")]
+    Interrupted,
 }
 
-/// The content hash of a folder outside the store.
-pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, SourceError> {
-    let fail = |problem| SourceError::Unreadable { folder: folder.to_path_buf(), problem };
-    let absolute = folder
-        .canonicalize()
-        .map_err(|problem| SourceError::Absent { folder: folder.to_path_buf(), problem })?;
-    if !absolute.is_dir() {
-        return Err(SourceError::NoFolder(folder.to_path_buf()));
-    }
-    let files = list_files(&absolute).map_err(fail)?;
-    let (listing, newest) = listing(&files).map_err(fail)?;
-    let cache_file = store.root().join("cache/sources.json");
-    let mut cache: HashCache = std::fs::read(&cache_file)
-        .ok()
-        .and_then(|b| serde_json::from_slice(&b).ok())
-        .unwrap_or_default();
-    let place = name_of(&absolute);
-    if let Some(entry) = cache.0.get(&place).filter(|e| e.listing == listing) {
-        return Ok(entry.content.clone());
-    }
-    let named = files.into_iter().map(|(relative, file)| (name_of(&relative), file)).collect();
-    let content = hash_json(&hash_files(named).map_err(fail)?);
-    // A file changed within the clock's grain could change again unseen; such a listing isn't kept.
-    let settled = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .is_ok_and(|now| now.as_nanos().saturating_sub(newest) > 2_000_000_000);
-    if settled {
-        cache.0.insert(place, Entry { listing, content: content.clone() });
-        if let Ok(bytes) = serde_json::to_vec(&cache) {
-            write_atomically(&cache_file, &bytes).ok();
+/// A folder outside the store as it was when it was read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Source {
+    /// Its files by their paths inside it.
+    files: BTreeMap<String, SourceFile>,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct SourceFile {
+    #[serde(flatten)]
+    stamp: Stamp,
+    blake3: String,
+}
+
+impl Source {
+    /// Reads a folder. Files that the store's cache knows by their stamps aren't hashed again. Says
+    /// how far it is where that takes long, and ends soon after `stop` is set.
+    pub fn read(
+        store: &Store,
+        folder: &Path,
+        stop: Option<&AtomicBool>,
+    ) -> Result<Self, SourceError> {
+        let absolute = folder
+            .canonicalize()
+            .map_err(|problem| SourceError::Absent { folder: folder.to_path_buf(), problem })?;
+        if !absolute.is_dir() {
+            return Err(SourceError::NoFolder(folder.to_path_buf()));
+        }
+        let cache = CacheFile::new(store, &absolute);
+        let progress = Arc::new(HashProgress::default());
+        let (sender, receiver) = mpsc::channel();
+        let shared = Arc::clone(&progress);
+        // A thread of its own, which may wait for a dead file server for ever.
+        std::thread::spawn(move || sender.send(read(&absolute, &cache, &shared)));
+        let (begun, mut notice) = (Instant::now(), NOTICE_AFTER);
+        loop {
+            match receiver.recv_timeout(LOOK_INTERVAL) {
+                Ok(result) => return result.map_err(|failure| failure.at(folder)),
+                Err(RecvTimeoutError::Disconnected) => return Err(SourceError::Interrupted),
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+            if stop.is_some_and(|stop| stop.load(Ordering::Relaxed)) {
+                progress.is_abandoned.store(true, Ordering::Relaxed);
+                return Err(SourceError::Interrupted);
+            }
+            if begun.elapsed() >= notice {
+                report_line!("{}", progress.words(folder));
+                notice *= 2;
+            }
         }
     }
-    Ok(content)
+
+    /// The content hash: of each file's path, size and hash.
+    pub fn content(&self) -> String {
+        let entries: Vec<FileEntry> = self
+            .files
+            .iter()
+            .map(|(path, file)| FileEntry {
+                path: path.clone(),
+                size: file.stamp.size,
+                blake3: file.blake3.clone(),
+            })
+            .collect();
+        hash_json(&entries)
+    }
+
+    /// A hash of each file's path, size and time of change, which a copy that keeps times has, too.
+    pub fn times(&self) -> String {
+        let files: Vec<_> =
+            self.files.iter().map(|(path, file)| (path, file.stamp.of_content())).collect();
+        hash_json(&files)
+    }
+
+    /// Returns the first file to which something was done since an earlier reading, and what. A
+    /// file that has its earlier content again counts: what was read in between isn't known.
+    pub fn change_since(&self, earlier: &Self) -> Option<String> {
+        first_change(&earlier.files, &self.files, |before, now| {
+            now.stamp.is_untouched_since(&before.stamp) && now.blake3 == before.blake3
+        })
+    }
 }
 
-/// A hash of every file's path, size and time, and the newest time.
-fn listing(files: &[(PathBuf, PathBuf)]) -> io::Result<(String, u128)> {
-    let mut entries = Vec::with_capacity(files.len());
-    let mut newest = 0;
-    for (relative, file) in files {
-        let meta = std::fs::metadata(file)?;
-        let time = meta.modified()?.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
-        newest = newest.max(time);
-        entries.push((name_of(relative), meta.len(), time.to_string()));
+/// The first name at which two lists differ, in words.
+fn first_change<T>(
+    before: &BTreeMap<String, T>,
+    now: &BTreeMap<String, T>,
+    is_same: impl Fn(&T, &T) -> bool,
+) -> Option<String> {
+    let changed = before.iter().find_map(|(name, old)| match now.get(name) {
+        None => Some(format!("{name} was removed")),
+        Some(new) if !is_same(old, new) => Some(format!("{name} was changed")),
+        Some(_) => None,
+    });
+    let added = || now.keys().find(|name| !before.contains_key(*name));
+    changed.or_else(|| added().map(|name| format!("{name} was added")))
+}
+
+/// How far the hashing of a folder is.
+#[derive(Default)]
+struct HashProgress {
+    /// Bytes hashed.
+    done: AtomicU64,
+    /// Bytes to hash; 0 while files are listed.
+    total: AtomicU64,
+    /// Whether nobody waits for the hash any more.
+    is_abandoned: AtomicBool,
+}
+
+impl HashProgress {
+    fn words(&self, folder: &Path) -> String {
+        let (done, total) = (self.done.load(Ordering::Relaxed), self.total.load(Ordering::Relaxed));
+        if total == 0 {
+            return format!("listing the files of {}", folder.display());
+        }
+        format!("hashing {}: {} of {}", folder.display(), sized(done), sized(total))
     }
-    Ok((hash_json(&entries), newest))
+}
+
+/// Why a folder's files couldn't be read.
+enum ReadFailure {
+    Unreadable(io::Error),
+    Changing(String),
+}
+
+impl ReadFailure {
+    fn at(self, folder: &Path) -> SourceError {
+        let folder = folder.to_path_buf();
+        match self {
+            Self::Unreadable(problem) => SourceError::Unreadable { folder, problem },
+            Self::Changing(change) => SourceError::Changing { folder, change },
+        }
+    }
+}
+
+impl From<io::Error> for ReadFailure {
+    fn from(problem: io::Error) -> Self {
+        Self::Unreadable(problem)
+    }
+}
+
+/// Files by their paths inside a folder: their own paths, and their stamps.
+type Listing = BTreeMap<String, (PathBuf, Stamp)>;
+
+fn list(folder: &Path) -> io::Result<Listing> {
+    let files = list_files(folder)?.into_iter();
+    files
+        .map(|(relative, file)| {
+            let stamp = Stamp::of(&file).map_err(|e| naming(&file, &e))?;
+            Ok((name_of(&relative), (file, stamp)))
+        })
+        .collect()
+}
+
+fn naming(file: &Path, error: &io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("{}: {error}", file.display()))
+}
+
+fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Source, ReadFailure> {
+    let listing = list(folder)?;
+    let mut files = cache.files();
+    files.retain(|name, file| listing.get(name).is_some_and(|(_, stamp)| *stamp == file.stamp));
+    let unknown: Vec<(&String, &(PathBuf, Stamp))> =
+        listing.iter().filter(|(name, _)| !files.contains_key(*name)).collect();
+    if unknown.is_empty() {
+        return Ok(Source { files });
+    }
+    progress.total.store(unknown.iter().map(|(_, (_, s))| s.size).sum(), Ordering::Relaxed);
+    let hashed: Vec<(String, SourceFile)> = unknown
+        .into_par_iter()
+        .map(|(name, (file, stamp))| {
+            let blake3 = hash_file(file, progress).map_err(|e| naming(file, &e))?;
+            Ok((name.clone(), SourceFile { stamp: *stamp, blake3 }))
+        })
+        .collect::<io::Result<_>>()?;
+    files.extend(hashed);
+    // What was written to while it was hashed has a hash that it may never have had.
+    let is_same = |before: &(PathBuf, Stamp), now: &(PathBuf, Stamp)| before.1 == now.1;
+    if let Some(change) = first_change(&listing, &list(folder)?, is_same) {
+        return Err(ReadFailure::Changing(change));
+    }
+    cache.write(&files);
+    Ok(Source { files })
+}
+
+/// A file whose bytes are counted as they are read.
+struct Counted<'a> {
+    file: File,
+    progress: &'a HashProgress,
+}
+
+impl Read for Counted<'_> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        if self.progress.is_abandoned.load(Ordering::Relaxed) {
+            return Err(io::Error::other("interrupted"));
+        }
+        let read = self.file.read(buffer)?;
+        self.progress.done.fetch_add(read as u64, Ordering::Relaxed);
+        Ok(read)
+    }
+}
+
+fn hash_file(path: &Path, progress: &HashProgress) -> io::Result<String> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update_reader(Counted { file: File::open(path)?, progress })?;
+    Ok(hasher.finalize().to_hex().to_string())
+}
+
+/// A file of the store's cache: what is known of a folder's files.
+struct CacheFile {
+    path: PathBuf,
+    folder: String,
+}
+
+/// The content of such a file.
+#[derive(Default, Serialize, Deserialize)]
+struct Cached {
+    folder: String,
+    files: BTreeMap<String, SourceFile>,
+}
+
+impl CacheFile {
+    fn new(store: &Store, folder: &Path) -> Self {
+        let folder = name_of(folder);
+        let name = format!("{}.json", hash_json(&folder));
+        Self { path: store.root().join("cache/sources").join(name), folder }
+    }
+
+    /// Known files; none where the cache can't be read.
+    fn files(&self) -> BTreeMap<String, SourceFile> {
+        let bytes = std::fs::read(&self.path).unwrap_or_default();
+        let cached: Cached = serde_json::from_slice(&bytes).unwrap_or_default();
+        if cached.folder == self.folder { cached.files } else { BTreeMap::new() }
+    }
+
+    /// Writes the files whose next change will be seen by their stamps.
+    fn write(&self, files: &BTreeMap<String, SourceFile>) {
+        let settled = files.iter().filter(|(_, file)| file.stamp.is_settled());
+        let files = settled.map(|(name, file)| (name.clone(), file.clone())).collect();
+        let folder = self.folder.clone();
+        if let Ok(bytes) = serde_json::to_vec(&Cached { folder, files })
+            && let Some(parent) = self.path.parent()
+        {
+            // Only a cache: without it the next start is slower.
+            std::fs::create_dir_all(parent)
+                .and_then(|()| write_atomically(&self.path, &bytes))
+                .ok();
+        }
+    }
 }
 
 /// A path as text, another for each path: names that aren't UTF-8 are written in hexadecimal after
@@ -107,43 +321,5 @@ fn name_of(path: &Path) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use std::ffi::OsStr;
-    use std::os::unix::ffi::OsStrExt as _;
-
-    #[test]
-    fn what_is_no_folder_is_refused() {
-        let dir = tempfile::tempdir().unwrap();
-        let store = Store::open(&dir.path().join("store")).unwrap();
-        let (file, absent) = (dir.path().join("file"), dir.path().join("absent"));
-        std::fs::write(&file, "x").unwrap();
-        let problem = |folder: &Path| hash_source(&store, folder).unwrap_err().to_string();
-        assert_eq!(problem(&file), format!("{file:?}: not a folder"));
-        let words = "No such file or directory (os error 2); name a folder that is there";
-        assert_eq!(problem(&absent), format!("{absent:?}: {words}"));
-    }
-
-    /// Any file name is taken, and each makes a hash of its own.
-    #[test]
-    fn any_name_has_a_hash() {
-        let dir = tempfile::tempdir().unwrap();
-        let (store, data) =
-            (Store::open(&dir.path().join("store")).unwrap(), dir.path().join("data"));
-        let mut seen = std::collections::BTreeSet::new();
-        for name in [
-            &b"plain"[..],
-            b"\xff",
-            b"\xfe",
-            b"new\nline",
-            b"\x1b]0;title\x07",
-            "übung 🎈".as_bytes(),
-            b"ff",
-        ] {
-            std::fs::create_dir_all(&data).unwrap();
-            std::fs::write(data.join(OsStr::from_bytes(name)), "x").unwrap();
-            assert!(seen.insert(hash_source(&store, &data).unwrap()), "{name:?}");
-            std::fs::remove_dir_all(&data).unwrap();
-        }
-    }
-}
+#[path = "source_tests.rs"]
+mod tests;

@@ -6,11 +6,9 @@
 //! answered then, while its bytes are the same.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::UNIX_EPOCH;
 
 use artifact::{nearest, write_atomically};
 use contract::{Description, DescriptionError, Schema, SchemaError};
@@ -22,6 +20,7 @@ use store::Store;
 use crate::file::StageBlock;
 use crate::part::{Part, PipelineError};
 use crate::pipeline::Pipeline;
+use crate::stamp::Stamp;
 
 /// A stage's executable and what it says of itself.
 #[derive(Debug)]
@@ -32,6 +31,8 @@ pub struct StageProgram {
     pub description: Description,
     /// Its parameters.
     pub schema: Schema,
+    /// Stamp of the executable from before it was asked; none of a plan that was read from a file.
+    pub(crate) stamp: Option<Stamp>,
 }
 
 /// Why a stage's program can't be used.
@@ -59,6 +60,9 @@ pub enum ProgramError {
     /// It doesn't say what it is.
     #[error(transparent)]
     Describe(#[from] DescribeError),
+    /// Its file changed while it was asked.
+    #[error("{0} changed while it was asked what it is; run again")]
+    Changing(PathBuf),
     /// Nobody says what it is.
     #[error("nothing describes {0}")]
     Undescribed(PathBuf),
@@ -82,7 +86,7 @@ impl StageProgram {
             .check()
             .map_err(|problem| ProgramError::Description { path: path.to_path_buf(), problem })?;
         let schema = Schema::new(&description.parameters)?;
-        Ok(Self { path: path.to_path_buf(), description, schema })
+        Ok(Self { path: path.to_path_buf(), description, schema, stamp: None })
     }
 
     /// Whether a block of this program gives a parameter itself.
@@ -142,13 +146,8 @@ impl Programs {
         needed: &BTreeSet<String>,
         asking: Asking,
     ) -> Result<Self, Interrupted> {
-        let file = store.root().join("cache/describe.json");
-        // A cache that can't be read is an empty one.
-        let mut cache: DescriptionCache = std::fs::read(&file)
-            .ok()
-            .and_then(|b| serde_json::from_slice(&b).ok())
-            .unwrap_or_default();
-        let mut answers: BTreeMap<PathBuf, Result<Description, ProgramError>> = BTreeMap::new();
+        let mut cache = DescriptionCache::of(store);
+        let mut answers: BTreeMap<PathBuf, Result<Answer, ProgramError>> = BTreeMap::new();
         let mut unasked = BTreeMap::new();
         let paths: BTreeMap<&str, PathBuf> =
             pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
@@ -158,7 +157,9 @@ impl Programs {
             match identify(path, program_name(pipeline, stage)) {
                 Err(problem) => _ = answers.insert(path.clone(), Err(problem)),
                 Ok(identity) => match cache.answer(path, &identity) {
-                    Some(description) => _ = answers.insert(path.clone(), Ok(description)),
+                    Some(description) => {
+                        _ = answers.insert(path.clone(), Ok(Answer { identity, description }));
+                    }
                     None if identity.may_be_asked(asking, is_needed) => {
                         _ = unasked.insert(path.clone(), identity);
                     }
@@ -173,25 +174,20 @@ impl Programs {
             Asking::Look => None,
         };
         let asked = ask_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?;
-        answers.extend(
-            asked.into_iter().map(|(path, answer)| (path, answer.map_err(ProgramError::Describe))),
-        );
-        for (path, identity) in &unasked {
-            if let Ok(description) = &answers[path] {
-                cache.0.insert(
-                    id(path),
-                    Answer { identity: identity.clone(), description: description.clone() },
-                );
+        for (path, description) in asked {
+            let answer = answer(&path, unasked[&path].clone(), description);
+            if let Ok(answer) = &answer {
+                cache.0.insert(id(&path), answer.clone());
             }
+            answers.insert(path, answer);
         }
-        if !unasked.is_empty()
-            && let Ok(bytes) = serde_json::to_vec(&cache)
-        {
-            // Only a cache: without it the next start is slower.
-            write_atomically(&file, &bytes).ok();
+        if !unasked.is_empty() {
+            cache.write(store);
         }
         Ok(Self::new(pipeline, |stage| {
-            StageProgram::new(&paths[stage], answers[&paths[stage]].clone()?)
+            let Answer { identity, description } = answers[&paths[stage]].clone()?;
+            let program = StageProgram::new(&paths[stage], description)?;
+            Ok(StageProgram { stamp: Some(identity.stamp), ..program })
         }))
     }
 
@@ -207,11 +203,25 @@ impl Programs {
     }
 }
 
+/// The answer of a program that was asked, unless its file has changed since it was identified.
+fn answer(
+    path: &Path,
+    identity: Identity,
+    description: Result<Description, DescribeError>,
+) -> Result<Answer, ProgramError> {
+    let description = description?;
+    if Stamp::of(path).is_ok_and(|now| now.is_untouched_since(&identity.stamp)) {
+        Ok(Answer { identity, description })
+    } else {
+        Err(ProgramError::Changing(path.to_path_buf()))
+    }
+}
+
 /// Answers of `describe` by the program's path.
 #[derive(Default, Serialize, Deserialize)]
-struct DescriptionCache(BTreeMap<String, Answer>);
+pub(crate) struct DescriptionCache(BTreeMap<String, Answer>);
 
-#[derive(Serialize, Deserialize)]
+#[derive(Clone, Serialize, Deserialize)]
 struct Answer {
     #[serde(flatten)]
     identity: Identity,
@@ -219,25 +229,55 @@ struct Answer {
 }
 
 /// By what a program is known again.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Identity {
-    size: u64,
-    modified: u64,
+    #[serde(flatten)]
+    stamp: Stamp,
     /// The hash of its bytes, where it isn't one of the runner's own: then a run has started it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     blake3: Option<String>,
 }
 
 impl DescriptionCache {
+    /// The cache of a store. One that can't be read is empty.
+    fn of(store: &Store) -> Self {
+        let bytes = std::fs::read(Self::file(store)).unwrap_or_default();
+        serde_json::from_slice(&bytes).unwrap_or_default()
+    }
+
+    fn file(store: &Store) -> PathBuf {
+        store.root().join("cache/describe.json")
+    }
+
+    fn write(&self, store: &Store) {
+        if let Ok(bytes) = serde_json::to_vec(self) {
+            // Only a cache: without it the next start is slower.
+            write_atomically(&Self::file(store), &bytes).ok();
+        }
+    }
+
+    /// Removes the answer of a program, so that the next run asks again.
+    pub(crate) fn forget(store: &Store, program: &Path) {
+        let mut cache = Self::of(store);
+        if cache.0.remove(&id(program)).is_some() {
+            cache.write(store);
+        }
+    }
+
     fn answer(&self, path: &Path, identity: &Identity) -> Option<Description> {
         self.0
             .get(&id(path))
-            .filter(|answer| answer.identity == *identity)
+            .filter(|answer| answer.identity.is_same(identity))
             .map(|answer| answer.description.clone())
     }
 }
 
 impl Identity {
+    /// Somebody's file is known by its bytes alone: a copy of a project has other times.
+    fn is_same(&self, other: &Self) -> bool {
+        self.blake3 == other.blake3 && (self.blake3.is_some() || self.stamp == other.stamp)
+    }
+
     fn may_be_asked(&self, asking: Asking, is_needed: bool) -> bool {
         self.blake3.is_none() || (is_needed && matches!(asking, Asking::Run(_)))
     }
@@ -268,6 +308,11 @@ pub fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
     own_folder().join(name)
 }
 
+/// Whether a program is one of the runner's own.
+pub(crate) fn is_own(path: &Path) -> bool {
+    path.parent() == Some(&own_folder())
+}
+
 /// The runner's own folder.
 fn own_folder() -> PathBuf {
     let exe = std::env::current_exe().and_then(|exe| exe.canonicalize());
@@ -277,18 +322,15 @@ fn own_folder() -> PathBuf {
 /// What a program is known by; else what is wrong and what to do.
 fn identify(path: &Path, name: &str) -> Result<Identity, ProgramError> {
     let fail = |problem: String| ProgramError::File { path: path.to_path_buf(), problem };
-    let meta = std::fs::metadata(path).and_then(|meta| {
+    let stamp = std::fs::metadata(path).and_then(|meta| {
         let kind = std::io::ErrorKind::IsADirectory;
-        if meta.is_dir() { Err(std::io::Error::from(kind)) } else { Ok(meta) }
+        if meta.is_dir() { Err(std::io::Error::from(kind)) } else { Stamp::of(path) }
     });
-    let is_own = path.parent() == Some(&own_folder());
-    match meta {
-        Ok(meta) if is_own => {
-            Ok(Identity { size: meta.len(), modified: modified(&meta), blake3: None })
-        }
-        Ok(meta) => {
+    match stamp {
+        Ok(stamp) if is_own(path) => Ok(Identity { stamp, blake3: None }),
+        Ok(stamp) => {
             let hash = hash_file(path).map_err(|e| fail(e.to_string()))?;
-            Ok(Identity { size: meta.len(), modified: 0, blake3: Some(hash) })
+            Ok(Identity { stamp, blake3: Some(hash) })
         }
         Err(e) if name.contains('/') => {
             Err(fail(format!("{e}; set `run:` to the stage's executable")))
@@ -312,11 +354,6 @@ fn neighbour(name: &str) -> Option<String> {
     let mut programs: Vec<String> = files.filter(|file| !file.contains('.')).collect();
     programs.sort_unstable();
     nearest(name, programs.iter().map(String::as_str)).map(str::to_owned)
-}
-
-fn modified(meta: &Metadata) -> u64 {
-    let since = meta.modified().ok().and_then(|t| t.duration_since(UNIX_EPOCH).ok());
-    since.and_then(|d| u64::try_from(d.as_nanos()).ok()).unwrap_or(0)
 }
 
 fn hash_file(path: &Path) -> std::io::Result<String> {

@@ -6,25 +6,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{hash_json, unix_time};
-use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
+use planning::{FoundInputs, Node, NodeInput, Origin, Plan, find_inputs};
 use serde_json::{Map, Value};
 use stage::SUMMARY_FILE;
 use stage_call::{Call, Display, StageFailure, StageView, Usage, seconds};
 use store::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, host_name};
 
+use crate::unchanged::{ConfirmedProgram, Inputs, unusable};
 use crate::waiting::{by, enter, until_held};
 use crate::watch::{Chain, Watch, Watching};
-
-/// A node's inputs: where each lies, and the hash of its content.
-struct Inputs {
-    folders: Vec<(String, PathBuf)>,
-    hashes: Vec<(String, String)>,
-}
 
 /// A node's action that isn't done.
 pub(crate) struct Action {
     key_parts: Map<String, Value>,
-    hashes: Vec<(String, String)>,
+    inputs: FoundInputs,
 }
 
 impl Action {
@@ -66,25 +61,20 @@ impl NodeJob<'_> {
     /// Looks whether it is cached. Either way it is written down that this run needs it, so that it
     /// can't go meanwhile.
     pub(crate) fn find(&self) -> Result<Found, StageFailure> {
-        let hashes = input_hashes(self.node, self.store, |index| self.output_of(index)).map_err(
-            |e| match e {
-                PlanError::Source { .. } | PlanError::Artifact(_) => {
-                    StageFailure { code: 3, message: e.to_string() }
-                }
-                other => fail(other),
-            },
-        )?;
-        let key_parts = planning::parts(self.node, &hashes, self.device());
+        let inputs =
+            find_inputs(self.node, self.store, Some(self.stop), |index| self.output_of(index))
+                .map_err(|e| unusable(&e))?;
+        let key_parts = planning::parts(self.node, &inputs.hashes, self.device());
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
         self.file.needs(&entered, &self.node.stage, &key).map_err(fail)?;
         let record = self.store.hit(&key).map_err(fail)?;
-        Ok(record.map_or(Found::ToDo(Action { key_parts, hashes }), Found::Cached))
+        Ok(record.map_or(Found::ToDo(Action { key_parts, inputs }), Found::Cached))
     }
 
     /// Makes it; whether it had to.
     pub(crate) fn carry_out(&self, action: Action) -> Result<(Record, bool), StageFailure> {
-        let Action { key_parts, hashes } = action;
+        let Action { key_parts, inputs } = action;
         let key = hash_json(&key_parts);
         let lock =
             until_held(self.stop, &|holder, waited| self.say_waiting(holder, waited), || {
@@ -107,13 +97,8 @@ impl NodeJob<'_> {
             }
             self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?
         };
-        let folders = self
-            .node
-            .inputs
-            .iter()
-            .filter_map(|input| Some((input.name.clone(), self.folder_of(input)?)))
-            .collect();
-        self.make(&lock, attempt, action, &Inputs { folders, hashes }).map(|record| (record, true))
+        let inputs = Inputs::new(self.node, self.store, inputs, |index| self.output_of(index))?;
+        self.make(&lock, attempt, action, &inputs).map(|record| (record, true))
     }
 
     fn output_of(&self, index: usize) -> String {
@@ -145,28 +130,9 @@ impl NodeJob<'_> {
         lock: &KeyLock,
         attempt: Attempt,
         action: Unfinished,
-        inputs: &Inputs,
+        inputs: &Inputs<'_>,
     ) -> Result<Record, StageFailure> {
-        let label = self.node.label();
-        let call = Call {
-            label: &label,
-            program: &self.node.program.path,
-            description: &self.node.program.description,
-            params: &attempt.params,
-            inputs: &inputs.folders,
-            hashes: &inputs.hashes,
-            output: &attempt.output,
-            work: Some(&attempt.work),
-            from_checkpoint: false,
-            device: self.device(),
-            threads: self.threads,
-            lock: Some(lock.file()),
-        };
-        let view = self.display.start(&label);
-        let started = Instant::now();
-        let result = self.run_watched(&call, &attempt, &view);
-        view.end();
-        let usage = result?;
+        let (usage, time) = self.call(lock, &attempt, inputs)?;
         let record = Record {
             stage: action.stage,
             point: action.point,
@@ -174,7 +140,7 @@ impl NodeJob<'_> {
             made_of: action.made_of,
             output: String::new(),
             started_unix: action.started_unix,
-            seconds: milliseconds(started.elapsed().as_secs_f64()),
+            seconds: milliseconds(time.as_secs_f64()),
             threads: self.threads,
             peak_memory: Some(usage.peak_memory),
             processor_seconds: Some(milliseconds(usage.processor_seconds)),
@@ -185,11 +151,62 @@ impl NodeJob<'_> {
             self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
         let record = self.store.publish(&self.enter()?, checked, record).map_err(fail)?;
         self.display.line(&format!(
-            "{label}: done in {} → {}",
+            "{}: done in {} → {}",
+            self.node.label(),
             seconds(record.seconds),
             &record.output[..10]
         ));
         Ok(record)
+    }
+
+    /// Calls the stage, and fails unless its program and its inputs are what the key was made of,
+    /// from before its start to its end. Returns what it used, and how long it took.
+    fn call(
+        &self,
+        lock: &KeyLock,
+        attempt: &Attempt,
+        inputs: &Inputs<'_>,
+    ) -> Result<(Usage, Duration), StageFailure> {
+        let label = self.node.label();
+        let program = ConfirmedProgram::new(&self.node.program, self.store, self.stop)?;
+        inputs.check(self.stop)?;
+        if inputs.drop_doubtful_checkpoints(attempt).map_err(fail)? {
+            self.display.line(&format!(
+                "{label}: an input was written to since its checkpoint; it starts over"
+            ));
+        }
+        let folders: Vec<(String, PathBuf)> = self
+            .node
+            .inputs
+            .iter()
+            .filter_map(|input| Some((input.name.clone(), self.folder_of(input)?)))
+            .collect();
+        let call = Call {
+            label: &label,
+            program: &self.node.program.path,
+            description: &self.node.program.description,
+            params: &attempt.params,
+            inputs: &folders,
+            hashes: &inputs.hashes,
+            output: &attempt.output,
+            work: Some(&attempt.work),
+            from_checkpoint: false,
+            device: self.device(),
+            threads: self.threads,
+            lock: Some(lock.file()),
+        };
+        let view = self.display.start(&label);
+        let started = Instant::now();
+        let result = self.run_watched(&call, attempt, &view);
+        let time = started.elapsed();
+        view.end();
+        let usage = result?;
+        program.confirm_again()?;
+        inputs.check(self.stop).inspect_err(|_| {
+            // What they were made of isn't known, even if the input gets its old content back.
+            std::fs::remove_dir_all(&attempt.work).ok();
+        })?;
+        Ok((usage, time))
     }
 
     /// Runs the stage; whoever watches its checkpoints ends when it does.

@@ -7,14 +7,15 @@ use std::sync::atomic::Ordering;
 
 use anyhow::Context as _;
 use artifact::{Failure, counted, hash_json, print_line, report_line};
-use planning::{Frozen, Plan, PlanError, State};
+use planning::{Frozen, PlanError, State};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
-use store::{Record, Store};
+use store::Record;
 
 use super::work::{Executor, Work};
 use crate::counts;
 use crate::identities::identities;
+use crate::session::check_name;
 use crate::sink::is_shown;
 
 /// The verb that a job calls.
@@ -30,8 +31,8 @@ impl Executor for Cluster {
     fn carry_out(&self, work: &Work<'_>) -> anyhow::Result<ExitCode> {
         let root = work.session.store.root();
         let out = std::path::absolute(work.out)?;
-        let submission =
-            Submission::new(root, work.run.id(), tasks(work.plan, &work.session.store, &out)?);
+        check_name("the folder of pages", &out)?;
+        let submission = Submission::new(root, work.run.id(), tasks(work, &out)?);
         if let Some((task, problem)) =
             submission.tasks.iter().find_map(|t| Some((t, self.site.problem(&t.resources)?)))
         {
@@ -86,8 +87,9 @@ impl Cluster {
 }
 
 /// What there is to do: nodes, and after them sinks.
-fn tasks(plan: &Plan, store: &Store, out: &Path) -> Result<Vec<Task>, PlanError> {
-    let identities = identities(plan, store)?;
+fn tasks(work: &Work<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
+    let plan = work.plan;
+    let identities = identities(plan, &work.session.store, Some(work.stop))?;
     let resources = |stage: &str| plan.resources.get(stage).cloned().unwrap_or_default();
     let nodes = plan.nodes.iter().zip(&identities).map(|(node, identity)| Task {
         stage: node.stage.clone(),
@@ -115,7 +117,8 @@ fn tasks(plan: &Plan, store: &Store, out: &Path) -> Result<Vec<Task>, PlanError>
 /// Which tasks need no job.
 fn done(work: &Work<'_>, out: &Path) -> anyhow::Result<Vec<bool>> {
     let (plan, store) = (work.plan, &work.session.store);
-    let records: Vec<Option<Record>> = plan.states(store)?.into_iter().map(State::record).collect();
+    let records: Vec<Option<Record>> =
+        plan.states(store, Some(work.stop))?.into_iter().map(State::record).collect();
     let sinks: Vec<bool> =
         plan.sinks.iter().map(|sink| is_shown(plan, sink, &records, store, out)).collect();
     Ok(records.iter().map(Option::is_some).chain(sinks).collect())

@@ -5,17 +5,17 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
 use artifact::{print_line, report_line, report_text};
-use planning::{Frozen, Node, Plan, Sink, StageProgram, State};
+use planning::{Frozen, Node, Plan, Sink, State};
 use signal_hook::consts::SIGUSR1;
 use slurm::{Slurm, Submission};
-use stage::stop_on_signals;
-use stage_call::{Display, StageFailure, ask_all};
+use stage_call::{Display, StageFailure, stop_on_signals};
 use store::{Record, RunFile, Store};
 
 use super::run::register;
 use crate::execute::{NodeJob, say_aside};
 use crate::recorded::Course;
 use crate::sink::{Showing, Shown, show};
+use crate::unchanged::unusable;
 
 /// Does one task of a submission, as a job of a cluster: a node, whose parents' jobs are over, or a
 /// sink.
@@ -54,7 +54,7 @@ fn submitted_by(store: &Store, folder: &Path) -> Vec<String> {
 
 /// Puts the job into the queue once more, where its stage has left something to go on from.
 fn go_on_later(plan: &Plan, store: &Store) -> anyhow::Result<()> {
-    let state = plan.states(store)?.pop();
+    let state = plan.states(store, None)?.pop();
     let key = state.and_then(|state| state.key());
     let has_checkpoint = key.map_or(Ok(false), |key| store.has_checkpoint(&key))?;
     let Some(id) = slurm::this_job().filter(|_| has_checkpoint) else {
@@ -83,10 +83,7 @@ struct Task<'a> {
 
 impl Task<'_> {
     fn carry_out(&self) -> Result<(), StageFailure> {
-        let states = self
-            .plan
-            .states(self.store)
-            .map_err(|e| StageFailure { code: 3, message: e.to_string() })?;
+        let states = self.plan.states(self.store, Some(self.stop)).map_err(|e| unusable(&e))?;
         let records: Vec<Option<Record>> = states.into_iter().map(State::record).collect();
         match (self.plan.sinks.first(), self.plan.nodes.last()) {
             (Some(sink), _) => self.show(sink, &records),
@@ -101,7 +98,6 @@ impl Task<'_> {
             return Ok(());
         }
         self.check(&node.label(), node.parents(), records)?;
-        self.check_program(&node.program)?;
         let parents =
             node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
         let (threads, display) = (slurm::cores(), Display::new());
@@ -113,7 +109,6 @@ impl Task<'_> {
 
     fn show(&self, sink: &Sink, records: &[Option<Record>]) -> Result<(), StageFailure> {
         self.check(&sink.stage, sink.shows.iter().copied(), records)?;
-        self.check_program(&sink.program)?;
         let Self { plan, store, run, out, stop, command } = *self;
         let showing = Showing { plan, store, run, out, threads: slurm::cores(), stop };
         let course = Course { command, ..Course::before(records) };
@@ -145,21 +140,5 @@ impl Task<'_> {
             );
             Err(StageFailure { code: 3, message })
         })
-    }
-
-    /// Checks that the program is the one that was submitted; its code is in the key.
-    fn check_program(&self, program: &StageProgram) -> Result<(), StageFailure> {
-        let path = std::slice::from_ref(&program.path);
-        let answers = ask_all(path, Some(self.stop))
-            .map_err(|_| StageFailure { code: 130, message: "interrupted".to_owned() })?;
-        let message = match &answers[&program.path] {
-            Ok(now) if now.code == program.description.code => return Ok(()),
-            Ok(_) => format!(
-                "{} was built anew since this was submitted; run it again",
-                program.path.display()
-            ),
-            Err(problem) => problem.to_string(),
-        };
-        Err(StageFailure { code: 2, message })
     }
 }

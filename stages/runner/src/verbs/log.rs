@@ -74,7 +74,7 @@ fn job_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
     let logs = slurm::job_logs(session.store.root()).unwrap_or_default();
     // Without submissions no source is hashed.
     let identities =
-        (!logs.is_empty()).then(|| identities(plan, &session.store).unwrap_or_default());
+        (!logs.is_empty()).then(|| identities(plan, &session.store, None).unwrap_or_default());
     identities.into_iter().flatten().map(|identity| logs.get(&identity).cloned()).collect()
 }
 

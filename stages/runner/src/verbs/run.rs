@@ -4,12 +4,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use artifact::{Failure, report_line};
 use planning::{Plan, Request, State};
-use stage::stop_on_signals;
-use stage_call::StageFailure;
+use stage_call::{StageFailure, stop_on_signals};
 use store::{RunFile, Store};
 
 use crate::execute::{Executor, Work};
-use crate::session::{Session, command_line};
+use crate::session::{Session, check_apart, command_line};
 use crate::waiting::enter;
 
 /// Makes what the targets need and shows it.
@@ -21,6 +20,7 @@ pub(crate) fn run(
 ) -> anyhow::Result<ExitCode> {
     let stop = stop_on_signals()?;
     let plan = session.plan_to_run(what, &stop)?;
+    check_apart(&plan, "the folder of pages", out)?;
     let file = match register(&session.store, &plan, &stop) {
         Ok(file) => file,
         Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),
@@ -43,7 +43,7 @@ pub(super) fn register(
     let file = store.begin_run(&entered, command_line()).map_err(fail)?;
     // A source that can't be read is said when the stage's turn comes; other stages may not need
     // it.
-    let states = plan.states(store).unwrap_or_default();
+    let states = plan.states(store, Some(stop)).unwrap_or_default();
     for (index, node) in plan.nodes.iter().enumerate() {
         match states.get(index).and_then(State::key) {
             Some(key) => file.needs(&entered, &node.stage, &key),

@@ -1,0 +1,141 @@
+use std::ffi::OsStr;
+use std::fs;
+use std::os::unix::ffi::OsStrExt as _;
+use std::time::SystemTime;
+
+use super::*;
+
+fn store_and_data() -> (tempfile::TempDir, Store, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Store::open(&dir.path().join("store")).unwrap();
+    let data = dir.path().join("data");
+    fs::create_dir(&data).unwrap();
+    (dir, store, data)
+}
+
+fn content(store: &Store, folder: &Path) -> String {
+    Source::read(store, folder, None).unwrap().content()
+}
+
+/// Gives a file a time of change long ago, as an archive does.
+fn unpack(file: &Path, text: &str) {
+    fs::write(file, text).unwrap();
+    let time = SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000_000);
+    File::options().write(true).open(file).unwrap().set_modified(time).unwrap();
+}
+
+/// Waits until the stamps of a folder's files are cached.
+fn settle(store: &Store, folder: &Path) -> Source {
+    std::thread::sleep(Duration::from_secs(COARSE_SECONDS));
+    Source::read(store, folder, None).unwrap()
+}
+const COARSE_SECONDS: u64 = 4;
+
+#[test]
+fn what_is_no_folder_is_refused() {
+    let (dir, store, _) = store_and_data();
+    let (file, absent) = (dir.path().join("file"), dir.path().join("absent"));
+    fs::write(&file, "x").unwrap();
+    let problem = |folder: &Path| Source::read(&store, folder, None).unwrap_err().to_string();
+    assert_eq!(problem(&file), format!("{file:?}: not a folder"));
+    let words = "No such file or directory (os error 2); name a folder that is there";
+    assert_eq!(problem(&absent), format!("{absent:?}: {words}"));
+}
+
+/// Any file name is taken, and each makes a hash of its own.
+#[test]
+fn any_name_has_a_hash() {
+    let (_dir, store, data) = store_and_data();
+    let mut seen = std::collections::BTreeSet::new();
+    for name in [
+        &b"plain"[..],
+        b"\xff",
+        b"\xfe",
+        b"new\nline",
+        b"\x1b]0;title\x07",
+        "übung 🎈".as_bytes(),
+        b"ff",
+    ] {
+        fs::create_dir_all(&data).unwrap();
+        fs::write(data.join(OsStr::from_bytes(name)), "x").unwrap();
+        assert!(seen.insert(content(&store, &data)), "{name:?}");
+        fs::remove_dir_all(&data).unwrap();
+    }
+}
+
+/// Names, sizes and times stay when two files of one archive are exchanged.
+#[test]
+fn files_that_change_places_are_hashed_anew() {
+    let (_dir, store, data) = store_and_data();
+    let [a, b, aside] = ["a", "b", "aside"].map(|name| data.join(name));
+    unpack(&a, "one");
+    unpack(&b, "two");
+    let before = settle(&store, &data);
+    fs::rename(&a, &aside).unwrap();
+    fs::rename(&b, &a).unwrap();
+    fs::rename(&aside, &b).unwrap();
+    let now = Source::read(&store, &data, None).unwrap();
+    assert_ne!(now.content(), before.content());
+    assert_eq!(now.change_since(&before).as_deref(), Some("a was changed"));
+}
+
+/// A file that was changed and has its content and time again was changed.
+#[test]
+fn what_was_done_to_a_file_is_seen() {
+    let (_dir, store, data) = store_and_data();
+    let (file, other) = (data.join("a"), data.join("b"));
+    unpack(&file, "one");
+    let before = Source::read(&store, &data, None).unwrap();
+    let change = || Source::read(&store, &data, None).unwrap().change_since(&before);
+    assert_eq!(change(), None);
+    fs::write(&other, "").unwrap();
+    assert_eq!(change().as_deref(), Some("b was added"));
+    fs::remove_file(&other).unwrap();
+    assert_eq!(change(), None);
+    std::thread::sleep(Duration::from_millis(20));
+    unpack(&file, "two");
+    assert_eq!(change().as_deref(), Some("a was changed"));
+    unpack(&file, "one");
+    assert_eq!(content(&store, &data), before.content());
+    assert_eq!(change().as_deref(), Some("a was changed"));
+    fs::remove_file(&file).unwrap();
+    assert_eq!(change().as_deref(), Some("a was removed"));
+}
+
+/// Files whose stamps are known aren't read: a cache that says otherwise is believed.
+#[test]
+fn a_known_file_is_not_read_again() {
+    let (_dir, store, data) = store_and_data();
+    unpack(&data.join("a"), "one");
+    let before = settle(&store, &data);
+    let cache = CacheFile::new(&store, &data.canonicalize().unwrap());
+    let mut files = cache.files();
+    files.get_mut("a").unwrap().blake3 = "0".repeat(64);
+    cache.write(&files);
+    assert_ne!(content(&store, &data), before.content());
+    // A damaged cache is none.
+    fs::write(&cache.path, "{").unwrap();
+    assert_eq!(content(&store, &data), before.content());
+}
+
+#[test]
+fn hashing_ends_with_the_signal_and_tells_how_far_it_is() {
+    let (_dir, store, data) = store_and_data();
+    File::create(data.join("large")).unwrap().set_len(1 << 40).unwrap();
+    let stop = AtomicBool::new(true);
+    let result = Source::read(&store, &data, Some(&stop));
+    assert!(matches!(result, Err(SourceError::Interrupted)), "{result:?}");
+    let progress = HashProgress::default();
+    assert_eq!(progress.words(Path::new("data")), "listing the files of data");
+    progress.done.store(1_500_000_000, Ordering::Relaxed);
+    progress.total.store(30_000_000_000, Ordering::Relaxed);
+    assert_eq!(progress.words(Path::new("data")), "hashing data: 1.5 GB of 30.0 GB");
+}
+
+#[test]
+fn a_socket_is_named_before_anything_waits_for_it() {
+    let (_dir, store, data) = store_and_data();
+    let _socket = std::os::unix::net::UnixListener::bind(data.join("r_0.png")).unwrap();
+    let problem = Source::read(&store, &data, None).unwrap_err().to_string();
+    assert!(problem.contains("r_0.png") && problem.contains("FIFO, socket"), "{problem}");
+}

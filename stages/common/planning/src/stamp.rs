@@ -1,0 +1,54 @@
+use std::fs::metadata;
+use std::io;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use serde::{Deserialize, Serialize};
+
+/// Clocks of file systems tick in steps of up to two seconds (FAT).
+const COARSEST_TICK_SECONDS: u64 = 2;
+
+/// Size, times and inode of a file. While they are equal, so is the content.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Stamp {
+    /// Size in bytes.
+    pub(crate) size: u64,
+    /// Time of the last change of the content, in seconds and nanoseconds since 1970.
+    modified: (i64, i64),
+    /// Time of the last change of content, name, links or rights. No program can set it.
+    changed: (i64, i64),
+    inode: u64,
+}
+
+impl Stamp {
+    /// Reads the stamp of a file, through links.
+    pub fn of(file: &Path) -> io::Result<Self> {
+        let meta = metadata(file)?;
+        Ok(Self {
+            size: meta.len(),
+            modified: (meta.mtime(), meta.mtime_nsec()),
+            changed: (meta.ctime(), meta.ctime_nsec()),
+            inode: meta.ino(),
+        })
+    }
+
+    /// Returns whether nothing was done to the file since `earlier`. The inode may differ: exFAT,
+    /// SMB and SSHFS number files anew whenever they forget them.
+    pub fn is_untouched_since(&self, earlier: &Self) -> bool {
+        Self { inode: earlier.inode, ..*self } == *earlier
+    }
+
+    /// Returns whether the next change will make another stamp. One within the clock's tick would
+    /// not.
+    pub(crate) fn is_settled(&self) -> bool {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs() as i64;
+        let age = |time: (i64, i64)| now.abs_diff(time.0);
+        age(self.modified).min(age(self.changed)) > COARSEST_TICK_SECONDS
+    }
+
+    /// Size and time of the content's last change. A copy of the file may have the same.
+    pub(crate) fn of_content(&self) -> (u64, (i64, i64)) {
+        (self.size, self.modified)
+    }
+}
