@@ -11,6 +11,7 @@ use std::os::unix::process::CommandExt as _;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use common::random::{Random, number};
 use common::{Finished, Project, is_running, wait_until};
 use serde_json::Value;
 
@@ -18,24 +19,6 @@ const SIGNALS: [&str; 4] = ["-KILL", "-INT", "-TERM", "-HUP"];
 const STAGES: [&str; 5] = ["demo-scene", "prep", "train-ss", "render-depth", "eval"];
 /// So many pipelines are run by turns; each trains from another seed.
 const POINTS: u64 = 3;
-
-/// Random numbers that a seed repeats (xorshift).
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, bound: u64) -> u64 {
-        for (left, shift) in [(true, 13), (false, 7), (true, 17)] {
-            self.0 ^= if left { self.0 << shift } else { self.0 >> shift };
-        }
-        self.0 % bound
-    }
-}
-
-fn number(variable: &str) -> Option<u64> {
-    std::env::var(variable)
-        .ok()
-        .map(|text| text.parse().unwrap_or_else(|_| panic!("{variable}={text}: not a number")))
-}
 
 fn point(number: u64) -> [String; 2] {
     ["-p".to_owned(), format!("train-ss.seed={number}")]
@@ -101,7 +84,7 @@ fn kills_at_random_moments_lose_nothing() {
     let kills = number("NERF_SR_KILLS").unwrap_or(20);
     let seed = number("NERF_SR_SEED").unwrap_or_else(|| std::process::id().into());
     println!("NERF_SR_KILLS={kills} NERF_SR_SEED={seed}");
-    let mut random = Random(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
+    let mut random = Random::new(seed);
     let undisturbed = Project::fast();
     let begun = Instant::now();
     undisturbed.ok(&["run", "-p", "train-ss.seed=0"]);

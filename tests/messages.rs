@@ -63,6 +63,12 @@ fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
             one stage at a time",
         ),
         (
+            "echo \"terminate called after throwing an instance of 'std::bad_alloc'\" >&2; \
+            echo '  what():  std::bad_alloc' >&2; kill -ABRT $$",
+            1,
+            "talk: failed: out of memory; end other programs, run one stage at a time",
+        ),
+        (
             "echo working >&2; kill -KILL $$",
             1,
             "talk: failed: ended by SIGKILL after it said: working; maybe the kernel",

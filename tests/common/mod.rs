@@ -6,6 +6,7 @@
 
 pub mod browser;
 pub mod large;
+pub mod random;
 pub mod splats;
 pub mod surfaces;
 
