@@ -80,7 +80,8 @@ impl Session {
     }
 }
 
-/// Refuses a folder whose name isn't UTF-8: the records of runs, which are JSON, name folders.
+/// Refuses a folder whose name isn't UTF-8: the records of runs are JSON and contain folders'
+/// names.
 pub(crate) fn check_name(what: &str, folder: &Path) -> Result<(), Failure> {
     let (named, real) = (absolute(folder), real(folder));
     if named.to_str().is_some() && real.to_str().is_some() {
@@ -91,8 +92,8 @@ pub(crate) fn check_name(what: &str, folder: &Path) -> Result<(), Failure> {
     )))
 }
 
-/// Refuses a plan that reads a folder in which it writes: each run would change its own input.
-/// `written` is the store or the folder of pages, as `what` says.
+/// Refuses a plan with an input folder that contains the folder `written`, which is the store or the
+/// folder of pages, named by `what`: each run would change its own input.
 pub(crate) fn check_apart(plan: &Plan, what: &str, written: &Path) -> Result<(), PlanError> {
     let written = real(written);
     for node in &plan.nodes {
@@ -113,13 +114,13 @@ pub(crate) fn check_apart(plan: &Plan, what: &str, written: &Path) -> Result<(),
     Ok(())
 }
 
-/// The absolute path of a file; the empty path means the current folder.
+/// Returns the absolute path of a file; the empty path means the current folder.
 fn absolute(path: &Path) -> PathBuf {
     let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
     std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 
-/// The absolute path of a file without links, as far as the file exists.
+/// Returns the absolute path of a file, with links resolved as far as the file exists.
 fn real(path: &Path) -> PathBuf {
     let absolute = absolute(path);
     let mut existing = absolute.as_path();

@@ -1,5 +1,5 @@
-//! What a stage uses stays what its key was made of, from before its start to its end; otherwise no
-//! result is recorded. Local runs and a cluster's jobs check it here.
+//! Checks that a stage's program and inputs are those of its key from before its start to its end;
+//! otherwise no result is recorded. Local runs and a cluster's jobs share this.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -14,7 +14,7 @@ use planning::{
 use stage_call::StageFailure;
 use store::{Attempt, Store};
 
-/// A program that was confirmed before its start.
+/// Program that was confirmed before its start.
 pub(crate) struct ConfirmedProgram<'a> {
     program: &'a StageProgram,
     store: &'a Store,
@@ -23,7 +23,7 @@ pub(crate) struct ConfirmedProgram<'a> {
 }
 
 impl<'a> ConfirmedProgram<'a> {
-    /// Confirms that a program is the planned one; its code is in the key.
+    /// Confirms that a program is the planned one.
     pub(crate) fn new(
         program: &'a StageProgram,
         store: &'a Store,
@@ -33,7 +33,7 @@ impl<'a> ConfirmedProgram<'a> {
         Ok(Self { program, store, stop, stamp })
     }
 
-    /// Confirms after the program's end that it was the planned one all the time.
+    /// Confirms after the program's end that the program was the planned one all the time.
     pub(crate) fn confirm_again(&self) -> Result<(), StageFailure> {
         let confirmed = self.program.confirm_since(&self.stamp, self.store, Some(self.stop));
         confirmed.map_err(unconfirmed)
@@ -45,7 +45,7 @@ fn unconfirmed(problem: Unconfirmed) -> StageFailure {
     StageFailure { code, message: problem.to_string() }
 }
 
-/// The failure of a stage whose inputs can't be used.
+/// Returns the failure of a stage whose inputs can't be used.
 pub(crate) fn unusable(problem: &PlanError) -> StageFailure {
     let code = match problem {
         PlanError::Source { .. } | PlanError::Artifact(_) => 3,
@@ -55,18 +55,18 @@ pub(crate) fn unusable(problem: &PlanError) -> StageFailure {
     StageFailure { code, message: problem.to_string() }
 }
 
-/// A node's inputs as its key was made of them.
+/// Inputs of a node when its key was computed.
 pub(crate) struct Inputs<'a> {
     node: &'a Node,
     store: &'a Store,
-    /// Their content hashes, by name.
+    /// Content hashes by the inputs' names.
     pub(crate) hashes: Vec<(String, String)>,
     sources: BTreeMap<String, Source>,
     artifacts: Vec<StoredInput>,
 }
 
 impl<'a> Inputs<'a> {
-    /// Takes down the state of the inputs' files. `output_of` names the artifact of a parent.
+    /// Reads the stamps of artifacts' files. `output_of` returns a parent's artifact.
     pub(crate) fn new(
         node: &'a Node,
         store: &'a Store,
@@ -83,7 +83,7 @@ impl<'a> Inputs<'a> {
         let FoundInputs { hashes, sources } = found;
         let inputs = Self { node, store, hashes, sources, artifacts };
         if !node.program.is_own() {
-            // Only the project's own stages look at manifests themselves.
+            // The runner's own programs compare files with manifests themselves.
             for artifact in &inputs.artifacts {
                 artifact.check_contents().map_err(damaged)?;
             }
@@ -91,7 +91,7 @@ impl<'a> Inputs<'a> {
         Ok(inputs)
     }
 
-    /// Fails where something was done to an input since its content was hashed.
+    /// Fails if an input was changed since its content was hashed.
     pub(crate) fn check(&self, stop: &AtomicBool) -> Result<(), StageFailure> {
         for NodeInput { name, from } in &self.node.inputs {
             let Origin::Folder(folder) = from else { continue };
@@ -109,8 +109,9 @@ impl<'a> Inputs<'a> {
         self.artifacts.iter().try_for_each(StoredInput::check).map_err(damaged)
     }
 
-    /// Removes checkpoints of an earlier attempt that read other versions of folders outside the
-    /// store, though the content is the same again. Returns whether there were any.
+    /// Removes checkpoints of an earlier attempt if a folder outside the store was written to since
+    /// that attempt began: the content is the same again, but not what the attempt read. Returns
+    /// whether there were any.
     pub(crate) fn drop_doubtful_checkpoints(&self, attempt: &Attempt) -> io::Result<bool> {
         let times: BTreeMap<&str, String> =
             self.sources.iter().map(|(name, source)| (name.as_str(), source.times())).collect();
@@ -133,11 +134,11 @@ fn damaged(damage: Damage) -> StageFailure {
     StageFailure { code: 3, message: damage.to_string() }
 }
 
-/// An input from the store.
+/// Input from the store.
 struct StoredInput {
     folder: PathBuf,
     manifest: Manifest,
-    /// One for each file of the manifest.
+    /// Stamps of the manifest's files, in order.
     stamps: Vec<Stamp>,
 }
 
@@ -154,7 +155,8 @@ impl StoredInput {
         Ok(Self { folder, manifest, stamps })
     }
 
-    /// Reads the files again where something was done to one: a backup may only have linked it.
+    /// Fails if the content of a file has changed. Contents are only read if a stamp has changed: a
+    /// backup may have made links.
     fn check(&self) -> Result<(), Damage> {
         let now = stamps(&self.folder, &self.manifest)?;
         let is_untouched =

@@ -1,4 +1,5 @@
-//! Whether a stage's program is still the one that was planned: its code is in the key.
+//! Checks that a stage's program is the planned one before its start and after its end: the key
+//! contains its code.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -9,24 +10,24 @@ use store::Store;
 use crate::stages::{DescriptionCache, StageProgram, is_own};
 use crate::stamp::Stamp;
 
-/// Why a program isn't known to be the planned one.
+/// Error returned when a program differs from the planned one, or can't be compared with it.
 #[derive(Debug, thiserror::Error)]
 pub enum Unconfirmed {
-    /// Its file, or its answer, is another.
+    /// The program's file or its code differs.
     #[error("{0} was changed or rebuilt since this was planned; run again")]
     Changed(PathBuf),
-    /// Its file can't be read.
+    /// The program's file can't be read.
     #[error("{program}: {problem}")]
     File {
         /// The file.
         program: PathBuf,
-        /// Why.
+        /// Error of the system.
         problem: std::io::Error,
     },
-    /// It doesn't say what it is any more.
+    /// The program no longer describes itself.
     #[error(transparent)]
     Describe(#[from] DescribeError),
-    /// A signal came while it was asked.
+    /// A signal came while the program was asked.
     #[error("interrupted")]
     Interrupted,
 }
@@ -43,7 +44,7 @@ impl StageProgram {
         is_own(&self.path)
     }
 
-    /// Confirms before a start that the program is the planned one. Returns its stamp.
+    /// Confirms before a start that the program is the planned one. Returns the file's stamp.
     pub fn confirm(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<Stamp, Unconfirmed> {
         let now = self.stamp_now()?;
         if self.stamp == Some(now) {
@@ -53,8 +54,8 @@ impl StageProgram {
         self.ask_again(store, stop).map(|()| now)
     }
 
-    /// Confirms after an end that the program was the planned one all the time. One that isn't the
-    /// runner's own may be a wrapper of another, so it is asked.
+    /// Confirms after an end that the program was the planned one since the `start`. A program
+    /// that isn't the runner's own may be a wrapper of another one, so it is asked again.
     pub fn confirm_since(
         &self,
         start: &Stamp,
@@ -74,8 +75,9 @@ impl StageProgram {
         Stamp::of(&self.path).map_err(|problem| Unconfirmed::File { program: program(), problem })
     }
 
-    /// An interpreter may read a script's file at any time. The runner's own programs are in memory
-    /// once they have started, and a build that changes none of their code may write them anew.
+    /// Fails if somebody's file was written to: an interpreter may read a script at any time. The
+    /// runner's own programs stay in memory once they have started, and a build that changes none
+    /// of their code may write their files anew.
     fn check_untouched(&self, before: &Stamp, now: &Stamp) -> Result<(), Unconfirmed> {
         if self.is_own() || now.is_untouched_since(before) {
             return Ok(());

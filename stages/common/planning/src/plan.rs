@@ -121,11 +121,11 @@ impl<'a> Goal<'a> {
     }
 }
 
-/// A node's inputs as they are now.
+/// Inputs of a node, as found.
 pub struct FoundInputs {
-    /// Their content hashes, by name.
+    /// Content hashes by the inputs' names.
     pub hashes: Vec<(String, String)>,
-    /// Those that are folders outside the store, by name.
+    /// Folders outside the store by the inputs' names.
     pub sources: BTreeMap<String, Source>,
 }
 

@@ -24,12 +24,11 @@ fn unpack(file: &Path, text: &str) {
     File::options().write(true).open(file).unwrap().set_modified(time).unwrap();
 }
 
-/// Waits until the stamps of a folder's files are cached.
-fn settle(store: &Store, folder: &Path) -> Source {
-    std::thread::sleep(Duration::from_secs(COARSE_SECONDS));
+/// Reads a folder once its files are old enough for the cache.
+fn settled(store: &Store, folder: &Path) -> Source {
+    std::thread::sleep(Duration::from_secs(4));
     Source::read(store, folder, None).unwrap()
 }
-const COARSE_SECONDS: u64 = 4;
 
 #[test]
 fn what_is_no_folder_is_refused() {
@@ -70,7 +69,7 @@ fn files_that_change_places_are_hashed_anew() {
     let [a, b, aside] = ["a", "b", "aside"].map(|name| data.join(name));
     unpack(&a, "one");
     unpack(&b, "two");
-    let before = settle(&store, &data);
+    let before = settled(&store, &data);
     fs::rename(&a, &aside).unwrap();
     fs::rename(&b, &a).unwrap();
     fs::rename(&aside, &b).unwrap();
@@ -107,7 +106,7 @@ fn what_was_done_to_a_file_is_seen() {
 fn a_known_file_is_not_read_again() {
     let (_dir, store, data) = store_and_data();
     unpack(&data.join("a"), "one");
-    let before = settle(&store, &data);
+    let before = settled(&store, &data);
     let cache = CacheFile::new(&store, &data.canonicalize().unwrap());
     let mut files = cache.files();
     files.get_mut("a").unwrap().blake3 = "0".repeat(64);

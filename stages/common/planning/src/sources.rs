@@ -43,12 +43,12 @@ pub enum SourceError {
         /// Why.
         problem: io::Error,
     },
-    /// A file changed while it was read.
+    /// A file changed while the folder was hashed.
     #[error("{folder:?}: {change} while it was hashed; run again when nothing writes there")]
     Changing {
         /// The folder.
         folder: PathBuf,
-        /// What happened to which file.
+        /// File and change, as text.
         change: String,
     },
     /// A signal came.
@@ -59,7 +59,7 @@ pub enum SourceError {
 /// A folder outside the store as it was when it was read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Source {
-    /// Its files by their paths inside it.
+    /// Files by their paths inside the folder.
     files: BTreeMap<String, SourceFile>,
 }
 
@@ -71,8 +71,8 @@ struct SourceFile {
 }
 
 impl Source {
-    /// Reads a folder. Files that the store's cache knows by their stamps aren't hashed again. Says
-    /// how far it is where that takes long, and ends soon after `stop` is set.
+    /// Reads a folder. Files that the store's cache knows by their stamps aren't hashed again.
+    /// Reports progress if hashing takes long, and ends soon after `stop` is set.
     pub fn read(
         store: &Store,
         folder: &Path,
@@ -108,7 +108,7 @@ impl Source {
         }
     }
 
-    /// The content hash: of each file's path, size and hash.
+    /// Returns the content hash: that of each file's path, size and hash.
     pub fn content(&self) -> String {
         let entries: Vec<FileEntry> = self
             .files
@@ -122,15 +122,17 @@ impl Source {
         hash_json(&entries)
     }
 
-    /// A hash of each file's path, size and time of change, which a copy that keeps times has, too.
+    /// Returns a hash of each file's path, size and time of its content's last change. A copy that
+    /// keeps times has the same.
     pub fn times(&self) -> String {
         let files: Vec<_> =
             self.files.iter().map(|(path, file)| (path, file.stamp.of_content())).collect();
         hash_json(&files)
     }
 
-    /// Returns the first file to which something was done since an earlier reading, and what. A
-    /// file that has its earlier content again counts: what was read in between isn't known.
+    /// Returns the first file that was changed, added or removed since an earlier reading, as text.
+    /// A file that has its earlier content again counts as changed: what a stage read in between
+    /// isn't known.
     pub fn change_since(&self, earlier: &Self) -> Option<String> {
         first_change(&earlier.files, &self.files, |before, now| {
             now.stamp.is_untouched_since(&before.stamp) && now.blake3 == before.blake3
@@ -138,7 +140,7 @@ impl Source {
     }
 }
 
-/// The first name at which two lists differ, in words.
+/// Finds the first name at which two lists differ. Returns the difference as text.
 fn first_change<T>(
     before: &BTreeMap<String, T>,
     now: &BTreeMap<String, T>,
@@ -153,14 +155,14 @@ fn first_change<T>(
     changed.or_else(|| added().map(|name| format!("{name} was added")))
 }
 
-/// How far the hashing of a folder is.
+/// Progress of hashing a folder.
 #[derive(Default)]
 struct HashProgress {
     /// Bytes hashed.
     done: AtomicU64,
-    /// Bytes to hash; 0 while files are listed.
+    /// Bytes to hash in all; 0 while files are listed.
     total: AtomicU64,
-    /// Whether nobody waits for the hash any more.
+    /// True once nobody waits for the hash any more.
     is_abandoned: AtomicBool,
 }
 
@@ -174,7 +176,7 @@ impl HashProgress {
     }
 }
 
-/// Why a folder's files couldn't be read.
+/// Error returned when a folder's files can't be hashed.
 enum ReadFailure {
     Unreadable(io::Error),
     Changing(String),
@@ -196,7 +198,7 @@ impl From<io::Error> for ReadFailure {
     }
 }
 
-/// Files by their paths inside a folder: their own paths, and their stamps.
+/// Paths and stamps of files, by their paths inside a folder.
 type Listing = BTreeMap<String, (PathBuf, Stamp)>;
 
 fn list(folder: &Path) -> io::Result<Listing> {
@@ -231,7 +233,7 @@ fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Sou
         })
         .collect::<io::Result<_>>()?;
     files.extend(hashed);
-    // What was written to while it was hashed has a hash that it may never have had.
+    // The hash of a file that is written to meanwhile may be that of no content it ever had.
     let is_same = |before: &(PathBuf, Stamp), now: &(PathBuf, Stamp)| before.1 == now.1;
     if let Some(change) = first_change(&listing, &list(folder)?, is_same) {
         return Err(ReadFailure::Changing(change));
@@ -240,7 +242,7 @@ fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Sou
     Ok(Source { files })
 }
 
-/// A file whose bytes are counted as they are read.
+/// Open file that counts the bytes that are read from it.
 struct Counted<'a> {
     file: File,
     progress: &'a HashProgress,
@@ -263,13 +265,13 @@ fn hash_file(path: &Path, progress: &HashProgress) -> io::Result<String> {
     Ok(hasher.finalize().to_hex().to_string())
 }
 
-/// A file of the store's cache: what is known of a folder's files.
+/// File of the store's cache for one folder.
 struct CacheFile {
     path: PathBuf,
     folder: String,
 }
 
-/// The content of such a file.
+/// Content of a [`CacheFile`].
 #[derive(Default, Serialize, Deserialize)]
 struct Cached {
     folder: String,
@@ -283,14 +285,14 @@ impl CacheFile {
         Self { path: store.root().join("cache/sources").join(name), folder }
     }
 
-    /// Known files; none where the cache can't be read.
+    /// Reads the known files. A cache that can't be read is empty.
     fn files(&self) -> BTreeMap<String, SourceFile> {
         let bytes = std::fs::read(&self.path).unwrap_or_default();
         let cached: Cached = serde_json::from_slice(&bytes).unwrap_or_default();
         if cached.folder == self.folder { cached.files } else { BTreeMap::new() }
     }
 
-    /// Writes the files whose next change will be seen by their stamps.
+    /// Writes the files whose next change will give them another stamp.
     fn write(&self, files: &BTreeMap<String, SourceFile>) {
         let settled = files.iter().filter(|(_, file)| file.stamp.is_settled());
         let files = settled.map(|(name, file)| (name.clone(), file.clone())).collect();

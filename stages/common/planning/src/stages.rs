@@ -31,7 +31,8 @@ pub struct StageProgram {
     pub description: Description,
     /// Its parameters.
     pub schema: Schema,
-    /// Stamp of the executable from before it was asked; none of a plan that was read from a file.
+    /// Stamp of the executable from before it was asked; `None` in a plan that was read from a
+    /// file.
     pub(crate) stamp: Option<Stamp>,
 }
 
@@ -60,7 +61,7 @@ pub enum ProgramError {
     /// It doesn't say what it is.
     #[error(transparent)]
     Describe(#[from] DescribeError),
-    /// Its file changed while it was asked.
+    /// The program's file changed while the program was asked.
     #[error("{0} changed while it was asked what it is; run again")]
     Changing(PathBuf),
     /// Nobody says what it is.
@@ -203,7 +204,7 @@ impl Programs {
     }
 }
 
-/// The answer of a program that was asked, unless its file has changed since it was identified.
+/// Returns the answer of a program. Fails if its file has changed since it was identified.
 fn answer(
     path: &Path,
     identity: Identity,
@@ -239,7 +240,7 @@ struct Identity {
 }
 
 impl DescriptionCache {
-    /// The cache of a store. One that can't be read is empty.
+    /// Reads the cache of a store. A cache that can't be read is empty.
     fn of(store: &Store) -> Self {
         let bytes = std::fs::read(Self::file(store)).unwrap_or_default();
         serde_json::from_slice(&bytes).unwrap_or_default()
@@ -273,7 +274,8 @@ impl DescriptionCache {
 }
 
 impl Identity {
-    /// Somebody's file is known by its bytes alone: a copy of a project has other times.
+    /// Compares two identities. Somebody's file is identified by its bytes alone: a copy of a
+    /// project has other times.
     fn is_same(&self, other: &Self) -> bool {
         self.blake3 == other.blake3 && (self.blake3.is_some() || self.stamp == other.stamp)
     }
@@ -308,7 +310,7 @@ pub fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
     own_folder().join(name)
 }
 
-/// Whether a program is one of the runner's own.
+/// Returns whether a program is one of the runner's own.
 pub(crate) fn is_own(path: &Path) -> bool {
     path.parent() == Some(&own_folder())
 }

@@ -33,21 +33,21 @@ impl Stamp {
         })
     }
 
-    /// Returns whether nothing was done to the file since `earlier`. The inode may differ: exFAT,
-    /// SMB and SSHFS number files anew whenever they forget them.
+    /// Returns whether nobody has touched the file since `earlier`. Inodes aren't compared: exFAT,
+    /// SMB and SSHFS give new ones to old files.
     pub fn is_untouched_since(&self, earlier: &Self) -> bool {
         Self { inode: earlier.inode, ..*self } == *earlier
     }
 
-    /// Returns whether the next change will make another stamp. One within the clock's tick would
-    /// not.
+    /// Returns whether the next change of the file will change the stamp. A change within the same
+    /// tick of the clock would not.
     pub(crate) fn is_settled(&self) -> bool {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs() as i64;
         let age = |time: (i64, i64)| now.abs_diff(time.0);
         age(self.modified).min(age(self.changed)) > COARSEST_TICK_SECONDS
     }
 
-    /// Size and time of the content's last change. A copy of the file may have the same.
+    /// Returns size and time of the content's last change. A copy of the file may have the same.
     pub(crate) fn of_content(&self) -> (u64, (i64, i64)) {
         (self.size, self.modified)
     }

@@ -275,8 +275,8 @@ impl Ear<'_> {
     }
 }
 
-/// Waits for the end of a stage, and kills what it has left running. `is_silent` says whether
-/// nobody holds its pipes any more.
+/// Waits for the end of a stage, and kills what the stage has left running. `is_silent` returns
+/// whether all processes have closed the stage's pipes.
 fn wait(
     group: Group,
     stop: &AtomicBool,

@@ -1,5 +1,5 @@
 //! Process groups: a stage with all that it starts. Ctrl-C in a terminal reaches the runner alone,
-//! which asks its stages to end, once; a second one kills them.
+//! which asks its stages to end, once; a second Ctrl-C kills them.
 
 use std::collections::BTreeSet;
 use std::io::{self, Read as _};
@@ -14,8 +14,8 @@ use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process_group, wa
 use stage::stop_signals;
 use wait4::{ResUse, Wait4 as _};
 
-/// Leaders of the groups that run. None of them has been waited for, so their numbers are their
-/// own.
+/// Process ids of the leaders of all running groups. None has been waited for, so no other process
+/// can have the same id.
 static RUNNING: Mutex<BTreeSet<i32>> = Mutex::new(BTreeSet::new());
 
 fn running() -> MutexGuard<'static, BTreeSet<i32>> {

@@ -33,14 +33,15 @@ pub(crate) struct End {
     pub(crate) tail: Vec<String>,
     /// Whether it was asked to end.
     pub(crate) asked: bool,
-    /// Whether the kernel ended some process meanwhile because memory ran out.
+    /// True if the kernel ended some process meanwhile because memory ran out.
     pub(crate) memory_ran_out: bool,
 }
 
 /// Exit code of a shell whose program was ended by SIGKILL.
 const KILLED_IN_SHELL: i32 = 128 + 9;
 
-/// Number of processes that the kernel has ended because memory ran out; none where it counts none.
+/// Returns the number of processes that the kernel has ended because memory ran out; `None` where
+/// the kernel doesn't count them.
 pub(crate) fn memory_kills() -> Option<u64> {
     let counts = std::fs::read_to_string("/proc/vmstat").ok()?;
     counts.lines().find_map(|line| line.strip_prefix("oom_kill "))?.parse().ok()

@@ -159,8 +159,8 @@ impl NodeJob<'_> {
         Ok(record)
     }
 
-    /// Calls the stage, and fails unless its program and its inputs are what the key was made of,
-    /// from before its start to its end. Returns what it used, and how long it took.
+    /// Calls the stage. Fails unless program and inputs are those of the key from before the start
+    /// to the end. Returns the stage's usage and its running time.
     fn call(
         &self,
         lock: &KeyLock,
@@ -203,7 +203,7 @@ impl NodeJob<'_> {
         let usage = result?;
         program.confirm_again()?;
         inputs.check(self.stop).inspect_err(|_| {
-            // What they were made of isn't known, even if the input gets its old content back.
+            // Checkpoints may contain the changed input, even if it gets its old content back.
             std::fs::remove_dir_all(&attempt.work).ok();
         })?;
         Ok((usage, time))
