@@ -29,18 +29,18 @@ impl<'a> ConfirmedProgram<'a> {
         store: &'a Store,
         stop: &'a AtomicBool,
     ) -> Result<Self, StageFailure> {
-        let stamp = program.confirm(store, Some(stop)).map_err(unconfirmed)?;
+        let stamp = program.confirm(store, Some(stop)).map_err(|e| unconfirmed(&e))?;
         Ok(Self { program, store, stop, stamp })
     }
 
     /// Confirms after the program's end that the program was the planned one all the time.
     pub(crate) fn confirm_again(&self) -> Result<(), StageFailure> {
         let confirmed = self.program.confirm_since(&self.stamp, self.store, Some(self.stop));
-        confirmed.map_err(unconfirmed)
+        confirmed.map_err(|e| unconfirmed(&e))
     }
 }
 
-fn unconfirmed(problem: Unconfirmed) -> StageFailure {
+fn unconfirmed(problem: &Unconfirmed) -> StageFailure {
     let code = if matches!(problem, Unconfirmed::Interrupted) { 130 } else { 2 };
     StageFailure { code, message: problem.to_string() }
 }
@@ -77,7 +77,7 @@ impl<'a> Inputs<'a> {
         for input in &node.inputs {
             if let Origin::Node { index, subtree } = &input.from {
                 let stored = StoredInput::new(store, &output_of(*index), subtree.as_deref());
-                artifacts.push(stored.map_err(damaged)?);
+                artifacts.push(stored.map_err(|e| damaged(&e))?);
             }
         }
         let FoundInputs { hashes, sources } = found;
@@ -85,7 +85,7 @@ impl<'a> Inputs<'a> {
         if !node.program.is_own() {
             // The runner's own programs compare files with manifests themselves.
             for artifact in &inputs.artifacts {
-                artifact.check_contents().map_err(damaged)?;
+                artifact.check_contents().map_err(|e| damaged(&e))?;
             }
         }
         Ok(inputs)
@@ -106,7 +106,7 @@ impl<'a> Inputs<'a> {
                 return Err(StageFailure { code: 3, message });
             }
         }
-        self.artifacts.iter().try_for_each(StoredInput::check).map_err(damaged)
+        self.artifacts.iter().try_for_each(StoredInput::check).map_err(|e| damaged(&e))
     }
 
     /// Removes checkpoints of an earlier attempt if a folder outside the store was written to since
@@ -130,7 +130,7 @@ impl<'a> Inputs<'a> {
     }
 }
 
-fn damaged(damage: Damage) -> StageFailure {
+fn damaged(damage: &Damage) -> StageFailure {
     StageFailure { code: 3, message: damage.to_string() }
 }
 
