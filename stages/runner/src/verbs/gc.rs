@@ -82,7 +82,7 @@ impl Style {
 /// What the pipeline needs with these arguments.
 fn needed(session: &Session, what: &Request) -> anyhow::Result<Root> {
     let plan = session.plan(what)?;
-    let states = match plan.states(&session.store) {
+    let states = match plan.states(&session.store, None) {
         Err(error @ PlanError::Store(_)) => return Err(anyhow::Error::from(error).context(UNREAD)),
         states => states?,
     };

@@ -46,7 +46,7 @@ fn logs_of(
     nodes: &[usize],
 ) -> anyhow::Result<Vec<(String, PathBuf, String)>> {
     // What can't be known, say of a folder that is gone, may still have a log from before.
-    let states = match plan.states(&session.store) {
+    let states = match plan.states(&session.store, None) {
         Err(PlanError::Source { .. }) => return Ok(Vec::new()),
         states => states?,
     };
