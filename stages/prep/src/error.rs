@@ -1,4 +1,4 @@
-use artifact::Failure;
+use artifact::{Failure, number};
 
 use crate::bounds::SpaceError;
 use crate::sizes::{SizeError, Sizes};
@@ -29,9 +29,9 @@ pub(crate) enum ParameterError {
     Sizes(SizeError),
     #[error(transparent)]
     Space(#[from] SpaceError),
-    #[error("parameter {name}: {value} is not a distance")]
+    #[error("parameter {name}: {} is not a distance", number(*value))]
     NoDistance { name: &'static str, value: f64 },
-    #[error("parameter near: {near} is not before far = {far}")]
+    #[error("parameter near: {} is not before far = {}", number(*near), number(*far))]
     NearAndFar { near: f64, far: f64 },
 }
 

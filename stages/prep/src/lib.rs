@@ -7,6 +7,7 @@
 //! * `sizes`: LR and HR size from `lr_width`, `hr_width`, `scale`.
 //! * `degrade`: HR and LR images of one photograph, through Pillow's exact kernels.
 //! * `bounds`: where the scene is, from what the cameras see.
+//! * `memory`: how many images are prepared at a time.
 //! * `pose_warnings`: poses that can't be right, or hardly.
 //!
 //! The photographs are read by the crate `dataset`, whatever form their folder has.
@@ -22,6 +23,7 @@ mod degrade;
 mod error;
 mod frame_name;
 mod image_plan;
+mod memory;
 mod params;
 mod pose_warnings;
 mod references;
@@ -32,7 +34,9 @@ mod strips;
 mod summary;
 mod writer;
 
-use artifact::{Failure, FailureExt as _};
+use std::path::Path;
+
+use artifact::{Failure, FailureExt as _, counted, list_source_files, printable};
 use contract::{Input, Output, Rule};
 use dataset::{Dataset, Frame};
 use scene::Background;
@@ -96,15 +100,17 @@ impl Stage for Prep {
         let mut notes: Vec<String> =
             set.notes.iter().cloned().chain([images.choice(&split)]).chain(warnings).collect();
         notes.iter().for_each(|note| context.say(note));
+        let used = split.train.iter().chain(&split.test).map(|&i| &set.frames[i]);
+        let threads = memory::threads(context, used, &images)?;
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
-        let (background, signs) = background(params, &training)?;
+        let (background, signs) = threads.install(|| background(params, &training))?;
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
         let writer = SceneWriter::new(context, &plan);
         for note in signs.into_iter().chain([space_note(&plan.bounds, background)]) {
             context.say(&note);
             notes.push(note);
         }
-        writer.write()?;
+        threads.install(|| writer.write())?;
         if let Some(note) = writer.clipping_note() {
             context.say(&note);
             notes.push(note);
@@ -118,7 +124,9 @@ impl Stage for Prep {
 /// The data set, with its lenses treated as asked, and all its views together where it isn't its
 /// own split that counts.
 fn dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
-    let set = Dataset::read(context.input("dataset")?.folder()).bad_input("dataset")?;
+    let folder = context.input("dataset")?.folder();
+    note_passed_over(context, folder);
+    let set = Dataset::read(folder).bad_input("dataset")?;
     let set = match params.lens {
         LensHandling::Follow => {
             let wrong = set
@@ -138,6 +146,20 @@ fn dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
     };
     let is_own = !matches!(params.split, Some(SplitKind::Holdout | SplitKind::Paper));
     Ok(if is_own { set } else { set.merged() })
+}
+
+/// Logs the files of a data set that are neither hashed nor read. Scenes don't note them: such
+/// files come and go without another hash.
+fn note_passed_over(context: &Context, folder: &Path) {
+    let Ok((_, passed_over)) = list_source_files(folder) else { return };
+    if let Some(first) = passed_over.first() {
+        let first = first.display().to_string();
+        context.say(&format!(
+            "{} passed over (links to nothing, editors' and systems' own), first {}",
+            counted(passed_over.len(), "file"),
+            printable(&first)
+        ));
+    }
 }
 
 /// Returns what lies behind the scene, and the signs by which that is known where it wasn't given.

@@ -6,8 +6,8 @@ use anyhow::Context as _;
 use artifact::{FailureExt as _, WARNING, counted, printable};
 use dataset::{Clipping, Frame};
 use pixels::{
-    Channel, DEGRADATION_FILE, Degradation, DepthMap, Kernel, Mask, Rgba8, SampleType, read_exr,
-    write_exr, write_png,
+    Channel, DEGRADATION_FILE, DEPTH_CHANNELS, Degradation, DepthMap, Kernel, Mask, Rgba8,
+    SampleType, read_exr, write_exr, write_png,
 };
 use rayon::prelude::*;
 use scene::{VIEWS_FILE, View, Views, mask_file};
@@ -299,7 +299,7 @@ impl<'a> SceneWriter<'a> {
         name: &str,
         (width, height): (usize, usize),
     ) -> anyhow::Result<()> {
-        let native = read_exr(source)?;
+        let native = read_exr(source)?.with_finite(&DEPTH_CHANNELS, source)?;
         let shown = source.display().to_string();
         let map = DepthMap::of(&native)
             .with_context(|| format!("{}: depth needs channels Z and A", printable(&shown)))?;

@@ -46,8 +46,12 @@ impl Folder {
                 }
             }
             for frame in set.frames.iter().take(2) {
+                frame.reading_bytes().ok();
                 frame.photograph().ok();
-                frame.mask().ok();
+                if let Ok(Some(mask)) = frame.mask() {
+                    let size = (frame.taken_with.width as usize, frame.taken_with.height as usize);
+                    assert_eq!((mask.width, mask.height), size, "a mask has its image's size");
+                }
             }
         }
     }

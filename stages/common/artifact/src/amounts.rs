@@ -25,6 +25,13 @@ pub fn sized(bytes: u64) -> String {
     }
 }
 
+/// Formats a number from a file or a parameter for a message: in scientific notation where plain digits
+/// would be many, as in `1e308`.
+pub fn number(value: f64) -> String {
+    let is_plain = value == 0.0 || (1e-4..1e7).contains(&value.abs());
+    if is_plain { value.to_string() } else { format!("{value:e}") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -37,6 +44,12 @@ mod tests {
         );
         let amounts = [0, 1, 999, 1000, 40_000, 999_999, 1_000_000, 14_049_000].map(amount);
         assert_eq!(amounts, ["0", "1", "999", "1,000", "40,000", "999,999", "1.0 M", "14.0 M"]);
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        let numbers = [0.0, -2.5, 800.0, 1e-4, 1e-5, -1e308, f64::NAN, f64::INFINITY].map(number);
+        assert_eq!(numbers, ["0", "-2.5", "800", "0.0001", "1e-5", "-1e308", "NaN", "inf"]);
     }
 
     #[test]

@@ -33,22 +33,25 @@ mod fsio;
 mod given_input;
 mod manifest;
 mod nearest;
+mod passed_over;
 mod printable;
 mod run_record;
 mod warnings;
 
 pub use advice::advice;
-pub use amounts::{amount, counted, sized};
+pub use amounts::{amount, counted, number, sized};
 pub use canonical::{canonical, hash_json};
 pub use console::{print_lines, print_text, report_text};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{sync_folder, temporary, write_atomically, write_json, write_json_atomically};
 pub use given_input::GivenInput;
 pub use manifest::{
-    Damage, FileEntry, MANIFEST_FILE, Manifest, PathError, list_files, relative_path,
+    Damage, FileEntry, MANIFEST_FILE, Manifest, PathError, list_files, list_source_files,
+    relative_path,
 };
 pub use nearest::{known_names, nearest};
-pub use printable::printable;
+pub use passed_over::has_passed_over_name;
+pub use printable::{printable, shortened};
 pub use run_record::{
     FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, folders_of, label,
 };

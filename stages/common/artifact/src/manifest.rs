@@ -8,6 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::advice::advice;
 use crate::canonical::hash_json;
+use crate::passed_over::is_passed_over;
+use crate::printable::shortened;
 
 /// The manifest's name inside an artifact.
 pub const MANIFEST_FILE: &str = "artifact.json";
@@ -195,8 +197,38 @@ impl Manifest {
 /// followed; one that leads back up is an error that names it, and so is a FIFO, socket or device:
 /// who reads one may wait for ever.
 pub fn list_files(folder: &Path) -> io::Result<Vec<(PathBuf, PathBuf)>> {
+    list(folder, |_| false)
+}
+
+/// Lists files like [`list_files`], in a folder that a user keeps: what [`is_passed_over`] is left
+/// out, and returned second, by its path inside the folder.
+pub fn list_source_files(folder: &Path) -> io::Result<(Vec<(PathBuf, PathBuf)>, Vec<PathBuf>)> {
+    let mut passed_over = Vec::new();
+    let files = list(folder, |path| {
+        let is_left_out = is_passed_over(path);
+        if is_left_out {
+            passed_over.push(path.strip_prefix(folder).unwrap_or(path).to_path_buf());
+        }
+        is_left_out
+    })?;
+    Ok((files, passed_over))
+}
+
+/// Lists the files below a folder, but those that are left out.
+fn list(
+    folder: &Path,
+    mut is_left_out: impl FnMut(&Path) -> bool,
+) -> io::Result<Vec<(PathBuf, PathBuf)>> {
     let mut found = Vec::new();
     for entry in walkdir::WalkDir::new(folder).follow_links(true).sort_by_file_name() {
+        let path = match &entry {
+            Ok(entry) if entry.file_type().is_dir() => None,
+            Ok(entry) => Some(entry.path()),
+            Err(error) => error.path(),
+        };
+        if path.is_some_and(&mut is_left_out) {
+            continue;
+        }
         let entry = entry.map_err(|error| match (error.path(), error.loop_ancestor()) {
             (Some(link), Some(up)) => io::Error::other(format!(
                 "{link:?} is a link that leads back to {up:?}; remove the link"
@@ -246,7 +278,7 @@ fn hash_file(path: &Path) -> io::Result<String> {
 
 /// A path that leaves its folder, or names nothing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0:?} is not a path inside the folder")]
+#[error("{:?} is not a path inside the folder", shortened(.0))]
 pub struct PathError(String);
 
 /// A path from a file that may be hostile: relative, `/`-separated, never upwards.
@@ -262,6 +294,8 @@ pub fn relative_path(text: &str) -> Result<PathBuf, PathError> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
 
     fn example() -> (tempfile::TempDir, Manifest) {
@@ -340,6 +374,36 @@ mod tests {
         std::os::unix::fs::symlink(dir.path(), dir.path().join("train/loop")).unwrap();
         let message = list_files(dir.path()).unwrap_err().to_string();
         assert!(message.contains("train/loop") && message.contains("leads back"), "{message}");
+    }
+
+    /// Links to nothing and editors' files are passed over in a user's folder; in an artifact
+    /// nothing is.
+    #[test]
+    fn a_user_s_folder_has_files_that_are_passed_over() {
+        use std::os::unix::fs::symlink;
+        let (dir, _) = example();
+        let at = |name: &str| dir.path().join(name);
+        let passed_over = [".#b.txt", ".DS_Store", ".b.txt.swp", ".~lock.b.txt#", "._b.txt"];
+        for name in passed_over {
+            fs::write(at(name), "").unwrap();
+        }
+        symlink("nowhere", at("train/gone")).unwrap();
+        symlink("b.txt", at("c.txt")).unwrap();
+        let names = |files: Vec<(PathBuf, PathBuf)>| {
+            files.into_iter().map(|(relative, _)| relative.display().to_string()).collect()
+        };
+        let (files, left_out) = list_source_files(dir.path()).unwrap();
+        let files: Vec<String> = names(files);
+        assert_eq!(files, ["b.txt", "c.txt", "train/a.txt"]);
+        let left_out: BTreeSet<String> = left_out.iter().map(|p| p.display().to_string()).collect();
+        let expected = passed_over.iter().chain(&["train/gone"]).map(|name| (*name).to_owned());
+        assert_eq!(left_out, expected.collect());
+        assert!(list_files(dir.path()).unwrap_err().to_string().contains("train/gone"));
+        fs::remove_file(at("train/gone")).unwrap();
+        assert_eq!(list_files(dir.path()).unwrap().len(), files.len() + passed_over.len());
+        // A link that leads round, or into what may not be read, isn't one to nothing.
+        symlink("round", at("round")).unwrap();
+        assert!(list_source_files(dir.path()).unwrap_err().to_string().contains("round"));
     }
 
     #[test]

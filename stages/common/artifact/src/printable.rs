@@ -24,6 +24,22 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
+/// Characters of a file's text that a message repeats.
+const MAX_SHOWN_CHARACTERS: usize = 100;
+
+/// Returns the beginning of a text from a file, for a message: a damaged file's names may have megabytes.
+///
+/// ```
+/// assert_eq!(artifact::shortened("r_0"), "r_0");
+/// assert_eq!(artifact::shortened(&"é".repeat(101)), format!("{}…", "é".repeat(100)));
+/// ```
+pub fn shortened(text: &str) -> Cow<'_, str> {
+    match text.char_indices().nth(MAX_SHOWN_CHARACTERS) {
+        Some((end, _)) => Cow::Owned(format!("{}…", &text[..end])),
+        None => Cow::Borrowed(text),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

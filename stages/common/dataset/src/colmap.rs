@@ -10,11 +10,12 @@ use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::file_reason::FileReason;
 use crate::format::Format;
-use crate::found::is_hidden;
+use crate::found::{check_link, is_file, is_hidden};
 use crate::frame::{Frame, names, pose_from_world_to_camera};
 use crate::frame_reason::FrameReason;
 use crate::lookup::{Listings, Located, Lookup, reduced_copies};
 use crate::photograph::{fitted, look};
+use crate::reach::Reach;
 use crate::text::read_text;
 
 /// A reconstruction as COLMAP writes it (its documentation, "Output format").
@@ -36,19 +37,30 @@ struct Image {
     points: Vec<u64>,
 }
 
+impl Image {
+    /// Centre of its camera in world space.
+    fn centre(&self) -> DVec3 {
+        -(self.rotation.transpose() * self.translation)
+    }
+}
+
 /// Returns the folders below `sparse` that contain a model, by name. Where there are none, and the
 /// data set's folder has images, those below `sparse` in its sub-folders without images: nerfstudio
 /// writes `colmap/sparse/0`.
-pub(crate) fn models(folder: &Path) -> Vec<PathBuf> {
-    let found = with_list(folder, "images");
+pub(crate) fn models(folder: &Path) -> Result<Vec<PathBuf>, DatasetError> {
+    let found = with_list(folder, "images")?;
     if !found.is_empty() || !has_images(folder) {
-        return found;
+        return Ok(found);
     }
     let mut below: Vec<PathBuf> =
         std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()).collect();
     below.retain(|path| !is_hidden(path) && !has_images(path));
     below.sort();
-    below.iter().flat_map(|path| with_list(path, "images")).collect()
+    let mut models = Vec::new();
+    for path in &below {
+        models.extend(with_list(path, "images")?);
+    }
+    Ok(models)
 }
 
 /// True if a folder has photographs as COLMAP's users keep them: `images` or a reduced copy.
@@ -59,7 +71,7 @@ fn has_images(folder: &Path) -> bool {
 /// Returns the names of the images of the first model below `sparse`, if there is one.
 pub(crate) fn image_names(folder: &Path) -> Result<Vec<String>, DatasetError> {
     let mut model = Model::default();
-    if let Some(first) = with_list(folder, "images").first() {
+    if let Some(first) = with_list(folder, "images")?.first() {
         model.read_images(first)?;
     }
     Ok(model.images.into_iter().map(|image| image.name).collect())
@@ -69,7 +81,7 @@ pub(crate) fn image_names(folder: &Path) -> Result<Vec<String>, DatasetError> {
 /// has isn't looked at.
 pub(crate) fn only_camera(folder: &Path) -> Result<Option<Intrinsics>, DatasetError> {
     let mut model = Model::default();
-    if let Some(first) = with_list(folder, "cameras").first() {
+    if let Some(first) = with_list(folder, "cameras")?.first() {
         model.read_cameras(first)?;
     }
     let mut cameras = model.cameras.into_values();
@@ -77,25 +89,34 @@ pub(crate) fn only_camera(folder: &Path) -> Result<Option<Intrinsics>, DatasetEr
 }
 
 /// `sparse` and the folders in it that have a list of such things, binary or as text, in order.
-fn with_list(folder: &Path, things: &str) -> Vec<PathBuf> {
+fn with_list(folder: &Path, things: &str) -> Result<Vec<PathBuf>, DatasetError> {
     let sparse = folder.join("sparse");
+    check_link(&sparse)?;
     let mut found: Vec<PathBuf> =
         std::fs::read_dir(&sparse).into_iter().flatten().flatten().map(|e| e.path()).collect();
     found.retain(|path| !is_hidden(path));
     found.sort();
     found.insert(0, sparse);
-    found.retain(|p| ["bin", "txt"].iter().any(|e| p.join(things).with_extension(e).is_file()));
-    found
+    let mut with_list = Vec::new();
+    for path in found {
+        let list = path.join(things);
+        if is_file(&list.with_extension("bin"))? || is_file(&list.with_extension("txt"))? {
+            with_list.push(path);
+        }
+    }
+    Ok(with_list)
 }
 
 /// Reads the model with most images, the first of several, and the images that it names.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
-    let models = models(folder);
+    let models = models(folder)?;
     let (path, mut model, mut notes) = largest_model(folder, &models)?;
+    notes.extend(model.remove_wild_points());
     // By name: the order in which COLMAP happened to register them means nothing.
     model.images.sort_by(|a, b| a.name.cmp(&b.name));
     let list =
         path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
+    check_link(&folder.join("images"))?;
     let named: Vec<&str> = model.images.iter().map(|image| image.name.as_str()).collect();
     let mut lookup = Lookup::in_images(folder, &named);
     let (mut frames, mut labels, mut missing) = (Vec::new(), Vec::new(), Vec::new());
@@ -171,7 +192,7 @@ fn largest_model<'a>(
 /// A file of a folder, if it is there.
 fn bytes_of(folder: &Path, name: &str) -> Result<Option<(PathBuf, Vec<u8>)>, DatasetError> {
     let path = folder.join(name);
-    if !path.is_file() {
+    if !is_file(&path)? {
         return Ok(None);
     }
     let bytes =
@@ -186,7 +207,7 @@ impl Model {
         model.read_images(folder)?;
         if let Some((path, points)) = bytes_of(folder, "points3D.bin")? {
             model.binary_points(&mut Bytes::new(&path, &points))?;
-        } else if folder.join("points3D.txt").is_file() {
+        } else if is_file(&folder.join("points3D.txt"))? {
             model.text_points(&folder.join("points3D.txt"))?;
         }
         Ok(model)
@@ -316,6 +337,17 @@ impl Model {
             self.points.insert(id, at);
         }
         Ok(())
+    }
+
+    /// Removes points whose depth no two of the photographs can tell, and says how many.
+    fn remove_wild_points(&mut self) -> Option<String> {
+        let centres: Vec<DVec3> = self.images.iter().map(Image::centre).collect();
+        let focal = self.cameras.values().map(|k| k.fx.max(k.fy)).fold(0.0, f64::max);
+        let before = self.points.len();
+        let reach = Reach::new(&centres, focal)?;
+        self.points.retain(|_, point| reach.contains(*point));
+        let wild = before - self.points.len();
+        (wild > 0).then(|| reach.note(wild, before))
     }
 
     fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, FrameReason> {
@@ -632,6 +664,44 @@ mod tests {
         );
         let message = Dataset::read(latin.path()).unwrap_err().to_string();
         assert!(message.contains(r"images.txt: line 1: \xe4.png is not UTF-8"), "{message}");
+    }
+
+    /// Depths are those without the wild points, which are counted.
+    #[test]
+    fn wild_points_are_left_out() {
+        let plain = folder("sparse/0", &text(CAMERAS, IMAGES, POINTS));
+        for place in ["0 0 1e300", "0 0 1e6", "-1e6 0 1e6", "0 0 inf", "nan 0 1"] {
+            let points = format!("{POINTS}8 {place} 255 0 0 0.1 7 0\n");
+            let images = IMAGES.replace("30 30 -1", "30 30 8");
+            let wild = folder("sparse/0", &text(CAMERAS, &images, &points));
+            assert_eq!(read_frames(wild.path()), read_frames(plain.path()), "{place}");
+            let notes = Dataset::read(wild.path()).unwrap().notes;
+            assert!(notes[1].starts_with("1 of 3 points is left out: too far away"), "{notes:?}");
+        }
+        let notes = Dataset::read(plain.path()).unwrap().notes;
+        assert!(!notes.iter().any(|note| note.contains("left out")), "{notes:?}");
+    }
+
+    /// What a link to nothing stands for is needed, or might be.
+    #[test]
+    fn links_to_nothing_are_named() {
+        let files = text(CAMERAS, IMAGES, POINTS);
+        for link in
+            ["sparse", "images", "sparse/0/images.bin", "sparse/0/points3D.txt", "images/a.png"]
+        {
+            let dir = folder("sparse/0", &files);
+            let path = dir.path().join(link);
+            if path.is_dir() {
+                std::fs::remove_dir_all(&path).unwrap();
+            } else if path.is_file() {
+                std::fs::remove_file(&path).unwrap();
+            }
+            std::os::unix::fs::symlink("gone", &path).unwrap();
+            let message = Dataset::read(dir.path()).unwrap_err().to_string();
+            let words =
+                format!("{} is a symbolic link to gone, which is not there", path.display());
+            assert!(message.contains(&words), "{message}");
+        }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use artifact::printable;
+use artifact::{printable, shortened};
 
 use crate::file_reason::FileReason;
 use crate::format::signs;
@@ -43,7 +43,7 @@ pub enum DatasetError {
     },
     /// Something about one frame.
     #[error(
-        "{}: frame {index} ({}): {}", shown(path), printable(file), printable(&reason.to_string())
+        "{}: frame {index} ({}): {}", shown(path), printable(&shortened(file)), printable(&reason.to_string())
     )]
     Frame {
         /// The file that lists the frames.

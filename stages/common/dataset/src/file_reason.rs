@@ -1,6 +1,7 @@
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
-use artifact::counted;
+use artifact::{counted, number, shortened};
 use scene::Distortion;
 
 use crate::lookup::LookupError;
@@ -37,7 +38,7 @@ pub enum FileReason {
         reason: Box<Self>,
     },
     /// Something about an image of a binary file.
-    #[error("image {id} ({name}): {reason}")]
+    #[error("image {id} ({}): {reason}", shortened(name))]
     Image {
         /// Its number.
         id: u32,
@@ -50,13 +51,16 @@ pub enum FileReason {
     #[error("is UTF-16; save it as UTF-8")]
     Utf16,
     /// Text that isn't.
-    #[error("{word} is not UTF-8; save the file as UTF-8, and rename what it names so")]
+    #[error(
+        "{} is not UTF-8; save the file as UTF-8, and rename what it names so",
+        shortened(word)
+    )]
     NoText {
         /// The first word that isn't, its bytes spelled out.
         word: String,
     },
     /// A name in a binary file that isn't text.
-    #[error("{what}, {name}, is not UTF-8; rename the file, and make the model again")]
+    #[error("{what}, {}, is not UTF-8; rename the file, and make the model again", shortened(name))]
     NoName {
         /// Whose name.
         what: &'static str,
@@ -64,7 +68,7 @@ pub enum FileReason {
         name: String,
     },
     /// It isn't the JSON that was expected.
-    #[error(transparent)]
+    #[error("{}", json_problem(.0))]
     Json(#[from] serde_json::Error),
     /// It isn't the array that was expected.
     #[error("not a NumPy array of N×{columns} numbers: {reason}")]
@@ -81,7 +85,7 @@ pub enum FileReason {
         what: &'static str,
     },
     /// A word isn't a number.
-    #[error("{what}: {word:?} is not a number of its kind")]
+    #[error("{what}: {:?} is not a number of its kind", shortened(word))]
     NoNumber {
         /// What it is to say.
         what: &'static str,
@@ -129,8 +133,9 @@ pub enum FileReason {
     },
     /// A name of no camera model.
     #[error(
-        "camera model {model:?} is unknown (a newer COLMAP's?); undistort with colmap \
-        image_undistorter"
+        "camera model {:?} is unknown (a newer COLMAP's?); undistort with colmap \
+        image_undistorter",
+        shortened(model)
     )]
     ModelName {
         /// The name.
@@ -161,7 +166,7 @@ pub enum FileReason {
         height: u64,
     },
     /// A quaternion that is no rotation.
-    #[error("its rotation ({}, {}, {}, {}) is none", .0[0], .0[1], .0[2], .0[3])]
+    #[error("its rotation ({}) is none", .0.map(number).join(", "))]
     Rotation([f64; 4]),
     /// A list of frames has none.
     #[error("`frames` is empty; at least one view is needed")]
@@ -171,7 +176,8 @@ pub enum FileReason {
     NoImages,
     /// None of the images that it names is there.
     #[error(
-        "none of the {count} images exists{} (first missing: {first})", place(folder.as_deref())
+        "none of the {count} images exists{} (first missing: {})",
+        place(folder.as_deref()), shortened(first)
     )]
     ImagesMissing {
         /// How many it names.
@@ -213,6 +219,15 @@ pub enum FileReason {
     /// Distortion that can't be undone.
     #[error("lens distortion {0} leaves no pinhole's image; are its coefficients right?")]
     Distortion(Distortion),
+}
+
+/// Returns the message of a JSON error, cut where serde repeats a long string.
+fn json_problem(error: &serde_json::Error) -> String {
+    let text = error.to_string();
+    match shortened(&text) {
+        Cow::Borrowed(_) => text,
+        Cow::Owned(cut) => format!("{cut} at line {} column {}", error.line(), error.column()),
+    }
 }
 
 impl FileReason {

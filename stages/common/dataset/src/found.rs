@@ -3,6 +3,8 @@ use std::io::ErrorKind;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
+use artifact::has_passed_over_name;
+
 use crate::error::DatasetError;
 use crate::misplaced::Misplaced;
 
@@ -17,9 +19,19 @@ pub(crate) enum Found {
     Other(Misplaced),
 }
 
+/// Maximum length of a path in bytes (Linux's `PATH_MAX`).
+const MAX_PATH_BYTES: usize = 4096;
+
 /// Looks at a place where a file is wanted, which `wanted` names ("an image").
 pub(crate) fn find(path: &Path, wanted: &'static str) -> Found {
     let path_buf = || path.to_path_buf();
+    let bytes = path.as_os_str().len();
+    if bytes > MAX_PATH_BYTES {
+        return Found::Other(Misplaced::Long { path: path_buf(), bytes });
+    }
+    if path.file_name().is_some_and(has_passed_over_name) {
+        return Found::Other(Misplaced::PassedOver { path: path_buf() });
+    }
     match fs::metadata(path) {
         Ok(there) if there.is_file() => Found::File,
         Ok(there) => Found::Other(Misplaced::Kind {
@@ -30,8 +42,10 @@ pub(crate) fn find(path: &Path, wanted: &'static str) -> Found {
         Err(error) => match (broken_link(path), error.kind()) {
             (Some(link), ErrorKind::NotFound) => {
                 let target = fs::read_link(link).unwrap_or_default();
-                let found = Misplaced::Dangling { link: link.to_path_buf(), target };
-                if link == path { Found::Nothing(found) } else { Found::Other(found) }
+                Found::Other(Misplaced::Dangling { link: link.to_path_buf(), target })
+            }
+            (None, ErrorKind::InvalidFilename) => {
+                Found::Other(Misplaced::Long { path: path_buf(), bytes })
             }
             (Some(link), _) => Found::Other(Misplaced::Nowhere { link: link.to_path_buf(), error }),
             (None, ErrorKind::NotFound | ErrorKind::NotADirectory) => {
@@ -67,6 +81,16 @@ fn kind(of: FileType) -> &'static str {
 /// photographs.
 pub(crate) fn is_hidden(path: &Path) -> bool {
     path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
+}
+
+/// Fails if a path is a dangling link, or leads through one.
+pub(crate) fn check_link(path: &Path) -> Result<(), DatasetError> {
+    match find(path, "a folder") {
+        Found::Other(found @ (Misplaced::Dangling { .. } | Misplaced::Nowhere { .. })) => {
+            Err(DatasetError::Place(found))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Whether a file is there; something else in its place is refused.
@@ -107,16 +131,18 @@ mod tests {
             ("loop", "loop is a symbolic link that leads nowhere"),
             ("loop/x.png", "loop is a symbolic link that leads nowhere"),
             ("dangling/x.png", "dangling is a symbolic link to gone, which is not there"),
+            ("dangling", "dangling is a symbolic link to gone, which is not there"),
+            ("._x.png", "._x.png is named like an editor's or a system's own files"),
+            (&"y".repeat(300), ": no file has so long a name"),
+            (&"z/".repeat(1 << 20), ": no file has so long a name"),
         ] {
             let Found::Other(it) = found(name) else { panic!("{name}: {:?}", found(name)) };
             let text = it.to_string();
             assert!(text.contains(words), "{text}");
         }
-        for (name, words) in [
-            ("nothing", "nothing is not there"),
-            ("file/x.png", "file/x.png is not there"),
-            ("dangling", "dangling is a symbolic link to gone, which is not there"),
-        ] {
+        for (name, words) in
+            [("nothing", "nothing is not there"), ("file/x.png", "file/x.png is not there")]
+        {
             let Found::Nothing(it) = found(name) else { panic!("{name}: {:?}", found(name)) };
             let text = it.to_string();
             assert!(text.contains(words), "{text}");

@@ -1,4 +1,4 @@
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
@@ -72,19 +72,25 @@ pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> 
     pose_of(axes, -(back * translation))
 }
 
+/// Separators between the parts of a name with folders; the second tells `a/b` from `a_b`.
+const SEPARATORS: [&str; 2] = ["_", "__"];
+
 /// Names for images, by their paths inside the data set: the files' names alone where those differ,
-/// else with their folders.
+/// otherwise with their folders.
 pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
-    let short = each_name(list, paths, |path| text(path.file_stem()))?;
-    if first_twice(&short).is_none() {
-        return Ok(short);
+    let mut names = each_name(list, paths, |path| text(path.file_stem()))?;
+    for separator in SEPARATORS {
+        if first_twice(&names).is_none() {
+            return Ok(names);
+        }
+        names = each_name(list, paths, |path| name_with_folders(path, separator))?;
     }
-    let long = each_name(list, paths, name_with_folders)?;
-    match first_twice(&long) {
-        None => Ok(long),
-        Some(index) => {
-            let reason = FrameReason::SecondName { name: short[index].clone() };
-            Err(DatasetError::frame(list, index, &shown(&paths[index]), reason))
+    match first_twice(&names) {
+        None => Ok(names),
+        Some((first, second)) => {
+            let (name, first) = (names[second].clone(), shown(&paths[first]));
+            let reason = FrameReason::SecondName { name, first };
+            Err(DatasetError::frame(list, second, &shown(&paths[second]), reason))
         }
     }
 }
@@ -92,7 +98,7 @@ pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, Datas
 fn each_name(
     list: &Path,
     paths: &[PathBuf],
-    name: fn(&Path) -> Result<String, FrameReason>,
+    name: impl Fn(&Path) -> Result<String, FrameReason>,
 ) -> Result<Vec<String>, DatasetError> {
     let mut names = Vec::with_capacity(paths.len());
     for (index, path) in paths.iter().enumerate() {
@@ -102,10 +108,10 @@ fn each_name(
     Ok(names)
 }
 
-fn name_with_folders(path: &Path) -> Result<String, FrameReason> {
+fn name_with_folders(path: &Path, separator: &str) -> Result<String, FrameReason> {
     let whole = path.with_extension("");
     let parts = whole.iter().map(|part| text(Some(part))).collect::<Result<Vec<_>, _>>()?;
-    Ok(parts.join("_"))
+    Ok(parts.join(separator))
 }
 
 /// A part of a path as text. Names become files' names and are printed everywhere: no control
@@ -115,10 +121,15 @@ fn text(part: Option<&OsStr>) -> Result<String, FrameReason> {
     Ok(name.replace(char::is_control, "_"))
 }
 
-/// The first that was there before.
-fn first_twice(names: &[String]) -> Option<usize> {
-    let mut seen = BTreeSet::new();
-    names.iter().position(|name| !seen.insert(name))
+/// Returns the indices of the first two frames that share a name.
+fn first_twice(names: &[String]) -> Option<(usize, usize)> {
+    let mut seen = BTreeMap::new();
+    for (index, name) in names.iter().enumerate() {
+        if let Some(first) = seen.insert(name, index) {
+            return Some((first, index));
+        }
+    }
+    None
 }
 
 #[cfg(test)]
@@ -131,21 +142,27 @@ mod tests {
 
     #[test]
     fn names_are_as_short_as_can_be() {
-        assert_eq!(names_of(&["images/a.jpg", "images/b.png"]).unwrap(), ["a", "b"]);
-        assert_eq!(names_of(&["left/a.jpg", "right/a.jpg"]).unwrap(), ["left_a", "right_a"]);
-        assert!(
-            names_of(&["x/a.jpg", "x/a.png"])
-                .unwrap_err()
-                .to_string()
-                .contains("frame 1 (x/a.png): a second view named \"a\"")
-        );
-        assert_eq!(names_of(&["a\u{1b}[31m\n.png", "b.png"]).unwrap(), ["a_[31m_", "b"]);
-        assert!(
-            names_of(&["a\n.png", "a\t.png"])
-                .unwrap_err()
-                .to_string()
-                .contains("frame 1 (a\\t.png): a second view named \"a_\"")
-        );
+        for (paths, names) in [
+            (&["images/a.jpg", "images/b.png"][..], &["a", "b"][..]),
+            (&["left/a.jpg", "right/a.jpg"], &["left_a", "right_a"]),
+            (&["a/b.png", "c/b.png", "a_b.png"], &["a__b", "c__b", "a_b"]),
+            (&["a\u{1b}[31m\n.png", "b.png"], &["a_[31m_", "b"]),
+        ] {
+            assert_eq!(names_of(paths).unwrap(), names);
+        }
+        for (paths, words) in [
+            (
+                &["x/a.jpg", "x/a.png"][..],
+                "frame 1 (x/a.png): its view would be named \"x__a\", as that of x/a.jpg; rename",
+            ),
+            (
+                &["a\n.png", "a\t.png"],
+                "frame 1 (a\\t.png): its view would be named \"a_\", as that of a\\n.png; rename",
+            ),
+        ] {
+            let message = names_of(paths).unwrap_err().to_string();
+            assert!(message.contains(words), "{message}");
+        }
         let odd =
             <std::ffi::OsStr as std::os::unix::ffi::OsStrExt>::from_bytes(b"images/\xff\xfe.png");
         let message = names("list".as_ref(), &[PathBuf::from(odd)]).unwrap_err().to_string();

@@ -1,3 +1,4 @@
+use artifact::{number, shortened};
 use scene::CameraError;
 
 use crate::lookup::LookupError;
@@ -57,7 +58,7 @@ pub enum FrameReason {
         camera: (u32, u32),
     },
     /// A side of an image without pixels.
-    #[error("{name} is {value}; an image has at least one pixel")]
+    #[error("{name} is {}; an image has 1 to {} pixels a side", number(*value), u32::MAX)]
     Empty {
         /// Which.
         name: &'static str,
@@ -66,9 +67,10 @@ pub enum FrameReason {
     },
     /// Depths that contradict each other.
     #[error(
-        "bounds {near} and {far}, expected 0 < near < far; LLFF's imgs2poses orders views otherwise \
+        "bounds {} and {}, expected 0 < near < far; LLFF's imgs2poses orders views otherwise \
         than their names where COLMAP registered them in another order: run COLMAP again on images \
-        sorted by name, or give COLMAP's model without poses_bounds.npy"
+        sorted by name, or give COLMAP's model without poses_bounds.npy",
+        number(*near), number(*far)
     )]
     Depths {
         /// Of the nearest point.
@@ -78,8 +80,9 @@ pub enum FrameReason {
     },
     /// A camera model that isn't read.
     #[error(
-        "camera_model {model:?} is not supported; undistort the images first (colmap \
-        image_undistorter)"
+        "camera_model {:?} is not supported; undistort the images first (colmap \
+        image_undistorter)",
+        shortened(model)
     )]
     Model {
         /// Its name.
@@ -92,7 +95,10 @@ pub enum FrameReason {
     #[error("no focal length: neither fl_x nor camera_angle_x is given")]
     NoFocalLength,
     /// An angle of view that no pinhole has.
-    #[error("{name} is {angle}: focal length {focal}; the angle must lie between 0 and π")]
+    #[error(
+        "{name} is {}: focal length {}; the angle must lie between 0 and π",
+        number(*angle), number(*focal)
+    )]
     Angle {
         /// What says it.
         name: &'static str,
@@ -102,10 +108,16 @@ pub enum FrameReason {
         focal: f64,
     },
     /// Another frame has its name.
-    #[error("a second view named {name:?}; file names must differ")]
+    #[error(
+        "its view would be named {:?}, as that of {}; rename one of the two files",
+        shortened(name),
+        shortened(first)
+    )]
     SecondName {
         /// The name.
         name: String,
+        /// Path of the other frame's image.
+        first: String,
     },
     /// A name that isn't text.
     #[error("its name is not UTF-8; rename the file")]

@@ -33,6 +33,8 @@ mod found;
 mod frame;
 mod frame_file;
 mod frame_reason;
+mod huffman;
+mod jpeg;
 mod llff;
 mod lookup;
 mod mask_file;
@@ -42,6 +44,7 @@ mod nearby;
 mod npy;
 mod number;
 mod photograph;
+mod reach;
 mod split;
 mod split_lists;
 mod text;
@@ -110,7 +113,7 @@ fn is_present(format: Format, folder: &Path) -> Result<bool, DatasetError> {
         Format::Blender => is_file(&folder.join("transforms_train.json")),
         Format::Transforms => is_file(&folder.join("transforms.json")),
         Format::Llff => is_file(&folder.join("poses_bounds.npy")),
-        Format::Colmap => Ok(!colmap::models(folder).is_empty()),
+        Format::Colmap => Ok(!colmap::models(folder)?.is_empty()),
     }
 }
 

@@ -9,7 +9,7 @@ use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::file_reason::{FileReason, ImageFolder};
 use crate::format::Format;
-use crate::found::{Found, find, is_file, is_hidden};
+use crate::found::{Found, check_link, find, is_file, is_hidden};
 use crate::frame::{Frame, names};
 use crate::frame_reason::FrameReason;
 use crate::lookup::{Located, Lookup};
@@ -28,6 +28,7 @@ const NUMBERS: usize = 17;
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("poses_bounds.npy");
     let rows = read_numbers(&path)?;
+    check_link(&folder.join("images"))?;
     let Photographs { images, labels, notes } = photographs(folder, &path, rows.len())?;
     let names = names(&path, &labels)?;
     let (distortion, note) = distortion(folder, &rows);

@@ -1,7 +1,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use artifact::printable;
+use artifact::{printable, shortened};
 
 /// What stands at a place where a file is wanted.
 #[derive(Debug, thiserror::Error)]
@@ -43,6 +43,23 @@ pub enum Misplaced {
         link: PathBuf,
         /// Why.
         error: io::Error,
+    },
+    /// A file whose name is that of an editor's or a system's own file.
+    #[error(
+        "{} is named like an editor's or a system's own files, which are passed over; rename it",
+        shown(path)
+    )]
+    PassedOver {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A path that is longer than the system allows.
+    #[error("{}: no file has so long a name ({bytes} bytes)", shortened(&shown(path)))]
+    Long {
+        /// The path.
+        path: PathBuf,
+        /// Length of the path.
+        bytes: usize,
     },
     /// It can't be looked at.
     #[error("{} can't be looked at: {error}", shown(path))]

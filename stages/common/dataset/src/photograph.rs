@@ -1,11 +1,12 @@
-use std::fs::File;
-use std::io::BufReader;
+use std::fs::{self, File};
+use std::io::{self, BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
+use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use pixels::{
-    MAX_PIXELS, Mask, PixelError, Rgba8, exr_size, read_exr, sample_cubic, srgb_from_linear, to_u8,
+    COLOUR_CHANNELS, MAX_PIXELS, Mask, PixelError, Rgba8, exr_reading_bytes, exr_size, read_exr,
+    sample_cubic, srgb_from_linear, to_u8,
 };
 use scene::Intrinsics;
 
@@ -13,6 +14,7 @@ use crate::clipping::Clipping;
 use crate::error::DatasetError;
 use crate::frame::Frame;
 use crate::frame_reason::FrameReason;
+use crate::jpeg::{END_MARKER, Extent, extent};
 use crate::turn::Turn;
 use crate::unread::refusal;
 
@@ -29,21 +31,31 @@ pub(crate) fn is_exr(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
 }
 
-/// A PNG or JPEG whose header has been read, by what it is, whatever its name says.
-fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PixelError> {
-    let io = |source| PixelError::Io { path: path.to_path_buf(), source };
-    let mut reader =
-        ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(io)?;
+fn io_error(path: &Path, source: io::Error) -> PixelError {
+    PixelError::Io { path: path.to_path_buf(), source }
+}
+
+/// Opens a decoder of a PNG or JPEG, recognised by content rather than by name.
+fn decoder<R: BufRead + Seek + 'static>(
+    file: R,
+    path: &Path,
+) -> Result<impl ImageDecoder + use<R>, PixelError> {
+    let guessed = ImageReader::new(file).with_guessed_format();
+    let mut reader = guessed.map_err(|source| io_error(path, source))?;
     let mut limits = Limits::default();
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
-    match reader.format() {
-        Some(ImageFormat::Png | ImageFormat::Jpeg) => Ok(reader),
-        _ => Err(refusal(path).unwrap_or_else(|| PixelError::Format {
-            path: path.to_path_buf(),
-            reason: "neither PNG, JPEG nor EXR".to_owned(),
-        })),
-    }
+    let reason = match reader.format() {
+        Some(ImageFormat::Png | ImageFormat::Jpeg) => match reader.into_decoder() {
+            Ok(decoder) => return Ok(decoder),
+            Err(error) => format!("its header can't be read ({})", error.to_string().trim_end()),
+        },
+        _ => match refusal(path) {
+            Some(error) => return Err(error),
+            None => "neither PNG, JPEG nor EXR".to_owned(),
+        },
+    };
+    Err(PixelError::Format { path: path.to_path_buf(), reason })
 }
 
 /// What an image's header says.
@@ -76,7 +88,8 @@ pub(crate) fn look(path: &Path) -> Result<Stored, PixelError> {
         let size = (width as u32, height as u32);
         return Ok(Stored { size, orientation: Orientation::NoTransforms });
     }
-    let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
+    let file = File::open(path).map_err(|source| io_error(path, source))?;
+    let mut decoder = decoder(BufReader::new(file), path)?;
     let (width, height) = decoder.dimensions();
     if width == 0 || height == 0 {
         return Err(format(format!("{width}×{height} pixels")));
@@ -119,13 +132,17 @@ pub(crate) fn has_shape_of(k: &Intrinsics, width: u32, height: u32) -> bool {
     (across / down - 1.0).abs() <= 0.01 + 1.0 / f64::from(width.min(height).max(1))
 }
 
-/// The image as it is stored, or turned as its EXIF data ask.
+/// The image as it is stored, or turned as its EXIF data ask. One that isn't whole is refused.
 fn read(path: &Path, turned: bool) -> Result<(Rgba8, Clipping), PixelError> {
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     if is_exr(path) {
         return encoded(path);
     }
-    let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
+    let mut bytes = fs::read(path).map_err(|source| io_error(path, source))?;
+    if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
+        complete(&mut bytes).map_err(format)?;
+    }
+    let mut decoder = decoder(Cursor::new(bytes), path)?;
     let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
         .map_err(|e| format(format!("not a whole image ({e})")))?;
@@ -135,9 +152,28 @@ fn read(path: &Path, turned: bool) -> Result<(Rgba8, Clipping), PixelError> {
     Ok((image.into(), Clipping::default()))
 }
 
+/// Refuses a JPEG that lacks image data, which its decoder would replace by grey. A missing end
+/// marker is added: without it the decoder leaves out the last rows.
+fn complete(jpeg: &mut Vec<u8>) -> Result<(), String> {
+    match extent(jpeg) {
+        Extent::Whole => Ok(()),
+        Extent::Unterminated => {
+            jpeg.extend(END_MARKER);
+            Ok(())
+        }
+        Extent::Missing { rows, of } => {
+            Err(format!("cut short or damaged: {rows} of {of} rows are missing"))
+        }
+        Extent::Coarse { scan, rows } => Err(format!(
+            "cut short or damaged in scan {scan} of a progressive JPEG: detail of all {rows} rows is \
+            missing"
+        )),
+    }
+}
+
 /// An EXR's linear light, display-encoded.
 fn encoded(path: &Path) -> Result<(Rgba8, Clipping), PixelError> {
-    let image = read_exr(path)?;
+    let image = read_exr(path)?.with_finite(&COLOUR_CHANNELS, path)?;
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     let [r, g, b] = ["R", "G", "B"]
         .map(|name| image.channel(name).ok_or_else(|| format(format!("no channel {name}"))));
@@ -157,7 +193,31 @@ fn encoded_pixel(colour: [f32; 3], alpha: f32) -> [u8; 4] {
     [r, g, b, to_u8(alpha)]
 }
 
+/// Bytes of an 8-bit RGBA pixel.
+const RGBA_BYTES: u64 = 4;
+/// Bytes that decoding a JPEG takes for a pixel besides: a progressive one's coefficients.
+const COEFFICIENT_BYTES: u64 = 6;
+
+/// Returns the bytes of memory that reading an image takes at its peak, by its header alone.
+fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
+    if is_exr(path) {
+        let (width, height) = exr_size(path)?;
+        return Ok(exr_reading_bytes(path)? + RGBA_BYTES * (width * height) as u64);
+    }
+    let file = File::open(path).map_err(|source| io_error(path, source))?;
+    let decoder = decoder(BufReader::new(file), path)?;
+    let (width, height) = decoder.dimensions();
+    let pixels = u64::from(width) * u64::from(height);
+    Ok(decoder.total_bytes() + (RGBA_BYTES + COEFFICIENT_BYTES) * pixels)
+}
+
 impl Frame {
+    /// Returns the bytes of memory that [`Frame::photograph`] takes at its peak, by the image's
+    /// header.
+    pub fn reading_bytes(&self) -> Result<u64, DatasetError> {
+        Ok(reading_bytes(&self.image)?)
+    }
+
     /// The image that [`Frame::camera`] sees: as it was taken, or with its distortion undone, as
     /// sharp as it was.
     pub fn photograph(&self) -> Result<Rgba8, DatasetError> {
@@ -233,6 +293,8 @@ fn undistorted(image: &Rgba8, taken_with: &Intrinsics, pinhole: &Intrinsics) -> 
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::jpeg::tests::jpeg;
+    use jpeg_encoder::SamplingFactor;
     use scene::Distortion;
 
     /// An image whose red says the column and whose green says the row.
@@ -309,6 +371,60 @@ pub(crate) mod tests {
         let other = dir.path().join("a.dat");
         std::fs::write(&other, "no image").unwrap();
         assert!(look(&other).unwrap_err().to_string().contains("neither PNG, JPEG nor EXR"));
+    }
+
+    /// A NaN is neither black nor transparent, and an infinity isn't white.
+    #[test]
+    fn pixels_that_are_not_finite_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.exr");
+        let read_with = |bad: [f32; 4]| {
+            exr::prelude::write_rgba_file(&path, 4, 3, |x, y| {
+                let [r, g, b, a] = if (x, y) == (1, 2) { bad } else { [0.25; 4] };
+                (r, g, b, a)
+            })
+            .unwrap();
+            super::read(&path, false)
+        };
+        assert!(read_with([1e9, -1.0, 0.0, 1.0]).is_ok());
+        for (index, channel) in COLOUR_CHANNELS.into_iter().enumerate() {
+            for (value, words) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf")] {
+                let mut bad = [0.25; 4];
+                bad[index] = value;
+                let message = read_with(bad).unwrap_err().to_string();
+                let expected = format!("a.exr: channel {channel} is {words} at column 1, row 2;");
+                assert!(message.contains(&expected), "{message}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_jpeg_that_is_cut_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.jpg");
+        let read = |bytes: &[u8]| {
+            fs::write(&path, bytes).unwrap();
+            super::read(&path, false).map_err(|error| error.to_string())
+        };
+        let bytes = jpeg((40, 64), Some(SamplingFactor::R_4_2_0), false, 3);
+        let whole = read(&bytes).unwrap();
+        assert_eq!(
+            read(&bytes[..bytes.len() - 2]),
+            Ok(whole.clone()),
+            "only the end marker is cut"
+        );
+        assert_eq!(read(&[&bytes, &b"more"[..]].concat()), Ok(whole));
+        let progressive = jpeg((40, 64), Some(SamplingFactor::R_4_2_0), true, 0);
+        let third = bytes.windows(2).position(|w| w == [0xff, 0xd1]).unwrap();
+        for (bytes, words) in [
+            (&bytes[..third], "a.jpg: cut short or damaged: 32 of 64 rows are missing; export"),
+            (&bytes[..bytes.len() - 9], "a.jpg: cut short or damaged: 16 of 64 rows are missing;"),
+            (&bytes[..100], "a.jpg: its header can't be read (Format error"),
+            (&progressive[..progressive.len() - 1], "detail of all 64 rows is missing; export"),
+        ] {
+            let message = read(bytes).unwrap_err();
+            assert!(message.contains(words), "{message}");
+        }
     }
 
     /// Smooth in the direction of the ray, so that what each lens sees is known exactly.

@@ -113,6 +113,7 @@ pub(crate) fn read_frame(
         Ok(()) => Ok(frame),
         Err(
             e @ (CameraError::Intrinsics { .. }
+            | CameraError::Proportion { .. }
             | CameraError::Distortion(_)
             | CameraError::Empty { .. }),
         ) => Err(e.into()),

@@ -56,6 +56,23 @@ pub enum PixelError {
         /// The sample.
         value: f32,
     },
+    /// A file has a sample that isn't finite.
+    #[error(
+        "{path}: channel {channel} is {value} at column {x}, row {y}; such a pixel has no colour \
+        or depth: export the image again without it"
+    )]
+    NotFiniteInput {
+        /// The file.
+        path: PathBuf,
+        /// The channel.
+        channel: String,
+        /// Column.
+        x: usize,
+        /// Row.
+        y: usize,
+        /// The sample.
+        value: f32,
+    },
 }
 
 /// More pixels than any image has; a header that says so is damaged or hostile.

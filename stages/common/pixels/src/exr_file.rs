@@ -4,9 +4,9 @@ use std::path::Path;
 
 use exr::block::UncompressedBlock;
 use exr::block::writer::ChunksWriter as _;
-use exr::meta::BlockDescription;
 use exr::meta::attribute::{AttributeValue, ChannelDescription, ChannelList, LineOrder, Text};
 use exr::meta::header::Header;
+use exr::meta::{BlockDescription, MetaData};
 use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
 
 use crate::error::{MAX_PIXELS, PixelError};
@@ -30,6 +30,11 @@ pub struct Channel {
     pub sample_type: SampleType,
 }
 
+/// Channels of a view's colours, premultiplied by the last.
+pub const COLOUR_CHANNELS: [&str; 4] = ["R", "G", "B", "A"];
+/// Channels of a depth map.
+pub const DEPTH_CHANNELS: [&str; 2] = ["Z", "A"];
+
 /// What an EXR file holds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExrImage {
@@ -47,10 +52,27 @@ impl ExrImage {
         self.channels.iter().find(|(n, _)| n == name).map(|(_, samples)| samples.as_slice())
     }
 
+    /// Returns the image, or fails at the first sample of the named channels that is NaN or
+    /// infinite; `path` names the file.
+    pub fn with_finite(self, names: &[&str], path: &Path) -> Result<Self, PixelError> {
+        for name in names {
+            let samples = self.channel(name).unwrap_or_default();
+            if let Some(at) = samples.iter().position(|sample| !sample.is_finite()) {
+                return Err(PixelError::NotFiniteInput {
+                    path: path.to_path_buf(),
+                    channel: (*name).to_owned(),
+                    x: at % self.width,
+                    y: at / self.width,
+                    value: samples[at],
+                });
+            }
+        }
+        Ok(self)
+    }
+
     /// Channels R, G, B and A together, where it has them.
     pub fn premultiplied(&self) -> Option<Image> {
-        let [Some(r), Some(g), Some(b), Some(a)] =
-            ["R", "G", "B", "A"].map(|name| self.channel(name))
+        let [Some(r), Some(g), Some(b), Some(a)] = COLOUR_CHANNELS.map(|name| self.channel(name))
         else {
             return None;
         };
@@ -199,14 +221,26 @@ fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
 /// Columns and rows of the first layer, by the header alone; one that asks for more pixels than any
 /// view has is refused.
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
-    let meta = exr::meta::MetaData::read_from_buffered(open(path)?, false)
-        .map_err(|e| exr_error(path, e))?;
+    let meta = header_of(path)?;
+    let first = meta.headers.first().ok_or_else(|| format(path, "it has no layer"))?;
+    Ok((first.layer_size.width(), first.layer_size.height()))
+}
+
+/// Returns the bytes of memory that [`read_exr`] takes, by the header alone: each sample as it is
+/// stored, and as f32.
+pub fn exr_reading_bytes(path: &Path) -> Result<u64, PixelError> {
+    let layers = header_of(path)?.headers;
+    let samples = layers.iter().map(|h| (h.layer_size.area() * h.channels.list.len()) as u64);
+    Ok(8 * samples.sum::<u64>())
+}
+
+fn header_of(path: &Path) -> Result<MetaData, PixelError> {
+    let meta = MetaData::read_from_buffered(open(path)?, false).map_err(|e| exr_error(path, e))?;
     if let Some(header) = meta.headers.iter().find(|h| h.layer_size.area() > MAX_PIXELS) {
         let (width, height) = (header.layer_size.width(), header.layer_size.height());
         return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
     }
-    let first = meta.headers.first().ok_or_else(|| format(path, "it has no layer"))?;
-    Ok((first.layer_size.width(), first.layer_size.height()))
+    Ok(meta)
 }
 
 /// Reads every channel of the first layer as f32.
@@ -323,6 +357,27 @@ mod tests {
             });
         assert!(matches!(result, Err(PixelError::NotFinite { x: 1, y: 1, ref channel,
                 .. }) if channel == "Z"));
+    }
+
+    #[test]
+    fn a_nan_that_is_read_is_named() {
+        let path = Path::new("a.exr");
+        let image = |value: f32| ExrImage {
+            width: 3,
+            height: 2,
+            channels: vec![
+                ("A".to_owned(), vec![1.0; 6]),
+                ("Z".to_owned(), vec![1.0, 1.0, 1.0, 1.0, 1.0, value]),
+            ],
+        };
+        for (value, words) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf"), (-f32::INFINITY, "-inf")]
+        {
+            let message = image(value).with_finite(&DEPTH_CHANNELS, path).unwrap_err().to_string();
+            let expected = format!("a.exr: channel Z is {words} at column 2, row 1; such a pixel");
+            assert!(message.starts_with(&expected), "{message}");
+            // Nobody reads the depth of a colour.
+            assert!(image(value).with_finite(&COLOUR_CHANNELS, path).is_ok());
+        }
     }
 
     #[test]

@@ -29,6 +29,7 @@ impl From<DynamicImage> for Rgba8 {
         // Most photographs are RGB. `image` compiles with little optimisation (Cargo.toml).
         let data = match image {
             DynamicImage::ImageRgb8(image) => opaque(&image),
+            DynamicImage::ImageLuma8(image) => grey(&image),
             other => other.into_rgba8().into_raw(),
         };
         Self::new(width, height, data)
@@ -40,6 +41,15 @@ fn opaque(rgb: &[u8]) -> Vec<u8> {
     let mut rgba = vec![u8::MAX; rgb.len() / 3 * 4];
     for (to, from) in rgba.chunks_exact_mut(4).zip(rgb.chunks_exact(3)) {
         to[..3].copy_from_slice(from);
+    }
+    rgba
+}
+
+/// Grey samples as RGB with alpha.
+fn grey(levels: &[u8]) -> Vec<u8> {
+    let mut rgba = vec![u8::MAX; levels.len() * 4];
+    for (to, level) in rgba.as_chunks_mut::<4>().0.iter_mut().zip(levels) {
+        to[..3].fill(*level);
     }
     rgba
 }
@@ -132,10 +142,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rgb_becomes_what_the_library_makes_of_it() {
-        let bytes = (0..5 * 3 * 3).map(|i| (i * 37 % 256) as u8).collect();
-        let image = DynamicImage::ImageRgb8(image::RgbImage::from_raw(5, 3, bytes).unwrap());
-        let expected = image.clone().into_rgba8().into_raw();
-        assert_eq!(Rgba8::from(image), Rgba8::new(5, 3, expected));
+    fn pixels_become_what_the_library_makes_of_them() {
+        let bytes = |channels: usize| (0..5 * 3 * channels).map(|i| (i * 37 % 256) as u8).collect();
+        let images = [
+            DynamicImage::ImageRgb8(image::RgbImage::from_raw(5, 3, bytes(3)).unwrap()),
+            DynamicImage::ImageLuma8(image::GrayImage::from_raw(5, 3, bytes(1)).unwrap()),
+        ];
+        for image in images {
+            let expected = image.clone().into_rgba8().into_raw();
+            assert_eq!(Rgba8::from(image), Rgba8::new(5, 3, expected));
+        }
     }
 }

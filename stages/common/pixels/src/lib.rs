@@ -46,7 +46,10 @@ pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use depth_map::{DepthMap, common_range};
 pub use error::{MAX_PIXELS, PixelError};
 pub use exposure::Exposure;
-pub use exr_file::{Channel, ExrImage, SampleType, exr_size, read_exr, write_exr};
+pub use exr_file::{
+    COLOUR_CHANNELS, Channel, DEPTH_CHANNELS, ExrImage, SampleType, exr_reading_bytes, exr_size,
+    read_exr, write_exr,
+};
 pub use heat::{Palette, heat};
 pub use image_buffer::{Image, Rgba8, psnr_of, to_u8};
 pub use image_file::read_premultiplied;

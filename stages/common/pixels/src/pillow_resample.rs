@@ -4,6 +4,8 @@
 //! and is clipped to 8 bits before the vertical one; weights are computed in f64, normalised, and
 //! rounded to 22 bits.
 
+use std::borrow::Cow;
+
 use crate::image_buffer::Rgba8;
 
 /// A resampling kernel, widened by the scale when shrinking (so it is an anti-aliasing filter).
@@ -133,7 +135,7 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
                 data.extend(sum.map(clip));
             }
         }
-        current = Rgba8::new(width, image.height, data);
+        current = Cow::Owned(Rgba8::new(width, image.height, data));
     }
     if height != image.height {
         let taps = taps(image.height, height, filter);
@@ -151,13 +153,17 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
             }
             data.extend(sums.iter().map(|&s| clip(s)));
         }
-        current = Rgba8::new(width, height, data);
+        current = Cow::Owned(Rgba8::new(width, height, data));
     }
-    straightened(current)
+    straightened(current.into_owned())
 }
 
-/// Pillow's RGBA → RGBa: c·a/255, rounded, in 8 bits.
-fn premultiplied(image: &Rgba8) -> Rgba8 {
+/// Pillow's RGBA → RGBa: c·a/255, rounded, in 8 bits. An opaque image, which may be large, stays
+/// as it is.
+fn premultiplied(image: &Rgba8) -> Cow<'_, Rgba8> {
+    if image.data.as_chunks::<4>().0.iter().all(|p| p[3] == u8::MAX) {
+        return Cow::Borrowed(image);
+    }
     let mut out = image.clone();
     for p in out.data.chunks_exact_mut(4) {
         let alpha = u32::from(p[3]);
@@ -166,7 +172,7 @@ fn premultiplied(image: &Rgba8) -> Rgba8 {
             *c = (((product >> 8) + product) >> 8) as u8;
         }
     }
-    out
+    Cow::Owned(out)
 }
 
 /// Pillow's RGBa → RGBA: 255·c/a, truncated and clipped.

@@ -41,6 +41,17 @@ fn what_is_no_folder_is_refused() {
     assert_eq!(problem(&absent), format!("{absent:?}: {words}"));
 }
 
+/// Editors' files come and go without another hash.
+#[test]
+fn what_is_passed_over_has_no_part_in_the_hash() {
+    let (_dir, store, data) = store_and_data();
+    fs::write(data.join("transforms.json"), "{}").unwrap();
+    let before = content(&store, &data);
+    std::os::unix::fs::symlink("me@host.1", data.join(".#transforms.json")).unwrap();
+    fs::write(data.join("._transforms.json"), "x").unwrap();
+    assert_eq!(content(&store, &data), before);
+}
+
 /// Any file name is taken, and each makes a hash of its own.
 #[test]
 fn any_name_has_a_hash() {

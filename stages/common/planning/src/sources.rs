@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use artifact::{FileEntry, hash_json, list_files, report_line, sized, write_atomically};
+use artifact::{FileEntry, hash_json, list_source_files, report_line, sized, write_atomically};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use store::Store;
@@ -202,7 +202,7 @@ impl From<io::Error> for ReadFailure {
 type Listing = BTreeMap<String, (PathBuf, Stamp)>;
 
 fn list(folder: &Path) -> io::Result<Listing> {
-    let files = list_files(folder)?.into_iter();
+    let files = list_source_files(folder)?.0.into_iter();
     files
         .map(|(relative, file)| {
             let stamp = Stamp::of(&file).map_err(|e| naming(&file, &e))?;

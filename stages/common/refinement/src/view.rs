@@ -55,8 +55,10 @@ impl Rendered {
     ) -> Result<Option<(Self, ExrImage)>, Failure> {
         let Some(file) = &view.image else { return Ok(None) };
         let place = format!("input {}", input.name());
-        let image =
-            read_exr(&input.path(file)).bad_input(format!("{place}: view {}", view.camera.name))?;
+        let path = input.path(file);
+        let image = read_exr(&path)
+            .and_then(|image| image.with_finite(&["R", "G", "B", "A", "Z"], &path))
+            .bad_input(format!("{place}: view {}", view.camera.name))?;
         let rendered = Self::new(view.camera.clone(), &image, background).bad_input(place)?;
         Ok(Some((rendered, image)))
     }

@@ -1,3 +1,6 @@
+use std::ops::RangeInclusive;
+
+use artifact::number;
 use glam::{DMat3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -71,12 +74,30 @@ pub enum CameraError {
         value: f64,
     },
     /// Focal length or principal point that no camera has.
-    #[error("{name} is {value}; focal lengths must be above 0 and principal points finite")]
+    #[error(
+        "{name} is {}; focal lengths must be above 0 and principal points finite", number(*value)
+    )]
     Intrinsics {
         /// `fx`, `fy`, `cx` or `cy`.
         name: &'static str,
         /// The number.
         value: f64,
+    },
+    /// Focal length or principal point out of all proportion to the image.
+    #[error(
+        "{name} is {} pixels where the image's side has {side}; is the {quantity} in pixels, and \
+        of this image?",
+        number(*value)
+    )]
+    Proportion {
+        /// `fx`, `fy`, `cx` or `cy`.
+        name: &'static str,
+        /// Its quantity, as text.
+        quantity: &'static str,
+        /// The number.
+        value: f64,
+        /// Length of the image along the same axis, in pixels.
+        side: u32,
     },
     /// Distortion by which a place in the image would belong to no ray, or to several.
     #[error("lens distortion {0} can't be undone within the image; are its coefficients right?")]
@@ -205,12 +226,13 @@ impl Camera {
         if k.width == 0 || k.height == 0 {
             return Err(CameraError::Empty { width: k.width, height: k.height });
         }
-        for (name, value, positive) in
-            [("fx", k.fx, true), ("fy", k.fy, true), ("cx", k.cx, false), ("cy", k.cy, false)]
-        {
-            if !value.is_finite() || (positive && value <= 0.0) {
-                return Err(CameraError::Intrinsics { name, value });
-            }
+        for (name, value, side) in [("fx", k.fx, k.width), ("fy", k.fy, k.height)] {
+            check_length(name, value, value > 0.0)?;
+            check_proportion(name, "focal length", value, side, FOCAL_LENGTHS)?;
+        }
+        for (name, value, side) in [("cx", k.cx, k.width), ("cy", k.cy, k.height)] {
+            check_length(name, value, true)?;
+            check_proportion(name, "principal point", value, side, PRINCIPAL_POINTS)?;
         }
         for (row, values) in self.camera_to_world.iter().enumerate() {
             for (column, &value) in values.iter().enumerate() {
@@ -242,6 +264,35 @@ impl Camera {
         } else {
             Ok(())
         }
+    }
+}
+
+/// Focal lengths that cameras may have, in image sides: angles of view from 0.006° to 179.98°. The
+/// longest photographic lenses have about 1°.
+const FOCAL_LENGTHS: RangeInclusive<f64> = 1e-4..=1e4;
+/// Principal points that cameras may have, in image sides from the corner. A part cut out of a
+/// photograph may be far from the principal point.
+const PRINCIPAL_POINTS: RangeInclusive<f64> = -1e4..=1e4;
+
+fn check_length(name: &'static str, value: f64, is_allowed: bool) -> Result<(), CameraError> {
+    if value.is_finite() && is_allowed {
+        Ok(())
+    } else {
+        Err(CameraError::Intrinsics { name, value })
+    }
+}
+
+fn check_proportion(
+    name: &'static str,
+    quantity: &'static str,
+    value: f64,
+    side: u32,
+    allowed: RangeInclusive<f64>,
+) -> Result<(), CameraError> {
+    if allowed.contains(&(value / f64::from(side))) {
+        Ok(())
+    } else {
+        Err(CameraError::Proportion { name, quantity, value, side })
     }
 }
 
@@ -338,6 +389,17 @@ mod tests {
         let mut bad = good.clone();
         bad.intrinsics.fx = 0.0;
         assert!(matches!(bad.check(), Err(CameraError::Intrinsics { name: "fx", .. })));
+        for (fx, cy, words) in [
+            (1e300, 12.5, "fx is 1e300 pixels where the image's side has 37; is the focal length"),
+            (1e-5, 12.5, "fx is 1e-5 pixels"),
+            (40.0, -1e9, "cy is -1e9 pixels where the image's side has 23; is the principal point"),
+            (40.0, f64::INFINITY, "cy is inf"),
+        ] {
+            let mut bad = good.clone();
+            (bad.intrinsics.fx, bad.intrinsics.cy) = (fx, cy);
+            let message = bad.check().unwrap_err().to_string();
+            assert!(message.starts_with(words), "{message}");
+        }
         let mut bad = good.clone();
         bad.camera_to_world[0][0] *= 1.1;
         bad.camera_to_world[0][1] += 0.2;

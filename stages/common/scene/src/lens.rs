@@ -1,5 +1,6 @@
 use std::fmt;
 
+use artifact::number;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -21,7 +22,7 @@ const UNDO_TOLERANCE: f64 = 1e-9;
 
 impl fmt::Display for Distortion {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let ([k1, k2, k3], [p1, p2]) = (self.radial, self.tangential);
+        let ([k1, k2, k3], [p1, p2]) = (self.radial.map(number), self.tangential.map(number));
         write!(f, "(k1 {k1}, k2 {k2}, k3 {k3}, p1 {p1}, p2 {p2})")
     }
 }

@@ -10,10 +10,12 @@ mod psnr;
 mod ssim;
 mod warp;
 
+use std::path::PathBuf;
+
 use anyhow::Context as _;
 use artifact::FailureExt as _;
 use metrics::{Figure, Score, Scores};
-use pixels::read_exr;
+use pixels::{DEPTH_CHANNELS, read_exr};
 
 use crate::metric::{Measured, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
@@ -210,8 +212,9 @@ impl Metric for DepthMetric {
         let (Some(found), Some(expected)) = (&view.view.depth, &view.true_view.depth) else {
             return Ok(Measured::default());
         };
-        let found = read_exr(&scene.views_in.path(found)).bad_input(&place)?;
-        let expected = read_exr(&scene.truth_in.path(expected)).bad_input(&place)?;
+        let read = |path: PathBuf| read_exr(&path)?.with_finite(&DEPTH_CHANNELS, &path);
+        let found = read(scene.views_in.path(found)).bad_input(&place)?;
+        let expected = read(scene.truth_in.path(expected)).bad_input(&place)?;
         let error = depth_error(&found, &expected);
         let error = error.context("depth needs channels Z and A of one size").bad_input(&place)?;
         let score = Score::several([

@@ -1,5 +1,5 @@
 use artifact::{FailureExt as _, GivenInput};
-use pixels::{DepthMap, ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
+use pixels::{DEPTH_CHANNELS, DepthMap, ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
 
 use crate::scored_view::{ScoredView, read_image};
@@ -23,7 +23,10 @@ pub(crate) fn neighbour<'a>(of: &Camera, views: &'a [View]) -> Option<&'a View> 
 /// A rendered view's depth and opacity.
 pub(crate) fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Option<ExrImage>> {
     let Some(depth) = &view.depth else { return Ok(None) };
-    let image = read_exr(&input.path(depth)).bad_input(format!("view {}", view.camera.name))?;
+    let path = input.path(depth);
+    let image = read_exr(&path)
+        .and_then(|image| image.with_finite(&DEPTH_CHANNELS, &path))
+        .bad_input(format!("view {}", view.camera.name))?;
     let k = &view.camera.intrinsics;
     let whole = (image.width, image.height) == (k.width as usize, k.height as usize);
     Ok((whole && DepthMap::of(&image).is_some()).then_some(image))

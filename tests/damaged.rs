@@ -1,0 +1,240 @@
+//! Damaged images and numbers in a data set: each is refused by a line that names the file, and
+//! nothing of it becomes grey, black or transparent. Files that are no part of a data set are
+//! passed over.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+
+use common::{Finished, Project, stage, stage_command};
+use exr::prelude::{Image, SpecificChannels, WritableImage as _, write_rgba_file};
+use serde_json::{Value, json};
+
+const FROM_FOLDER: &str = "
+default: [prep]
+stages:
+  prep:
+    inputs: {dataset: ./data}
+    parameters: {lr_width: 16, scale: 2}
+";
+
+/// A demo scene as a user's folder, below a pipeline that prepares it.
+fn project() -> (Project, PathBuf) {
+    let project = Project::new(FROM_FOLDER);
+    let folder = project.path("data");
+    let params = r#"{"size": 32, "train": 4, "test": 2, "samples_per_axis": 1}"#;
+    let made = stage("demo-scene", params, &[], &folder, &[]);
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    std::fs::remove_file(folder.join("artifact.json")).unwrap();
+    (project, folder)
+}
+
+/// Changes a list of views.
+fn edit(list: &Path, change: impl FnOnce(&mut Value)) {
+    let mut value: Value = serde_json::from_slice(&std::fs::read(list).unwrap()).unwrap();
+    change(&mut value);
+    std::fs::write(list, value.to_string()).unwrap();
+}
+
+fn edit_training(folder: &Path, change: impl FnOnce(&mut Value)) {
+    edit(&folder.join("transforms_train.json"), change);
+}
+
+/// A JPEG of 32×32 pixels.
+fn jpeg(is_progressive: bool) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, 90);
+    encoder.set_progressive(is_progressive);
+    let samples: Vec<u8> = (0..32 * 32 * 3).map(|i: usize| (i * 7 + i * i / 31) as u8).collect();
+    encoder.encode(&samples, 32, 32, jpeg_encoder::ColorType::Rgb).unwrap();
+    bytes
+}
+
+/// Puts the beginning of a JPEG in the place of an image.
+fn put_cut_jpeg(path: &Path, is_progressive: bool) {
+    let bytes = jpeg(is_progressive);
+    std::fs::write(path, &bytes[..bytes.len() - 300]).unwrap();
+}
+
+/// Writes an EXR that is grey but for the pixel in column 3 of row 5.
+fn put_exr(path: &Path, bad: (f32, f32, f32, f32)) {
+    let pixel = |x, y| if (x, y) == (3, 5) { bad } else { (0.5, 0.5, 0.5, 1.0) };
+    write_rgba_file(path, 32, 32, pixel).unwrap();
+}
+
+/// Damage to a data set, and words of the refusal.
+type Damage = (fn(&Path), &'static [&'static str]);
+
+const DAMAGES: &[Damage] = &[
+    (
+        |data| put_cut_jpeg(&data.join("train/r_1.png"), false),
+        &["frame r_1", "data/train/r_1.png: cut short or damaged: ", " of 32 rows are missing;"],
+    ),
+    (
+        |data| put_cut_jpeg(&data.join("test/r_1.png"), true),
+        &[
+            "frame r_1",
+            "data/test/r_1.png: cut short or damaged in scan ",
+            "of all 32 rows is missing;",
+        ],
+    ),
+    (
+        |data| {
+            put_exr(&data.join("train/bad.exr"), (0.5, f32::NAN, 0.5, 1.0));
+            edit_training(data, |list| list["frames"][2]["file_path"] = json!("./train/bad.exr"));
+        },
+        &["frame bad", "data/train/bad.exr: channel G is NaN at column 3, row 5;"],
+    ),
+    (
+        |data| {
+            put_exr(&data.join("train/bad.exr"), (0.5, 0.5, 0.5, f32::NAN));
+            edit_training(data, |list| list["frames"][2]["file_path"] = json!("./train/bad.exr"));
+        },
+        &["frame bad", "data/train/bad.exr: channel A is NaN at column 3, row 5;"],
+    ),
+    (
+        |data| {
+            put_exr(&data.join("test/bad.exr"), (f32::INFINITY, 0.5, 0.5, 1.0));
+            edit(&data.join("transforms_test.json"), |list| {
+                list["frames"][0]["file_path"] = json!("./test/bad.exr");
+            });
+        },
+        &["frame bad", "data/test/bad.exr: channel R is inf at column 3, row 5;"],
+    ),
+    (
+        |data| {
+            put_exr(&data.join("mask.exr"), (0.5, 0.5, f32::NEG_INFINITY, 1.0));
+            edit_training(data, |list| list["frames"][0]["mask_path"] = json!("mask.exr"));
+        },
+        &["frame r_0", "data/mask.exr: channel B is -inf at column 3, row 5;"],
+    ),
+    (
+        |data| {
+            let depth = |bad: f32| {
+                SpecificChannels::build().with_channel("A").with_channel("Z").with_pixel_fn(
+                    move |at| (1.0f32, if (at.x(), at.y()) == (3, 5) { bad } else { 2.0f32 }),
+                )
+            };
+            let image = Image::from_channels((32, 32), depth(f32::INFINITY));
+            image.write().to_file(data.join("test/r_0_depth.exr")).unwrap();
+        },
+        &["frame r_0", "data/test/r_0_depth.exr: channel Z is inf at column 3, row 5;"],
+    ),
+    (
+        |data| edit_training(data, |list| list["fl_x"] = json!(1e300)),
+        &[
+            "transforms_train.json: frame 0 (./train/r_0): fx is 1e300 pixels where the image's side",
+        ],
+    ),
+    (
+        |data| edit_training(data, |list| list["frames"][3]["cx"] = json!(-1e12)),
+        &["transforms_train.json: frame 3 (./train/r_3): cx is -1e12 pixels"],
+    ),
+    (
+        |data| edit_training(data, |list| list["w"] = json!(1e308)),
+        &["transforms_train.json: frame 0 (./train/r_0): w is 1e308;"],
+    ),
+    (
+        |data| {
+            edit_training(data, |list| {
+                list["frames"][1]["file_path"] = json!("x".repeat(5_000_000));
+            });
+        },
+        &["transforms_train.json: frame 1 (xxx", "x…): ", "no file has so long a name (5000"],
+    ),
+    (
+        |data| edit_training(data, |list| list["frames"][1]["fl_x"] = json!("y".repeat(5_000_000))),
+        &["transforms_train.json: invalid type: string \"yyy", "y… at line 1 column "],
+    ),
+    (
+        |data| {
+            std::fs::remove_file(data.join("train/r_2.png")).unwrap();
+            symlink("/unmounted/r_2.png", data.join("train/r_2.png")).unwrap();
+        },
+        &[
+            "frame 2 (./train/r_2)",
+            "r_2.png is a symbolic link to /unmounted/r_2.png, which is not",
+        ],
+    ),
+    (
+        |data| {
+            std::fs::rename(data.join("train/r_2.png"), data.join("train/._r_2.png")).unwrap();
+            edit_training(data, |list| list["frames"][2]["file_path"] = json!("train/._r_2.png"));
+        },
+        &[
+            "frame 2 (train/._r_2.png)",
+            "._r_2.png is named like an editor's or a system's own files",
+        ],
+    ),
+];
+
+#[test]
+fn damage_is_named_by_file_and_place() {
+    for (damage, words) in DAMAGES {
+        let (project, folder) = project();
+        damage(&folder);
+        let run = project.run(&["run"]);
+        run.fails(3, words);
+        let longest = run.stderr.lines().map(str::len).max();
+        assert!(longest < Some(1000), "{}", run.stderr);
+        assert_eq!(project.store_listing(), Vec::<String>::new());
+    }
+}
+
+#[test]
+fn memory_is_looked_at_before_images_are_decoded() {
+    let (project, folder) = project();
+    let prepare = |memory: &str, output: &str| {
+        let inputs = [("dataset", folder.as_path())];
+        let (output, more) = (project.path(output), ["--threads", "2", "--progress", "plain"]);
+        let mut command = stage_command("prep", r#"{"scale": 2}"#, &inputs, &output, &more);
+        Finished::of(command.env("NERF_SR_MEMORY", memory).output().unwrap())
+    };
+    prepare("20000", "none").fails(
+        2,
+        &["frame r_0: preparing its image of 32×32 pixels needs 20.5 kB of memory, and 20.0 kB are"],
+    );
+    let one = prepare("30000", "one");
+    assert_eq!(one.code, 0, "{}", one.stderr);
+    let said = format!("{}{}", one.stdout, one.stderr);
+    assert!(said.contains("1 of 2 threads: an image takes 20.5 kB of memory"), "{said}");
+    let both = prepare("4000000000", "both");
+    assert_eq!(
+        (both.code, common::manifest(&project.path("both"))),
+        (0, common::manifest(&project.path("one")))
+    );
+}
+
+/// Editors' and systems' own files and links to nothing come and go without a new run.
+#[test]
+fn files_that_are_no_part_of_the_data_are_passed_over() {
+    let (project, folder) = project();
+    symlink("me@host.123:4", folder.join(".#transforms_train.json")).unwrap();
+    symlink("gone", folder.join("train/link.png")).unwrap();
+    project.ok(&["run"]);
+    let said = project.ok(&["log", "prep"]);
+    assert!(said.contains("2 files passed over") && said.contains(".#transforms_train"), "{said}");
+    std::fs::remove_file(folder.join(".#transforms_train.json")).unwrap();
+    for name in [".DS_Store", "train/._r_0.png", ".~lock.transforms_train.json#", ".x.swp"] {
+        std::fs::write(folder.join(name), "").unwrap();
+    }
+    let run = project.ok(&["run"]);
+    assert!(run.contains("nothing to run"), "{run}");
+}
+
+#[test]
+fn files_of_one_name_in_other_folders_are_told_apart() {
+    let (project, folder) = project();
+    let names = ["a/b", "c/b", "a_b"];
+    for (frame, name) in names.into_iter().enumerate() {
+        let file = folder.join(format!("{name}.png"));
+        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+        std::fs::copy(folder.join("train/r_0.png"), file).unwrap();
+        edit_training(&folder, |list| list["frames"][frame]["file_path"] = json!(name));
+    }
+    project.ok(&["run"]);
+    let images = project.artifact("prep", &[]).join("train/images");
+    assert!(["a__b.png", "c__b.png", "a_b.png"].iter().all(|name| images.join(name).is_file()));
+}
