@@ -57,9 +57,9 @@ test: build remote ## Every test, the skipped and the slowest named; FILTER=WORD
 KILLS ?= 200
 RUNNERS ?= 10
 ROUNDS ?= 100
-faults: build ## Many kills and changed files at random moments, and runners at once: make faults KILLS=200 ROUNDS=100 SEED=1
-	NERF_SR_KILLS=$(KILLS) NERF_SR_ROUNDS=$(ROUNDS) NERF_SR_REPEAT=$(RUNNERS) $(if $(SEED),NERF_SR_SEED=$(SEED)) \
-	  cargo test --release -p end-to-end --test kills --test random_changes --test sharing -- --nocapture random_moments eight_runners
+faults: build remote ## Kills at random moments and at every call that changes a folder, files changed during runs, runners at once: make faults KILLS=200 ROUNDS=100 SEED=1
+	NERF_SR_KILLS=$(KILLS) NERF_SR_ROUNDS=$(ROUNDS) NERF_SR_REPEAT=$(RUNNERS) NERF_SR_CALL_STEP=1 $(if $(SEED),NERF_SR_SEED=$(SEED)) \
+	  cargo test --release -p end-to-end --test kills --test random_changes --test sharing --test every_call -- --nocapture random_moments eight_runners every_call
 
 lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets; cargo-deny and typos where installed
 	cargo fmt --all --check

@@ -276,3 +276,65 @@ fn verify_beside_gc_cries_no_damage() {
         assert!(finished.stdout.ends_with(", 0 damaged\n"), "{}", finished.stdout);
     }
 }
+
+/// What scripts do to their output, and why it is refused; `${0%/*}` is the project.
+const LINKS: [(&str, &str); 4] = [
+    ("rmdir $out; ln -s ${0%/*}/own $out", "/output is a symbolic link"),
+    ("cp ${0%/*}/own/x $out; ln -s x $out/link", "/output/link is a symbolic link"),
+    ("mkdir $out/in; ln -s .. $out/in/loop", "/output/in/loop is a symbolic link"),
+    ("mkfifo $out/summary.txt", "/output/summary.txt is a named pipe (FIFO)"),
+];
+
+fn assert_untouched(project: &Project) {
+    assert_eq!(fs::read_dir(project.path("own")).unwrap().count(), 1);
+    assert_eq!(fs::read_to_string(project.path("own/x")).unwrap(), "mine");
+}
+
+/// An artifact that is a link would change with the user's file, and the runner would write into
+/// the user's folder.
+#[test]
+fn links_in_a_stages_output_are_refused() {
+    for (run, words) in LINKS {
+        let project = scripted(run);
+        project.write("own/x", "mine");
+        project.run(&["run", "text"]).fails(1, &["text", "without a proper artifact", words]);
+        assert!(project.store_listing().is_empty());
+        assert_untouched(&project);
+    }
+}
+
+#[test]
+fn links_in_a_sinks_output_are_refused() {
+    let description = r#"{"name": "page", "version": "1", "code": "1", "summary": "Shows.", "sink": true, "parameters": {"type": "object"},
+      "inputs": {"run": {"kinds": ["run"], "summary": "a run"}}, "output": {"kind": "page"}}"#;
+    for (run, words) in LINKS {
+        let project = scripted(WORD);
+        project.write("own/x", "mine");
+        project.write(
+            "pipeline.yaml",
+            "stages:\n  text: {run: ./text}\n  page: {run: ./page, inputs: {run: text}}\n",
+        );
+        let script = fs::read_to_string(project.path("text")).unwrap();
+        let (_, arguments) = script.split_once("exit; fi\n").unwrap();
+        let arguments = arguments.replace(WORD, run);
+        project.program(
+            "page",
+            &format!(
+                "#!/bin/sh\nif [ $1 = describe ]; then echo '{description}'; exit; fi\n{arguments}"
+            ),
+        );
+        project.run(&["run", "page"]).fails(1, &["page", words]);
+        assert!(!project.path("out/page").exists());
+        assert_untouched(&project);
+    }
+}
+
+/// A hard link is a second name of the user's file: the artifact has a copy.
+#[test]
+fn a_hard_link_in_an_output_becomes_a_copy() {
+    let project = scripted("ln ${0%/*}/own/x $out/x");
+    project.write("own/x", "mine");
+    project.ok(&["run", "text"]);
+    fs::write(project.path("own/x"), "new!").unwrap();
+    assert!(project.ok(&["verify"]).ends_with("1 artifact, 0 damaged\n"));
+}

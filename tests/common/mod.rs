@@ -6,6 +6,7 @@
 
 pub mod browser;
 pub mod large;
+pub mod leftovers;
 pub mod random;
 pub mod splats;
 pub mod surfaces;
@@ -207,7 +208,12 @@ impl Project {
     }
 
     pub fn command(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(bin("nerf-sr"));
+        self.command_of(&bin("nerf-sr"), arguments)
+    }
+
+    /// The command of any program in the project's folder.
+    pub fn command_of(&self, program: &Path, arguments: &[&str]) -> Command {
+        let mut command = Command::new(program);
         command.args(arguments).current_dir(self.dir.path());
         // Defaults of whoever runs the tests.
         for name in ["STORE", "EXECUTOR", "SITE", "DATA"] {

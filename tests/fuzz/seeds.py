@@ -2,10 +2,12 @@
 """Writes a few whole files for each fuzz target to start from: seeds.py FOLDER."""
 
 import base64
+import io
 import json
 import pathlib
 import struct
 import sys
+import tarfile
 import zlib
 
 out = pathlib.Path(sys.argv[1])
@@ -183,3 +185,22 @@ for one in (make, train, report):
 seed("runner", "arguments", b"\x02pseed=1,2\npkernel=box\nptrain.rate=2,2.0,3\npplace=[1,2]\nidata=a,b\nprays=6e4\nttrain\nitrain.weights=w")
 seed("runner", "arguments-wrong", b'\x02pplace=[1,"a,b"],2\nidata=a,,b\nprays=0x10')
 seed("runner", "record", b"\x03" + json.dumps(record).encode())
+
+entry = {"path": "views/r_0.png", "size": 3, "blake3": "0" * 64}
+files = [entry | {"path": "metrics.json"}, entry, entry | {"path": "views/" + "n" * 120}]
+index = {"export": 1, "store": 1, "artifact": "0" * 64, "objects": ["0" * 64], "actions": ["0" * 64, "1" * 64]}
+seed("remote", "edits", bytes([1, 124, 0, 1, 0, 2, 255]))
+seed("remote", "index", b"\x02" + json.dumps(index).encode())
+seed("remote", "manifest", b"\x03" + json.dumps({"kind": "views", "schema": 1, "files": files}).encode())
+seed("remote", "record", b"\x04" + json.dumps(record | {"made_of": ["2" * 64]}).encode())
+for which, path in enumerate(["../evil", "/tmp/evil", "a/../../evil", "a", "artifact.json", "a/" * 400 + "x"]):
+    hostile = {"kind": "views", "schema": 1, "files": [entry | {"path": path}, entry | {"path": path + "/x"}]}
+    seed("remote", f"path-{which}", b"\x03" + json.dumps(hostile).encode())
+archive = io.BytesIO()
+with tarfile.open(fileobj=archive, mode="w", format=tarfile.GNU_FORMAT) as tar:
+    for name in ("export.json", f"objects/{'0' * 64}/artifact.json"):
+        data = json.dumps(index).encode()
+        member = tarfile.TarInfo(name)
+        member.size = len(data)
+        tar.addfile(member, io.BytesIO(data))
+seed("remote", "archive", b"\x00" + archive.getvalue()[:4000])

@@ -6,10 +6,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::{Failure, report_line};
+use artifact::{Failure, print_line, report_line};
 use clap::{CommandFactory as _, Parser, Subcommand};
 use store::Store;
 
+use crate::destination::Destination;
 use crate::export::export;
 use crate::import::import;
 use crate::pull::pull;
@@ -60,8 +61,11 @@ enum Verb {
     Export {
         /// An artifact's hash or an action's key, or how it begins
         what: String,
-        /// The file, a tar; replaced where it is there
+        /// Path of the file to create, a tar
         file: PathBuf,
+        /// Replace an existing regular file
+        #[arg(long)]
+        force: bool,
         /// Of the history, write the records alone
         #[arg(long)]
         records_only: bool,
@@ -109,10 +113,15 @@ fn run(cli: Cli) -> anyhow::Result<()> {
             let store = Store::open(&cli.store)?;
             block_on(&stop, pull(&store, &remote, &selection, &stop))
         }
-        Verb::Export { what, file, records_only } => {
-            export(&existing(&cli.store)?, &what, &file, records_only, &stop)
+        Verb::Export { what, file, force, records_only } => {
+            let destination = Destination { file: &file, force };
+            export(&existing(&cli.store)?, &what, destination, records_only, &stop)
         }
-        Verb::Import { file } => import(&Store::open(&cli.store)?, &file, &stop),
+        Verb::Import { file } => {
+            let imported = import(&Store::open(&cli.store)?, &file, &stop)?;
+            print_line!("{}: {imported}", file.display());
+            Ok(())
+        }
         Verb::Completions { shell } => {
             let mut script = Vec::new();
             clap_complete::generate(shell, &mut Cli::command(), NAME, &mut script);

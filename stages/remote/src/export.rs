@@ -11,6 +11,7 @@ use serde::Serialize;
 use store::{Record, Store};
 
 use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
+use crate::destination::Destination;
 use crate::intake::entered;
 use crate::progress::Progress;
 use crate::selection::{one, with_history};
@@ -20,10 +21,11 @@ use crate::transfer::Checked;
 pub(crate) fn export(
     store: &Store,
     what: &str,
-    file: &Path,
+    destination: Destination<'_>,
     records_only: bool,
     stop: &Arc<AtomicBool>,
 ) -> anyhow::Result<()> {
+    destination.check()?;
     let run = store.begin_run(&entered(store, stop)?, std::env::args().collect())?;
     let id = run.id().to_owned();
     let written = (|| {
@@ -33,7 +35,7 @@ pub(crate) fn export(
             run.needs(&entered, &record.stage, key)?;
         }
         drop(entered);
-        history.write(store, file, stop)
+        history.write(store, destination, stop)
     })();
     // Reading is no use that keeps an artifact longer.
     run.end()?;
@@ -94,19 +96,19 @@ impl History {
         Ok(Self { artifact, records, objects })
     }
 
-    fn write(&self, store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyhow::Result<()> {
+    fn write(
+        &self,
+        store: &Store,
+        destination: Destination<'_>,
+        stop: &Arc<AtomicBool>,
+    ) -> anyhow::Result<()> {
         let mut manifests = Vec::new();
         for identity in &self.objects {
             manifests.push((identity, store.manifest(identity)?));
         }
         let total = manifests.iter().map(|(_, manifest)| manifest.size()).sum();
-        let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let temporary = tempfile::Builder::new()
-            .prefix(".")
-            .suffix(".partial")
-            .permissions(mode(0o666))
-            .tempfile_in(folder);
-        let temporary = temporary.with_context(|| folder.display().to_string())?;
+        let file = destination.file;
+        let temporary = destination.begin()?;
         let mut out = Writer {
             tar: tar::Builder::new(BufWriter::with_capacity(1 << 20, temporary)),
             name: file.display().to_string(),
@@ -123,9 +125,7 @@ impl History {
             .tar
             .into_inner()
             .and_then(|buffer| buffer.into_inner().map_err(io::IntoInnerError::into_error));
-        let temporary = temporary.with_context(|| file.display().to_string())?;
-        temporary.as_file().sync_all().with_context(|| file.display().to_string())?;
-        temporary.persist(file).map_err(|e| e.error).with_context(|| file.display().to_string())?;
+        destination.finish(temporary.with_context(|| file.display().to_string())?)?;
         drop(out.progress);
         let (records, objects) =
             (counted(self.records.len(), "record"), counted(self.objects.len(), "artifact"));
@@ -148,10 +148,6 @@ impl History {
         };
         out.json(INDEX, &index)
     }
-}
-
-fn mode(mode: u32) -> std::fs::Permissions {
-    std::os::unix::fs::PermissionsExt::from_mode(mode)
 }
 
 struct Writer {

@@ -1,15 +1,16 @@
+use std::fmt;
 use std::fs::File;
-use std::io::{BufReader, Read, Write as _};
+use std::io::{self, BufReader, Read, Write as _};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, print_line, sized};
+use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, file_kind, sized};
 use store::{Arrival, Record, Store, is_hash};
 
 use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
-use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, read_manifest, read_record};
+use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, create, read_manifest, read_record};
 use crate::progress::Progress;
 use crate::transfer::Checked;
 
@@ -18,11 +19,30 @@ const PATH_LIMIT: u64 = 8 << 10;
 const PIECE_BYTES: usize = 1 << 18;
 const REMEDY: &str = "nothing is taken in; export it again from a whole store";
 
+/// Content of an archive that was read.
+#[derive(Debug)]
+pub struct Imported {
+    records: usize,
+    objects: usize,
+    /// Size of the archive.
+    bytes: u64,
+    /// Number of records that the store didn't have.
+    new: usize,
+}
+
+impl fmt::Display for Imported {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (records, objects) =
+            (counted(self.records, "record"), counted(self.objects, "artifact"));
+        let (size, new) = (sized(self.bytes), self.new);
+        write!(f, "{records} and {objects} read ({size}), {new} records new")
+    }
+}
+
 /// Reads what `export` wrote. Nothing is taken in before all is verified.
-pub(crate) fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyhow::Result<()> {
+pub fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyhow::Result<Imported> {
     let name = file.display().to_string();
-    let open = File::open(file).and_then(|open| Ok((open.metadata()?.len(), open)));
-    let (total, open) = open.map_err(|e| Failure::BadInput(format!("{name}: {e}")))?;
+    let (total, open) = open(file)?;
     let mut archive = tar::Archive::new(BufReader::with_capacity(1 << 20, open));
     let entries = archive.entries().with_context(|| name.clone())?.raw(true);
     let intake = Intake::begin(store, stop)?;
@@ -43,14 +63,21 @@ pub(crate) fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyh
     drop(reader);
     let new = take_in(&intake, &arrivals, records)?;
     intake.end()?;
-    let (records, objects) =
-        (counted(index.actions.len(), "record"), counted(index.objects.len(), "artifact"));
-    print_line!(
-        "{}: {records} and {objects} read ({}), {new} records new",
-        file.display(),
-        sized(total)
-    );
-    Ok(())
+    Ok(Imported { records: index.actions.len(), objects: index.objects.len(), bytes: total, new })
+}
+
+/// Opens an archive; returns its size, too. A named pipe would be waited for, and a device has no
+/// end.
+fn open(file: &Path) -> anyhow::Result<(u64, File)> {
+    let unreadable =
+        |problem: io::Error| Failure::BadInput(format!("{}: {problem}", file.display()));
+    let found = file.metadata().map_err(unreadable)?;
+    if !found.is_file() {
+        let (name, kind) = (file.display(), file_kind(found.file_type()));
+        let problem = format!("{name} is {kind}, not a regular file; save the archive as a file");
+        return Err(Failure::BadInput(problem).into());
+    }
+    Ok((found.len(), File::open(file).map_err(unreadable)?))
 }
 
 /// Objects first, each with its records, and then records that stand alone. How many records are
@@ -192,8 +219,7 @@ impl<'a, R: Read> Reader<'a, R> {
             let sizes = format!("{} bytes where the manifest says {}", entry.size(), file.size);
             return Err(self.refuse(format!("{path:?} has {sizes}")));
         }
-        let mut out =
-            to.map(|to| create(to).with_context(|| to.display().to_string())).transpose()?;
+        let mut out = to.map(create).transpose()?;
         let name = self.name_of(&path);
         let mut checked = Checked::new(file);
         let mut piece = vec![0; PIECE_BYTES];
@@ -226,11 +252,4 @@ impl<'a, R: Read> Reader<'a, R> {
             None => Ok(()),
         }
     }
-}
-
-fn create(path: &Path) -> std::io::Result<File> {
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    File::create_new(path)
 }

@@ -1,3 +1,5 @@
+use std::fs::{self, File};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,6 +12,14 @@ use store::{Arrival, Entered, Locked, Record, RunFile, Store, is_hash};
 pub(crate) const RECORD_LIMIT: u64 = 4 << 20;
 /// A manifest has some 150 bytes a file.
 pub(crate) const MANIFEST_LIMIT: u64 = 64 << 20;
+
+/// Maximum number of folders in a path, with the file. `std::fs::remove_dir_all` keeps each folder
+/// on its way open, and a process may often open 1024 files.
+const MAX_DEPTH: usize = 100;
+/// Maximum number of characters of a refused path in a message.
+const SHOWN_CHARS: usize = 200;
+/// Maximum length of a path, in bytes: the folders above also need some of the system's 4096.
+const MAX_PATH_BYTES: usize = 1000;
 
 /// What is being copied into a store. It is a run: garbage collection leaves alone what a run
 /// needs, and clears what a killed one left behind.
@@ -121,13 +131,34 @@ pub(crate) fn read_manifest(folder: &Path, identity: &str, name: &str) -> anyhow
     }
     match manifest.files.iter().find(|file| !is_plain(file)) {
         Some(file) => {
-            Err(refuse(format!("{:?} is not the path of an artifact's file", file.path)).into())
+            let path: String = file.path.chars().take(SHOWN_CHARS).collect();
+            Err(refuse(format!("{path:?} is not the path of an artifact's file")).into())
         }
         None => Ok(manifest),
     }
 }
 
+/// Returns whether a path is one as nerf-sr writes them, and can be created and removed again.
 fn is_plain(file: &FileEntry) -> bool {
     file.path != MANIFEST_FILE
+        && file.path.len() <= MAX_PATH_BYTES
         && relative_path(&file.path).is_ok_and(|path| path.to_str() == Some(file.path.as_str()))
+        && file.path.split('/').count() <= MAX_DEPTH
+}
+
+/// Creates a file of an artifact in a scratch folder. A path that this file system doesn't take is
+/// the sender's mistake; any other failure would meet all files.
+pub(crate) fn create(path: &Path) -> anyhow::Result<File> {
+    let folder = path.parent().unwrap_or(path);
+    fs::create_dir_all(folder).and_then(|()| File::create_new(path)).map_err(|error| {
+        let name = path.display().to_string();
+        match error.kind() {
+            ErrorKind::InvalidFilename
+            | ErrorKind::InvalidInput
+            | ErrorKind::AlreadyExists
+            | ErrorKind::NotADirectory
+            | ErrorKind::IsADirectory => Failure::BadInput(format!("{name}: {error}")).into(),
+            _ => anyhow::Error::new(error).context(name),
+        }
+    })
 }

@@ -8,6 +8,7 @@ use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, one_line, print_line,
 use store::{Record, Store, StoreError};
 
 use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, read_manifest, read_record};
+use crate::listing::{ACTIONS, Listing};
 use crate::progress::Progress;
 use crate::remote::{Access, Remote};
 use crate::selection::Selection;
@@ -67,7 +68,11 @@ async fn missing_records(
     progress: &Arc<Progress>,
     refused: &mut Vec<anyhow::Error>,
 ) -> anyhow::Result<(Vec<Record>, usize)> {
-    let mut keys = remote.keys().await?;
+    let Listing { mut keys, odd } = remote.records().await?;
+    for name in odd {
+        let file = remote.name(&format!("{ACTIONS}/{name}"));
+        refused.push(Failure::BadInput(format!("{file}: not a record; remove the file")).into());
+    }
     let all_are_meant = selection.keys.is_empty() && selection.artifacts.is_empty();
     let count = keys.len();
     if all_are_meant {

@@ -26,7 +26,7 @@ pub(crate) async fn push(
     let selected = selection.of(&records, &place)?;
     let run = store.begin_run(&entered(store, stop)?, std::env::args().collect())?;
     let id = run.id().to_owned();
-    let there: BTreeSet<String> = remote.keys().await?.into_iter().collect();
+    let there: BTreeSet<String> = remote.records().await?.keys.into_iter().collect();
     let missing: Vec<&Record> =
         selected.iter().filter(|key| !there.contains(*key)).map(|key| &records[key]).collect();
     {
@@ -91,14 +91,14 @@ async fn push_object(
 ) -> anyhow::Result<()> {
     let folder = store.object(&output);
     let manifest = Manifest::read(&folder)?;
-    let there = transfer.remote.list(&format!("objects/{output}")).await?;
+    let object = format!("objects/{output}");
+    let there = transfer.remote.has_files(&object, &manifest.files).await?;
     let mut missing = Vec::new();
-    for entry in manifest.files {
-        let to = format!("objects/{output}/{}", entry.path);
-        if there.get(&transfer.remote.path(&to)) == Some(&entry.size) {
+    for (entry, is_there) in manifest.files.into_iter().zip(there) {
+        if is_there {
             transfer.progress.add(entry.size)?;
         } else {
-            missing.push((folder.join(&entry.path), to, entry));
+            missing.push((folder.join(&entry.path), format!("{object}/{}", entry.path), entry));
         }
     }
     all(missing
@@ -107,7 +107,7 @@ async fn push_object(
     .await?;
     let path = folder.join(MANIFEST_FILE);
     let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
-    transfer.remote.write(&format!("objects/{output}/{MANIFEST_FILE}"), bytes).await?;
+    transfer.remote.write(&format!("{object}/{MANIFEST_FILE}"), bytes).await?;
     for record in records {
         transfer.progress.add(0)?;
         let mut bytes = serde_json::to_vec_pretty(&record)?;

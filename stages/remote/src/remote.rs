@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::Failure;
+use artifact::{Failure, FileEntry, one_line};
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use object_store::aws::AmazonS3Builder;
 use object_store::local::LocalFileSystem;
@@ -12,7 +12,10 @@ use object_store::path::Path;
 use object_store::{
     ClientOptions, GetResult, ObjectStore, ObjectStoreExt as _, PutPayload, RetryConfig,
 };
-use store::{FORMAT, is_hash};
+use store::FORMAT;
+
+use crate::folder::Folder;
+use crate::listing::{ACTIONS, Listing};
 
 /// A server that says nothing for so long is given up.
 const LONGEST_SILENCE: Duration = Duration::from_secs(60);
@@ -26,6 +29,8 @@ const FORMAT_LIMIT: u64 = 100;
 #[derive(Clone, Debug)]
 pub(crate) struct Remote {
     pub(crate) files: Arc<dyn ObjectStore>,
+    /// The remote's folder, if the remote is one.
+    folder: Option<Folder>,
     prefix: Path,
     name: String,
     /// What a request that failed may lack.
@@ -81,7 +86,17 @@ impl Remote {
         }
         // A record that survives a power cut must not outlive its artifact.
         let files = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true);
-        Ok(Self { files: Arc::new(files), prefix: Path::default(), name, hint: "" })
+        let mut folder = Folder::new(folder, files.clone());
+        if access == Access::Write {
+            folder = folder.for_push().with_context(|| name.clone())?;
+        }
+        Ok(Self {
+            files: Arc::new(files),
+            folder: Some(folder),
+            prefix: Path::default(),
+            name,
+            hint: "",
+        })
     }
 
     /// Credentials, region and endpoint come from the usual `AWS_…` variables.
@@ -118,7 +133,7 @@ impl Remote {
         } else {
             NO_IDENTITY
         };
-        Ok(Self { files: Arc::new(files), prefix, name, hint })
+        Ok(Self { files: Arc::new(files), folder: None, prefix, name, hint })
     }
 
     /// Where a file of the store is kept. Names with characters that a server or a file system may
@@ -140,12 +155,30 @@ impl Remote {
         format!("{}{}", self.name(file), self.hint)
     }
 
+    /// Returns the failure of reading a file. In a folder it concerns this file alone; a server
+    /// that has failed after all retries fails for all files.
+    pub(crate) fn unreadable(&self, file: &str, error: object_store::Error) -> anyhow::Error {
+        match self.folder {
+            Some(_) => {
+                let problem = format!("{}: {}", self.name(file), one_line(&error.into()));
+                Failure::BadInput(problem).into()
+            }
+            None => anyhow::Error::new(error).context(self.failed(file)),
+        }
+    }
+
     /// Opens a file; none where it isn't there.
     pub(crate) async fn get(&self, file: &str) -> anyhow::Result<Option<GetResult>> {
-        match self.files.get(&self.path(file)).await {
+        let path = self.path(file);
+        if let Some(folder) = &self.folder
+            && !folder.has(&path, &self.name(file))?
+        {
+            return Ok(None);
+        }
+        match self.files.get(&path).await {
             Ok(found) => Ok(Some(found)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
-            Err(error) => Err(error).with_context(|| self.failed(file)),
+            Err(error) => Err(self.unreadable(file, error)),
         }
     }
 
@@ -155,7 +188,7 @@ impl Remote {
         let mut bytes = Vec::new();
         let mut stream = found.into_stream();
         while let Some(piece) = stream.next().await {
-            bytes.extend_from_slice(&piece.with_context(|| self.failed(file))?);
+            bytes.extend_from_slice(&piece.map_err(|e| self.unreadable(file, e))?);
             if bytes.len() as u64 > limit {
                 return Err(Failure::BadInput(format!(
                     "{}: more than {limit} bytes",
@@ -169,27 +202,72 @@ impl Remote {
 
     /// Writes a file at once: a reader sees the old or the new one.
     pub(crate) async fn write(&self, file: &str, bytes: Vec<u8>) -> anyhow::Result<()> {
+        let staged = self.staged(file);
         self.files
-            .put(&self.path(file), PutPayload::from(bytes))
+            .put(&staged, PutPayload::from(bytes))
             .await
             .with_context(|| self.failed(file))?;
-        Ok(())
+        self.place(&staged, file).await
     }
 
-    /// Every file below a folder with its size.
-    pub(crate) async fn list(&self, folder: &str) -> anyhow::Result<BTreeMap<Path, u64>> {
+    /// Returns the path to write a file to until [`Remote::place`] gives the file its own.
+    pub(crate) fn staged(&self, file: &str) -> Path {
+        self.folder.as_ref().and_then(Folder::staged).unwrap_or_else(|| self.path(file))
+    }
+
+    /// Moves a file that is whole to its path; on a server it is there already.
+    pub(crate) async fn place(&self, staged: &Path, file: &str) -> anyhow::Result<()> {
+        if self.folder.is_none() {
+            return Ok(());
+        }
+        self.files.rename(staged, &self.path(file)).await.with_context(|| self.failed(file))
+    }
+
+    /// Lists the files below a folder of a server with their sizes.
+    async fn list(&self, folder: &str) -> anyhow::Result<BTreeMap<Path, u64>> {
         let entries =
             self.files.list(Some(&self.path(folder))).map_ok(|meta| (meta.location, meta.size));
         entries.try_collect().await.with_context(|| self.failed(folder))
     }
 
-    /// Keys that have a record, sorted.
-    pub(crate) async fn keys(&self) -> anyhow::Result<Vec<String>> {
-        let files = self.list("actions").await?;
-        let keys = files
-            .keys()
-            .filter_map(|path| Some(path.filename()?.strip_suffix(".json")?.to_owned()));
-        Ok(keys.filter(|key| is_hash(key)).collect())
+    /// Returns for each file of an artifact whether the artifact's folder on the remote, `object`,
+    /// has a file of its name and size.
+    pub(crate) async fn has_files(
+        &self,
+        object: &str,
+        files: &[FileEntry],
+    ) -> anyhow::Result<Vec<bool>> {
+        let paths = files.iter().map(|file| self.path(&format!("{object}/{}", file.path)));
+        let paths = paths.zip(files.iter().map(|file| file.size));
+        if let Some(folder) = &self.folder {
+            return Ok(paths.map(|(path, size)| folder.has_size(&path, size)).collect());
+        }
+        let sizes = self.list(object).await?;
+        Ok(paths.map(|(path, size)| sizes.get(&path) == Some(&size)).collect())
+    }
+
+    /// Lists the records.
+    pub(crate) async fn records(&self) -> anyhow::Result<Listing> {
+        let mut listing = match &self.folder {
+            Some(folder) => folder.records()?,
+            None => self.records_of_server().await?,
+        };
+        listing.sort();
+        Ok(listing)
+    }
+
+    async fn records_of_server(&self) -> anyhow::Result<Listing> {
+        let (mut listing, actions) = (Listing::default(), self.path(ACTIONS));
+        for path in self.list(ACTIONS).await?.into_keys() {
+            let inside: Vec<_> = path.prefix_match(&actions).into_iter().flatten().collect();
+            match &inside[..] {
+                // An empty object may stand for the folder.
+                [] => {}
+                [name] => listing.add(name.as_ref()),
+                _ => listing.odd.push(path.to_string()),
+            }
+        }
+        Ok(listing)
     }
 
     /// Refuses a remote of a newer form, and for reading one that isn't marked; marks it for

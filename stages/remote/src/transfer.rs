@@ -10,6 +10,7 @@ use futures_util::StreamExt as _;
 use object_store::{ObjectStoreExt as _, WriteMultipart};
 use tokio::sync::Semaphore;
 
+use crate::intake::create;
 use crate::progress::Progress;
 use crate::remote::Remote;
 
@@ -54,15 +55,19 @@ impl Transfer {
             return self.remote.write(to, bytes).await;
         }
         let part = LEAST_PART_BYTES.max(entry.size.div_ceil(MOST_PARTS));
+        let staged = self.remote.staged(to);
         let upload = self
             .remote
             .files
-            .put_multipart(&self.remote.path(to))
+            .put_multipart(&staged)
             .await
             .with_context(|| self.remote.failed(to))?;
         let mut upload = WriteMultipart::new_with_chunk_size(upload, part as usize);
         match self.write_parts(&mut upload, file, part, checked, from).await {
-            Ok(()) => upload.finish().await.map(|_| ()).with_context(|| self.remote.failed(to)),
+            Ok(()) => {
+                upload.finish().await.with_context(|| self.remote.failed(to))?;
+                self.remote.place(&staged, to).await
+            }
             Err(error) => {
                 // The first error counts, whatever became of the clean-up.
                 upload.abort().await.ok();
@@ -109,14 +114,11 @@ impl Transfer {
                 Failure::BadInput(format!("{name}: it is not there; {REMOTE_REMEDY}")).into()
             );
         };
-        if let Some(folder) = to.parent() {
-            std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
-        }
-        let mut file = File::create_new(to).with_context(|| to.display().to_string())?;
+        let mut file = create(to)?;
         let mut checked = Checked::new(entry);
         let mut stream = found.into_stream();
         while let Some(piece) = stream.next().await {
-            let piece = piece.with_context(|| name.clone())?;
+            let piece = piece.map_err(|error| self.remote.unreadable(from, error))?;
             checked.take(&piece, &self.progress, &name)?;
             file.write_all(&piece).with_context(|| to.display().to_string())?;
         }

@@ -15,7 +15,7 @@ fn exported(dir: &Path, store: &Store, what: &str, options: &[&str]) -> PathBuf 
     let file = dir.join("export.tar");
     let name = file.display().to_string();
     let words: Vec<&str> =
-        ["export", what, &name].into_iter().chain(options.iter().copied()).collect();
+        ["export", what, &name, "--force"].into_iter().chain(options.iter().copied()).collect();
     succeed(&mut command(store.root(), &words));
     file
 }

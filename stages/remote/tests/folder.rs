@@ -3,11 +3,15 @@
 mod common;
 
 use std::fs;
+use std::os::unix::ffi::OsStrExt as _;
+use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 
 use artifact::{MANIFEST_FILE, Manifest, write_json};
-use common::{Setup, assert_clean, assert_equal, assert_tidy, command, make, said, succeed};
+use common::{
+    Setup, assert_clean, assert_equal, assert_tidy, command, make, make_pipe, said, succeed,
+};
 use store::{Record, Store};
 
 #[test]
@@ -100,6 +104,11 @@ fn edit(path: &Path, change: impl FnOnce(&mut Vec<u8>)) {
     fs::write(path, bytes).unwrap();
 }
 
+fn replace(path: &Path, make: impl FnOnce(&Path)) {
+    fs::remove_file(path).unwrap();
+    make(path);
+}
+
 /// A record whose artifact's manifest names a file outside.
 fn lead_outside(setup: &Setup, path: &str) {
     let mut manifest = Manifest::read(&setup.store.object(&setup.records[3].output)).unwrap();
@@ -144,6 +153,30 @@ fn harm_is_refused_by_name() {
         (MANIFEST_FILE, "not the path of an artifact's file", |s| {
             lead_outside(s, "./metrics.json");
         }),
+        ("metrics.json", "is a named pipe (FIFO)", |s| {
+            replace(&on_remote(s, 3, "metrics.json"), make_pipe);
+        }),
+        (MANIFEST_FILE, "is a named pipe (FIFO)", |s| {
+            replace(&on_remote(s, 3, MANIFEST_FILE), make_pipe);
+        }),
+        (".json", "is a named pipe (FIFO)", |s| replace(&record_file(s, 3), make_pipe)),
+        ("metrics.json", "symbolic links", |s| {
+            replace(&on_remote(s, 3, "metrics.json"), |p| symlink("metrics.json", p).unwrap());
+        }),
+        (".json", "symbolic links", |s| {
+            replace(&record_file(s, 3), |p| symlink(p.file_name().unwrap(), p).unwrap());
+        }),
+        (MANIFEST_FILE, "is a folder", |s| {
+            replace(&on_remote(s, 3, MANIFEST_FILE), |p| fs::create_dir(p).unwrap());
+        }),
+        ("/xxxx", "File name too long", |s| lead_outside(s, &"x".repeat(300))),
+        (MANIFEST_FILE, "not the path of an artifact's file", |s| {
+            lead_outside(s, &format!("{}x", "folder/".repeat(150)));
+        }),
+        (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, &"../".repeat(2000))),
+        (MANIFEST_FILE, "not the path of an artifact's file", |s| {
+            lead_outside(s, &format!("{}x", "a/".repeat(400)));
+        }),
         (".json", "not a record", |s| edit(&record_file(s, 3), |b| b.truncate(40))),
         (".json", "its key is not its name", |s| {
             fs::copy(record_file(s, 0), record_file(s, 3)).map(|_| ()).unwrap();
@@ -176,6 +209,7 @@ fn harm_is_refused_by_name() {
             code == 3 && lines.len() == 2 && lines[0].contains(name) && lines[0].contains(reason),
             "{reason}: {code} {err}"
         );
+        assert!(lines[0].len() < 600, "{reason}: {err}");
         assert!(lines[1].contains("1 file refused"), "{err}");
         assert_eq!(
             (store.records().unwrap().len(), store.objects().unwrap().len()),
@@ -193,6 +227,50 @@ fn copy(from: &Path, to: &Path) {
         let target = to.join(relative);
         fs::create_dir_all(target.parent().unwrap()).unwrap();
         fs::copy(file, target).unwrap();
+    }
+}
+
+/// Whatever lies among the records, all records come in; what may be a lost one is named.
+#[test]
+fn odd_names_stop_nothing() {
+    type Make = fn(&Path);
+    let file: Make = |path| fs::write(path, "{}").unwrap();
+    let cases: &[(&[u8], i32, Make)] = &[
+        (b"\xff.json", 3, file),
+        (b"\xff", 3, file),
+        (b"notes.json", 3, file),
+        (b"folder", 3, |path| fs::create_dir(path).unwrap()),
+        (b"loop", 3, |path| symlink(".", path).unwrap()),
+        (b"self", 3, |path| symlink("self", path).unwrap()),
+        (b"gone", 3, |path| symlink("nowhere", path).unwrap()),
+        (b"pipe", 3, make_pipe),
+        (b"README", 0, file),
+        (b"._notes.json", 0, file),
+        (b"field.json#1", 0, file),
+    ];
+    let setup = Setup::pushed();
+    for &(name, expected, make) in cases {
+        let odd = setup.path("remote/actions").join(std::ffi::OsStr::from_bytes(name));
+        make(&odd);
+        let (code, err, store) = setup.pull("other", &[]);
+        let lines: Vec<&str> = err.lines().collect();
+        assert_eq!(code, expected, "{name:?}: {err}");
+        if expected == 0 {
+            assert!(lines.is_empty(), "{name:?}: {err}");
+        } else {
+            let shown = String::from_utf8_lossy(name);
+            assert!(lines.len() == 2 && lines[0].contains(&*shown), "{name:?}: {err}");
+        }
+        assert_equal(&setup.store, &store);
+        // Nor do they stop a push.
+        succeed(&mut command(setup.store.root(), &["push", &setup.remote()]));
+        fs::remove_dir_all(setup.path("other")).unwrap();
+        if odd.is_dir() && !odd.is_symlink() {
+            fs::remove_dir(&odd)
+        } else {
+            fs::remove_file(&odd)
+        }
+        .unwrap();
     }
 }
 

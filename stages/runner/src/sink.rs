@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{MANIFEST_FILE, Manifest, RunRecord, hash_json, write_json};
+use artifact::{MANIFEST_FILE, Manifest, RunRecord, hash_json, plain_files, write_json};
 use planning::{Plan, Sink};
 use serde_json::json;
 use stage_call::{Call, Display, StageFailure};
@@ -97,6 +97,8 @@ pub(crate) fn show(
     view.end();
     result?;
     program.confirm_again()?;
+    plain_files(&output)
+        .map_err(|problem| StageFailure { code: 1, message: problem.to_string() })?;
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
     if !manifest.exists() {

@@ -34,6 +34,7 @@ mod given_input;
 mod manifest;
 mod nearest;
 mod passed_over;
+mod plain;
 mod printable;
 mod run_record;
 mod warnings;
@@ -51,6 +52,7 @@ pub use manifest::{
 };
 pub use nearest::{known_names, nearest};
 pub use passed_over::has_passed_over_name;
+pub use plain::{NotPlain, file_kind, plain_files};
 pub use printable::{printable, shortened};
 pub use run_record::{
     FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, folders_of, label,

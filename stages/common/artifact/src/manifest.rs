@@ -287,7 +287,8 @@ pub fn relative_path(text: &str) -> Result<PathBuf, PathError> {
     let plain =
         path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
     if text.is_empty() || !plain || text.contains('\0') {
-        return Err(PathError(text.to_owned()));
+        // A hostile path may be as long as its file.
+        return Err(PathError(text.chars().take(200).collect()));
     }
     Ok(path.components().filter(|part| matches!(part, Component::Normal(_))).collect())
 }

@@ -1,9 +1,8 @@
-use std::fs::{self, FileType};
+use std::fs;
 use std::io::ErrorKind;
-use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
-use artifact::has_passed_over_name;
+use artifact::{file_kind, has_passed_over_name};
 
 use crate::error::DatasetError;
 use crate::misplaced::Misplaced;
@@ -36,7 +35,7 @@ pub(crate) fn find(path: &Path, wanted: &'static str) -> Found {
         Ok(there) if there.is_file() => Found::File,
         Ok(there) => Found::Other(Misplaced::Kind {
             path: path_buf(),
-            kind: kind(there.file_type()),
+            kind: file_kind(there.file_type()),
             wanted,
         }),
         Err(error) => match (broken_link(path), error.kind()) {
@@ -63,18 +62,6 @@ fn broken_link(path: &Path) -> Option<&Path> {
     ways.into_iter().find(|way| {
         fs::symlink_metadata(way).is_ok_and(|m| m.is_symlink()) && fs::metadata(way).is_err()
     })
-}
-
-fn kind(of: FileType) -> &'static str {
-    if of.is_dir() {
-        "a folder"
-    } else if of.is_fifo() {
-        "a named pipe (FIFO)"
-    } else if of.is_socket() {
-        "a socket"
-    } else {
-        "a device"
-    }
 }
 
 /// True if a file's name begins with a dot: `.DS_Store` and macOS's `._IMG_0000.png` are nobody's

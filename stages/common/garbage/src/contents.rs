@@ -11,6 +11,8 @@ pub(crate) struct Contents {
     pub(crate) action_files: Vec<String>,
     /// Bytes of the objects, by identity.
     pub(crate) objects: BTreeMap<String, u64>,
+    /// Actions that have finished, but whose folders of work are still there, by key.
+    pub(crate) left_over: Vec<String>,
     /// Actions that haven't finished, by key; where known, what they are.
     pub(crate) unfinished: BTreeMap<String, Option<Unfinished>>,
 }
@@ -31,12 +33,13 @@ impl Contents {
             let bytes = size(store, &identity)?;
             objects.insert(identity, bytes);
         }
+        let left_over = store.finished_partials()?;
         let mut unfinished = BTreeMap::new();
-        for key in store.partials()? {
+        for key in store.partials()?.into_iter().filter(|key| !left_over.contains(key)) {
             let action = store.unfinished(&key)?;
             unfinished.insert(key, action);
         }
-        Ok(Self { records, action_files, objects, unfinished })
+        Ok(Self { records, action_files, objects, left_over, unfinished })
     }
 }
 

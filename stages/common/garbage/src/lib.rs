@@ -121,7 +121,7 @@ impl Verdict {
 
     /// Removes what goes: records first, so that none names an object that is gone. The store is
     /// closed meanwhile; deleting ([`Store::empty_trash`]) can wait until it is open again.
-    pub fn carry_out(&self, store: &Store, _: &Closed) -> Result<(), StoreError> {
+    pub fn carry_out(&self, store: &Store, closed: &Closed) -> Result<(), StoreError> {
         let goes = |kept: &BTreeMap<String, String>, key: &String| !kept.contains_key(key);
         for key in self.contents.action_files.iter().filter(|key| goes(&self.kept.records, key)) {
             store.remove_record(key)?;
@@ -132,6 +132,9 @@ impl Verdict {
         for key in self.contents.unfinished.keys().filter(|key| goes(&self.kept.unfinished, key)) {
             store.remove_partial(key)?;
         }
+        for key in &self.contents.left_over {
+            store.remove_partial(key)?;
+        }
         for run in &self.runs_to_go {
             store.remove_run(run)?;
         }
@@ -140,7 +143,7 @@ impl Verdict {
                 store.remove_lock(&key)?;
             }
         }
-        Ok(())
+        store.remove_leftovers(closed)
     }
 }
 

@@ -1,12 +1,13 @@
 use std::fs;
-use std::path::PathBuf;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
 
-use artifact::{MANIFEST_FILE, Manifest, hash_json, write_json};
+use artifact::{MANIFEST_FILE, Manifest, NotPlain, hash_json, plain_files, write_json};
 use serde_json::Value;
 
 use crate::action::{Record, Unfinished};
 use crate::error::{StoreError, at};
-use crate::folder::Store;
+use crate::folder::{Store, remove};
 use crate::lock::Entered;
 use crate::objects::make_durable;
 
@@ -33,6 +34,31 @@ pub struct Checked {
     is_there: bool,
 }
 
+impl Checked {
+    /// Folder of the output.
+    pub fn output(&self) -> &Path {
+        &self.attempt.output
+    }
+}
+
+impl Attempt {
+    /// Refuses what an artifact may not contain. Replaces each file that has a second name by a
+    /// copy: whoever writes to the file under its other name would change the artifact.
+    fn own_files(&self) -> Result<(), StoreError> {
+        let files = plain_files(&self.output).map_err(|problem| match problem {
+            NotPlain::Kind { .. } => StoreError::NoArtifact(problem.to_string()),
+            NotPlain::Io(source) => StoreError::Io { path: self.output.clone(), source },
+        })?;
+        let copy = self.folder.join("copy");
+        for (file, metadata) in files {
+            if metadata.nlink() > 1 {
+                at(&file, fs::copy(&file, &copy).and_then(|_| fs::rename(&copy, &file)))?;
+            }
+        }
+        Ok(())
+    }
+}
+
 impl Store {
     /// Begins an action, with its key locked. Leftovers of a killed attempt are cleared, its
     /// checkpoints kept.
@@ -52,9 +78,7 @@ impl Store {
         };
         at(&folder, fs::create_dir_all(&folder))?;
         for leftover in [attempt.output.clone(), folder.join(".output.partial")] {
-            if leftover.exists() {
-                at(&leftover, fs::remove_dir_all(&leftover))?;
-            }
+            at(&leftover, remove(&leftover))?;
         }
         let file = folder.join("action.json");
         at(&file, write_json(&file, action))?;
@@ -63,12 +87,14 @@ impl Store {
     }
 
     /// Looks at what an attempt made: checks the manifest against the files and makes both durable.
-    /// This takes its time; taking it in ([`Store::publish`]) doesn't.
+    /// Refuses links and special files. This takes its time; taking it in ([`Store::publish`])
+    /// doesn't.
     pub fn check(&self, attempt: Attempt, kind: &str) -> Result<Checked, StoreError> {
         let output = &attempt.output;
-        if !output.is_dir() {
+        if output.symlink_metadata().is_err() {
             return Err(StoreError::NoArtifact("its --output was not made".to_owned()));
         }
+        attempt.own_files()?;
         let found = at(output, Manifest::of_folder(kind, output))?;
         if !output.join(MANIFEST_FILE).exists() {
             // The plainest stage of all, a script, may leave the hashing to the runner.
@@ -114,8 +140,11 @@ impl Store {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::symlink;
+    use std::os::unix::net::UnixListener;
+
     use super::*;
-    use crate::testing::{begin, make};
+    use crate::testing::{begin, entered, make};
 
     #[test]
     fn two_actions_may_end_in_one_object() {
@@ -127,6 +156,53 @@ mod tests {
         assert_eq!(store.objects().unwrap(), std::slice::from_ref(&a.output));
         assert_eq!(store.hit(&a.key()).unwrap(), Some(a));
         assert!(store.partials().unwrap().is_empty());
+    }
+
+    /// Nothing is written through a link, whatever the output is a link to, and the next attempt
+    /// begins anew.
+    #[test]
+    fn links_and_special_files_are_refused() {
+        type Harm = fn(&Path, &Path);
+        let cases: [(&str, Harm); 5] = [
+            ("output is a symbolic link", |out, own| symlink(own, out).unwrap()),
+            ("output is a symbolic link", |out, _| symlink("nowhere", out).unwrap()),
+            ("output is a regular file", |out, _| fs::write(out, "").unwrap()),
+            ("output/in/x is a symbolic link", |out, own| {
+                fs::create_dir_all(out.join("in")).unwrap();
+                symlink(own.join("x"), out.join("in/x")).unwrap();
+            }),
+            ("output/socket is a socket", |out, _| {
+                fs::create_dir(out).unwrap();
+                drop(UnixListener::bind(out.join("socket")).unwrap());
+            }),
+        ];
+        let dir = tempfile::tempdir().unwrap();
+        let (store, own) = (Store::open(&dir.path().join("s")).unwrap(), dir.path().join("own"));
+        fs::create_dir(&own).unwrap();
+        fs::write(own.join("x"), "mine").unwrap();
+        for (words, harm) in cases {
+            let attempt = begin(&store, "k", None);
+            harm(&attempt.output, &own);
+            let message = store.check(attempt, "text").unwrap_err().to_string();
+            assert!(message.contains(words) && !message.contains('\n'), "{words}: {message}");
+        }
+        assert_eq!(fs::read_dir(&own).unwrap().count(), 1);
+        assert_eq!(store.hit(&make(&store, "k", "1").key()).unwrap().unwrap().stage, "k");
+    }
+
+    /// A file's other name is the user's: what is written there changes no artifact.
+    #[test]
+    fn hard_links_become_copies() {
+        let dir = tempfile::tempdir().unwrap();
+        let (store, own) = (Store::open(&dir.path().join("s")).unwrap(), dir.path().join("own"));
+        fs::write(&own, "before").unwrap();
+        let attempt = begin(&store, "k", Some("1"));
+        fs::hard_link(&own, attempt.output.join("linked")).unwrap();
+        let checked = store.check(attempt, "text").unwrap();
+        let record = Record { stage: "k".to_owned(), ..Record::default() };
+        let output = store.publish(&entered(&store), checked, record).unwrap().output;
+        fs::write(&own, "after!").unwrap();
+        store.verify(&output).unwrap();
     }
 
     #[test]

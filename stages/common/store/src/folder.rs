@@ -99,15 +99,23 @@ impl Store {
     pub fn empty_trash(&self) -> Result<(), StoreError> {
         for name in self.names("trash")? {
             let path = self.root.join("trash").join(name);
-            let removed =
-                if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
-            match removed {
-                // Somebody else empties it, too.
-                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-                result => at(&path, result)?,
-            }
+            // Somebody else may empty it, too.
+            at(&path, remove(&path))?;
         }
         Ok(())
+    }
+}
+
+/// Removes a file, a link or a folder, if there is one.
+pub(crate) fn remove(path: &Path) -> io::Result<()> {
+    let removed = match path.symlink_metadata() {
+        Ok(metadata) if metadata.is_dir() => fs::remove_dir_all(path),
+        Ok(_) => fs::remove_file(path),
+        Err(error) => Err(error),
+    };
+    match removed {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        result => result,
     }
 }
 

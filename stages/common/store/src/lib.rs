@@ -39,6 +39,7 @@ mod attempt;
 mod error;
 mod folder;
 mod format;
+mod leftovers;
 mod lock;
 mod objects;
 mod run;

@@ -4,16 +4,23 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
 
 use serde_json::json;
 use store::{Entered, Locked, Record, Store, Unfinished};
 
+/// A process that another thread has just forked holds the gate of a new store until it becomes a
+/// program.
 pub(crate) fn entered(store: &Store) -> Entered {
-    match store.try_enter().unwrap() {
-        Locked::Held(entered) => entered,
-        Locked::By(_) => panic!("closed"),
+    let since = Instant::now();
+    while since.elapsed() < PATIENCE {
+        if let Locked::Held(entered) = store.try_enter().unwrap() {
+            return entered;
+        }
+        std::thread::sleep(Duration::from_millis(5));
     }
+    panic!("closed")
 }
 
 /// An action as a runner carries it out.
@@ -95,7 +102,30 @@ pub(crate) fn command(store: &Path, words: &[&str]) -> Command {
 
 /// Exit code, stdout, and stderr.
 pub(crate) fn said(command: &mut Command) -> (i32, String, String) {
-    let output = command.output().unwrap();
+    said_by(command.output().unwrap())
+}
+
+pub(crate) fn make_pipe(path: &Path) {
+    assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
+}
+
+/// Longest time for a command that has nothing to wait for.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Likewise, of a command that may wait for what never comes: then it is killed.
+pub(crate) fn said_in_time(command: &mut Command) -> (i32, String, String) {
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let pid = child.id().to_string();
+    let (sender, receiver) = std::sync::mpsc::channel();
+    std::thread::spawn(move || sender.send(child.wait_with_output()));
+    let output = receiver.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+        Command::new("kill").args(["-KILL", &pid]).status().unwrap();
+        panic!("it waits: {command:?}")
+    });
+    said_by(output.unwrap())
+}
+
+fn said_by(output: Output) -> (i32, String, String) {
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
     (output.status.code().unwrap_or(-1), text(output.stdout), text(output.stderr))
 }
@@ -162,7 +192,7 @@ impl Setup {
     pub(crate) fn pull(&self, store: &str, words: &[&str]) -> (i32, String, Store) {
         let remote = self.remote();
         let words: Vec<&str> = ["pull", &remote].into_iter().chain(words.iter().copied()).collect();
-        let (code, _, err) = said(&mut command(&self.path(store), &words));
+        let (code, _, err) = said_in_time(&mut command(&self.path(store), &words));
         (code, err, Store::open(&self.path(store)).unwrap())
     }
 }

@@ -133,7 +133,7 @@ impl NodeJob<'_> {
         inputs: &Inputs<'_>,
     ) -> Result<Record, StageFailure> {
         let (usage, time) = self.call(lock, &attempt, inputs)?;
-        let record = Record {
+        let mut record = Record {
             stage: action.stage,
             point: action.point,
             key_parts: action.key_parts,
@@ -145,10 +145,12 @@ impl NodeJob<'_> {
             peak_memory: Some(usage.peak_memory),
             processor_seconds: Some(milliseconds(usage.processor_seconds)),
             host: host_name(),
-            summary: std::fs::read_to_string(attempt.output.join(SUMMARY_FILE)).ok(),
+            summary: None,
         };
         let checked =
             self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
+        // Not before the check: a FIFO of this name would never end.
+        record.summary = std::fs::read_to_string(checked.output().join(SUMMARY_FILE)).ok();
         let record = self.store.publish(&self.enter()?, checked, record).map_err(fail)?;
         self.display.line(&format!(
             "{}: done in {} → {}",

@@ -1,0 +1,107 @@
+//! The file that `export` creates.
+
+use std::io;
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::{Failure, file_kind, sync_folder, temporary};
+use tempfile::NamedTempFile;
+
+use crate::leftovers::{Affixes, remove_leftovers};
+
+/// Name of an archive that is being written.
+const TEMPORARY: Affixes = (".nerf-sr-export-", ".partial");
+
+/// Path of an archive to be written.
+#[derive(Clone, Copy)]
+pub(crate) struct Destination<'a> {
+    pub(crate) file: &'a Path,
+    /// Whether a regular file is replaced.
+    pub(crate) force: bool,
+}
+
+impl Destination<'_> {
+    fn name(&self) -> String {
+        self.file.display().to_string()
+    }
+
+    fn folder(&self) -> &Path {
+        self.file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+    }
+
+    /// Fails if the path names something that may not be replaced. Only a regular file may: writing
+    /// to a device or through a link would harm what `export` doesn't know.
+    pub(crate) fn check(&self) -> anyhow::Result<()> {
+        let name = self.name();
+        let problem = match self.file.symlink_metadata() {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            Err(error) => return Err(error).context(name),
+            Ok(found) if !found.is_file() => format!(
+                "{name} is {}; an archive replaces regular files only, choose another name",
+                file_kind(found.file_type())
+            ),
+            Ok(_) if self.force => return Ok(()),
+            Ok(_) => format!(
+                "{name}: the file exists; choose another name, or replace the file with --force"
+            ),
+        };
+        Err(Failure::Usage(problem).into())
+    }
+
+    /// Creates the temporary file that becomes the archive.
+    pub(crate) fn begin(&self) -> anyhow::Result<NamedTempFile> {
+        let folder = self.folder();
+        remove_leftovers(folder, TEMPORARY);
+        let file = temporary(0o666).prefix(TEMPORARY.0).suffix(TEMPORARY.1).tempfile_in(folder);
+        file.with_context(|| folder.display().to_string())
+    }
+
+    /// Gives the whole archive its name. Without `force` a file that has got this name meanwhile
+    /// stays.
+    pub(crate) fn finish(&self, mut archive: NamedTempFile) -> anyhow::Result<()> {
+        archive.as_file().sync_all().with_context(|| self.name())?;
+        loop {
+            let problem = match archive.persist_noclobber(self.file) {
+                Ok(_) => break,
+                Err(problem) => problem,
+            };
+            if problem.error.kind() != io::ErrorKind::AlreadyExists {
+                return Err(problem.error).with_context(|| self.name());
+            }
+            self.check()?;
+            archive = problem.file;
+            if self.force {
+                archive.persist(self.file).map_err(|e| e.error).with_context(|| self.name())?;
+                break;
+            }
+        }
+        sync_folder(self.folder()).with_context(|| self.name())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::io::Write as _;
+
+    use super::*;
+
+    /// A file that appears while the archive is written stays, unless it may be replaced.
+    #[test]
+    fn what_appears_meanwhile_stays() {
+        for force in [false, true] {
+            let dir = tempfile::tempdir().unwrap();
+            let file = dir.path().join("export.tar");
+            let destination = Destination { file: &file, force };
+            destination.check().unwrap();
+            let mut archive = destination.begin().unwrap();
+            archive.write_all(b"archive").unwrap();
+            fs::write(&file, "precious").unwrap();
+            let finished = destination.finish(archive);
+            assert_eq!(finished.is_ok(), force);
+            let expected = if force { "archive" } else { "precious" };
+            assert_eq!(fs::read_to_string(&file).unwrap(), expected);
+            assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+        }
+    }
+}

@@ -1,0 +1,135 @@
+//! What `export` may replace, what `import` may read, and what killed commands leave.
+
+mod common;
+
+use std::fs;
+use std::os::unix::fs::{FileTypeExt as _, symlink};
+use std::os::unix::net::UnixListener;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, SystemTime};
+
+use common::{Setup, command, make_pipe, said, said_in_time, succeed};
+
+/// Everything in a folder, in words.
+fn listing(folder: &Path) -> Vec<String> {
+    let mut all: Vec<String> = fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| {
+            let path = entry.unwrap().path();
+            let kind = path.symlink_metadata().unwrap().file_type();
+            let content = if kind.is_file() { fs::read(&path).unwrap() } else { Vec::new() };
+            format!("{path:?} {kind:?} {content:?}")
+        })
+        .collect();
+    all.sort();
+    all
+}
+
+/// What isn't a regular file stays, with --force, too; a regular file is replaced only with it.
+#[test]
+fn export_replaces_nothing_unasked() {
+    type Make = fn(&Path);
+    let cases: &[(&str, &str, Make)] = &[
+        ("file", "the file exists", |path| fs::write(path, "precious").unwrap()),
+        ("pipe", "is a named pipe (FIFO)", make_pipe),
+        ("socket", "is a socket", |path| drop(UnixListener::bind(path).unwrap())),
+        ("folder", "is a folder", |path| fs::create_dir(path).unwrap()),
+        ("link", "is a symbolic link", |path| {
+            fs::write(path.with_extension("real"), "precious").unwrap();
+            symlink(path.with_extension("real"), path).unwrap();
+        }),
+        ("dangling", "is a symbolic link", |path| symlink("nowhere", path).unwrap()),
+        ("device", "is a device", |path| {
+            let made = Command::new("mknod").arg(path).args(["c", "1", "3"]).output();
+            if !path.symlink_metadata().is_ok_and(|found| found.file_type().is_char_device()) {
+                eprintln!("only root makes devices: {made:?}; a link to one stands in");
+                symlink("/dev/null", path).unwrap();
+            }
+        }),
+    ];
+    let setup = Setup::new();
+    let what = setup.records[3].output.as_str();
+    for (name, reason, make) in cases {
+        let folder = setup.path(&format!("{name}-folder"));
+        fs::create_dir(&folder).unwrap();
+        let file = folder.join(name);
+        make(&file);
+        let before = listing(&folder);
+        for options in [&[][..], &["--force"]] {
+            if *name == "file" && !options.is_empty() {
+                continue;
+            }
+            let words = [&["export", what, file.to_str().unwrap()], options].concat();
+            let (code, out, err) = said(&mut command(setup.store.root(), &words));
+            let is_said = err.contains(reason) || (*name == "device" && err.contains("link"));
+            assert!(code == 2 && is_said && err.lines().count() == 1, "{name}: {code} {out}{err}");
+            assert_eq!(listing(&folder), before, "{name}");
+        }
+    }
+    let file = setup.path("file-folder/file").display().to_string();
+    succeed(&mut command(setup.store.root(), &["export", what, &file, "--force"]));
+    succeed(&mut command(&setup.path("other"), &["import", &file]));
+    assert_eq!(listing(&setup.path("file-folder")).len(), 1);
+}
+
+/// A pipe that nobody writes to isn't waited for, a device without end isn't read.
+#[test]
+fn import_reads_regular_files_only() {
+    let dir = tempfile::tempdir().unwrap();
+    make_pipe(&dir.path().join("pipe"));
+    symlink("pipe", dir.path().join("link")).unwrap();
+    drop(UnixListener::bind(dir.path().join("socket")).unwrap());
+    for (file, reason) in [
+        ("pipe", "is a named pipe (FIFO)"),
+        ("link", "is a named pipe (FIFO)"),
+        ("socket", "is a socket"),
+        ("/dev/zero", "is a device"),
+        (".", "is a folder"),
+        ("nothing", "No such file"),
+    ] {
+        let file = dir.path().join(file).display().to_string();
+        let (code, _, err) =
+            said_in_time(&mut command(&dir.path().join("store"), &["import", &file]));
+        assert!(code == 3 && err.contains(reason) && err.lines().count() == 1, "{file}: {err}");
+    }
+}
+
+/// A file of a command that was killed so long ago.
+fn leave(path: &Path, age: Duration) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    fs::write(path, "half").unwrap();
+    for path in [path, path.parent().unwrap()] {
+        fs::File::open(path).unwrap().set_modified(SystemTime::now() - age).unwrap();
+    }
+}
+
+/// The next command removes what killed ones left, but nothing that may be in use, and no user's
+/// file.
+#[test]
+fn leftovers_of_killed_commands_go() {
+    let setup = Setup::pushed();
+    let long_ago = Duration::from_secs(2 * 3600);
+    let gone = ["remote/uploads/push-a1B2c3/0#1", "exports/.nerf-sr-export-a1B2c3.partial"];
+    let user = ["remote/uploads/notes", "exports/.a1B2c3.partial", "exports/notes.partial"];
+    let in_use = ["remote/uploads/push-d4E5f6/1", "exports/.nerf-sr-export-d4E5f6.partial"];
+    for file in gone.iter().chain(&user) {
+        leave(&setup.path(file), long_ago);
+    }
+    for file in in_use {
+        leave(&setup.path(file), Duration::ZERO);
+    }
+    let store = setup.store.root();
+    succeed(&mut command(store, &["push", &setup.remote()]));
+    let file = setup.path("exports/eval.tar").display().to_string();
+    succeed(&mut command(store, &["export", &setup.records[3].output, &file]));
+    for file in gone {
+        assert!(!setup.path(file).exists(), "{file}");
+    }
+    for file in user.iter().chain(&in_use) {
+        assert!(setup.path(file).exists(), "{file}");
+    }
+    assert_eq!(setup.pull("other", &[]).0, 0);
+    let left = fs::read_dir(setup.path("remote/uploads")).unwrap();
+    assert_eq!(left.count(), 2, "a push leaves nothing there");
+}
