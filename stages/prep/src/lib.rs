@@ -8,6 +8,7 @@
 //! * `degrade`: HR and LR images of one photograph, through Pillow's exact kernels.
 //! * `bounds`: where the scene is, from what the cameras see.
 //! * `memory`: how many images are prepared at a time.
+//! * `borders`, `strips`: what lies behind the scene, by the borders of its images.
 //! * `pose_warnings`: poses that can't be right, or hardly.
 //!
 //! The photographs are read by the crate `dataset`, whatever form their folder has.

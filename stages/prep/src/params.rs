@@ -33,7 +33,8 @@ pub struct Params {
     #[schemars(extend("x-group" = "data"))]
     pub lens: LensHandling,
     /// What lies behind the scene. Default: `white` where images have alpha. Without alpha `white`
-    /// or `black` where the borders of nine in ten views are that colour, else `opaque`.
+    /// or `black` where the borders of nine in ten views are that colour and no strips, else
+    /// `opaque`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub background: Option<Background>,
     /// Distance along rays before which nothing lies. Default: from the cameras.

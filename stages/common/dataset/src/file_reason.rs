@@ -272,8 +272,7 @@ fn listed(folders: &[ImageFolder]) -> String {
     };
     let each: Vec<String> = folders.iter().map(one).collect();
     format!(
-        "for {}; counts must match: remove the other images, or list the images with poses in \
-        view_imgs.txt",
+        "for {}; counts must match, or view_imgs.txt list the images with poses",
         each.join(" and ")
     )
 }

@@ -2,8 +2,9 @@
 //! folder's files; `Format::ALL` lists which format goes first.
 //!
 //! A new form is a module with its reader; in `format`, a variant of [`Format`], its place in
-//! `Format::ALL` and its description; in this file, how it is recognised and read. What readers
-//! share is in `found`, `frame`, `photograph` and `text`.
+//! `Format::ALL` and its description; in this file, how it is recognised and read. Readers find
+//! files by `lookup`, and share `frame`, `photograph` and `text`; `masks` finds masks next to
+//! images, `nearby` explains folders that are no data set.
 //!
 //! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left
 //! corner, scene units) and its lens's distortion; [`Frame::photograph`] reads the

@@ -10,8 +10,8 @@ use crate::found::is_hidden;
 use crate::misplaced::shown;
 use crate::present_format;
 
-/// Entries of a folder that are looked at: a home folder may have many.
-const MAX_ENTRIES: usize = 1000;
+/// Maximum number of folders two levels below that are searched: a home folder may have many.
+const MAX_FOLDERS: usize = 1000;
 /// Data sets that a message lists.
 const MAX_LISTED: usize = 3;
 /// Files by which formats are recognised.
@@ -90,9 +90,7 @@ impl Nearby {
     /// Looks for a data set, or for what may become one, in and around a folder.
     pub(crate) fn of(folder: &Path) -> Option<Self> {
         if folder.is_file() {
-            let above = folder.parent().unwrap_or(Path::new("")).to_path_buf();
-            let above = if above.as_os_str().is_empty() { PathBuf::from(".") } else { above };
-            return Some(Self::File { folder: above });
+            return Some(Self::File { folder: folder_above(folder) });
         }
         export(folder)
             .or_else(|| misnamed(folder))
@@ -105,9 +103,14 @@ impl Nearby {
 fn entries(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut paths: Vec<PathBuf> =
-        entries.take(MAX_ENTRIES).map(|e| e.path()).filter(|path| !is_hidden(path)).collect();
+        entries.map(|entry| entry.path()).filter(|path| !is_hidden(path)).collect();
     paths.sort();
     paths
+}
+
+fn folder_above(path: &Path) -> PathBuf {
+    let above = path.parent().filter(|above| !above.as_os_str().is_empty());
+    above.unwrap_or(Path::new(".")).to_path_buf()
 }
 
 fn folders(folder: &Path) -> Vec<PathBuf> {
@@ -133,24 +136,13 @@ fn export(folder: &Path) -> Option<Nearby> {
 }
 
 fn polycam(folder: &Path) -> Option<Nearby> {
-    for (cameras, data) in [
-        ("keyframes/corrected_cameras", folder),
-        ("keyframes/cameras", folder),
-        // The folder `keyframes` itself.
-        ("corrected_cameras", folder.parent()?),
-        ("cameras", folder.parent()?),
-    ] {
-        let is_keyframes = cameras.starts_with("keyframes") || text_of_name(folder) == "keyframes";
-        let sign = folder.join(cameras);
-        if is_keyframes && entries(&sign).iter().any(|path| has_extension(path, "json")) {
-            return Some(Nearby::Export {
-                application: "Polycam",
-                sign,
-                remedy: converted("polycam", data),
-            });
-        }
-    }
-    None
+    let is_inside = text_of_name(folder) == "keyframes";
+    let data = if is_inside { folder_above(folder) } else { folder.to_path_buf() };
+    let keyframes = if is_inside { folder.to_path_buf() } else { folder.join("keyframes") };
+    let mut cameras = ["corrected_cameras", "cameras"].map(|name| keyframes.join(name)).into_iter();
+    let sign = cameras.find(|path| entries(path).iter().any(|e| has_extension(e, "json")))?;
+    let remedy = converted("polycam", &data);
+    Some(Nearby::Export { application: "Polycam", sign, remedy })
 }
 
 fn record3d(folder: &Path) -> Option<Nearby> {
@@ -195,9 +187,10 @@ fn misnamed(folder: &Path) -> Option<Nearby> {
     }
     for path in &entries {
         let name = text_of_name(path);
-        let meant = match path.is_dir() {
-            true => nearest(name, ["sparse"]).filter(|_| has_model(path)).map(|_| "sparse"),
-            false => nearest(name, SIGNS).and_then(|sign| SIGNS.into_iter().find(|s| *s == sign)),
+        let meant = if path.is_dir() {
+            nearest(name, ["sparse"]).filter(|_| has_model(path))
+        } else {
+            nearest(name, SIGNS)
         };
         if let Some(meant) = meant {
             return Some(Nearby::Misspelt { found: name.to_owned(), meant });
@@ -221,7 +214,7 @@ fn below(folder: &Path) -> Option<Nearby> {
     if !sets.is_empty() {
         return Some(Nearby::Elsewhere { sets });
     }
-    let far: Vec<PathBuf> = near.iter().flat_map(|path| folders(path)).take(MAX_ENTRIES).collect();
+    let far: Vec<PathBuf> = near.iter().flat_map(|path| folders(path)).take(MAX_FOLDERS).collect();
     let sets = sets_of(&far);
     (!sets.is_empty()).then_some(Nearby::Elsewhere { sets })
 }

@@ -245,7 +245,7 @@ fn format_cases() -> Vec<Case> {
                 }
             },
             Expected::Refused(
-                "dataset: DIR/poses_bounds.npy: 2 poses for 0 images in images/ (2 in WebP, which is not read; convert: magick mogrify -format png 'DIR/images'/*.webp); counts must match: remove the other images, or list the images with poses in view_imgs.txt",
+                "dataset: DIR/poses_bounds.npy: 2 poses for 0 images in images/ (2 in WebP, which is not read; convert: magick mogrify -format png 'DIR/images'/*.webp); counts must match, or view_imgs.txt list the images with poses",
             ),
         ),
     ]

@@ -110,7 +110,7 @@ fn llff_cases() -> Vec<Case> {
             "LLFF#69: fewer poses than photographs",
             llff,
             Expected::Refused(
-                "dataset: DIR/poses_bounds.npy: 8 poses for 10 images in images/; counts must match: remove the other images, or list the images with poses in view_imgs.txt",
+                "dataset: DIR/poses_bounds.npy: 8 poses for 10 images in images/; counts must match, or view_imgs.txt list the images with poses",
             ),
         ),
         case(
