@@ -419,7 +419,8 @@ pub(crate) mod tests {
         for (bytes, words) in [
             (&bytes[..third], "a.jpg: cut short or damaged: 32 of 64 rows are missing; export"),
             (&bytes[..bytes.len() - 9], "a.jpg: cut short or damaged: 16 of 64 rows are missing;"),
-            (&bytes[..100], "a.jpg: its header can't be read (Format error"),
+            (&bytes[..100], "a.jpg: cut short or damaged: 64 of 64 rows are missing; export"),
+            (&bytes[..20], "a.jpg: its header can't be read (Format error"),
             (&progressive[..progressive.len() - 1], "detail of all 64 rows is missing; export"),
         ] {
             let message = read(bytes).unwrap_err();
