@@ -234,7 +234,7 @@ fn lenses_are_followed_or_undone() {
     let folder = as_transforms(&project);
     let file = folder.join("transforms.json");
     let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
-    let distortion = Distortion { radial: [3.0, 0.0, 0.0], tangential: [0.0, 0.05] };
+    let distortion = Distortion::brown([3.0, 0.0, 0.0], [0.0, 0.05]);
     let lens = Intrinsics { distortion, ..Intrinsics::from_angle_x(WIDTH, WIDTH, ANGLE) };
     (transforms["k1"], transforms["p2"]) =
         (json!(distortion.radial[0]), json!(distortion.tangential[1]));

@@ -24,6 +24,12 @@ images = struct.pack("<Q", 2) + image(1, b"a.png") + image(2, b"b.png")
 points = struct.pack("<QQ3d3BdQII", 1, 1, 0, 0, 5, 9, 9, 9, 0.5, 1, 1, 0)
 for which, data in enumerate([cameras, images, points]):
     seed("colmap", f"binary-{which}", bytes([which]) + data)
+fisheye = struct.pack("<QIIQQ8d", 1, 1, 5, 4, 3, 2, 2, 2, 1.5, -0.02, 0.006, -0.003, 0.0005)
+seed("colmap", "binary-fisheye", b"\0" + fisheye)
+rational = struct.pack("<QIIQQ12d", 1, 1, 6, 4, 3, 5, 5, 2, 1.5, 0.1, -0.02, 0.001, 0.002, 0.01, 0.2, -0.05, 0.01)
+seed("colmap", "binary-rational", b"\0" + rational)
+for model, numbers in {"FISHEYE": "2 2 2 1.5", "RADIAL_FISHEYE": "2 2 1.5 -0.02 0.004", "THIN_PRISM_FISHEYE": "2 2 2 1.5 0.1 0 0.01 0 0 0 0 0"}.items():
+    seed("colmap", f"text-{model}", f"\x041 {model} 4 3 {numbers}\n".encode())
 seed("colmap", "text-cameras", b"\x041 SIMPLE_RADIAL 4 3 5 2 1.5 0.1\n")
 seed("colmap", "text-images", b"\x051 1 0 0 0 0 0 1 1 a.png\n1 1 1\n2 1 0 0 0 0 0 2 1 b.png\n\n")
 seed("colmap", "text-points", b"\x061 0 0 5 9 9 9 0.5 1 0\n")
@@ -66,6 +72,18 @@ for which, text in enumerate(names):
     seed("names", f"transforms-{which}", b"\0" + text.encode())
 seed("names", "colmap", b"\1a.png\nx/b.png\nA  b.png\nimages/c.jpg\n/x/images/x/b.png")
 seed("names", "llff", b"\2b.png\r\na\r\n")
+for name, lens in {
+    "brown4": '"fl_x": 5, "k1": 0.1, "k2": -0.02, "k3": 0.003, "k4": -0.0004, "p1": 0.001',
+    "rational": '"fl_x": 5, "camera_model": "FULL_OPENCV", "k1": 0.1, "k4": 0.2, "k5": -0.05, "k6": 0.01',
+    "opencv-fisheye": '"fl_x": 1.1, "camera_model": "OPENCV_FISHEYE", "k1": -0.02, "k2": 0.006, "k3": -0.003, "k4": 0.0005',
+    "is-fisheye": '"fl_x": 2, "is_fisheye": true, "k1": 0.1, "p2": 0.01',
+}.items():
+    seed("transforms", name, f'{{{lens}, "frames": [{{"file_path": "images/a.png", "transform_matrix": {pose}}}]}}'.encode())
+for which in range(4):
+    # Radial, tangential and rational terms, focal lengths, principal point; whole numbers are shares of the largest.
+    terms = [-0.02, 0.006, -0.003, 0.0005, 0.1, 0.2, 0, 0, 0, -0.1, -0.1, 0.1, 0.1]
+    numbers = struct.pack("<13q", *(int(k * (2**63 - 1)) for k in terms)) if which & 2 == 0 else struct.pack("<13d", *terms)
+    seed("lens", str(which), bytes([which]) + numbers)
 
 chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 for bits, size in ((8, 4), (16, 8)):

@@ -7,9 +7,11 @@
 //!
 //! * `world`: shapes, where they stand, how they intersect a ray.
 //! * `material`: albedo and gloss of a point.
+//! * `camera`: what views are taken with: a pinhole camera, training views also a fisheye lens.
 //! * `render`: light, shadow, reflection, anti-aliasing.
 //! * `written`: files of both forms.
 
+mod camera;
 mod material;
 mod params;
 mod render;
@@ -21,6 +23,7 @@ use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use stage::{Context, Stage};
 
+use camera::ViewCamera;
 pub use params::{Form, Layout, Params};
 pub use render::RenderedImage;
 pub use world::World;
@@ -51,14 +54,15 @@ impl Stage for DemoScene {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let world = World::new(params.seed);
         let world = if params.backdrop { world.with_backdrop() } else { world };
-        let views = u64::from(params.train + params.test);
-        let [width, height] = params.sides();
-        let at_once = views.min(context.threads as u64);
-        let pixels = u64::from(width) * u64::from(height);
-        context.check_memory("rendering", BYTES_PER_PIXEL * pixels * at_once, REMEDY)?;
-        let progress = context.progress("rendering", views * u64::from(height));
+        let splits = [
+            ("train", params.train, ViewCamera::of_training(params)),
+            ("test", params.test, ViewCamera::of_test(params)),
+        ];
+        check_memory(context, &splits)?;
+        let rows = splits.iter().map(|(_, count, camera)| u64::from(count * camera.sides[1]));
+        let progress = context.progress("rendering", rows.sum());
         let mut written = Written::new(params);
-        for (split, count) in [("train", params.train), ("test", params.test)] {
+        for (split, count, camera) in splits {
             let poses: Vec<[[f64; 4]; 4]> =
                 (0..count).map(|i| pose(params.layout, split, i, count)).collect();
             context.output_path(&format!("{}/.", params.form.folder(split)))?;
@@ -67,26 +71,30 @@ impl Stage for DemoScene {
                 .map(|i| {
                     context.check_interrupt()?;
                     let pose = &poses[i as usize];
-                    let frame = render::render(
-                        &world,
-                        pose,
-                        params.angle_x(),
-                        params.sides(),
-                        params.samples_per_axis,
-                        &progress,
-                    );
+                    let samples = params.samples_per_axis;
+                    let frame = render::render(&world, pose, &camera, samples, &progress);
                     params.form.write_view(context, split, i, &frame)
                 })
                 .collect::<anyhow::Result<Vec<()>>>()?;
-            written.add(context, split, &poses)?;
+            written.add(context, split, &camera, &poses)?;
         }
         written.end(context)?;
+        let [width, height] = splits[0].2.sides;
         context.write_summary(&format!(
             "{}, {}, {width}×{height}",
             artifact::counted(params.train as usize, "training view"),
             artifact::counted(params.test as usize, "test view"),
         ))
     }
+}
+
+/// Fails unless there is memory for the views that are rendered at once.
+fn check_memory(context: &Context, splits: &[(&str, u32, ViewCamera)]) -> anyhow::Result<()> {
+    let needs = splits.iter().map(|(_, count, camera)| {
+        let pixels = u64::from(camera.sides[0]) * u64::from(camera.sides[1]);
+        BYTES_PER_PIXEL * pixels * u64::from(*count).min(context.threads as u64)
+    });
+    Ok(context.check_memory("rendering", needs.max().unwrap_or(0), REMEDY)?)
 }
 
 /// Camera `i` of `count`. Around: training views spread evenly over the upper hemisphere, test
@@ -127,16 +135,20 @@ fn matrix(r: DMat3, centre: DVec3) -> [[f64; 4]; 4] {
 
 #[cfg(test)]
 mod tests {
+    use scene::Projection;
     use stage::Progress;
 
     use super::*;
-    use crate::params::CAMERA_ANGLE;
+
+    fn test_camera(size: u32, aspect: f64) -> ViewCamera {
+        ViewCamera::of_test(&Params { size, aspect, ..Params::default() })
+    }
 
     #[test]
     fn depth_is_that_of_the_surface() {
         let world = World::new(0);
         let pose = pose(Layout::Around, "test", 3, 10);
-        let frame = render::render(&world, &pose, CAMERA_ANGLE, [64, 64], 2, &Progress::silent());
+        let frame = render::render(&world, &pose, &test_camera(64, 1.0), 2, &Progress::silent());
         let seen: Vec<f32> = frame.depth.iter().flatten().copied().collect();
         assert!(seen.len() > 64 * 64 / 8, "{} pixels see something", seen.len());
         assert!(seen.iter().all(|z| (2.0..6.0).contains(z)));
@@ -183,17 +195,11 @@ mod tests {
         // would be guesses.
         let world = World::new(0);
         for aspect in [1.0, 1.5, 0.75] {
-            let params = Params { size: 48, aspect, ..Params::default() };
-            let [width, height] = params.sides();
+            let camera = test_camera(48, aspect);
+            let [width, height] = camera.sides;
             for i in 0..10 {
-                let frame = render::render(
-                    &world,
-                    &pose(Layout::Around, "test", i, 10),
-                    params.angle_x(),
-                    [width, height],
-                    1,
-                    &Progress::silent(),
-                );
+                let pose = pose(Layout::Around, "test", i, 10);
+                let frame = render::render(&world, &pose, &camera, 1, &Progress::silent());
                 let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
                 for (x, y) in rows.chain((0..height).flat_map(|y| [(0, y), (width - 1, y)])) {
                     let alpha = frame.colour.data[((y * width + x) * 4 + 3) as usize];
@@ -204,20 +210,39 @@ mod tests {
     }
 
     fn view(seed: u32) -> pixels::Rgba8 {
-        render::render(
-            &World::new(seed),
-            &pose(Layout::Around, "test", 0, 10),
-            CAMERA_ANGLE,
-            [32, 32],
-            1,
-            &Progress::silent(),
-        )
-        .colour
+        let pose = pose(Layout::Around, "test", 0, 10);
+        let camera = test_camera(32, 1.0);
+        render::render(&World::new(seed), &pose, &camera, 1, &Progress::silent()).colour
     }
 
     #[test]
     fn seeds_differ() {
         assert_eq!(view(0), view(0));
         assert_ne!(view(0), view(1));
+    }
+
+    /// A fisheye's middle has as many pixels per degree as a test view, its border is seen at the
+    /// angle asked for, and corners beyond 89° are black.
+    #[test]
+    fn a_fisheye_view_is_taken_through_its_lens() {
+        let params = Params {
+            size: 40,
+            projection: Projection::Fisheye,
+            angle: Some(150.0),
+            ..Params::default()
+        };
+        let [camera, test] = [ViewCamera::of_training(&params), ViewCamera::of_test(&params)];
+        let axes = [DVec3::X, DVec3::Y, DVec3::Z];
+        let angle = |camera: &ViewCamera, from_middle: f64| {
+            let [cx, cy] = camera.sides.map(|side| 0.5 * f64::from(side));
+            camera.direction([cx + from_middle, cy], axes).unwrap().dot(-DVec3::Z).acos()
+        };
+        assert!((angle(&camera, 0.1) - angle(&test, 0.1)).abs() < 1e-6);
+        let half = 0.5 * f64::from(camera.sides[0]);
+        assert!((angle(&camera, half).to_degrees() - 75.0).abs() < 0.5, "{camera:?}");
+        assert_eq!(camera.direction([0.0, 0.0], axes), None);
+        let pose = pose(Layout::Around, "train", 3, 10);
+        let frame = render::render(&World::new(0), &pose, &camera, 1, &Progress::silent());
+        assert_eq!(frame.colour.data[..4], [0, 0, 0, 255]);
     }
 }

@@ -1,3 +1,4 @@
+use scene::Projection;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -8,7 +9,7 @@ pub(crate) const CAMERA_ANGLE: f64 = 0.691_111_2;
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the images, in pixels.
+    /// Width of the images, in pixels; where `projection` or `angle` is given, of the test views.
     #[schemars(range(min = 1, max = 2048))]
     pub size: u32,
     /// Width over height.
@@ -23,6 +24,14 @@ pub struct Params {
     /// Rays along each side of a pixel, against aliasing.
     #[schemars(range(min = 1, max = 16))]
     pub samples_per_axis: u32,
+    /// Projection of the training views' lens. Test views are always a pinhole camera's. A
+    /// `fisheye` lens has OpenCV's model, and black beyond 89° from its axis.
+    pub projection: Projection,
+    /// Angle of view of the training views across the shorter side, in degrees. They have as many
+    /// pixels per degree in the middle as the test views. Default: that of the test views, 39.6, or
+    /// 120 through a fisheye lens.
+    #[schemars(range(min = 10.0, max = 170.0), extend("x-default" = "by `projection`"))]
+    pub angle: Option<f64>,
     /// Where cameras stand.
     pub layout: Layout,
     /// Adds an unbounded background: ground, towers far away, a sky.
@@ -45,7 +54,16 @@ pub enum Form {
     Transforms,
 }
 
+/// Angle of view of a fisheye lens across the shorter side unless given, in degrees.
+const FISHEYE_ANGLE: f64 = 120.0;
+
 impl Params {
+    /// Angle of view of the training views across the shorter side, in degrees; none where it is
+    /// the test views'.
+    pub(crate) fn training_angle(&self) -> Option<f64> {
+        self.angle.or((self.projection == Projection::Fisheye).then_some(FISHEYE_ANGLE))
+    }
+
     /// Width and height of the images.
     pub(crate) fn sides(&self) -> [u32; 2] {
         [self.size, ((f64::from(self.size) / self.aspect).round() as u32).max(1)]
@@ -70,6 +88,8 @@ impl Default for Params {
             train: 80,
             test: 10,
             samples_per_axis: 4,
+            projection: Projection::Perspective,
+            angle: None,
             layout,
             backdrop: false,
             form,

@@ -2,6 +2,7 @@ use glam::DVec3;
 use pixels::{Rgba8, srgb_from_linear};
 use stage::Progress;
 
+use crate::camera::ViewCamera;
 use crate::material::surface;
 use crate::world::World;
 
@@ -16,22 +17,19 @@ pub struct RenderedImage {
 /// Where the sun stands.
 const SUN: DVec3 = DVec3::new(0.48, 0.36, 0.8);
 
-/// Renders one view of `width`×`height` pixels with `samples`² rays a pixel, averaged in linear
-/// light over the pixel's square.
+/// Renders one view with `samples`² rays a pixel, averaged in linear light over the pixel's square.
+/// Where the lens has no ray, the image is opaque and black.
 pub(crate) fn render(
     world: &World,
     pose: &[[f64; 4]; 4],
-    angle_x: f64,
-    [width, height]: [u32; 2],
+    camera: &ViewCamera,
     samples: u32,
     progress: &Progress,
 ) -> RenderedImage {
-    let [half_x, half_y] = [width, height].map(|side| 0.5 * f64::from(side));
-    let focal = half_x / libm::tan(0.5 * angle_x);
+    let [width, height] = camera.sides;
     let column = |c: usize| DVec3::new(pose[0][c], pose[1][c], pose[2][c]);
-    let (right, up, back, centre) = (column(0), column(1), column(2), column(3));
-    let slope = |at: f64, half: f64| (at - half) / focal;
-    let direction = |x, y| (slope(x, half_x) * right - slope(y, half_y) * up - back).normalize();
+    let (axes, centre) = ([0, 1, 2].map(column), column(3));
+    let back = axes[2];
     let mut colour = Vec::with_capacity((width * height * 4) as usize);
     let mut depth = Vec::with_capacity((width * height) as usize);
     for j in 0..height {
@@ -41,8 +39,12 @@ pub(crate) fn render(
             for b in 0..samples {
                 for a in 0..samples {
                     let offset = |k: u32| (f64::from(k) + 0.5) / f64::from(samples);
-                    let d = direction(f64::from(i) + offset(a), f64::from(j) + offset(b));
-                    if let Some(radiance) = shade(world, centre, d, 1) {
+                    let place = [f64::from(i) + offset(a), f64::from(j) + offset(b)];
+                    let radiance = match camera.direction(place, axes) {
+                        Some(direction) => shade(world, centre, direction, 1),
+                        None => Some(DVec3::ZERO),
+                    };
+                    if let Some(radiance) = radiance {
                         light += radiance;
                         hits += 1;
                     }
@@ -57,8 +59,12 @@ pub(crate) fn render(
                 level(mean.z),
                 (alpha * 255.0 + 0.5) as u8,
             ]);
-            let d = direction(f64::from(i) + 0.5, f64::from(j) + 0.5);
-            depth.push(world.first_hit(centre, d).map(|hit| (hit.t * -d.dot(back)) as f32));
+            let middle = camera.direction([f64::from(i) + 0.5, f64::from(j) + 0.5], axes);
+            depth.push(
+                middle.and_then(|d| {
+                    world.first_hit(centre, d).map(|hit| (hit.t * -d.dot(back)) as f32)
+                }),
+            );
         }
         progress.add(1);
     }

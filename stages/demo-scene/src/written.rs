@@ -11,6 +11,7 @@ use pixels::{Channel, PixelError, Rgba8, SampleType, write_exr, write_png};
 use serde_json::{Value, json};
 use stage::Context;
 
+use crate::camera::ViewCamera;
 use crate::params::{Form, Params};
 use crate::render::RenderedImage;
 
@@ -55,8 +56,10 @@ fn photograph(split: &str, number: u32) -> String {
 /// The files with cameras.
 pub(crate) struct Written {
     form: Form,
-    sides: [u32; 2],
-    angle_x: f64,
+    /// Camera of the frames that say nothing of theirs.
+    shared: ViewCamera,
+    /// Whether training frames have another.
+    is_mixed: bool,
     /// Frames of `transforms.json`, and which of them are for what.
     frames: Vec<Value>,
     splits: Vec<(String, Vec<String>)>,
@@ -64,8 +67,8 @@ pub(crate) struct Written {
 
 impl Written {
     pub(crate) fn new(params: &Params) -> Self {
-        let (sides, angle_x) = (params.sides(), params.angle_x());
-        Self { form: params.form, sides, angle_x, frames: Vec::new(), splits: Vec::new() }
+        let (shared, is_mixed) = (ViewCamera::of_test(params), params.training_angle().is_some());
+        Self { form: params.form, shared, is_mixed, frames: Vec::new(), splits: Vec::new() }
     }
 
     /// Takes in a split's cameras.
@@ -73,16 +76,19 @@ impl Written {
         &mut self,
         context: &Context,
         split: &str,
+        camera: &ViewCamera,
         poses: &[[[f64; 4]; 4]],
     ) -> anyhow::Result<()> {
         if self.form == Form::Transforms {
             let names: Vec<String> =
                 (0..poses.len() as u32).map(|number| photograph(split, number)).collect();
-            let frames = names
-                .iter()
-                .zip(poses)
-                .map(|(name, pose)| json!({"file_path": name, "transform_matrix": pose}));
-            self.frames.extend(frames);
+            let own =
+                if self.is_mixed && split == "train" { camera.transforms() } else { json!({}) };
+            for (name, pose) in names.iter().zip(poses) {
+                let mut frame = own.clone();
+                (frame["file_path"], frame["transform_matrix"]) = (json!(name), json!(pose));
+                self.frames.push(frame);
+            }
             self.splits.push((format!("{split}_filenames"), names));
             return Ok(());
         }
@@ -95,11 +101,10 @@ impl Written {
             frame
         });
         let frames: Vec<Value> = frames.collect();
+        let mut file = camera.blender();
+        file["frames"] = json!(frames);
         context
-            .write_json(
-                &format!("transforms_{split}.json"),
-                &json!({"camera_angle_x": self.angle_x, "frames": frames}),
-            )
+            .write_json(&format!("transforms_{split}.json"), &file)
             .context("cannot write the cameras")
     }
 
@@ -108,11 +113,8 @@ impl Written {
         if self.form == Form::Blender {
             return Ok(());
         }
-        let [width, height] = self.sides;
-        let focal = 0.5 * f64::from(width) / libm::tan(0.5 * self.angle_x);
-        let [cx, cy] = self.sides.map(|side| 0.5 * f64::from(side));
-        let mut file = json!({"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx,
-            "cy": cy, "frames": self.frames});
+        let mut file = self.shared.transforms();
+        file["frames"] = json!(self.frames);
         for (key, names) in self.splits {
             file[key] = json!(names);
         }

@@ -1,7 +1,7 @@
 use std::fmt::Write as _;
 
 use glam::{DMat3, DQuat, DVec3};
-use scene::{Camera, Intrinsics};
+use scene::{Camera, Distortion, Intrinsics};
 use serde_json::{Map, Value, json};
 
 use crate::surfel::Surfel;
@@ -42,16 +42,53 @@ fn image(camera: &Camera, folder: &str) -> String {
 }
 
 fn lens(k: &Intrinsics) -> Map<String, Value> {
-    let ([k1, k2, k3], [p1, p2]) = (k.distortion.radial, k.distortion.tangential);
+    let ([k1, k2, k3, k4], [p1, p2]) = (k.distortion.radial, k.distortion.tangential);
     let half_angle = |size: u32, focal: f64| (0.5 * f64::from(size) / focal).atan();
-    let entry = json!({
+    let mut entry = json!({
         "camera_model": if k.distortion.is_none() { "PINHOLE" } else { "OPENCV" },
         "camera_angle_x": 2.0 * half_angle(k.width, k.fx),
         "camera_angle_y": 2.0 * half_angle(k.height, k.fy),
         "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": k.width, "h": k.height,
         "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2,
     });
-    if let Value::Object(entry) = entry { entry } else { Map::new() }
+    if k4 != 0.0 || k.distortion.is_fisheye() {
+        entry["k4"] = json!(k4);
+    }
+    let Value::Object(mut entry) = entry else { return Map::new() };
+    if k.distortion.is_fisheye() {
+        entry.insert("camera_model".to_owned(), json!("OPENCV_FISHEYE"));
+        entry.insert("is_fisheye".to_owned(), json!(true));
+        // Those of a pinhole.
+        entry.retain(|key, _| !key.starts_with("camera_angle"));
+    }
+    entry
+}
+
+/// A format of cameras, and what its readers know of lenses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum CameraFormat {
+    /// `transforms.json`.
+    Transforms,
+    /// COLMAP's text files.
+    Colmap,
+}
+
+impl CameraFormat {
+    /// Returns why the format can't hold some of the cameras, or `None` if it can hold all.
+    pub(crate) fn problem(self, cameras: &[Camera]) -> Option<&'static str> {
+        let is_any =
+            |has: fn(&Distortion) -> bool| cameras.iter().any(|c| has(&c.intrinsics.distortion));
+        match self {
+            Self::Transforms if is_any(|lens| lens.denominator != [0.0; 3]) => Some(
+                "transforms.json is not written: its readers know no lens with the rational terms \
+                k4 to k6",
+            ),
+            Self::Colmap if is_any(|lens| lens.radial[3] != 0.0 && !lens.is_fisheye()) => Some(
+                "colmap/ is not written: COLMAP has no perspective lens with a fourth radial term",
+            ),
+            _ => None,
+        }
+    }
 }
 
 /// A COLMAP model as text: `cameras.txt`, `images.txt` and `points3D.txt`. Poses are world to
@@ -86,16 +123,22 @@ pub(crate) fn colmap(cameras: &[Camera], surfels: &[Surfel]) -> [(&'static str, 
     [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)]
 }
 
-/// COLMAP's model of a lens, and its parameters.
+/// Returns COLMAP's model of a lens, and its parameters.
 fn colmap_model(k: &Intrinsics) -> (&'static str, Vec<f64>) {
-    let ([k1, k2, k3], [p1, p2]) = (k.distortion.radial, k.distortion.tangential);
+    let ([k1, k2, k3, k4], [p1, p2]) = (k.distortion.radial, k.distortion.tangential);
+    let [d1, d2, d3] = k.distortion.denominator;
+    let is_rational = [d1, d2, d3] != [0.0; 3];
     let pinhole = [k.fx, k.fy, k.cx, k.cy];
     if k.distortion.is_none() {
         ("PINHOLE", pinhole.to_vec())
-    } else if k3 == 0.0 {
+    } else if k.distortion.is_fisheye() && [p1, p2] == [0.0; 2] {
+        ("OPENCV_FISHEYE", [&pinhole[..], &[k1, k2, k3, k4]].concat())
+    } else if k.distortion.is_fisheye() {
+        ("THIN_PRISM_FISHEYE", [&pinhole[..], &[k1, k2, p1, p2, k3, k4, 0.0, 0.0]].concat())
+    } else if k3 == 0.0 && !is_rational {
         ("OPENCV", [&pinhole[..], &[k1, k2, p1, p2]].concat())
     } else {
-        ("FULL_OPENCV", [&pinhole[..], &[k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]].concat())
+        ("FULL_OPENCV", [&pinhole[..], &[k1, k2, p1, p2, k3, d1, d2, d3]].concat())
     }
 }
 

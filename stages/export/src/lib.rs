@@ -42,10 +42,12 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
 
+use cameras::CameraFormat;
 use coordinates::COORDINATES;
 use lattice::Lattice;
 use mesh::Mesh;
 use seen::SeenView;
+use surfel::Surfel;
 
 /// Name of the summary in the artifact.
 pub const EXPORT_FILE: &str = "export.json";
@@ -147,6 +149,9 @@ impl Stage for Export {
         let field = Members::read(context.input("field")?, &context.device)?;
         let given = Views::read(context.input("cameras")?)?;
         let cameras: Vec<Camera> = given.views.into_iter().map(|view| view.camera).collect();
+        for note in lens_notes(&cameras, params) {
+            context.say(note);
+        }
         let resized = resized(&cameras, params.size);
         let lattice = params.mesh.then(|| Lattice::new(&field.file.bounds, params.resolution));
         context.check_memory("the export", memory_need(&resized, lattice.as_ref()), REMEDY)?;
@@ -170,6 +175,23 @@ impl Stage for Export {
         context.write_json(EXPORT_FILE, &summary)?;
         context.write_summary(&in_words(&summary))
     }
+}
+
+/// Describes what files won't hold of the cameras' lenses, a line each.
+fn lens_notes(cameras: &[Camera], params: &Params) -> Vec<&'static str> {
+    let mut notes = Vec::new();
+    let is_fisheye = |camera: &Camera| camera.intrinsics.distortion.is_fisheye();
+    if (params.points || params.splats || params.mesh) && cameras.iter().any(is_fisheye) {
+        notes.push(
+            "fisheye lenses: points, splats and mesh hold what pinhole cameras in their place see, \
+            at most 100° across",
+        );
+    }
+    if params.cameras {
+        let formats = [CameraFormat::Transforms, CameraFormat::Colmap];
+        notes.extend(formats.into_iter().filter_map(|format| format.problem(cameras)));
+    }
+    notes
 }
 
 fn in_words(summary: &ExportSummary) -> String {
@@ -245,10 +267,20 @@ impl ExportJob<'_> {
             summary.splats = surfels.len();
         }
         if self.params.cameras {
-            let points = self.params.points.then_some("points.ply");
-            let file = cameras::transforms(&self.cameras, points);
+            self.write_cameras(&chosen)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the cameras in each format that can hold them.
+    fn write_cameras(&self, points: &[Surfel]) -> anyhow::Result<()> {
+        if CameraFormat::Transforms.problem(&self.cameras).is_none() {
+            let file = self.params.points.then_some("points.ply");
+            let file = cameras::transforms(&self.cameras, file);
             self.context.write_json("transforms.json", &file)?;
-            for (name, text) in cameras::colmap(&self.cameras, &chosen) {
+        }
+        if CameraFormat::Colmap.problem(&self.cameras).is_none() {
+            for (name, text) in cameras::colmap(&self.cameras, points) {
                 self.write(&format!("colmap/sparse/0/{name}"), |file| {
                     file.write_all(text.as_bytes())
                 })?;

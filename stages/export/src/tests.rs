@@ -6,6 +6,7 @@ use radiance::{Pixel, Ray, RayField, RenderError};
 use scene::{Background, Bounds, Camera, Distortion, Frustum, Intrinsics, Space};
 use stage::Progress;
 
+use crate::cameras::CameraFormat;
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 use crate::seen::SeenView;
@@ -323,27 +324,72 @@ fn assert_same(set: &Dataset, cameras: &[Camera]) {
 fn cameras_come_back_from_both_files() {
     let plain = around(7, -0.9);
     let mut mixed = plain.clone();
-    let distortion = Distortion { radial: [0.1, -0.01, 0.0], tangential: [0.001, 0.002] };
+    let distortion = Distortion::brown([0.1, -0.01, 0.0], [0.001, 0.002]);
     mixed[2].intrinsics.distortion = distortion;
+    let fisheye = Distortion::fisheye([-0.02, 0.006, -0.003, 0.0005]);
+    mixed[6].intrinsics.distortion = fisheye;
     mixed[4].intrinsics.cx += 3.5;
     // As published poses are: rounded.
     mixed[5].camera_to_world = plain[5].camera_to_world.map(|row| row.map(|v| f64::from(v as f32)));
     for cameras in [plain, mixed] {
-        let folder = folder(&cameras);
-        let text = cameras::transforms(&cameras, Some("points.ply")).to_string();
-        std::fs::write(folder.path().join("transforms.json"), text).unwrap();
-        assert_same(&Dataset::read(folder.path()).unwrap(), &cameras);
-        std::fs::remove_file(folder.path().join("transforms.json")).unwrap();
-        let sparse = folder.path().join("sparse/0");
-        std::fs::create_dir_all(&sparse).unwrap();
-        for (name, text) in cameras::colmap(&cameras, &[one_surfel()]) {
-            std::fs::write(sparse.join(name), text).unwrap();
-        }
-        let set = Dataset::read(folder.path()).unwrap();
-        assert!(set.notes[0].starts_with("COLMAP"), "{:?}", set.notes);
-        let rounded: Vec<Camera> = cameras.iter().map(orthonormal).collect();
-        assert_same(&set, &rounded);
+        assert!(comes_back_from_transforms(&cameras) && comes_back_from_colmap(&cameras));
     }
+}
+
+/// A format that can't hold a lens says so, and the other holds it.
+#[test]
+fn lenses_are_in_the_formats_that_have_them() {
+    let with = |lens: Distortion| {
+        let mut cameras = around(3, -0.9);
+        cameras[1].intrinsics.distortion = lens;
+        cameras
+    };
+    let brown = Distortion::brown([0.1, -0.01, 0.02], [0.001, 0.002]);
+    let tangential = Distortion { tangential: [0.001, 0.002], ..Distortion::fisheye([0.01; 4]) };
+    for (lens, formats) in [
+        (brown, [true, true]),
+        (Distortion { radial: [0.1, -0.01, 0.02, 0.003], ..brown }, [true, false]),
+        (Distortion { denominator: [0.1, -0.01, 0.02], ..brown }, [false, true]),
+        (Distortion::fisheye([0.0; 4]), [true, true]),
+        (tangential, [true, true]),
+    ] {
+        let cameras = with(lens);
+        let found = [comes_back_from_transforms(&cameras), comes_back_from_colmap(&cameras)];
+        assert_eq!(found, formats, "{lens}");
+    }
+    let cameras = with(Distortion { radial: [0.0, 0.0, 0.0, 0.01], ..Distortion::default() });
+    let words = crate::lens_notes(&cameras, &crate::Params::default());
+    assert!(words.len() == 1 && words[0].contains("fourth radial term"), "{words:?}");
+}
+
+/// False where the format says that it can't hold the cameras.
+fn comes_back_from_transforms(cameras: &[Camera]) -> bool {
+    if CameraFormat::Transforms.problem(cameras).is_some() {
+        return false;
+    }
+    let folder = folder(cameras);
+    let text = cameras::transforms(cameras, Some("points.ply")).to_string();
+    std::fs::write(folder.path().join("transforms.json"), text).unwrap();
+    assert_same(&Dataset::read(folder.path()).unwrap(), cameras);
+    true
+}
+
+/// False where the format says that it can't hold the cameras.
+fn comes_back_from_colmap(cameras: &[Camera]) -> bool {
+    if CameraFormat::Colmap.problem(cameras).is_some() {
+        return false;
+    }
+    let folder = folder(cameras);
+    let sparse = folder.path().join("sparse/0");
+    std::fs::create_dir_all(&sparse).unwrap();
+    for (name, text) in cameras::colmap(cameras, &[one_surfel()]) {
+        std::fs::write(sparse.join(name), text).unwrap();
+    }
+    let set = Dataset::read(folder.path()).unwrap();
+    assert!(set.notes[0].starts_with("COLMAP"), "{:?}", set.notes);
+    let rounded: Vec<Camera> = cameras.iter().map(orthonormal).collect();
+    assert_same(&set, &rounded);
+    true
 }
 
 /// A camera's nearest rotation that a quaternion can say: what COLMAP's files hold.

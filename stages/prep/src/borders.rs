@@ -208,7 +208,11 @@ struct View {
 
 fn look(frame: &Frame) -> anyhow::Result<View> {
     let image = frame.photograph().bad_input(frame_name(frame))?;
-    let border = Border::of(&image);
+    let mut border = Border::of(&image);
+    // Outside of its circle a fisheye photograph is black, whatever lies behind the scene.
+    if matches!(border, Border::Flat(_)) && frame.intrinsics().has_cut_rays() {
+        border = Border::Mixed;
+    }
     let strips = if border == Border::Transparent { None } else { Strips::of(&image) };
     let mut are_masked = false;
     if let Some(strips) = &strips {

@@ -1,5 +1,5 @@
 use glam::{DMat3, DVec3};
-use scene::{Bounds, Camera, Frustum, Space, common_direction, pose_of};
+use scene::{Bounds, Camera, CameraRay, Frustum, Space, common_direction, pose_of};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -24,6 +24,12 @@ pub enum SpaceError {
         doesn't say; give near and far, or choose box"
     )]
     NoDepths,
+    /// Lenses that see more than a frustum holds.
+    #[error(
+        "parameter space: ndc can't hold what a fisheye lens sees; choose box or contraction, or \
+        lens: undo"
+    )]
+    Fisheye,
     /// Cameras that look every way.
     #[error("parameter space: ndc needs cameras that look one way; choose box or contraction")]
     NotForward,
@@ -71,6 +77,9 @@ fn in_ndc(
 ) -> Result<Bounds, SpaceError> {
     let known = |(camera, depths): &SeenDepths| (camera.clone(), depths.or(guessed));
     let all: Vec<SeenDepths> = training.iter().chain(others).map(known).collect();
+    if all.iter().any(|(camera, _)| camera.intrinsics.distortion.is_fisheye()) {
+        return Err(SpaceError::Fisheye);
+    }
     let space = Space::Ndc(frustum(&all)?);
     Ok(Bounds { space, ..around_frusta(&all).ok_or(SpaceError::NoDepths)? })
 }
@@ -166,10 +175,28 @@ fn contracted(boxed: Bounds, sights: &[SeenDepths]) -> Bounds {
     Bounds { min, max, near, far, space: Space::Contraction }
 }
 
-/// The border of what a camera sees between two depths.
-fn border(camera: &Camera, depths: [f64; 2]) -> impl Iterator<Item = DVec3> + '_ {
-    let rays = camera.intrinsics.border().map(|[x, y]| camera.ray(x, y));
-    rays.flat_map(move |ray| depths.map(|depth| ray.at(depth / camera.depth_per_distance(&ray))))
+/// Places along each side of a grid over a fisheye image.
+const FISHEYE_PLACES: u32 = 16;
+
+/// Returns points on the border of what a camera sees between two depths. A fisheye camera sees a
+/// part of a ball between two distances, whose border is everywhere in the image.
+fn border(camera: &Camera, depths: [f64; 2]) -> Vec<DVec3> {
+    let k = &camera.intrinsics;
+    if !k.distortion.is_fisheye() {
+        let rays = k.border().map(|[x, y]| camera.ray(x, y));
+        let points =
+            |ray: CameraRay| depths.map(|depth| ray.at(depth / camera.depth_per_distance(&ray)));
+        return rays.flat_map(points).collect();
+    }
+    let at = |place: u32, size: u32| f64::from(place * size) / f64::from(FISHEYE_PLACES);
+    let mut points = Vec::new();
+    for row in 0..=FISHEYE_PLACES {
+        for column in 0..=FISHEYE_PLACES {
+            let ray = camera.ray(at(column, k.width), at(row, k.height));
+            points.extend(depths.map(|distance| ray.at(distance)));
+        }
+    }
+    points
 }
 
 /// A box around what all cameras look at, from the cameras alone where they say enough.
@@ -203,10 +230,20 @@ fn bounds_of(sights: &[SeenDepths]) -> Bounds {
     with_range(box_only, cameras)
 }
 
+/// Largest slope of a fisheye view's border that a box follows: 45° from the axis. Farther out, a
+/// box around what the cameras look at would hold the cameras.
+const MAX_FISHEYE_SLOPE: f64 = 1.0;
+
 /// Half the longer side of what a camera sees as far away as a place.
 fn half_width(camera: &Camera, place: DVec3) -> f64 {
     let k = &camera.intrinsics;
-    let slope = (0.5 * f64::from(k.width) / k.fx).max(0.5 * f64::from(k.height) / k.fy);
+    let [x, y] = [0.5 * f64::from(k.width) / k.fx, 0.5 * f64::from(k.height) / k.fy];
+    let slope = if k.distortion.is_fisheye() {
+        let [across, down] = [[x, 0.0], [0.0, y]].map(|at| k.distortion.undistort(at));
+        across[0].max(down[1]).min(MAX_FISHEYE_SLOPE)
+    } else {
+        x.max(y)
+    };
     (camera.centre() - place).length() * slope
 }
 
@@ -389,6 +426,50 @@ mod tests {
             Err(SpaceError::NoDepths)
         );
         assert_eq!(place(&sights(&one, None), &[], false, None).map(|b| b.space), Ok(Space::Box));
+    }
+
+    /// The camera behind an equidistant lens that sees so many degrees across.
+    fn fisheye(camera: &Camera, degrees: f64) -> Camera {
+        let focal = 100.0 / degrees.to_radians();
+        let distortion = scene::Distortion::fisheye([0.0; 4]);
+        let intrinsics = Intrinsics { fx: focal, fy: focal, distortion, ..camera.intrinsics };
+        Camera { intrinsics, ..camera.clone() }
+    }
+
+    /// Between two distances a fisheye camera sees a part of a ball, which no frustum holds.
+    #[test]
+    fn fisheye_cameras_have_a_box_or_a_contraction() {
+        let row: Vec<Camera> = (0..5).map(|i| fisheye(&parallel(1.0, i), 160.0)).collect();
+        let seen = sights(&row, Some([2.0, 10.0]));
+        let bounds = bounds_of(&seen);
+        for camera in &row {
+            for (x, y) in [(0.0, 0.0), (3.0, 50.0), (51.0, 97.0), (50.0, 50.0), (70.0, 20.0)] {
+                for distance in [2.0, 5.0, 10.0] {
+                    let p = camera.ray(x, y).at(distance).to_array();
+                    assert!((0..3).all(|i| (bounds.min[i]..=bounds.max[i]).contains(&p[i])));
+                }
+            }
+        }
+        assert!(bounds.longest_side() < 24.0 && bounds.far < 11.1, "{bounds:?}");
+        assert_eq!(place(&seen, &[], false, Some(SpaceKind::Ndc)), Err(SpaceError::Fisheye));
+        let known = place(&seen, &[], false, None).unwrap();
+        assert_eq!(known.space, Space::Box);
+        let unknown = place(&sights(&row, None), &[], true, None).unwrap();
+        assert_eq!(unknown.space, Space::Contraction);
+        // Test views count, too.
+        let pinholes: Vec<Camera> = (0..5).map(|i| parallel(1.0, i)).collect();
+        let others = sights(&row[..1], Some([2.0, 10.0]));
+        assert_eq!(
+            place(&sights(&pinholes, Some([2.0, 10.0])), &others, false, Some(SpaceKind::Ndc)),
+            Err(SpaceError::Fisheye)
+        );
+        // The box around what they look at doesn't hold them, however wide their view is.
+        for (degrees, half) in [(60.0, 1.05 * 4.0 * f64::to_radians(30.0).tan()), (180.0, 4.2)] {
+            let around = circle(DVec3::ZERO, 4.0);
+            let ring: Vec<Camera> = around.iter().map(|c| fisheye(c, degrees)).collect();
+            let found = 0.5 * bounds_of(&sights(&ring, None)).longest_side();
+            assert!((found - half).abs() < 1e-9, "{degrees}: {found}");
+        }
     }
 
     fn parallel(scale: f64, i: u32) -> Camera {

@@ -140,7 +140,7 @@ fn dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
                     format!("dataset: {frame}: {e} (parameter lens: undo keeps what has its ray)");
                 return Err(Failure::BadInput(message).into());
             }
-            set
+            set.followed()
         }
         LensHandling::Undo => set.undistorted().bad_input("dataset")?,
         LensHandling::Ignore => set.without_distortion(),

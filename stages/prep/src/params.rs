@@ -29,7 +29,7 @@ pub struct Params {
     /// assumed to have made them. Default: `lanczos` for downscaled images, `box` for photographs.
     #[schemars(extend("x-group" = "data", "x-default" = "by `lr_source`"))]
     pub kernel: Option<Kernel>,
-    /// Treatment of lens distortion, where the data set states it.
+    /// Treatment of lens distortion and of fisheye lenses, where the data set states them.
     #[schemars(extend("x-group" = "data"))]
     pub lens: LensHandling,
     /// What lies behind the scene. Default: `white` where images have alpha. Without alpha `white`
@@ -86,9 +86,10 @@ impl Default for Params {
 #[serde(rename_all = "lowercase")]
 pub enum LensHandling {
     /// Rays follow it: photographs stay as they were taken, to the last pixel, and so do rendered
-    /// views.
+    /// views. Pixels more than 89° from the axis of a fisheye lens are masked.
     Follow,
-    /// Photographs are resampled to what pinhole cameras would have taken, and lose a border.
+    /// Photographs are resampled to what pinhole cameras would have taken, and lose a border. A
+    /// fisheye lens's pinhole camera sees at most 100° across the longer side.
     Undo,
     /// Photographs are taken for a pinhole's: the habit with LLFF's scenes, whose files don't speak
     /// of lenses. To compare with.

@@ -331,5 +331,5 @@ impl<'a> SceneWriter<'a> {
 
 /// A mask's file, where a frame has one.
 fn mask_name(frame: &Frame) -> Option<String> {
-    frame.mask.as_ref().map(|_| mask_file(&frame.name))
+    frame.is_masked().then(|| mask_file(&frame.name))
 }

@@ -319,7 +319,7 @@ mod tests {
         scale: [f64; 2],
         image: Option<Image>,
     ) -> (Supersampling, Camera) {
-        let distortion = Distortion { radial: [0.1, -0.02, 0.01], tangential: [0.005, -0.003] };
+        let distortion = Distortion::brown([0.1, -0.02, 0.01], [0.005, -0.003]);
         let camera = Camera {
             name: "a".into(),
             intrinsics: Intrinsics {

@@ -32,7 +32,7 @@ use base64::Engine as _;
 use contract::{Input, Output};
 use pixels::{Filter, Rgba8, encode_png, resize_pillow};
 use radiance::{Field, FieldFile, FieldModel};
-use scene::{Bounds, Camera, Space, Views};
+use scene::{Bounds, Camera, Intrinsics, Space, Views, undistorted};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
@@ -188,9 +188,15 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
     for (i, view) in views.views.iter().enumerate() {
         // One in so many: where the share so far passes a whole number.
         let is_shown = (i + 1) * most / count > i * most / count;
+        let taken_with = view.camera.intrinsics;
+        let drawn = drawn_with(&taken_with);
         let photograph = match &view.image {
             Some(file) if is_shown => {
                 let image = views.read_over(&folder.join(file))?.to_rgba8();
+                let image = match drawn {
+                    Some(pinhole) => undistorted(&image, &taken_with, &pinhole),
+                    None => image,
+                };
                 Some(shrunk(image, params.photograph_width as usize))
             }
             _ => None,
@@ -198,12 +204,18 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
         cameras.push(PageCamera {
             name: view.camera.name.clone(),
             camera_to_world: view.camera.camera_to_world,
-            intrinsics: view.camera.intrinsics,
+            intrinsics: drawn.unwrap_or(taken_with),
             photograph: photograph.as_ref().map(data_uri),
             photograph_size: photograph.map(|p| ImageSize { width: p.width, height: p.height }),
         });
     }
     Ok(cameras)
+}
+
+/// Returns the pinhole camera that the page draws in place of a fisheye camera. Other distortion is
+/// small enough to be left out.
+fn drawn_with(taken_with: &Intrinsics) -> Option<Intrinsics> {
+    if taken_with.distortion.is_fisheye() { taken_with.pinhole() } else { None }
 }
 
 /// An image of at most a width, a whole number of times smaller.

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use dataset::Dataset;
+use scene::{Camera, Distortion, Intrinsics, Projection};
 
 /// A 4×3 image, as PNG.
 const SIZE: (usize, usize) = (4, 3);
@@ -39,6 +40,11 @@ impl Folder {
     /// much memory isn't.
     pub fn read(&self) {
         if let Ok(set) = Dataset::read(self.0.path()) {
+            // Lenses as `prep` treats them.
+            set.clone().followed();
+            if let Ok(undone) = set.clone().undistorted() {
+                undone.frames.iter().take(2).for_each(|frame| drop(frame.photograph()));
+            }
             for frame in &set.frames {
                 let mask = frame.mask.as_ref().map(|mask| &mask.path);
                 for file in [Some(&frame.image), mask, frame.depth.as_ref()].into_iter().flatten() {
@@ -52,6 +58,7 @@ impl Folder {
                     let size = (frame.taken_with.width as usize, frame.taken_with.height as usize);
                     assert_eq!((mask.width, mask.height), size, "a mask has its image's size");
                 }
+                frame.camera().check().ok();
             }
         }
     }
@@ -68,6 +75,30 @@ impl Default for Folder {
     fn default() -> Self {
         Self::new()
     }
+}
+
+/// A camera at the origin with a lens of any numbers: with one bit of `which` a fisheye's, with
+/// another as large as f64 has them.
+pub fn lens_camera(which: u8, bytes: &[u8]) -> Camera {
+    let mut numbers = bytes.chunks(8).map(|chunk| {
+        let mut word = [0; 8];
+        word[..chunk.len()].copy_from_slice(chunk);
+        let wide = f64::from_le_bytes(word);
+        let tame = i64::from_le_bytes(word) as f64 / i64::MAX as f64;
+        if which & 2 == 0 { tame } else { wide }
+    });
+    let mut next = || numbers.next().unwrap_or(0.0);
+    let projection = if which & 1 == 0 { Projection::Perspective } else { Projection::Fisheye };
+    let radial = [0; 4].map(|_| next());
+    let tangential = [0; 2].map(|_| 0.01 * next());
+    let denominator = [0; 3].map(|_| next());
+    let distortion = Distortion { projection, radial, tangential, denominator };
+    let focal = [0; 2].map(|_| 16.0 * (1.1 + next()));
+    let [cx, cy] = [16.0, 12.0].map(|middle| middle * (1.0 + next()));
+    let intrinsics =
+        Intrinsics { width: 32, height: 24, fx: focal[0], fy: focal[1], cx, cy, distortion };
+    let camera_to_world = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]];
+    Camera { name: "a".to_owned(), intrinsics, camera_to_world }
 }
 
 /// A COLMAP model's three files, binary, of two views: the seeds that `seeds.py` writes, less their

@@ -3,9 +3,10 @@ use std::path::{Path, PathBuf};
 
 use artifact::counted;
 use glam::{DMat3, DQuat, DVec3};
-use scene::{Distortion, Intrinsics};
+use scene::Intrinsics;
 
 use crate::bytes::Bytes;
+use crate::colmap_camera::CameraModel;
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::file_reason::FileReason;
@@ -232,12 +233,14 @@ impl Model {
             let id = bytes.u32("a camera")?;
             let model = bytes.u32("a camera")?;
             let (width, height) = (bytes.u64("a camera")?, bytes.u64("a camera")?);
-            let Some((name, count)) = MODELS.get(model as usize) else {
+            let Some(model) = CameraModel::of_number(model) else {
                 return Err(bytes.error(FileReason::ModelNumber { id, model }));
             };
-            let parameters =
-                (0..*count).map(|_| bytes.f64("a camera")).collect::<Result<Vec<_>, _>>()?;
-            let intrinsics = intrinsics(name, width, height, &parameters)
+            let parameters = (0..model.parameters)
+                .map(|_| bytes.f64("a camera"))
+                .collect::<Result<Vec<_>, _>>()?;
+            let intrinsics = model
+                .intrinsics(width, height, &parameters)
                 .map_err(|reason| bytes.error(reason.of_camera(id)))?;
             self.cameras.insert(id, intrinsics);
         }
@@ -287,7 +290,11 @@ impl Model {
             let parameters = (4..line.words.len())
                 .map(|i| line.number(i, "parameter"))
                 .collect::<Result<Vec<f64>, _>>()?;
-            let intrinsics = intrinsics(name, width, height, &parameters)
+            let Some(model) = CameraModel::of_name(name) else {
+                return Err(line.error(FileReason::ModelName { model: name.to_owned() }));
+            };
+            let intrinsics = model
+                .intrinsics(width, height, &parameters)
                 .map_err(|reason| line.error(reason))?;
             self.cameras.insert(id, intrinsics);
         }
@@ -356,7 +363,7 @@ impl Model {
         let (taken_with, turn) = fitted(*camera, look(&file)?)
             .map_err(|reason| FrameReason::OfCamera { id, reason: Box::new(reason) })?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
-        let depths = depths(image, &self.points);
+        let depths = depths(image, camera, &self.points);
         let frame = Frame {
             name: String::new(),
             image: file,
@@ -373,10 +380,13 @@ impl Model {
     }
 }
 
-/// 0.1 and 99.9 % of the depths of what an image sees: a few points are always wrong.
-fn depths(image: &Image, points: &BTreeMap<u64, DVec3>) -> Option<[f64; 2]> {
+/// Returns the 0.1 and 99.9 % quantiles of the depths of what an image sees, or of the distances
+/// through a fisheye lens: a few points are always wrong.
+fn depths(image: &Image, camera: &Intrinsics, points: &BTreeMap<u64, DVec3>) -> Option<[f64; 2]> {
     let seen: BTreeSet<u64> = image.points.iter().copied().collect();
-    let depth = |id: &u64| points.get(id).map(|p| (image.rotation * *p + image.translation).z);
+    let in_camera = |id: &u64| points.get(id).map(|p| image.rotation * *p + image.translation);
+    let is_fisheye = camera.distortion.is_fisheye();
+    let depth = |id: &u64| in_camera(id).map(|p| if is_fisheye { p.length() } else { p.z });
     let mut depths: Vec<f64> =
         seen.iter().filter_map(depth).filter(|d| d.is_finite() && *d > 0.0).collect();
     depths.sort_unstable_by(f64::total_cmp);
@@ -384,56 +394,6 @@ fn depths(image: &Image, points: &BTreeMap<u64, DVec3>) -> Option<[f64; 2]> {
     let share = |s: f64| depths[(s * last as f64).round() as usize];
     let (near, far) = (share(0.001), share(0.999));
     (near < far).then_some([near, far])
-}
-
-/// COLMAP's camera models in the order of their numbers, and how many parameters each has.
-const MODELS: [(&str, usize); 11] = [
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-];
-
-fn intrinsics(
-    model: &str,
-    width: u64,
-    height: u64,
-    parameters: &[f64],
-) -> Result<Intrinsics, FileReason> {
-    let side = |value: u64| u32::try_from(value).ok().filter(|v| *v > 0);
-    let (Some(columns), Some(rows)) = (side(width), side(height)) else {
-        return Err(FileReason::Size { width, height });
-    };
-    let (focal, centre, radial, tangential): ([f64; 2], [f64; 2], [f64; 3], [f64; 2]) =
-        match (model, parameters) {
-            ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 3], [0.0; 2]),
-            ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], [0.0; 3], [0.0; 2]),
-            ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f], [cx, cy], [k, 0.0, 0.0], [0.0; 2]),
-            ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], [k1, k2, 0.0], [0.0; 2]),
-            ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
-                ([fx, fy], [cx, cy], [k1, k2, 0.0], [p1, p2])
-            }
-            _ => match MODELS.iter().find(|(name, _)| *name == model) {
-                Some((_, count)) if *count != parameters.len() => {
-                    return Err(FileReason::Parameters {
-                        model: model.to_owned(),
-                        expected: *count,
-                        found: parameters.len(),
-                    });
-                }
-                Some(_) => return Err(FileReason::Model { model: model.to_owned() }),
-                None => return Err(FileReason::ModelName { model: model.to_owned() }),
-            },
-        };
-    let ([fx, fy], [cx, cy], distortion) = (focal, centre, Distortion { radial, tangential });
-    Ok(Intrinsics { width: columns, height: rows, fx, fy, cx, cy, distortion })
 }
 
 /// The rotation of a quaternion (w, x, y, z), which needn't have unit length.
@@ -510,6 +470,8 @@ impl<'a> Line<'a> {
 
 #[cfg(test)]
 mod tests {
+    use scene::Distortion;
+
     use super::*;
     use crate::photograph::tests::write_png;
 
@@ -573,8 +535,6 @@ mod tests {
         files.iter().for_each(|(name, bytes)| std::fs::write(sparse.join(name), bytes).unwrap());
     }
 
-    const SIMPLE: Distortion = Distortion { radial: [-0.1, 0.0, 0.0], tangential: [0.0; 2] };
-
     fn text<'a>(
         cameras: &'a str,
         images: &'a str,
@@ -624,15 +584,12 @@ mod tests {
                 fy: 35.0,
                 cx: 20.0,
                 cy: 15.0,
-                distortion: SIMPLE
+                distortion: Distortion::brown([-0.1, 0.0, 0.0], [0.0; 2])
             }
         );
         assert_eq!(b.depths, Some([4.0, 5.0]));
         assert_eq!(b.camera_to_world, [[1., 0., 0., 0.], [0., -1., 0., 0.], [0., 0., -1., -3.]]);
-        assert_eq!(
-            a.taken_with.distortion,
-            Distortion { radial: [0.1, 0.01, 0.0], tangential: [0.001, -0.002] }
-        );
+        assert_eq!(a.taken_with.distortion, Distortion::brown([0.1, 0.01, 0.0], [0.001, -0.002]));
         assert_eq!(a.depths, None);
         assert!(
             (a.camera_to_world[0][3] - 1.0).abs() < 1e-12
@@ -725,8 +682,8 @@ mod tests {
             ("SIMPLE_RADIAL", "FOV", "line 2: FOV has 5 parameters"),
             (
                 "SIMPLE_RADIAL 80 60 70 40 30 -0.1",
-                "SIMPLE_RADIAL_FISHEYE 80 60 70 40 30 -0.1",
-                "not supported",
+                "FOV 80 60 70 70 40 30 -0.1",
+                "camera model FOV is not supported; undistort with colmap image_undistorter",
             ),
             ("SIMPLE_RADIAL", "ROUND", "camera model \"ROUND\" is unknown"),
             ("1 SIMPLE_RADIAL", "9 SIMPLE_RADIAL", "frame 1 (b 1.png): there is no camera 1"),
@@ -763,6 +720,32 @@ mod tests {
                 .unwrap_err()
                 .to_string()
                 .contains("it has no images")
+        );
+    }
+
+    fn with_number(number: u8) -> [Vec<u8>; 3] {
+        let mut files = binary();
+        files[0][12] = number;
+        files
+    }
+
+    #[test]
+    fn unknown_model_numbers_are_named() {
+        for number in [11, 12, 13, 16, 17, 200] {
+            let message = read_binaries(&with_number(number)).unwrap_err().to_string();
+            let words = format!(
+                "camera 1 has model {number}, which this program doesn't know (a newer COLMAP's?); \
+                undistort with colmap image_undistorter"
+            );
+            assert!(message.ends_with(&words), "{message}");
+        }
+        // A fisheye model with as many parameters.
+        let set = read_binaries(&with_number(8)).unwrap();
+        assert_eq!(set.frames[1].taken_with.distortion, Distortion::fisheye([-0.1, 0.0, 0.0, 0.0]));
+        assert!(
+            set.notes.contains(&"1 photograph was taken with a fisheye lens".to_owned()),
+            "{:?}",
+            set.notes
         );
     }
 

@@ -142,7 +142,7 @@ pub enum FileReason {
         model: String,
     },
     /// A camera model that isn't read.
-    #[error("camera model {model} is not supported; undistort first (colmap image_undistorter)")]
+    #[error("camera model {model} is not supported; undistort with colmap image_undistorter")]
     Model {
         /// Its name.
         model: String,

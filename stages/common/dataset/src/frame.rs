@@ -32,7 +32,7 @@ pub struct Frame {
     /// space.
     pub camera_to_world: Pose,
     /// Depth of the nearest and of the farthest point that it is known to see, along its axis,
-    /// where the data says so.
+    /// where the data says so; through a fisheye lens their distances.
     pub depths: Option<[f64; 2]>,
 }
 
@@ -49,6 +49,11 @@ impl Frame {
             intrinsics: self.intrinsics(),
             camera_to_world: self.camera_to_world,
         }
+    }
+
+    /// True if some of its pixels may not count.
+    pub fn is_masked(&self) -> bool {
+        self.mask.is_some() || self.intrinsics().has_cut_rays()
     }
 
     /// Refuses what no camera can be. Whether each place in a distorted image has its ray is asked

@@ -88,9 +88,6 @@ pub enum FrameReason {
         /// Its name.
         model: String,
     },
-    /// A fisheye lens.
-    #[error("fisheye lenses are not supported; undistort the images first")]
-    Fisheye,
     /// Nothing says how wide it looks.
     #[error("no focal length: neither fl_x nor camera_angle_x is given")]
     NoFocalLength,

@@ -6,9 +6,9 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use pixels::{
     COLOUR_CHANNELS, MAX_PIXELS, Mask, PixelError, Rgba8, exr_reading_bytes, exr_size, read_exr,
-    sample_cubic, srgb_from_linear, to_u8,
+    srgb_from_linear, to_u8,
 };
-use scene::Intrinsics;
+use scene::{Intrinsics, undistorted};
 
 use crate::clipping::Clipping;
 use crate::error::DatasetError;
@@ -238,15 +238,21 @@ impl Frame {
         Ok((self.seen(image), clipping))
     }
 
-    /// Which of [`Frame::photograph`]'s pixels count, where the data say so. A mask of another size
-    /// than the photograph's is resampled by nearest neighbour.
+    /// Returns which of [`Frame::photograph`]'s pixels count: those of its mask whose rays the lens
+    /// has. `None` if all do. A mask of another size than the photograph's is resampled by nearest
+    /// neighbour.
     pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
-        let Some(file) = &self.mask else { return Ok(None) };
+        let lens = self.intrinsics().lens_mask();
+        let Some(file) = &self.mask else { return Ok(lens) };
         let (image, _) = read(&file.path, self.turn == Turn::Upright)?;
         let size = (self.taken_with.width as usize, self.taken_with.height as usize);
         let mut mask = Mask::of(&self.seen(nearest(&image, size)));
         if file.kind.is_inverted() {
             mask.counts.iter_mut().for_each(|counts| *counts = !*counts);
+        }
+        if let Some(lens) = lens {
+            let counts = mask.counts.iter_mut().zip(lens.counts);
+            counts.for_each(|(counts, has_ray)| *counts &= has_ray);
         }
         Ok(Some(mask))
     }
@@ -272,22 +278,6 @@ fn nearest(image: &Rgba8, (width, height): (usize, usize)) -> Rgba8 {
         }
     }
     Rgba8::new(width, height, data)
-}
-
-/// The image that a pinhole camera would have taken, by cubic interpolation.
-fn undistorted(image: &Rgba8, taken_with: &Intrinsics, pinhole: &Intrinsics) -> Rgba8 {
-    let mut data = Vec::with_capacity(image.data.len());
-    for y in 0..image.height {
-        for x in 0..image.width {
-            let at = taken_with.source(pinhole, [x as f64 + 0.5, y as f64 + 0.5]);
-            let colour = sample_cubic((image.width, image.height), at, |column, row| {
-                let at = 4 * (row * image.width + column);
-                [0, 1, 2, 3].map(|c| f64::from(image.data[at + c]))
-            });
-            data.extend(colour.map(|v| (v + 0.5) as u8));
-        }
-    }
-    Rgba8::new(image.width, image.height, data)
 }
 
 #[cfg(test)]
@@ -452,7 +442,7 @@ pub(crate) mod tests {
     /// A pinhole image seen through a lens and undone is the pinhole image again.
     #[test]
     fn distortion_is_undone() {
-        let distortion = Distortion { radial: [-0.12, 0.02, 0.0], tangential: [0.002, -0.001] };
+        let distortion = Distortion::brown([-0.12, 0.02, 0.0], [0.002, -0.001]);
         let intrinsics = Intrinsics {
             width: 120,
             height: 90,

@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use artifact::counted;
-use scene::{CameraError, Distortion, Intrinsics};
+use scene::{CameraError, Intrinsics};
 use serde::Deserialize;
 
 use crate::dataset::Dataset;
@@ -11,6 +11,7 @@ use crate::format::Format;
 use crate::frame::Frame;
 use crate::frame_file::{FrameFile, Missing, lookup_of};
 use crate::frame_reason::FrameReason;
+use crate::lens_entry::LensEntry;
 use crate::number::Number;
 use crate::photograph::{Stored, fitted, look};
 use crate::turn::Turn;
@@ -25,26 +26,6 @@ pub(crate) struct Transforms {
     pub(crate) train_filenames: Option<Vec<String>>,
     pub(crate) test_filenames: Option<Vec<String>>,
     pub(crate) val_filenames: Option<Vec<String>>,
-}
-
-#[derive(Clone, Default, Deserialize)]
-pub(crate) struct LensEntry {
-    camera_model: Option<String>,
-    camera_angle_x: Option<Number>,
-    camera_angle_y: Option<Number>,
-    fl_x: Option<Number>,
-    fl_y: Option<Number>,
-    cx: Option<Number>,
-    cy: Option<Number>,
-    w: Option<Number>,
-    h: Option<Number>,
-    k1: Option<Number>,
-    k2: Option<Number>,
-    k3: Option<Number>,
-    k4: Option<Number>,
-    p1: Option<Number>,
-    p2: Option<Number>,
-    is_fisheye: Option<bool>,
 }
 
 #[derive(Deserialize)]
@@ -121,46 +102,9 @@ pub(crate) fn read_frame(
     }
 }
 
-impl LensEntry {
-    /// What is said here, and where nothing is, what `other` says.
-    fn or(&self, other: &Self) -> Self {
-        macro_rules! both {
-            ($($name:ident),*) => {
-                Self { $($name: self.$name.clone().or_else(|| other.$name.clone())),* }
-            };
-        }
-        both!(
-            camera_model,
-            camera_angle_x,
-            camera_angle_y,
-            fl_x,
-            fl_y,
-            cx,
-            cy,
-            w,
-            h,
-            k1,
-            k2,
-            k3,
-            k4,
-            p1,
-            p2,
-            is_fisheye
-        )
-    }
-}
-
 /// What an image was taken with, and whether it has to be turned.
 fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, Turn), FrameReason> {
-    let model = entry.camera_model.as_deref().unwrap_or("OPENCV");
-    if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"]
-        .contains(&model)
-    {
-        return Err(FrameReason::Model { model: model.to_owned() });
-    }
-    if entry.is_fisheye == Some(true) || entry.k4.is_some_and(|k| k.0 != 0.0) {
-        return Err(FrameReason::Fisheye);
-    }
+    let distortion = entry.distortion()?;
     // The size that the numbers are for; the stored image may be a smaller copy.
     let (width, height) =
         (whole(entry.w, "w", stored.size.0)?, whole(entry.h, "h", stored.size.1)?);
@@ -171,10 +115,6 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, Turn), F
     };
     let or = |number: Option<Number>, otherwise: f64| number.map_or(otherwise, |number| number.0);
     let (cx, cy) = (or(entry.cx, 0.5 * f64::from(width)), or(entry.cy, 0.5 * f64::from(height)));
-    let distortion = Distortion {
-        radial: [entry.k1, entry.k2, entry.k3].map(|k| or(k, 0.0)),
-        tangential: [entry.p1, entry.p2].map(|p| or(p, 0.0)),
-    };
     let (k, turn) = fitted(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)?;
     // A size that the file doesn't give is the stored image's, which proves nothing.
     let is_assumed = turn == Turn::Stored && (entry.w.is_none() || entry.h.is_none());
@@ -211,6 +151,8 @@ fn focal(
 
 #[cfg(test)]
 mod tests {
+    use scene::Distortion;
+
     use super::*;
     use crate::photograph::tests::write_png;
     use crate::split::Split;
@@ -241,7 +183,7 @@ mod tests {
             "p2": 0.01, "camera_model": "OPENCV""#;
         let set = set(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
         let of = |i: usize| set.frames[i].taken_with;
-        let distortion = Distortion { radial: [0.0; 3], tangential: [0.0, 0.01] };
+        let distortion = Distortion::brown([0.0; 3], [0.0, 0.01]);
         assert_eq!(
             of(0),
             Intrinsics {
@@ -297,13 +239,48 @@ mod tests {
         assert_eq!(set(&frames(r#""fl_x": 50"#, "")).unwrap().split, None);
     }
 
+    fn lens(head: &str) -> Distortion {
+        set(&frames(&format!(r#""fl_x": 50, {head}"#), "")).unwrap().frames[0].taken_with.distortion
+    }
+
+    /// The same letters are other coefficients in other models.
+    #[test]
+    fn coefficients_belong_to_their_model() {
+        let all = r#""k1": 0.1, "k2": -0.02, "k3": 0.003, "k4": -0.0004, "p1": 0.01, "p2": 0.002"#;
+        let radial = [0.1, -0.02, 0.003, -0.0004];
+        let tangential = [0.01, 0.002];
+        let brown = Distortion { radial, tangential, ..Distortion::default() };
+        let fisheye = Distortion { tangential, ..Distortion::fisheye(radial) };
+        let rational = |k5, k6| Distortion {
+            denominator: [-0.0004, k5, k6],
+            ..Distortion::brown([0.1, -0.02, 0.003], tangential)
+        };
+        for (head, expected) in [
+            ("", brown),
+            (r#""camera_model": "OPENCV", "is_fisheye": false,"#, brown),
+            (r#""camera_model": "FULL_OPENCV","#, rational(0.0, 0.0)),
+            (r#""camera_model": "FULL_OPENCV", "k5": 0.5, "k6": 0.25,"#, rational(0.5, 0.25)),
+            (r#""camera_model": "OPENCV", "k6": 0.25,"#, rational(0.0, 0.25)),
+            (r#""camera_model": "OPENCV_FISHEYE","#, fisheye),
+            (r#""camera_model": "OPENCV", "is_fisheye": true,"#, fisheye),
+            (r#""is_fisheye": true,"#, fisheye),
+            (r#""camera_model": "RADIAL_FISHEYE", "is_fisheye": false,"#, fisheye),
+        ] {
+            assert_eq!(lens(&format!("{head} {all}")), expected, "{head}");
+        }
+        assert_eq!(lens(r#""is_fisheye": true"#), Distortion::fisheye([0.0; 4]));
+        assert_eq!(lens(r#""is_fisheye": false, "latlong": false"#), Distortion::default());
+    }
+
     #[test]
     fn mistakes_are_named() {
         for (head, first, words) in [
             (r#""w": 40"#, "", "no focal length"),
             (r#""fl_x": -5"#, "", "fx is -5"),
-            (r#""fl_x": 50, "camera_model": "OPENCV_FISHEYE""#, "", "OPENCV_FISHEYE"),
-            (r#""fl_x": 50, "k4": 0.1"#, "", "fisheye"),
+            (r#""fl_x": 50, "camera_model": "EQUIRECTANGULAR""#, "", "\"EQUIRECTANGULAR\" is not"),
+            (r#""fl_x": 50, "camera_model": "FISHEYE624""#, "", "\"FISHEYE624\" is not supported"),
+            (r#""fl_x": 50, "latlong": true"#, "", "latlong"),
+            (r#""fl_x": 50, "k4": Infinity"#, "", "k4 inf"),
             (r#""fl_x": 50, "w": 40, "h": 40"#, "", "another shape"),
             (r#""fl_x": 50, "w": 0"#, "", "w is 0"),
             (r#""fl_x": 50"#, r#""mask_path": "masks/a.png","#, "masks/a.png is not there"),

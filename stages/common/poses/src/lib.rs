@@ -206,13 +206,13 @@ fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [[D
     let k = &camera.intrinsics;
     let [u, v] = k.undistort([u, v]);
     let (x, y) = ((u - k.cx) / k.fx, -(v - k.cy) / k.fy);
-    let [by_x, by_both, by_y] = k.distortion.slope([x, -y]);
+    let [by_x, by_y] = k.distortion.derivative([x, -y]);
     let place = depth * DVec3::new(x, y, -1.0);
     // Of a point in camera space, on the plane of depth 1.
     let along_x = DVec3::new(1.0, 0.0, x) / depth;
     let along_y = DVec3::new(0.0, -1.0, -y) / depth;
-    let right = k.fx * (by_x * along_x + by_both * along_y);
-    let down = k.fy * (by_both * along_x + by_y * along_y);
+    let right = k.fx * (by_x[0] * along_x + by_x[1] * along_y);
+    let down = k.fy * (by_y[0] * along_x + by_y[1] * along_y);
     // In camera space a point goes the other way: by place × turn, and by -shift.
     [right, down].map(|along| [along.cross(place), -unit * along])
 }

@@ -48,7 +48,7 @@ fn camera(i: usize) -> Camera {
         0.1 * angle.cos(),
         0.05 * i as f64,
     );
-    let distortion = Distortion { radial: [-0.1, 0.03, 0.0], tangential: [0.002, -0.004] };
+    let distortion = Distortion::brown([-0.1, 0.03, 0.0], [0.002, -0.004]);
     let bare = Camera {
         name: format!("r_{i}"),
         intrinsics: Intrinsics {
@@ -101,15 +101,25 @@ fn motion(turn: [f64; 3], shift: [f64; 3]) -> Motion {
 
 #[test]
 fn image_motion_is_that_of_a_moved_camera() {
-    let (camera, at, unit) = (camera(3), [50.0, 7.0], 3.7);
+    assert_image_motion(&camera(3));
+    let mut wide = camera(3);
+    let lens = Distortion::fisheye([-0.02, 0.006, -0.003, 0.0005]);
+    wide.intrinsics.distortion = Distortion { tangential: [0.002, -0.004], ..lens };
+    (wide.intrinsics.fx, wide.intrinsics.fy) = (30.0, 31.0);
+    assert_image_motion(&wide);
+}
+
+#[track_caller]
+fn assert_image_motion(camera: &Camera) {
+    let (at, unit) = ([50.0, 7.0], 3.7);
     let ray = camera.ray(at[0], at[1]);
     let distance = 3.0;
     let depth = distance * camera.depth_per_distance(&ray);
-    let predicted = image_motion(&camera, at, depth, unit);
+    let predicted = image_motion(camera, at, depth, unit);
     let step = 1e-6;
     for i in 0..6 {
         let one = |k: usize, size: f64| [0, 1, 2].map(|j| if j + k == i { size } else { 0.0 });
-        let moved = motion(one(0, step), one(3, unit * step)).applied_to(&camera);
+        let moved = motion(one(0, step), one(3, unit * step)).applied_to(camera);
         let (u, v, _) = moved.project(ray.at(distance)).unwrap();
         for (predicted, seen) in
             [(predicted[0][i / 3][i % 3], u - at[0]), (predicted[1][i / 3][i % 3], v - at[1])]

@@ -338,10 +338,32 @@ mod tests {
 
     fn mild() -> impl Strategy<Value = Distortion> {
         let radial = (-0.2..0.2f64, -0.05..0.05f64, -0.02..0.02f64);
-        (radial, -0.01..0.01f64, -0.01..0.01f64).prop_map(|((k1, k2, k3), p1, p2)| Distortion {
-            radial: [k1, k2, k3],
-            tangential: [p1, p2],
-        })
+        (radial, -0.01..0.01f64, -0.01..0.01f64)
+            .prop_map(|((k1, k2, k3), p1, p2)| Distortion::brown([k1, k2, k3], [p1, p2]))
+    }
+
+    fn fisheye() -> impl Strategy<Value = Distortion> {
+        (-0.04..0.06f64, -0.01..0.01f64)
+            .prop_map(|(k1, k2)| Distortion::fisheye([k1, k2, 0.0, 0.0]))
+    }
+
+    /// Rays of a fisheye end 89° from its axis, with positive depth, and nothing beyond is seen.
+    #[test]
+    fn a_fisheye_sees_up_to_89_degrees() {
+        let mut camera = camera(DVec3::Y, 0.4, DVec3::ONE);
+        camera.intrinsics.distortion = Distortion::fisheye([-0.02, 0.006, -0.003, 0.0005]);
+        (camera.intrinsics.fx, camera.intrinsics.fy) = (10.0, 10.0);
+        camera.check().unwrap();
+        let corner = camera.ray(37.0, 0.0);
+        let angle = corner.direction.dot(camera.forward()).acos().to_degrees();
+        assert!((angle - 89.0).abs() < 1e-9, "{angle}");
+        let r = camera.rotation();
+        let seen = |degrees: f64| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            camera.project(camera.centre() + r * DVec3::new(sin, 0.0, -cos))
+        };
+        assert!(seen(88.9).is_some());
+        assert_eq!([seen(89.1), seen(90.1), seen(180.0)], [None; 3]);
     }
 
     proptest! {
@@ -350,7 +372,7 @@ mod tests {
             a in (unit(), unit(), 0.1..1.0f64), angle in -3.0..3.0f64,
             c in (unit(), unit(), unit()),
             x in 0.0..37.0f64, y in 0.0..23.0f64, t in 0.1..100.0f64,
-            distortion in prop_oneof![Just(Distortion::default()), mild()],
+            distortion in prop_oneof![Just(Distortion::default()), mild(), fisheye()],
         ) {
             let mut camera = camera(DVec3::from(a), angle, DVec3::from(c) * 5.0);
             camera.intrinsics.distortion = distortion;

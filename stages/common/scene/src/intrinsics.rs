@@ -1,3 +1,4 @@
+use pixels::Mask;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +20,7 @@ pub struct Intrinsics {
     pub cx: f64,
     /// Principal point, y; the image's top edge is 0.
     pub cy: f64,
-    /// The lens's distortion; without it a pinhole.
+    /// The lens's projection and distortion; a pinhole's by default.
     #[serde(default, skip_serializing_if = "Distortion::is_none")]
     pub distortion: Distortion,
 }
@@ -29,6 +30,11 @@ const MOST_ZOOM: f64 = 4.0;
 
 /// Places along each side of an image at which a distortion is looked at.
 const BORDER_PLACES: u32 = 64;
+
+/// Maximum of half a side over the focal length for a pinhole camera that takes a fisheye's place:
+/// tan 50°. At 100° across, the border has 2.4 times as many pixels per degree as the middle; wider
+/// views would spend ever more of the image on their borders.
+const MAX_PINHOLE_SLOPE: f64 = 1.191_753_592_594_21;
 
 impl Intrinsics {
     /// A centred camera with square pixels that sees `angle_x` radians from left to right edge.
@@ -78,8 +84,8 @@ impl Intrinsics {
     }
 
     /// The pinhole camera of the same size that sees as much as it can and nothing that this one
-    /// doesn't. `None` where the distortion is beyond sense: its image would have to be cut to a
-    /// quarter and less.
+    /// doesn't; in place of a fisheye lens it sees at most 100° across its longer side. `None` where
+    /// the distortion is beyond sense: its image would have to be cut to a quarter and less.
     pub fn pinhole(&self) -> Option<Self> {
         let pinhole = Self { distortion: Distortion::default(), ..*self };
         if self.distortion.is_none() {
@@ -87,7 +93,7 @@ impl Intrinsics {
         }
         let zoomed = |zoom: f64| Self { fx: self.fx * zoom, fy: self.fy * zoom, ..pinhole };
         let fits = |zoom: f64| self.sees_all_of(&zoomed(zoom));
-        let (mut low, mut high) = (1.0 / MOST_ZOOM, MOST_ZOOM);
+        let (mut low, mut high) = (self.least_zoom(), MOST_ZOOM);
         if !fits(high) {
             return None;
         }
@@ -100,6 +106,48 @@ impl Intrinsics {
             if fits(middle) { high = middle } else { low = middle }
         }
         Some(zoomed(high))
+    }
+
+    /// Returns the least zoom of a pinhole camera that takes this one's place.
+    fn least_zoom(&self) -> f64 {
+        let least = 1.0 / MOST_ZOOM;
+        if !self.distortion.is_fisheye() {
+            return least;
+        }
+        let zoom = |size: u32, focal: f64| 0.5 * f64::from(size) / (focal * MAX_PINHOLE_SLOPE);
+        least.max(zoom(self.width, self.fx)).max(zoom(self.height, self.fy)).min(MOST_ZOOM)
+    }
+
+    /// Returns a pinhole's angles of view across width and height, in degrees.
+    pub fn pinhole_angles(&self) -> [f64; 2] {
+        let angle = |centre: f64, size: u32, focal: f64| {
+            let sides = [centre, f64::from(size) - centre];
+            sides.map(|side| libm::atan(side / focal)).iter().sum::<f64>().to_degrees()
+        };
+        [angle(self.cx, self.width, self.fx), angle(self.cy, self.height, self.fy)]
+    }
+
+    /// Returns the mask of pixels whose centre's ray isn't cut, or `None` if no ray is: those of a
+    /// fisheye lens are, 89° from the axis.
+    pub fn lens_mask(&self) -> Option<Mask> {
+        if !self.has_cut_rays() {
+            return None;
+        }
+        let (width, height) = (self.width as usize, self.height as usize);
+        let centre = |i: usize| [(i % width) as f64 + 0.5, (i / width) as f64 + 0.5];
+        let counts = (0..width * height).map(|i| !self.is_cut(centre(i))).collect();
+        Some(Mask { width, height, counts })
+    }
+
+    /// True if rays of the image are cut, as those of a fisheye lens are 89° from the axis.
+    pub fn has_cut_rays(&self) -> bool {
+        self.border().any(|at| self.is_cut(at))
+    }
+
+    /// True if the ray at a position, in pixels, is that of another: a fisheye's ray is cut 89°
+    /// from the axis.
+    pub fn is_cut(&self, [x, y]: [f64; 2]) -> bool {
+        self.distortion.is_cut([(x - self.cx) / self.fx, (y - self.cy) / self.fy])
     }
 
     /// Where in this camera's image what another, at the same place, sees at a position.
@@ -193,7 +241,7 @@ mod tests {
 
     #[test]
     fn nonsense_is_no_lens() {
-        let bent = |radial, tangential: [f64; 2]| camera(Distortion { radial, tangential });
+        let bent = |radial, tangential| camera(Distortion::brown(radial, tangential));
         let folded = bent([-40.0, 0.0, 0.0], [0.0; 2]);
         assert_eq!(folded.pinhole(), None);
         assert!(!folded.has_rays());
@@ -202,9 +250,43 @@ mod tests {
         assert!(!bent([-0.193, -0.047, -0.0156], [-0.0056, 0.0078]).has_rays());
     }
 
+    /// A fisheye camera that sees so many degrees from left to right, without distortion.
+    fn fisheye(degrees: f64) -> Intrinsics {
+        let focal = 400.0 / degrees.to_radians();
+        Intrinsics { fx: focal, fy: focal, ..camera(Distortion::fisheye([0.0; 4])) }
+    }
+
+    /// Pixels beyond 89° are masked, by the angle of their centres.
+    #[test]
+    fn pixels_beyond_the_last_ray_are_masked() {
+        let wide = fisheye(200.0);
+        assert!(wide.has_rays());
+        let mask = wide.lens_mask().unwrap();
+        for (i, counts) in mask.counts.iter().enumerate() {
+            let (x, y) = ((i % 400) as f64 + 0.5 - wide.cx, (i / 400) as f64 + 0.5 - wide.cy);
+            assert_eq!(*counts, (x.hypot(y) / wide.fx).to_degrees() < 89.0, "{x} {y}");
+        }
+        assert_eq!(fisheye(140.0).lens_mask(), None);
+        assert_eq!(camera(Distortion::default()).lens_mask(), None);
+    }
+
+    /// In place of a fisheye a pinhole sees at most 100° across, and less if the lens does.
+    #[test]
+    fn a_fisheyes_pinhole_has_a_known_angle() {
+        for (degrees, expected) in [(200.0, 100.0), (120.0, 100.0)] {
+            let pinhole = fisheye(degrees).pinhole().unwrap();
+            let [across, down] = pinhole.pinhole_angles();
+            assert!((across - expected).abs() < 0.1 && down < across, "{degrees}: {across} {down}");
+            assert!(pinhole.distortion.is_none());
+        }
+        let [across, _] = fisheye(60.0).pinhole().unwrap().pinhole_angles();
+        assert!((50.0..60.0).contains(&across), "{across}");
+    }
+
     /// Cameras with lenses that bend, but fold no corner of the image.
     fn mild() -> impl Strategy<Value = Intrinsics> {
-        crate::lens::tests::mild().prop_map(camera)
+        use crate::lens::tests::{fisheye, higher, mild};
+        prop_oneof![mild(), higher(), fisheye()].prop_map(camera)
     }
 
     proptest! {

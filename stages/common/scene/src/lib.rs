@@ -12,7 +12,8 @@
 //!   (width/2, height/2). So resizing an image from W to W' multiplies `fx` and `cx` by W'/W and
 //!   nothing else; a half-pixel shift caps PSNR at 25–28 dB at 200 pixels.
 //! * **Distortion** is part of the intrinsics: [`Camera::ray`] and [`Camera::project`] follow it,
-//!   so that photographs stay as they were taken. Rays are straight all the same.
+//!   so that photographs stay as they were taken. Rays are straight all the same. A fisheye lens's
+//!   rays end 89° from the axis, so that depth stays positive: pixels beyond are masked.
 //! * **Rays**: directions have unit length; t is the distance along the ray. **Depth** is
 //!   camera-space z-depth in scene units, -z of the point in camera space: what EXR channel `Z`
 //!   holds.
@@ -34,7 +35,9 @@ mod camera;
 mod intrinsics;
 mod lens;
 mod pose;
+mod projection;
 mod space;
+mod undistorted;
 mod view_image;
 mod views;
 mod warp;
@@ -44,7 +47,9 @@ pub use camera::{Camera, CameraError, CameraRay, CameraRays, common_direction};
 pub use intrinsics::Intrinsics;
 pub use lens::Distortion;
 pub use pose::{Pose, looking_at, pose_of};
+pub use projection::Projection;
 pub use space::{Frustum, Space};
+pub use undistorted::undistorted;
 pub use view_image::{VIEW_CHANNELS, image_file, mask_file, preview_file, write_view_image};
 pub use views::{Background, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
 pub use warp::{Surface, Visibility};

@@ -49,6 +49,8 @@ pub(crate) struct View {
     /// Number of the pose.
     pub(crate) pose: usize,
     pub(crate) inside: [f64; 6],
+    /// Lens as in `views.json`; null for a pinhole.
+    pub(crate) lens: Value,
     /// True for each pixel that counts; no mask where `None`.
     pub(crate) mask: Option<fn(u32, u32) -> bool>,
 }
@@ -59,6 +61,7 @@ pub(crate) fn views(names: &str, numbers: impl IntoIterator<Item = usize>) -> Ve
         name: names.replace('#', &pose.to_string()),
         pose,
         inside: INSIDE,
+        lens: Value::Null,
         mask: None,
     };
     numbers.into_iter().map(of).collect()
@@ -159,6 +162,10 @@ fn failure_of_view(subtree: &Path, view: &Value, expected: &View) -> Option<Stri
     let is_near = |a: &f64, b: &f64| (a - b).abs() < 1e-9;
     if !inside.iter().zip(&expected.inside).all(|(a, b)| is_near(a, b)) {
         return Some(format!("{}: {inside:?}, expected {:?}", expected.name, expected.inside));
+    }
+    let lens = &camera["intrinsics"]["distortion"];
+    if *lens != expected.lens {
+        return Some(format!("{}: lens {lens}, expected {}", expected.name, expected.lens));
     }
     let pose: Vec<Vec<f64>> = serde_json::from_value(camera["camera_to_world"].clone()).unwrap();
     let expected_pose = pose_of(expected.pose);

@@ -3,6 +3,7 @@
 
 mod images;
 mod kit;
+mod lenses;
 mod masks;
 mod names;
 mod nearby;
@@ -13,8 +14,15 @@ mod splits;
 use kit::Case;
 
 /// Tables of cases, one a subject.
-const SUBJECTS: &[fn() -> Vec<Case>] =
-    &[names::cases, reduced::cases, splits::cases, masks::cases, images::cases, nearby::cases];
+const SUBJECTS: &[fn() -> Vec<Case>] = &[
+    names::cases,
+    reduced::cases,
+    splits::cases,
+    masks::cases,
+    lenses::cases,
+    images::cases,
+    nearby::cases,
+];
 
 #[test]
 fn folders_as_people_have_them() {

@@ -1,0 +1,106 @@
+//! COLMAP's camera models (its `models.h`).
+
+use scene::{Distortion, Intrinsics};
+
+use crate::file_reason::FileReason;
+
+/// A camera model.
+pub(crate) struct CameraModel {
+    /// Number in binary files.
+    number: u32,
+    /// Name in text files.
+    name: &'static str,
+    /// Number of parameters.
+    pub(crate) parameters: usize,
+}
+
+/// Models by number. COLMAP 4 has more, which stay unknown here.
+const MODELS: [CameraModel; 13] = [
+    CameraModel { number: 0, name: "SIMPLE_PINHOLE", parameters: 3 },
+    CameraModel { number: 1, name: "PINHOLE", parameters: 4 },
+    CameraModel { number: 2, name: "SIMPLE_RADIAL", parameters: 4 },
+    CameraModel { number: 3, name: "RADIAL", parameters: 5 },
+    CameraModel { number: 4, name: "OPENCV", parameters: 8 },
+    CameraModel { number: 5, name: "OPENCV_FISHEYE", parameters: 8 },
+    CameraModel { number: 6, name: "FULL_OPENCV", parameters: 12 },
+    CameraModel { number: 7, name: "FOV", parameters: 5 },
+    CameraModel { number: 8, name: "SIMPLE_RADIAL_FISHEYE", parameters: 4 },
+    CameraModel { number: 9, name: "RADIAL_FISHEYE", parameters: 5 },
+    CameraModel { number: 10, name: "THIN_PRISM_FISHEYE", parameters: 12 },
+    CameraModel { number: 14, name: "SIMPLE_FISHEYE", parameters: 3 },
+    CameraModel { number: 15, name: "FISHEYE", parameters: 4 },
+];
+
+impl CameraModel {
+    /// Finds a model by its number.
+    pub(crate) fn of_number(number: u32) -> Option<&'static Self> {
+        MODELS.iter().find(|model| model.number == number)
+    }
+
+    /// Finds a model by its name.
+    pub(crate) fn of_name(name: &str) -> Option<&'static Self> {
+        MODELS.iter().find(|model| model.name == name)
+    }
+
+    /// Returns a camera's intrinsics, or why they can't be.
+    pub(crate) fn intrinsics(
+        &self,
+        width: u64,
+        height: u64,
+        parameters: &[f64],
+    ) -> Result<Intrinsics, FileReason> {
+        let side = |value: u64| u32::try_from(value).ok().filter(|v| *v > 0);
+        let (Some(columns), Some(rows)) = (side(width), side(height)) else {
+            return Err(FileReason::Size { width, height });
+        };
+        if parameters.len() != self.parameters {
+            return Err(FileReason::Parameters {
+                model: self.name.to_owned(),
+                expected: self.parameters,
+                found: parameters.len(),
+            });
+        }
+        let (pinhole, distortion) = self.lens(parameters)?;
+        let [fx, fy, cx, cy] = pinhole;
+        Ok(Intrinsics { width: columns, height: rows, fx, fy, cx, cy, distortion })
+    }
+
+    /// Returns focal lengths with principal point, and the distortion.
+    fn lens(&self, parameters: &[f64]) -> Result<([f64; 4], Distortion), FileReason> {
+        let none = Distortion::default();
+        let lens = match (self.name, parameters) {
+            ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f, cx, cy], none),
+            ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], none),
+            ("SIMPLE_RADIAL", &[f, cx, cy, k]) => {
+                ([f, f, cx, cy], Distortion::brown([k, 0.0, 0.0], [0.0; 2]))
+            }
+            ("RADIAL", &[f, cx, cy, k1, k2]) => {
+                ([f, f, cx, cy], Distortion::brown([k1, k2, 0.0], [0.0; 2]))
+            }
+            ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
+                ([fx, fy, cx, cy], Distortion::brown([k1, k2, 0.0], [p1, p2]))
+            }
+            ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
+                let above = Distortion::brown([k1, k2, k3], [p1, p2]);
+                ([fx, fy, cx, cy], Distortion { denominator: [k4, k5, k6], ..above })
+            }
+            ("SIMPLE_FISHEYE", &[f, cx, cy]) => ([f, f, cx, cy], Distortion::fisheye([0.0; 4])),
+            ("FISHEYE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], Distortion::fisheye([0.0; 4])),
+            ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k]) => {
+                ([f, f, cx, cy], Distortion::fisheye([k, 0.0, 0.0, 0.0]))
+            }
+            ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => {
+                ([f, f, cx, cy], Distortion::fisheye([k1, k2, 0.0, 0.0]))
+            }
+            ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
+                ([fx, fy, cx, cy], Distortion::fisheye([k1, k2, k3, k4]))
+            }
+            ("THIN_PRISM_FISHEYE", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, 0.0, 0.0]) => {
+                let radial = Distortion::fisheye([k1, k2, k3, k4]);
+                ([fx, fy, cx, cy], Distortion { tangential: [p1, p2], ..radial })
+            }
+            _ => return Err(FileReason::Model { model: self.name.to_owned() }),
+        };
+        Ok(lens)
+    }
+}

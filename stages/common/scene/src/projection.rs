@@ -1,0 +1,71 @@
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Mapping of a ray to the image plane before distortion. The plane's unit is the focal length.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Projection {
+    /// Distance from the principal point is the tangent of the ray's angle from the optical axis.
+    #[default]
+    Perspective,
+    /// Equidistant: distance from the principal point is the angle itself, in radians.
+    Fisheye,
+}
+
+/// Maximum angle between a fisheye lens's ray and the optical axis, in radians: 89°. Beyond 90° a
+/// point has no positive depth, and just below it no useful slope.
+pub(crate) const MAX_FISHEYE_ANGLE: f64 = 89.0 / 180.0 * std::f64::consts::PI;
+
+impl Projection {
+    /// True for the perspective projection.
+    pub fn is_perspective(&self) -> bool {
+        *self == Self::Perspective
+    }
+
+    /// Returns the plane position of the ray with slopes (x, y) against the optical axis.
+    pub(crate) fn plane_position(self, [x, y]: [f64; 2]) -> [f64; 2] {
+        match self {
+            Self::Perspective => [x, y],
+            Self::Fisheye => {
+                let slope = libm::hypot(x, y);
+                scaled([x, y], ratio(libm::atan(slope), slope))
+            }
+        }
+    }
+
+    /// Returns the slopes of the ray at a plane position, whose fisheye angle is below 90°.
+    pub(crate) fn slopes(self, [u, v]: [f64; 2]) -> [f64; 2] {
+        match self {
+            Self::Perspective => [u, v],
+            Self::Fisheye => {
+                let angle = libm::hypot(u, v);
+                scaled([u, v], ratio(libm::tan(angle), angle))
+            }
+        }
+    }
+
+    /// Returns the derivative of [`Projection::plane_position`], a symmetric matrix: of x by x, of
+    /// x by y and of y by y.
+    pub(crate) fn derivative(self, [x, y]: [f64; 2]) -> [f64; 3] {
+        match self {
+            Self::Perspective => [1.0, 0.0, 1.0],
+            Self::Fisheye => {
+                let slope = libm::hypot(x, y);
+                let across = ratio(libm::atan(slope), slope);
+                let excess = 1.0 / (1.0 + slope * slope) - across;
+                let [nx, ny] = [ratio(x, slope), ratio(y, slope)];
+                [across + excess * nx * nx, excess * nx * ny, across + excess * ny * ny]
+            }
+        }
+    }
+}
+
+/// Multiplies both coordinates.
+pub(crate) fn scaled([x, y]: [f64; 2], factor: f64) -> [f64; 2] {
+    [factor * x, factor * y]
+}
+
+/// Divides; 0 / 0 is 1, the limit of tan(a) / a.
+pub(crate) fn ratio(value: f64, by: f64) -> f64 {
+    if by == 0.0 { 1.0 } else { value / by }
+}

@@ -1,0 +1,107 @@
+use glam::DVec3;
+use scene::{Distortion, Intrinsics, Projection};
+use serde_json::{Value, json};
+
+use crate::params::{CAMERA_ANGLE, Params};
+
+/// OpenCV's fisheye coefficients of the lens: angles are compressed towards the border, by 4 % at
+/// 89°.
+const FISHEYE: [f64; 4] = [-0.02, 0.006, -0.003, 0.0005];
+
+/// Camera of a split's views; its principal point is the middle of the image.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ViewCamera {
+    /// Width and height of the images.
+    pub(crate) sides: [u32; 2],
+    /// Focal length in pixels.
+    focal: f64,
+    lens: ViewLens,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum ViewLens {
+    /// Horizontal angle of view.
+    Pinhole {
+        angle_x: f64,
+    },
+    Fisheye(Intrinsics),
+}
+
+impl ViewCamera {
+    /// Creates the camera of test views, and of training views unless parameters say otherwise.
+    pub(crate) fn of_test(params: &Params) -> Self {
+        let (sides, angle_x) = (params.sides(), params.angle_x());
+        Self::pinhole(sides, angle_x)
+    }
+
+    /// Creates the camera of training views: with as many pixels per degree in the middle as the
+    /// test views have.
+    pub(crate) fn of_training(params: &Params) -> Self {
+        let test = Self::of_test(params);
+        let Some(degrees) = params.training_angle() else { return test };
+        let half_angle = 0.5 * degrees.to_radians();
+        let distortion = Distortion::fisheye(FISHEYE);
+        let half_width = match params.projection {
+            Projection::Perspective => libm::tan(half_angle),
+            Projection::Fisheye => distortion.distort([libm::tan(half_angle), 0.0])[0],
+        };
+        let scale = half_width / libm::tan(0.5 * CAMERA_ANGLE);
+        let sides = test.sides.map(|side| (f64::from(side) * scale).round().max(1.0) as u32);
+        let [width, height] = sides;
+        let [cx, cy] = sides.map(|side| 0.5 * f64::from(side));
+        match params.projection {
+            Projection::Perspective => Self::pinhole(sides, 2.0 * libm::atan(cx / test.focal)),
+            Projection::Fisheye => {
+                let (fx, fy) = (test.focal, test.focal);
+                let intrinsics = Intrinsics { width, height, fx, fy, cx, cy, distortion };
+                Self { sides, focal: test.focal, lens: ViewLens::Fisheye(intrinsics) }
+            }
+        }
+    }
+
+    fn pinhole(sides: [u32; 2], angle_x: f64) -> Self {
+        let focal = 0.5 * f64::from(sides[0]) / libm::tan(0.5 * angle_x);
+        Self { sides, focal, lens: ViewLens::Pinhole { angle_x } }
+    }
+
+    /// Returns the direction of the ray at an image position, for a camera with axes right, up and
+    /// back; `None` where the lens has none.
+    pub(crate) fn direction(
+        &self,
+        [x, y]: [f64; 2],
+        [right, up, back]: [DVec3; 3],
+    ) -> Option<DVec3> {
+        let [half_x, half_y] = self.sides.map(|side| 0.5 * f64::from(side));
+        let [x, y] = match self.lens {
+            ViewLens::Pinhole { .. } => [x, y],
+            ViewLens::Fisheye(intrinsics) if intrinsics.is_cut([x, y]) => return None,
+            ViewLens::Fisheye(intrinsics) => intrinsics.undistort([x, y]),
+        };
+        let (across, down) = ((x - half_x) / self.focal, (y - half_y) / self.focal);
+        Some((across * right - down * up - back).normalize())
+    }
+
+    /// Returns the entries of Blender's form.
+    pub(crate) fn blender(&self) -> Value {
+        match self.lens {
+            ViewLens::Pinhole { angle_x } => json!({"camera_angle_x": angle_x}),
+            ViewLens::Fisheye(_) => self.transforms(),
+        }
+    }
+
+    /// Returns the entries of `transforms.json`.
+    pub(crate) fn transforms(&self) -> Value {
+        let [width, height] = self.sides;
+        let [cx, cy] = self.sides.map(|side| 0.5 * f64::from(side));
+        let focal = self.focal;
+        let mut entries =
+            json!({"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy});
+        if let ViewLens::Fisheye(intrinsics) = self.lens {
+            entries["camera_model"] = json!("OPENCV_FISHEYE");
+            for (name, k) in ["k1", "k2", "k3", "k4"].iter().zip(intrinsics.distortion.radial) {
+                entries[*name] = json!(k);
+            }
+        }
+        entries
+    }
+}
