@@ -1,4 +1,5 @@
 use std::fs;
+use std::io;
 
 use crate::error::{StoreError, at};
 use crate::folder::{Store, remove};
@@ -6,7 +7,7 @@ use crate::lock::Closed;
 
 /// Folders of the store whose files are written under a temporary name first; the store's own
 /// folder is the first.
-const FOLDERS: [&str; 4] = ["", "actions", "cache", "pins"];
+const FOLDERS: [&str; 5] = ["", "actions", "cache", "cache/sources", "pins"];
 
 impl Store {
     /// Finished actions whose folders of work are still there, sorted: their runners were killed
@@ -28,7 +29,11 @@ impl Store {
     pub fn remove_leftovers(&self, _: &Closed) -> Result<(), StoreError> {
         for folder in FOLDERS {
             let folder = self.root().join(folder);
-            for entry in at(&folder, fs::read_dir(&folder))? {
+            let entries = match fs::read_dir(&folder) {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+                entries => at(&folder, entries)?,
+            };
+            for entry in entries {
                 let entry = at(&folder, entry)?;
                 if entry.file_name().to_str().is_some_and(is_temporary) {
                     at(&entry.path(), remove(&entry.path()))?;
@@ -56,6 +61,7 @@ mod tests {
         let store = Store::open(dir.path()).unwrap();
         let done = make(&store, "a", "1234");
         for folder in FOLDERS {
+            fs::create_dir_all(dir.path().join(folder)).unwrap();
             fs::write(dir.path().join(folder).join(".aB3xYz.partial"), "half").unwrap();
             fs::write(dir.path().join(folder).join("notes"), "mine").unwrap();
         }
