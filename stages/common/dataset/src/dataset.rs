@@ -244,7 +244,7 @@ mod tests {
     fn undone_fisheye_lenses_have_a_known_angle() {
         let dir = tempfile::tempdir().unwrap();
         let set = fisheye_set(dir.path()).undistorted().unwrap();
-        let said = "3 fisheye photographs are resampled for pinhole cameras that see 85.0°×69.0° to \
+        let said = "3 fisheye photographs are resampled for pinhole cameras that see 91.3°×75.0° to \
             100.0°×83.6°; what lies beyond is cut off";
         assert_eq!(set.notes.last().unwrap(), said);
         assert!(set.frames[0].mask().unwrap().is_none() && set.frames[1].is_masked());
