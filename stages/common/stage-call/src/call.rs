@@ -111,8 +111,7 @@ impl Call<'_> {
                 log.line(format_args!(
                     "done in {time}; {processor} of processor time, {memory} of memory at most"
                 ));
-                let summary =
-                    std::fs::read_to_string(self.output.join(SUMMARY_FILE)).unwrap_or_default();
+                let summary = summary_of(self.output).unwrap_or_default();
                 summary.lines().for_each(|line| log.line(format_args!("result: {line}")));
             }
             Err(StageFailure { code, message }) => {
@@ -310,4 +309,12 @@ fn lines(pipe: Option<impl Read>) -> impl Iterator<Item = String> {
         let line = text.trim_end().rsplit('\r').find(|state| !state.trim().is_empty())?;
         Some(printable(line).into_owned())
     })
+}
+
+/// Reads the summary that a stage wrote to its output, if there is one. A named pipe of this name
+/// would never end.
+pub fn summary_of(output: &Path) -> Option<String> {
+    let file = output.join(SUMMARY_FILE);
+    file.metadata().ok().filter(std::fs::Metadata::is_file)?;
+    std::fs::read_to_string(file).ok()
 }

@@ -51,7 +51,7 @@ mod group;
 mod log;
 mod verdict;
 
-pub use call::{Call, Usage, Watcher};
+pub use call::{Call, Usage, Watcher, summary_of};
 pub use clock::{seconds, utc};
 pub use describing::{Answers, DescribeError, Interrupted, ask_all};
 pub use display::{Display, StageView};

@@ -1,6 +1,6 @@
 use std::fs;
 use std::os::unix::fs::MetadataExt as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use artifact::{MANIFEST_FILE, Manifest, NotPlain, hash_json, plain_files, write_json};
 use serde_json::Value;
@@ -32,13 +32,6 @@ pub struct Checked {
     identity: String,
     /// Whether the store has such an object already.
     is_there: bool,
-}
-
-impl Checked {
-    /// Folder of the output.
-    pub fn output(&self) -> &Path {
-        &self.attempt.output
-    }
 }
 
 impl Attempt {
@@ -142,6 +135,7 @@ impl Store {
 mod tests {
     use std::os::unix::fs::symlink;
     use std::os::unix::net::UnixListener;
+    use std::path::Path;
 
     use super::*;
     use crate::testing::{begin, entered, make};

@@ -8,8 +8,7 @@ use std::time::{Duration, Instant};
 use artifact::{hash_json, unix_time};
 use planning::{FoundInputs, Node, NodeInput, Origin, Plan, find_inputs};
 use serde_json::{Map, Value};
-use stage::SUMMARY_FILE;
-use stage_call::{Call, Display, StageFailure, StageView, Usage, seconds};
+use stage_call::{Call, Display, StageFailure, StageView, Usage, seconds, summary_of};
 use store::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, host_name};
 
 use crate::unchanged::{ConfirmedProgram, Inputs, unusable};
@@ -133,7 +132,7 @@ impl NodeJob<'_> {
         inputs: &Inputs<'_>,
     ) -> Result<Record, StageFailure> {
         let (usage, time) = self.call(lock, &attempt, inputs)?;
-        let mut record = Record {
+        let record = Record {
             stage: action.stage,
             point: action.point,
             key_parts: action.key_parts,
@@ -145,12 +144,10 @@ impl NodeJob<'_> {
             peak_memory: Some(usage.peak_memory),
             processor_seconds: Some(milliseconds(usage.processor_seconds)),
             host: host_name(),
-            summary: None,
+            summary: summary_of(&attempt.output),
         };
         let checked =
             self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
-        // Not before the check: a FIFO of this name would never end.
-        record.summary = std::fs::read_to_string(checked.output().join(SUMMARY_FILE)).ok();
         let record = self.store.publish(&self.enter()?, checked, record).map_err(fail)?;
         self.display.line(&format!(
             "{}: done in {} → {}",
