@@ -120,7 +120,7 @@ const CLEAN_OTHER: &[&str] = &[
 /// Not a command: changes a file of an artifact.
 const DAMAGE: &str = "damage";
 
-/// So many cases at once.
+/// Number of cases that are tried in parallel.
 const WORKERS: usize = 2;
 /// Without NERF_SR_CALL_STEP.
 const DEFAULT_STEP: usize = 12;
@@ -310,7 +310,7 @@ impl Bench {
         assert!(code == 0 && stdout.contains(", 0 damaged"), "{place}: {stdout}{stderr}");
     }
 
-    /// What comes into a new store is whole.
+    /// Checks that the artifacts that a command brings into a new store are whole.
     fn verify_fresh(&self, words: &str, place: &str) {
         let Finished { code, stdout, stderr } = self.run(&format!("{words} --store fresh"), &[]);
         assert_eq!(code, 0, "{place}: {words}: {stdout}{stderr}");
@@ -339,7 +339,8 @@ impl Bench {
 /// Exit code of the tracer for a killed program.
 const KILLED: i32 = 128 + 9;
 
-/// Whether a command has done its work: `verify` tells by its code of the damage that it removed.
+/// Returns whether a command has done its work: `verify` reports by its code the damage that it
+/// removed.
 fn is_success(words: &str, code: i32) -> bool {
     code == 0 || words == VERIFY && code == 3
 }

@@ -16,7 +16,7 @@ const TEMPORARY: Affixes = (".nerf-sr-export-", ".partial");
 #[derive(Clone, Copy)]
 pub(crate) struct Destination<'a> {
     pub(crate) file: &'a Path,
-    /// Whether a regular file is replaced.
+    /// True if a regular file is replaced.
     pub(crate) force: bool,
 }
 

@@ -11,7 +11,7 @@ use std::time::{Duration, SystemTime};
 
 use common::{Setup, command, make_pipe, said, said_in_time, succeed};
 
-/// Everything in a folder, in words.
+/// Lists the entries of a folder with kind and content.
 fn listing(folder: &Path) -> Vec<String> {
     let mut all: Vec<String> = fs::read_dir(folder)
         .unwrap()
