@@ -81,10 +81,10 @@ fn wrong_names_are_told_the_nearest() {
     let project = project();
     for (arguments, words) in [
         (&["run", "regsitered"][..], &["no stage \"regsitered\"", "did you mean registered?"][..]),
-        (&["why", "downscaled-feild", "refined"], &["did you mean downscaled-field?"]),
-        (&["describe", "regisetr"], &["did you mean register?"]),
+        (&["why", "downscaled-fields", "refined"], &["did you mean downscaled-field?"]),
+        (&["describe", "registers"], &["did you mean register?"]),
         (
-            &["plan", "refined", "-p", "downscaled-feild.rays=1"],
+            &["plan", "refined", "-p", "downscaled-fields.rays=1"],
             &["did you mean downscaled-field?"],
         ),
     ] {

@@ -155,7 +155,7 @@ fn note_passed_over(context: &Context, folder: &Path) {
     let Ok((_, passed_over)) = list_source_files(folder) else { return };
     if let Some(first) = passed_over.first() {
         let first = first.display().to_string();
-        context.say(&format!(
+        context.say(format!(
             "{} passed over (links to nothing, editors' and systems' own), first {}",
             counted(passed_over.len(), "file"),
             printable(&first)

@@ -65,7 +65,7 @@ pub(crate) fn threads<'a>(
         count = largest.fitting(free)?.min(context.threads);
         if count < context.threads {
             let (need, free) = (sized(largest.bytes), sized(free));
-            context.say(&format!(
+            context.say(format!(
                 "{count} of {} threads: an image takes {need} of memory, and {free} are free",
                 context.threads
             ));

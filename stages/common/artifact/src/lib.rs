@@ -47,8 +47,8 @@ pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{sync_folder, temporary, write_atomically, write_json, write_json_atomically};
 pub use given_input::GivenInput;
 pub use manifest::{
-    Damage, FileEntry, MANIFEST_FILE, Manifest, PathError, list_files, list_source_files,
-    relative_path,
+    Damage, FileEntry, ListedFiles, MANIFEST_FILE, Manifest, PathError, list_files,
+    list_source_files, relative_path,
 };
 pub use nearest::{known_names, nearest};
 pub use passed_over::has_passed_over_name;

@@ -196,13 +196,16 @@ impl Manifest {
 /// Every file below a folder with its path inside it, in the order of names. Symbolic links are
 /// followed; one that leads back up is an error that names it, and so is a FIFO, socket or device:
 /// who reads one may wait for ever.
-pub fn list_files(folder: &Path) -> io::Result<Vec<(PathBuf, PathBuf)>> {
+pub fn list_files(folder: &Path) -> io::Result<ListedFiles> {
     list(folder, |_| false)
 }
 
+/// Files of a folder: each path inside the folder, and the file.
+pub type ListedFiles = Vec<(PathBuf, PathBuf)>;
+
 /// Lists files like [`list_files`], in a folder that a user keeps: what [`is_passed_over`] is left
 /// out, and returned second, by its path inside the folder.
-pub fn list_source_files(folder: &Path) -> io::Result<(Vec<(PathBuf, PathBuf)>, Vec<PathBuf>)> {
+pub fn list_source_files(folder: &Path) -> io::Result<(ListedFiles, Vec<PathBuf>)> {
     let mut passed_over = Vec::new();
     let files = list(folder, |path| {
         let is_left_out = is_passed_over(path);
@@ -215,10 +218,7 @@ pub fn list_source_files(folder: &Path) -> io::Result<(Vec<(PathBuf, PathBuf)>, 
 }
 
 /// Lists the files below a folder, but those that are left out.
-fn list(
-    folder: &Path,
-    mut is_left_out: impl FnMut(&Path) -> bool,
-) -> io::Result<Vec<(PathBuf, PathBuf)>> {
+fn list(folder: &Path, mut is_left_out: impl FnMut(&Path) -> bool) -> io::Result<ListedFiles> {
     let mut found = Vec::new();
     for entry in walkdir::WalkDir::new(folder).follow_links(true).sort_by_file_name() {
         let path = match &entry {

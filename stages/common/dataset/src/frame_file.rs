@@ -171,7 +171,7 @@ fn mask_of(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>, 
     }
 }
 
-/// Finds the depth image that a frame names. Only EXR has true depth: nerfstudio's 16-bit PNGs are
+/// Finds the depth image that a frame names. Only EXR has true depth: nerfstudio's PNG files are
 /// estimates, so that they may be missing.
 fn depth_of(
     lookup: &mut Lookup,

@@ -59,7 +59,7 @@ pub(crate) enum Extent {
 /// Finds how much of its image data a JPEG has.
 pub(crate) fn extent(bytes: &[u8]) -> Extent {
     let mut walk = Walk { bytes: without_filling(bytes), ..Walk::default() };
-    let is_terminated = walk.to_end();
+    let is_terminated = walk.read_to_end();
     if is_terminated.is_none() && walk.scans == 0 {
         return Extent::Whole;
     }
@@ -116,7 +116,7 @@ struct Walk<'a> {
 impl<'a> Walk<'a> {
     /// Walks to the end marker, or to the end of the file (false); `None` where a segment can't be
     /// parsed.
-    fn to_end(&mut self) -> Option<bool> {
+    fn read_to_end(&mut self) -> Option<bool> {
         loop {
             let marker = match self.next_marker() {
                 Some(EOI) => return Some(true),
