@@ -161,7 +161,7 @@ impl World {
         assert_eq!(left, 0, "a scratch folder is left");
         assert_eq!(fs::read_dir(self.dir.path()).expect("a folder").count(), 2);
         self.imports += 1;
-        if imported.is_ok() || self.imports % 100 == 0 {
+        if imported.is_ok() || self.imports.is_multiple_of(100) {
             fs::remove_dir_all(self.path("store")).expect("an old store");
         }
     }
