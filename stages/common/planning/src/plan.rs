@@ -47,8 +47,7 @@ impl Plan {
         if self.devices.by_resources && has_gpu { "cuda:0" } else { &self.devices.given }
     }
 
-    /// What is known of each node before a run.
-    /// Ends soon after `stop` is set.
+    /// Finds the state of each node before a run. Ends soon after `stop` is set.
     pub fn states(
         &self,
         store: &Store,
