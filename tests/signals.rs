@@ -209,7 +209,8 @@ impl Running {
         assert!(happens(ready), "it isn't ready: {}", locked(&self.said));
         let sent = status.is_none().then(Instant::now);
         if sent.is_some() {
-            signal(&self.child, "-INT");
+            // A shell in the background has SIGINT ignored; verbs without a handler leave that so.
+            signal(&self.child, if ignores_sigint(&self.child) { "-TERM" } else { "-INT" });
         }
         let too_late = Instant::now() + 10 * LIMIT;
         while status.is_none() && Instant::now() < too_late {
@@ -223,6 +224,14 @@ impl Running {
         let stderr = locked(&self.said).clone();
         Ended { after, code: status.and_then(|status| status.code()), stderr }
     }
+}
+
+/// True if a process ignores SIGINT, by the kernel's mask of ignored signals.
+fn ignores_sigint(child: &Child) -> bool {
+    let status =
+        std::fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).map(str::trim);
+    mask.and_then(|mask| u64::from_str_radix(mask, 16).ok()).is_some_and(|mask| mask & 2 != 0)
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
