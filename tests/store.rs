@@ -312,7 +312,7 @@ fn links_in_a_sinks_output_are_refused() {
         project.write("own/x", "mine");
         project.write(
             "pipeline.yaml",
-            "stages:\n  text: {run: ./text}\n  page: {run: ./page, inputs: {run: text}}\n",
+            "default: [page]\nstages:\n  text: {run: ./text}\n  page: {run: ./page, inputs: {run: text}}\n",
         );
         let script = fs::read_to_string(project.path("text")).unwrap();
         let (_, arguments) = script.split_once("exit; fi\n").unwrap();
