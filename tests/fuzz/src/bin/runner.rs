@@ -65,8 +65,7 @@ static SEEDS: LazyLock<()> = LazyLock::new(|| {
 /// change by being read again.
 fn resolve(data: &[u8]) {
     let Some(description) = description(data).filter(|d| d.check().is_ok()) else { return };
-    let schema = Schema::new(&description.parameters)
-        .expect("the description was checked");
+    let schema = Schema::new(&description.parameters).expect("the description was checked");
     let Ok(resolved) = schema.resolve(&serde_json::Map::new()) else { return };
     let again = schema.resolve(resolved.as_object().expect("parameters are an object"));
     assert_eq!(again.ok(), Some(resolved));
