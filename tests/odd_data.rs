@@ -122,7 +122,7 @@ fn poses_that_cannot_be_are_refused() {
         (
             |list| pose(list, 2)[0][3] = json!(1e30),
             3,
-            &["frame 2 (./train/r_2)", "(1e30, ", "farther from the origin than 1e9"],
+            &["frame 2 (./train/r_2)", "(1e30, ", "farther from the origin than 1e18"],
         ),
         (
             |list| {

@@ -78,6 +78,7 @@ fn schemas() -> BTreeMap<String, Value> {
         ("metrics", of::<metrics::Metrics>()),
         ("results", of::<Vec<report::ResultRow>>()),
         ("export", of::<export::ExportSummary>()),
+        ("offset", of::<export::ExportOffset>()),
         ("degradation", of::<pixels::Degradation>()),
     ];
     let parameters = descriptions()

@@ -23,6 +23,9 @@ const LETTERS: [[u8; 5]; 4] = [
     [0x7f, 0x09, 0x09, 0x09, 0x01], // F
 ];
 
+/// Middle of the boards: in UTM coordinates, which a browser's floats can't hold.
+const MIDDLE: DVec3 = DVec3::new(500_000.0, 4_649_776.0, 120.0);
+
 /// Whether a place of a board, 0 to 1 to the right and downwards, is ink: "NERF".
 fn is_ink(right: f64, down: f64) -> bool {
     let (column, row) = ((26.0 * right - 1.5).floor(), (10.0 * down - 1.5).floor());
@@ -64,6 +67,12 @@ fn colour_along(origin: DVec3, direction: DVec3) -> [u8; 4] {
     }
 }
 
+/// A pose as seen from the middle, in the data set's coordinates.
+fn moved_there(mut matrix: [[f64; 4]; 4]) -> [[f64; 4]; 4] {
+    (0..3).for_each(|i| matrix[i][3] += MIDDLE[i]);
+    matrix
+}
+
 /// A camera that looks at the middle.
 fn pose(centre: DVec3) -> [[f64; 4]; 4] {
     let back = centre.normalize();
@@ -103,7 +112,7 @@ fn write_split(folder: &Path, split: &str, centres: &[DVec3]) {
             .collect();
         let file = format!("{split}/r_{k}.png");
         pixels::write_png(&folder.join(&file), &Rgba8::new(PIXELS, PIXELS, data)).unwrap();
-        frames.push(json!({"file_path": format!("./{split}/r_{k}"), "transform_matrix": matrix}));
+        frames.push(json!({"file_path": format!("./{split}/r_{k}"), "transform_matrix": moved_there(matrix)}));
     }
     let list = json!({"camera_angle_x": angle, "frames": frames});
     std::fs::write(folder.join(format!("transforms_{split}.json")), list.to_string()).unwrap();

@@ -92,8 +92,13 @@ impl CameraFormat {
 }
 
 /// A COLMAP model as text: `cameras.txt`, `images.txt` and `points3D.txt`. Poses are world to
-/// camera with axes right, down, forward. Points have no track.
-pub(crate) fn colmap(cameras: &[Camera], surfels: &[Surfel]) -> [(&'static str, String); 3] {
+/// camera with axes right, down, forward. Points have no track; `offset` is their origin's place in
+/// the world.
+pub(crate) fn colmap(
+    cameras: &[Camera],
+    surfels: &[Surfel],
+    offset: DVec3,
+) -> [(&'static str, String); 3] {
     let mut lenses: Vec<&Intrinsics> = Vec::new();
     let mut images =
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; a line of points\n".to_owned();
@@ -116,11 +121,20 @@ pub(crate) fn colmap(cameras: &[Camera], surfels: &[Surfel]) -> [(&'static str, 
     let mut points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n".to_owned();
     let step = surfels.len().div_ceil(MOST_POINTS).max(1);
     for (id, surfel) in (1..).zip(surfels.iter().step_by(step)) {
-        let [x, y, z] = surfel.position.as_vec3().to_array();
+        let [x, y, z] = coordinates(surfel.position, offset);
         let [r, g, b] = crate::points::level(surfel.colour);
         let _ = writeln!(points, "{id} {x} {y} {z} {r} {g} {b} 0");
     }
     [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)]
+}
+
+/// A point's world coordinates as text: in double precision where single precision can't hold them.
+fn coordinates(position: DVec3, offset: DVec3) -> [String; 3] {
+    if offset == DVec3::ZERO {
+        position.as_vec3().to_array().map(|x| x.to_string())
+    } else {
+        (offset + position).to_array().map(|x| x.to_string())
+    }
 }
 
 /// Returns COLMAP's model of a lens, and its parameters.

@@ -1,5 +1,5 @@
 use fields::{Members, rendering_failure};
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use radiance::{Ray, RayField};
 use rayon::prelude::*;
 
@@ -10,12 +10,13 @@ use crate::seen::{SeenView, Sight};
 
 /// Colours of a mesh's vertices, display-encoded sRGB. Each is the mean over the views that see a
 /// vertex, more from those that see it not aslant. Where none does, the field's own colour along
-/// the normal.
+/// the normal. `offset` is the world point that is the mesh's origin.
 pub(crate) fn colours(
     field: &Members,
     views: &[SeenView],
     mesh: &Mesh,
     lattice: &Lattice,
+    offset: DVec3,
 ) -> anyhow::Result<Vec<[f32; 3]>> {
     let seen: Vec<Option<[f32; 3]>> = (0..mesh.positions.len())
         .into_par_iter()
@@ -27,9 +28,10 @@ pub(crate) fn colours(
         .iter()
         .map(|&vertex| {
             let (position, normal) = (mesh.positions[vertex], mesh.normals[vertex]);
-            let near = field.file.bounds.near as f32 + reach(lattice, position);
-            let [origin, direction] = [position + near * normal, -normal].map(|v| v.to_array());
-            Ray { origin, direction, background }
+            let near = field.file.bounds.near + f64::from(reach(lattice, position));
+            let normal = normal.as_dvec3();
+            let origin = (offset + position.as_dvec3() + near * normal).to_array();
+            Ray { origin, direction: (-normal).to_array(), background }
         })
         .collect();
     let rendered = field.render(&rays).map_err(rendering_failure)?;

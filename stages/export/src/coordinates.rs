@@ -1,3 +1,87 @@
-/// What coordinates in all files are.
-pub(crate) const COORDINATES: &str =
-    "coordinates, scale and orientation are those of the input's cameras";
+use std::fmt;
+
+use glam::DVec3;
+use scene::{Bounds, Space};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Name of the file with an offset, next to the files that it belongs to.
+pub const OFFSET_FILE: &str = "offset.json";
+
+/// Files whose coordinates have single precision.
+const SINGLE_FILES: [&str; 3] = ["points.ply", "splats.ply", "mesh.glb"];
+
+/// Distance of a scene's middle from the origin, in scene sizes, up to which single precision holds
+/// its coordinates: rounding moves a point by less than a millionth of the size.
+const MAX_DISTANCE_SIZES: f64 = 8.0;
+
+/// `offset.json`: the offset of files with single precision, for scenes far from the origin.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ExportOffset {
+    /// Use of the offset, as text.
+    pub note: String,
+    /// Offset in scene units: added to a coordinate of the files, it gives the input's.
+    pub offset: [f64; 3],
+    /// Files whose coordinates lack the offset.
+    pub files: Vec<String>,
+}
+
+/// Frame of the coordinates in files: the input's, moved so that single precision holds them.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Coordinates {
+    /// World point that is the origin of files with single precision.
+    pub(crate) offset: DVec3,
+}
+
+impl Coordinates {
+    /// Chooses the frame for a field's bounds: the input's where single precision holds it.
+    pub(crate) fn of(bounds: &Bounds) -> Self {
+        let (middle, size) = match bounds.space {
+            Space::Ndc(frustum) => (frustum.centre(), frustum.near),
+            _ => (bounds.middle(), bounds.longest_side()),
+        };
+        if middle.abs().max_element() <= MAX_DISTANCE_SIZES * size {
+            return Self::default();
+        }
+        Self { offset: middle.to_array().map(|x| short(x, size)).into() }
+    }
+
+    /// True if files with single precision lack an offset.
+    pub(crate) fn is_moved(&self) -> bool {
+        self.offset != DVec3::ZERO
+    }
+
+    /// Returns the content of [`OFFSET_FILE`] for the files that are written.
+    pub(crate) fn file(&self, is_written: [bool; 3]) -> ExportOffset {
+        let files = SINGLE_FILES.iter().zip(is_written).filter(|(_, is_written)| *is_written);
+        ExportOffset {
+            note: "add the offset to the coordinates of these files for the input's coordinates"
+                .to_owned(),
+            offset: self.offset.to_array(),
+            files: files.map(|(file, _)| (*file).to_owned()).collect(),
+        }
+    }
+}
+
+impl fmt::Display for Coordinates {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("coordinates, scale and orientation are those of the input's cameras")?;
+        if self.is_moved() {
+            let [x, y, z] = self.offset.to_array();
+            write!(f, ", less the offset ({x}, {y}, {z}) of {OFFSET_FILE} where single precision")?;
+            f.write_str(" can't hold them (points.ply, splats.ply, mesh.glb)")?;
+        }
+        Ok(())
+    }
+}
+
+/// Rounds a coordinate to as few decimals as a scene's size needs.
+fn short(value: f64, size: f64) -> f64 {
+    let scientific = format!("{size:e}");
+    let exponent = scientific.split_once('e').and_then(|(_, e)| e.parse::<i32>().ok());
+    let decimals = exponent.map_or(0, |exponent| (-exponent).clamp(0, 300));
+    let rounded: f64 = format!("{value:.*}", decimals as usize).parse().unwrap_or(value);
+    // No -0.
+    rounded + 0.0
+}

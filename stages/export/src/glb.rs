@@ -4,7 +4,7 @@ use glam::Vec3;
 use pixels::linear_from_srgb;
 use serde_json::{Value, json};
 
-use crate::coordinates::COORDINATES;
+use crate::coordinates::Coordinates;
 use crate::mesh::Mesh;
 
 /// glTF's numbers for kinds of components and of buffers.
@@ -15,10 +15,15 @@ const INDICES: u32 = 34963;
 
 /// Writes a mesh as binary glTF 2.0, unlit: the colours hold the scene's light. glTF has linear
 /// colours, so `colours`, display-encoded sRGB of each vertex, are converted.
-pub(crate) fn write(file: &mut impl Write, mesh: &Mesh, colours: &[[f32; 3]]) -> io::Result<()> {
+pub(crate) fn write(
+    file: &mut impl Write,
+    mesh: &Mesh,
+    colours: &[[f32; 3]],
+    coordinates: &Coordinates,
+) -> io::Result<()> {
     let linear = |v: f32| linear_from_srgb(f64::from(v)) as f32;
     let colours: Vec<Vec3> = colours.iter().map(|c| Vec3::from(c.map(linear))).collect();
-    let mut text = serde_json::to_string(&description(mesh))?;
+    let mut text = serde_json::to_string(&description(mesh, coordinates))?;
     // Chunks have whole words.
     while !text.len().is_multiple_of(4) {
         text.push(' ');
@@ -45,7 +50,7 @@ pub(crate) fn buffer_length(mesh: &Mesh) -> usize {
     3 * 12 * mesh.positions.len() + 12 * mesh.triangles.len()
 }
 
-fn description(mesh: &Mesh) -> Value {
+fn description(mesh: &Mesh, coordinates: &Coordinates) -> Value {
     let (vertices, triangles) = (mesh.positions.len(), mesh.triangles.len());
     let mut positions = vectors(0, vertices);
     positions["min"] = json!(bound(mesh, Vec3::min));
@@ -55,7 +60,7 @@ fn description(mesh: &Mesh) -> Value {
     let length = 12 * vertices;
     json!({
         "asset": {"version": "2.0", "generator": "nerf-sr export",
-            "extras": {"coordinates": COORDINATES}},
+            "extras": {"coordinates": coordinates.to_string()}},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

@@ -7,9 +7,11 @@
 //! * `mesh.glb`: triangles with vertex colours, by fusing the views' depth.
 //! * `transforms.json`, `colmap/sparse/0/`: the cameras for instant-ngp, nerfstudio and COLMAP.
 //! * [`EXPORT_FILE`]: counts, and the coordinates in words.
+//! * [`OFFSET_FILE`]: for scenes far from the origin, what points, splats and mesh lack.
 //!
 //! Coordinates, scale and orientation are those of the cameras given, which `prep` leaves as the
-//! data set has them. Camera axes are OpenGL's (x right, y up, looking along -z) in
+//! data set has them. Points, splats and mesh have single precision. Where that can't hold the
+//! coordinates, these files are counted from an offset ([`coordinates`]). Camera axes are OpenGL's (x right, y up, looking along -z) in
 //! `transforms.json`, and COLMAP's (x right, y down, looking along z) in its model.
 
 mod cameras;
@@ -37,13 +39,15 @@ use anyhow::Context as _;
 use artifact::{Failure, amount, counted};
 use contract::{Input, Output};
 use fields::Members;
-use scene::{Camera, Views};
+use glam::DVec3;
+use scene::{Bounds, Camera, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
 
 use cameras::CameraFormat;
-use coordinates::COORDINATES;
+use coordinates::Coordinates;
+pub use coordinates::{ExportOffset, OFFSET_FILE};
 use lattice::Lattice;
 use mesh::Mesh;
 use seen::SeenView;
@@ -152,15 +156,17 @@ impl Stage for Export {
         for note in lens_notes(&cameras, params) {
             context.say(note);
         }
+        let coordinates = Coordinates::of(&field.file.bounds);
+        let bounds = field.file.bounds.moved(-coordinates.offset);
         let resized = resized(&cameras, params.size);
-        let lattice = params.mesh.then(|| Lattice::new(&field.file.bounds, params.resolution));
+        let lattice = params.mesh.then(|| Lattice::new(&bounds, params.resolution));
         context.check_memory("the export", memory_need(&resized, lattice.as_ref()), REMEDY)?;
-        let mut views = render(context, &field, &resized)?;
+        let mut views = render(context, &field, &resized, coordinates.offset)?;
         let progress = context.progress("comparing", views.len() as u64);
         consensus::agree(&mut views, &progress);
-        let job = ExportJob { context, params, field, cameras, views };
+        let job = ExportJob { context, params, field, cameras, views, coordinates, bounds };
         let mut summary = ExportSummary {
-            coordinates: COORDINATES.to_owned(),
+            coordinates: coordinates.to_string(),
             cameras: job.cameras.len(),
             points: 0,
             splats: 0,
@@ -172,6 +178,7 @@ impl Stage for Export {
             context.check_interrupt()?;
             job.write_mesh(lattice, &mut summary)?;
         }
+        job.write_offset()?;
         context.write_json(EXPORT_FILE, &summary)?;
         context.write_summary(&in_words(&summary))
     }
@@ -222,13 +229,19 @@ fn pixel_count(camera: &Camera) -> u64 {
     u64::from(camera.intrinsics.width) * u64::from(camera.intrinsics.height)
 }
 
-/// Renders the field from every camera.
-fn render(context: &Context, field: &Members, cameras: &[Camera]) -> anyhow::Result<Vec<SeenView>> {
+/// Renders the field from every camera, in the frame whose origin in the world is `offset`.
+fn render(
+    context: &Context,
+    field: &Members,
+    cameras: &[Camera],
+    offset: DVec3,
+) -> anyhow::Result<Vec<SeenView>> {
     let progress = context.progress("rendering", cameras.iter().map(pixel_count).sum());
     let mut views = Vec::with_capacity(cameras.len());
     for camera in cameras {
         context.check_interrupt()?;
-        views.push(SeenView::render(field, camera, field.file.background, &progress)?);
+        let background = field.file.background;
+        views.push(SeenView::render(field, camera, background, offset, &progress)?);
     }
     Ok(views)
 }
@@ -247,23 +260,26 @@ struct ExportJob<'a> {
     field: Members,
     cameras: Vec<Camera>,
     views: Vec<SeenView>,
+    coordinates: Coordinates,
+    /// Bounds of the field, in the frame of the exported files.
+    bounds: Bounds,
 }
 
 impl ExportJob<'_> {
     /// Points, splats and cameras.
     fn write_surfels(&self, summary: &mut ExportSummary) -> anyhow::Result<()> {
-        let bounds = &self.field.file.bounds;
-        let surfels = surfel::merge(&self.views, bounds, self.params.max_points as usize);
+        let most = self.params.max_points as usize;
+        let surfels = surfel::merge(&self.views, &self.bounds, most);
         if surfels.is_empty() {
             return Err(no_surface());
         }
         let chosen = points::chosen(&surfels);
         if self.params.points {
-            self.write("points.ply", |file| points::write(file, &chosen))?;
+            self.write("points.ply", |file| points::write(file, &chosen, &self.coordinates))?;
             summary.points = chosen.len();
         }
         if self.params.splats {
-            self.write("splats.ply", |file| splats::write(file, &surfels))?;
+            self.write("splats.ply", |file| splats::write(file, &surfels, &self.coordinates))?;
             summary.splats = surfels.len();
         }
         if self.params.cameras {
@@ -275,12 +291,14 @@ impl ExportJob<'_> {
     /// Writes the cameras in each format that can hold them.
     fn write_cameras(&self, points: &[Surfel]) -> anyhow::Result<()> {
         if CameraFormat::Transforms.problem(&self.cameras).is_none() {
-            let file = self.params.points.then_some("points.ply");
-            let file = cameras::transforms(&self.cameras, file);
+            // Programs take the cameras and this file to have one frame.
+            let is_same_frame = self.params.points && !self.coordinates.is_moved();
+            let points = is_same_frame.then_some("points.ply");
+            let file = cameras::transforms(&self.cameras, points);
             self.context.write_json("transforms.json", &file)?;
         }
         if CameraFormat::Colmap.problem(&self.cameras).is_none() {
-            for (name, text) in cameras::colmap(&self.cameras, points) {
+            for (name, text) in cameras::colmap(&self.cameras, points, self.coordinates.offset) {
                 self.write(&format!("colmap/sparse/0/{name}"), |file| {
                     file.write_all(text.as_bytes())
                 })?;
@@ -298,8 +316,9 @@ impl ExportJob<'_> {
         if mesh.triangles.is_empty() {
             return Err(no_surface());
         }
-        let colours = colour::colours(&self.field, &self.views, &mesh, lattice)?;
-        self.write("mesh.glb", |file| glb::write(file, &mesh, &colours))?;
+        let offset = self.coordinates.offset;
+        let colours = colour::colours(&self.field, &self.views, &mesh, lattice, offset)?;
+        self.write("mesh.glb", |file| glb::write(file, &mesh, &colours, &self.coordinates))?;
         (summary.vertices, summary.triangles) = (mesh.positions.len(), mesh.triangles.len());
         Ok(())
     }
@@ -311,6 +330,21 @@ impl ExportJob<'_> {
         let values = fusion::fuse(&self.views, lattice, &progress);
         let progress = self.context.progress("meshing", nz as u64 - 1);
         surface_nets::extract(lattice, &values, &progress)
+    }
+
+    /// Writes the offset that files with single precision lack, if they lack one, and says so.
+    fn write_offset(&self) -> anyhow::Result<()> {
+        let Params { points, splats, mesh, .. } = *self.params;
+        let offset = self.coordinates.file([points, splats, mesh]);
+        if !self.coordinates.is_moved() || offset.files.is_empty() {
+            return Ok(());
+        }
+        let ([x, y, z], files) = (offset.offset, offset.files.join(", "));
+        self.context.say(format!(
+            "the scene is far from the origin: coordinates of {files} lack the offset ({x}, {y}, \
+            {z}), which is in {OFFSET_FILE}"
+        ));
+        self.context.write_json(OFFSET_FILE, &offset)
     }
 
     /// Writes a file of the output.

@@ -3,7 +3,7 @@ use glam::{DVec3, Vec3};
 /// Triangles.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Mesh {
-    /// Vertices in scene units.
+    /// Vertices in scene units, in the frame of the exported files.
     pub(crate) positions: Vec<Vec3>,
     /// Unit normals of the vertices, outwards.
     pub(crate) normals: Vec<Vec3>,

@@ -1,6 +1,6 @@
 use std::io::{self, Write};
 
-use crate::coordinates::COORDINATES;
+use crate::coordinates::Coordinates;
 use crate::ply::{Kind, write_floats, write_header};
 use crate::surfel::Surfel;
 
@@ -15,7 +15,11 @@ pub(crate) fn chosen(surfels: &[Surfel]) -> Vec<Surfel> {
 }
 
 /// Writes points with normals and 8-bit colours, display-encoded sRGB.
-pub(crate) fn write(file: &mut impl Write, surfels: &[Surfel]) -> io::Result<()> {
+pub(crate) fn write(
+    file: &mut impl Write,
+    surfels: &[Surfel],
+    coordinates: &Coordinates,
+) -> io::Result<()> {
     let named = |names: [&str; 3], kind| names.map(|name| (name.to_owned(), kind));
     let properties = [
         named(["x", "y", "z"], Kind::Float),
@@ -23,7 +27,7 @@ pub(crate) fn write(file: &mut impl Write, surfels: &[Surfel]) -> io::Result<()>
         named(["red", "green", "blue"], Kind::Byte),
     ]
     .concat();
-    write_header(file, &[COORDINATES.to_owned()], surfels.len(), &properties)?;
+    write_header(file, &[coordinates.to_string()], surfels.len(), &properties)?;
     for surfel in surfels {
         write_floats(file, &surfel.position.as_vec3().to_array())?;
         write_floats(file, &surfel.normal.as_vec3().to_array())?;

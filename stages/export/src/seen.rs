@@ -20,6 +20,7 @@ pub(crate) struct SeenView {
     intrinsics: Intrinsics,
     /// Camera axes (x right, y up, looking along -z) as columns, in the world.
     axes: DMat3,
+    /// Centre, in the frame of the exported files.
     centre: DVec3,
     /// World to camera axes, and focal lengths and principal point, for quick looks.
     to_camera: Mat3,
@@ -67,11 +68,13 @@ impl SeenView {
     /// Bytes of a pixel.
     pub(crate) const BYTES_PER_PIXEL: u64 = size_of::<SeenPixel>() as u64;
 
-    /// Casts a ray through each pixel's centre of a camera without its lens's distortion.
+    /// Casts a ray through each pixel's centre of a camera without its lens's distortion. The view
+    /// is in the frame of the exported files, whose origin in the world is `offset`.
     pub(crate) fn render(
         field: &dyn RayField,
         camera: &Camera,
         background: Background,
+        offset: DVec3,
         progress: &Progress,
     ) -> anyhow::Result<Self> {
         let intrinsics = camera.intrinsics.pinhole().unwrap_or(camera.intrinsics);
@@ -80,7 +83,7 @@ impl SeenView {
         let mut seen = Self {
             intrinsics,
             axes: camera.rotation(),
-            centre: camera.centre(),
+            centre: camera.centre() - offset,
             to_camera: camera.rotation().transpose().as_mat3(),
             lens: [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy].map(|v| v as f32),
             pixels: Vec::with_capacity(count),
@@ -130,7 +133,8 @@ impl SeenView {
                     continue;
                 };
                 self.pixels[at].margin = in_row.min(in_column);
-                let normal = along.cross(down).normalize_or_zero();
+                // Lengths may be so small or large that their squares leave single precision.
+                let normal = along.as_dvec3().cross(down.as_dvec3()).normalize_or_zero().as_vec3();
                 let towards = if normal.dot(self.point(at)) > 0.0 { -normal } else { normal };
                 self.pixels[at].normal = towards;
             }
@@ -203,7 +207,7 @@ impl SeenView {
         &self.pixels[at]
     }
 
-    /// A pixel's surface point in the world.
+    /// A pixel's surface point in the frame of the exported files.
     pub(crate) fn world_point(&self, at: usize) -> DVec3 {
         self.centre + self.axes * self.point(at).as_dvec3()
     }
@@ -231,7 +235,7 @@ impl SeenView {
         self.pixels[at].normal = Vec3::ZERO;
     }
 
-    /// The camera's centre in the world.
+    /// The camera's centre in the frame of the exported files.
     pub(crate) fn centre(&self) -> DVec3 {
         self.centre
     }
@@ -246,7 +250,7 @@ impl SeenView {
         f64::from(self.pixels[at].depth) / self.intrinsics.fx
     }
 
-    /// What this view says of a world point, where surfaces count up to a distance `reach`.
+    /// What this view says of a point in the frame of the exported files, where surfaces count up to a distance `reach`.
     pub(crate) fn look(&self, point: DVec3, reach: f32) -> Sight {
         let place = self.to_camera * (point - self.centre).as_vec3();
         let depth = -place.z;

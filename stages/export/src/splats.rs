@@ -2,7 +2,7 @@ use std::io::{self, Write};
 
 use glam::{DQuat, DVec3};
 
-use crate::coordinates::COORDINATES;
+use crate::coordinates::Coordinates;
 use crate::ply::{Kind, write_floats, write_header};
 use crate::surfel::Surfel;
 
@@ -23,12 +23,16 @@ const OPACITY_BOUNDS: [f64; 2] = [0.02, 0.99];
 /// Writes surfels as 3D Gaussians, in the PLY layout of Kerbl et al. 2023: position, normal, colour
 /// as coefficient of the constant spherical harmonic, opacity as logit, standard deviations as
 /// logarithms, rotation as quaternion with the real part first.
-pub(crate) fn write(file: &mut impl Write, surfels: &[Surfel]) -> io::Result<()> {
+pub(crate) fn write(
+    file: &mut impl Write,
+    surfels: &[Surfel],
+    coordinates: &Coordinates,
+) -> io::Result<()> {
     let names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 \
         rot_2 rot_3";
     let properties: Vec<_> =
         names.split_whitespace().map(|name| (name.to_owned(), Kind::Float)).collect();
-    write_header(file, &[COORDINATES.to_owned()], surfels.len(), &properties)?;
+    write_header(file, &[coordinates.to_string()], surfels.len(), &properties)?;
     surfels.iter().try_for_each(|surfel| write_floats(file, &splat(surfel)))
 }
 

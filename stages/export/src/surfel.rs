@@ -7,7 +7,7 @@ use crate::seen::SeenView;
 /// A piece of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Surfel {
-    /// Middle, in scene units.
+    /// Middle in scene units, in the frame of the exported files.
     pub(crate) position: DVec3,
     /// Unit normal, towards the cameras that see it.
     pub(crate) normal: DVec3,

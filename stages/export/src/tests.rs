@@ -7,6 +7,7 @@ use scene::{Background, Bounds, Camera, Distortion, Frustum, Intrinsics, Space};
 use stage::Progress;
 
 use crate::cameras::CameraFormat;
+use crate::coordinates::Coordinates;
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 use crate::seen::SeenView;
@@ -25,7 +26,7 @@ impl RayField for Ball {
 }
 
 fn ball_pixel(ray: &Ray) -> Pixel {
-    let [origin, direction] = [ray.origin, ray.direction].map(|v| DVec3::from(v.map(f64::from)));
+    let [origin, direction] = [ray.origin, ray.direction].map(DVec3::from);
     let along = -origin.dot(direction);
     let under = RADIUS * RADIUS - (origin + along * direction).length_squared();
     if under < 0.0 {
@@ -61,8 +62,8 @@ fn around(count: u32, lowest: f64) -> Vec<Camera> {
 }
 
 fn views(cameras: &[Camera]) -> Vec<SeenView> {
-    let view =
-        |c: &Camera| SeenView::render(&Ball, c, Background::White, &Progress::silent()).unwrap();
+    let (background, silent) = (Background::White, Progress::silent());
+    let view = |c: &Camera| SeenView::render(&Ball, c, background, DVec3::ZERO, &silent).unwrap();
     cameras.iter().map(view).collect()
 }
 
@@ -233,7 +234,7 @@ fn ply(bytes: &[u8]) -> (String, Vec<u8>) {
 #[test]
 fn points_have_normals_and_colours() {
     let mut bytes = Vec::new();
-    points::write(&mut bytes, &[one_surfel()]).unwrap();
+    points::write(&mut bytes, &[one_surfel()], &Coordinates::default()).unwrap();
     let (header, data) = ply(&bytes);
     assert!(header.contains("\nelement vertex 1\nproperty float x\n"), "{header}");
     assert!(
@@ -257,7 +258,7 @@ fn points_keep_away_from_silhouettes_where_there_are_others() {
 #[test]
 fn splats_are_discs_across_their_normal() {
     let mut bytes = Vec::new();
-    splats::write(&mut bytes, &[one_surfel()]).unwrap();
+    splats::write(&mut bytes, &[one_surfel()], &Coordinates::default()).unwrap();
     let (header, data) = ply(&bytes);
     let names: Vec<&str> =
         header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
@@ -279,7 +280,7 @@ fn glb_chunks_hold_what_the_json_says() {
     let mesh = fused(&views(&around(9, -0.5)), 24);
     let colours = vec![[1.0, 0.5, 0.0]; mesh.positions.len()];
     let mut bytes = Vec::new();
-    glb::write(&mut bytes, &mesh, &colours).unwrap();
+    glb::write(&mut bytes, &mesh, &colours, &Coordinates::default()).unwrap();
     let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
     assert_eq!((&bytes[..4], word(4), word(8)), (&b"glTF"[..], 2, bytes.len()));
     let text = word(12);
@@ -293,6 +294,82 @@ fn glb_chunks_hold_what_the_json_says() {
     // 50 % display-encoded are 21.4 % of the light.
     let first = 28 + text + views[2]["byteOffset"].as_u64().unwrap() as usize;
     assert!((f32::from_bits(word(first + 4) as u32) - 0.2140).abs() < 1e-3);
+}
+
+/// A ball far away from the origin, of another size.
+struct MovedBall {
+    at: DVec3,
+    scale: f64,
+}
+
+impl RayField for MovedBall {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+        let pixel = |ray: &Ray| {
+            let origin = (DVec3::from(ray.origin) - self.at) / self.scale;
+            let pixel = ball_pixel(&Ray { origin: origin.to_array(), ..*ray });
+            let scaled = |depth: f32| depth * self.scale as f32;
+            Pixel { depth: scaled(pixel.depth), median_depth: scaled(pixel.median_depth), ..pixel }
+        };
+        Ok(rays.iter().map(pixel).collect())
+    }
+}
+
+/// Surfaces far from the origin, with tiny and huge units, are counted from an offset; with it they
+/// lie where they do around the origin.
+#[test]
+fn surfaces_far_away_have_an_offset() {
+    let here = surfel::merge(&views(&around(9, -0.5)), &BOX, 100_000);
+    for scale in [1e-12f64, 1e-5, 1.0, 1e5, 1e12] {
+        let at = scale.max(1.0) * DVec3::new(500_000.3, 4_649_776.0, 120.0);
+        let bounds = Bounds {
+            min: [-scale; 3],
+            max: [scale; 3],
+            near: scale,
+            far: 9.0 * scale,
+            space: Space::Box,
+        };
+        // A tiny scene so far away has no digits left.
+        let at = if scale < 1e-6 { DVec3::ZERO } else { at };
+        let field = MovedBall { at, scale };
+        let coordinates = Coordinates::of(&bounds.moved(at));
+        let offset = coordinates.offset;
+        assert_eq!(coordinates.is_moved(), at != DVec3::ZERO);
+        assert!((offset - at).length() < 8.0 * scale, "{offset}");
+        let cameras = around(9, -0.5).into_iter().map(|camera| {
+            let centre = camera.centre();
+            camera.moved(at + scale * centre - centre)
+        });
+        let (background, silent) = (Background::White, Progress::silent());
+        let views: Vec<SeenView> = cameras
+            .map(|c| SeenView::render(&field, &c, background, offset, &silent).unwrap())
+            .collect();
+        let there = surfel::merge(&views, &bounds.moved(at - offset), 100_000);
+        // Cells at which roundings differ apart.
+        let share = there.len() as f64 / here.len() as f64;
+        assert!((share - 1.0).abs() < 0.05, "{share} at {scale}");
+        for surfel in &there {
+            let position = (offset - at + surfel.position) / scale;
+            assert!((position.length() - RADIUS).abs() < 4e-3, "{position} at {scale}");
+            assert!(position.normalize().dot(surfel.normal) > 0.9, "{position} at {scale}");
+        }
+    }
+}
+
+#[test]
+fn offsets_are_short_and_only_where_they_are_needed() {
+    let boxed = |middle: [f64; 3], half: f64| {
+        let bounds = Bounds { min: [-half; 3], max: [half; 3], ..BOX };
+        Coordinates::of(&bounds.moved(middle.into())).offset.to_array()
+    };
+    assert_eq!(boxed([15.9, -3.0, 0.0], 1.0), [0.0; 3]);
+    assert_eq!(boxed([16.3, -3.2, -0.1], 1.0), [16.0, -3.0, 0.0]);
+    assert_eq!(boxed([499_999.97, 4_649_776.21, 120.4], 0.02), [499_999.97, 4_649_776.21, 120.4]);
+    assert_eq!(boxed([1e9, 0.0, 0.0], 3e7), [1e9, 0.0, 0.0]);
+    let file = Coordinates { offset: DVec3::X }.file([true, false, true]);
+    assert_eq!(
+        (file.offset, file.files),
+        ([1.0, 0.0, 0.0], vec!["points.ply".into(), "mesh.glb".into()])
+    );
 }
 
 /// A folder with images of the cameras' size, where `transforms.json` and COLMAP look for them.
@@ -382,7 +459,7 @@ fn comes_back_from_colmap(cameras: &[Camera]) -> bool {
     let folder = folder(cameras);
     let sparse = folder.path().join("sparse/0");
     std::fs::create_dir_all(&sparse).unwrap();
-    for (name, text) in cameras::colmap(cameras, &[one_surfel()]) {
+    for (name, text) in cameras::colmap(cameras, &[one_surfel()], DVec3::ZERO) {
         std::fs::write(sparse.join(name), text).unwrap();
     }
     let set = Dataset::read(folder.path()).unwrap();

@@ -1,5 +1,7 @@
 use glam::{DMat3, DVec3};
-use scene::{Bounds, Camera, CameraRay, Frustum, Space, common_direction, pose_of};
+use scene::{
+    Bounds, Camera, CameraRay, Frustum, Space, common_direction, pose_of, power_of_two_below,
+};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -47,7 +49,51 @@ pub type SeenDepths = (Camera, Option<[f64; 2]>);
 /// and depths aren't known, no box is known to hold it: depths are guessed where cameras look one
 /// way, and elsewhere it is the contraction. A `kind` that is given is taken. The box is that of
 /// the training views; `others` are cameras that will look, too.
+///
+/// Far from the origin everything is computed from a point near the cameras: sums of large
+/// coordinates lose the digits in which cameras differ.
 pub fn place(
+    training: &[SeenDepths],
+    others: &[SeenDepths],
+    goes_on: bool,
+    kind: Option<SpaceKind>,
+) -> Result<Bounds, SpaceError> {
+    let origin = near_point(training);
+    if origin == DVec3::ZERO {
+        return place_near_origin(training, others, goes_on, kind);
+    }
+    let (training, others) = (moved(training, -origin), moved(others, -origin));
+    let bounds = place_near_origin(&training, &others, goes_on, kind)?;
+    // Rounded as training rounds them, while there are digits left to round.
+    let anchor = training.first().map_or(DVec3::ZERO, |(camera, _)| camera.centre());
+    Ok(bounds.rounded(anchor).moved(origin))
+}
+
+fn moved(sights: &[SeenDepths], by: DVec3) -> Vec<SeenDepths> {
+    sights.iter().map(|(camera, depths)| (camera.moved(by), *depths)).collect()
+}
+
+/// Step of [`near_point`] over a scene's extent. Up to half of it from the origin, f64 keeps ten
+/// digits of the extent.
+const NEAR_POINT_STEP: f64 = 1024.0;
+
+/// Returns a point near the cameras, a multiple of a step much larger than what is known of the
+/// scene: the origin itself for scenes around it.
+fn near_point(sights: &[SeenDepths]) -> DVec3 {
+    let Some(first) = sights.first().map(|(camera, _)| camera.centre()) else { return DVec3::ZERO };
+    let mut extent = 0.0f64;
+    for (camera, depths) in sights {
+        let farthest = depths.map_or(0.0, |[_, farthest]| farthest);
+        extent = extent.max(camera.centre().distance(first)).max(farthest);
+    }
+    let step = NEAR_POINT_STEP * power_of_two_below(extent);
+    let point = (first / step).round() * step;
+    // Cameras in one place have no extent, and need none.
+    if point.is_finite() { point } else { DVec3::ZERO }
+}
+
+/// As [`place`], for scenes near the origin.
+fn place_near_origin(
     training: &[SeenDepths],
     others: &[SeenDepths],
     goes_on: bool,
@@ -407,6 +453,86 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// Cameras around, forward without and with depths, and outwards: a scene of each space.
+    fn scenes() -> [(Vec<SeenDepths>, bool); 4] {
+        let ring = circle(DVec3::new(0.5, -0.3, 0.2), 4.0);
+        let outwards = ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre()));
+        [
+            (sights(&ring, None), false),
+            (sights(&outwards.collect::<Vec<_>>(), None), true),
+            (sights(&(0..5).map(|i| meeting(1.0, i)).collect::<Vec<_>>(), None), true),
+            (
+                sights(&(0..5).map(|i| parallel(1.0, i)).collect::<Vec<_>>(), Some([2.0, 10.0])),
+                false,
+            ),
+        ]
+    }
+
+    /// A camera whose centre is a multiple of 2⁻²⁰, so that large shifts are exact.
+    fn on_grid(camera: &Camera) -> Camera {
+        let grid = 1_048_576.0;
+        camera.moved((grid * camera.centre()).round() / grid - camera.centre())
+    }
+
+    fn placed(sights: &[SeenDepths], goes_on: bool, shift: DVec3, scale: f64) -> Bounds {
+        let moved = |(camera, depths): &SeenDepths| {
+            let centre = on_grid(camera).centre();
+            let moved = on_grid(camera).moved(scale * (centre + shift) - centre);
+            (moved, depths.map(|depths| depths.map(|depth| scale * depth)))
+        };
+        let all: Vec<SeenDepths> = sights.iter().map(moved).collect();
+        place(&all, &all[..1], goes_on, None).unwrap().rounded(all[0].0.centre())
+    }
+
+    fn scaled(bounds: Bounds, by: f64) -> Bounds {
+        let corner = |corner: [f64; 3]| corner.map(|x| by * x);
+        let space = match bounds.space {
+            Space::Ndc(f) => Space::Ndc(Frustum {
+                camera_to_world: pose_of(
+                    DMat3::from_cols_array_2d(
+                        &[0, 1, 2].map(|c| f.camera_to_world.map(|row| row[c])),
+                    ),
+                    by * f.centre(),
+                ),
+                near: by * f.near,
+                far: by * f.far,
+                ..f
+            }),
+            other => other,
+        };
+        let (near, far) = (by * bounds.near, by * bounds.far);
+        Bounds { min: corner(bounds.min), max: corner(bounds.max), near, far, space }
+    }
+
+    /// Rounded bounds move with a scene, and grow with it, to the last bit: rays in the unit cube
+    /// don't know where the scene lies.
+    #[test]
+    fn bounds_move_with_the_scene() {
+        for (sights, goes_on) in scenes() {
+            let here = placed(&sights, goes_on, DVec3::ZERO, 1.0);
+            for shift in [
+                DVec3::new(500_000.0, 4_649_776.0, 120.0),
+                DVec3::new(4_027_893.75, 307_045.625, 4_919_474.875),
+                DVec3::new(-7.25, 300.0, 1024.0),
+            ] {
+                assert_eq!(placed(&sights, goes_on, shift, 1.0), here.moved(shift), "{shift}");
+            }
+            for scale in [1.0 / 131_072.0, 0.5, 65_536.0] {
+                let there = placed(&sights, goes_on, DVec3::ZERO, scale);
+                assert_eq!(there, scaled(here, scale), "{scale}");
+            }
+        }
+    }
+
+    #[test]
+    fn scenes_around_the_origin_are_computed_from_there() {
+        for (sights, _) in scenes() {
+            assert_eq!(near_point(&sights), DVec3::ZERO);
+        }
+        assert_eq!(near_point(&sights(&[parallel(1.0, 0)], None)), DVec3::ZERO);
+        assert_eq!(near_point(&[]), DVec3::ZERO);
     }
 
     #[test]

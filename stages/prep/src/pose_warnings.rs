@@ -1,6 +1,6 @@
 use artifact::counted;
 use glam::DVec3;
-use scene::{Camera, Intrinsics};
+use scene::{Camera, Intrinsics, length};
 
 use crate::error::SamePose;
 
@@ -12,9 +12,13 @@ const LEAST_CAMERAS: usize = 4;
 /// A principal point farther from the middle of the image, as a share of its length, is far from
 /// it. Real lenses have a hundredth.
 const OFF_CENTRE_SHARE: f64 = 0.2;
-/// Centres nearer to each other than this share of their distance from the origin are one place:
-/// they were the same before they were rounded.
-const ONE_PLACE_SHARE: f64 = 1e-7;
+/// Relative errors of coordinates in double precision, which were computed by a few operations, and
+/// of coordinates that all fit into single precision.
+const DOUBLE_ERROR: f64 = 8.0 * f64::EPSILON;
+const SINGLE_ERROR: f64 = f32::EPSILON as f64;
+/// Cameras whose centres are known to less than this share of their distance from each other have
+/// poses too coarse for a sharp field: a thousandth is a pixel or so.
+const COARSE_SHARE: f64 = 1e-3;
 
 /// Refuses training views that were all taken by the same camera at the same place: whatever they
 /// show, it isn't one scene seen from several sides.
@@ -39,12 +43,8 @@ pub(crate) fn warnings(training: &[Camera], test: &[Camera]) -> Vec<String> {
             other sides"
                 .to_owned(),
         );
-    } else if stand_in_one_place(training) {
-        let count = training.len();
-        found.push(format!(
-            "all {count} training cameras stand in one place: nothing tells how far anything is"
-        ));
     }
+    found.extend(one_place(training));
     let named = |kind: &'static str| move |camera| Named { camera, kind };
     let all: Vec<Named> =
         training.iter().map(named("training")).chain(test.iter().map(named("test"))).collect();
@@ -66,9 +66,36 @@ impl std::fmt::Display for Named<'_> {
     }
 }
 
-fn stand_in_one_place(cameras: &[Camera]) -> bool {
-    let Some(first) = cameras.first().map(Camera::centre) else { return false };
-    cameras.iter().all(|camera| camera.centre().distance(first) <= ONE_PLACE_SHARE * first.length())
+/// Cameras in one place, up to rounding, and cameras whose centres are rounded too coarsely: poses
+/// of a georeferenced scene in single precision.
+fn one_place(cameras: &[Camera]) -> Option<String> {
+    let [first, others @ ..] = cameras else { return None };
+    let distances = others.iter().map(|camera| camera.centre().distance(first.centre()));
+    let (apart, error) = (distances.fold(0.0, f64::max), rounding_error(cameras));
+    if others.is_empty() || error < COARSE_SHARE * apart {
+        return None;
+    }
+    let count = cameras.len();
+    Some(if apart <= error {
+        format!(
+            "all {count} training cameras stand in one place: nothing tells how far anything is"
+        )
+    } else {
+        format!(
+            "the {count} training cameras stand up to {} units apart, but their centres are known \
+            only to {}: subtract an offset from all centres before they are rounded",
+            length(apart, 3),
+            length(error, 3)
+        )
+    })
+}
+
+/// Returns the error of the cameras' coordinates that follows from their number format.
+fn rounding_error(cameras: &[Camera]) -> f64 {
+    let coordinates = || cameras.iter().flat_map(|camera| camera.centre().to_array());
+    let are_single = coordinates().all(|x| f64::from(x as f32) == x);
+    let largest = coordinates().fold(0.0, |largest: f64, x| largest.max(x.abs()));
+    largest * if are_single { SINGLE_ERROR } else { DOUBLE_ERROR }
 }
 
 /// Cameras far away from the others, by the medians: those hold whatever a few cameras do.
@@ -161,6 +188,28 @@ mod tests {
         assert_eq!(warnings(&ring(2, 1.0, 0.0), &ring(1, 1.0, 0.0)), Vec::<String>::new());
     }
 
+    /// Captures of a table and of a town in UTM and ECEF coordinates: nothing is wrong with them,
+    /// unless they were written in single precision.
+    #[test]
+    fn georeferenced_cameras_are_known_as_well_as_their_numbers_say() {
+        let (utm, ecef) = ([500_000.0, 4_649_776.0, 120.0], [4_027_893.75, 307_045.6, 4_919_474.9]);
+        for offset in [utm, ecef] {
+            for (scale, words) in [
+                (0.025, "all 8 training cameras stand in one place"),
+                (10.0, "units apart, but their centres are known only to 0.5"),
+            ] {
+                let mut there: Vec<Camera> =
+                    ring(8, scale, 0.0).iter().map(|c| c.moved(offset.into())).collect();
+                assert_eq!(warnings(&there, &[]), Vec::<String>::new(), "{scale}");
+                for number in there.iter_mut().flat_map(|c| c.camera_to_world.as_flattened_mut()) {
+                    *number = f64::from(*number as f32);
+                }
+                let found = warnings(&there, &[]).join("; ");
+                assert!(found.contains(words), "{scale}: {found}");
+            }
+        }
+    }
+
     #[test]
     fn published_scenes_are_nothing_to_warn_of() {
         let data = std::env::var("NERF_SR_DATA").map_or_else(
@@ -211,6 +260,9 @@ mod tests {
         let turning: Vec<Camera> =
             (0..5).map(|i| camera("t", f64::from(i), [3.0, 1.0, 4.0])).collect();
         assert_one_warning(&turning, &[], "all 5 training cameras stand in one place");
+        let utm = DVec3::new(500_000.0, 4_649_776.0, 120.0);
+        let there: Vec<Camera> = turning.iter().map(|camera| camera.moved(utm)).collect();
+        assert_one_warning(&there, &[], "all 5 training cameras stand in one place");
         let mut far = ring(8, 1.0, 0.0);
         far[5].camera_to_world[0][3] = 1e6;
         assert_one_warning(&far, &ring(3, 1.0, 0.0), "training view r_5 is 3");

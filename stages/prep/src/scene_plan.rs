@@ -1,6 +1,6 @@
 use artifact::{Failure, WARNING};
 use dataset::{Dataset, Frame, Split};
-use scene::{Background, Bounds, Camera, Space};
+use scene::{Background, Bounds, Camera, Space, length};
 
 use crate::bounds::{SeenDepths, place};
 use crate::error::{ParameterError, SamePose};
@@ -38,6 +38,10 @@ impl<'a> ScenePlan<'a> {
     }
 }
 
+/// Message about cameras that see a box which is a point for f64.
+const NO_INSIDE: &str = "dataset: the box that the cameras see has no inside; are the poses right, \
+    and their unit?";
+
 /// Where a scene is, by what its cameras see and by what the user says of it.
 fn bounds(
     train: &[&Frame],
@@ -54,6 +58,9 @@ fn bounds(
     let (train, test) = (sights(train, given), sights(test, given));
     let goes_on = background == Background::Opaque;
     let mut bounds = place(&train, &test, goes_on, params.space).map_err(ParameterError::from)?;
+    if !bounds.is_valid() {
+        return Err(Failure::BadInput(NO_INSIDE.to_owned()));
+    }
     for (name, given, bound) in
         [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)]
     {
@@ -102,21 +109,22 @@ pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
     let space = match bounds.space {
         Space::Box => {
             format!(
-                "space: a box of {:.3} units, seen from {:.3} to {:.3}",
-                bounds.longest_side(),
-                bounds.near,
-                bounds.far
+                "space: a box of {} units, seen from {} to {}",
+                length(bounds.longest_side(), 3),
+                length(bounds.near, 3),
+                length(bounds.far, 3)
             )
         }
         Space::Ndc(f) => format!(
-            "space: all cameras look one way, so NDC, from depth {:.3} to {:.3}",
-            f.near, f.far
+            "space: all cameras look one way, so NDC, from depth {} to {}",
+            length(f.near, 3),
+            length(f.far, 3)
         ),
         Space::Contraction => {
             format!(
-                "space: a ball of {:.3} units, and all around it up to {:.0}, contracted",
-                bounds.longest_side(),
-                bounds.far
+                "space: a ball of {} units, and all around it up to {}, contracted",
+                length(bounds.longest_side(), 3),
+                length(bounds.far, 0)
             )
         }
     };
@@ -212,6 +220,39 @@ mod tests {
         assert_eq!(
             near_and_far(&set, None, Some(f64::INFINITY)).unwrap_err().to_string(),
             "parameter far: inf is not a distance"
+        );
+    }
+
+    /// Lengths are printed with significant digits, however large the scene's unit is.
+    #[test]
+    fn spaces_are_printed_with_their_digits() {
+        let (near, far) = (2e-5, 9e-5);
+        for (space, note) in [
+            (Space::Box, "space: a box of 6.00e-5 units, seen from 2.00e-5 to 9.00e-5; on black"),
+            (
+                Space::Contraction,
+                "space: a ball of 6.00e-5 units, and all around it up to 9.00e-5, contracted; on \
+                black",
+            ),
+        ] {
+            let bounds = Bounds { min: [-3e-5; 3], max: [3e-5; 3], near, far, space };
+            assert_eq!(space_note(&bounds, Background::Black), note);
+        }
+    }
+
+    /// A box that is a point for f64 is refused, without a word of parameters that nobody has given.
+    #[test]
+    fn boxes_without_an_inside_are_refused() {
+        let mut set = ring(Format::Blender, 8);
+        for frame in &mut set.frames {
+            (frame.taken_with.fx, frame.taken_with.fy) = (1e300, 1e300);
+        }
+        let refused = planned(&set, &Params::default(), Background::White).unwrap_err();
+        assert!(matches!(refused, Failure::BadInput(_)));
+        assert_eq!(
+            refused.to_string(),
+            "dataset: the box that the cameras see has no inside; are the poses right, and their \
+            unit?"
         );
     }
 

@@ -1,7 +1,7 @@
 use artifact::{WARNING, counted, with_warnings};
 use dataset::Dataset;
 use pixels::Kernel;
-use scene::{Background, Bounds};
+use scene::{Background, Bounds, length};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -68,10 +68,11 @@ impl SceneSummary {
             self.notes.iter().filter_map(|n| n.strip_prefix(WARNING)).map(str::to_owned).collect();
         let ([lr_width, lr_height], [hr_width, hr_height]) = (self.lr, self.hr);
         let (train, test) = (counted(self.train, "training view"), counted(self.test, "test view"));
-        let (kernel, near, far) = (self.kernel, self.bounds.near, self.bounds.far);
+        let [near, far] = [self.bounds.near, self.bounds.far].map(|end| length(end, 2));
+        let kernel = self.kernel;
         let summary = format!(
             "{train} at {lr_width}×{lr_height} from {hr_width}×{hr_height} ({kernel:?}), {test}; \
-            rays from {near:.2} to {far:.2}"
+            rays from {near} to {far}"
         );
         with_warnings(&summary, &warnings)
     }

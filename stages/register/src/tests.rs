@@ -12,8 +12,7 @@ struct Wall {
 }
 
 fn seen_along(ray: &Ray, is_whole: bool, shift: f64) -> Pixel {
-    let (origin, direction) =
-        (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
+    let (origin, direction) = (DVec3::from(ray.origin), DVec3::from(ray.direction));
     let distance = -origin.z / direction.z;
     let at = origin + distance * direction + DVec3::X * if is_whole { 0.0 } else { shift };
     let colour = [0.0, 1.0, 2.0]

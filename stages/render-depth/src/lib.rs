@@ -321,7 +321,7 @@ mod tests {
 
     impl Picture {
         fn pixel(&self, ray: &Ray) -> radiance::Pixel {
-            let [x, y, z] = ray.direction.map(f64::from);
+            let [x, y, z] = ray.direction;
             let value = (self.colour)(CENTRE - x / z, CENTRE + y / z) as f32;
             radiance::Pixel {
                 colour: [value; 3],
@@ -408,7 +408,7 @@ mod tests {
 
     impl Wall {
         fn pixel(&self, ray: &Ray) -> radiance::Pixel {
-            let median_depth = self.0 / -ray.direction[2];
+            let median_depth = self.0 / -ray.direction[2] as f32;
             let (depth, opacity) = (2.0 * median_depth, 0.25 * self.0);
             radiance::Pixel { opacity, depth, median_depth, ..radiance::Pixel::default() }
         }

@@ -216,7 +216,7 @@ fn bandwidth() -> f64 {
 fn rays(count: usize) -> Vec<Ray> {
     let side = (count as f64).sqrt() as usize;
     let at = |i: usize| {
-        let (x, y) = ((i % side) as f32 / side as f32 - 0.5, (i / side) as f32 / side as f32 - 0.5);
+        let (x, y) = ((i % side) as f64 / side as f64 - 0.5, (i / side) as f64 / side as f64 - 0.5);
         let length = (x * x + y * y + 4.0).sqrt();
         Ray {
             origin: [0.1, -0.2, 4.0],

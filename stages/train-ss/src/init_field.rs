@@ -2,7 +2,8 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use artifact::{Failure, GivenInput};
-use radiance::FieldFile;
+use glam::DVec3;
+use radiance::{FieldFile, FieldModel};
 use stage::Context;
 
 /// A field to go on from.
@@ -12,9 +13,21 @@ pub(crate) struct InitField<'a> {
 }
 
 impl<'a> InitField<'a> {
-    /// Reads what it says of itself, which must be what is to be trained.
-    pub(crate) fn read(input: &'a GivenInput, wanted: &FieldFile) -> anyhow::Result<Self> {
+    /// Reads what it says of itself, which must be what is to be trained. An older field keeps its
+    /// frame: bounds that differ from those of `wanted` by rounding, as seen from `anchor`, and its
+    /// positions.
+    pub(crate) fn read(
+        input: &'a GivenInput,
+        wanted: &mut FieldFile,
+        anchor: DVec3,
+    ) -> anyhow::Result<Self> {
         let file = fields::read_file(input)?;
+        if file.bounds.rounded(anchor) == wanted.bounds {
+            wanted.bounds = file.bounds;
+        }
+        if let (FieldModel::Mlp(own), FieldModel::Mlp(wanted)) = (file.field, &mut wanted.field) {
+            wanted.scaled_positions = own.scaled_positions;
+        }
         let differs = [
             ("lies elsewhere; train both from one prep", file.bounds != wanted.bounds),
             (
@@ -57,5 +70,43 @@ impl<'a> InitField<'a> {
                 .context("cannot keep input init")?;
         }
         Ok(self.members)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use radiance::{FIELD_FILE, FIELD_FORMAT, MlpArchitecture};
+    use scene::{Background, Bounds};
+
+    use super::*;
+
+    /// Reads a field that is initialised from another; both by their bounds and positions.
+    fn read(init: (Bounds, bool), wanted: (Bounds, bool)) -> Result<(Bounds, bool), String> {
+        let file = |(bounds, scaled_positions)| FieldFile {
+            format: FIELD_FORMAT,
+            field: FieldModel::Mlp(MlpArchitecture { scaled_positions, ..Default::default() }),
+            members: 1,
+            bounds,
+            background: Background::White,
+        };
+        let folder = tempfile::tempdir().unwrap();
+        artifact::write_json(&folder.path().join(FIELD_FILE), &file(init)).unwrap();
+        let (input, mut wanted) = (GivenInput::open("init", folder.path()).unwrap(), file(wanted));
+        InitField::read(&input, &mut wanted, DVec3::Y).map_err(|error| error.to_string())?;
+        let FieldModel::Mlp(architecture) = wanted.field else { panic!("the model stays") };
+        Ok((wanted.bounds, architecture.scaled_positions))
+    }
+
+    /// A field from before bounds were rounded and positions scaled is trained on in its own frame.
+    #[test]
+    fn older_fields_keep_their_frame() {
+        let bounds =
+            Bounds { min: [-1.1; 3], max: [1.3; 3], near: 0.7, far: 6.1, ..Bounds::default() };
+        let rounded = bounds.rounded(DVec3::Y);
+        assert_eq!(read((bounds, false), (rounded, true)), Ok((bounds, false)));
+        assert_eq!(read((rounded, true), (rounded, true)), Ok((rounded, true)));
+        let elsewhere = bounds.moved(DVec3::splat(1e-4));
+        let refused = read((elsewhere, true), (rounded, true)).unwrap_err();
+        assert!(refused.contains("it lies elsewhere"), "{refused}");
     }
 }

@@ -125,22 +125,25 @@ impl Stage for TrainSs {
         params.check().map_err(|e| Failure::Usage(e.to_string()))?;
         let input = context.input("scene")?;
         let references = context.optional_input("references");
-        let views = Views::read(input)?;
+        let mut views = Views::read(input)?;
+        let anchor = views.views[0].camera.centre();
+        views.bounds = views.bounds.rounded(anchor);
         let init = context.optional_input("init");
         let has_kernel = input.path(DEGRADATION_FILE).exists();
         let params = params.resolve(&SceneFacts {
             is_fine_tuning: init.is_some(),
             ..SceneFacts::of(&views, has_kernel)
         });
-        let (model, combine) = (params.model(), params.combine);
         let mut file = FieldFile {
             format: FIELD_FORMAT,
-            field: model,
+            field: params.model(),
             members: if context.from_checkpoint() { 1 } else { params.ensemble },
             bounds: views.bounds,
             background: views.background,
         };
-        let init = init.map(|input| InitField::read(input, &file)).transpose()?;
+        let init = init.map(|input| InitField::read(input, &mut file, anchor)).transpose()?;
+        views.bounds = file.bounds;
+        let (model, combine) = (file.field, params.combine);
         let mut log = TrainingLog { resolved: params.record(), ..TrainingLog::default() };
         if context.from_checkpoint() {
             let from = init.as_ref().map(|init| (init.member(0), combine));

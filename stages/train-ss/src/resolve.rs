@@ -302,6 +302,7 @@ impl MlpParams {
             position_octaves: self.position_frequencies,
             direction_octaves: self.direction_frequencies,
             ndc_directions: self.ndc_directions,
+            scaled_positions: true,
             depth: self.layers,
             width: self.hidden_dim,
             coarse_samples: self.coarse_samples,

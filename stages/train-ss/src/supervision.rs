@@ -381,7 +381,7 @@ mod tests {
                             (i % size[0] as usize) as f64 + 0.5,
                             (i / size[0] as usize) as f64 + 0.5,
                         );
-                        let expected = hr.ray(x, y).direction.as_vec3().to_array();
+                        let expected = hr.ray(x, y).direction;
                         (0..3).all(|c| (ray.direction[c] - expected[c]).abs() < 1e-6)
                     });
                     seen[pixel.unwrap_or_else(|| {
@@ -553,9 +553,9 @@ mod tests {
         Photographs::taken_by(camera, hr_image(width, height))
     }
 
-    fn direction_through(camera: &Camera, pixel: usize) -> glam::Vec3 {
+    fn direction_through(camera: &Camera, pixel: usize) -> glam::DVec3 {
         let width = camera.intrinsics.width as usize;
-        camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction.as_vec3()
+        camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction
     }
 
     /// References join LR images as they are: whatever made those, each sub-pixel ray is a
@@ -609,7 +609,7 @@ mod tests {
             let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
             joined.sample_rays(bundle, &mut rays[..1]);
             assert!(
-                large.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6,
+                large.ray(8.0, 1.0).direction.distance(rays[0].direction.into()) < 1e-6,
                 "{kind:?}"
             );
             let block = [7, 8, 16, 17].map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));

@@ -188,6 +188,45 @@ mod tests {
         }
     }
 
+    /// A pose's text with another left 3×3 part, given row by row.
+    fn with_axes(axes: [[f64; 3]; 3]) -> String {
+        let [x, y, z] = axes.map(|[a, b, c]| format!("[{a},{b},{c}"));
+        let pose = format!("[{x},7],{y},8],{z},4],[0,0,0,1]]");
+        with_pose("1").replace("[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]", &pose)
+    }
+
+    /// instant-ngp's users scale scenes by the whole matrix, or by its rotation alone.
+    #[test]
+    fn a_scale_of_all_axes_is_removed_and_said() {
+        let dir = folder(&with_axes([[0.0, 0.0, 0.25], [0.25, 0.0, 0.0], [0.0, 0.25, 0.0]]));
+        let set = Dataset::read(dir.path()).unwrap();
+        let rigid = [[0.0, 0.0, 1.0, 7.0], [1.0, 0.0, 0.0, 8.0], [0.0, 1.0, 0.0, 4.0]];
+        assert_eq!(set.frames[0].camera_to_world, rigid);
+        let note = "warning: rotations of 1 of 2 views have a scale of 0.25, which is removed; \
+            centres stay";
+        assert!(set.notes.iter().any(|found| found == note), "{:?}", set.notes);
+        let plain = Dataset::read(folder(&with_pose("1.004")).path()).unwrap();
+        assert_eq!(plain.notes.len(), 1, "rounding is no scale: {:?}", plain.notes);
+    }
+
+    #[test]
+    fn other_matrices_are_refused() {
+        let half =
+            |[a, b, c]: [f64; 3]| [[0.5 * a, 0.0, 0.0], [0.0, 0.5 * b, 0.0], [0.0, 0.0, 0.5 * c]];
+        let sheared = [[1.0, 0.2, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        for (axes, words) in [
+            (half([1.0, 1.0, -1.0]), "camera_to_world is a reflection (its determinant is -1.000)"),
+            (half([1.0, 1.0, 1.2]), "camera_to_world is no rigid motion"),
+            (half([0.0; 3]), "camera_to_world is no rigid motion"),
+            (sheared, "camera_to_world is no rigid motion"),
+            (sheared.map(|row| row.map(|x| 0.1 * x)), "camera_to_world is no rigid motion"),
+        ] {
+            let message = Dataset::read(folder(&with_axes(axes)).path()).unwrap_err().to_string();
+            let place = "transforms_train.json: frame 0 (./train/r_0): transform_matrix: ";
+            assert!(message.contains(&format!("{place}{words}")), "{message}");
+        }
+    }
+
     #[test]
     fn any_bytes_are_an_error_and_no_panic() {
         let whole = with_pose("1");

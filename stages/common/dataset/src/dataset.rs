@@ -1,4 +1,4 @@
-use artifact::counted;
+use artifact::{WARNING, counted};
 use scene::Intrinsics;
 
 use crate::error::DatasetError;
@@ -107,6 +107,28 @@ impl Dataset {
         self
     }
 
+    /// Removes a uniform scale from the rotations of poses, and warns of it. Centres stay: they are
+    /// where the program that wrote the poses meant cameras to be.
+    pub(crate) fn remove_scales(&mut self) {
+        let (mut count, mut least, mut largest) = (0, f64::INFINITY, 0.0f64);
+        for frame in &mut self.frames {
+            if let Some((rigid, scale)) = scene::without_scale(&frame.camera_to_world) {
+                frame.camera_to_world = rigid;
+                count += 1;
+                (least, largest) = (least.min(scale), largest.max(scale));
+            }
+        }
+        if count > 0 {
+            let [least, largest] = [least, largest].map(four_digits);
+            let range = if least == largest { least } else { format!("{least} to {largest}") };
+            self.notes.push(format!(
+                "{WARNING}rotations of {count} of {} have a scale of {range}, which is removed; \
+                centres stay",
+                counted(self.frames.len(), "view")
+            ));
+        }
+    }
+
     /// Says what is done to images that aren't all alike, upright and from a pinhole.
     pub(crate) fn note_what_is_special(&mut self) {
         let count = |is: &dyn Fn(&Frame) -> bool| self.frames.iter().filter(|f| is(f)).count();
@@ -154,6 +176,12 @@ impl Dataset {
             ));
         }
     }
+}
+
+/// Formats a number with at most four significant digits.
+fn four_digits(value: f64) -> String {
+    let rounded = format!("{value:.3e}").parse().unwrap_or(value);
+    format!("{rounded:?}")
 }
 
 /// Describes the pinhole cameras in place of fisheye cameras, by their angles of view.

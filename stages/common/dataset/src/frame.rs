@@ -3,7 +3,7 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
-use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of};
+use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of, without_scale};
 
 use crate::error::DatasetError;
 use crate::frame_reason::FrameReason;
@@ -56,7 +56,9 @@ impl Frame {
         self.mask.is_some() || self.intrinsics().has_cut_rays()
     }
 
-    /// Refuses what no camera can be. Whether each place in a distorted image has its ray is asked
+    /// Refuses what no camera can be, except a uniform scale of the rotation, which
+    /// [`Dataset::read`](crate::Dataset::read) removes. Whether each place in a distorted image has
+    /// its ray is asked
     /// where that matters.
     pub(crate) fn check(&self) -> Result<(), CameraError> {
         let distortion = self.taken_with.distortion;
@@ -65,6 +67,9 @@ impl Frame {
         }
         let mut camera = self.camera();
         camera.intrinsics.distortion = Distortion::default();
+        if let Some((rigid, _)) = without_scale(&camera.camera_to_world) {
+            camera.camera_to_world = rigid;
+        }
         camera.check()
     }
 }

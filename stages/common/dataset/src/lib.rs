@@ -84,6 +84,7 @@ impl Dataset {
     pub fn read(folder: &Path) -> Result<Self, DatasetError> {
         let mut set = read_as(format_of(folder)?, folder)?;
         add_masks(folder, &mut set)?;
+        set.remove_scales();
         set.note_what_is_special();
         for note in &mut set.notes {
             *note = printable(note).into_owned();

@@ -242,7 +242,7 @@ mod tests {
         std::fs::write(folder.join(FIELD_FILE), serde_json::to_vec(&file).unwrap()).unwrap();
     }
 
-    fn ray(x: f32) -> Ray {
+    fn ray(x: f64) -> Ray {
         Ray { origin: [x, 0.1, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] }
     }
 

@@ -47,7 +47,7 @@ use std::fmt;
 
 use glam::{DMat3, DQuat, DVec3};
 use radiance::{Ray, RayField, RenderError};
-use scene::{Camera, pose_of};
+use scene::{Camera, length, pose_of};
 
 use crate::cast::cast;
 use crate::huber::{HUBER_ERROR, huber};
@@ -299,8 +299,9 @@ impl fmt::Display for Moved {
         let Self { angle, distance, pixels } = self;
         write!(
             f,
-            "turned by {:.3}° and moved by {distance:.4} ({pixels:.1} LR pixels) in the mean",
-            angle.to_degrees()
+            "turned by {:.3}° and moved by {} ({pixels:.1} LR pixels) in the mean",
+            angle.to_degrees(),
+            length(*distance, 4)
         )
     }
 }

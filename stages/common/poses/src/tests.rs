@@ -24,10 +24,7 @@ impl BallAndWall {
 }
 
 fn seen_along(ray: &Ray) -> Pixel {
-    let (origin, direction) = (
-        DVec3::from(ray.origin.map(f64::from)),
-        DVec3::from(ray.direction.map(f64::from)).normalize(),
-    );
+    let (origin, direction) = (DVec3::from(ray.origin), DVec3::from(ray.direction).normalize());
     let distance = BallAndWall::hit(origin, direction);
     let colour = BallAndWall::paint(origin + distance * direction);
     let depth = distance as f32;
@@ -174,6 +171,56 @@ fn moved_cameras_come_back() {
         found.check().unwrap();
         let is = pixels_apart(&truth, &found);
         assert!(is < 0.15, "{i}: {was} pixels before, {is} after");
+    }
+}
+
+/// The same scene at another position, in another unit.
+struct Elsewhere {
+    shift: DVec3,
+    scale: f64,
+}
+
+impl Elsewhere {
+    fn camera(&self, camera: &Camera) -> Camera {
+        placed(camera, rotation(camera), self.scale * camera.centre() + self.shift)
+    }
+}
+
+impl RayField for Elsewhere {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+        let origin = |ray: &Ray| ((DVec3::from(ray.origin) - self.shift) / self.scale).to_array();
+        let here: Vec<Ray> = rays.iter().map(|ray| Ray { origin: origin(ray), ..*ray }).collect();
+        let mut seen = BallAndWall.render(&here)?;
+        for pixel in &mut seen {
+            pixel.depth *= self.scale as f32;
+            pixel.median_depth *= self.scale as f32;
+        }
+        Ok(seen)
+    }
+}
+
+/// Cameras of a georeferenced scene, and of one in another unit, are found as those at the origin.
+#[test]
+fn cameras_come_back_wherever_the_scene_lies() {
+    let truth = camera(1);
+    let pyramid = Pyramid::new(&photograph(&truth), 2);
+    let off = motion([0.01, -0.02, 0.01], [0.1, -0.05, 0.1]).applied_to(&truth);
+    let found_by = |field: &dyn RayField, camera: &Camera| {
+        let mut found = camera.clone();
+        for level in (0..3).rev() {
+            let refined = refine(field, &found, &pyramid, level, &Options::default()).unwrap();
+            found = refined.camera;
+        }
+        found
+    };
+    let here = found_by(&BallAndWall, &off);
+    assert!(pixels_apart(&truth, &here) < 0.15);
+    let utm = DVec3::new(500_000.0, 4_649_776.0, 120.0);
+    for (shift, scale) in [(utm, 1.0), (utm, 0.025), (DVec3::ZERO, 1e-5), (DVec3::ZERO, 1e5)] {
+        let scene = Elsewhere { shift, scale };
+        let there = found_by(&scene, &scene.camera(&off));
+        let back = Elsewhere { shift: -shift / scale, scale: 1.0 / scale }.camera(&there);
+        assert!(pixels_apart(&back, &here) < 1e-3, "{shift} {scale}");
     }
 }
 

@@ -100,6 +100,10 @@ pub struct MlpArchitecture {
     /// In NDC: colours depend on the ray's direction there, from the near to the far plane and not
     /// of unit length, as the reference's code has it; without it on its direction in the world.
     pub ndc_directions: bool,
+    /// In a box: positions are counted from the box's middle, in [`Bounds::unit`]s. Without it they
+    /// are scene units from the origin, as in the reference's code, which expects scenes of a few
+    /// units around the origin.
+    pub scaled_positions: bool,
 }
 
 impl Default for MlpArchitecture {
@@ -112,6 +116,7 @@ impl Default for MlpArchitecture {
             coarse_samples: 64,
             fine_samples: 64,
             ndc_directions: false,
+            scaled_positions: false,
         }
     }
 }

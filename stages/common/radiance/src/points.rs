@@ -133,7 +133,7 @@ mod tests {
         for (sample, weight) in samples.iter().zip(&weights) {
             features.iter_mut().zip(&sample.view_features).for_each(|(sum, f)| *sum += weight * f);
         }
-        let added = field.view_colours(&features, &[ray.direction, [0.0, 1.0, 0.0]]);
+        let added = field.view_colours(&features, &[clipped.view, [0.0, 1.0, 0.0]]);
         let colour: [f32; 3] = std::array::from_fn(|c| {
             let lights = samples.iter().zip(&weights);
             lights.map(|(s, weight)| weight * sigmoid(s.raw_colour[c] + added[0][c])).sum::<f32>()

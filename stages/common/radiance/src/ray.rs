@@ -3,25 +3,34 @@ use scene::{Bounds, CameraRay, Frustum, Space};
 
 use crate::math::exp;
 
-/// A ray in scene units.
+/// A ray in scene units. Double precision, since scenes may lie far from the origin; [`clip`] maps
+/// the ray to the unit cube first, and only then rounds it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Ray {
-    /// Where it starts.
-    pub origin: [f32; 3],
+    /// Start of the ray.
+    pub origin: [f64; 3],
     /// Unit length; a direction that isn't finite or is zero sees the background alone.
-    pub direction: [f32; 3],
+    pub direction: [f64; 3],
     /// What it sees where nothing stands in its way.
     pub background: [f32; 3],
 }
 
 impl Ray {
-    /// A camera's ray before a background, in single precision.
+    /// Returns a camera's ray before a background.
     pub fn new(ray: &CameraRay, background: [f32; 3]) -> Self {
-        Self {
-            origin: ray.origin.as_vec3().to_array(),
-            direction: ray.direction.as_vec3().to_array(),
-            background,
-        }
+        let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
+        Self { origin, direction, background }
+    }
+
+    /// True if the ray has a direction, and all its numbers are finite.
+    pub fn is_usable(&self) -> bool {
+        let numbers = self.origin.iter().chain(&self.direction);
+        self.direction != [0.0; 3] && numbers.into_iter().all(|x| x.is_finite())
+    }
+
+    /// Returns the direction as fields take it: single precision.
+    fn view(&self) -> [f32; 3] {
+        self.direction.map(|x| x as f32)
     }
 }
 
@@ -173,29 +182,25 @@ impl NormalizedRay {
 
     /// A ray that meets nothing.
     fn miss(ray: &Ray) -> Self {
-        Self { enter: 0.0, leave: 0.0, view: ray.direction, ..Self::default() }
+        Self { enter: 0.0, leave: 0.0, view: ray.view(), ..Self::default() }
     }
 }
 
 /// Clips a ray to what a field sees of the world, and to the range of distances. Computed in f64,
-/// so that scenes of 1e-6 and 1e6 units lose nothing.
+/// so that scenes of 1e-6 and 1e6 units, and georeferenced ones, lose nothing.
 pub fn clip(bounds: &Bounds, ray: &Ray) -> NormalizedRay {
     // A NaN or a zero direction anywhere ends here.
-    if ray.direction == [0.0; 3] || !ray.direction.iter().chain(&ray.origin).all(|x| x.is_finite())
-    {
+    if !ray.is_usable() {
         return NormalizedRay::miss(ray);
     }
-    let (origin, direction) =
-        (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
+    let (origin, direction) = (DVec3::from(ray.origin), DVec3::from(ray.direction));
     let clipped = match &bounds.space {
         Space::Box => through_box(bounds, origin, direction),
         Space::Ndc(frustum) => through_frustum(frustum, bounds.near, origin, direction),
         Space::Contraction => through_contraction(bounds, origin, direction),
     };
-    clipped.map_or(NormalizedRay::miss(ray), |clipped| NormalizedRay {
-        view: ray.direction,
-        ..clipped
-    })
+    clipped
+        .map_or(NormalizedRay::miss(ray), |clipped| NormalizedRay { view: ray.view(), ..clipped })
 }
 
 fn through_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
@@ -255,8 +260,7 @@ fn through_frustum(
 
 fn through_contraction(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
     let radius = 0.5 * bounds.longest_side();
-    let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
-    let from = (origin - centre) / radius;
+    let from = (origin - bounds.middle()) / radius;
     let to_nearest = -from.dot(direction);
     let nearest = from + to_nearest * direction;
     let radii = nearest.length().max(1.0);
@@ -300,7 +304,7 @@ fn clip_to(
 mod tests {
     use super::*;
 
-    fn ray(origin: [f32; 3], direction: [f32; 3]) -> Ray {
+    fn ray(origin: [f64; 3], direction: [f64; 3]) -> Ray {
         Ray { origin, direction, background: [1.0; 3] }
     }
 
@@ -315,7 +319,7 @@ mod tests {
                 far: 100.0 * scale,
                 ..Default::default()
             };
-            let hit = clip(&bounds, &ray([0., 0., 4. * s], [0., 0., -1.]));
+            let hit = clip(&bounds, &ray([0., 0., 4. * scale], [0., 0., -1.]));
             assert!((hit.enter - 1.5).abs() < 1e-5 && (hit.leave - 2.5).abs() < 1e-5, "{hit:?}");
             assert!((hit.distance(hit.enter) - 3.0 * s).abs() < 1e-5 * s);
             // Starting inside, missing, parallel to a face inside and outside, behind, zero length,
@@ -326,10 +330,52 @@ mod tests {
                 ([2., 0., 0.], [0., 1., 0.]),
                 ([0., 0., 4.], [0., 0., 1.]),
                 ([0.; 3], [0.; 3]),
-                ([0.; 3], [f32::NAN, 0., 1.]),
+                ([0.; 3], [f64::NAN, 0., 1.]),
             ] {
-                let miss = clip(&bounds, &ray(o.map(|x| x * s), d));
+                let miss = clip(&bounds, &ray(o.map(|x| x * scale), d));
                 assert!(miss.enter >= miss.leave, "{o:?} {d:?}: {miss:?}");
+            }
+        }
+    }
+
+    /// A scene's ray is the same in the unit cube wherever the scene lies, and whatever its unit.
+    #[test]
+    fn rays_do_not_know_where_a_scene_lies() {
+        let turned = glam::DMat3::from_axis_angle(unit([0.3, 1.0, -0.2]), 0.4);
+        let from = DVec3::new(0.1, -0.4, 3.2);
+        let frustum = Frustum {
+            camera_to_world: scene::pose_of(turned, from),
+            min: [-0.9, -0.6],
+            max: [0.8, 0.7],
+            near: 0.8,
+            far: 50.0,
+        };
+        let (utm, ecef) = (
+            DVec3::new(500_000.0, 4_649_776.0, 120.0),
+            DVec3::new(4_027_893.7, 307_045.6, 4_919_474.9),
+        );
+        for space in [Space::Box, Space::Ndc(frustum), Space::Contraction] {
+            let here = Bounds { min: [-1.1; 3], max: [1.1; 3], near: 0.1, far: 90.0, space };
+            for (shift, tolerance) in [(utm, 1e-6), (ecef, 1e-6), (DVec3::splat(1024.0), 1e-7)] {
+                let there = here.moved(shift);
+                for k in 0..200 {
+                    let mut rng = counter_rng::CounterRng::new(5, 1, k);
+                    let mut draw = || f64::from(rng.uniform()) - 0.5;
+                    let direction =
+                        (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
+                    let origin = from + DVec3::new(draw(), draw(), draw());
+                    let cast = |bounds: &Bounds, origin: DVec3| {
+                        clip(bounds, &ray(origin.to_array(), direction.to_array()))
+                    };
+                    let (a, b) = (cast(&here, origin), cast(&there, origin + shift));
+                    assert_eq!(a.enter < a.leave, b.enter < b.leave);
+                    let numbers = |r: &NormalizedRay| {
+                        [&r.origin[..], &r.direction, &r.view, &[r.enter, r.leave]].concat()
+                    };
+                    for (a, b) in numbers(&a).into_iter().zip(numbers(&b)) {
+                        assert!((a - b).abs() <= tolerance * a.abs().max(1.0), "{space:?} {a} {b}");
+                    }
+                }
             }
         }
     }
@@ -367,7 +413,7 @@ mod tests {
                 let from = centre + scale * DVec3::new(draw(), draw(), draw());
                 let direction =
                     (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
-                let ray = ray(from.as_vec3().to_array(), direction.as_vec3().to_array());
+                let ray = ray(from.to_array(), direction.to_array());
                 for (i, space) in [Space::Ndc(frustum), Space::Contraction].into_iter().enumerate()
                 {
                     let seen = clip(&bounds(space), &ray);
@@ -412,10 +458,10 @@ mod tests {
         let mut most_bent: f32 = 0.0;
         for k in 0..300 {
             let mut rng = counter_rng::CounterRng::new(6, 0, k);
-            let mut draw = || 2.0 * rng.uniform() - 1.0;
+            let mut draw = || 2.0 * f64::from(rng.uniform()) - 1.0;
             let far = [0.5, 3.0, 40.0, 0.0][k as usize % 4];
             let origin = [far * draw(), far * draw(), far * draw()];
-            let direction = unit([draw(), draw(), draw()].map(f64::from)).as_vec3().to_array();
+            let direction = unit([draw(), draw(), draw()]).to_array();
             let seen = clip(&bounds, &ray(origin, direction));
             let RayMap::Contracted { radii, .. } = seen.map else {
                 panic!("the space is contracted");

@@ -105,7 +105,7 @@ impl Judge<'_> {
             }
             depth += tau;
         }
-        let added = self.added(&composited, ray.direction);
+        let added = self.added(&composited, ray.direction.map(|x| x as f32));
         (
             counted.iter().map(|(weight, outputs)| (*weight, colour_of(outputs, &added))).collect(),
             (-depth).exp(),
@@ -210,7 +210,8 @@ fn example() -> (Field, Vec<Ray>) {
             let origin = [3.0 * unit(), 3.0, 2.0 * unit()];
             let d: [f32; 3] = std::array::from_fn(|i| target[i] - origin[i]);
             let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
-            Ray { origin, direction: d.map(|x| x / length), background: [0.9, 0.5, 0.2] }
+            let direction = d.map(|x| f64::from(x / length));
+            Ray { origin: origin.map(f64::from), direction, background: [0.9, 0.5, 0.2] }
         })
         .collect();
     (field, rays)
@@ -449,18 +450,17 @@ fn extremes_stay_finite() {
             );
             field.grid.fill(1.0);
             field.network.fill(raw / 1e3);
-            let s = scale as f32;
             let directions = [
                 [0.0, 0.0, -1.0],
                 [0.0, 1.0, 0.0],
                 [0.0; 3],
-                [f32::NAN, 0.0, 1.0],
+                [f64::NAN, 0.0, 1.0],
                 [0.577, 0.577, 0.577],
             ];
             let rays: Vec<Ray> = directions
                 .iter()
                 .map(|&direction| Ray {
-                    origin: [0.0, 0.0, 4.0 * s],
+                    origin: [0.0, 0.0, 4.0 * scale],
                     direction,
                     background: [1.0; 3],
                 })

@@ -354,7 +354,7 @@ mod tests {
 
         fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
             let mut rng = CounterRng::new(1, 2, bundle);
-            let [x, y] = [0, 1].map(|_| 1.6 * rng.uniform() - 0.8);
+            let [x, y] = [0, 1].map(|_| f64::from(1.6 * rng.uniform() - 0.8));
             rays[0] = Ray {
                 origin: [x, y, 4.0],
                 direction: [0.0, 0.0, -1.0],

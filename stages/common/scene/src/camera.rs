@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::intrinsics::Intrinsics;
 use crate::lens::Distortion;
-use crate::pose::Pose;
+use crate::pose::{MAX_ROTATION_ERROR, Pose, moved, rotation_error, rotation_of};
 
 /// A camera: intrinsics and pose.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -110,7 +110,7 @@ pub enum CameraError {
         /// Rows.
         height: u32,
     },
-    /// A place that no scene reaches to.
+    /// A centre so far away that depths leave the range of single precision.
     #[error(
         "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than \
         {FARTHEST_CENTRE:e}; is the pose right, and its unit?",
@@ -137,9 +137,9 @@ pub enum CameraError {
     },
 }
 
-/// Scene units from the origin beyond which there are no cameras: f32, by which rays are cast,
-/// tells no neighbours apart there.
-const FARTHEST_CENTRE: f64 = 1e9;
+/// Largest distance of a camera from the origin, in scene units. Depths have single precision, and
+/// the product of two depths must be finite.
+const FARTHEST_CENTRE: f64 = 1e18;
 
 /// Cameras that turn at most so far from their mean direction look one way: cos 45°.
 const ONE_WAY_COSINE: f64 = 0.707;
@@ -153,8 +153,7 @@ pub fn common_direction<'a>(cameras: impl Iterator<Item = &'a Camera> + Clone) -
 impl Camera {
     /// The rotation R.
     pub fn rotation(&self) -> DMat3 {
-        let m = &self.camera_to_world;
-        DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| [m[0][c], m[1][c], m[2][c]]))
+        rotation_of(&self.camera_to_world)
     }
 
     /// The camera's centre in world space.
@@ -213,6 +212,12 @@ impl Camera {
         ray.direction.dot(self.forward())
     }
 
+    /// Returns the camera moved by a vector.
+    #[must_use]
+    pub fn moved(&self, by: DVec3) -> Self {
+        Self { camera_to_world: moved(&self.camera_to_world, by), ..self.clone() }
+    }
+
     /// The same camera with another number of pixels.
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
@@ -245,13 +250,8 @@ impl Camera {
             return Err(CameraError::Distortion(k.distortion));
         }
         let r = self.rotation();
-        let error = (r * r.transpose() - DMat3::IDENTITY)
-            .to_cols_array()
-            .into_iter()
-            .fold(0.0, |a: f64, b| a.max(b.abs()));
-        // Published poses are rounded to single precision; real mistakes (a scaled matrix) are far
-        // off.
-        if error > 1e-2 {
+        let error = rotation_error(r);
+        if error > MAX_ROTATION_ERROR {
             return Err(CameraError::NotRigid { error });
         }
         let determinant = r.determinant();
@@ -438,7 +438,8 @@ mod tests {
         bad.camera_to_world[0][3] = 1e30;
         let far = bad.check().unwrap_err();
         assert!(
-            far.to_string().contains("centre (1e30, 0e0, 0e0) is farther from the origin than 1e9"),
+            far.to_string()
+                .contains("centre (1e30, 0e0, 0e0) is farther from the origin than 1e18"),
             "{far}"
         );
         bad.camera_to_world[0][3] = f64::NEG_INFINITY;

@@ -1,8 +1,9 @@
-use glam::{DMat3, DVec3};
+use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::pose::Pose;
+use crate::pose::{Pose, moved, pose_of, rotation_of};
+use crate::rounding::{multiple, rounded, rounded_offset, rounding_step};
 
 /// How a field sees the world: what it keeps in its unit cube.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -50,15 +51,19 @@ impl Frustum {
             && self.near < self.far
     }
 
+    /// Returns the virtual camera's centre.
+    pub fn centre(&self) -> DVec3 {
+        self.column(3)
+    }
+
     /// A world point in the virtual camera's space: x to the right, y up, and the depth.
     pub fn to_camera(&self, point: DVec3) -> DVec3 {
-        self.turn(point - self.column(3))
+        self.turn(point - self.centre())
     }
 
     /// A world direction in the virtual camera's space.
     pub fn turn(&self, direction: DVec3) -> DVec3 {
-        let rotation = DMat3::from_cols(self.column(0), self.column(1), self.column(2));
-        rotation.transpose() * direction * DVec3::new(1.0, 1.0, -1.0)
+        rotation_of(&self.camera_to_world).transpose() * direction * DVec3::new(1.0, 1.0, -1.0)
     }
 
     fn column(&self, i: usize) -> DVec3 {
@@ -80,5 +85,27 @@ impl Frustum {
         let depth = 1.0 / (1.0 / self.near - place.z * (1.0 / self.near - 1.0 / self.far));
         let [x, y] = [0, 1].map(|i| (place[i] * side + self.min[i]) * depth);
         self.column(3) + x * self.column(0) + y * self.column(1) - depth * self.column(2)
+    }
+
+    /// Returns the frustum of the scene moved by a vector.
+    pub(crate) fn moved(&self, by: DVec3) -> Self {
+        Self { camera_to_world: moved(&self.camera_to_world, by), ..*self }
+    }
+
+    /// Rounds slopes, depths, and the centre's offset from `anchor`; see [`Bounds::rounded`].
+    ///
+    /// [`Bounds::rounded`]: crate::Bounds::rounded
+    pub(crate) fn rounded(&self, anchor: DVec3) -> Self {
+        let side = (self.max[0] - self.min[0]).max(self.max[1] - self.min[1]);
+        let slope = |slope: f64| multiple(slope, rounding_step(side));
+        // The frustum is narrowest at its front plane: there the centre matters most.
+        let centre = rounded_offset(self.centre(), anchor, rounding_step(self.near * side));
+        Self {
+            camera_to_world: pose_of(rotation_of(&self.camera_to_world), centre),
+            min: self.min.map(slope),
+            max: self.max.map(slope),
+            near: rounded(self.near),
+            far: rounded(self.far),
+        }
     }
 }

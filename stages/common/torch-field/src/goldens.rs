@@ -80,6 +80,7 @@ fn small() -> (Mlp, Batch, SampleDraws) {
         coarse_samples: 8,
         fine_samples: 8,
         ndc_directions: false,
+        scaled_positions: false,
     };
     let bounds =
         Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Default::default() };

@@ -498,7 +498,8 @@ mod tests {
         let length = |v: [f32; 3]| v.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-6);
         let origin = from.map(|x| 4.0 * x / length(from));
         let d: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
-        Ray { origin, direction: d.map(|x| x / length(d)), background: [1.0; 3] }
+        let direction = d.map(|x| f64::from(x / length(d)));
+        Ray { origin: origin.map(f64::from), direction, background: [1.0; 3] }
     }
 
     fn rays(count: u64, reach: f32) -> Vec<Ray> {
@@ -615,8 +616,8 @@ mod tests {
             ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]),
             ([0.0, 0.0, 4.0], [0.0, 0.0, 1.0]),
             ([0.0, 0.0, 0.5], [0.0, 0.0, 0.0]),
-            ([f32::NAN, 0.0, 4.0], [0.0, 0.0, -1.0]),
-            ([0.0, 0.0, 4.0], [0.0, f32::INFINITY, -1.0]),
+            ([f64::NAN, 0.0, 4.0], [0.0, 0.0, -1.0]),
+            ([0.0, 0.0, 4.0], [0.0, f64::INFINITY, -1.0]),
             ([1e30, 0.0, 0.0], [-1.0, 0.0, 0.0]),
         ]
         .map(|(origin, direction)| Ray { origin, direction, background: [0.3, 0.6, 0.9] })

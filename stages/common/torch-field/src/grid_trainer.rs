@@ -377,7 +377,8 @@ mod tests {
                 let origin = [from[0], from[1], from[2] + 4.0];
                 let d: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
                 let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
-                *ray = Ray { origin, direction: d.map(|x| x / length), background };
+                let direction = d.map(|x| f64::from(x / length));
+                *ray = Ray { origin: origin.map(f64::from), direction, background };
             }
         }
 

@@ -2,6 +2,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use counter_rng::CounterRng;
+use glam::DVec3;
 use radiance::spec::UNSEEN;
 use radiance::{MlpArchitecture, Pixel, Ray, RayField, RenderError};
 use rayon::prelude::*;
@@ -17,7 +18,7 @@ use crate::sampling::{importance, middles, stratified};
 use crate::transfer::{columns, host, matrix};
 
 /// The paper's field: a coarse network that says where to look and a fine one that is looked at. In
-/// a box, positions are scene units, as they come, and rays run from `near` to `far` of the bounds;
+/// a box, positions are those of [`MlpFrame`], and rays run from `near` to `far` of the bounds;
 /// in NDC and in a contraction they are those of the unit cube stretched to -1..1, and rays run
 /// through it evenly, as the paper has it for forward-facing scenes. Directions are the world's.
 #[derive(Debug)]
@@ -39,6 +40,20 @@ pub(crate) struct SampleDraws {
     pub(crate) fine: Tensor,
     /// Added to raw densities: n × coarse samples, and n × (coarse + fine) samples.
     pub(crate) noise: Option<[Tensor; 2]>,
+}
+
+/// Frame of the networks' positions in a box: a world point and a unit, in which t is counted, too.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct MlpFrame {
+    origin: DVec3,
+    unit: f64,
+}
+
+impl MlpFrame {
+    /// Returns the origin of a ray in this frame, rounded to single precision at last.
+    fn origin_of(&self, ray: &Ray) -> [f32; 3] {
+        ((DVec3::from(ray.origin) - self.origin) / self.unit).as_vec3().to_array()
+    }
 }
 
 /// Rays as tensors.
@@ -115,11 +130,12 @@ fn rows(
 impl Batch {
     /// Rays as a field sees them.
     pub(crate) fn new(rays: &[Ray], field: &Mlp) -> Result<Self, TchError> {
+        let frame = field.frame();
         let Mlp { bounds, device, architecture: MlpArchitecture { ndc_directions, .. }, .. } =
             *field;
         Ok(Self {
-            origin: columns(rays, device, |r| r.origin)?,
-            direction: columns(rays, device, |r| r.direction)?,
+            origin: columns(rays, device, |r| frame.origin_of(r))?,
+            direction: columns(rays, device, |r| r.direction.map(|x| x as f32))?,
             background: columns(rays, device, |r| r.background)?,
             maps: (bounds.space != Space::Box)
                 .then(|| RayMaps::new(&bounds, rays, device, ndc_directions))
@@ -206,12 +222,22 @@ impl Mlp {
         Self { architecture, bounds, coarse: self.coarse.share(), fine: self.fine.share(), device }
     }
 
+    /// Returns the frame of positions; in other spaces than a box it isn't used.
+    fn frame(&self) -> MlpFrame {
+        if self.architecture.scaled_positions {
+            MlpFrame { origin: self.bounds.middle(), unit: self.bounds.unit() }
+        } else {
+            MlpFrame { origin: DVec3::ZERO, unit: 1.0 }
+        }
+    }
+
     /// What rays see; `noise` and places of samples by `draws`.
     pub(crate) fn see(&self, batch: &Batch, draws: Option<&SampleDraws>) -> Result<Seen, TchError> {
         let n = batch.origin.size()[0];
         let like = |value: f64| Tensor::f_full([n, 1], value, (batch.origin.kind(), self.device));
+        let unit = self.frame().unit;
         let (near, far) = match &batch.maps {
-            None => (like(self.bounds.near)?, like(self.bounds.far)?),
+            None => (like(self.bounds.near / unit)?, like(self.bounds.far / unit)?),
             Some(maps) => (maps.enter.shallow_clone(), maps.leave.shallow_clone()),
         };
         let count = i64::from(self.architecture.coarse_samples);
@@ -232,7 +258,7 @@ impl Mlp {
         let t = Tensor::f_cat(&[&t, &finer], 1)?.f_sort(1, false)?.0;
         let fine = self.look(&self.fine, batch, &direction, &t, noise(1))?;
         let distances = match &batch.maps {
-            None => t,
+            None => t.f_mul_scalar(unit)?,
             Some(maps) => maps.distances(&t)?,
         };
         Ok(Seen { coarse, fine, distances })
@@ -294,10 +320,11 @@ impl Mlp {
 
     fn pixels(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
         let tame = |r: &Ray| Ray { background: r.background, ..Ray::default() };
-        let tame: Vec<Ray> = rays.iter().map(|r| if is_usable(r) { *r } else { tame(r) }).collect();
+        let tame: Vec<Ray> =
+            rays.iter().map(|r| if r.is_usable() { *r } else { tame(r) }).collect();
         let batch = Batch::new(&tame, self)?;
         let hits = batch.maps.as_ref().map(|c| host(&c.hits()?)).transpose()?;
-        let usable = |i: usize, r: &Ray| is_usable(r) && hits.as_ref().is_none_or(|h| h[i] > 0.0);
+        let usable = |i: usize, r: &Ray| r.is_usable() && hits.as_ref().is_none_or(|h| h[i] > 0.0);
         let [colour, premultiplied, weights, t] =
             no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
                 let seen = self.see(&batch, None)?;
@@ -366,10 +393,6 @@ fn read_network(
     Ok(read.to(device, Kind::Float)?)
 }
 
-fn is_usable(ray: &Ray) -> bool {
-    ray.origin.iter().chain(&ray.direction).all(|x| x.is_finite()) && ray.direction != [0.0; 3]
-}
-
 #[cfg(test)]
 mod tests {
     use radiance::clip;
@@ -392,7 +415,7 @@ mod tests {
             ..MlpArchitecture::default()
         };
         let ray =
-            |origin, direction: [f32; 3]| Ray { origin, direction, background: [0.1, 0.2, 0.3] };
+            |origin, direction: [f64; 3]| Ray { origin, direction, background: [0.1, 0.2, 0.3] };
         let rays =
             [ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]), ray([0.2, -0.1, 4.1], [0.28, 0.0, -0.96])];
         for space in [Space::Ndc(frustum), Space::Contraction] {
@@ -430,6 +453,43 @@ mod tests {
         let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
         let away = field.render(&[ray([0.0, 0.0, 4.0], [0.0, 0.0, 1.0])]).unwrap()[0];
         assert_eq!((away.colour, away.opacity), ([0.1, 0.2, 0.3], 0.0));
+    }
+
+    /// In a box a field with scaled positions renders the same wherever the scene lies and whatever
+    /// its unit; one without, as the reference's, only around the origin in its unit.
+    #[test]
+    fn scaled_positions_move_with_the_scene() {
+        let utm = DVec3::new(500_000.0, 4_649_776.0, 120.0);
+        let rendered = |scaled_positions, shift: DVec3, scale: f64| {
+            let architecture = MlpArchitecture {
+                scaled_positions,
+                depth: 5,
+                width: 16,
+                ..MlpArchitecture::default()
+            };
+            let bounds = Bounds {
+                min: [-1.25 * scale; 3],
+                max: [1.25 * scale; 3],
+                near: 2.0 * scale,
+                far: 6.0 * scale,
+                ..Bounds::default()
+            };
+            let origin = (scale * DVec3::new(0.25, 0.5, 4.0) + shift).to_array();
+            let rays = [Ray { origin, direction: [0.0, 0.0, -1.0], background: [1.0; 3] }];
+            let field = Mlp::new(architecture, bounds.moved(shift), 3, Device::Cpu).unwrap();
+            let pixel = field.render(&rays).unwrap()[0];
+            let [r, g, b] = pixel.colour.map(f64::from);
+            [r, g, b, f64::from(pixel.opacity), f64::from(pixel.depth) / scale]
+        };
+        let off = |a: [f64; 5], b: [f64; 5]| {
+            a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        };
+        let here = rendered(true, DVec3::ZERO, 1.0);
+        assert!(off(here, rendered(false, DVec3::ZERO, 1.0)) < 1e-6, "a unit of 1 at the origin");
+        for (shift, scale) in [(utm, 1.0), (DVec3::ZERO, 1024.0), (DVec3::ZERO, 1.0 / 65_536.0)] {
+            assert!(off(here, rendered(true, shift, scale)) < 1e-5, "{shift} {scale}");
+            assert!(off(here, rendered(false, shift, scale)) > 1e-3, "{shift} {scale}");
+        }
     }
 
     /// Every number of both networks is the mean of both fields'.

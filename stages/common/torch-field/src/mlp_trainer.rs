@@ -330,7 +330,7 @@ mod tests {
         }
 
         fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
-            let across = 0.2 * (bundle % 4) as f32;
+            let across = 0.2 * (bundle % 4) as f64;
             rays[0] = Ray {
                 origin: [across, 0.0, 4.0],
                 direction: [0.0, 0.0, -1.0],

@@ -122,8 +122,8 @@ mod tests {
         let (origin, direction) =
             (DVec3::new(0.05, -0.02, 0.1), DVec3::new(0.1, 0.05, -1.0).normalize());
         let ray = Ray {
-            origin: origin.as_vec3().to_array(),
-            direction: direction.as_vec3().to_array(),
+            origin: origin.to_array(),
+            direction: direction.to_array(),
             background: [1.0; 3],
         };
         // Shifted to the near plane, then as Mildenhall et al. 2020 have it, appendix C; f / (W /

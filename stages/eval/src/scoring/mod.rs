@@ -16,6 +16,7 @@ use anyhow::Context as _;
 use artifact::FailureExt as _;
 use metrics::{Figure, Score, Scores};
 use pixels::{DEPTH_CHANNELS, read_exr};
+use scene::length;
 
 use crate::metric::{Measured, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
@@ -226,9 +227,9 @@ impl Metric for DepthMetric {
     }
 
     fn in_words(&self, mean: &Scores) -> Option<String> {
-        let [mean, median] =
-            ["mean_absolute", "median_absolute"].map(|part| value(mean, &format!("depth/{part}")));
-        Some(format!("depth error {:.4} mean, {:.4} median", mean?, median?))
+        let [mean, median] = ["mean_absolute", "median_absolute"]
+            .map(|part| Some(length(value(mean, &format!("depth/{part}"))?, 4)));
+        Some(format!("depth error {} mean, {} median", mean?, median?))
     }
 }
 

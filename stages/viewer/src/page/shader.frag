@@ -16,13 +16,14 @@ uniform vec3 atlas_size;    // of both textures, in texels
 uniform float resolution;   // voxels along the cube's side
 uniform vec3 components[36];  // four times nine spherical harmonics' red, green and blue
 
-// The box that the unit cube holds, scaled by its longest side.
-uniform vec3 box_min, box_max;
+// The box in the unit cube. All lengths are in its longest side: single precision can't hold the
+// world's coordinates far from the origin, so the page computes with them.
+uniform vec3 extent;
 uniform vec2 range;  // distances between which there is anything
 
 // The camera: OpenGL's axes; pixels from the top left corner.
 uniform mat3 rotation;
-uniform vec3 centre;
+uniform vec3 centre;  // in the unit cube
 uniform vec4 intrinsics;  // fx, fy, cx, cy
 uniform float height;
 
@@ -45,7 +46,7 @@ int reads = 0;
 // A ray in the cube, by a parameter t: its distance over the box's longest side.
 struct CubeRay {
   vec3 origin, direction;
-  float enter, leave, side;
+  float enter, leave;
 };
 
 // Limits [enter, leave] to where offset + slope * x >= 0.
@@ -55,15 +56,13 @@ void clip_to(float offset, float slope, inout vec2 part) {
   else if (offset < 0.0) part = vec2(1.0, 0.0);
 }
 
-CubeRay into_cube(vec3 from, vec3 along) {
-  float side = max(max(box_max.x - box_min.x, box_max.y - box_min.y), box_max.z - box_min.z);
-  vec3 origin = (from - box_min) / side, extent = (box_max - box_min) / side;
-  vec2 part = range / side;
+CubeRay clipped(vec3 origin, vec3 along) {
+  vec2 part = range;
   for (int i = 0; i < 3; i++) {
     clip_to(origin[i], along[i], part);
     clip_to(extent[i] - origin[i], -along[i], part);
   }
-  return CubeRay(origin, along, part.x, part.y, side);
+  return CubeRay(origin, along, part.x, part.y);
 }
 
 vec3 place_at(CubeRay ray, float t) { return ray.origin + t * ray.direction; }
@@ -156,7 +155,7 @@ void main() {
   vec2 slope = (pixel - intrinsics.zw) / intrinsics.xy;
   vec3 own = normalize(vec3(slope.x, -slope.y, -1.0));
   vec3 along = rotation * own;
-  CubeRay ray = into_cube(centre, along);
+  CubeRay ray = clipped(centre, along);
   Seen seen = march(ray);
   float opacity = 1.0 - seen.through;
   if (mode == READS) {
@@ -164,7 +163,7 @@ void main() {
   } else if (mode == OPACITY) {
     shown = vec4(vec3(opacity), 1.0);
   } else if (mode == DEPTH) {
-    float z = -own.z * ray.side * seen.median;
+    float z = -own.z * seen.median;
     // Even in disparity, so that what is near has most colours.
     vec2 ends = 1.0 / depth_range;
     vec3 colour = of_depth((1.0 / z - ends.x) / (ends.y - ends.x));

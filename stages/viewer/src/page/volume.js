@@ -122,11 +122,14 @@ class Volume {
     gl.uniform1i(this.at(name), unit);
   }
 
+  /** Lengths on the GPU are in the box's longest side, positions from its corner: the world's may be too large for floats. */
   setBox({ min, max, near, far }) {
     const { gl } = this;
-    gl.uniform3fv(this.at("box_min"), min);
-    gl.uniform3fv(this.at("box_max"), max);
-    gl.uniform2f(this.at("range"), near, far);
+    const sides = plus(max, min, -1);
+    this.corner = min;
+    this.side = Math.max(...sides);
+    gl.uniform3fv(this.at("extent"), scaled(sides, 1 / this.side));
+    gl.uniform2f(this.at("range"), near / this.side, Math.min(far / this.side, 1e30));
   }
 
   /**
@@ -138,11 +141,11 @@ class Volume {
     if (canvas.width !== k.width || canvas.height !== k.height) [canvas.width, canvas.height] = [k.width, k.height];
     gl.viewport(0, 0, k.width, k.height);
     gl.uniformMatrix3fv(this.at("rotation"), false, [0, 1, 2].flatMap((c) => m.map((row) => row[c])));
-    gl.uniform3fv(this.at("centre"), m.map((row) => row[3]));
+    gl.uniform3fv(this.at("centre"), scaled(plus(column(m, 3), this.corner, -1), 1 / this.side));
     gl.uniform4f(this.at("intrinsics"), k.fx, k.fy, k.cx, k.cy);
     gl.uniform1f(this.at("height"), k.height);
     gl.uniform1i(this.at("mode"), MODES[mode]);
-    gl.uniform2fv(this.at("depth_range"), depths);
+    gl.uniform2fv(this.at("depth_range"), scaled(depths, 1 / this.side));
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 

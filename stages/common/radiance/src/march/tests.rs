@@ -52,8 +52,8 @@ fn straight_ray(seed: u64) -> NormalizedRay {
     d.iter_mut().take(seed as usize / 3 % 3).for_each(|x| *x = 0.0);
     let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
     let cube = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.1, far: 9.0, ..Bounds::default() };
-    let direction = d.map(|x| x / length);
-    clip(&cube, &Ray { origin, direction, background: [0.0; 3] })
+    let direction = d.map(|x| f64::from(x / length));
+    clip(&cube, &Ray { origin: origin.map(f64::from), direction, background: [0.0; 3] })
 }
 
 /// Cells in planes across x, thin and dense ones.
@@ -197,8 +197,8 @@ fn bent_ray(seed: u64, wide: f32) -> NormalizedRay {
         d = [d[0], draw(), draw()];
     }
     let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
-    let direction = d.map(|x| x / length);
-    clip(&AROUND, &Ray { origin, direction, background: [0.0; 3] })
+    let direction = d.map(|x| f64::from(x / length));
+    clip(&AROUND, &Ray { origin: origin.map(f64::from), direction, background: [0.0; 3] })
 }
 
 /// Bent rays leap far through empty cubes, and never out of them: as far as cells tell.
