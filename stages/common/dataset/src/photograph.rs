@@ -58,7 +58,7 @@ fn decoder<R: BufRead + Seek + 'static>(
     Err(PixelError::Format { path: path.to_path_buf(), reason })
 }
 
-/// What an image's header says.
+/// Size and orientation of an image, from its header.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Stored {
     /// Columns and rows.
@@ -132,7 +132,8 @@ pub(crate) fn has_shape_of(k: &Intrinsics, width: u32, height: u32) -> bool {
     (across / down - 1.0).abs() <= 0.01 + 1.0 / f64::from(width.min(height).max(1))
 }
 
-/// The image as it is stored, or turned as its EXIF data ask. One that isn't whole is refused.
+/// Reads an image with its stored pixels, or turned as its EXIF data ask. One that isn't whole is
+/// refused.
 fn read(path: &Path, turned: bool) -> Result<(Rgba8, Clipping), PixelError> {
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     if is_exr(path) {
