@@ -7,7 +7,6 @@ mod lenses;
 mod masks;
 mod names;
 mod nearby;
-
 mod reduced;
 mod splits;
 
