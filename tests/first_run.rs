@@ -82,15 +82,15 @@ fn init_overwrites_nothing() {
     let project = empty();
     as_colmap(&project);
     project.write("pipelines/video.yaml", "mine");
-    project.run(&["init", "colmap"]).fails(2, &["pipelines/video.yaml is there already"]);
+    project.run(&["init", "colmap"]).fails(2, &["pipelines/video.yaml exists"]);
     assert!(!project.path("pipeline.yaml").exists(), "all or nothing");
     std::fs::remove_file(project.path("pipelines/video.yaml")).unwrap();
     std::os::unix::fs::symlink("nowhere", project.path("pipeline.yaml")).unwrap();
-    project.run(&["init", "colmap"]).fails(2, &["pipeline.yaml is there already"]);
+    project.run(&["init", "colmap"]).fails(2, &["pipeline.yaml exists"]);
     std::fs::remove_file(project.path("pipeline.yaml")).unwrap();
     project.ok(&["init", "colmap"]);
     let before = std::fs::read(project.path("pipeline.yaml")).unwrap();
-    project.run(&["init", "colmap"]).fails(2, &["pipeline.yaml is there already and stays"]);
+    project.run(&["init", "colmap"]).fails(2, &["pipeline.yaml exists and was not changed"]);
     assert_eq!(std::fs::read(project.path("pipeline.yaml")).unwrap(), before);
 }
 
@@ -116,7 +116,7 @@ fn folders_that_init_refuses() {
         .run(&["init", "cameraless"])
         .fails(3, &["cameraless: 1 image, but no cameras", "--image_path 'cameraless/images'"]);
     let inside = project.command(&["init", "."]).current_dir(project.path("colmap")).output();
-    Finished::of(inside.unwrap()).fails(2, &["can't lie among the data"]);
+    Finished::of(inside.unwrap()).fails(2, &["can't be inside the data set"]);
     project.run(&["plan"]).fails(2, &["pipeline.yaml: No such file", "`nerf-sr init DIR`"]);
     assert!(!project.path("pipelines").exists() && !project.path("colmap/.nerf-sr").exists());
 }

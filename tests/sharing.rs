@@ -108,9 +108,9 @@ fn garbage_collection_keeps_what_a_run_in_progress_needs() {
     Command::new("touch").args(["-d", "9 days ago"]).arg(&partial).status().unwrap();
     let said = project.ok(&["gc", "demo-scene", "--keep-days", "0", "--drop-unfinished"]);
     for (stage, reason) in [
-        ("prep", "is running it"),
+        ("prep", "needed by the run of process"),
         ("demo-scene", "the pipeline needs it"),
-        ("train-ss", "is running it"),
+        ("train-ss", "needed by the run of process"),
     ] {
         assert!(
             said.lines().any(|line| line.contains(stage) && line.contains(reason)),
@@ -128,13 +128,13 @@ fn garbage_collection_keeps_what_a_run_in_progress_needs() {
     let said = project.ok(&["gc", "demo-scene", "--keep-days", "0"]);
     assert!(partial.join("work").is_dir() && said.contains("has a checkpoint"), "{said}");
     assert!(
-        said.lines().any(|line| line.contains("prep") && line.contains("train-ss was made of it")),
+        said.lines().any(|line| line.contains("prep") && line.contains("input of train-ss")),
         "{said}"
     );
     let said = project.ok(&["gc", "demo-scene", "--keep-days", "0", "--drop-unfinished"]);
     assert!(
         !partial.exists()
-            && said.lines().any(|line| line.contains("prep") && line.ends_with("goes")),
+            && said.lines().any(|line| line.contains("prep") && line.ends_with("delete")),
         "{said}"
     );
 }

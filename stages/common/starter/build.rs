@@ -1,11 +1,11 @@
-//! Writes `targets.rs`: names and texts of the files in `pipelines/` of the repository, sorted.
+//! Writes `targets.rs`: names and texts of the repository's `pipelines/*.yaml`, sorted by name.
 
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 fn main() {
-    let home = env::var_os("CARGO_MANIFEST_DIR").expect("cargo names the crate's folder");
-    let shelf = Path::new(&home).join("../../../pipelines");
+    let package = env::var_os("CARGO_MANIFEST_DIR").expect("cargo names the crate's folder");
+    let shelf = Path::new(&package).join("../../../pipelines");
     let shelf = shelf.canonicalize().expect("the repository has pipelines/");
     println!("cargo::rerun-if-changed={}", shelf.display());
     let mut files: Vec<PathBuf> = fs::read_dir(&shelf)
@@ -20,7 +20,7 @@ fn main() {
         .expect("the folder can be written");
 }
 
-/// A file's name and text, in Rust.
+/// Returns a Rust tuple of a file's name and text.
 fn target(file: &Path) -> String {
     let name = file.file_name().and_then(|name| name.to_str()).expect("the name is UTF-8");
     format!("    ({name:?}, include_str!({file:?})),\n")

@@ -3,7 +3,7 @@ use std::process::ExitCode;
 
 use artifact::report_line;
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
-use garbage::Choice;
+use garbage::Policy;
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::{Memory, Site};
 use stage::machine_memory;
@@ -334,8 +334,8 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Pin { name, what } => verbs::pin(&session, &name, &what.into()),
         Verb::Unpin { name } => verbs::unpin(&session, &name),
         Verb::Gc { what, dry_run, keep_days, drop_unfinished, drop_old, json } => {
-            let choice = Choice { keep_days, drop_unfinished, drop_old };
-            verbs::gc(&session, &what.into(), choice, Style { dry_run, json })
+            let policy = Policy { keep_days, drop_unfinished, drop_old };
+            verbs::gc(&session, &what.into(), policy, Style { dry_run, json })
         }
         Verb::Completions { .. }
         | Verb::Describe { .. }

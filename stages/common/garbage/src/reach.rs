@@ -1,21 +1,21 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::contents::Contents;
 use crate::roots::Root;
 
-/// What roots reach, and why it stays.
+/// Entries of a store that some root reaches, each with the reason of the first such root.
 #[derive(Debug, Default)]
 pub(crate) struct Kept {
-    /// By key.
+    /// Reasons by key.
     pub(crate) records: BTreeMap<String, String>,
-    /// By identity.
+    /// Reasons by identity.
     pub(crate) objects: BTreeMap<String, String>,
-    /// By key.
+    /// Reasons by key.
     pub(crate) unfinished: BTreeMap<String, String>,
 }
 
-/// From the roots to the records and unfinished actions that they name and, where a root asks for
-/// it, on to the actions that those were made of.
+/// Marks the records and unfinished actions of all roots and, for roots `with_inputs`, the actions
+/// that produced their inputs.
 pub(crate) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
     let mut kept = Kept::default();
     for root in roots {
@@ -27,40 +27,38 @@ pub(crate) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
             .keys
             .iter()
             .chain(fitting.map(|(key, _)| key))
-            .map(|key| (key.clone(), root.why.clone()))
+            .map(|key| (key.clone(), root.reason.clone()))
             .collect();
-        let mut seen = std::collections::BTreeSet::new();
-        while let Some((key, why)) = open.pop() {
+        let mut seen = BTreeSet::new();
+        while let Some((key, reason)) = open.pop() {
             if !seen.insert(key.clone()) {
                 continue;
             }
             if root.with_inputs {
-                open.extend(made_of(contents, &key));
+                open.extend(input_actions(contents, &key));
             }
             if contents.unfinished.contains_key(&key) {
-                kept.unfinished.entry(key.clone()).or_insert_with(|| why.clone());
+                kept.unfinished.entry(key.clone()).or_insert_with(|| reason.clone());
             }
             if let Some(record) = contents.records.get(&key) {
-                kept.objects.entry(record.output.clone()).or_insert_with(|| why.clone());
-                kept.records.entry(key).or_insert(why);
+                kept.objects.entry(record.output.clone()).or_insert_with(|| reason.clone());
+                kept.records.entry(key).or_insert(reason);
             }
         }
     }
     kept
 }
 
-/// The actions that an action was made of, and why they stay.
-fn made_of(contents: &Contents, key: &str) -> Vec<(String, String)> {
-    let finished = contents.records.get(key).map(|record| (&record.stage, &record.made_of));
-    let unfinished = contents
-        .unfinished
-        .get(key)
-        .and_then(Option::as_ref)
-        .map(|action| (&action.stage, &action.made_of));
-    let parents = [finished, unfinished].into_iter().flatten();
-    parents
-        .flat_map(|(stage, keys)| {
-            keys.iter().map(move |key| (key.clone(), format!("{stage} was made of it")))
-        })
-        .collect()
+/// Returns the actions that produced an action's inputs, each with the reason for keeping it.
+fn input_actions(contents: &Contents, key: &str) -> Vec<(String, String)> {
+    let mut actions = Vec::new();
+    if let Some(record) = contents.records.get(key) {
+        let reason = format!("input of {}", record.stage);
+        actions.extend(record.made_of.iter().map(|key| (key.clone(), reason.clone())));
+    }
+    if let Some(Some(action)) = contents.unfinished.get(key) {
+        let reason = format!("input of {}", action.stage);
+        actions.extend(action.made_of.iter().map(|key| (key.clone(), reason.clone())));
+    }
+    actions
 }

@@ -6,114 +6,116 @@ use store::{Run, Store, StoreError, Waiting};
 
 use crate::contents::Contents;
 
-/// Something that is needed, and why.
+/// Actions that are needed, and why.
 #[derive(Debug, Clone, Default)]
 pub struct Root {
-    /// As people read it after "stays:".
-    pub why: String,
+    /// Reason for keeping them, as a sentence fragment.
+    pub reason: String,
     /// Keys of actions.
     pub keys: BTreeSet<String>,
-    /// Nodes that any fitting record may belong to.
+    /// Nodes with unknown inputs: each keeps all records that may be the node's.
     pub waiting: Vec<Waiting>,
-    /// Whether it needs the actions that those were made of, too. A plan or a run names them
-    /// itself.
+    /// True if the actions that produced their inputs are needed, too. Plans and runs list these
+    /// actions themselves.
     pub with_inputs: bool,
 }
 
-/// What the person who collects garbage chooses.
+/// Choices of the caller: ages and kinds of entries to keep.
 #[derive(Debug, Clone, Copy)]
-pub struct Choice {
-    /// What was used within so many days stays.
+pub struct Policy {
+    /// Age, in days since the last use, below which an entry is kept.
     pub keep_days: u64,
-    /// Whether checkpoints of actions that nobody works on go.
+    /// True to delete checkpoints of actions that no process is working on.
     pub drop_unfinished: bool,
-    /// Whether artifacts whose keys are of an older version go.
+    /// True to delete artifacts whose keys have an older version.
     pub drop_old: bool,
 }
 
-impl Choice {
-    /// Whether a time lies within the days to keep. A time to come does, unless nothing is to be
-    /// kept for its age.
+impl Policy {
+    /// Returns whether a time is less than `keep_days` ago. A time in the future is recent unless
+    /// `keep_days` is 0.
     pub(crate) fn is_recent(self, unix: u64) -> bool {
         unix_time().saturating_sub(unix) < self.keep_days.saturating_mul(86_400)
     }
 }
 
-/// All roots of a store; where several hold a thing, the first says why.
-pub(crate) fn roots(
+/// Returns all roots of a store. If several roots reach an entry, the first one gives the reason.
+pub(crate) fn find_roots(
     store: &Store,
     contents: &Contents,
     plan: Root,
-    choice: Choice,
+    policy: Policy,
     runs: &[Run],
-    outstanding: &BTreeMap<String, String>,
+    submissions: &BTreeMap<String, String>,
 ) -> Result<Vec<Root>, StoreError> {
     let mut roots = vec![plan];
-    roots.extend(store.pins()?.into_iter().map(|pin| of_run(format!("pinned as {}", pin.id), pin)));
+    for pin in store.pins()? {
+        roots.push(run_root(format!("pinned as {}", pin.id), pin));
+    }
     for run in runs.iter().cloned() {
-        if let Some(why) = outstanding.get(&run.id) {
-            roots.push(of_run(why.clone(), run));
+        if let Some(reason) = submissions.get(&run.id) {
+            roots.push(run_root(reason.clone(), run));
         } else if run.in_progress {
             let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
-            roots.push(of_run(format!("process {process} is running it"), run));
-        } else if choice.is_recent(run.used_unix()) {
-            roots.push(of_run(format!("a run {} used it", ago(run.used_unix())), run));
+            roots.push(run_root(format!("needed by the run of process {process}"), run));
+        } else if policy.is_recent(run.used_unix()) {
+            roots.push(run_root(format!("used by a run {}", format_age(run.used_unix())), run));
         }
     }
-    let locked = store.locked_keys()?;
-    let at_work = "a stage is at work on it";
-    roots.extend(locked.iter().map(|key| of_action(at_work.to_owned(), key)));
-    for (key, record) in
-        contents.records.iter().filter(|(_, record)| choice.is_recent(record.started_unix))
-    {
-        roots.push(of_action(format!("made {}", ago(record.started_unix)), key));
+    for key in store.locked_keys()? {
+        roots.push(action_root("a stage is creating it".to_owned(), &key));
     }
-    if !choice.drop_old {
-        let old = contents.records.iter().filter(|(_, record)| record.has_old_key());
-        roots.extend(old.map(|(key, _)| {
-            of_action("an older version of nerf-sr made it (--drop-old)".to_owned(), key)
-        }));
+    for (key, record) in &contents.records {
+        if policy.is_recent(record.started_unix) {
+            let reason = format!("created {}", format_age(record.started_unix));
+            roots.push(action_root(reason, key));
+        }
+        if !policy.drop_old && record.has_old_key() {
+            let reason = "created by an older version of nerf-sr (--drop-old)";
+            roots.push(action_root(reason.to_owned(), key));
+        }
     }
-    if !choice.drop_unfinished {
-        let why = "an unfinished action has a checkpoint (--drop-unfinished)";
+    if !policy.drop_unfinished {
         for key in contents.unfinished.keys() {
             if store.has_checkpoint(key)? {
-                roots.push(of_action(why.to_owned(), key));
+                let reason = "has a checkpoint (--drop-unfinished)";
+                roots.push(action_root(reason.to_owned(), key));
             }
         }
     }
     Ok(roots)
 }
 
-/// Submissions whose jobs haven't ended, with the reason. Where Slurm can't be asked, that is every
-/// one.
-pub(crate) fn outstanding(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
-    match Queue::look(&Slurm::default(), store.root()) {
-        Ok(queue) => Ok(all("a submitted job needs it", queue.submissions())),
+/// Returns the ids of submissions with unfinished jobs, each with the reason for keeping it; all
+/// submissions if Slurm doesn't answer.
+pub(crate) fn outstanding_submissions(
+    store: &Store,
+) -> Result<BTreeMap<String, String>, StoreError> {
+    let (reason, ids) = match Queue::look(&Slurm::default(), store.root()) {
+        Ok(queue) => (
+            "a submitted job needs it".to_owned(),
+            queue.submissions().into_iter().map(str::to_owned).collect::<Vec<_>>(),
+        ),
         Err(error) => {
             let path = store.root().join("slurm");
             let submissions = slurm::all(store.root())
                 .map_err(|e| StoreError::Io { path, source: std::io::Error::other(e) })?;
-            let why = format!("a submitted job may need it, for {error}");
-            Ok(all(&why, submissions.iter().map(|(id, _)| id.as_str())))
+            let reason = format!("a submitted job may need it ({error})");
+            (reason, submissions.into_iter().map(|(id, _)| id).collect())
         }
-    }
+    };
+    Ok(ids.into_iter().map(|id| (id, reason.clone())).collect())
 }
 
-/// All of these submissions, with one reason.
-fn all<'a>(why: &str, ids: impl IntoIterator<Item = &'a str>) -> BTreeMap<String, String> {
-    ids.into_iter().map(|id| (id.to_owned(), why.to_owned())).collect()
+fn action_root(reason: String, key: &str) -> Root {
+    Root { reason, keys: BTreeSet::from([key.to_owned()]), waiting: Vec::new(), with_inputs: true }
 }
 
-fn of_action(why: String, key: &str) -> Root {
-    Root { why, keys: BTreeSet::from([key.to_owned()]), waiting: Vec::new(), with_inputs: true }
+fn run_root(reason: String, run: Run) -> Root {
+    Root { reason, keys: run.keys, waiting: run.waiting, with_inputs: false }
 }
 
-fn of_run(why: String, run: Run) -> Root {
-    Root { why, keys: run.keys, waiting: run.waiting, with_inputs: false }
-}
-
-fn ago(unix: u64) -> String {
+fn format_age(unix: u64) -> String {
     let hours = unix_time().saturating_sub(unix) / 3600;
     if hours < 48 { format!("{hours} h ago") } else { format!("{} days ago", hours / 24) }
 }

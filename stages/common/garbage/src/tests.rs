@@ -10,7 +10,7 @@ use store::{
     KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting,
 };
 
-use super::{Choice, Root, judge};
+use super::{Collection, Policy, Root};
 
 /// An action of a random store. Numbers name earlier actions, modulo how many there are.
 #[derive(Debug, Clone)]
@@ -289,18 +289,18 @@ proptest! {
             records.iter().map(|key| store.record(key).unwrap().unwrap().output).collect();
         let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
         let plan = Root {
-            why: "the plan".into(),
+            reason: "the plan".into(),
             keys: case.plan.0.iter().map(key).collect(),
             waiting: case.plan.1.iter().map(|node| waiting(*node)).collect(),
             with_inputs: false,
         };
-        let choice = Choice { keep_days: case.keep_days, drop_unfinished: case.drop_unfinished,
+        let policy = Policy { keep_days: case.keep_days, drop_unfinished: case.drop_unfinished,
             drop_old: true };
 
-        let verdict = judge(store, plan, choice).unwrap();
-        prop_assert_eq!(verdict.lines().len(),
+        let collection = Collection::new(store, plan, policy).unwrap();
+        prop_assert_eq!(collection.decisions().len(),
             store.objects().unwrap().len() + store.partials().unwrap().len());
-        verdict.carry_out(store, &held(|| store.try_close())).unwrap();
+        collection.carry_out(store, &held(|| store.try_close())).unwrap();
         store.empty_trash().unwrap();
 
         let left = |names: Vec<String>| -> BTreeSet<String> { names.into_iter().collect() };
@@ -318,10 +318,10 @@ proptest! {
     }
 }
 
-const CHOICE: Choice = Choice { keep_days: 7, drop_unfinished: false, drop_old: true };
+const POLICY: Policy = Policy { keep_days: 7, drop_unfinished: false, drop_old: true };
 
-/// An object that no record names goes, with the log that is left; the reason is said. A damaged
-/// record may be the one that names it: nothing goes then.
+/// An object that no record names is deleted with its leftover log, and the reason is printed. A
+/// damaged record may be the one that names it: nothing is deleted then.
 #[test]
 fn orphans_go() {
     let dir = tempfile::tempdir().unwrap();
@@ -331,12 +331,13 @@ fn orphans_go() {
     let record = store.action(&key, "json");
     fs::write(store.action(&key, "log"), "done").unwrap();
     fs::write(&record, "{").unwrap();
-    let said = judge(&store, Root::default(), CHOICE).err().unwrap().to_string();
+    let said = Collection::new(&store, Root::default(), POLICY).err().unwrap().to_string();
     assert!(said.contains(&format!("{key}.json: the record is damaged")), "{said}");
     fs::remove_file(&record).unwrap();
-    let verdict = judge(&store, Root::default(), CHOICE).unwrap();
-    assert!(verdict.lines()[0].ends_with("no record names it: goes"), "{:?}", verdict.lines());
-    verdict.carry_out(&store, &held(|| store.try_close())).unwrap();
+    let collection = Collection::new(&store, Root::default(), POLICY).unwrap();
+    let decision = collection.decisions()[0].to_string();
+    assert!(decision.ends_with("no record names it: delete"), "{decision}");
+    collection.carry_out(&store, &held(|| store.try_close())).unwrap();
     assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
 }
 
@@ -367,7 +368,7 @@ fn what_can_not_be_read_is_an_error() {
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         fs::remove_file(&path).ok();
         std::os::unix::fs::symlink(path.file_name().unwrap(), &path).unwrap();
-        let said = judge(&store, Root::default(), CHOICE).err().unwrap().to_string();
+        let said = Collection::new(&store, Root::default(), POLICY).err().unwrap().to_string();
         assert!(said.contains(&file), "{file}: {said}");
     }
 }
@@ -391,19 +392,20 @@ fn what_an_older_version_made_stays_until_it_is_dropped() {
     let now = map(json!({KEY_VERSION_PART: KEY_VERSION, "parameter lr_width": 100}));
     make_action(&store, &old_action(2), &now, &[]);
     for (drop_old, expected) in [(false, vec![old]), (true, vec![])] {
-        let verdict = judge(
+        let collection = Collection::new(
             &store,
             Root::default(),
-            Choice { keep_days: 7, drop_unfinished: false, drop_old },
+            Policy { keep_days: 7, drop_unfinished: false, drop_old },
         )
         .unwrap();
-        let reason = verdict
-            .lines()
+        let reason = collection
+            .decisions()
             .iter()
-            .filter(|line| line.ends_with("an older version of nerf-sr made it (--drop-old)"))
+            .map(ToString::to_string)
+            .filter(|line| line.ends_with("created by an older version of nerf-sr (--drop-old)"))
             .count();
         assert_eq!(reason, expected.len());
-        verdict.carry_out(&store, &held(|| store.try_close())).unwrap();
+        collection.carry_out(&store, &held(|| store.try_close())).unwrap();
         assert_eq!(store.action_files().unwrap(), expected);
     }
 }

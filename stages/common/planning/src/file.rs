@@ -133,7 +133,7 @@ impl File {
                 None => located(e),
             })?;
         let mut document = serde_yaml::Value::Mapping(mapping);
-        let merged = yaml_lines::merge(&mut document).map_err(located)?;
+        let merged = yaml_lines::expand_merge_keys(&mut document).map_err(located)?;
         if let Some((keys, problem)) = problem_of(&document) {
             return Err(fail(line_of(text, &keys), problem));
         }
@@ -173,7 +173,7 @@ impl File {
 
 /// What is wrong with a file before its types are looked at: the key, and what to do.
 fn problem_of(document: &serde_yaml::Value) -> Option<(Vec<String>, String)> {
-    if let Some(keys) = yaml_lines::not_finite(document) {
+    if let Some(keys) = yaml_lines::find_non_finite(document) {
         let problem = format!("{}: a number is neither NaN nor infinite", keys.join("."));
         return Some((keys, problem));
     }

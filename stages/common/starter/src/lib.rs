@@ -1,21 +1,21 @@
-//! The first pipeline for a folder of posed photographs: what `nerf-sr init` writes.
+//! First pipeline for a folder of posed photographs, as `nerf-sr init` writes it
+//! (docs/design/040).
 //!
-//! * [`Starter`]: the form of the folder, in words, and a commented pipeline file for it. The file
-//!   is whole: it runs as it is.
-//! * [`Starter::write`]: the pipeline, and beside it `pipelines/` with the shipped further targets.
-//!   Nothing that is there is overwritten.
+//! * [`Starter`]: summary of the folder, and a complete, commented pipeline file for it.
+//! * [`Starter::write`]: writes the pipeline file and, next to it, `pipelines/` with the shipped
+//!   targets. Existing files are never overwritten.
 //!
-//! Images up to [`LARGEST_WIDTH`] pixels wide keep their size. Larger ones are shrunk first: on a
-//! CPU, training on twelve million pixels a photograph takes hours.
+//! Images up to [`MAX_WIDTH`] pixels wide keep their size. Larger ones are shrunk first: on a CPU,
+//! training on photographs of twelve million pixels takes hours.
 //!
 //! ```no_run
 //! let starter = starter::Starter::new("photographs".as_ref(), "pipeline.yaml".as_ref())?;
-//! println!("{}", starter.found());
+//! println!("{}", starter.summary());
 //! starter.write()?;
 //! # Ok::<(), starter::StarterError>(())
 //! ```
 
-mod pictures;
+mod unposed;
 
 use std::fs;
 use std::io::{self, Write as _};
@@ -24,212 +24,213 @@ use std::path::{Path, PathBuf};
 use artifact::counted;
 use dataset::{Dataset, DatasetError, Frame};
 
-use pictures::Pictures;
+use unposed::UnposedImages;
 
-/// Widest images, in pixels, that keep their size.
-pub const LARGEST_WIDTH: u32 = 800;
-/// HR width over LR width.
+/// Maximum width, in pixels, of images that keep their size. Chosen by hand: a CPU trains on larger
+/// ones for hours.
+pub const MAX_WIDTH: u32 = 800;
+/// HR width over LR width, chosen by hand.
 const SCALE: u32 = 2;
-/// Rays of the training.
+/// Number of training rays: chosen by hand for a training of minutes on a CPU.
 const TRAINING_RAYS: u64 = 20_000_000;
-/// The shipped further targets, `pipelines/` of the repository: file names and texts.
+/// File names and texts of the shipped targets (`pipelines/` of the repository).
 const TARGETS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/targets.rs"));
 
-/// A pipeline for a data set, not written yet.
+/// Pipeline for a data set, not written yet.
 #[derive(Clone, Debug)]
 pub struct Starter {
-    found: String,
+    summary: String,
     notes: Vec<String>,
     text: String,
     file: PathBuf,
 }
 
-/// Why there is no pipeline.
+/// Error returned when the pipeline can't be composed or written.
 #[derive(Debug, thiserror::Error)]
 pub enum StarterError {
-    /// The folder holds no data set.
+    /// The folder contains no data set.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
-    /// The folder holds images whose cameras aren't known.
+    /// The folder contains images, but no cameras.
     #[error(
-        "{}: {found}, but no cameras; COLMAP finds them: {command}", folder.display()
+        "{}: {found}, but no cameras; estimate them with COLMAP: {command}", folder.display()
     )]
     NoCameras {
-        /// The folder.
+        /// Folder of the images.
         folder: PathBuf,
-        /// What it holds, in words.
+        /// Number and unread formats of the images, as text.
         found: String,
-        /// The command that finds the cameras.
+        /// Command that estimates the cameras.
         command: String,
     },
-    /// The pipeline would lie among the images.
+    /// The pipeline file would be inside the data set.
     #[error(
-        "{}: the pipeline and its results can't lie among the data; go to another folder first, \
-        such as the one above",
+        "{}: the pipeline and its results can't be inside the data set; change to another folder, \
+        such as the parent",
         folder.display()
     )]
     Inside {
-        /// The data's folder.
+        /// Folder of the data set.
         folder: PathBuf,
     },
-    /// A path can't stand in a pipeline file.
-    #[error("{}: a pipeline file names folders in UTF-8; rename the folder", folder.display())]
+    /// The path can't be written to a pipeline file.
+    #[error("{}: path isn't UTF-8; rename the folder", folder.display())]
     Name {
-        /// The data's folder.
+        /// Folder of the data set.
         folder: PathBuf,
     },
-    /// A file is there already.
+    /// A file to write exists already.
     #[error(
-        "{} is there already and stays as it is; call `nerf-sr init` in a new folder",
+        "{} exists and was not changed; run `nerf-sr init` in a new folder",
         file.display()
     )]
-    There {
-        /// The file.
+    Exists {
+        /// Existing file.
         file: PathBuf,
     },
-    /// A file can't be written.
+    /// A file or folder can't be found or written.
     #[error("{}: {source}", file.display())]
     Io {
-        /// The file.
+        /// Path of the file or folder.
         file: PathBuf,
-        /// Why.
+        /// Error of the system.
         source: io::Error,
     },
 }
 
 impl Starter {
-    /// Looks at a folder of posed photographs; `file` is the pipeline file to be.
+    /// Reads a folder of posed photographs and composes the pipeline `file` for it.
     pub fn new(folder: &Path, file: &Path) -> Result<Self, StarterError> {
-        let set = Dataset::read(folder).map_err(|error| without_cameras(folder, error))?;
-        let home = file.parent().filter(|home| !home.as_os_str().is_empty());
-        let named = named(folder, home.unwrap_or(Path::new(".")))?;
-        let found = found(&set);
-        let text = text(&set, &found, &named);
-        Ok(Self { found, notes: set.notes, text, file: file.to_path_buf() })
+        let set = Dataset::read(folder).map_err(|error| read_error(folder, error))?;
+        let parent = file.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let dataset = data_path(folder, parent.unwrap_or(Path::new(".")))?;
+        let summary = summarize(&set);
+        let text = pipeline_text(&set, &summary, &dataset);
+        Ok(Self { summary, notes: set.notes, text, file: file.to_path_buf() })
     }
 
-    /// The folder's form, and number and size of its photographs.
-    pub fn found(&self) -> &str {
-        &self.found
+    /// Returns the format of the data set, and number and size of its photographs.
+    pub fn summary(&self) -> &str {
+        &self.summary
     }
 
-    /// What is special about the photographs, a line each.
+    /// Returns the data set's notes, such as lens distortion, one line each.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
 
-    /// Writes the pipeline and, in `pipelines/` beside it, the further targets, unless one of these
-    /// files is there. Returns the written files.
+    /// Writes the pipeline file and, in `pipelines/` next to it, the shipped targets. Returns the
+    /// written files. Writes nothing if any of them exists.
     pub fn write(&self) -> Result<Vec<PathBuf>, StarterError> {
         let shelf = self.file.with_file_name("pipelines");
         let name = self.file.file_name().unwrap_or_default().to_string_lossy();
-        let targets = TARGETS.iter().map(|(target, text)| {
-            (shelf.join(target), text.replace("../pipeline.yaml", &format!("../{name}")))
-        });
-        let files: Vec<(PathBuf, String)> =
-            [(self.file.clone(), self.text.clone())].into_iter().chain(targets).collect();
-        if let Some((file, _)) = files.iter().find(|(file, _)| fs::symlink_metadata(file).is_ok()) {
-            return Err(StarterError::There { file: file.clone() });
+        let mut files = vec![(self.file.clone(), self.text.clone())];
+        for (target, text) in TARGETS {
+            let text = text.replace("../pipeline.yaml", &format!("../{name}"));
+            files.push((shelf.join(target), text));
         }
-        let fail = |file: &Path, source| StarterError::Io { file: file.to_path_buf(), source };
-        fs::create_dir_all(&shelf).map_err(|e| fail(&shelf, e))?;
+        if let Some((file, _)) = files.iter().find(|(file, _)| fs::symlink_metadata(file).is_ok()) {
+            return Err(StarterError::Exists { file: file.clone() });
+        }
+        fs::create_dir_all(&shelf).map_err(|e| io_error(&shelf, e))?;
         for (file, text) in &files {
-            let written = fs::File::create_new(file).and_then(|mut f| f.write_all(text.as_bytes()));
-            written.map_err(|e| fail(file, e))?;
+            fs::File::create_new(file)
+                .and_then(|mut created| created.write_all(text.as_bytes()))
+                .map_err(|e| io_error(file, e))?;
         }
         Ok(files.into_iter().map(|(file, _)| file).collect())
     }
 }
 
-/// The data's folder as a pipeline file in `home` names it: relative where the data lie below.
-fn named(folder: &Path, home: &Path) -> Result<String, StarterError> {
-    let (data, home) = (absolute(folder)?, absolute(home)?);
-    if home.starts_with(&data) {
+fn io_error(file: &Path, source: io::Error) -> StarterError {
+    StarterError::Io { file: file.to_path_buf(), source }
+}
+
+/// Returns the YAML text for the data set's folder in a pipeline file of the folder `parent`: a
+/// relative path if the data set is inside `parent`, otherwise an absolute one.
+fn data_path(folder: &Path, parent: &Path) -> Result<String, StarterError> {
+    let data = folder.canonicalize().map_err(|e| io_error(folder, e))?;
+    let parent = parent.canonicalize().map_err(|e| io_error(parent, e))?;
+    if parent.starts_with(&data) {
         return Err(StarterError::Inside { folder: folder.to_path_buf() });
     }
-    let path = match data.strip_prefix(&home) {
-        Ok(below) => Path::new(".").join(below),
-        Err(_) => data.clone(),
+    let path = match data.strip_prefix(&parent) {
+        Ok(relative) => Path::new(".").join(relative),
+        Err(_) => data,
     };
     let text = path.to_str().ok_or_else(|| StarterError::Name { folder: folder.to_path_buf() })?;
+    if text.chars().all(|c| c.is_alphanumeric() || "./_-+".contains(c)) {
+        return Ok(text.to_owned());
+    }
     // A JSON string is a YAML string, too.
-    let plain = |c: char| c.is_alphanumeric() || "./_-+".contains(c);
-    Ok(if text.chars().all(plain) { text.to_owned() } else { serde_json::json!(text).to_string() })
+    Ok(serde_json::json!(text).to_string())
 }
 
-fn absolute(path: &Path) -> Result<PathBuf, StarterError> {
-    path.canonicalize().map_err(|source| StarterError::Io { file: path.to_path_buf(), source })
-}
-
-/// A data set's form, and number and size of its photographs, in words.
-fn found(set: &Dataset) -> String {
-    let sizes = || set.frames.iter().map(Frame::intrinsics);
-    let size = sizes().next().map(|size| format!("{}×{}", size.width, size.height));
-    let alike =
-        sizes().zip(sizes().skip(1)).all(|(a, b)| (a.width, a.height) == (b.width, b.height));
-    let of = match size {
-        Some(size) if alike => format!(" of {size}"),
+/// Returns the format of a data set, and number and size of its photographs, as text.
+fn summarize(set: &Dataset) -> String {
+    let mut sizes = set.frames.iter().map(Frame::intrinsics).map(|i| (i.width, i.height));
+    let size = match sizes.next() {
+        Some(first) if sizes.all(|size| size == first) => format!(" of {}×{}", first.0, first.1),
         _ => " of several sizes".to_owned(),
     };
-    format!("{}: {}{of}", set.format.title(), counted(set.frames.len(), "photograph"))
+    format!("{}: {}{size}", set.format.title(), counted(set.frames.len(), "photograph"))
 }
 
-fn text(set: &Dataset, found: &str, dataset: &str) -> String {
-    let is_bent = set.frames.iter().any(|frame| frame.camera().check().is_err());
-    let lens = if is_bent {
-        "\n      lens: undo # the lenses' distortion can't be followed everywhere; photographs \
-        lose a border"
+fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {
+    let is_irregular = set.frames.iter().any(|frame| frame.camera().check().is_err());
+    let lens = if is_irregular {
+        "\n      lens: undo # some lens distortion can't be modelled up to the border; photographs \
+        are undistorted and lose a border"
     } else {
         ""
     };
     let split = match &set.split {
-        Some(split) if !split.test.is_empty() => {
-            "left out, the data set's own test views are tested"
-        }
-        _ => "left out, every eighth view is only tested",
+        Some(split) if !split.test.is_empty() => "the default uses the data set's own test views",
+        _ => "by default every eighth view is for testing only",
     };
     include_str!("pipeline.yaml")
-        .replace("{found}", found)
+        .replace("{found}", summary)
         .replace("{scale}", &SCALE.to_string())
-        .replace("{images}", &images(set))
+        .replace("{images}", &image_parameters(set))
         .replace("{lens}", lens)
         .replace("{split}", split)
         .replace("{rays}", &TRAINING_RAYS.to_string())
-        // Last: what a folder is called is no part of the template.
+        // Last, since a folder's name may contain braces.
         .replace("{dataset}", dataset)
 }
 
-/// The parameters that say where LR images come from.
-fn images(set: &Dataset) -> String {
+/// Returns the YAML lines of the parameters that select the source of LR images.
+fn image_parameters(set: &Dataset) -> String {
     let width = set.frames.iter().map(|frame| frame.intrinsics().width).min().unwrap_or(0);
-    if width > LARGEST_WIDTH {
-        let (lr, hr) = (LARGEST_WIDTH / SCALE, LARGEST_WIDTH);
+    if width > MAX_WIDTH {
+        let lr_width = MAX_WIDTH / SCALE;
         format!(
-            "      lr_width: {lr} # images are shrunk to {hr} pixels, and to {lr} to train on: \
-            views can be scored, and a CPU is done in minutes\n      \
-            # lr_source: photographs # instead of lr_width: trains on the photographs as they are"
+            "      lr_width: {lr_width} # photographs are shrunk to {MAX_WIDTH} pixels for scoring \
+            and to {lr_width} for training, which takes minutes on a CPU\n      \
+            # lr_source: photographs # instead of lr_width: trains on the unmodified photographs"
         )
     } else if set.format.is_benchmark() {
-        "      lr_source: downscaled # LR images are made from these; `photographs` trains on them \
-        as they are"
+        "      lr_source: downscaled # LR images are made from the data set's images; \
+        `photographs` trains on the unmodified images"
             .to_owned()
     } else {
-        "      lr_source: photographs # they are trained on as they are; `downscaled` makes LR \
-        images from them first, to score views"
+        "      lr_source: photographs # trains on the unmodified photographs; `downscaled` makes \
+        LR images from them first, so that views can be scored"
             .to_owned()
     }
 }
 
-/// What to say of a folder without a data set: where it holds images, how to find their cameras.
-fn without_cameras(folder: &Path, error: DatasetError) -> StarterError {
-    let pictures = Pictures::of(folder);
-    if !matches!(error, DatasetError::Unknown { nearby: None, .. }) || pictures.count() == 0 {
+/// Converts an error of the data set's reader: if the folder contains images, the new error names
+/// the command that estimates their cameras.
+fn read_error(folder: &Path, error: DatasetError) -> StarterError {
+    let images = UnposedImages::find(folder);
+    if !matches!(error, DatasetError::Unknown { nearby: None, .. }) || images.files.is_empty() {
         return StarterError::Dataset(error);
     }
     StarterError::NoCameras {
         folder: folder.to_path_buf(),
-        found: pictures.found(),
-        command: pictures.command(folder),
+        found: images.summary(),
+        command: images.colmap_command(folder),
     }
 }
 

@@ -28,7 +28,7 @@ fn images_keep_their_size_where_a_cpu_can_do_with_it() {
         (Format::Blender, vec![(801, 801)], "lr_width: 400"),
         (Format::Colmap, vec![(4000, 3000), (3000, 4000)], "lr_width: 400"),
     ] {
-        let images = images(&set(format, &sizes));
+        let images = image_parameters(&set(format, &sizes));
         assert!(images.trim_start().starts_with(line), "{format} {sizes:?}: {images}");
     }
 }
@@ -36,12 +36,12 @@ fn images_keep_their_size_where_a_cpu_can_do_with_it() {
 #[test]
 fn what_was_found_is_said() {
     let several = set(Format::Colmap, &[(640, 480), (480, 640)]);
-    assert_eq!(found(&several), "COLMAP (sparse): 2 photographs of several sizes");
+    assert_eq!(summarize(&several), "COLMAP (sparse): 2 photographs of several sizes");
     let one = set(Format::Llff, &[(640, 480)]);
-    assert_eq!(found(&one), "LLFF (poses_bounds.npy): 1 photograph of 640×480");
+    assert_eq!(summarize(&one), "LLFF (poses_bounds.npy): 1 photograph of 640×480");
     let tested = Split { train: vec![0], test: vec![1] };
     for (split, words) in [(None, "every eighth view"), (Some(tested), "own test views")] {
-        let text = text(&Dataset { split, ..several.clone() }, "found", "./data");
+        let text = pipeline_text(&Dataset { split, ..several.clone() }, "found", "./data");
         assert!(text.contains(words) && !text.contains(['{', '}']), "{text}");
     }
 }

@@ -1,10 +1,11 @@
-//! YAML as people write it: encodings, merge keys, and the lines on which keys stand.
+//! Encodings, merge keys and key lines of hand-written YAML files.
 //!
-//! * [`decode`]: a file's bytes as text, or the [`DecodeError`] that says what to do.
-//! * [`merge`]: replaces merge keys. [`not_finite`]: finds a number that JSON doesn't have.
-//! * [`line_of`]: the line of a key. [`line_of_duplicate`]: the line of a key that stands twice.
+//! * [`decode`]: converts a file's bytes to text, or fails with a [`DecodeError`].
+//! * [`expand_merge_keys`]: replaces merge keys. [`find_non_finite`]: finds a number that JSON can't
+//!   represent.
+//! * [`line_of`]: line number of a key. [`line_of_duplicate`]: line number of a repeated key.
 //!
-//! serde_yaml reads the values; this crate finds the lines, so that complaints can name them.
+//! serde_yaml reads the values; this crate finds line numbers for error messages.
 //!
 //! ```
 //! let text = yaml_lines::decode(b"stages:\n  train:\n    run: train-ss\n")?;
@@ -19,37 +20,38 @@ use std::fmt;
 use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_yaml::Value;
 
-/// A file whose bytes are no text in UTF-8.
+/// Error returned when a file isn't UTF-8 text.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{problem}")]
 pub struct DecodeError {
-    /// Its line, where that is known.
+    /// Line number of the first invalid byte; `None` if the whole file has another encoding.
     pub line: Option<usize>,
-    /// What is wrong and what to do.
+    /// Problem and remedy.
     pub problem: &'static str,
 }
 
-/// The text of a file in UTF-8, without its byte order mark.
+/// Returns the text of a UTF-8 file without its byte order mark.
 pub fn decode(bytes: &[u8]) -> Result<&str, DecodeError> {
     let is_utf16 = bytes.starts_with(&[0xff, 0xfe])
         || bytes.starts_with(&[0xfe, 0xff])
         || bytes.iter().take(2).any(|b| *b == 0);
     if is_utf16 {
-        let problem = "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)";
+        let problem = "encoding is UTF-16; save the file as UTF-8 (iconv -f UTF-16 -t UTF-8)";
         return Err(DecodeError { line: None, problem });
     }
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     std::str::from_utf8(bytes).map_err(|e| {
         let line = 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count();
-        let problem = "the text isn't UTF-8; save the file as UTF-8";
+        let problem = "encoding isn't UTF-8; save the file as UTF-8";
         DecodeError { line: Some(line), problem }
     })
 }
 
-/// Replaces merge keys (`<<: *anchor`) by what they stand for; whether there were any.
-pub fn merge(document: &mut Value) -> Result<bool, serde_yaml::Error> {
+/// Replaces merge keys (`<<: *anchor`) by the entries of their anchors. Returns whether the document
+/// has merge keys.
+pub fn expand_merge_keys(document: &mut Value) -> Result<bool, serde_yaml::Error> {
     let mut merged = false;
-    // What is merged may bring a merge key of its own.
+    // A merged mapping may contain merge keys of its own.
     while has_merge_key(document) {
         document.apply_merge()?;
         merged = true;
@@ -68,45 +70,46 @@ fn has_merge_key(value: &Value) -> bool {
     }
 }
 
-/// Where a number stands that JSON doesn't have: `.nan` or `.inf`.
-pub fn not_finite(value: &Value) -> Option<Vec<String>> {
+/// Returns the keys that lead to the first number that JSON can't represent (`.nan` or `.inf`).
+pub fn find_non_finite(value: &Value) -> Option<Vec<String>> {
     match value {
         Value::Number(number) if !number.as_f64().is_none_or(f64::is_finite) => Some(Vec::new()),
         Value::Mapping(entries) => entries.iter().find_map(|(key, value)| {
-            let mut path = not_finite(value)?;
+            let mut path = find_non_finite(value)?;
             path.insert(0, key.as_str().unwrap_or_default().to_owned());
             Some(path)
         }),
-        Value::Sequence(items) => items.iter().find_map(not_finite),
-        Value::Tagged(tagged) => not_finite(&tagged.value),
+        Value::Sequence(items) => items.iter().find_map(find_non_finite),
+        Value::Tagged(tagged) => find_non_finite(&tagged.value),
         _ => None,
     }
 }
 
-/// What a search ends with: the parser says on which line an error came up, so what is found is
-/// reported as one.
-const FOUND: &str = "the key that was looked for";
+/// Message of the error with which a visitor ends a search: serde_yaml knows lines only for errors,
+/// so a visitor reports the wanted key as one.
+const FOUND: &str = "key found";
 
-fn line_found(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
+/// Returns the line at which a search reported its key.
+fn found_line(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
     let error = searched.err()?;
     error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
 }
 
-/// The line of a key: the last of `path`, through nested mappings; where it isn't there, that of
-/// the last one that is.
+/// Returns the line number of a key, given as a path through nested mappings. If the key is missing,
+/// returns the line of the last existing key of the path.
 pub fn line_of(text: &str, path: &[&str]) -> Option<usize> {
     (1..=path.len()).rev().find_map(|length| {
         let search = Search(&path[..length]);
-        line_found(search.deserialize(serde_yaml::Deserializer::from_str(text)))
+        found_line(search.deserialize(serde_yaml::Deserializer::from_str(text)))
     })
 }
 
-/// The line on which a key stands that its mapping has already.
+/// Returns the line number of the first key that repeats an earlier key of its mapping.
 pub fn line_of_duplicate(text: &str) -> Option<usize> {
-    line_found(Duplicates.deserialize(serde_yaml::Deserializer::from_str(text)))
+    found_line(DuplicateSearch.deserialize(serde_yaml::Deserializer::from_str(text)))
 }
 
-/// Looks for a key in nested mappings.
+/// Search for a key, given as a path through nested mappings.
 struct Search<'a>(&'a [&'a str]);
 
 impl<'de> DeserializeSeed<'de> for Search<'_> {
@@ -126,10 +129,10 @@ impl<'de> Visitor<'de> for Search<'_> {
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
         let Some((first, rest)) = self.0.split_first() else { return Ok(()) };
-        while let Some(is_first) =
+        while let Some(is_match) =
             map.next_key_seed(Key { name: first, is_last: rest.is_empty() })?
         {
-            if is_first {
+            if is_match {
                 map.next_value_seed(Search(rest))?;
             } else {
                 map.next_value::<IgnoredAny>()?;
@@ -139,7 +142,7 @@ impl<'de> Visitor<'de> for Search<'_> {
     }
 }
 
-/// Compares a key with a name; the last one is reported.
+/// Comparison of a key with a name. If the name is the last of the path, a match ends the search.
 struct Key<'a> {
     name: &'a str,
     is_last: bool,
@@ -161,15 +164,15 @@ impl Visitor<'_> for Key<'_> {
     }
 
     fn visit_str<E: Error>(self, key: &str) -> Result<bool, E> {
-        let is_it = key == self.name;
-        if is_it && self.is_last { Err(E::custom(FOUND)) } else { Ok(is_it) }
+        let is_match = key == self.name;
+        if is_match && self.is_last { Err(E::custom(FOUND)) } else { Ok(is_match) }
     }
 }
 
-/// Looks for a key that comes twice, in mappings inside of mappings and lists.
-struct Duplicates;
+/// Search for a repeated key in nested mappings and lists.
+struct DuplicateSearch;
 
-impl<'de> DeserializeSeed<'de> for Duplicates {
+impl<'de> DeserializeSeed<'de> for DuplicateSearch {
     type Value = ();
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
@@ -177,7 +180,7 @@ impl<'de> DeserializeSeed<'de> for Duplicates {
     }
 }
 
-impl<'de> Visitor<'de> for Duplicates {
+impl<'de> Visitor<'de> for DuplicateSearch {
     type Value = ();
 
     fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
@@ -209,20 +212,20 @@ impl<'de> Visitor<'de> for Duplicates {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
-        while items.next_element_seed(Duplicates)?.is_some() {}
+        while items.next_element_seed(DuplicateSearch)?.is_some() {}
         Ok(())
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
         let mut seen = BTreeSet::new();
         while map.next_key_seed(NewKey(&mut seen))?.is_some() {
-            map.next_value_seed(Duplicates)?;
+            map.next_value_seed(DuplicateSearch)?;
         }
         Ok(())
     }
 }
 
-/// A key, reported where it was seen before.
+/// Key that ends the search if its mapping has an equal earlier key.
 struct NewKey<'a>(&'a mut BTreeSet<String>);
 
 impl<'de> DeserializeSeed<'de> for NewKey<'_> {
@@ -284,8 +287,9 @@ mod tests {
     fn encodings() {
         assert_eq!(decode(b"\xef\xbb\xbfa: 1"), Ok("a: 1"));
         assert_eq!(decode("ä: 1\r\n".as_bytes()), Ok("ä: 1\r\n"));
-        let utf16 =
-            |bytes: &[u8]| decode(bytes).unwrap_err().problem.contains("UTF-16; save it as UTF-8");
+        let utf16 = |bytes: &[u8]| {
+            decode(bytes).unwrap_err().problem.contains("UTF-16; save the file as UTF-8")
+        };
         assert!(
             utf16(b"\xff\xfea\0:\0")
                 && utf16(b"\xfe\xff\0a\0:")
@@ -308,10 +312,10 @@ mod tests {
         ] {
             let [mut found, expected] =
                 [text, expected].map(|t| serde_yaml::from_str::<Value>(t).unwrap());
-            assert!(merge(&mut found).unwrap());
+            assert!(expand_merge_keys(&mut found).unwrap());
             assert_eq!(found, expected, "{text}");
         }
         let mut scalar = serde_yaml::from_str("a: {<<: 1}").unwrap();
-        assert!(merge(&mut scalar).is_err());
+        assert!(expand_merge_keys(&mut scalar).is_err());
     }
 }

@@ -3,7 +3,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use artifact::{Failure, print_line, report_line};
-use garbage::{Choice, Root, Verdict, judge};
+use garbage::{Collection, Policy, Root};
 use planning::{PlanError, Request};
 use serde_json::json;
 use stage::stop_on_signals;
@@ -17,13 +17,13 @@ use crate::waiting::until_held;
 pub(crate) fn gc(
     session: &Session,
     what: &Request,
-    choice: Choice,
+    policy: Policy,
     style: Style,
 ) -> anyhow::Result<ExitCode> {
     let store = &session.store;
     let needed = needed(session, what)?;
     if style.dry_run {
-        return style.tell(&judge(store, needed, choice).context(UNREAD)?);
+        return style.tell(&Collection::new(store, needed, policy).context(UNREAD)?);
     }
     let stop = stop_on_signals()?;
     let closed = match until_held(&stop, &|_, waited| say_wait(waited), || store.try_close()) {
@@ -31,11 +31,11 @@ pub(crate) fn gc(
         Err(failure) if failure.code == 130 => return Err(Failure::Interrupted.into()),
         Err(failure) => return Err(failure.into()),
     };
-    let verdict = judge(store, needed, choice).context(UNREAD)?;
-    verdict.carry_out(store, &closed)?;
+    let collection = Collection::new(store, needed, policy).context(UNREAD)?;
+    collection.carry_out(store, &closed)?;
     drop(closed);
     store.empty_trash()?;
-    style.tell(&verdict)
+    style.tell(&collection)
 }
 
 /// Context of an error that comes before anything is deleted.
@@ -59,14 +59,16 @@ pub(crate) struct Style {
 }
 
 impl Style {
-    fn tell(self, verdict: &Verdict) -> anyhow::Result<ExitCode> {
-        let (goes, stays) = verdict.bytes();
+    fn tell(self, collection: &Collection) -> anyhow::Result<ExitCode> {
+        let (goes, stays) = collection.bytes();
         if self.json {
             let told = json!({"dry_run": self.dry_run, "bytes_gone": goes, "bytes_left": stays,
-                "items": verdict.fates()});
+                "items": collection.decisions()});
             return print_json(&told);
         }
-        verdict.fates().iter().for_each(|fate| print_line!("{fate}"));
+        for decision in collection.decisions() {
+            print_line!("{decision}");
+        }
         let verbs = if self.dry_run { ("would go", "would stay") } else { ("freed", "stay") };
         print_line!(
             "{:.1} MB {}, {:.1} MB {}",
@@ -86,7 +88,7 @@ fn needed(session: &Session, what: &Request) -> anyhow::Result<Root> {
         Err(error @ PlanError::Store(_)) => return Err(anyhow::Error::from(error).context(UNREAD)),
         states => states?,
     };
-    let mut root = Root { why: "the pipeline needs it".to_owned(), ..Root::default() };
+    let mut root = Root { reason: "the pipeline needs it".to_owned(), ..Root::default() };
     for (node, state) in plan.nodes.iter().zip(states) {
         match state.key() {
             Some(key) => _ = root.keys.insert(key),

@@ -7,7 +7,7 @@ use starter::{Starter, StarterError};
 /// Writes a pipeline for a folder of posed photographs, and says what it found.
 pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
     let starter = Starter::new(folder, file).map_err(refused)?;
-    print_line!("found: {}", starter.found());
+    print_line!("found: {}", starter.summary());
     starter.notes().iter().for_each(|note| print_line!("  {note}"));
     let written = starter.write().map_err(refused)?;
     let names: Vec<String> = written.iter().map(|file| file.display().to_string()).collect();
@@ -22,7 +22,7 @@ fn refused(error: StarterError) -> anyhow::Error {
             Failure::BadInput(error.to_string()).into()
         }
         StarterError::Io { .. } => error.into(),
-        StarterError::Inside { .. } | StarterError::Name { .. } | StarterError::There { .. } => {
+        StarterError::Inside { .. } | StarterError::Name { .. } | StarterError::Exists { .. } => {
             Failure::Usage(error.to_string()).into()
         }
     }

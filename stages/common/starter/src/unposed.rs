@@ -5,29 +5,25 @@ use std::path::{Path, PathBuf};
 use artifact::counted;
 use dataset::{is_image_name, is_unread_name, unread_images};
 
-/// Images of a folder, or of `images` in it.
-pub(crate) struct Pictures {
-    files: Vec<PathBuf>,
-    /// True if they are in `images`, where COLMAP's form has them.
-    in_place: bool,
+/// Images of a folder, or of its subfolder `images`.
+pub(crate) struct UnposedImages {
+    /// Paths, sorted.
+    pub(crate) files: Vec<PathBuf>,
+    /// True if the images are in `images`, where COLMAP's format expects them.
+    in_subfolder: bool,
 }
 
-impl Pictures {
-    pub(crate) fn of(folder: &Path) -> Self {
-        let beside = images(&folder.join("images"));
-        if !beside.is_empty() {
-            return Self { files: beside, in_place: true };
+impl UnposedImages {
+    pub(crate) fn find(folder: &Path) -> Self {
+        let files = list_images(&folder.join("images"));
+        if !files.is_empty() {
+            return Self { files, in_subfolder: true };
         }
-        Self { files: images(folder), in_place: false }
+        Self { files: list_images(folder), in_subfolder: false }
     }
 
-    /// Returns the number of images.
-    pub(crate) fn count(&self) -> usize {
-        self.files.len()
-    }
-
-    /// Returns the number of images, with the command that converts those that aren't read.
-    pub(crate) fn found(&self) -> String {
+    /// Returns the number of images, with the command that converts those in unread formats.
+    pub(crate) fn summary(&self) -> String {
         let images = counted(self.files.len(), "image");
         match unread_images(&self.files) {
             Some(unread) => format!("{images} ({unread})"),
@@ -35,10 +31,10 @@ impl Pictures {
         }
     }
 
-    /// The commands after which the folder has cameras.
-    pub(crate) fn command(&self, folder: &Path) -> String {
+    /// Returns the commands that estimate cameras.
+    pub(crate) fn colmap_command(&self, folder: &Path) -> String {
         let folder = folder.display().to_string().replace('\'', r"'\''");
-        let moved = if self.in_place {
+        let moved = if self.in_subfolder {
             String::new()
         } else {
             format!("move them to '{folder}/images', then ")
@@ -50,8 +46,8 @@ impl Pictures {
     }
 }
 
-/// Returns a folder's images by name, in any format that is known.
-fn images(folder: &Path) -> Vec<PathBuf> {
+/// Returns a folder's images, sorted by name. Images in unread formats are included.
+fn list_images(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut files: Vec<PathBuf> =
         entries.map(|entry| entry.path()).filter(|path| is_image(path)).collect();
