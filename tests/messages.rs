@@ -71,11 +71,11 @@ fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
         (
             "echo working >&2; kill -KILL $$",
             1,
-            "talk: failed: ended by SIGKILL after it said: working; maybe the kernel",
+            "talk: failed: ended by SIGKILL (last line: working); if memory ran out",
         ),
         ("kill -SEGV $$", 1, "talk: failed: crashed with SIGSEGV; please report it"),
         (&panic, 101, "talk: failed: no entry"),
-        ("exit 7", 7, "talk: failed: ended with exit code 7 and said nothing"),
+        ("exit 7", 7, "talk: failed: exit code 7 without a message"),
     ] {
         let project = talking(run);
         let finished = project.run(&["run"]);

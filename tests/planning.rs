@@ -122,7 +122,7 @@ fn asking_can_be_watched_and_interrupted() {
     let mut stderr = BufReader::new(child.stderr.take().unwrap());
     let mut line = String::new();
     stderr.read_line(&mut line).unwrap();
-    assert!(line.contains("asking the stages what they are"), "{line}");
+    assert!(line.contains("reading the stages' descriptions"), "{line}");
     wait_until(|| project.path("started").exists());
     signal(&child, "-TERM");
     line.clear();

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use stage_call::{DescribeError, Interrupted, ask_all};
+use stage_call::{DescribeError, Interrupted, describe_all};
 use store::Store;
 
 use crate::stages::{DescriptionCache, StageProgram, is_own};
@@ -87,7 +87,7 @@ impl StageProgram {
 
     fn ask_again(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<(), Unconfirmed> {
         let path: &Path = &self.path;
-        let mut answers = ask_all(&[path.to_path_buf()], stop)?;
+        let mut answers = describe_all(&[path.to_path_buf()], stop)?;
         let Some(answer) = answers.remove(path) else { return Err(Unconfirmed::Interrupted) };
         if answer?.code == self.description.code {
             return Ok(());

@@ -14,7 +14,7 @@ use artifact::{nearest, write_atomically};
 use contract::{Description, DescriptionError, Schema, SchemaError};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use stage_call::{DescribeError, Interrupted, ask_all};
+use stage_call::{DescribeError, Interrupted, describe_all};
 use store::Store;
 
 use crate::file::StageBlock;
@@ -174,7 +174,7 @@ impl Programs {
             Asking::Run(stop) => Some(stop),
             Asking::Look => None,
         };
-        let asked = ask_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?;
+        let asked = describe_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?;
         for (path, description) in asked {
             let answer = answer(&path, unasked[&path].clone(), description);
             if let Ok(answer) = &answer {

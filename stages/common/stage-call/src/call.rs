@@ -1,4 +1,4 @@
-//! One call of a stage: its process, its pipes, its end.
+//! One call of a stage: starts the process, reads its output and waits for its end.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -13,12 +13,13 @@ use contract::Description;
 use stage::{Event, SUMMARY_FILE};
 use wait4::ResUse;
 
-use crate::clock::seconds;
-use crate::group::Group;
-use crate::log::{StageLog, Tenths};
-use crate::verdict::{End, StageFailure, is_noise, memory_kills};
+use crate::failure::{Exit, StageFailure, is_noise, memory_kills};
+use crate::group::{Group, Pipes};
+use crate::log::{ProgressFilter, StageLog};
+use crate::seconds;
 
-/// Environment that a stage gets; what else changes its result must be declared in its description.
+/// Environment variables that every stage gets. A description declares the further variables that
+/// change the stage's result, since they are part of its key.
 const ENVIRONMENT: [&str; 12] = [
     stage::MEMORY_VARIABLE,
     "PATH",
@@ -34,65 +35,65 @@ const ENVIRONMENT: [&str; 12] = [
     stage::SLOW_VARIABLE,
 ];
 
-/// Last lines of a stage's stderr in which the reason of a failure is looked for.
-const TAIL_LINES: usize = 8;
-/// Interval between two looks at a running stage.
-const LOOK_INTERVAL: Duration = Duration::from_millis(10);
-/// Time to write a checkpoint for a stage that was asked to end, if the wrapper script that it runs
-/// in has ended at once.
-const GRACE: Duration = Duration::from_secs(10);
+/// Maximum number of last stderr lines that are searched for the reason of a failure, chosen by hand.
+const MAX_TAIL_LINES: usize = 8;
+/// Interval between two checks of a running stage.
+const POLL_INTERVAL: Duration = Duration::from_millis(10);
+/// Time that a stopped stage has for its checkpoint after the end of the wrapper script that started
+/// it (docs/design/001).
+const MAX_CHECKPOINT_TIME: Duration = Duration::from_secs(10);
 
-/// One call of a stage by the contract.
+/// Arguments of one call of a stage.
 pub struct Call<'a> {
-    /// Block and point, for the log.
+    /// Block and point, for the log and messages.
     pub label: &'a str,
-    /// The program.
+    /// Path of the program.
     pub program: &'a Path,
-    /// What it says of itself.
+    /// Description of the program.
     pub description: &'a Description,
-    /// `--params`.
+    /// File of `--params`.
     pub params: &'a Path,
-    /// `--input`, by name.
+    /// Names and folders of `--input`.
     pub inputs: &'a [(String, PathBuf)],
-    /// What the inputs' contents are, where that is known; for the log.
+    /// Content hashes of inputs by name, as far as known; for the log.
     pub hashes: &'a [(String, String)],
-    /// `--output`.
+    /// Folder of `--output`.
     pub output: &'a Path,
-    /// `--work`; none for a sink.
+    /// Folder of `--work`; `None` for a sink.
     pub work: Option<&'a Path>,
-    /// `--from-checkpoint`: the stage writes its output from the latest checkpoint in `work`.
+    /// True for `--from-checkpoint`: write the output from the latest checkpoint in `work`.
     pub from_checkpoint: bool,
-    /// `--device`.
+    /// Value of `--device`.
     pub device: &'a str,
-    /// `--threads`.
+    /// Value of `--threads`.
     pub threads: usize,
-    /// The file of the key's lock, which the stage holds on to as its standard input.
+    /// File of the key's lock. The stage inherits it as standard input, so that the key stays locked
+    /// until the stage ends.
     pub lock: Option<&'a File>,
 }
 
-/// What a call took of the machine.
+/// Memory and processor time of a call.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Usage {
-    /// Peak resident memory in bytes, of the stage or, where it is larger, of a program that it
-    /// called.
+    /// Peak resident memory in bytes: the larger one of the stage and the programs that it called.
     pub peak_memory: u64,
-    /// Processor time of all its threads, and of the programs that it called, in seconds.
+    /// Processor time in seconds, of all threads and of the programs that the stage called.
     pub processor_seconds: f64,
 }
 
-/// What to do with a stage's output while it runs. Control characters in it are spelled out.
+/// Receiver of a running stage's output. Control characters in the output are escaped.
 pub trait Watcher: Sync {
-    /// How far it is.
+    /// Takes a progress event.
     fn progress(&self, event: &Event);
-    /// A line that it said on stderr.
-    fn said(&self, line: &str);
-    /// It is still at work; called often.
-    fn alive(&self) {}
+    /// Takes a line of stderr.
+    fn stderr_line(&self, line: &str);
+    /// Runs every few milliseconds until the stage ends.
+    fn tick(&self) {}
 }
 
 impl Call<'_> {
-    /// Runs the stage; appends to `log` what it was given, what it says and how it ends. When
-    /// `stop` is set the stage is asked to end, so that it leaves a checkpoint.
+    /// Runs the stage, and appends its arguments, output and result to the file `log`. If `stop` is
+    /// set, the stage is asked to end, so that it can write a checkpoint.
     pub fn run(
         &self,
         log: &Path,
@@ -100,28 +101,29 @@ impl Call<'_> {
         stop: &AtomicBool,
     ) -> Result<Usage, StageFailure> {
         let log = StageLog::open(log).map_err(|e| StageFailure::at(log, &e))?;
-        self.log_start(&log);
+        self.log_arguments(&log);
         let started = Instant::now();
-        let result = self.carry_out(&log, watcher, stop);
+        let result = self.run_process(&log, watcher, stop);
         let time = seconds(started.elapsed().as_secs_f64());
         match &result {
             Ok(usage) => {
-                let (memory, processor) =
-                    (sized(usage.peak_memory), seconds(usage.processor_seconds));
                 log.line(format_args!(
-                    "done in {time}; {processor} of processor time, {memory} of memory at most"
+                    "done in {time}; processor time {}, peak memory {}",
+                    seconds(usage.processor_seconds),
+                    sized(usage.peak_memory)
                 ));
-                let summary = summary_of(self.output).unwrap_or_default();
-                summary.lines().for_each(|line| log.line(format_args!("result: {line}")));
+                for line in read_summary(self.output).unwrap_or_default().lines() {
+                    log.line(format_args!("result: {line}"));
+                }
             }
             Err(StageFailure { code, message }) => {
-                log.line(format_args!("failed after {time} with {code}: {message}"));
+                log.line(format_args!("failed after {time} with exit code {code}: {message}"));
             }
         }
         result
     }
 
-    fn log_start(&self, log: &StageLog) {
+    fn log_arguments(&self, log: &StageLog) {
         log.start(self.label);
         log.line(format_args!(
             "program: {} {}, {}",
@@ -135,58 +137,60 @@ impl Call<'_> {
             .and_then(|b| serde_json::from_slice::<serde_json::Value>(&b).ok());
         log.line(format_args!("parameters: {}", parameters.unwrap_or_default()));
         for (name, folder) in self.inputs {
-            let hash = self
-                .hashes
-                .iter()
-                .find(|(of, _)| of == name)
-                .map(|(_, hash)| format!(" ({hash})"))
-                .unwrap_or_default();
+            let hash = self.hashes.iter().find(|(hashed, _)| hashed == name);
+            let hash = hash.map(|(_, hash)| format!(" ({hash})")).unwrap_or_default();
             log.line(format_args!("input {name}: {}{hash}", folder.display()));
         }
     }
 
-    fn carry_out(
+    fn run_process(
         &self,
         log: &StageLog,
         watcher: &dyn Watcher,
         stop: &AtomicBool,
     ) -> Result<Usage, StageFailure> {
-        let fail = |e: std::io::Error| StageFailure::at(self.program, &e);
-        let stdin = match self.lock {
-            Some(lock) => Stdio::from(lock.try_clone().map_err(fail)?),
-            None => Stdio::null(),
-        };
         let kills_before = memory_kills();
-        let (group, (stdout, stderr)) = Group::start(self.command().stdin(stdin)).map_err(fail)?;
-        let ear = Ear { log, watcher };
-        let (end, stated, tail) = std::thread::scope(|scope| {
-            let events = scope.spawn(|| ear.hear_events(stdout));
-            let words = scope.spawn(|| ear.hear_words(stderr));
-            let end = wait(group, stop, watcher, &|| events.is_finished() && words.is_finished());
-            (end, events.join().ok().flatten(), words.join().unwrap_or_default())
+        let (group, (stdout, stderr)) =
+            self.start().map_err(|e| StageFailure::at(self.program, &e))?;
+        let output = OutputReader { log, watcher };
+        let (exit, stated_reason, tail) = std::thread::scope(|scope| {
+            let stdout = scope.spawn(|| output.read_stdout(stdout));
+            let stderr = scope.spawn(|| output.read_stderr(stderr));
+            let are_closed = || stdout.is_finished() && stderr.is_finished();
+            let exit = wait(group, stop, watcher, &are_closed);
+            (exit, stdout.join().ok().flatten(), stderr.join().unwrap_or_default())
         });
-        let ResUse { status, rusage } = end.map_err(fail)?;
-        let last = tail.last().cloned();
+        let ResUse { status, rusage } = exit.map_err(|e| StageFailure::at(self.program, &e))?;
+        let last_line = tail.last().cloned();
         let result = if status.success() {
             let processor_seconds = (rusage.utime + rusage.stime).as_secs_f64();
             Ok(Usage { peak_memory: rusage.maxrss, processor_seconds })
         } else {
-            let end = End {
+            let exit = Exit {
                 status,
-                stated,
+                stated_reason,
                 tail,
-                asked: stop.load(Ordering::Relaxed),
-                memory_ran_out: memory_kills() > kills_before,
+                was_stopped: stop.load(Ordering::Relaxed),
+                was_memory_exhausted: memory_kills() > kills_before,
             };
-            Err(end.failure(&self.description.name))
+            Err(exit.failure(&self.description.name))
         };
-        // Not twice: as what it said, and as the reason.
-        let is_reason =
-            |line: &String| result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
-        if let Some(last) = last.filter(|line| !is_reason(line)) {
-            watcher.said(&last);
+        if let Some(line) = last_line {
+            // The caller prints the reason: the same line must not appear twice.
+            let is_reason = result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
+            if !is_reason {
+                watcher.stderr_line(&line);
+            }
         }
         result
+    }
+
+    fn start(&self) -> std::io::Result<(Group, Pipes)> {
+        let stdin = match self.lock {
+            Some(lock) => Stdio::from(lock.try_clone()?),
+            None => Stdio::null(),
+        };
+        Group::start(self.command().stdin(stdin))
     }
 
     fn command(&self) -> Command {
@@ -225,47 +229,48 @@ impl Call<'_> {
     }
 }
 
-/// Listens to a stage.
-struct Ear<'a> {
+/// Reader of a stage's output.
+struct OutputReader<'a> {
     log: &'a StageLog,
     watcher: &'a dyn Watcher,
 }
 
-impl Ear<'_> {
-    /// Hears stdout: events, and what a plain script prints, which is for the log alone. Returns
-    /// the reason of a failure, where one is stated.
-    fn hear_events(&self, stdout: Option<impl Read>) -> Option<String> {
-        let (mut stated, mut tenths) = (None, Tenths::default());
-        for line in lines(stdout) {
+impl OutputReader<'_> {
+    /// Reads stdout: progress events, and other lines, which are for the log alone. Returns the
+    /// reason of a failure if the stage states one.
+    fn read_stdout(&self, stdout: Option<impl Read>) -> Option<String> {
+        let mut reason = None;
+        let mut filter = ProgressFilter::default();
+        for line in read_lines(stdout) {
             match serde_json::from_str(&line) {
-                Ok(Event::Failed { message }) => stated = Some(printable(&message).into_owned()),
+                Ok(Event::Failed { message }) => reason = Some(printable(&message).into_owned()),
                 Ok(Event::Progress { label, done, total, note }) => {
-                    let (label, note) =
-                        (printable(&label).into_owned(), printable(&note).into_owned());
-                    if let Some(told) = tenths.told(&label, done, total, &note) {
-                        self.log.line(told);
+                    let label = printable(&label).into_owned();
+                    let note = printable(&note).into_owned();
+                    if let Some(line) = filter.line(&label, done, total, &note) {
+                        self.log.line(line);
                     }
                     self.watcher.progress(&Event::Progress { label, done, total, note });
                 }
                 Err(_) => self.log.line(line),
             }
         }
-        stated
+        reason
     }
 
-    /// Hears stderr, and passes on all but the last line, which may be the reason of a failure.
+    /// Reads stderr, and forwards all lines but the last, which may be the reason of a failure.
     /// Returns the last lines.
-    fn hear_words(&self, stderr: Option<impl Read>) -> Vec<String> {
+    fn read_stderr(&self, stderr: Option<impl Read>) -> Vec<String> {
         let mut tail: VecDeque<String> = VecDeque::new();
-        for line in lines(stderr) {
+        for line in read_lines(stderr) {
             self.log.line(&line);
             if is_noise(&line) {
                 continue;
             }
             if let Some(last) = tail.back() {
-                self.watcher.said(last);
+                self.watcher.stderr_line(last);
             }
-            if tail.len() == TAIL_LINES {
+            if tail.len() == MAX_TAIL_LINES {
                 tail.pop_front();
             }
             tail.push_back(line);
@@ -274,35 +279,35 @@ impl Ear<'_> {
     }
 }
 
-/// Waits for the end of a stage, and kills what the stage has left running. `is_silent` returns
-/// whether all processes have closed the stage's pipes.
+/// Waits for the end of a stage, then kills the processes that it has left running. `are_closed`
+/// returns whether all processes have closed the stage's pipes.
 fn wait(
     group: Group,
     stop: &AtomicBool,
     watcher: &dyn Watcher,
-    is_silent: &dyn Fn() -> bool,
+    are_closed: &dyn Fn() -> bool,
 ) -> std::io::Result<ResUse> {
-    let mut asked = false;
-    while !group.is_over()? {
-        if stop.load(Ordering::Relaxed) && !asked {
-            group.ask_to_end();
-            asked = true;
+    let mut is_stopped = false;
+    while !group.has_exited()? {
+        if stop.load(Ordering::Relaxed) && !is_stopped {
+            group.terminate();
+            is_stopped = true;
         }
-        watcher.alive();
-        std::thread::sleep(LOOK_INTERVAL);
+        watcher.tick();
+        std::thread::sleep(POLL_INTERVAL);
     }
-    let over = Instant::now();
-    while asked && !is_silent() && over.elapsed() < GRACE {
-        watcher.alive();
-        std::thread::sleep(LOOK_INTERVAL);
+    let exited = Instant::now();
+    while is_stopped && !are_closed() && exited.elapsed() < MAX_CHECKPOINT_TIME {
+        watcher.tick();
+        std::thread::sleep(POLL_INTERVAL);
     }
-    group.end()
+    group.kill()
 }
 
-/// Lines of a pipe that hold something; bytes that aren't UTF-8 are replaced, and control
-/// characters spelled out. Of what was written over in place (a foreign progress bar) the last
-/// state counts.
-fn lines(pipe: Option<impl Read>) -> impl Iterator<Item = String> {
+/// Returns the non-blank lines of a pipe. Bytes that aren't UTF-8 are replaced, control characters
+/// are escaped. Of a line that is overwritten by `\r`, as by a progress bar, only the last state
+/// is returned.
+fn read_lines(pipe: Option<impl Read>) -> impl Iterator<Item = String> {
     let reader = pipe.map(BufReader::new);
     reader.into_iter().flat_map(|r| r.split(b'\n').map_while(Result::ok)).filter_map(|bytes| {
         let text = String::from_utf8_lossy(&bytes);
@@ -311,10 +316,10 @@ fn lines(pipe: Option<impl Read>) -> impl Iterator<Item = String> {
     })
 }
 
-/// Reads the summary that a stage wrote to its output, if there is one. A named pipe of this name
-/// would never end.
-pub fn summary_of(output: &Path) -> Option<String> {
+/// Reads the summary in a stage's output; `None` if the stage wrote none.
+pub fn read_summary(output: &Path) -> Option<String> {
     let file = output.join(SUMMARY_FILE);
+    // Reading a named pipe would never end.
     file.metadata().ok().filter(std::fs::Metadata::is_file)?;
     std::fs::read_to_string(file).ok()
 }

@@ -1,4 +1,4 @@
-//! What a person sees of running stages: bars on a terminal, lines elsewhere.
+//! Progress of running stages: bars on a terminal, otherwise lines.
 
 use std::io::IsTerminal as _;
 use std::sync::Mutex;
@@ -9,16 +9,16 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use stage::{Event, Pace};
 
 use crate::call::Watcher;
-use crate::clock::seconds;
+use crate::seconds;
 
-/// Lines of a stage come at least so often, so that nobody takes it for dead: whoever waits ten
-/// seconds sees one.
-const LONGEST_SILENCE: Duration = Duration::from_secs(8);
-/// A bar moves so often, if only its spinner.
-const TICK: Duration = Duration::from_millis(500);
+/// Maximum time without a line of a running stage, which would seem dead (docs/design/040).
+const MAX_SILENCE: Duration = Duration::from_secs(8);
+/// Interval between two movements of a bar's spinner.
+const SPINNER_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Bars on a terminal, lines elsewhere.
+/// Output of a run on stderr: progress bars and lines.
 pub struct Display {
+    /// Progress bars; `None` if stderr isn't a terminal.
     bars: Option<MultiProgress>,
 }
 
@@ -29,7 +29,7 @@ impl Default for Display {
 }
 
 impl Display {
-    /// Bars where stderr is a terminal.
+    /// Creates a display with bars if stderr is a terminal, otherwise with lines.
     pub fn new() -> Self {
         Self { bars: std::io::stderr().is_terminal().then(MultiProgress::new) }
     }
@@ -37,14 +37,14 @@ impl Display {
     /// Prints a line above the bars.
     pub fn line(&self, text: &str) {
         match &self.bars {
-            // The terminal may have gone; the run goes on.
+            // An error is ignored: the run continues after the terminal is closed.
             Some(bars) => bars.println(printable(text)).unwrap_or_default(),
             None => report_text(text),
         }
     }
 
-    /// Shows a picture above the bars; does nothing where stderr isn't a terminal. `draw` takes the
-    /// terminal's columns and rows and returns text with escape sequences.
+    /// Prints a picture above the bars if stderr is a terminal. `draw` takes the terminal's columns
+    /// and rows and returns text with escape sequences.
     pub fn picture(&self, draw: impl FnOnce(u16, u16) -> String) {
         if let Some(bars) = &self.bars {
             let (rows, columns) = console::Term::stderr().size();
@@ -52,7 +52,7 @@ impl Display {
         }
     }
 
-    /// Shows a stage from now on.
+    /// Starts displaying a stage.
     pub fn start(&self, label: &str) -> StageView<'_> {
         let bar = self.bars.as_ref().map(|bars| {
             let template = "{spinner} {prefix} [{bar:30}] {percent:>3}% {msg}";
@@ -62,7 +62,7 @@ impl Display {
                     .with_style(style.progress_chars("=> "))
                     .with_prefix(printable(label).into_owned()),
             );
-            bar.enable_steady_tick(TICK);
+            bar.enable_steady_tick(SPINNER_INTERVAL);
             bar
         });
         if bar.is_none() {
@@ -73,9 +73,9 @@ impl Display {
             label: label.to_owned(),
             bar,
             started: Instant::now(),
-            shown: Mutex::new(LastShown {
-                when: Instant::now(),
-                label: String::new(),
+            state: Mutex::new(ViewState {
+                last_line: Instant::now(),
+                task: String::new(),
                 text: None,
                 pace: Pace::default(),
             }),
@@ -83,26 +83,29 @@ impl Display {
     }
 }
 
-/// One running stage on the display.
+/// Display of one running stage.
 pub struct StageView<'a> {
     display: &'a Display,
     label: String,
     bar: Option<ProgressBar>,
     started: Instant,
-    shown: Mutex<LastShown>,
+    state: Mutex<ViewState>,
 }
 
-/// What was last shown of a stage, and how fast the work that it last told of gets on.
-struct LastShown {
-    when: Instant,
-    label: String,
-    /// How far it is, in words, if it has told.
+/// State of a stage's display.
+struct ViewState {
+    /// Time of the last line.
+    last_line: Instant,
+    /// Task of the last progress event.
+    task: String,
+    /// Last progress as text; `None` before the first event.
     text: Option<String>,
+    /// Pace of the task.
     pace: Pace,
 }
 
 impl StageView<'_> {
-    /// Takes its bar away.
+    /// Removes the stage's bar.
     pub fn end(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
@@ -113,34 +116,36 @@ impl StageView<'_> {
 impl Watcher for StageView<'_> {
     fn progress(&self, event: &Event) {
         let Event::Progress { label, done, total, note } = event else { return };
-        let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        if shown.label != *label {
-            (shown.label, shown.pace) = (label.clone(), Pace::default());
+        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if state.task != *label {
+            state.task.clone_from(label);
+            state.pace = Pace::default();
         }
-        let left = shown.pace.left(*done, *total);
+        let left = state.pace.left(*done, *total);
         if let Some(bar) = &self.bar {
             bar.set_length(*total);
             bar.set_position(*done);
             bar.set_message(format!("{label} {note} · {left} left"));
         } else {
             let percent = done * 100 / total.max(&1);
-            shown.text = Some(format!("{label} {percent}% {note} · {left} left"));
+            state.text = Some(format!("{label} {percent}% {note} · {left} left"));
         }
     }
 
-    /// Says where the stage is, where nothing has been said for long.
-    fn alive(&self) {
-        let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        if self.bar.is_some() || shown.when.elapsed() < LONGEST_SILENCE {
+    /// Prints the progress, or else the elapsed time, after [`MAX_SILENCE`] without a line.
+    fn tick(&self) {
+        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if self.bar.is_some() || state.last_line.elapsed() < MAX_SILENCE {
             return;
         }
-        shown.when = Instant::now();
-        let running = || format!("running for {}", seconds(self.started.elapsed().as_secs_f64()));
-        let text = shown.text.clone().unwrap_or_else(running);
+        state.last_line = Instant::now();
+        let text = state.text.clone().unwrap_or_else(|| {
+            format!("running for {}", seconds(self.started.elapsed().as_secs_f64()))
+        });
         self.display.line(&format!("{}: {text}", self.label));
     }
 
-    fn said(&self, line: &str) {
+    fn stderr_line(&self, line: &str) {
         self.display.line(&format!("{}: {line}", self.label));
     }
 }

@@ -1,5 +1,5 @@
-//! Process groups: a stage with all that it starts. Ctrl-C in a terminal reaches the runner alone,
-//! which asks its stages to end, once; a second Ctrl-C kills them.
+//! Process groups: a stage with the processes that it starts. Ctrl-C in a terminal signals the runner
+//! alone: the first one makes it terminate its stages, the second one kills them.
 
 use std::collections::BTreeSet;
 use std::io::{self, Read as _};
@@ -14,28 +14,28 @@ use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process_group, wa
 use stage::stop_signals;
 use wait4::{ResUse, Wait4 as _};
 
-/// Process ids of the leaders of all running groups. None has been waited for, so no other process
-/// can have the same id.
+/// Process ids of the leaders of all running groups. No leader has been waited for, so that no other
+/// process can have the same id.
 static RUNNING: Mutex<BTreeSet<i32>> = Mutex::new(BTreeSet::new());
 
 fn running() -> MutexGuard<'static, BTreeSet<i32>> {
     RUNNING.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A running program that leads a process group. The group is killed when this is dropped.
+/// Running program that leads a process group. Dropping it kills the group.
 pub(crate) struct Group {
     id: Pid,
-    /// The program; none once it has been waited for.
+    /// Process of the program; `None` after it has been waited for.
     leader: Option<Child>,
 }
 
-/// The pipes of a program's stdout and stderr, where it has them.
+/// Pipes of a program's stdout and stderr, as far as they were requested.
 pub(crate) type Pipes = (Option<ChildStdout>, Option<ChildStderr>);
 
 impl Group {
-    /// Starts a program.
+    /// Starts a program as the leader of a new group.
     pub(crate) fn start(command: &mut Command) -> io::Result<(Self, Pipes)> {
-        // Held meanwhile, so that nothing starts unseen while all groups are killed.
+        // Locked until the id is listed, so that `kill_all` misses no group.
         let mut running = running();
         let mut leader = command.process_group(0).spawn()?;
         let id = i32::try_from(leader.id()).ok().and_then(Pid::from_raw);
@@ -45,44 +45,44 @@ impl Group {
         Ok((Self { id, leader: Some(leader) }, pipes))
     }
 
-    /// Returns whether the leader has ended. It isn't waited for yet.
-    pub(crate) fn is_over(&self) -> io::Result<bool> {
+    /// Returns whether the leader has ended, without waiting for it or releasing its id.
+    pub(crate) fn has_exited(&self) -> io::Result<bool> {
         let options = WaitIdOptions::EXITED | WaitIdOptions::NOWAIT | WaitIdOptions::NOHANG;
         Ok(waitid(WaitId::Pid(self.id), options)?.is_some())
     }
 
-    /// Asks all processes of the group to end: a wrapper script would not pass the signal on.
-    pub(crate) fn ask_to_end(&self) {
-        // They may just have ended by themselves.
+    /// Sends SIGTERM to all processes of the group: a wrapper script would not forward the signal.
+    pub(crate) fn terminate(&self) {
+        // An error means that all of them have ended.
         kill_process_group(self.id, Signal::TERM).ok();
     }
 
-    /// Kills what is left of the group, which would write unseen and hold pipes and locks. Returns
-    /// how the leader ended, and what it used.
-    pub(crate) fn end(mut self) -> io::Result<ResUse> {
+    /// Kills the remaining processes of the group, which would write unnoticed and keep pipes and
+    /// locks open. Returns the leader's exit status and resource usage.
+    pub(crate) fn kill(mut self) -> io::Result<ResUse> {
         let leader = self.leader.take().ok_or(io::ErrorKind::InvalidInput)?;
-        end(self.id, leader)
+        kill_and_wait(self.id, leader)
     }
 }
 
 impl Drop for Group {
     fn drop(&mut self) {
         if let Some(leader) = self.leader.take() {
-            end(self.id, leader).ok();
+            kill_and_wait(self.id, leader).ok();
         }
     }
 }
 
-fn end(id: Pid, leader: Child) -> io::Result<ResUse> {
-    // Mostly there is nothing left.
+fn kill_and_wait(id: Pid, leader: Child) -> io::Result<ResUse> {
+    // An error means that all processes have ended, as is usual.
     kill_process_group(id, Signal::KILL).ok();
-    // First: the number is free for others as soon as the leader is waited for.
+    // Before the wait, after which another process may get the same id.
     running().remove(&id.as_raw_pid());
     leader.wait4()
 }
 
-/// Returns a flag that SIGINT, SIGTERM and SIGHUP set. The second of them kills all groups that
-/// run, and ends the process at once, with exit code 130.
+/// Returns a flag that SIGINT, SIGTERM and SIGHUP set. The second signal kills all running groups and
+/// ends the process with exit code 130.
 pub fn stop_on_signals() -> io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let (mut signals, sender) = UnixStream::pair()?;
@@ -91,7 +91,7 @@ pub fn stop_on_signals() -> io::Result<Arc<AtomicBool>> {
     }
     let flag = Arc::clone(&stop);
     std::thread::Builder::new().spawn(move || {
-        // A byte for each signal; `sender` lives as long as the process.
+        // The pipe gets a byte per signal; `sender` lives as long as the process.
         while signals.read_exact(&mut [0]).is_ok() {
             if flag.swap(true, Ordering::SeqCst) {
                 kill_all();
@@ -102,7 +102,7 @@ pub fn stop_on_signals() -> io::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-/// Kills all groups. None starts from then on.
+/// Kills all groups, and blocks the start of further ones by keeping the lock.
 fn kill_all() {
     let running = running();
     for id in running.iter().filter_map(|id| Pid::from_raw(*id)) {

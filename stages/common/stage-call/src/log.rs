@@ -1,4 +1,4 @@
-//! The log of a stage: when it started, with what, all it said, how far it got, and how it ended.
+//! Log file of a stage: start time, arguments, output, progress and result.
 
 use std::fmt::Display;
 use std::fs::File;
@@ -8,51 +8,52 @@ use std::sync::{Mutex, PoisonError};
 
 use artifact::{printable, unix_time};
 
-use crate::clock::utc;
+use crate::utc;
 
-/// The file, which the readers of both pipes write to.
+/// Log file, shared by the readers of stdout and stderr.
 pub(crate) struct StageLog {
     file: Mutex<File>,
 }
 
 impl StageLog {
-    /// Goes on after what earlier attempts said.
+    /// Opens a log file to append to the lines of earlier attempts.
     pub(crate) fn open(path: &Path) -> io::Result<Self> {
         Ok(Self { file: Mutex::new(File::options().create(true).append(true).open(path)?) })
     }
 
-    /// The first line of a run.
+    /// Writes the first line of an attempt.
     pub(crate) fn start(&self, label: &str) {
         self.line(format_args!("{label}: started {}", utc(unix_time())));
     }
 
-    /// Writes a line, control characters spelled out.
+    /// Writes a line with escaped control characters.
     pub(crate) fn line(&self, text: impl Display) {
         let line = format!("{}\n", printable(&text.to_string()));
-        // The log is for people; a full disk shows itself in the output.
+        // An error is ignored: the log isn't part of the result, and a full disk fails the output.
         self.file.lock().unwrap_or_else(PoisonError::into_inner).write_all(line.as_bytes()).ok();
     }
 }
 
-/// Thins out progress: a line at each tenth of a piece of work.
+/// Filter that reduces progress to one log line per tenth of each task.
 #[derive(Default)]
-pub(crate) struct Tenths {
-    work: String,
+pub(crate) struct ProgressFilter {
+    task: String,
+    /// Tenths of the task that were logged.
     tenth: u128,
 }
 
-impl Tenths {
-    /// How far the work is, in words, where that is another tenth than was last told.
-    pub(crate) fn told(&mut self, work: &str, done: u64, total: u64, note: &str) -> Option<String> {
-        if self.work != work {
-            *self = Self { work: work.to_owned(), tenth: 0 };
+impl ProgressFilter {
+    /// Returns the log line of a progress event if the task has reached a further tenth.
+    pub(crate) fn line(&mut self, task: &str, done: u64, total: u64, note: &str) -> Option<String> {
+        if self.task != task {
+            *self = Self { task: task.to_owned(), tenth: 0 };
         }
         let tenth = u128::from(done) * 10 / u128::from(total.max(1));
         if tenth <= self.tenth {
             return None;
         }
         self.tenth = tenth;
-        Some(format!("{work}: {}% {note}", tenth * 10).trim_end().to_owned())
+        Some(format!("{task}: {}% {note}", tenth * 10).trim_end().to_owned())
     }
 }
 
@@ -61,19 +62,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn progress_is_told_at_tenths() {
-        let mut tenths = Tenths::default();
-        let mut told = Vec::new();
+    fn progress_is_logged_at_tenths() {
+        let mut filter = ProgressFilter::default();
+        let mut lines = Vec::new();
         for done in 0..=1000 {
-            told.extend(tenths.told("training", done, 1000, "PSNR 20"));
+            lines.extend(filter.line("training", done, 1000, "PSNR 20"));
         }
         assert_eq!(
-            (told.len(), told[0].as_str(), told[9].as_str()),
+            (lines.len(), lines[0].as_str(), lines[9].as_str()),
             (10, "training: 10% PSNR 20", "training: 100% PSNR 20")
         );
-        // Other work begins anew; counts may be as large as can be.
+        // Another task starts at 0; products of large counts must not overflow.
         assert_eq!(
-            tenths.told("rendering", u64::MAX / 2, u64::MAX, ""),
+            filter.line("rendering", u64::MAX / 2, u64::MAX, ""),
             Some("rendering: 40%".to_owned())
         );
     }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use artifact::{hash_json, unix_time};
 use planning::{FoundInputs, Node, NodeInput, Origin, Plan, find_inputs};
 use serde_json::{Map, Value};
-use stage_call::{Call, Display, StageFailure, StageView, Usage, seconds, summary_of};
+use stage_call::{Call, Display, StageFailure, StageView, Usage, read_summary, seconds};
 use store::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, host_name};
 
 use crate::unchanged::{ConfirmedProgram, Inputs, unusable};
@@ -144,7 +144,7 @@ impl NodeJob<'_> {
             peak_memory: Some(usage.peak_memory),
             processor_seconds: Some(milliseconds(usage.processor_seconds)),
             host: host_name(),
-            summary: summary_of(&attempt.output),
+            summary: read_summary(&attempt.output),
         };
         let checked =
             self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;

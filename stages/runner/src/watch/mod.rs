@@ -225,9 +225,9 @@ struct EndInTime<'a> {
 impl Watcher for EndInTime<'_> {
     fn progress(&self, _: &Event) {}
 
-    fn said(&self, _: &str) {}
+    fn stderr_line(&self, _: &str) {}
 
-    fn alive(&self) {
+    fn tick(&self) {
         let is_over = self.look.watching.is_over.load(Ordering::Relaxed);
         if is_over || Instant::now() >= self.look.deadline {
             self.stop.store(true, Ordering::Relaxed);
