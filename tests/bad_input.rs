@@ -65,7 +65,7 @@ fn datasets_that_cannot_be_used() {
         |_, d| std::fs::remove_dir_all(d).unwrap(),
         &[],
         3,
-        &["input dataset", "data", "name a folder that is there"],
+        &["input dataset", "data", "name an existing folder"],
     );
     refused(
         |_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(),
@@ -239,7 +239,7 @@ fn pipelines_that_cannot_be_used() {
         ("lr_width: 24", "lr_width: twenty", 8, "parameter lr_width"),
         ("lr_width: 24", "lr_width: -3", 8, "parameter lr_width"),
         ("lr_width: 24", "lr_widht: 24", 8, "parameter lr_widht: unknown"),
-        ("default: [eval]", "default: [all]", 0, "named in `default`"),
+        ("default: [eval]", "default: [all]", 0, "default: no stage"),
         ("  eval:\n", "  eval:\n    run: ./nowhere\n", 0, "set `run:`"),
         ("default: [eval]", "default: [eval", 0, ""),
     ] {
@@ -263,7 +263,7 @@ fn a_cycle_is_named() {
     std::process::Command::new("chmod").arg("+x").arg(project.path("x")).status().unwrap();
     project
         .run(&["run"])
-        .fails(2, &["pipeline.yaml:", "lead back to it", "one ← two ← three ← one"]);
+        .fails(2, &["pipeline.yaml:", "inputs form a cycle", "one ← two ← three ← one"]);
 }
 
 #[test]
@@ -271,9 +271,9 @@ fn command_lines_that_cannot_be_used() {
     let project = Project::tiny();
     for (arguments, words) in [
         (&["run", "nowhere"][..], "no stage \"nowhere\""),
-        (&["run", "-p", "kernal=box"], "no stage has such a parameter"),
+        (&["run", "-p", "kernal=box"], "no stage has this parameter"),
         (&["run", "-p", "kernel"], "expected NAME=VALUE"),
-        (&["run", "-i", "nothing=."], "no stage has such an input"),
+        (&["run", "-i", "nothing=."], "no stage has this input"),
         (&["run", "-j", "0"], "at least 1"),
         (&["why", "nowhere"], "no stage \"nowhere\""),
     ] {

@@ -93,5 +93,5 @@ fn wrong_names_are_told_the_nearest() {
     project.replace("scene: prep/train", "scene: prep/trian");
     project
         .run(&["plan"])
-        .fails(2, &["pipeline.yaml:", "prep has no folder \"trian\"; did you mean train?"]);
+        .fails(2, &["pipeline.yaml:", "prep has no subtree \"trian\"; did you mean train?"]);
 }

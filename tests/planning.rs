@@ -64,7 +64,7 @@ fn only_run_starts_a_foreign_program() {
                 &[
                     "pipeline.yaml:3: stage mine",
                     "mine.sh",
-                    "`nerf-sr run` starts it; read it first",
+                    "read it first, then start it with `nerf-sr run`",
                 ],
             );
         }
@@ -166,7 +166,7 @@ fn a_missing_program_is_missed_where_it_is_needed() {
     run_installed(&project, &["plan"])
         .fails(2, &["pipeline.yaml:9: stage train-ss: ", "train-ss isn't built; run `make build`"]);
     run_installed(&project, &["plan", "prep", "-p", "rays=1"])
-        .fails(2, &["no stage has such a parameter", "couldn't be asked"]);
+        .fails(2, &["no stage has this parameter", "not described: "]);
     project.replace("  demo-scene:\n", "  demo-secne:\n");
     project.replace("{dataset: demo-scene}", "{dataset: demo-secne}");
     run_installed(&project, &["plan"])
@@ -322,5 +322,5 @@ fn a_file_in_another_encoding_is_refused_with_the_cure() {
     project.write("pipeline.yaml", &format!("\u{feff}{}", TINY.replace('\n', "\r\n")));
     project.ok(&["plan"]);
     project.write("pipeline.yaml", "default: [../x]\nstages:\n  ../x: {run: report}\n");
-    project.run(&["plan"]).fails(2, &["pipeline.yaml:3: stage \"../x\": a stage's name"]);
+    project.run(&["plan"]).fails(2, &["pipeline.yaml:3: stage \"../x\": name must not start"]);
 }

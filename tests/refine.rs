@@ -119,9 +119,9 @@ fn a_block_follows_the_one_it_extends() {
     );
     let own = "parameters: {rays: 40000}";
     for (more, words) in [
-        ("extends: nothing", &["pipeline.yaml:", "there is no stage \"nothing\""][..]),
-        ("extends: downscaled-views", &["itself extends another"]),
-        ("extends: train-ss\n    run: train-ss", &["give one of them"]),
+        ("extends: nothing", &["pipeline.yaml:", "extends: no stage \"nothing\""][..]),
+        ("extends: downscaled-views", &["itself extends a block"]),
+        ("extends: train-ss\n    run: train-ss", &["remove one of them"]),
         ("like: train-ss", &["pipeline.yaml:", "unknown field `like`"]),
     ] {
         let changed = format!("{own}\n    {more}");

@@ -304,7 +304,7 @@ fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
     assert!(
         log.contains("failed after")
             && log.contains("slurm/")
-            && log.contains("ended with exit code 7"),
+            && log.contains("exit code 7 without a message"),
         "{log}"
     );
     // Once more: what failed, and what needs it.

@@ -290,8 +290,9 @@ impl From<What> for Request {
     fn from(what: What) -> Self {
         let OfExperiment { scenes, protocols, variants, first_variants, show, data } =
             what.experiment;
-        let choice = Selection { data, scenes, protocols, variants, first: first_variants, show };
-        Self { targets: what.targets, parameters: what.parameters, inputs: what.inputs, choice }
+        let selection =
+            Selection { data, scenes, protocols, variants, max_variants: first_variants, show };
+        Self { targets: what.targets, parameters: what.parameters, inputs: what.inputs, selection }
     }
 }
 
@@ -316,7 +317,7 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     let session = Session::open(&cli.pipeline, cli.store.as_deref(), devices)?;
     match cli.verb {
         Verb::Run { what, how } => {
-            let home = session.pipeline.home();
+            let home = session.pipeline.project_folder();
             let out = how.out.clone().unwrap_or_else(|| home.join("out"));
             let words = given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device);
             let executor = executor(cli.executor, &how, Remedy::new(words), &out)?;

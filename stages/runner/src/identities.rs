@@ -20,12 +20,12 @@ pub(crate) fn identities(
                     format!("{}/{}", identities[*index], subtree.as_deref().unwrap_or_default())
                 }
                 Origin::Folder(folder) => {
-                    read_source(store, node, &input.name, folder, stop)?.content()
+                    read_source(store, node, &input.name, folder, stop)?.content_hash()
                 }
             };
             inputs.push((input.name.clone(), from));
         }
-        identities.push(hash_json(&planning::parts(node, &inputs, plan.device(&node.stage))));
+        identities.push(hash_json(&planning::key_parts(node, &inputs, plan.device(&node.stage))));
     }
     Ok(identities)
 }

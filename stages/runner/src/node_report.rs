@@ -119,7 +119,7 @@ impl NodeReport {
             number,
             stage: node.stage.clone(),
             point: node.point.clone(),
-            state: state.word(),
+            state: state.name(),
             parameters: node.parameters.as_object().cloned().unwrap_or_default(),
             by_scene: Map::new(),
             inputs: node.run_inputs(Some),

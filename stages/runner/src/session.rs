@@ -4,7 +4,7 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{Failure, report_text};
-use planning::{Asking, Devices, Origin, Pipeline, Plan, PlanError, Request, State};
+use planning::{Describing, Devices, Origin, Pipeline, Plan, PlanError, Request, State};
 use slurm::{Job, Queue, Slurm};
 use stage::check_device;
 use store::Store;
@@ -26,8 +26,9 @@ impl Session {
     ) -> anyhow::Result<Self> {
         check_device(&devices.given).map_err(|e| PlanError::Usage(e.to_string()))?;
         let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
-        check_name("the pipeline's folder", &pipeline.home())?;
-        let root = store.map_or_else(|| pipeline.home().join(".nerf-sr"), Path::to_path_buf);
+        check_name("the pipeline's folder", &pipeline.project_folder())?;
+        let root =
+            store.map_or_else(|| pipeline.project_folder().join(".nerf-sr"), Path::to_path_buf);
         check_name("the store", &root)?;
         std::fs::create_dir_all(&root).with_context(|| {
             format!("cannot open the store {}; name another with --store", root.display())
@@ -41,17 +42,18 @@ impl Session {
 
     /// The plan, to look at: no program is started that isn't the runner's own.
     pub(crate) fn plan(&self, what: &Request) -> anyhow::Result<Plan> {
-        self.plan_asking(what, Asking::Look)
+        self.plan_asking(what, Describing::Own)
     }
 
     /// The plan, to be run; asking stages what they are ends when `stop` is set.
     pub(crate) fn plan_to_run(&self, what: &Request, stop: &AtomicBool) -> anyhow::Result<Plan> {
-        self.plan_asking(what, Asking::Run(stop))
+        self.plan_asking(what, Describing::Needed(stop))
     }
 
-    fn plan_asking(&self, what: &Request, asking: Asking) -> anyhow::Result<Plan> {
-        let (pipeline, targets) = planning::find(&self.pipeline, &what.targets)?;
-        let plan = Plan::new(&pipeline, &self.store, &Request { targets, ..what.clone() }, asking)?;
+    fn plan_asking(&self, what: &Request, describing: Describing) -> anyhow::Result<Plan> {
+        let (pipeline, targets) = planning::find_targets(&self.pipeline, &what.targets)?;
+        let plan =
+            Plan::new(&pipeline, &self.store, &Request { targets, ..what.clone() }, describing)?;
         let plan = Plan { devices: self.devices.clone(), ..plan };
         check_apart(&plan, "the store", self.store.root())?;
         plan.notes.iter().for_each(|note| report_text(note));

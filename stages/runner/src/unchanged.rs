@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 
 use artifact::{Damage, FileEntry, MANIFEST_FILE, Manifest};
 use planning::{
-    FoundInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp, Unconfirmed,
+    ConfirmError, FoundInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp,
     read_source,
 };
 use stage_call::StageFailure;
@@ -40,8 +40,8 @@ impl<'a> ConfirmedProgram<'a> {
     }
 }
 
-fn unconfirmed(problem: &Unconfirmed) -> StageFailure {
-    let code = if matches!(problem, Unconfirmed::Interrupted) { 130 } else { 2 };
+fn unconfirmed(problem: &ConfirmError) -> StageFailure {
+    let code = if matches!(problem, ConfirmError::Interrupted) { 130 } else { 2 };
     StageFailure { code, message: problem.to_string() }
 }
 
@@ -113,8 +113,11 @@ impl<'a> Inputs<'a> {
     /// that attempt began: the content is the same again, but not what the attempt read. Returns
     /// whether there were any.
     pub(crate) fn drop_doubtful_checkpoints(&self, attempt: &Attempt) -> io::Result<bool> {
-        let times: BTreeMap<&str, String> =
-            self.sources.iter().map(|(name, source)| (name.as_str(), source.times())).collect();
+        let times: BTreeMap<&str, String> = self
+            .sources
+            .iter()
+            .map(|(name, source)| (name.as_str(), source.times_hash()))
+            .collect();
         if times.is_empty() {
             return Ok(false);
         }

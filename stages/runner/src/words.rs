@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use artifact::hash_json;
-use planning::{Node, Plan, Sink, State, short};
+use planning::{Node, Plan, Sink, State, short_hash};
 use serde_json::Value;
 use stage_call::seconds;
 use store::Record;
@@ -51,7 +51,7 @@ pub(crate) fn words(
                     match session.store.record(&hash_json(key_parts)) {
                         Ok(Some(record)) => format!(
                             "will run: its artifact {} is gone or incomplete",
-                            short(&record.output)
+                            short_hash(&record.output)
                         ),
                         _ => "will run".to_owned(),
                     }

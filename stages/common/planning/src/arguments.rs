@@ -1,85 +1,86 @@
-//! What stands after `=` on the command line: `-p NAME=VALUE[,VALUE…]`.
+//! Values on the command line: `-p NAME=VALUE[,VALUE…]` (docs/design/030, S3.6).
 //!
-//! One rule for a value: a JSON number, `true`, `false` or `null` is that; nothing at all is
-//! `null`; what begins with `[`, `{` or `"` is JSON, commas inside it included; anything else is a
-//! word, as it stands. So `0x10`, `+2`, `02` and ` 2` are words, and where a number is expected the
-//! parameter's type refuses them.
+//! A JSON number, `true`, `false` or `null` is parsed as JSON. An empty value is `null`. A value that
+//! starts with `[`, `{` or `"` is JSON and may contain commas. Any other value is a string: also
+//! `0x10`, `+2`, `02` and ` 2`, which the type of a numeric parameter refuses.
 
 use serde_json::Value;
 
-/// What is wrong after `=`, and what to do.
+/// Error returned for invalid values of an argument.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ArgumentError {
     /// One of several values is empty.
-    #[error("a value between commas is empty; leave the comma out, or write null")]
+    #[error("empty value between commas; remove the comma, or write null")]
     EmptyValue,
-    /// A value isn't the JSON that it begins like.
-    #[error("{value} begins like JSON and isn't: {problem}")]
+    /// A value starts like JSON, but is invalid.
+    #[error("{value} is invalid JSON: {problem}")]
     Json {
-        /// The value.
+        /// Text of the value.
         value: String,
-        /// What is wrong.
+        /// Error of the parser.
         problem: serde_json::Error,
     },
-    /// There is no folder.
-    #[error("no folder is named")]
+    /// No folder is given.
+    #[error("expected a folder after `=`")]
     NoFolder,
-    /// One of several folders has no name.
-    #[error("a folder's name between commas is empty; leave the comma out")]
+    /// One of several folders is empty.
+    #[error("empty folder name between commas; remove the comma")]
     EmptyFolder,
 }
 
-/// The values of a list with what they mean. Of several none may be empty.
+/// Parses a list of values. Returns each with its text.
 pub(crate) fn values(text: &str) -> Result<Vec<(&str, Value)>, ArgumentError> {
     if text.is_empty() {
         return Ok(vec![("", Value::Null)]);
     }
-    split(text).into_iter().map(|piece| Ok((piece, value(piece)?))).collect()
+    split(text).into_iter().map(|part| Ok((part, parse_value(part)?))).collect()
 }
 
-/// The folders of a list.
+/// Parses a list of folders.
 pub(crate) fn folders(text: &str) -> Result<Vec<&str>, ArgumentError> {
-    let folders: Vec<&str> = text.split(',').collect();
-    match folders.iter().any(|folder| folder.is_empty()) {
-        true if text.is_empty() => Err(ArgumentError::NoFolder),
-        true => Err(ArgumentError::EmptyFolder),
-        false => Ok(folders),
+    if text.is_empty() {
+        return Err(ArgumentError::NoFolder);
     }
+    let folders: Vec<&str> = text.split(',').collect();
+    if folders.contains(&"") { Err(ArgumentError::EmptyFolder) } else { Ok(folders) }
 }
 
-fn value(piece: &str) -> Result<Value, ArgumentError> {
-    if piece.is_empty() {
+fn parse_value(text: &str) -> Result<Value, ArgumentError> {
+    if text.is_empty() {
         return Err(ArgumentError::EmptyValue);
     }
-    let parsed = serde_json::from_str::<Value>(piece);
-    if piece.starts_with(JSON) {
-        return parsed.map_err(|problem| ArgumentError::Json { value: piece.to_owned(), problem });
+    let parsed = serde_json::from_str::<Value>(text);
+    if text.starts_with(JSON_START) {
+        return parsed.map_err(|problem| ArgumentError::Json { value: text.to_owned(), problem });
     }
-    // JSON itself allows white space around a value.
-    Ok(parsed.ok().filter(|_| piece.trim() == piece).unwrap_or_else(|| Value::from(piece)))
+    // A value with white space around it is a string, although JSON allows white space.
+    Ok(parsed.ok().filter(|_| text.trim() == text).unwrap_or_else(|| Value::from(text)))
 }
 
-/// What JSON with commas inside begins with.
-const JSON: [char; 3] = ['[', '{', '"'];
+/// First characters of JSON values that may contain commas.
+const JSON_START: [char; 3] = ['[', '{', '"'];
 
+/// Splits a list at the commas that aren't inside JSON.
 fn split(text: &str) -> Vec<&str> {
-    let mut pieces = Vec::new();
+    let mut parts = Vec::new();
     let mut rest = Some(text);
     while let Some(text) = rest {
-        let end = if text.starts_with(JSON) {
+        let end = if text.starts_with(JSON_START) {
             json_end(text)
         } else {
             text.find(',').unwrap_or(text.len())
         };
-        pieces.push(&text[..end]);
+        parts.push(&text[..end]);
         rest = text.get(end + 1..);
     }
-    pieces
+    parts
 }
 
-/// Where the first comma outside brackets and quotes stands, or the end.
+/// Returns the position of the first comma outside brackets and quotes, or the length of the text.
 fn json_end(text: &str) -> usize {
-    let (mut depth, mut is_quoted, mut is_escaped) = (0usize, false, false);
+    let mut depth = 0usize;
+    let mut is_quoted = false;
+    let mut is_escaped = false;
     for (at, c) in text.char_indices() {
         match c {
             _ if is_escaped => is_escaped = false,
@@ -131,17 +132,17 @@ mod tests {
     #[test]
     fn what_cannot_be_meant_is_refused() {
         for (text, words) in [
-            (",", "between commas is empty"),
-            ("1,,2", "between commas is empty"),
+            (",", "empty value between commas"),
+            ("1,,2", "empty value between commas"),
             ("1,", "write null"),
-            ("[1,2", "begins like JSON and isn't"),
-            ("\"a", "begins like JSON and isn't"),
+            ("[1,2", "is invalid JSON"),
+            ("\"a", "is invalid JSON"),
         ] {
             let problem = values(text).unwrap_err().to_string();
             assert!(problem.contains(words), "{text}: {problem}");
         }
         assert_eq!(folders("a,./b").unwrap(), ["a", "./b"]);
-        assert!(folders("").unwrap_err().to_string().contains("no folder"));
-        assert!(folders("a,,b").unwrap_err().to_string().contains("leave the comma out"));
+        assert!(folders("").unwrap_err().to_string().contains("expected a folder"));
+        assert!(folders("a,,b").unwrap_err().to_string().contains("remove the comma"));
     }
 }

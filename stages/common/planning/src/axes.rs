@@ -1,5 +1,5 @@
-//! What the command line sets: values of parameters and inputs, each for a stage, swept where there
-//! are several.
+//! Axes of the plan: values of parameters and inputs from the command line and from experiments,
+//! swept if there are several.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -8,30 +8,31 @@ use artifact::known_names;
 use serde_json::Value;
 
 use crate::arguments;
+use crate::check::known_stages;
 use crate::file::StageBlock;
 use crate::pipeline::Pipeline;
 use crate::request::{PlanError, Request};
 use crate::stages::{Programs, StageProgram};
 
-/// Settings that go together, or several such that are swept.
+/// Alternative values, of which each point of the sweep has one.
 #[derive(Debug)]
 pub(crate) struct Axis {
-    /// By which points are called.
+    /// Name in the labels of points.
     pub name: String,
     pub values: Vec<AxisValue>,
-    /// Whether points have its value in their name, though it is the only one.
+    /// True if tables list the axis's value, even if it is the only one.
     pub is_named: bool,
-    /// As it was given, for people.
-    given: String,
+    /// Text on the command line, for messages.
+    argument: String,
 }
 
-/// A parameter or an input of a stage, set.
+/// A value of one parameter or input of a stage.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Setting {
     pub stage: String,
     pub kind: Kind,
     pub name: String,
-    /// The parameter's value; of an input, the folder that it leads to.
+    /// Value of a parameter, or canonical path of an input's folder.
     pub value: Value,
 }
 
@@ -41,8 +42,8 @@ pub(crate) enum Kind {
     Input,
 }
 
-/// One value of an axis: as it was written, and what it sets. On the command line that is one
-/// thing; a scene, a protocol or a variant of an experiment sets several.
+/// One value of an axis: its text and its settings. A value on the command line has one setting; a
+/// scene, protocol or variant of an experiment has several.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct AxisValue {
     pub text: String,
@@ -64,14 +65,7 @@ impl Kind {
         }
     }
 
-    fn article(self) -> &'static str {
-        match self {
-            Self::Parameter => "a",
-            Self::Input => "an",
-        }
-    }
-
-    /// Whether a block gives that name itself.
+    /// Returns whether a block gives a parameter or input itself.
     pub(crate) fn is_given(
         self,
         program: Option<&StageProgram>,
@@ -93,174 +87,178 @@ impl Kind {
 }
 
 impl Setting {
-    /// The folder that an input leads to.
+    /// Returns the folder of an input.
     pub(crate) fn folder(&self) -> PathBuf {
         PathBuf::from(self.value.as_str().unwrap_or_default())
     }
 
-    fn is_of(&self, other: &Self) -> bool {
+    fn has_same_target(&self, other: &Self) -> bool {
         (&self.stage, self.kind, &self.name) == (&other.stage, other.kind, &other.name)
     }
 }
 
 impl Axis {
-    /// An axis of an experiment.
+    /// Creates an axis of an experiment.
     pub(crate) fn new(name: &str, values: Vec<AxisValue>) -> Self {
-        Self { name: name.to_owned(), values, is_named: true, given: String::new() }
+        Self { name: name.to_owned(), values, is_named: true, argument: String::new() }
     }
 
-    /// All that any of its values sets.
+    /// Returns the settings of all values.
     pub(crate) fn settings(&self) -> impl Iterator<Item = &Setting> {
         self.values.iter().flat_map(|value| &value.settings)
     }
 
-    /// Whether each of its values sets one thing.
+    /// Returns whether each value has one setting.
     fn is_single(&self) -> bool {
         self.values.iter().all(|value| value.settings.len() == 1)
     }
 
-    /// Whether both set one and the same thing.
-    fn is_of(&self, other: &Self) -> bool {
-        self.settings().zip(other.settings()).next().is_some_and(|(one, other)| one.is_of(other))
+    /// Returns whether the first settings of two axes set the same parameter or input.
+    fn has_same_target(&self, other: &Self) -> bool {
+        let first = self.settings().next();
+        first.is_some_and(|own| other.settings().next().is_some_and(|s| own.has_same_target(s)))
     }
 }
 
-/// What names on the command line are looked up in.
+/// Context for resolving the names of parameters and inputs.
 pub(crate) struct Scope<'a> {
     pub pipeline: &'a Pipeline,
     pub programs: &'a Programs,
-    /// The stages that the targets come to.
+    /// Targets and their transitive dependencies.
     pub needed: &'a BTreeSet<String>,
 }
 
 impl Scope<'_> {
-    /// The axes in the order in which they were given, the last one where several set the same; and
-    /// what to say of it.
-    ///
-    /// `experiment` are those of the pipeline's file.
+    /// Returns the axes of the experiment and the command line, with notes on overridden and
+    /// repeated arguments. Later axes override earlier ones.
     pub(crate) fn axes(
         &self,
         request: &Request,
         mut experiment: Vec<Axis>,
     ) -> Result<(Vec<Axis>, Vec<String>), PlanError> {
-        let (mut axes, mut notes): (Vec<Axis>, Vec<String>) = (Vec::new(), Vec::new());
+        let mut axes: Vec<Axis> = Vec::new();
+        let mut notes = Vec::new();
         let parameters = request.parameters.iter().map(|text| (Kind::Parameter, text));
         let inputs = request.inputs.iter().map(|text| (Kind::Input, text));
         for (kind, text) in parameters.chain(inputs) {
-            let axis = self.axis(kind, text, &mut notes)?;
-            if let Some(earlier) = axes.iter().position(|earlier| earlier.is_of(&axis)) {
-                notes.push(format!("{}: overridden by {}", axes.remove(earlier).given, axis.given));
+            let axis = self.parse_axis(kind, text, &mut notes)?;
+            if let Some(earlier) = axes.iter().position(|earlier| earlier.has_same_target(&axis)) {
+                let overridden = axes.remove(earlier).argument;
+                notes.push(format!("{overridden}: overridden by {}", axis.argument));
             }
-            // A sweep of the file gives way; what sets several things at once stays, and the
-            // command line wins over a part of it.
-            let before = experiment.len();
-            experiment.retain(|earlier| !earlier.is_single() || !earlier.is_of(&axis));
-            // What takes the place of an axis with a name is in tables, too.
-            let is_named = axis.is_named || experiment.len() < before;
+            // An axis with one setting per value is replaced. One with several stays, and the
+            // command line overrides one of its settings.
+            let count = experiment.len();
+            experiment.retain(|earlier| !earlier.is_single() || !earlier.has_same_target(&axis));
+            let is_named = axis.is_named || experiment.len() < count;
             axes.push(Axis { is_named, ..axis });
         }
-        // What is said on the command line comes later, and so wins.
-        Ok((experiment.into_iter().chain(axes).collect(), notes))
+        experiment.extend(axes);
+        Ok((experiment, notes))
     }
 
-    /// What a name and a value of an experiment's file set.
+    /// Resolves a name and value of an experiment.
     pub(crate) fn setting(
         &self,
         kind: Kind,
         name: &str,
         value: &Value,
     ) -> Result<Setting, PlanError> {
-        let (stage, name) =
-            self.owner(kind, name).map_err(|error| self.in_file(kind, name, error))?;
+        let (stage, name) = self.find_owner(kind, name).map_err(|error| match error {
+            PlanError::Usage(problem) => {
+                let problem = problem.trim_start_matches(kind.flag()).trim_start();
+                self.pipeline.error_in_experiment(name, problem).into()
+            }
+            other => other,
+        })?;
         let program = self.programs.require(&stage)?;
-        let value = if kind == Kind::Parameter {
-            program.schema.canonical_value(&name, value)
-        } else {
-            value.clone()
+        let value = match kind {
+            Kind::Parameter => program.schema.canonical_value(&name, value),
+            Kind::Input => value.clone(),
         };
         Ok(Setting { stage, kind, name, value })
     }
 
-    /// An error about what the command line could say, as one about a name in an experiment's file.
-    fn in_file(&self, kind: Kind, name: &str, error: PlanError) -> PlanError {
-        match error {
-            PlanError::Usage(problem) => {
-                let problem = problem.trim_start_matches(kind.flag()).trim_start();
-                PlanError::Pipeline(self.pipeline.error_in_experiment(name, problem))
-            }
-            other => other,
-        }
-    }
-
-    fn axis(&self, kind: Kind, text: &str, notes: &mut Vec<String>) -> Result<Axis, PlanError> {
-        let given = format!("{} {text}", kind.flag());
-        let usage = |problem: String| PlanError::Usage(format!("{given}: {problem}"));
-        let (name, text) =
-            text.split_once('=').ok_or_else(|| usage("expected NAME=VALUE[,VALUE…]".to_owned()))?;
-        let (stage, name) = self.owner(kind, name)?;
+    /// Parses an argument NAME=VALUE[,VALUE…].
+    fn parse_axis(
+        &self,
+        kind: Kind,
+        text: &str,
+        notes: &mut Vec<String>,
+    ) -> Result<Axis, PlanError> {
+        let argument = format!("{} {text}", kind.flag());
+        let (name, text) = text
+            .split_once('=')
+            .ok_or_else(|| usage_error(&argument, "expected NAME=VALUE[,VALUE…]"))?;
+        let (stage, name) = self.find_owner(kind, name)?;
         let program = self.programs.require(&stage)?;
-        let values: Vec<(&str, Value)> = match kind {
+        let texts_and_values: Vec<(&str, Value)> = match kind {
             Kind::Parameter => {
-                let given = arguments::values(text).map_err(|e| usage(e.to_string()))?.into_iter();
+                let given = arguments::values(text).map_err(|e| usage_error(&argument, e))?;
                 given
-                    .map(|(text, given)| (text, program.schema.canonical_value(&name, &given)))
+                    .into_iter()
+                    .map(|(text, value)| (text, program.schema.canonical_value(&name, &value)))
                     .collect()
             }
-            Kind::Input => arguments::folders(text)
-                .map_err(|e| usage(e.to_string()))?
-                .into_iter()
-                .map(|text| (text, folder(text)))
-                .collect(),
+            Kind::Input => {
+                let folders = arguments::folders(text).map_err(|e| usage_error(&argument, e))?;
+                folders.into_iter().map(|text| (text, canonical_folder(text))).collect()
+            }
         };
-        let values = values.into_iter().map(|(text, value)| AxisValue {
-            text: text.to_owned(),
-            settings: vec![Setting { stage: stage.clone(), kind, name: name.clone(), value }],
-        });
-        let values = each_once(values.collect(), |again, first| {
-            notes.push(format!("{given}: {again} is {first} again; it is made once"));
-        });
+        let mut values: Vec<AxisValue> = Vec::new();
+        for (text, value) in texts_and_values {
+            let settings = vec![Setting { stage: stage.clone(), kind, name: name.clone(), value }];
+            match values.iter().find(|earlier| earlier.settings == settings) {
+                Some(earlier) => {
+                    let first = &earlier.text;
+                    notes.push(format!("{argument}: {text} equals {first}; it is used once"));
+                }
+                None => values.push(AxisValue { text: text.to_owned(), settings }),
+            }
+        }
         if program.description.sink && kind == Kind::Input {
-            return Err(usage(format!(
-                "{stage} is a sink, which shows what the run made; it takes no folder"
-            )));
+            let problem = format!("{stage} is a sink, which shows results of the run, no folder");
+            return Err(usage_error(&argument, problem));
         }
         if program.description.sink && values.len() > 1 {
-            return Err(usage(format!(
+            let problem = format!(
                 "{stage} is a sink and shows all points of a sweep at once; give one value"
-            )));
+            );
+            return Err(usage_error(&argument, problem));
         }
         let is_named = values.len() > 1;
-        Ok(Axis { name, values, is_named, given })
+        Ok(Axis { name, values, is_named, argument })
     }
 
-    /// The stage that a name belongs to, and the name without it. Where several stages have the
-    /// name, that one is meant that the targets need; a block that extends another follows that
-    /// one.
-    fn owner(&self, kind: Kind, name: &str) -> Result<(String, String), PlanError> {
-        // A stage's own name may have a point.
+    /// Returns the stage that a name belongs to, and the name without the stage. If several stages
+    /// have the name, the one that the targets need is meant; a block that inherits the value
+    /// doesn't count.
+    fn find_owner(&self, kind: Kind, name: &str) -> Result<(String, String), PlanError> {
+        // A stage's name may contain dots.
         let mut splits = name.match_indices('.').map(|(at, _)| (&name[..at], &name[at + 1..]));
-        let stated = splits
+        let explicit = splits
             .find(|(stage, _)| self.pipeline.stages.contains_key(*stage))
             .or_else(|| name.split_once('.'));
-        if let Some((stage, own)) = stated {
-            return self.stated_owner(kind, (stage, own));
+        if let Some((stage, own_name)) = explicit {
+            self.check_owner(kind, stage, own_name)?;
+            return Ok((stage.to_owned(), own_name.to_owned()));
         }
         let stages = self.pipeline.stages.keys();
-        let with_name: Vec<&String> =
-            stages.filter(|s| self.has(s, kind, name) && !self.follows(s, kind, name)).collect();
-        let meant: Vec<&String> =
-            with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();
-        match if meant.is_empty() { &with_name } else { &meant }[..] {
-            [] => Err(self.unknown(kind, name)),
+        let all: Vec<&String> =
+            stages.filter(|s| self.has(s, kind, name) && !self.inherits(s, kind, name)).collect();
+        let needed: Vec<&String> =
+            all.iter().copied().filter(|s| self.needed.contains(*s)).collect();
+        match if needed.is_empty() { &all } else { &needed }[..] {
+            [] => Err(self.unknown_name(kind, name)),
             [stage] => Ok((stage.clone(), name.to_owned())),
             ref several => {
-                let options =
-                    several.iter().map(|s| format!("{s}.{name}")).collect::<Vec<_>>().join(", ");
-                let problem = format!(
-                    "{} {name}: more than one stage has it; say which: {options}",
-                    kind.flag()
-                );
-                Err(PlanError::Usage(problem))
+                let options: Vec<String> = several.iter().map(|s| format!("{s}.{name}")).collect();
+                Err(PlanError::Usage(format!(
+                    "{} {name}: several stages have this {}; choose one: {}",
+                    kind.flag(),
+                    kind.noun(),
+                    options.join(", ")
+                )))
             }
         }
     }
@@ -269,67 +267,53 @@ impl Scope<'_> {
         self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name))
     }
 
-    /// Whether a block extends another, and has that name's value from there.
-    fn follows(&self, stage: &str, kind: Kind, name: &str) -> bool {
+    /// Returns whether a block inherits a value from the block that it extends.
+    fn inherits(&self, stage: &str, kind: Kind, name: &str) -> bool {
         let block = &self.pipeline.stages[stage];
-        let is_own = || kind.is_given(self.programs.get(stage), block, name);
-        block.extends.as_ref().is_some_and(|other| self.needed.contains(other) || !is_own())
+        block.extends.as_ref().is_some_and(|other| {
+            self.needed.contains(other) || !kind.is_given(self.programs.get(stage), block, name)
+        })
     }
 
-    /// The stage that is named itself, which must have such a parameter or input.
-    fn stated_owner(
-        &self,
-        kind: Kind,
-        (stage, own): (&str, &str),
-    ) -> Result<(String, String), PlanError> {
-        let usage =
-            |problem: String| PlanError::Usage(format!("{} {stage}.{own}: {problem}", kind.flag()));
-        if !self.pipeline.stages.contains_key(stage) {
-            let known = known_names(stage, self.pipeline.stages.keys().map(String::as_str));
-            return Err(usage(format!("no stage {stage:?}; {known}")));
-        }
-        let names = kind.names(self.programs.require(stage)?);
-        if names.contains(&own) {
-            return Ok((stage.to_owned(), own.to_owned()));
-        }
-        Err(usage(format!("{stage} has no such {}; {}", kind.noun(), known_names(own, names))))
+    /// Checks that an explicitly named stage exists and has a parameter or input.
+    fn check_owner(&self, kind: Kind, stage: &str, name: &str) -> Result<(), PlanError> {
+        let problem = if self.pipeline.stages.contains_key(stage) {
+            let names = kind.names(self.programs.require(stage)?);
+            if names.contains(&name) {
+                return Ok(());
+            }
+            format!("{stage} has no such {}; {}", kind.noun(), known_names(name, names))
+        } else {
+            format!("no stage {stage:?}; {}", known_stages(self.pipeline, stage))
+        };
+        Err(PlanError::Usage(format!("{} {stage}.{name}: {problem}", kind.flag())))
     }
 
-    fn unknown(&self, kind: Kind, name: &str) -> PlanError {
+    fn unknown_name(&self, kind: Kind, name: &str) -> PlanError {
         let programs = self.pipeline.stages.keys().filter_map(|stage| self.programs.get(stage));
         let known: BTreeSet<&str> = programs.flat_map(|program| kind.names(program)).collect();
-        let meant = artifact::nearest(name, known)
+        let suggestion = artifact::nearest(name, known)
             .map(|known| format!("did you mean {known}? "))
             .unwrap_or_default();
-        let problem = format!(
-            "{} {name}: no stage has such {} {}; {meant}see `STAGE --help`",
+        let mut problem = format!(
+            "{} {name}: no stage has this {}; {suggestion}see `STAGE --help`",
             kind.flag(),
-            kind.article(),
             kind.noun()
         );
-        let unasked: Vec<&str> = self.programs.unknown().collect();
-        if unasked.is_empty() {
-            return PlanError::Usage(problem);
+        let unusable: Vec<&str> = self.programs.unusable().collect();
+        if !unusable.is_empty() {
+            problem += &format!("; not described: {}", unusable.join(", "));
         }
-        PlanError::Usage(format!("{problem}; {} couldn't be asked", unasked.join(", ")))
+        PlanError::Usage(problem)
     }
 }
 
-/// A folder's name, which means the folder that it leads to.
-pub(crate) fn folder(name: &str) -> Value {
-    let leads_to = Path::new(name).canonicalize().unwrap_or_else(|_| PathBuf::from(name));
-    Value::from(leads_to.to_string_lossy())
+fn usage_error(argument: &str, problem: impl std::fmt::Display) -> PlanError {
+    PlanError::Usage(format!("{argument}: {problem}"))
 }
 
-/// Values without those that mean the same as an earlier one; `tell` is told of these and of the
-/// earlier ones.
-fn each_once(values: Vec<AxisValue>, mut tell: impl FnMut(&str, &str)) -> Vec<AxisValue> {
-    let mut kept: Vec<AxisValue> = Vec::new();
-    for value in values {
-        match kept.iter().find(|earlier| earlier.settings == value.settings) {
-            Some(earlier) => tell(&value.text, &earlier.text),
-            None => kept.push(value),
-        }
-    }
-    kept
+/// Returns the canonical path of a folder as a setting's value.
+pub(crate) fn canonical_folder(name: &str) -> Value {
+    let path = Path::new(name).canonicalize().unwrap_or_else(|_| PathBuf::from(name));
+    Value::from(path.to_string_lossy())
 }

@@ -1,26 +1,27 @@
-//! What differs between two lists of named values, such as two keys.
+//! Differences between two maps of named values, such as the parts of two keys.
 
 use std::collections::BTreeSet;
 
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-/// A named value that differs.
+/// Named value that differs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Change {
-    /// Its name, such as `parameter kernel`.
+    /// Name, such as `parameter kernel`.
     pub name: String,
-    /// What it was, if it was there.
+    /// Earlier value; `None` if it was absent.
     pub before: Option<Value>,
-    /// What it is, if it is there.
+    /// Present value; `None` if it is absent.
     pub now: Option<Value>,
 }
 
-/// The values that differ, by name.
+/// Returns the values that differ, sorted by name.
 pub fn changes(before: &Map<String, Value>, now: &Map<String, Value>) -> Vec<Change> {
     let names: BTreeSet<&String> = before.keys().chain(now.keys()).collect();
-    let differing = names.into_iter().filter(|name| before.get(*name) != now.get(*name));
-    differing
+    names
+        .into_iter()
+        .filter(|name| before.get(*name) != now.get(*name))
         .map(|name| Change {
             name: name.clone(),
             before: before.get(name).cloned(),
@@ -29,31 +30,32 @@ pub fn changes(before: &Map<String, Value>, now: &Map<String, Value>) -> Vec<Cha
         .collect()
 }
 
-/// The beginning of a hash, for people.
-pub fn short(hash: &str) -> &str {
+/// Returns the first digits of a hash, for messages.
+pub fn short_hash(hash: &str) -> &str {
     hash.get(..10).unwrap_or(hash)
 }
 
 impl std::fmt::Display for Change {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}: {} → {}", self.name, words(self.before.as_ref()), words(self.now.as_ref()))?;
-        match (
-            self.before.as_ref().and_then(Value::as_f64),
-            self.now.as_ref().and_then(Value::as_f64),
-        ) {
-            (Some(before), Some(now)) if self.name.starts_with("metric ") => {
-                write!(f, " ({:+.4})", now - before)
-            }
-            _ => Ok(()),
+        let Self { name, before, now } = self;
+        write!(f, "{name}: {} → {}", format_value(before.as_ref()), format_value(now.as_ref()))?;
+        if name.starts_with("metric ")
+            && let Some(before) = before.as_ref().and_then(Value::as_f64)
+            && let Some(now) = now.as_ref().and_then(Value::as_f64)
+        {
+            write!(f, " ({:+.4})", now - before)?;
         }
+        Ok(())
     }
 }
 
-fn words(value: Option<&Value>) -> String {
+fn format_value(value: Option<&Value>) -> String {
     match value {
         None => "absent".to_owned(),
-        Some(Value::String(hash)) if hash.len() == 64 && hash.is_ascii() => short(hash).to_owned(),
-        // A whole number is one, however it was given.
+        Some(Value::String(hash)) if hash.len() == 64 && hash.is_ascii() => {
+            short_hash(hash).to_owned()
+        }
+        // 2 and 2.0 are equal as parameters, but not as JSON.
         Some(value) => value.to_string().trim_end_matches(".0").to_owned(),
     }
 }
@@ -64,7 +66,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn every_difference_in_words() {
+    fn differences_as_text() {
         let map = |value: Value| value.as_object().cloned().unwrap();
         let before = map(json!({
             "code": "a".repeat(64), "parameter kernel": "box", "parameter near": null,

@@ -1,5 +1,5 @@
-//! From stages and values to nodes: every stage once for each combination of the values that reach
-//! it.
+//! Expansion of stages and axes to nodes: each stage has one node for each combination of the values
+//! that reach it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -9,34 +9,34 @@ use contract::GivenInputs;
 use serde_json::{Map, Value};
 
 use crate::axes::{Axis, Kind, Setting};
-use crate::check::closure;
+use crate::check::dependencies;
 use crate::experiment::Selection;
-use crate::left_out::{Files, check_shown, shown};
+use crate::file::{InputSource, Part};
+use crate::left_out::{RequiredFiles, check_show, shown_stages};
 use crate::node::{Node, NodeInput, Origin, Plan, Sink};
-use crate::part::{Part, Source};
 use crate::pipeline::Pipeline;
 use crate::request::PlanError;
 use crate::stages::{Programs, StageProgram};
 
-/// More nodes than anybody means.
-const MOST_NODES: usize = 10_000;
+/// Maximum number of nodes in a plan, chosen by hand.
+const MAX_NODES: usize = 10_000;
 
-/// The value (by number) of every axis that reaches a node.
+/// Index of a value by index of the axis, for each axis that reaches a node.
 type Point = BTreeMap<usize, usize>;
 
-/// The expansion of stages to nodes.
+/// State of the expansion.
 pub(crate) struct Expansion<'a> {
     pipeline: &'a Pipeline,
     programs: &'a Programs,
     axes: &'a [Axis],
-    choice: &'a Selection,
-    files: Files,
+    selection: &'a Selection,
+    required_files: RequiredFiles,
     nodes: Vec<Node>,
-    /// The nodes of each stage, with the value (by number) of every axis that reaches them.
-    of_stage: BTreeMap<String, Vec<(Point, usize)>>,
-    /// The node of each result, by its stage, parameters and inputs.
-    of_result: BTreeMap<String, usize>,
-    /// The points of each stage that aren't made, with the reason.
+    /// Points of each stage, with the indices of their nodes.
+    nodes_by_stage: BTreeMap<String, Vec<(Point, usize)>>,
+    /// Index of a node by its stage, parameters and inputs.
+    node_by_content: BTreeMap<String, usize>,
+    /// Points of each stage that are left out, with the reason.
     left_out: BTreeMap<String, Vec<(Point, String)>>,
     notes: Vec<String>,
 }
@@ -46,42 +46,40 @@ impl<'a> Expansion<'a> {
         pipeline: &'a Pipeline,
         programs: &'a Programs,
         axes: &'a [Axis],
-        choice: &'a Selection,
+        selection: &'a Selection,
     ) -> Result<Self, PlanError> {
-        let files = Files::new(pipeline, choice)?;
-        let (nodes, notes) = (Vec::new(), Vec::new());
-        let (of_stage, of_result, left_out) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
         Ok(Self {
             pipeline,
             programs,
             axes,
-            choice,
-            files,
-            nodes,
-            of_stage,
-            of_result,
-            left_out,
-            notes,
+            selection,
+            required_files: RequiredFiles::new(pipeline, selection)?,
+            nodes: Vec::new(),
+            nodes_by_stage: BTreeMap::new(),
+            node_by_content: BTreeMap::new(),
+            left_out: BTreeMap::new(),
+            notes: Vec::new(),
         })
     }
 
-    /// Makes the nodes of what the targets need, in an order in which each comes after those that
-    /// it needs.
+    /// Creates the nodes of the targets and their dependencies, each after its parents. `order` is a
+    /// topological order of all stages.
     pub(crate) fn expand(
         mut self,
         order: &[String],
         targets: &[String],
     ) -> Result<Plan, PlanError> {
-        let wanted = closure(targets, |stage| self.sources(stage));
-        let of_targets: Vec<&str> =
-            wanted.iter().map(String::as_str).filter(|stage| self.is_sink(stage)).collect();
-        check_shown(self.pipeline, &of_targets, self.choice)?;
+        let needed = dependencies(targets, |stage| self.parent_stages(stage));
+        let sinks: Vec<&str> =
+            needed.iter().map(String::as_str).filter(|stage| self.is_sink(stage)).collect();
+        check_show(self.pipeline, &sinks, self.selection)?;
         let mut sinks = Vec::new();
-        for stage in order.iter().filter(|s| wanted.contains(*s)) {
+        for stage in order.iter().filter(|stage| needed.contains(*stage)) {
             let program = Arc::clone(self.programs.require(stage)?);
-            match program.description.sink {
-                true => sinks.push(self.sink(stage, program)?),
-                false => self.add_stage(stage, &program)?,
+            if program.description.sink {
+                sinks.push(self.sink(stage, program)?);
+            } else {
+                self.add_nodes(stage, &program)?;
             }
         }
         Ok(Plan { nodes: self.nodes, sinks, notes: self.notes, ..Plan::default() })
@@ -91,80 +89,71 @@ impl<'a> Expansion<'a> {
         self.programs.get(stage).is_some_and(|program| program.description.sink)
     }
 
-    /// The stages that one needs, or that it shows where it is a sink.
-    fn sources(&self, stage: &str) -> Vec<String> {
-        match self.is_sink(stage) {
-            true => {
-                shown(self.pipeline, stage, self.choice).into_iter().map(str::to_owned).collect()
-            }
-            // An input replaced from the command line needs nothing.
-            false => self
-                .block_inputs(stage)
-                .filter_map(|(_, source)| source.stage())
-                .map(str::to_owned)
-                .collect(),
+    /// Returns the stages that a stage needs, or that a sink shows.
+    fn parent_stages(&self, stage: &str) -> Vec<String> {
+        if self.is_sink(stage) {
+            let shown = shown_stages(self.pipeline, stage, self.selection);
+            return shown.into_iter().map(str::to_owned).collect();
         }
+        let sources = self.block_inputs(stage).into_iter();
+        sources.filter_map(|(_, source)| source.stage().map(str::to_owned)).collect()
     }
 
-    /// A sink, with all points of what it shows.
+    /// Creates a sink that shows all points of its stages.
     fn sink(&self, stage: &str, program: Arc<StageProgram>) -> Result<Sink, PlanError> {
         let parameters = self.resolve(stage, &program, &Point::new())?;
-        let (mut shows, mut left_out) = (BTreeSet::new(), Vec::new());
-        for of in shown(self.pipeline, stage, self.choice) {
-            shows.extend(self.of_stage.get(of).into_iter().flatten().map(|(_, node)| *node));
-            left_out.extend(self.left_out.get(of).into_iter().flatten().map(|(point, reason)| {
-                FailedPoint {
-                    stage: of.to_owned(),
+        let mut shows = BTreeSet::new();
+        let mut left_out = Vec::new();
+        for shown in shown_stages(self.pipeline, stage, self.selection) {
+            shows.extend(
+                self.nodes_by_stage.get(shown).into_iter().flatten().map(|(_, node)| *node),
+            );
+            for (point, reason) in self.left_out.get(shown).into_iter().flatten() {
+                left_out.push(FailedPoint {
+                    stage: shown.to_owned(),
                     point: self.label(point),
                     values: self.values(point),
                     reason: Some(reason.clone()),
-                }
-            }));
+                });
+            }
         }
-        Ok(Sink {
-            stage: stage.to_owned(),
-            program,
-            parameters,
-            shows: shows.into_iter().collect(),
-            left_out,
-        })
+        let shows = shows.into_iter().collect();
+        Ok(Sink { stage: stage.to_owned(), program, parameters, shows, left_out })
     }
 
-    /// A block's inputs less those that the command line or an experiment replaces at every point.
-    fn block_inputs(&self, stage: &str) -> impl Iterator<Item = (&'a str, Source<'a>)> {
-        let inputs = self.pipeline.stages[stage]
-            .inputs
-            .iter()
-            .map(|(name, source)| (name.as_str(), Source::of(source)));
-        let replaced: Vec<bool> = inputs
-            .clone()
-            .map(|(name, _)| self.axes.iter().any(|axis| replaces(axis, stage, name)))
-            .collect();
-        inputs.zip(replaced).filter(|(_, is_replaced)| !is_replaced).map(|(input, _)| input)
+    /// Returns the inputs of a block, without those that an axis replaces at every point.
+    fn block_inputs(&self, stage: &str) -> Vec<(&'a str, InputSource<'a>)> {
+        let mut inputs = Vec::new();
+        for (name, source) in &self.pipeline.stages[stage].inputs {
+            if !self.axes.iter().any(|axis| replaces_input(axis, stage, name)) {
+                inputs.push((name.as_str(), InputSource::parse(source)));
+            }
+        }
+        inputs
     }
 
-    /// Whether a setting reaches a stage itself: given for it, or for the one it extends where it
-    /// doesn't say otherwise.
-    fn sets(&self, set: &Setting, stage: &str) -> bool {
+    /// Returns whether a setting applies to a stage: it is the stage's own, or that of the block
+    /// that the stage's block extends without a value of its own.
+    fn applies(&self, setting: &Setting, stage: &str) -> bool {
         let block = &self.pipeline.stages[stage];
-        let is_own = || set.kind.is_given(self.programs.get(stage), block, &set.name);
-        set.stage == stage || (block.extends.as_deref() == Some(&set.stage) && !is_own())
+        setting.stage == stage
+            || (block.extends.as_deref() == Some(&setting.stage)
+                && !setting.kind.is_given(self.programs.get(stage), block, &setting.name))
     }
 
-    /// The settings of a point that reach a stage, in the order of the axes.
-    fn settings<'b>(
-        &'b self,
-        stage: &'b str,
-        point: &'b Point,
-    ) -> impl Iterator<Item = &'b Setting> {
-        let settings = self.axes.iter().enumerate().flat_map(move |(index, axis)| {
-            // A stage that an axis doesn't reach has no value of it; a sink has the only one.
-            &axis.values[point.get(&index).copied().unwrap_or(0)].settings
-        });
-        settings.filter(move |set| self.sets(set, stage))
+    /// Returns the settings of a point that apply to a stage, in the order of the axes.
+    fn settings(&self, stage: &str, point: &Point) -> Vec<&Setting> {
+        let mut settings = Vec::new();
+        for (index, axis) in self.axes.iter().enumerate() {
+            // An axis that doesn't reach the stage has no setting for it. Sinks have no point:
+            // their axes have one value.
+            let value = &axis.values[point.get(&index).copied().unwrap_or(0)];
+            settings.extend(value.settings.iter().filter(|setting| self.applies(setting, stage)));
+        }
+        settings
     }
 
-    fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
+    fn add_nodes(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
         for point in self.points(stage)? {
             let parameters = self.resolve(stage, program, &point)?;
             if let Some(reason) = self.missing(stage, &point, &parameters) {
@@ -172,139 +161,156 @@ impl<'a> Expansion<'a> {
                 continue;
             }
             let inputs = self.node_inputs(stage, &point);
-            // Points that come to one result have one node.
-            let result = format!("{stage} {parameters} {inputs:?}");
-            if let Some(&node) = self.of_result.get(&result) {
-                self.of_stage.entry(stage.to_owned()).or_default().push((point, node));
-                continue;
-            }
-            let node = Node {
-                stage: stage.to_owned(),
-                point: self.label(&point),
-                values: self.values(&point),
-                parameters,
-                inputs,
-                program: Arc::clone(program),
+            // Points with equal parameters and inputs share a node.
+            let content = format!("{stage} {parameters} {inputs:?}");
+            let index = match self.node_by_content.get(&content).copied() {
+                Some(index) => index,
+                None => {
+                    let node = Node {
+                        stage: stage.to_owned(),
+                        point: self.label(&point),
+                        values: self.values(&point),
+                        parameters,
+                        inputs,
+                        program: Arc::clone(program),
+                    };
+                    self.check_rules(&node)?;
+                    self.node_by_content.insert(content, self.nodes.len());
+                    self.nodes.push(node);
+                    self.nodes.len() - 1
+                }
             };
-            let given: GivenInputs =
-                node.inputs.iter().map(|input| (input.name.clone(), self.made_by(input))).collect();
-            if let Some(problem) = program.description.broken_rule(&node.parameters, &given) {
-                return Err(PlanError::Usage(format!("stage {}: {problem}", node.label())));
-            }
-            self.of_result.insert(result, self.nodes.len());
-            self.of_stage.entry(stage.to_owned()).or_default().push((point, self.nodes.len()));
-            self.nodes.push(node);
+            self.nodes_by_stage.entry(stage.to_owned()).or_default().push((point, index));
         }
         Ok(())
     }
 
-    /// Why a stage isn't made at a point: its own file isn't there, or a parent isn't made.
+    /// Checks the rules of a stage's description, which may refer to the parameters of its parents.
+    fn check_rules(&self, node: &Node) -> Result<(), PlanError> {
+        let mut inputs = GivenInputs::new();
+        for input in &node.inputs {
+            let parameters = input.node().map(|index| self.nodes[index].parameters.clone());
+            inputs.insert(input.name.clone(), parameters);
+        }
+        match node.program.description.broken_rule(&node.parameters, &inputs) {
+            Some(problem) => Err(PlanError::Usage(format!("stage {}: {problem}", node.label()))),
+            None => Ok(()),
+        }
+    }
+
+    /// Returns the reason for leaving out a stage at a point: a missing file, its own or a parent's.
     fn missing(&mut self, stage: &str, point: &Point, parameters: &Value) -> Option<String> {
-        if let Some(reason) = self.files.missing(stage, parameters) {
-            let note = format!("{stage}: left out: {reason} in {}", self.files.data.display());
+        if let Some(reason) = self.required_files.missing(stage, parameters) {
+            let data = self.required_files.data.display();
+            let note = format!("{stage}: left out: {reason} in {data}");
             if !self.notes.contains(&note) {
                 self.notes.push(note);
             }
             return Some(reason);
         }
-        let parents = self.block_inputs(stage).filter_map(|(_, source)| source.stage());
-        let left_out = parents.flat_map(|parent| self.left_out.get(parent).into_iter().flatten());
-        left_out
-            .filter(|(values, _)| is_inside(values, point))
-            .map(|(_, reason)| reason.clone())
-            .next()
+        for parent in self.block_inputs(stage).into_iter().filter_map(|(_, s)| s.stage()) {
+            let mut left_out = self.left_out.get(parent).into_iter().flatten();
+            if let Some((_, reason)) = left_out.find(|(part, _)| is_subset(part, point)) {
+                return Some(reason.clone());
+            }
+        }
+        None
     }
 
-    /// All combinations of the values that reach a stage: those of its own axes and of its
+    /// Returns all combinations of the values that reach a stage: those of its own axes and of its
     /// parents'.
     fn points(&self, stage: &str) -> Result<Vec<Point>, PlanError> {
-        let is_set = |axis: &&usize| self.axes[**axis].settings().any(|set| self.sets(set, stage));
-        let all: Vec<usize> = (0..self.axes.len()).collect();
-        let mut reach: BTreeSet<usize> = all.iter().filter(is_set).copied().collect();
-        for parent in self.block_inputs(stage).filter_map(|(_, source)| source.stage()) {
-            let made = self.of_stage.get(parent).into_iter().flatten().map(|(values, _)| values);
-            let left_out =
-                self.left_out.get(parent).into_iter().flatten().map(|(values, _)| values);
-            reach.extend(made.chain(left_out).flat_map(|values| values.keys().copied()));
+        let mut reaching = BTreeSet::new();
+        for (index, axis) in self.axes.iter().enumerate() {
+            if axis.settings().any(|setting| self.applies(setting, stage)) {
+                reaching.insert(index);
+            }
+        }
+        for parent in self.block_inputs(stage).into_iter().filter_map(|(_, s)| s.stage()) {
+            let nodes = self.nodes_by_stage.get(parent).into_iter().flatten();
+            let left_out = self.left_out.get(parent).into_iter().flatten();
+            let points = nodes.map(|(point, _)| point).chain(left_out.map(|(point, _)| point));
+            reaching.extend(points.flat_map(|point| point.keys().copied()));
         }
         let mut points: Vec<Point> = vec![Point::new()];
-        for axis in reach {
+        for axis in reaching {
             let values = self.axes[axis].values.len();
-            if points.len() * values + self.nodes.len() > MOST_NODES {
+            if points.len() * values + self.nodes.len() > MAX_NODES {
                 let problem = format!(
-                    "the sweep comes to more than {MOST_NODES} points of {stage}; sweep fewer \
-                    values at once"
+                    "the sweep has more than {MAX_NODES} points of {stage}; sweep fewer values at \
+                    once"
                 );
                 return Err(PlanError::Usage(problem));
             }
-            points = points
-                .iter()
-                .flat_map(|point| (0..values).map(move |value| with(point, axis, value)))
-                .collect();
+            let mut extended = Vec::with_capacity(points.len() * values);
+            for point in &points {
+                for value in 0..values {
+                    let mut point = point.clone();
+                    point.insert(axis, value);
+                    extended.push(point);
+                }
+            }
+            points = extended;
         }
         Ok(points)
     }
 
-    /// Where a node's inputs come from, by name.
+    /// Returns the inputs of a node, sorted by name.
     fn node_inputs(&self, stage: &str, point: &Point) -> Vec<NodeInput> {
-        let of_block = self.block_inputs(stage).map(|(name, source)| {
-            let from = match source {
-                Source::Folder(path) => {
-                    Origin::Folder(self.pipeline.resolve(stage, Part::Input(name), path))
+        let mut inputs: BTreeMap<String, Origin> = BTreeMap::new();
+        for (name, source) in self.block_inputs(stage) {
+            let origin = match source {
+                InputSource::Folder(path) => {
+                    Origin::Folder(self.pipeline.resolve_path(stage, Part::Input(name), path))
                 }
-                Source::Stage { name, subtree } => Origin::Node {
+                InputSource::Stage { name, subtree } => Origin::Node {
                     index: self.parent(name, point),
                     subtree: subtree.map(str::to_owned),
                 },
             };
-            (name.to_owned(), from)
-        });
-        let mut inputs: BTreeMap<String, Origin> = of_block.collect();
-        let folders = self.settings(stage, point).filter(|set| set.kind == Kind::Input);
-        inputs.extend(folders.map(|set| (set.name.clone(), Origin::Folder(set.folder()))));
+            inputs.insert(name.to_owned(), origin);
+        }
+        for setting in self.settings(stage, point) {
+            if setting.kind == Kind::Input {
+                inputs.insert(setting.name.clone(), Origin::Folder(setting.folder()));
+            }
+        }
         inputs.into_iter().map(|(name, from)| NodeInput { name, from }).collect()
     }
 
-    /// A parent's node at a point of its child.
+    /// Returns the index of a parent's node at a point of its child.
     fn parent(&self, stage: &str, point: &Point) -> usize {
-        let found = self.of_stage[stage].iter().find(|(values, _)| is_inside(values, point));
+        let found = self.nodes_by_stage[stage].iter().find(|(part, _)| is_subset(part, point));
         found.expect("a parent's axes reach its children").1
     }
 
-    /// The parameters of the stage that an input comes from.
-    fn made_by(&self, input: &NodeInput) -> Option<Value> {
-        match input.from {
-            Origin::Node { index, .. } => Some(self.nodes[index].parameters.clone()),
-            Origin::Folder(_) => None,
-        }
-    }
-
-    /// What a point is called: the values of what is swept.
+    /// Returns the label of a point: names and values of the swept axes.
     fn label(&self, point: &Point) -> String {
-        let swept = self.named(point).filter(|(axis, _)| axis.values.len() > 1);
+        let swept = self.named_values(point).filter(|(axis, _)| axis.values.len() > 1);
         swept.map(|(axis, text)| format!("{}={text}", axis.name)).collect::<Vec<_>>().join(", ")
     }
 
-    /// The values of what has a name, for tables; the only value of an axis is every node's.
+    /// Returns the values of the named axes at a point, for tables. An axis's only value applies to
+    /// every node.
     fn values(&self, point: &Point) -> BTreeMap<String, String> {
-        let only = self.axes.iter().filter(|axis| axis.is_named && axis.values.len() == 1);
-        let only = only.map(|axis| (axis, axis.values[0].text.as_str()));
-        self.named(point)
-            .chain(only)
-            .map(|(axis, text)| (axis.name.clone(), text.to_owned()))
-            .collect()
+        let mut values: BTreeMap<String, String> = BTreeMap::new();
+        for (axis, text) in self.named_values(point) {
+            values.insert(axis.name.clone(), text.to_owned());
+        }
+        for axis in self.axes.iter().filter(|axis| axis.is_named && axis.values.len() == 1) {
+            values.insert(axis.name.clone(), axis.values[0].text.clone());
+        }
+        values
     }
 
-    fn named<'b>(&'b self, point: &'b Point) -> impl Iterator<Item = (&'b Axis, &'b str)> {
-        let values = point
-            .iter()
-            .map(|(axis, value)| (&self.axes[*axis], *value))
-            .filter(|(axis, _)| axis.is_named);
-        values.map(|(axis, value)| (axis, axis.values[value].text.as_str()))
+    fn named_values<'b>(&'b self, point: &'b Point) -> impl Iterator<Item = (&'b Axis, &'b str)> {
+        let values = point.iter().map(|(axis, value)| (&self.axes[*axis], *value));
+        let named = values.filter(|(axis, _)| axis.is_named);
+        named.map(|(axis, value)| (axis, axis.values[value].text.as_str()))
     }
 
-    /// A stage's parameters at a point: the command line's over the file's, those over what it
-    /// extends, and that over the defaults.
+    /// Resolves a stage's parameters at a point. The command line overrides the file, a block
+    /// overrides the block that it extends, and both override defaults.
     fn resolve(
         &self,
         stage: &str,
@@ -314,12 +320,13 @@ impl<'a> Expansion<'a> {
         let mut given = Map::new();
         for layer in self.pipeline.layers(stage) {
             program.lay_over(&mut given, &self.pipeline.stages[layer]);
-            let set = self
-                .settings(stage, point)
-                .filter(|set| set.kind == Kind::Parameter && set.stage == layer);
-            let from_line: Map<String, Value> =
-                set.map(|set| (set.name.clone(), set.value.clone())).collect();
-            program.schema.lay_over(&mut given, &from_line);
+            let mut settings = Map::new();
+            for setting in self.settings(stage, point) {
+                if setting.kind == Kind::Parameter && setting.stage == layer {
+                    settings.insert(setting.name.clone(), setting.value.clone());
+                }
+            }
+            program.schema.lay_over(&mut given, &settings);
         }
         program
             .schema
@@ -328,20 +335,15 @@ impl<'a> Expansion<'a> {
     }
 }
 
-/// Whether each value of an axis sets an input of a stage.
-fn replaces(axis: &Axis, stage: &str, input: &str) -> bool {
+/// Returns whether every value of an axis sets an input of a stage.
+fn replaces_input(axis: &Axis, stage: &str, input: &str) -> bool {
     axis.values.iter().all(|value| {
         let mut settings = value.settings.iter();
         settings.any(|set| set.stage == stage && set.kind == Kind::Input && set.name == input)
     })
 }
 
-/// A point with a further value.
-fn with(point: &Point, axis: usize, value: usize) -> Point {
-    point.iter().map(|(a, v)| (*a, *v)).chain([(axis, value)]).collect()
-}
-
-/// Whether a point has all values of another one.
-fn is_inside(values: &Point, point: &Point) -> bool {
-    values.iter().all(|(axis, value)| point.get(axis) == Some(value))
+/// Returns whether a point has all values of `part`.
+fn is_subset(part: &Point, point: &Point) -> bool {
+    part.iter().all(|(axis, value)| point.get(axis) == Some(value))
 }

@@ -1,5 +1,5 @@
-//! Experiments: a pipeline file with scenes, protocols and variants, each of which sets several
-//! things at once.
+//! Experiments: scenes, protocols and variants of a pipeline file, each of which sets several
+//! parameters and inputs (docs/design/034).
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -8,115 +8,112 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-/// What a pipeline file says of an experiment, besides its blocks. A file that extends others
-/// changes theirs part by part.
+/// The experiment of a pipeline file. A file that extends others overrides parts of their
+/// experiments.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Experiment {
-    /// Folder of the data sets, from the current folder, unless `--data` names another.
+    /// Folder of the data sets, relative to the current folder; `--data` overrides it.
     pub data: Option<String>,
-    /// Folders inside it in which a scene is looked for; the first that has it counts.
+    /// Folders inside `data` that are searched for a scene, in order.
     pub folders: Vec<String>,
-    /// Scenes: names of data sets, or `demo` for the pipeline's own.
+    /// Scenes: names of data sets, or `demo` for the pipeline's own data set.
     pub scenes: Vec<String>,
-    /// Protocols: names of `presets`. An unknown one of the form WIDTHxSCALE has the settings of
-    /// preset `other`.
+    /// Protocols: names of `presets`, or WIDTHxSCALE for the preset `other`.
     pub protocols: Vec<String>,
-    /// Parameters that go together, by name and then by `[STAGE.]NAME`. Preset `every` holds what
-    /// all of them have, where they don't say otherwise. In words, `{width}`, `{scale}` and
-    /// `{hr_width}` stand for a protocol's own.
+    /// Groups of parameters by name, each by `[STAGE.]NAME`. All protocols inherit the preset
+    /// `every`. In texts, `{width}`, `{scale}` and `{hr_width}` are replaced by the protocol's
+    /// values.
     pub presets: BTreeMap<String, Map<String, Value>>,
-    /// Inputs that come from the folder of the data sets, by `[STAGE.]NAME`; left out where the
-    /// folder isn't there.
+    /// Inputs by `[STAGE.]NAME`: folders inside `data`, ignored if they don't exist.
     pub inputs: BTreeMap<String, String>,
-    /// Files in the folder of the data sets without which a block isn't made, by block. `{NAME}`
-    /// stands for the block's parameter.
+    /// Required files by block: paths inside `data`, in which `{NAME}` is replaced by the block's
+    /// parameter. A block without its file is left out.
     pub needs: BTreeMap<String, String>,
-    /// Inputs of sinks that are shown unless the command line chooses, by their names or by the
-    /// blocks that they are; a sink that has none of them shows all of its own.
+    /// Inputs of sinks to show unless the command line selects others, by name or stage. A sink
+    /// with none of them shows all its inputs.
     pub show: Vec<String>,
-    /// Variants, in the order of the table; they form no product.
+    /// Variants, in the order of the table. They form no product with one another.
     pub variants: Vec<Variant>,
-    /// Parameters with several values each, by `[STAGE.]NAME`; they form a product. `-p` takes the
-    /// place of one.
+    /// Values of parameters by `[STAGE.]NAME`. The parameters form a product. `-p` replaces a
+    /// parameter's values.
     pub sweeps: BTreeMap<String, Vec<Value>>,
 }
 
-/// Parameters and inputs that go together.
+/// A named set of parameters and inputs.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Variant {
-    /// Its name in tables.
+    /// Name in tables.
     pub name: String,
-    /// Parameters, by `[STAGE.]NAME`.
+    /// Parameters by `[STAGE.]NAME`.
     #[serde(default)]
     pub parameters: Map<String, Value>,
-    /// Inputs from the folder of the data sets, by `[STAGE.]NAME`.
+    /// Inputs by `[STAGE.]NAME`: folders inside `data`.
     #[serde(default)]
     pub inputs: BTreeMap<String, String>,
 }
 
-/// What of an experiment the command line wants; nothing means all that the file names.
+/// Parts of an experiment that the command line selects; an empty list selects all.
 #[derive(Clone, Debug, Default)]
 pub struct Selection {
     /// Folder of the data sets.
     pub data: Option<PathBuf>,
-    /// Scenes.
+    /// Names of scenes.
     pub scenes: Vec<String>,
-    /// Protocols.
+    /// Names of protocols.
     pub protocols: Vec<String>,
-    /// Variants, by name.
+    /// Names of variants.
     pub variants: Vec<String>,
-    /// Only so many variants, the first.
-    pub first: Option<usize>,
-    /// Only these inputs of sinks, by their names or by the blocks that they are.
+    /// Maximum number of variants; further ones are left out.
+    pub max_variants: Option<usize>,
+    /// Inputs of sinks, by name or stage.
     pub show: Vec<String>,
 }
 
 impl Experiment {
-    /// Takes what a file that extends this one's says.
-    pub fn change(&mut self, by: &Self) {
-        take(&mut self.folders, &by.folders);
-        take(&mut self.scenes, &by.scenes);
-        take(&mut self.protocols, &by.protocols);
-        take(&mut self.show, &by.show);
-        if !by.variants.is_empty() {
-            self.variants.clone_from(&by.variants);
+    /// Overrides parts with those of `other`, the experiment of a file that extends this one's.
+    pub fn override_with(&mut self, other: &Self) {
+        replace_unless_empty(&mut self.folders, &other.folders);
+        replace_unless_empty(&mut self.scenes, &other.scenes);
+        replace_unless_empty(&mut self.protocols, &other.protocols);
+        replace_unless_empty(&mut self.show, &other.show);
+        replace_unless_empty(&mut self.variants, &other.variants);
+        if other.data.is_some() {
+            self.data.clone_from(&other.data);
         }
-        self.data = by.data.clone().or_else(|| self.data.take());
-        for (name, preset) in &by.presets {
+        for (name, preset) in &other.presets {
             self.presets.entry(name.clone()).or_default().extend(preset.clone());
         }
-        self.inputs.extend(by.inputs.clone());
-        self.needs.extend(by.needs.clone());
-        self.sweeps.extend(by.sweeps.clone());
+        self.inputs.extend(other.inputs.clone());
+        self.needs.extend(other.needs.clone());
+        self.sweeps.extend(other.sweeps.clone());
     }
 
-    /// Whether it sets something of that name, itself.
-    pub(crate) fn names(&self, name: &str) -> bool {
-        let parameters =
-            self.presets.values().chain(self.variants.iter().map(|variant| &variant.parameters));
-        let inputs =
-            [&self.inputs].into_iter().chain(self.variants.iter().map(|variant| &variant.inputs));
-        parameters.into_iter().any(|parameters| parameters.contains_key(name))
-            || inputs.into_iter().any(|inputs| inputs.contains_key(name))
+    /// Returns whether any preset, variant, input or sweep sets a name.
+    pub(crate) fn sets(&self, name: &str) -> bool {
+        self.inputs.contains_key(name)
             || self.sweeps.contains_key(name)
+            || self.presets.values().any(|preset| preset.contains_key(name))
+            || self.variants.iter().any(|variant| {
+                variant.parameters.contains_key(name) || variant.inputs.contains_key(name)
+            })
     }
 
-    pub(crate) fn is_none(&self) -> bool {
+    /// Returns whether the pipeline isn't an experiment.
+    pub(crate) fn is_empty(&self) -> bool {
         *self == Self::default()
     }
 
-    /// The folder of the data sets.
-    pub(crate) fn data(&self, choice: &Selection) -> PathBuf {
-        let stated = self.data.as_ref().map(PathBuf::from);
-        choice.data.clone().or(stated).unwrap_or_else(|| PathBuf::from("."))
+    /// Returns the folder of the data sets.
+    pub(crate) fn data_folder(&self, selection: &Selection) -> PathBuf {
+        let folder = selection.data.clone().or_else(|| self.data.as_ref().map(PathBuf::from));
+        folder.unwrap_or_else(|| PathBuf::from("."))
     }
 }
 
-/// Takes another list, unless it is empty.
-fn take(mine: &mut Vec<String>, by: &[String]) {
-    if !by.is_empty() {
-        *mine = by.to_vec();
+fn replace_unless_empty<T: Clone>(list: &mut Vec<T>, other: &[T]) {
+    if !other.is_empty() {
+        *list = other.to_vec();
     }
 }

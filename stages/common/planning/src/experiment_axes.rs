@@ -4,141 +4,129 @@ use artifact::known_names;
 use contract::plain;
 use serde_json::{Map, Value};
 
-use crate::axes::{Axis, AxisValue, Kind, Scope, Setting, folder};
-use crate::experiment::{Experiment, Selection, Variant};
+use crate::axes::{Axis, AxisValue, Kind, Scope, Setting, canonical_folder};
+use crate::experiment::{Experiment, Selection};
 use crate::request::{PlanError, Request};
 
-/// The scene that is the pipeline's own.
+/// Scene with the pipeline's own data set.
 const DEMO: &str = "demo";
-/// The preset of protocols that have none.
+/// Preset of protocols of the form WIDTHxSCALE that have no preset.
 const OTHER: &str = "other";
-/// The preset of what all protocols have.
+/// Preset that all protocols inherit.
 const EVERY: &str = "every";
 
-/// The axes of an experiment; none where the pipeline is none.
+/// Returns the axes of an experiment; none if the pipeline isn't one.
 pub(crate) fn axes(scope: &Scope<'_>, request: &Request) -> Result<Vec<Axis>, PlanError> {
-    let (experiment, choice) = (&scope.pipeline.experiment, &request.choice);
-    if experiment.is_none() {
-        let is_asked = !(choice.scenes.is_empty()
-            && choice.protocols.is_empty()
-            && choice.variants.is_empty());
+    let (experiment, selection) = (&scope.pipeline.experiment, &request.selection);
+    if experiment.is_empty() {
+        let Selection { scenes, protocols, variants, .. } = selection;
+        if scenes.is_empty() && protocols.is_empty() && variants.is_empty() {
+            return Ok(Vec::new());
+        }
         let problem = "--scene, --protocol and --variant are for experiments; name one as target, \
             such as quality";
-        return if is_asked { Err(PlanError::Usage(problem.to_owned())) } else { Ok(Vec::new()) };
+        return Err(PlanError::Usage(problem.to_owned()));
     }
-    let asked = Asked { scope, experiment, choice };
-    let axes = [
-        ("scene", asked.scenes()?),
-        ("protocol", asked.protocols()?),
-        ("variant", asked.variants()?),
+    let selected = SelectedExperiment { scope, experiment, selection };
+    let mut axes = vec![
+        Axis::new("scene", selected.scenes()?),
+        Axis::new("protocol", selected.protocols()?),
+        Axis::new("variant", selected.variants()?),
     ];
-    let axes = axes
-        .into_iter()
-        .filter(|(_, values)| !values.is_empty())
-        .map(|(name, values)| Axis::new(name, values));
-    let sweeps = experiment.sweeps.iter().map(|(name, values)| asked.sweep(name, values));
-    axes.map(Ok).chain(sweeps).collect()
+    axes.retain(|axis| !axis.values.is_empty());
+    for (name, values) in &experiment.sweeps {
+        axes.push(selected.sweep(name, values)?);
+    }
+    Ok(axes)
 }
 
-/// An experiment and what of it is wanted.
-struct Asked<'a> {
+/// Experiment with the parts that the command line selects.
+struct SelectedExperiment<'a> {
     scope: &'a Scope<'a>,
     experiment: &'a Experiment,
-    choice: &'a Selection,
+    selection: &'a Selection,
 }
 
-impl Asked<'_> {
+impl SelectedExperiment<'_> {
     fn scenes(&self) -> Result<Vec<AxisValue>, PlanError> {
-        let names = if self.choice.scenes.is_empty() {
-            &self.experiment.scenes
-        } else {
-            &self.choice.scenes
-        };
         let common = self.inputs(&self.experiment.inputs)?;
-        names.iter().map(|name| self.scene(name, &common)).collect()
-    }
-
-    /// A scene with its data set, besides what all of them have.
-    fn scene(&self, name: &str, common: &[Setting]) -> Result<AxisValue, PlanError> {
-        let mut settings = common.to_vec();
-        if name != DEMO {
-            let own = self.scope.setting(Kind::Input, "dataset", &self.scene_folder(name)?)?;
-            settings.extend(self.alike(&own));
+        let mut values = Vec::new();
+        for name in selected_or_all(&self.selection.scenes, &self.experiment.scenes) {
+            let mut settings = common.clone();
+            if name != DEMO {
+                let folder = self.scene_folder(name)?;
+                settings.extend(self.for_all_inputs(&self.scope.setting(
+                    Kind::Input,
+                    "dataset",
+                    &folder,
+                )?));
+            }
+            values.push(AxisValue { text: name.clone(), settings });
         }
-        Ok(AxisValue { text: name.to_owned(), settings })
+        Ok(values)
     }
 
-    /// That input of a block, and those of other blocks that come from the same source.
-    fn alike(&self, own: &Setting) -> Vec<Setting> {
+    /// Repeats an input's setting for all inputs of the pipeline with the same source.
+    fn for_all_inputs(&self, setting: &Setting) -> Vec<Setting> {
         let stages = &self.scope.pipeline.stages;
-        let Some(source) = stages[&own.stage].inputs.get(&own.name) else {
-            return vec![own.clone()];
+        let Some(source) = stages[&setting.stage].inputs.get(&setting.name) else {
+            return vec![setting.clone()];
         };
-        let inputs = stages.iter().flat_map(|(stage, block)| {
-            block.inputs.iter().map(move |(name, from)| (stage, name, from))
-        });
-        let same = inputs.filter(|(.., from)| *from == source);
-        same.map(|(stage, name, _)| Setting {
-            stage: stage.clone(),
-            name: name.clone(),
-            ..own.clone()
-        })
-        .collect()
-    }
-
-    /// The folder of a scene.
-    fn scene_folder(&self, name: &str) -> Result<Value, PlanError> {
-        let data = self.experiment.data(self.choice);
-        let place = |inside: &String| data.join(inside).join(name);
-        let here = ".".to_owned();
-        let found =
-            self.experiment.folders.iter().chain([&here]).map(place).find(|path| path.is_dir());
-        match found {
-            Some(path) => Ok(folder(&path.to_string_lossy())),
-            None => {
-                let problem = format!(
-                    "no scene {name} in {}; --data names a folder that has it",
-                    data.display()
-                );
-                Err(PlanError::Usage(problem))
+        let mut settings = Vec::new();
+        for (stage, block) in stages {
+            for (name, _) in block.inputs.iter().filter(|(_, other)| *other == source) {
+                let (stage, name) = (stage.clone(), name.clone());
+                settings.push(Setting { stage, name, ..setting.clone() });
             }
         }
+        settings
     }
 
-    /// Inputs from the data sets' folder, those that are there.
+    /// Returns the folder of a scene's data set.
+    fn scene_folder(&self, name: &str) -> Result<Value, PlanError> {
+        let data = self.experiment.data_folder(self.selection);
+        for folder in self.experiment.folders.iter().map(String::as_str).chain(["."]) {
+            let path = data.join(folder).join(name);
+            if path.is_dir() {
+                return Ok(canonical_folder(&path.to_string_lossy()));
+            }
+        }
+        Err(PlanError::Usage(format!(
+            "no scene {name} in {}; name its parent folder with --data",
+            data.display()
+        )))
+    }
+
+    /// Returns the settings of inputs whose folders exist.
     fn inputs(&self, inputs: &BTreeMap<String, String>) -> Result<Vec<Setting>, PlanError> {
-        let data = self.experiment.data(self.choice);
-        let there = inputs
-            .iter()
-            .map(|(name, inside)| (name, data.join(inside)))
-            .filter(|(_, path)| path.is_dir());
-        there
-            .map(|(name, path)| {
-                self.scope.setting(Kind::Input, name, &folder(&path.to_string_lossy()))
-            })
-            .collect()
+        let data = self.experiment.data_folder(self.selection);
+        let mut settings = Vec::new();
+        for (name, folder) in inputs {
+            let path = data.join(folder);
+            if path.is_dir() {
+                let folder = canonical_folder(&path.to_string_lossy());
+                settings.push(self.scope.setting(Kind::Input, name, &folder)?);
+            }
+        }
+        Ok(settings)
     }
 
     fn protocols(&self) -> Result<Vec<AxisValue>, PlanError> {
-        let names = if self.choice.protocols.is_empty() {
-            &self.experiment.protocols
-        } else {
-            &self.choice.protocols
-        };
+        let names = selected_or_all(&self.selection.protocols, &self.experiment.protocols);
         let protocols = names.iter().map(|name| {
             Ok(AxisValue { text: name.clone(), settings: self.parameters(&self.preset(name)?)? })
         });
         protocols.collect()
     }
 
-    /// A preset's parameters over those of `every`; those of `other` with the width and the scale
-    /// for one that isn't named.
+    /// Returns the parameters of a protocol: those of its preset over those of `every`. A protocol
+    /// WIDTHxSCALE without a preset has those of `other`, with its width and scale.
     fn preset(&self, name: &str) -> Result<Map<String, Value>, PlanError> {
         let presets = &self.experiment.presets;
-        let is_protocol = |name: &str| ![OTHER, EVERY].contains(&name);
-        let sizes = sizes(name);
+        let own = presets.get(name).filter(|_| is_protocol(name));
+        let sizes = parse_sizes(name);
         let mut preset = presets.get(EVERY).cloned().unwrap_or_default();
-        match (presets.get(name).filter(|_| is_protocol(name)), sizes) {
+        match (own, sizes) {
             (Some(own), _) => preset.extend(own.clone()),
             (None, Some((width, scale))) => {
                 preset.extend(presets.get(OTHER).cloned().unwrap_or_default());
@@ -146,57 +134,54 @@ impl Asked<'_> {
                 preset.insert("prep.scale".to_owned(), Value::from(scale));
             }
             (None, None) => {
-                let known = known_names(
-                    name,
-                    presets.keys().map(String::as_str).filter(|known| is_protocol(known)),
-                );
+                let names = presets.keys().map(String::as_str).filter(|known| is_protocol(known));
                 return Err(PlanError::Usage(format!(
-                    "no protocol {name:?}, and not of the form WIDTHxSCALE; {known}"
+                    "no protocol {name:?}, and the name isn't WIDTHxSCALE; {}",
+                    known_names(name, names)
                 )));
             }
         }
         if let Some(sizes) = sizes {
-            preset.values_mut().for_each(|value| fill(value, sizes));
+            for value in preset.values_mut() {
+                fill_placeholders(value, sizes);
+            }
         }
         Ok(preset)
     }
 
     fn variants(&self) -> Result<Vec<AxisValue>, PlanError> {
-        let (all, chosen) = (&self.experiment.variants, &self.choice.variants);
-        let known = |name: &str| known_names(name, all.iter().map(|variant| variant.name.as_str()));
-        if let Some(name) =
-            chosen.iter().find(|name| !all.iter().any(|variant| variant.name == **name))
-        {
-            return Err(PlanError::Usage(format!("no variant {name:?}; {}", known(name))));
+        let all = &self.experiment.variants;
+        let selected = &self.selection.variants;
+        for name in selected {
+            if !all.iter().any(|variant| variant.name == *name) {
+                let known = known_names(name, all.iter().map(|variant| variant.name.as_str()));
+                return Err(PlanError::Usage(format!("no variant {name:?}; {known}")));
+            }
         }
-        let wanted =
-            all.iter().filter(|variant| chosen.is_empty() || chosen.contains(&variant.name));
-        let first = wanted.take(self.choice.first.unwrap_or(usize::MAX));
-        first.map(|variant| self.variant(variant)).collect()
+        let mut values = Vec::new();
+        for variant in all {
+            if selected.is_empty() || selected.contains(&variant.name) {
+                if self.selection.max_variants.is_some_and(|max| values.len() >= max) {
+                    break;
+                }
+                let mut settings = self.parameters(&variant.parameters)?;
+                settings.extend(self.inputs(&variant.inputs)?);
+                values.push(AxisValue { text: variant.name.clone(), settings });
+            }
+        }
+        Ok(values)
     }
 
-    fn variant(&self, variant: &Variant) -> Result<AxisValue, PlanError> {
-        let settings =
-            [self.parameters(&variant.parameters)?, self.inputs(&variant.inputs)?].concat();
-        Ok(AxisValue { text: variant.name.clone(), settings })
-    }
-
-    /// A parameter with several values.
+    /// Returns the axis of a parameter with several values.
     fn sweep(&self, name: &str, values: &[Value]) -> Result<Axis, PlanError> {
-        let values = values.iter().map(|value| {
-            let text = plain(value);
-            Ok(AxisValue {
-                text,
-                settings: vec![self.scope.setting(Kind::Parameter, name, value)?],
-            })
-        });
-        let values = values.collect::<Result<Vec<_>, PlanError>>()?;
-        let name = values
-            .first()
-            .and_then(|value| value.settings.first())
-            .map_or(name, |setting| &setting.name)
-            .to_owned();
-        Ok(Axis::new(&name, values))
+        let mut axis = Axis::new(name, Vec::new());
+        for value in values {
+            let setting = self.scope.setting(Kind::Parameter, name, value)?;
+            // Without the stage.
+            axis.name.clone_from(&setting.name);
+            axis.values.push(AxisValue { text: plain(value), settings: vec![setting] });
+        }
+        Ok(axis)
     }
 
     fn parameters(&self, parameters: &Map<String, Value>) -> Result<Vec<Setting>, PlanError> {
@@ -207,22 +192,31 @@ impl Asked<'_> {
     }
 }
 
-/// LR width and scale of a protocol's name, WIDTHxSCALE.
-fn sizes(name: &str) -> Option<(u32, f64)> {
+fn selected_or_all<'a>(selected: &'a Vec<String>, all: &'a Vec<String>) -> &'a Vec<String> {
+    if selected.is_empty() { all } else { selected }
+}
+
+fn is_protocol(preset: &str) -> bool {
+    ![OTHER, EVERY].contains(&preset)
+}
+
+/// Parses the LR width and scale of a protocol WIDTHxSCALE.
+fn parse_sizes(name: &str) -> Option<(u32, f64)> {
     let (width, scale) = name.split_once('x')?;
     Some((width.parse().ok()?, scale.parse().ok()?))
 }
 
-/// Puts a protocol's sizes into a word that names them; what is a number then, is meant as one.
-fn fill(value: &mut Value, (width, scale): (u32, f64)) {
-    let Some(word) = value.as_str().filter(|word| word.contains('{')) else { return };
-    let sizes = [
+/// Replaces placeholders in a text by a protocol's sizes. If the result is a number, the value
+/// becomes one.
+fn fill_placeholders(value: &mut Value, (width, scale): (u32, f64)) {
+    let Some(text) = value.as_str().filter(|text| text.contains('{')) else { return };
+    let mut filled = text.to_owned();
+    for (placeholder, size) in [
         ("{width}", f64::from(width)),
         ("{scale}", scale),
         ("{hr_width}", (f64::from(width) * scale).round()),
-    ];
-    let filled = sizes
-        .iter()
-        .fold(word.to_owned(), |word, (name, size)| word.replace(name, &size.to_string()));
+    ] {
+        filled = filled.replace(placeholder, &size.to_string());
+    }
     *value = filled.parse().map_or_else(|_| Value::from(filled.as_str()), Value::Number);
 }

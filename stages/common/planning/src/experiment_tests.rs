@@ -69,7 +69,7 @@ fn descriptions() -> BTreeMap<String, Description> {
 /// The plan of an experiment, whose data sets lie in a folder of their own.
 fn plan_of(text: &str, data: &Path, change: impl Fn(&mut Request)) -> Result<Plan, PlanError> {
     let mut request = Request {
-        choice: Selection { data: Some(data.to_path_buf()), ..Selection::default() },
+        selection: Selection { data: Some(data.to_path_buf()), ..Selection::default() },
         ..Request::default()
     };
     change(&mut request);
@@ -149,18 +149,19 @@ fn the_command_line_chooses_and_wins() {
     let data = data();
     let named = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
     assert_eq!(
-        scores(data.path(), &|r| (r.choice.scenes, r.choice.first) = (named(&["chair"]), Some(1))),
+        scores(data.path(), &|r| (r.selection.scenes, r.selection.max_variants) =
+            (named(&["chair"]), Some(1))),
         ["score"]
     );
     assert_eq!(
-        scores(data.path(), &|r| (r.choice.scenes, r.choice.variants) =
+        scores(data.path(), &|r| (r.selection.scenes, r.selection.variants) =
             (named(&["demo"]), named(&["no warm-up", "as it is"]))),
         ["score [variant=as it is]", "score [variant=no warm-up]"]
     );
     let plan = plan_of(EXPERIMENT, data.path(), |r| {
-        r.choice.scenes = named(&["chair"]);
-        r.choice.protocols = named(&["50x3"]);
-        r.choice.first = Some(2);
+        r.selection.scenes = named(&["chair"]);
+        r.selection.protocols = named(&["50x3"]);
+        r.selection.max_variants = Some(2);
         r.parameters = named(&["warmup=7", "lr_width=20,30"]);
     });
     let plan = plan.unwrap();
@@ -184,7 +185,8 @@ fn the_command_line_chooses_and_wins() {
 fn an_only_value_is_every_nodes() {
     let data = data();
     let text = EXPERIMENT.replace("  inputs: {score.weights: weights}\n", "");
-    let plan = plan_of(&text, data.path(), |r| r.choice.scenes = vec!["demo".to_owned()]).unwrap();
+    let plan =
+        plan_of(&text, data.path(), |r| r.selection.scenes = vec!["demo".to_owned()]).unwrap();
     assert!(
         plan.nodes
             .iter()
@@ -196,8 +198,9 @@ fn an_only_value_is_every_nodes() {
 fn a_sweep_of_the_file_gives_way() {
     let data = data();
     let text = EXPERIMENT.replace("  variants:\n", "  sweeps: {train.rays: [5, 6]}\n  variants:\n");
-    let choose =
-        |r: &mut Request| (r.choice.scenes, r.choice.first) = (vec!["demo".to_owned()], Some(1));
+    let choose = |r: &mut Request| {
+        (r.selection.scenes, r.selection.max_variants) = (vec!["demo".to_owned()], Some(1))
+    };
     let plan = plan_of(&text, data.path(), choose).unwrap();
     assert_eq!(labels(&plan)[1..3], ["train [rays=5]", "train [rays=6]"]);
     let plan = plan_of(&text, data.path(), |r| {
@@ -235,9 +238,9 @@ fn shown() -> String {
 
 fn plan_showing(data: &Path, show: &[&str]) -> Result<Plan, PlanError> {
     plan_of(&shown(), data, |r| {
-        (r.choice.scenes, r.choice.protocols, r.choice.first) =
+        (r.selection.scenes, r.selection.protocols, r.selection.max_variants) =
             (vec!["lego".to_owned()], vec!["50x3".to_owned()], Some(1));
-        r.choice.show = show.iter().map(|name| (*name).to_owned()).collect();
+        r.selection.show = show.iter().map(|name| (*name).to_owned()).collect();
     })
 }
 
@@ -285,8 +288,8 @@ fn what_lacks_a_file_is_left_out() {
     let data = data();
     std::fs::write(data.path().join("weights/x500"), "").unwrap();
     let plan = plan_of(&shown(), data.path(), |r| {
-        r.choice.protocols = vec!["50x3".to_owned(), "100x2".to_owned()];
-        (r.choice.scenes, r.choice.first) = (vec!["chair".to_owned()], Some(1));
+        r.selection.protocols = vec!["50x3".to_owned(), "100x2".to_owned()];
+        (r.selection.scenes, r.selection.max_variants) = (vec!["chair".to_owned()], Some(1));
     });
     let plan = plan.unwrap();
     let scores: Vec<String> =
@@ -321,7 +324,7 @@ fn what_there_is_not_is_refused() {
         (
             EXPERIMENT.to_owned(),
             &|c| c.protocols = vec!["100y2".to_owned()],
-            "no protocol \"100y2\", and not of the form WIDTHxSCALE; did you mean 100x2?",
+            "no protocol \"100y2\", and the name isn't WIDTHxSCALE; did you mean 100x2?",
         ),
         (
             EXPERIMENT.to_owned(),
@@ -336,7 +339,7 @@ fn what_there_is_not_is_refused() {
         (
             EXPERIMENT.split("  table:").next().unwrap().replace("[table]", "[score]"),
             &|c| c.show = vec!["score".to_owned()],
-            "--show chooses what a sink shows, and no target is one",
+            "--show selects inputs of sinks, but no target is a sink",
         ),
         (
             EXPERIMENT.replace("  variants:", "  needs: {scor: x}\n  variants:"),
@@ -346,7 +349,7 @@ fn what_there_is_not_is_refused() {
         (
             EXPERIMENT.replace("warmup: 0", "warmap: 0"),
             &|_| (),
-            "experiment: warmap: no stage has such a parameter; did you mean warmup?",
+            "experiment: warmap: no stage has this parameter; did you mean warmup?",
         ),
         (EXPERIMENT.replace("score.samples: 1", "scor.samples: 1"), &|_| (), "no stage \"scor\""),
         (
@@ -355,7 +358,7 @@ fn what_there_is_not_is_refused() {
             "--scene, --protocol and --variant are for experiments",
         ),
     ] {
-        let plan = plan_of(&text, data.path(), |request| change(&mut request.choice));
+        let plan = plan_of(&text, data.path(), |request| change(&mut request.selection));
         let problem = plan.map(|plan| labels(&plan)).unwrap_err().to_string();
         assert!(problem.contains(words), "{problem}");
     }

@@ -1,60 +1,61 @@
-//! From files to a pipeline: each with the blocks of those that it extends.
+//! Reads a pipeline file with the files that it extends.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::file::File;
-use crate::part::PipelineError;
+use crate::file::{File, PipelineError};
 use crate::pipeline::Pipeline;
 
-/// Most files in a chain of which each extends the next.
-const MOST_CHAINED_FILES: usize = 8;
+/// Maximum length of a chain of files that extend one another, chosen by hand.
+const MAX_CHAINED_FILES: usize = 8;
 
-/// Two pipelines that can't be one: a block of one is another in the other.
+/// Error returned when two pipelines have different blocks of the same name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("block {block} isn't the same in {one} and in {two}")]
+#[error("block {block} differs in {first} and in {second}")]
 pub struct JoinError {
-    /// The block's name.
+    /// Name of the block.
     pub block: String,
-    /// The file that one has it from.
-    pub one: PathBuf,
-    /// The file that the other has it from.
-    pub two: PathBuf,
+    /// File of the first pipeline's block.
+    pub first: PathBuf,
+    /// File of the second pipeline's block.
+    pub second: PathBuf,
 }
 
 impl Pipeline {
-    /// Reads a file and those that it extends.
+    /// Reads a pipeline file and the files that it extends.
     pub fn read(path: &Path) -> Result<Self, PipelineError> {
-        let bytes = std::fs::read(path).map_err(|e| PipelineError {
-            place: path.display().to_string(),
-            problem: format!(
+        let bytes = std::fs::read(path).map_err(|e| {
+            let problem = format!(
                 "{e}; run in the folder of pipeline.yaml, name it with --pipeline, or write one \
                 with `nerf-sr init DIR`"
-            ),
+            );
+            PipelineError::new(path, None, problem)
         })?;
         Self::parse(&bytes, path)
     }
 
-    /// The pipeline of a file's bytes; `path` says where relative paths start, and is named in
-    /// errors.
+    /// Parses a pipeline file and reads the files that it extends. `path` locates the file for
+    /// relative paths and error messages.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let file = File::parse(bytes, path)?;
-        let mut trail = vec![file.id.clone()];
-        extended(file, &mut trail)
+        let mut chain = vec![file.canonical_path.clone()];
+        read_extended(file, &mut chain)
     }
 
-    /// Both pipelines as one, where no block of one is another in the other.
+    /// Joins two pipelines. Fails if blocks of the same name differ.
     pub fn joined(mut self, other: Self) -> Result<Self, JoinError> {
         let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
-        if let Some(name) = shared.find(|name| !self.has_same(&other, name)) {
-            let [one, two] =
-                [&self, &other].map(|pipeline| pipeline.file_of_block(name).path.clone());
-            return Err(JoinError { block: name.clone(), one, two });
+        if let Some(name) = shared.find(|name| !self.has_equal_block(&other, name)) {
+            return Err(JoinError {
+                block: name.clone(),
+                first: self.file_of_block(name).path.clone(),
+                second: other.file_of_block(name).path.clone(),
+            });
         }
         self.stages.extend(other.stages);
-        self.experiment.change(&other.experiment);
+        self.experiment.override_with(&other.experiment);
         for file in other.files {
-            if !self.files.iter().any(|known| known.id == file.id) {
+            if !self.files.iter().any(|known| known.canonical_path == file.canonical_path) {
                 self.files.push(file);
             }
         }
@@ -62,55 +63,57 @@ impl Pipeline {
     }
 }
 
-/// A file with what it extends; `trail` are the files that lead to it, itself the last.
-fn extended(file: File, trail: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineError> {
-    let mut all: Option<Pipeline> = None;
-    for other in &file.written.extends {
-        let fail =
-            |problem: String| file.error(&["extends"], format!("extends {other}: {problem}"));
-        let id = file.folder().join(other).canonicalize();
-        let id = id
-            .map_err(|e| fail(format!("{e}; a path is relative to the file in which it stands")))?;
-        if trail.contains(&id) {
-            return Err(fail("that file is this one or extends it; leave it out".to_owned()));
+/// Joins the files that a file extends, and overrides them with the file. `chain` contains the
+/// files that extend one another down to this one.
+fn read_extended(file: File, chain: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineError> {
+    let mut joined: Option<Pipeline> = None;
+    for extended in &file.content.extends {
+        let path = file.folder().join(extended).canonicalize().map_err(|e| {
+            let problem = format!("{e}; paths are relative to the file that contains them");
+            extends_error(&file, extended, problem)
+        })?;
+        if chain.contains(&path) {
+            let problem = "the file extends itself, maybe through other files; remove it";
+            return Err(extends_error(&file, extended, problem));
         }
-        if trail.len() == MOST_CHAINED_FILES {
-            return Err(fail(format!(
-                "more than {MOST_CHAINED_FILES} files extend one another; extend a file nearer to \
-                the last"
-            )));
+        if chain.len() == MAX_CHAINED_FILES {
+            let problem = format!(
+                "more than {MAX_CHAINED_FILES} files extend one another; extend a file further \
+                down the chain"
+            );
+            return Err(extends_error(&file, extended, problem));
         }
-        let bytes = std::fs::read(&id).map_err(|e| fail(e.to_string()))?;
-        trail.push(id.clone());
-        let pipeline = extended(File::parse(&bytes, &shown(&id))?, trail)?;
-        trail.pop();
-        all = Some(match all {
+        let bytes = std::fs::read(&path).map_err(|e| extends_error(&file, extended, e))?;
+        chain.push(path.clone());
+        let pipeline = read_extended(File::parse(&bytes, &display_path(&path))?, chain)?;
+        chain.pop();
+        joined = Some(match joined {
             None => pipeline,
-            Some(all) => all
+            Some(joined) => joined
                 .joined(pipeline)
-                .map_err(|problem| fail(format!("{problem}; extend one of them")))?,
+                .map_err(|e| extends_error(&file, extended, format!("{e}; extend one of them")))?,
         });
     }
-    Ok(changed(all.unwrap_or_default(), file))
+    let mut pipeline = joined.unwrap_or_default();
+    for (name, block) in &file.content.stages {
+        pipeline.stages.entry(name.clone()).or_default().override_with(block);
+    }
+    pipeline.experiment.override_with(&file.content.experiment);
+    if !file.content.default.is_empty() {
+        pipeline.default.clone_from(&file.content.default);
+    }
+    pipeline.files.insert(0, Arc::new(file));
+    Ok(pipeline)
 }
 
-/// What is extended, with what a file says of it and besides.
-fn changed(mut pipeline: Pipeline, by: File) -> Pipeline {
-    for (name, block) in &by.written.stages {
-        pipeline.stages.entry(name.clone()).or_default().change(block);
-    }
-    pipeline.experiment.change(&by.written.experiment);
-    if !by.written.default.is_empty() {
-        pipeline.default.clone_from(&by.written.default);
-    }
-    pipeline.files.insert(0, Arc::new(by));
-    pipeline
+fn extends_error(file: &File, extended: &str, problem: impl std::fmt::Display) -> PipelineError {
+    file.error(&["extends"], format!("extends {extended}: {problem}"))
 }
 
-/// A path as people know it: from the current folder, if it is inside.
-fn shown(path: &Path) -> PathBuf {
-    let here = std::env::current_dir().and_then(|here| here.canonicalize()).unwrap_or_default();
-    path.strip_prefix(here).unwrap_or(path).to_path_buf()
+/// Returns a path for messages: relative to the current folder if it is inside.
+fn display_path(path: &Path) -> PathBuf {
+    let current = std::env::current_dir().and_then(|path| path.canonicalize()).unwrap_or_default();
+    path.strip_prefix(current).unwrap_or(path).to_path_buf()
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use tempfile::TempDir;
 
 use super::*;
-use crate::part::Part;
+use crate::file::Part;
 use crate::request::PlanError;
 use crate::targets;
 
@@ -72,7 +72,7 @@ fn a_file_changes_part_by_part_what_it_extends() {
         let error = pipeline.error(stage, part, "wrong").to_string();
         assert_eq!(error, format!("{}:{line}: stage {stage}: wrong", file.display()));
         assert_eq!(
-            pipeline.resolve(stage, part, "./it"),
+            pipeline.resolve_path(stage, part, "./it"),
             file.with_file_name("it"),
             "{stage} {part:?}"
         );
@@ -93,17 +93,13 @@ fn files_that_cannot_be_extended() {
         (
             &[("x.yaml", "\nextends: ../none.yaml\n")][..],
             "x.yaml:2: ",
-            "a path is relative to the file in which it stands",
+            "paths are relative to the file that contains them",
         ),
-        (
-            &[("x.yaml", "extends: x.yaml")],
-            "x.yaml:1: ",
-            "extends x.yaml: that file is this one or extends it",
-        ),
+        (&[("x.yaml", "extends: x.yaml")], "x.yaml:1: ", "extends x.yaml: the file extends itself"),
         (
             &[("x.yaml", "extends: y.yaml"), ("y.yaml", "extends: [./x.yaml]")],
             "y.yaml:1: ",
-            "that file is this one or extends it",
+            "the file extends itself",
         ),
         (&[("x.yaml", "extends: 0.yaml")], "6.yaml:2: ", "more than 8 files extend one another"),
         (&[("x.yaml", "extends: .")], "x.yaml:1: ", "extends .: "),
@@ -125,12 +121,12 @@ fn files_that_cannot_be_extended() {
                 ("y.yaml", "extends: pipeline.yaml\nstages:\n  a: {parameters: {one: 2}}"),
             ],
             "x.yaml:1: ",
-            "isn't the same in",
+            "differs in",
         ),
         (
             &[("x.yaml", "extends: [y/y.yaml, pipeline.yaml]"), ("y/y.yaml", BASE)],
             "x.yaml:1: ",
-            "block a isn't the same in",
+            "block a differs in",
         ),
     ] {
         let folder = base_and(&[files, &deep].concat());
@@ -159,7 +155,7 @@ fn files_that_cannot_be_extended() {
 
 fn find(home: &Path, names: &[&str]) -> Result<(Pipeline, Vec<String>), PlanError> {
     let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
-    targets::find(&Pipeline::read(&home.join("pipeline.yaml")).unwrap(), &names)
+    targets::find_targets(&Pipeline::read(&home.join("pipeline.yaml")).unwrap(), &names)
 }
 
 /// Names are looked for in pipeline.yaml, then among the files of `pipelines/`, then among the
@@ -202,10 +198,7 @@ fn targets_are_found_beside_the_pipeline() {
         ),
         (&["../pipeline"], &["no stage \"../pipeline\""]),
         (&["broken"], &["pipelines/broken.yaml"]),
-        (
-            &["c", "e"],
-            &["e can't be made together with c: block a isn't the same in", "make it by itself"],
-        ),
+        (&["c", "e"], &["e can't be combined with c: block a differs in", "run e alone"]),
         (&["othre"], &["no stage \"othre\"; did you mean other?"]),
     ] {
         let error = find(&home, names).unwrap_err().to_string();
@@ -216,7 +209,7 @@ fn targets_are_found_beside_the_pipeline() {
 fn home_of(folder: &Path, file: &str) -> PathBuf {
     let pipeline = Pipeline::read(&folder.join(file)).unwrap();
     pipeline
-        .home()
+        .project_folder()
         .canonicalize()
         .unwrap()
         .strip_prefix(folder.canonicalize().unwrap())
@@ -258,23 +251,26 @@ fn shipped() -> (Pipeline, Vec<String>) {
 
 /// Whether a file's names are there and its stages have an order.
 fn holds_together(pipeline: &Pipeline) -> Result<(), crate::PipelineError> {
-    crate::check::names(pipeline)?;
-    crate::check::order(pipeline).map(drop)
+    crate::check::check_names(pipeline)?;
+    crate::check::topological_order(pipeline).map(drop)
 }
 
 #[test]
 fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
     let (pipeline, names) = shipped();
     assert_eq!(pipeline.stages.len(), 6);
-    let (all, blocks) = targets::find(&pipeline, &names).unwrap();
+    let (all, blocks) = targets::find_targets(&pipeline, &names).unwrap();
     assert_eq!(blocks, names);
     holds_together(&all).unwrap();
     for name in &names {
-        let (of_file, _) = targets::find(&pipeline, std::slice::from_ref(name)).unwrap();
+        let (of_file, _) = targets::find_targets(&pipeline, std::slice::from_ref(name)).unwrap();
         assert_eq!(&of_file.default, std::slice::from_ref(name));
         holds_together(&of_file).unwrap();
         // It has what it needs, and its blocks are those of pipeline.yaml where it doesn't say
         // otherwise.
-        assert!(pipeline.stages.keys().all(|stage| pipeline.has_same(&of_file, stage)), "{name}");
+        assert!(
+            pipeline.stages.keys().all(|stage| pipeline.has_equal_block(&of_file, stage)),
+            "{name}"
+        );
     }
 }

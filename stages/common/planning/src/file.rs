@@ -1,4 +1,4 @@
-//! A pipeline file as written, with what is needed to name its lines.
+//! One pipeline file as written, with the lines of its keys for error messages.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,42 +9,37 @@ use serde_json::{Map, Value};
 use slurm::Resources;
 
 use crate::experiment::Experiment;
-use crate::part::{Part, PipelineError};
 
-/// A pipeline file: `pipeline.yaml`, or one of `pipelines/`.
+/// A pipeline file: `pipeline.yaml`, or a file of `pipelines/`.
 ///
-/// A file that extends others has their blocks, too. For a block that both have, the file may give
-/// a part alone: an input or a parameter takes the place of the one of that name, `run` or
-/// `extends` the place of either. Paths are relative to the file in which they stand.
+/// A file that extends others inherits their blocks, and may override parts of a block: an input or
+/// a parameter replaces the one of the same name; `run` or `extends` replaces both. Paths are
+/// relative to the file that contains them.
 #[derive(Clone, Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PipelineFile {
-    /// Another pipeline file, or several, whose blocks this one has, too. Several may share blocks,
-    /// but not change them.
+    /// One or more pipeline files whose blocks are inherited. They may share blocks only if these are
+    /// equal.
     #[serde(deserialize_with = "one_or_more")]
     #[schemars(with = "OneOrMore")]
     pub extends: Vec<String>,
-    /// What `nerf-sr run` makes when no target is named. Left out, it is that of the first extended
-    /// file.
+    /// Targets of `nerf-sr run` if the command line names none. By default, those of the first
+    /// extended file.
     pub default: Vec<String>,
-    /// The stages by name.
+    /// Blocks by stage name.
     pub stages: BTreeMap<String, StageBlock>,
-    /// Scenes, protocols and variants, which make the file an experiment.
-    #[serde(skip_serializing_if = "is_default")]
+    /// Scenes, protocols and variants of an experiment.
+    #[serde(skip_serializing_if = "Experiment::is_empty")]
     pub experiment: Experiment,
 }
 
-fn is_default(experiment: &Experiment) -> bool {
-    *experiment == Experiment::default()
-}
-
-/// A text, or a list of them.
+/// A path, or a list of paths.
 #[derive(Deserialize, JsonSchema)]
 #[serde(untagged, expecting = "expected the path of a pipeline file, or a list of paths")]
 enum OneOrMore {
-    /// One.
+    /// One path.
     One(String),
-    /// Several.
+    /// Several paths.
     More(Vec<String>),
 }
 
@@ -55,38 +50,38 @@ fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<String>
     })
 }
 
-/// One stage's block.
+/// Block of one stage.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StageBlock {
-    /// What to run: a path from the file's folder, or the name of a binary beside `nerf-sr`;
-    /// without it: the block's name.
+    /// Program: a path relative to the file's folder, or the name of a program next to `nerf-sr`. The
+    /// default is the block's name.
     pub run: Option<String>,
-    /// Another block: this one runs the same program, with the parameters that the file and the
-    /// command line give the other one, except those given here.
+    /// Name of a block with the same program, whose parameters from the file and the command line
+    /// are inherited unless they are given here.
     pub extends: Option<String>,
-    /// Inputs: another stage (`prep`), a folder of its artifact (`prep/train`), or a path that
-    /// begins with `.` or `/`.
+    /// Inputs by name: a stage (`prep`), a subtree of its artifact (`prep/train`), or the path of a
+    /// folder, which starts with `.` or `/`.
     pub inputs: BTreeMap<String, String>,
-    /// Parameters that differ from the stage's defaults. One that selects a variant may hold that
-    /// variant's own: `field: {grid: {n_levels: 4}}` is `field: grid` and `n_levels: 4`.
+    /// Parameters that differ from the stage's defaults. A parameter that selects a variant may
+    /// contain the variant's own: `field: {grid: {n_levels: 4}}` is `field: grid` and `n_levels: 4`.
     pub parameters: Map<String, Value>,
-    /// What it needs of a machine, where a cluster runs it.
+    /// Resources that the stage needs on a cluster.
     #[serde(skip_serializing_if = "Resources::is_empty")]
     pub resources: Resources,
-    /// What files that extend this one's say of its parameters, one after the other.
+    /// Parameters that the files extending this block's file override, in order.
     #[serde(skip)]
-    pub changes: Vec<Map<String, Value>>,
+    pub overrides: Vec<Map<String, Value>>,
 }
 
 impl StageBlock {
-    /// Its parameters, those that weigh most last.
+    /// Returns the layers of parameters; a later layer overrides earlier ones.
     pub fn parameter_layers(&self) -> impl Iterator<Item = &Map<String, Value>> {
-        [&self.parameters].into_iter().chain(&self.changes)
+        [&self.parameters].into_iter().chain(&self.overrides)
     }
 
-    /// Whether the block itself says that.
-    fn says(&self, part: Part) -> bool {
+    /// Returns whether the block itself contains a part.
+    fn has(&self, part: Part) -> bool {
         match part {
             Part::Block => true,
             Part::Field("run") => self.run.is_some(),
@@ -96,127 +91,188 @@ impl StageBlock {
         }
     }
 
-    /// Takes what a block of the same name says in a file that extends this one's.
-    pub fn change(&mut self, by: &Self) {
-        if by.run.is_some() || by.extends.is_some() {
-            (self.run, self.extends) = (by.run.clone(), by.extends.clone());
+    /// Overrides parts of the block with those of `other`, the block of the same name in a file that
+    /// extends this one's.
+    pub fn override_with(&mut self, other: &Self) {
+        if other.run.is_some() || other.extends.is_some() {
+            self.run.clone_from(&other.run);
+            self.extends.clone_from(&other.extends);
         }
-        self.inputs.extend(by.inputs.clone());
-        self.changes.extend(by.parameter_layers().filter(|layer| !layer.is_empty()).cloned());
-        self.resources = self.resources.changed(&by.resources);
+        self.inputs.extend(other.inputs.clone());
+        let layers = other.parameter_layers().filter(|layer| !layer.is_empty());
+        self.overrides.extend(layers.cloned());
+        self.resources = self.resources.changed(&other.resources);
     }
 }
 
-/// A file that was read.
+/// Source of an input, parsed from the input's text in a block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum InputSource<'a> {
+    /// Folder outside the store.
+    Folder(&'a Path),
+    /// Artifact of another stage, or a subtree of it.
+    Stage { name: &'a str, subtree: Option<&'a str> },
+}
+
+impl<'a> InputSource<'a> {
+    pub(crate) fn parse(text: &'a str) -> Self {
+        if text.starts_with(['/', '.', '~']) {
+            return Self::Folder(Path::new(text));
+        }
+        match text.split_once('/') {
+            Some((name, subtree)) => Self::Stage { name, subtree: Some(subtree) },
+            None => Self::Stage { name: text, subtree: None },
+        }
+    }
+
+    /// Returns the stage's name; `None` for a folder.
+    pub(crate) fn stage(self) -> Option<&'a str> {
+        match self {
+            Self::Folder(_) => None,
+            Self::Stage { name, .. } => Some(name),
+        }
+    }
+}
+
+/// Part of a block that an error refers to.
+#[derive(Clone, Copy, Debug)]
+pub enum Part<'a> {
+    /// Whole block.
+    Block,
+    /// Field `run` or `extends`.
+    Field(&'a str),
+    /// Input of this name.
+    Input(&'a str),
+    /// Parameter of this name.
+    Parameter(&'a str),
+}
+
+/// Error in a pipeline file.
+#[derive(Debug, Clone, thiserror::Error)]
+#[error("{location}: {problem}")]
+pub struct PipelineError {
+    /// File and, if known, line number.
+    pub location: String,
+    /// Problem and remedy.
+    pub problem: String,
+}
+
+impl PipelineError {
+    pub(crate) fn new(path: &Path, line: Option<usize>, problem: impl Into<String>) -> Self {
+        let location = match line {
+            Some(line) => format!("{}:{line}", path.display()),
+            None => path.display().to_string(),
+        };
+        Self { location, problem: problem.into() }
+    }
+
+    fn from_yaml(path: &Path, error: &serde_yaml::Error) -> Self {
+        Self::new(path, error.location().map(|at| at.line()), without_line(error))
+    }
+}
+
+/// Pipeline file that was read.
 #[derive(Debug)]
 pub struct File {
-    /// As it is named in errors.
+    /// Path for messages.
     pub path: PathBuf,
-    /// By what it is known again, however it was named.
-    pub id: PathBuf,
-    pub written: PipelineFile,
+    /// Canonical path, the identity of the file.
+    pub canonical_path: PathBuf,
+    pub content: PipelineFile,
     text: String,
 }
 
 impl File {
-    /// The file of its bytes. Duplicate keys, unknown keys and types are refused here, with their
-    /// line.
+    /// Parses a pipeline file. Fails on duplicate keys, unknown keys and wrong types.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
-        let fail = |line, problem| PipelineError { place: place(path, line), problem };
-        let text = yaml_lines::decode(bytes).map_err(|e| fail(e.line, e.problem.to_owned()))?;
-        let located =
-            |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
-        // serde_yaml takes duplicate keys of maps silently; its own `Mapping` refuses them.
-        let mapping: serde_yaml::Mapping =
-            serde_yaml::from_str(text).map_err(|e| match yaml_lines::line_of_duplicate(text) {
-                Some(line) => fail(Some(line), format!("{}; leave one of them", without_line(&e))),
-                None => located(e),
-            })?;
-        let mut document = serde_yaml::Value::Mapping(mapping);
-        let merged = yaml_lines::expand_merge_keys(&mut document).map_err(located)?;
-        if let Some((keys, problem)) = problem_of(&document) {
-            return Err(fail(line_of(text, &keys), problem));
+        let text =
+            yaml_lines::decode(bytes).map_err(|e| PipelineError::new(path, e.line, e.problem))?;
+        let content = parse_content(text, path)?;
+        let canonical_path = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+        let file =
+            Self { path: path.to_path_buf(), canonical_path, content, text: text.to_owned() };
+        for name in file.content.stages.keys() {
+            if let Some(problem) = stage_name_problem(name) {
+                return Err(file.error(&["stages", name], format!("stage {name:?}: {problem}")));
+            }
         }
-        let written: PipelineFile = if merged {
-            serde_path_to_error::deserialize(document).map_err(|e| {
-                let keys: Vec<String> = e.path().iter().map(ToString::to_string).collect();
-                fail(line_of(text, &keys), format!("{}: {}", keys.join("."), e.inner()))
-            })?
-        } else {
-            serde_yaml::from_str(text).map_err(located)?
-        };
-        let id = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
-        let file = Self { path: path.to_path_buf(), id, written, text: text.to_owned() };
-        let named =
-            file.written.stages.keys().find_map(|name| Some((name, problem_of_name(name)?)));
-        named.map_or(Ok(()), |(name, problem)| {
-            Err(file.error(&["stages", name], format!("stage {name:?}: {problem}")))
-        })?;
         Ok(file)
     }
 
-    /// The folder that its relative paths start from.
+    /// Returns the folder that the file's relative paths start from.
     pub fn folder(&self) -> &Path {
         self.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
     }
 
-    /// Whether it says that of a stage.
-    pub fn says(&self, stage: &str, part: Part) -> bool {
-        self.written.stages.get(stage).is_some_and(|block| block.says(part))
+    /// Returns whether the file itself contains a part of a stage's block.
+    pub fn has(&self, stage: &str, part: Part) -> bool {
+        self.content.stages.get(stage).is_some_and(|block| block.has(part))
     }
 
-    /// An error about a key, through nested mappings, with its line.
+    /// Creates an error at the line of a key, given as a path through nested mappings.
     pub fn error(&self, keys: &[&str], problem: String) -> PipelineError {
-        PipelineError { place: place(&self.path, yaml_lines::line_of(&self.text, keys)), problem }
+        PipelineError::new(&self.path, yaml_lines::line_of(&self.text, keys), problem)
     }
 }
 
-/// What is wrong with a file before its types are looked at: the key, and what to do.
-fn problem_of(document: &serde_yaml::Value) -> Option<(Vec<String>, String)> {
-    if let Some(keys) = yaml_lines::find_non_finite(document) {
-        let problem = format!("{}: a number is neither NaN nor infinite", keys.join("."));
-        return Some((keys, problem));
+fn parse_content(text: &str, path: &Path) -> Result<PipelineFile, PipelineError> {
+    // serde_yaml silently accepts duplicate keys of maps; its own `Mapping` refuses them.
+    let mapping: serde_yaml::Mapping =
+        serde_yaml::from_str(text).map_err(|e| match yaml_lines::line_of_duplicate(text) {
+            None => PipelineError::from_yaml(path, &e),
+            line => PipelineError::new(path, line, without_line(&e) + "; remove one of them"),
+        })?;
+    let mut document = serde_yaml::Value::Mapping(mapping);
+    let has_merge_keys = yaml_lines::expand_merge_keys(&mut document)
+        .map_err(|e| PipelineError::from_yaml(path, &e))?;
+    if let Some(keys) = yaml_lines::find_non_finite(&document) {
+        let problem = format!("{}: expected a finite number", keys.join("."));
+        return Err(PipelineError::new(path, line_of(text, &keys), problem));
     }
-    let says_more = ["extends", "experiment"].iter().any(|key| document.get(key).is_some());
-    let missing = |key: &&str| document.get(key).is_none() && !says_more;
-    if let Some(key) = ["default", "stages"].iter().find(|key| missing(key)) {
-        return Some((Vec::new(), format!("missing field `{key}`")));
+    if document.get("extends").is_none() && document.get("experiment").is_none() {
+        for key in ["default", "stages"] {
+            if document.get(key).is_none() {
+                return Err(PipelineError::new(path, None, format!("missing field `{key}`")));
+            }
+        }
     }
-    None
+    if !has_merge_keys {
+        return serde_yaml::from_str(text).map_err(|e| PipelineError::from_yaml(path, &e));
+    }
+    // The merged document has no line numbers, but the error's keys lead to a line of the text.
+    serde_path_to_error::deserialize(document).map_err(|e| {
+        let keys: Vec<String> = e.path().iter().map(ToString::to_string).collect();
+        let problem = format!("{}: {}", keys.join("."), e.inner());
+        PipelineError::new(path, line_of(text, &keys), problem)
+    })
 }
 
-/// Names longer than this make no folder's name.
-const LONGEST_NAME: usize = 100;
+/// Maximum length of a stage's name, which becomes part of file names; chosen by hand.
+const MAX_NAME_BYTES: usize = 100;
 
-/// What is wrong with a stage's name, which becomes a part of file names and of command lines.
-fn problem_of_name(name: &str) -> Option<&'static str> {
+/// Returns the problem of a stage's name as part of file names and command lines.
+fn stage_name_problem(name: &str) -> Option<&'static str> {
     if name.is_empty() {
-        Some("a stage's name is empty")
+        Some("name is empty")
     } else if name.starts_with(['.', '-']) {
-        Some("a stage's name begins with a letter or a digit, not with `.` or `-`")
+        Some("name must not start with `.` or `-`")
     } else if name.contains(['/', '\\']) || name.contains("..") {
-        Some("a stage's name has no `/` and no `..`")
+        Some("name must not contain `/`, `\\` or `..`")
     } else if name.chars().any(|c| c.is_control() || c.is_whitespace()) {
-        Some("a stage's name has no white space and no control characters")
-    } else if name.len() > LONGEST_NAME {
-        Some("a stage's name has at most 100 bytes")
+        Some("name must not contain white space or control characters")
+    } else if name.len() > MAX_NAME_BYTES {
+        Some("name must not be longer than 100 bytes")
     } else {
         None
     }
 }
 
-/// What the parser says, less the line, which is named before it.
+/// Returns the parser's message without the line, which the location contains.
 fn without_line(error: &serde_yaml::Error) -> String {
     let text = error.to_string();
     text.rsplit_once(" at line ").map_or(text.clone(), |(problem, _)| problem.to_owned())
 }
 
-/// The line of a key, through nested mappings.
 fn line_of(text: &str, keys: &[String]) -> Option<usize> {
     yaml_lines::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>())
-}
-
-/// File and, where known, line.
-fn place(path: &Path, line: Option<usize>) -> String {
-    line.map_or_else(|| path.display().to_string(), |line| format!("{}:{line}", path.display()))
 }

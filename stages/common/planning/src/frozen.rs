@@ -1,5 +1,5 @@
-//! A plan as a file: what is queued stays what was submitted, whatever becomes of pipeline.yaml
-//! meanwhile.
+//! Plan as a file: queued jobs run the plan that was submitted, even if pipeline.yaml has changed
+//! (docs/design/032).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -14,10 +14,10 @@ use slurm::Resources;
 use crate::node::{Devices, Node, NodeInput, Origin, Plan, Sink};
 use crate::stages::{ProgramError, StageProgram};
 
-/// A plan without what can be made again from the rest.
+/// Serialisable plan.
 #[derive(Serialize, Deserialize)]
-pub struct Frozen {
-    /// Where pages go.
+pub struct FrozenPlan {
+    /// Folder of pages.
     pub out: PathBuf,
     devices: Devices,
     resources: BTreeMap<String, Resources>,
@@ -26,7 +26,7 @@ pub struct Frozen {
     sinks: Vec<FrozenSink>,
 }
 
-#[derive(Serialize, Deserialize)]
+#[derive(Clone, Serialize, Deserialize)]
 struct FrozenNode {
     stage: String,
     point: String,
@@ -36,7 +36,7 @@ struct FrozenNode {
     program: PathBuf,
 }
 
-#[derive(Serialize, Deserialize)]
+#[derive(Clone, Serialize, Deserialize)]
 struct FrozenSink {
     stage: String,
     parameters: Value,
@@ -45,41 +45,38 @@ struct FrozenSink {
     program: PathBuf,
 }
 
-/// Why a frozen plan can't be used.
+/// Error returned when a frozen plan can't be used.
 #[derive(Debug, thiserror::Error)]
 pub enum FrozenError {
     /// The file can't be read.
     #[error("{path}: {source}")]
     Read {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// It has another form.
-    #[error("{path}: another nerf-sr wrote it ({source}); submit it again")]
-    Form {
-        /// The file.
+    /// The file has the format of another version.
+    #[error("{path}: written by another version of nerf-sr ({source}); submit again")]
+    Format {
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Error of the parser.
         source: serde_json::Error,
     },
-    /// There is no such task.
+    /// The plan has no such task.
     #[error("the submission has no task {0}")]
     Task(usize),
-    /// A program isn't described as it should be.
+    /// The description of a program is missing or invalid.
     #[error(transparent)]
     Program(#[from] ProgramError),
 }
 
-impl Frozen {
-    /// The plan as it is written; pages go to a folder.
+impl FrozenPlan {
+    /// Freezes a plan. `out` is the folder of pages.
     pub fn new(plan: &Plan, out: &Path) -> Self {
-        let programs = plan
-            .nodes
-            .iter()
-            .map(|node| &node.program)
-            .chain(plan.sinks.iter().map(|sink| &sink.program));
+        let of_nodes = plan.nodes.iter().map(|node| &node.program);
+        let programs = of_nodes.chain(plan.sinks.iter().map(|sink| &sink.program));
         let nodes = plan.nodes.iter().map(|node| FrozenNode {
             stage: node.stage.clone(),
             point: node.point.clone(),
@@ -107,59 +104,54 @@ impl Frozen {
         }
     }
 
-    /// Reads a file that a submission wrote.
+    /// Reads the plan of a submission.
     pub fn read(path: &Path) -> Result<Self, FrozenError> {
         let bytes = std::fs::read(path)
             .map_err(|source| FrozenError::Read { path: path.to_path_buf(), source })?;
         serde_json::from_slice(&bytes)
-            .map_err(|source| FrozenError::Form { path: path.to_path_buf(), source })
+            .map_err(|source| FrozenError::Format { path: path.to_path_buf(), source })
     }
 
-    /// The plan of one task: the nodes that it needs, and itself at the end. Sinks are counted
-    /// after the nodes.
-    pub fn part(&self, number: usize) -> Result<Plan, FrozenError> {
-        let absent = || FrozenError::Task(number);
-        let sink = number
-            .checked_sub(self.nodes.len())
-            .map(|index| self.sinks.get(index).ok_or_else(absent))
-            .transpose()?;
-        let mut wanted: BTreeSet<usize> =
-            sink.map_or_else(|| [number].into(), |sink| sink.shows.iter().copied().collect());
+    /// Returns the plan of one task: the node or sink of this number, with all nodes that it needs.
+    /// Sinks are numbered after the nodes.
+    pub fn task_plan(&self, number: usize) -> Result<Plan, FrozenError> {
+        let mut needed = BTreeSet::new();
+        let mut sink = None;
+        if number < self.nodes.len() {
+            needed.insert(number);
+        } else {
+            let found =
+                self.sinks.get(number - self.nodes.len()).ok_or(FrozenError::Task(number))?;
+            needed.extend(&found.shows);
+            sink = Some(found.clone());
+        }
         for index in (0..self.nodes.len()).rev() {
-            if wanted.contains(&index) {
-                wanted.extend(self.nodes[index].inputs.iter().filter_map(NodeInput::node));
+            if needed.contains(&index) {
+                needed.extend(self.nodes[index].inputs.iter().filter_map(NodeInput::node));
             }
         }
-        let position: BTreeMap<usize, usize> =
-            wanted.iter().enumerate().map(|(at, &index)| (index, at)).collect();
+        let mut new_index = BTreeMap::new();
         let mut programs = BTreeMap::new();
-        let mut nodes = Vec::with_capacity(wanted.len());
-        for node in wanted.iter().map(|&index| &self.nodes[index]) {
-            let FrozenNode { stage, point, values, parameters, inputs, program } = node;
-            let (stage, point, values, parameters) =
-                (stage.clone(), point.clone(), values.clone(), parameters.clone());
-            let inputs = inputs.iter().map(|input| input.moved(&position)).collect();
-            nodes.push(Node {
-                stage,
-                point,
-                values,
-                parameters,
-                inputs,
-                program: self.program(program, &mut programs)?,
-            });
+        let mut nodes = Vec::with_capacity(needed.len());
+        for old_index in needed {
+            let FrozenNode { stage, point, values, parameters, mut inputs, program } =
+                self.nodes[old_index].clone();
+            for input in &mut inputs {
+                if let Origin::Node { index, .. } = &mut input.from {
+                    *index = new_index[index];
+                }
+            }
+            let program = self.program(&program, &mut programs)?;
+            new_index.insert(old_index, nodes.len());
+            nodes.push(Node { stage, point, values, parameters, inputs, program });
         }
         let mut sinks = Vec::new();
-        if let Some(FrozenSink { stage, parameters, shows, left_out, program }) = sink {
-            let (stage, parameters, left_out) =
-                (stage.clone(), parameters.clone(), left_out.clone());
-            let shows = shows.iter().map(|index| position[index]).collect();
-            sinks.push(Sink {
-                stage,
-                parameters,
-                shows,
-                left_out,
-                program: self.program(program, &mut programs)?,
-            });
+        if let Some(FrozenSink { stage, parameters, mut shows, left_out, program }) = sink {
+            for index in &mut shows {
+                *index = new_index[index];
+            }
+            let program = self.program(&program, &mut programs)?;
+            sinks.push(Sink { stage, parameters, shows, left_out, program });
         }
         Ok(Plan {
             nodes,
@@ -170,31 +162,20 @@ impl Frozen {
         })
     }
 
-    fn program<'a>(
-        &'a self,
-        path: &'a Path,
-        known: &mut BTreeMap<&'a Path, Arc<StageProgram>>,
+    /// Returns a program, the same one for all nodes of its path.
+    fn program(
+        &self,
+        path: &Path,
+        known: &mut BTreeMap<PathBuf, Arc<StageProgram>>,
     ) -> Result<Arc<StageProgram>, FrozenError> {
         if let Some(program) = known.get(path) {
             return Ok(Arc::clone(program));
         }
-        let absent = || ProgramError::Undescribed(path.to_path_buf());
-        let description = self.programs.get(path).ok_or_else(absent)?;
-        let program = Arc::new(StageProgram::new(path, description.clone())?);
-        known.insert(path, Arc::clone(&program));
-        Ok(program)
-    }
-}
-
-impl NodeInput {
-    /// The same input where nodes have other places.
-    fn moved(&self, position: &BTreeMap<usize, usize>) -> Self {
-        let from = match &self.from {
-            Origin::Node { index, subtree } => {
-                Origin::Node { index: position[index], subtree: subtree.clone() }
-            }
-            Origin::Folder(folder) => Origin::Folder(folder.clone()),
+        let Some(description) = self.programs.get(path) else {
+            return Err(ProgramError::Undescribed(path.to_path_buf()).into());
         };
-        Self { name: self.name.clone(), from }
+        let program = Arc::new(StageProgram::new(path, description.clone())?);
+        known.insert(path.to_path_buf(), Arc::clone(&program));
+        Ok(program)
     }
 }

@@ -1,5 +1,5 @@
-//! The key of an action. [`parts`] makes one flat list; its hash is the key, its differences are
-//! what `why` says. So an explanation can't drift from the key.
+//! Key of an action: the hash of one flat list of parts. `why` reports differences between such
+//! lists, so that its explanation always agrees with the key (docs/design/002).
 
 use std::cmp::Reverse;
 
@@ -9,15 +9,15 @@ use store::{KEY_VERSION, KEY_VERSION_PART, Record};
 use crate::changes::{Change, changes};
 use crate::node::Node;
 
-/// Everything that may change a node's result, by name. Not in it: threads, paths, verbosity, host,
-/// the block's name.
-pub fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
+/// Returns everything that may change a node's result, by name. Threads, paths, verbosity, host and
+/// the block's name are left out: they don't.
+pub fn key_parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
     let description = &node.program.description;
     let mut parts = Map::new();
     parts.insert(KEY_VERSION_PART.to_owned(), json!(KEY_VERSION));
     parts.insert("stage".to_owned(), json!(description.name));
     parts.insert("code".to_owned(), json!(description.code));
-    // cuda:0 and cuda:1 are the same kind of device.
+    // All CUDA devices are of one kind.
     parts.insert("device".to_owned(), json!(device.split(':').next().unwrap_or(device)));
     for (name, value) in node.parameters.as_object().into_iter().flatten() {
         parts.insert(format!("parameter {name}"), value.clone());
@@ -31,24 +31,25 @@ pub fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<Stri
     parts
 }
 
-/// What differs between a key and the nearest earlier one of the same block, in words; `None` when
-/// there is no earlier one.
+/// Returns the differences between a key and the nearest earlier one of the same block, as text;
+/// `None` if there is no earlier one.
 pub fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<String>> {
     Some(nearest_changes(parts, stage, records)?.iter().map(ToString::to_string).collect())
 }
 
-/// The same, for programs.
+/// Returns the differences between a key and the nearest earlier one of the same block; `None` if
+/// there is no earlier one.
 pub fn nearest_changes(
     parts: &Map<String, Value>,
     stage: &str,
     records: &[Record],
 ) -> Option<Vec<Change>> {
-    let record = nearest(parts, records.iter().filter(|record| record.stage == stage))?;
+    let record = nearest_record(parts, records.iter().filter(|record| record.stage == stage))?;
     Some(changes(&record.key_parts, parts))
 }
 
-/// The record whose key differs in the fewest parts; of several the newest.
-pub fn nearest<'a>(
+/// Returns the record whose key differs in the fewest parts, the newest if there are several.
+pub fn nearest_record<'a>(
     parts: &Map<String, Value>,
     records: impl Iterator<Item = &'a Record>,
 ) -> Option<&'a Record> {

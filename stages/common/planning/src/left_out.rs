@@ -1,4 +1,5 @@
-//! What isn't made: inputs of sinks that nobody wants to see, and blocks whose files aren't there.
+//! Parts of a pipeline that a plan leaves out: inputs of sinks that aren't selected, and blocks
+//! whose files are missing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -7,48 +8,53 @@ use artifact::known_names;
 use contract::plain;
 use serde_json::Value;
 
-use crate::check::needs;
+use crate::check::{input_stages, known_stages};
 use crate::experiment::Selection;
-use crate::part::Source;
+use crate::file::InputSource;
 use crate::pipeline::Pipeline;
 use crate::request::PlanError;
 
-/// The stages that a sink shows, of those that its block names.
-pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Selection) -> Vec<&'a str> {
-    let inputs = pipeline.stages[sink]
-        .inputs
-        .iter()
-        .filter_map(|(name, source)| Some((name, Source::of(source).stage()?)));
-    let wanted = if choice.show.is_empty() { &pipeline.experiment.show } else { &choice.show };
-    let chosen: Vec<&str> = inputs
-        .clone()
-        .filter(|(name, stage)| wanted.iter().any(|wanted| wanted == *name || wanted == stage))
-        .map(|(_, stage)| stage)
-        .collect();
-    // A file's own choice needn't be meant for this sink.
-    let shows_all = choice.show.is_empty() && chosen.is_empty();
-    if shows_all { inputs.map(|(_, stage)| stage).collect() } else { chosen }
+/// Returns the stages that a sink shows: its selected inputs, or all if none is selected.
+pub(crate) fn shown_stages<'a>(
+    pipeline: &'a Pipeline,
+    sink: &str,
+    selection: &Selection,
+) -> Vec<&'a str> {
+    let is_explicit = !selection.show.is_empty();
+    let show = if is_explicit { &selection.show } else { &pipeline.experiment.show };
+    let mut selected = Vec::new();
+    let mut all = Vec::new();
+    for (name, source) in &pipeline.stages[sink].inputs {
+        let Some(stage) = InputSource::parse(source).stage() else { continue };
+        all.push(stage);
+        if show.iter().any(|shown| shown == name || shown == stage) {
+            selected.push(stage);
+        }
+    }
+    // The file's selection may refer to another sink.
+    if is_explicit || !selected.is_empty() { selected } else { all }
 }
 
-/// Checks that sinks have the inputs that are wanted of them.
-pub(crate) fn check_shown(
+/// Checks that the sinks among the targets have the inputs of `--show`.
+pub(crate) fn check_show(
     pipeline: &Pipeline,
     sinks: &[&str],
-    choice: &Selection,
+    selection: &Selection,
 ) -> Result<(), PlanError> {
-    if choice.show.is_empty() {
+    if selection.show.is_empty() {
         return Ok(());
     }
     if sinks.is_empty() {
-        let problem = "--show chooses what a sink shows, and no target is one; name one as \
+        let problem = "--show selects inputs of sinks, but no target is a sink; name one as \
             target, such as report";
         return Err(PlanError::Usage(problem.to_owned()));
     }
     let names = sinks.iter().flat_map(|sink| {
-        pipeline.stages[*sink].inputs.keys().map(String::as_str).chain(needs(pipeline, sink))
+        let inputs = pipeline.stages[*sink].inputs.keys().map(String::as_str);
+        inputs.chain(input_stages(pipeline, sink))
     });
     let known: BTreeSet<&str> = names.collect();
-    if let Some(name) = choice.show.iter().find(|name| !known.contains(name.as_str())) {
+    if let Some(name) = selection.show.iter().find(|name| !known.contains(name.as_str())) {
         let problem = format!(
             "--show {name}: {} has no such input; {}",
             sinks.join(", "),
@@ -56,41 +62,40 @@ pub(crate) fn check_shown(
         );
         return Err(PlanError::Usage(problem));
     }
-    match sinks.iter().find(|sink| shown(pipeline, sink, choice).is_empty()) {
-        Some(sink) => Err(PlanError::Usage(format!(
-            "--show {}: {sink} has none of these; leave it out",
-            choice.show.join(",")
-        ))),
-        None => Ok(()),
+    if let Some(sink) = sinks.iter().find(|sink| shown_stages(pipeline, sink, selection).is_empty())
+    {
+        let show = selection.show.join(",");
+        let problem = format!("--show {show}: {sink} has none of these inputs; remove {sink}");
+        return Err(PlanError::Usage(problem));
     }
+    Ok(())
 }
 
-/// Files without which blocks aren't made.
+/// Files of an experiment without which blocks are left out.
 #[derive(Debug, Default)]
-pub(crate) struct Files {
+pub(crate) struct RequiredFiles {
+    /// Folder of the data sets.
     pub(crate) data: PathBuf,
-    /// Paths in `data` by block, with names of parameters in braces.
-    of: BTreeMap<String, String>,
+    /// Paths inside `data` by block, with names of parameters in braces.
+    paths: BTreeMap<String, String>,
 }
 
-impl Files {
-    pub(crate) fn new(pipeline: &Pipeline, choice: &Selection) -> Result<Self, PlanError> {
-        let of = pipeline.experiment.needs.clone();
-        if let Some(name) = of.keys().find(|name| !pipeline.stages.contains_key(*name)) {
-            let known = known_names(name, pipeline.stages.keys().map(String::as_str));
-            return Err(PlanError::Usage(format!(
-                "experiment: needs {name}: no such stage; {known}"
-            )));
+impl RequiredFiles {
+    pub(crate) fn new(pipeline: &Pipeline, selection: &Selection) -> Result<Self, PlanError> {
+        let paths = pipeline.experiment.needs.clone();
+        if let Some(name) = paths.keys().find(|name| !pipeline.stages.contains_key(*name)) {
+            let known = known_stages(pipeline, name);
+            let problem = format!("experiment: needs {name}: no such stage; {known}");
+            return Err(PlanError::Usage(problem));
         }
-        Ok(Self { data: pipeline.experiment.data(choice), of })
+        Ok(Self { data: pipeline.experiment.data_folder(selection), paths })
     }
 
-    /// What to say of a block whose file isn't there.
+    /// Returns the reason for leaving out a block; `None` if its file exists or it needs none.
     pub(crate) fn missing(&self, stage: &str, parameters: &Value) -> Option<String> {
-        let mut path = self.of.get(stage)?.clone();
+        let mut path = self.paths.get(stage)?.clone();
         for (name, value) in parameters.as_object().into_iter().flatten() {
-            let text = plain(value);
-            path = path.replace(&format!("{{{name}}}"), &text);
+            path = path.replace(&format!("{{{name}}}"), &plain(value));
         }
         (!self.data.join(&path).is_file()).then(|| format!("no {path}"))
     }

@@ -1,21 +1,23 @@
-//! From pipeline files, command lines and what stages say of themselves to a plan; nothing is run.
+//! Plans from pipeline files, command lines and descriptions of stages. This crate runs no stage.
 //!
-//! * [`PipelineFile`]: a file as written. [`Pipeline`]: its blocks with those of the files that it
-//!   extends. [`find`] looks for targets in `pipelines/` and `experiments/`, too.
-//! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several things.
-//! * [`Programs`]: what each stage says of itself; those that aren't known are asked.
-//! * [`Plan`]: stages × swept values as nodes in an order that works, and what of them is cached,
-//!   will run, or waits. `check` looks at the whole file, `arguments` and `axes` at the command
-//!   line, `expand` makes the nodes.
-//! * [`Source`]: a folder outside the store, its content hash and what was done to it since.
-//!   [`StageProgram::confirm`]: whether a program is still the planned one.
-//! * [`parts`]: the parts of an action's key; one list feeds both the hash and `why` ([`changes`]).
+//! * [`PipelineFile`]: content of one file. [`Pipeline`]: blocks of a file and of the files that it
+//!   extends. [`find_targets`] also searches the files in `pipelines/` and `experiments/`.
+//! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several parameters
+//!   and inputs.
+//! * [`Programs`]: description of each stage's program, cached in the store.
+//! * [`Plan`]: nodes (stages × swept values) in topological order, and their states: cached, to run
+//!   or waiting. `check` checks the whole pipeline, `arguments` and `axes` parse the command line,
+//!   `expand` creates the nodes.
+//! * [`Source`]: content hash of a folder outside the store, and changes since.
+//!   [`StageProgram::confirm`] checks that a program is still the planned one.
+//! * [`key_parts`]: parts of an action's key. The key is their hash, and [`changes`] explains
+//!   differences.
 //!
 //! ```no_run
-//! use planning::{Asking, Pipeline, Plan, Request};
+//! use planning::{Describing, Pipeline, Plan, Request};
 //! let pipeline = Pipeline::read("pipeline.yaml".as_ref())?;
 //! let store = store::Store::open(".nerf-sr".as_ref())?;
-//! let plan = Plan::new(&pipeline, &store, &Request::default(), Asking::Look)?;
+//! let plan = Plan::new(&pipeline, &store, &Request::default(), Describing::Own)?;
 //! println!("{} nodes", plan.nodes.len());
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -34,7 +36,6 @@ mod frozen;
 mod key;
 mod left_out;
 mod node;
-mod part;
 mod pipeline;
 mod plan;
 mod request;
@@ -43,19 +44,18 @@ mod stages;
 mod stamp;
 mod targets;
 
-pub use changes::{Change, changes, short};
-pub use confirm::Unconfirmed;
+pub use changes::{Change, changes, short_hash};
+pub use confirm::ConfirmError;
 pub use experiment::{Experiment, Selection, Variant};
 pub use extend::JoinError;
-pub use file::{PipelineFile, StageBlock};
-pub use frozen::{Frozen, FrozenError};
-pub use key::{explain, nearest, nearest_changes, parts};
+pub use file::{Part, PipelineError, PipelineFile, StageBlock};
+pub use frozen::{FrozenError, FrozenPlan};
+pub use key::{explain, key_parts, nearest_changes, nearest_record};
 pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
-pub use part::{Part, PipelineError};
 pub use pipeline::Pipeline;
 pub use plan::{FoundInputs, find_inputs, read_source};
 pub use request::{PlanError, Request};
 pub use sources::{Source, SourceError};
-pub use stages::{Asking, ProgramError, Programs, StageProgram, executable};
+pub use stages::{Describing, ProgramError, Programs, StageProgram, executable};
 pub use stamp::Stamp;
-pub use targets::find;
+pub use targets::find_targets;

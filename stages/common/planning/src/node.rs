@@ -10,110 +10,109 @@ use store::{Record, Waiting};
 
 use crate::stages::StageProgram;
 
-/// Stages × swept values, in an order in which every node comes after what it needs.
+/// Nodes (stages × swept values) and sinks to run.
 #[derive(Default)]
 pub struct Plan {
-    /// The nodes.
+    /// Nodes; each comes after its parents.
     pub nodes: Vec<Node>,
-    /// Sinks that are wanted: name, program, parameters, and the nodes they show (with what those
-    /// are made of).
+    /// Sinks among the targets.
     pub sinks: Vec<Sink>,
-    /// What to tell of the command line: what is overridden there, and what is given twice.
+    /// Notes to print: overridden and repeated arguments, blocks that are left out.
     pub notes: Vec<String>,
-    /// Where stages compute.
+    /// Devices of the stages.
     pub devices: Devices,
-    /// What each stage needs of a machine, where the file says so.
+    /// Resources by stage, as given in the file.
     pub resources: BTreeMap<String, Resources>,
 }
 
-/// Where stages compute.
+/// Devices of the stages.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Devices {
-    /// As the command line says.
+    /// Device given on the command line.
     pub given: String,
-    /// Whether a stage that needs GPUs computes on the first of its own.
+    /// True if stages with GPUs among their resources use `cuda:0`.
     pub by_resources: bool,
 }
 
-/// One action to be: a stage at one point of the sweep.
+/// Planned action: a stage at one point of the sweep.
 #[derive(Clone, Debug)]
 pub struct Node {
     /// Name of the stage's block.
     pub stage: String,
-    /// The sweep's values that reach it, e.g. `supersample=2`; empty without a sweep.
+    /// Swept values that reach the node, such as `supersample=2`; empty without a sweep.
     pub point: String,
-    /// The values of the axes that reach it and have a name, by that.
+    /// Values of the named axes that reach the node, by the axis's name.
     pub values: BTreeMap<String, String>,
-    /// All parameters, defaults filled in.
+    /// All parameters, including defaults.
     pub parameters: Value,
     /// Inputs, sorted by name.
     pub inputs: Vec<NodeInput>,
-    /// The stage's program.
+    /// Program of the stage.
     pub program: Arc<StageProgram>,
 }
 
-/// An input of a node.
+/// Input of a node.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NodeInput {
-    /// Its name.
+    /// Name of the input.
     pub name: String,
-    /// Where it comes from.
+    /// Origin of the input.
     pub from: Origin,
 }
 
-/// Where an input comes from.
+/// Origin of an input.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Origin {
-    /// Another node's artifact, or a folder of it.
+    /// Artifact of another node, or a subtree of it.
     Node {
-        /// The node.
+        /// Index of the node in the plan.
         index: usize,
-        /// The folder of its artifact that is meant, where that isn't all.
+        /// Subtree of the artifact; `None` for the whole artifact.
         subtree: Option<String>,
     },
-    /// A folder outside the store.
+    /// Folder outside the store.
     Folder(PathBuf),
 }
 
-/// A stage that shows a run.
+/// Planned sink: a stage that presents a run.
 pub struct Sink {
     /// Name of the stage's block.
     pub stage: String,
-    /// The stage's program.
+    /// Program of the stage.
     pub program: Arc<StageProgram>,
-    /// All parameters, defaults filled in.
+    /// All parameters, including defaults.
     pub parameters: Value,
-    /// The nodes that it shows.
+    /// Indices of the nodes to show.
     pub shows: Vec<usize>,
-    /// What it would show, if that had been there to make it of.
+    /// Points that can't be shown because a required file is missing.
     pub left_out: Vec<FailedPoint>,
 }
 
-/// The state of a node before a run.
+/// State of a node before a run.
 #[derive(Debug, Clone)]
 pub enum State {
-    /// Done before, with this record.
+    /// A record with the node's key exists.
     Cached(Box<Record>),
-    /// Its inputs are known, its key has no record.
+    /// The node's inputs are known, and no record has its key.
     WillRun {
-        /// All parts of its key.
+        /// All parts of the key.
         key_parts: Map<String, Value>,
     },
-    /// It can't be known before these have run.
+    /// The key depends on nodes that must run first.
     Waits {
-        /// Nodes.
+        /// Indices of these nodes.
         on: Vec<usize>,
     },
 }
 
 impl Node {
-    /// Stage and point, as people read it.
+    /// Returns stage and point as text.
     pub fn label(&self) -> String {
         label(&self.stage, &self.point)
     }
 
-    /// What a record of it looks like, while its inputs aren't known.
+    /// Returns the known part of the node's record, while inputs are unknown.
     pub fn waiting(&self) -> Waiting {
         Waiting {
             program: self.program.description.name.clone(),
@@ -121,56 +120,49 @@ impl Node {
         }
     }
 
-    /// The parameters that the scene decides, with the values that a finished artifact records;
-    /// null before that.
+    /// Returns the parameters whose defaults depend on the scene, with the values that the artifact
+    /// records; null if the artifact doesn't exist yet.
     pub fn by_scene(&self, artifact: &Path) -> Map<String, Value> {
         let output = &self.program.description.output;
         if output.resolved.is_none() {
             return Map::new();
         }
         let mut recorded = output.resolved(artifact);
-        let names = self.program.schema.by_scene(&self.parameters);
-        names
-            .into_iter()
-            .map(|name| (name.to_owned(), recorded.remove(name).unwrap_or_default()))
-            .collect()
+        let names = self.program.schema.by_scene(&self.parameters).into_iter();
+        names.map(|name| (name.to_owned(), recorded.remove(name).unwrap_or_default())).collect()
     }
 
-    /// The nodes it needs.
+    /// Returns the indices of the nodes that produce the inputs.
     pub fn parents(&self) -> impl Iterator<Item = usize> + '_ {
         self.inputs.iter().filter_map(NodeInput::node)
     }
-}
 
-impl Node {
-    /// Its inputs as a record names them; `number` gives another node's place in the record.
+    /// Returns the inputs for the record of a run. `index_in_record` converts a node's index in the
+    /// plan to its index in the record.
     pub fn run_inputs(
         &self,
-        number: impl Fn(usize) -> Option<usize>,
+        index_in_record: impl Fn(usize) -> Option<usize>,
     ) -> BTreeMap<String, RunInput> {
-        self.inputs
-            .iter()
-            .map(|input| (input.name.clone(), input.from.run_input(&number)))
-            .collect()
-    }
-}
-
-impl Origin {
-    /// As a record names it.
-    fn run_input(&self, number: impl Fn(usize) -> Option<usize>) -> RunInput {
-        match self {
-            Self::Node { index, subtree } => {
-                RunInput { node: number(*index), subtree: subtree.clone(), folder: None }
-            }
-            Self::Folder(folder) => {
-                RunInput { folder: Some(folder.clone()), ..RunInput::default() }
-            }
+        let mut inputs = BTreeMap::new();
+        for NodeInput { name, from } in &self.inputs {
+            let input = match from {
+                Origin::Node { index, subtree } => RunInput {
+                    node: index_in_record(*index),
+                    subtree: subtree.clone(),
+                    folder: None,
+                },
+                Origin::Folder(folder) => {
+                    RunInput { folder: Some(folder.clone()), ..RunInput::default() }
+                }
+            };
+            inputs.insert(name.clone(), input);
         }
+        inputs
     }
 }
 
 impl NodeInput {
-    /// The node that makes it.
+    /// Returns the index of the node that produces the input; `None` for a folder.
     pub fn node(&self) -> Option<usize> {
         match self.from {
             Origin::Node { index, .. } => Some(index),
@@ -180,8 +172,8 @@ impl NodeInput {
 }
 
 impl State {
-    /// In a word.
-    pub fn word(&self) -> &'static str {
+    /// Returns the name of the state.
+    pub fn name(&self) -> &'static str {
         match self {
             Self::Cached(_) => "cached",
             Self::WillRun { .. } => "will run",
@@ -189,15 +181,15 @@ impl State {
         }
     }
 
-    /// The record, where it is done.
-    pub fn record(self) -> Option<Record> {
+    /// Returns the record of a cached node.
+    pub fn into_record(self) -> Option<Record> {
         match self {
             Self::Cached(record) => Some(*record),
             Self::WillRun { .. } | Self::Waits { .. } => None,
         }
     }
 
-    /// The key, where it is known.
+    /// Returns the key, if it is known.
     pub fn key(&self) -> Option<String> {
         match self {
             Self::Cached(record) => Some(record.key()),

@@ -5,83 +5,87 @@ use std::sync::Arc;
 use slurm::Resources;
 
 use crate::experiment::Experiment;
-use crate::file::{File, StageBlock};
-use crate::part::{Part, PipelineError, Source};
+use crate::file::{File, InputSource, Part, PipelineError, StageBlock};
 
-/// The blocks of a pipeline file and of those that it extends.
+/// Blocks of a pipeline file and of the files that it extends.
 #[derive(Clone, Debug, Default)]
 pub struct Pipeline {
-    /// What `nerf-sr run` makes when no target is named.
+    /// Targets of `nerf-sr run` if the command line names none.
     pub default: Vec<String>,
-    /// The stages by name.
+    /// Blocks by stage name.
     pub stages: BTreeMap<String, StageBlock>,
     /// Scenes, protocols and variants.
     pub experiment: Experiment,
-    /// The file that was asked for, and those that it extends, each before what it extends itself.
+    /// The given file and the files that it extends; each file comes before those that it extends.
     pub files: Vec<Arc<File>>,
 }
 
-/// The folders of further pipelines and of experiments, beside pipeline.yaml.
-pub(crate) const SHELVES: [&str; 2] = ["pipelines", "experiments"];
+/// Folders of further pipelines and of experiments, next to pipeline.yaml.
+pub(crate) const TARGET_FOLDERS: [&str; 2] = ["pipelines", "experiments"];
 
 impl Pipeline {
-    /// The blocks that a stage's parameters come from, the weightiest last: the one it extends,
-    /// then its own.
+    /// Returns the blocks that give a stage's parameters: the block that it extends, then its own,
+    /// which overrides it.
     pub fn layers<'a>(&'a self, stage: &'a str) -> impl Iterator<Item = &'a str> {
         self.stages[stage].extends.as_deref().into_iter().chain([stage])
     }
 
-    /// What a stage needs of a machine: its own words over those of the block it extends.
+    /// Returns the resources that a stage needs, from all its layers.
     pub fn resources(&self, stage: &str) -> Resources {
-        let said = self.layers(stage).map(|layer| &self.stages[layer].resources);
-        said.fold(Resources::default(), |all, more| all.changed(more))
+        let layers = self.layers(stage).map(|layer| &self.stages[layer].resources);
+        layers.fold(Resources::default(), |resources, layer| resources.changed(layer))
     }
 
-    /// The project's folder, where the store, pages and `pipelines/` are: the file's own. A file of
-    /// `pipelines/` shares those of the folder above.
-    pub fn home(&self) -> PathBuf {
+    /// Returns the project's folder, which contains the store, pages and `pipelines/`: the folder of
+    /// the file, or the parent of `pipelines/` and `experiments/` for a file in them that extends
+    /// another.
+    pub fn project_folder(&self) -> PathBuf {
         let folder = self.files[0].folder();
-        let ends = |folder: &Path| SHELVES.iter().any(|shelf| folder.ends_with(shelf));
-        let is_shelf = folder.canonicalize().is_ok_and(|folder| ends(&folder));
+        let is_inside = folder.canonicalize().is_ok_and(|folder| is_target_folder(&folder));
         match folder.parent() {
-            _ if !is_shelf || self.files[0].written.extends.is_empty() => folder.to_path_buf(),
-            Some(above) if ends(folder) => Path::new(".").join(above),
+            _ if !is_inside || self.files[0].content.extends.is_empty() => folder.to_path_buf(),
+            Some(parent) if is_target_folder(folder) => Path::new(".").join(parent),
             _ => folder.join(".."),
         }
     }
 
-    /// Where a path leads that stands in a stage's block.
-    pub fn resolve(&self, stage: &str, part: Part, path: impl AsRef<Path>) -> PathBuf {
-        self.file_of(stage, part).folder().join(path)
+    /// Resolves a path of a stage's block from the folder of its file.
+    pub fn resolve_path(&self, stage: &str, part: Part, path: impl AsRef<Path>) -> PathBuf {
+        self.file_of_part(stage, part).folder().join(path)
     }
 
-    /// Whether another pipeline has the same block, with the same paths.
-    pub fn has_same(&self, other: &Self, stage: &str) -> bool {
-        self.stages[stage] == other.stages[stage] && self.roots(stage) == other.roots(stage)
+    /// Returns whether another pipeline has an equal block, with equal paths.
+    pub fn has_equal_block(&self, other: &Self, stage: &str) -> bool {
+        self.stages[stage] == other.stages[stage]
+            && self.base_folders(stage) == other.base_folders(stage)
     }
 
-    /// The folders that a block's relative paths start from.
-    fn roots(&self, stage: &str) -> Vec<Option<&Path>> {
+    /// Returns the folders that a block's relative paths start from.
+    fn base_folders(&self, stage: &str) -> Vec<Option<&Path>> {
         let block = &self.stages[stage];
         let run = block.run.iter().filter(|run| run.contains('/')).map(|_| Part::Field("run"));
         let folders =
-            block.inputs.iter().filter(|(_, source)| Source::of(source).stage().is_none());
+            block.inputs.iter().filter(|(_, source)| InputSource::parse(source).stage().is_none());
         let parts = run.chain(folders.map(|(name, _)| Part::Input(name)));
-        parts.map(|part| self.file_of(stage, part).id.parent()).collect()
+        parts.map(|part| self.file_of_part(stage, part).canonical_path.parent()).collect()
     }
 
-    /// The file that says that of a stage, or else the first that has it.
-    fn file_of(&self, stage: &str, part: Part) -> &File {
-        let file = self.files.iter().find(|file| file.says(stage, part));
+    /// Returns the file that gives a part of a block, or else the first file with the block.
+    fn file_of_part(&self, stage: &str, part: Part) -> &File {
+        let file = self.files.iter().find(|file| file.has(stage, part));
         file.map_or_else(|| self.file_of_block(stage), Arc::as_ref)
     }
 
-    /// The first file that has a block.
+    /// Returns the first file with a stage's block.
     pub fn file_of_block(&self, stage: &str) -> &File {
-        self.files.iter().find(|file| file.says(stage, Part::Block)).unwrap_or(&self.files[0])
+        self.find_file(|file| file.has(stage, Part::Block))
     }
 
-    /// An error about a stage's block, or a part of it, with its file and line.
+    fn find_file(&self, is_wanted: impl Fn(&File) -> bool) -> &File {
+        self.files.iter().find(|file| is_wanted(file)).unwrap_or(&self.files[0])
+    }
+
+    /// Creates an error about a part of a stage's block, with its file and line.
     pub fn error(&self, stage: &str, part: Part, problem: impl Into<String>) -> PipelineError {
         let inside = match part {
             Part::Block => &[][..],
@@ -90,26 +94,22 @@ impl Pipeline {
             Part::Parameter(name) => &["parameters", name],
         };
         let keys = [&["stages", stage], inside].concat();
-        self.file_of(stage, part).error(&keys, format!("stage {stage}: {}", problem.into()))
+        let problem = format!("stage {stage}: {}", problem.into());
+        self.file_of_part(stage, part).error(&keys, problem)
     }
 
-    /// An error about something that an experiment names, with the file that names it.
+    /// Creates an error about a name that an experiment sets, with the file that sets it.
     pub(crate) fn error_in_experiment(&self, name: &str, problem: &str) -> PipelineError {
-        let file = self
-            .files
-            .iter()
-            .find(|file| file.written.experiment.names(name))
-            .unwrap_or(&self.files[0]);
-        file.error(&["experiment"], format!("experiment: {problem}"))
+        self.find_file(|file| file.content.experiment.sets(name))
+            .error(&["experiment"], format!("experiment: {problem}"))
     }
 
-    /// An error about what stands before the stages.
+    /// Creates an error about the default targets.
     pub fn error_in_default(&self, problem: String) -> PipelineError {
-        let file = self
-            .files
-            .iter()
-            .find(|file| !file.written.default.is_empty())
-            .unwrap_or(&self.files[0]);
-        file.error(&["default"], problem)
+        self.find_file(|file| !file.content.default.is_empty()).error(&["default"], problem)
     }
+}
+
+fn is_target_folder(folder: &Path) -> bool {
+    TARGET_FOLDERS.iter().any(|name| folder.ends_with(name))
 }

@@ -2,52 +2,56 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use artifact::{hash_json, known_names};
+use artifact::hash_json;
 use contract::Description;
 use slurm::Resources;
 use store::Store;
 
 use crate::axes::Scope;
-use crate::check::{self, closure, needs};
+use crate::check;
 use crate::expand::Expansion;
 use crate::experiment_axes;
-use crate::key;
+use crate::key::key_parts;
 use crate::node::{Node, NodeInput, Origin, Plan, State};
 use crate::pipeline::Pipeline;
 use crate::request::{PlanError, Request};
 use crate::sources::{Source, SourceError};
-use crate::stages::{Asking, Programs};
+use crate::stages::{Describing, Programs};
 
 impl Plan {
-    /// Checks the whole file, then expands what is asked for.
+    /// Checks the whole pipeline, then expands the targets to nodes.
     pub fn new(
         pipeline: &Pipeline,
         store: &Store,
         request: &Request,
-        asking: Asking,
+        describing: Describing,
     ) -> Result<Self, PlanError> {
         let goal = Goal::new(pipeline, request)?;
-        let programs = Programs::ask(pipeline, store, &goal.needed, asking)?;
+        let programs = Programs::find(pipeline, store, &goal.needed, describing)?;
         goal.plan(pipeline, &programs, request)
     }
 
-    /// The plan where programs would describe themselves so: by the name of their file, or the path
-    /// that `run` gives. Nothing is started and no file is read.
+    /// Creates a plan from given descriptions, by the program's name or the path in `run`. Starts no
+    /// program and reads no file.
     pub fn from_descriptions(
         pipeline: &Pipeline,
         descriptions: &BTreeMap<String, Description>,
         request: &Request,
     ) -> Result<Self, PlanError> {
-        Goal::new(pipeline, request)?.plan(pipeline, &Programs::of(pipeline, descriptions), request)
+        Goal::new(pipeline, request)?.plan(
+            pipeline,
+            &Programs::from_descriptions(pipeline, descriptions),
+            request,
+        )
     }
 
-    /// Where a stage computes.
+    /// Returns the device of a stage.
     pub fn device(&self, stage: &str) -> &str {
         let has_gpu = self.resources.get(stage).is_some_and(Resources::has_gpu);
         if self.devices.by_resources && has_gpu { "cuda:0" } else { &self.devices.given }
     }
 
-    /// Finds the state of each node before a run. Ends soon after `stop` is set.
+    /// Returns the state of each node before a run. Ends soon after `stop` is set.
     pub fn states(
         &self,
         store: &Store,
@@ -62,7 +66,7 @@ impl Plan {
                 continue;
             }
             let inputs = find_inputs(node, store, stop, |index| cached_output(&states[index]))?;
-            let key_parts = key::parts(node, &inputs.hashes, self.device(&node.stage));
+            let key_parts = key_parts(node, &inputs.hashes, self.device(&node.stage));
             states.push(match store.hit(&hash_json(&key_parts))? {
                 Some(record) => State::Cached(Box::new(record)),
                 None => State::WillRun { key_parts },
@@ -75,26 +79,28 @@ impl Plan {
 fn cached_output(state: &State) -> String {
     match state {
         State::Cached(record) => record.output.clone(),
-        _ => unreachable!("a node whose parents aren't cached waits"),
+        _ => unreachable!("a node waits unless all parents are cached"),
     }
 }
 
-/// What is to be made.
+/// Targets, with the stages that they need.
 struct Goal<'a> {
     targets: &'a [String],
-    /// The stages that the targets come to by the file alone.
+    /// Targets and their transitive dependencies in the file.
     needed: BTreeSet<String>,
 }
 
 impl<'a> Goal<'a> {
     fn new(pipeline: &'a Pipeline, request: &'a Request) -> Result<Self, PlanError> {
-        check::names(pipeline)?;
+        check::check_names(pipeline)?;
         let targets = if request.targets.is_empty() { &pipeline.default } else { &request.targets };
         if let Some(target) = targets.iter().find(|target| !pipeline.stages.contains_key(*target)) {
-            let known = known_names(target, pipeline.stages.keys().map(String::as_str));
+            let known = check::known_stages(pipeline, target);
             return Err(PlanError::Usage(format!("no stage {target:?}; {known}")));
         }
-        let needed = closure(targets, |stage| needs(pipeline, stage).map(str::to_owned).collect());
+        let needed = check::dependencies(targets, |stage| {
+            check::input_stages(pipeline, stage).map(str::to_owned).collect()
+        });
         Ok(Self { targets, needed })
     }
 
@@ -104,31 +110,29 @@ impl<'a> Goal<'a> {
         programs: &Programs,
         request: &Request,
     ) -> Result<Plan, PlanError> {
-        check::blocks(pipeline, programs)?;
-        let order = check::order(pipeline)?;
+        check::check_blocks(pipeline, programs)?;
+        let order = check::topological_order(pipeline)?;
         let scope = Scope { pipeline, programs, needed: &self.needed };
         let (axes, mut notes) = scope.axes(request, experiment_axes::axes(&scope, request)?)?;
-        let plan = Expansion::new(pipeline, programs, &axes, &request.choice)?
+        let plan = Expansion::new(pipeline, programs, &axes, &request.selection)?
             .expand(&order, self.targets)?;
         notes.extend(plan.notes);
         let resources = self.needed.iter().map(|stage| (stage.clone(), pipeline.resources(stage)));
-        Ok(Plan {
-            notes,
-            resources: resources.filter(|(_, needs)| !needs.is_empty()).collect(),
-            ..plan
-        })
+        let resources = resources.filter(|(_, resources)| !resources.is_empty()).collect();
+        Ok(Plan { notes, resources, ..plan })
     }
 }
 
-/// Inputs of a node, as found.
+/// Inputs of a node, as far as the key and later checks need them.
 pub struct FoundInputs {
-    /// Content hashes by the inputs' names.
+    /// Content hashes by input name.
     pub hashes: Vec<(String, String)>,
-    /// Folders outside the store by the inputs' names.
+    /// Folders outside the store by input name.
     pub sources: BTreeMap<String, Source>,
 }
 
-/// Reads a node's inputs, given its parents' outputs. Ends soon after `stop` is set.
+/// Reads a node's inputs. `output_of` returns the identity of a parent's artifact. Ends soon after
+/// `stop` is set.
 pub fn find_inputs(
     node: &Node,
     store: &Store,
@@ -145,7 +149,7 @@ pub fn find_inputs(
             }
             Origin::Folder(folder) => {
                 let source = read_source(store, node, name, folder, stop)?;
-                let content = source.content();
+                let content = source.content_hash();
                 found.sources.insert(name.clone(), source);
                 content
             }
@@ -155,7 +159,7 @@ pub fn find_inputs(
     Ok(found)
 }
 
-/// Reads a folder outside the store, an input of a node. Ends soon after `stop` is set.
+/// Reads the folder of a node's input. Ends soon after `stop` is set.
 pub fn read_source(
     store: &Store,
     node: &Node,

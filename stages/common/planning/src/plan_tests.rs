@@ -156,7 +156,7 @@ fn a_block_follows_the_one_it_extends_save_in_what_it_says() {
 
 fn keys(text: &str, arguments: &[&str]) -> Vec<String> {
     let plan = plan_of(text, arguments).unwrap();
-    plan.nodes.iter().map(|node| artifact::hash_json(&key::parts(node, &[], "cpu"))).collect()
+    plan.nodes.iter().map(|node| artifact::hash_json(&key_parts(node, &[], "cpu"))).collect()
 }
 
 /// What is equal is one key, however it is written and wherever it is said; a default is the same
@@ -207,9 +207,9 @@ fn the_last_one_wins() {
         (
             &["-p", "scale=1,1.0,2,2e0", "-p", "scale=3,3.0"],
             &[
-                "-p scale=1,1.0,2,2e0: 1.0 is 1 again; it is made once",
-                "-p scale=1,1.0,2,2e0: 2e0 is 2 again; it is made once",
-                "-p scale=3,3.0: 3.0 is 3 again; it is made once",
+                "-p scale=1,1.0,2,2e0: 1.0 equals 1; it is used once",
+                "-p scale=1,1.0,2,2e0: 2e0 equals 2; it is used once",
+                "-p scale=3,3.0: 3.0 equals 3; it is used once",
                 "-p scale=1,1.0,2,2e0: overridden by -p scale=3,3.0",
             ],
             "scale",
@@ -223,7 +223,7 @@ fn the_last_one_wins() {
         ),
         (
             &["-i", "data=.,./,two"],
-            &["-i data=.,./,two: ./ is . again; it is made once"],
+            &["-i data=.,./,two: ./ equals .; it is used once"],
             "kernel",
             json!(null),
         ),
@@ -242,11 +242,8 @@ fn command_lines_that_cannot_be_meant() {
     for (arguments, words) in [
         (&["evla"][..], "no stage \"evla\"; known: again, make, prep, report, score, train"),
         (&["socre"], "no stage \"socre\"; did you mean score? known:"),
-        (
-            &["-p", "kernal=box"],
-            "-p kernal: no stage has such a parameter; did you mean kernel? see",
-        ),
-        (&["-i", "date=x"], "-i date: no stage has such an input; did you mean data?"),
+        (&["-p", "kernal=box"], "-p kernal: no stage has this parameter; did you mean kernel? see"),
+        (&["-i", "date=x"], "-i date: no stage has this input; did you mean data?"),
         (&["-p", "kernel"], "-p kernel: expected NAME=VALUE"),
         (&["-p", "perp.kernel=box"], "-p perp.kernel: no stage \"perp\"; did you mean prep?"),
         (
@@ -261,15 +258,15 @@ fn command_lines_that_cannot_be_meant() {
         ),
         (
             &["-p", "seed=1"],
-            "-p seed: more than one stage has it; say which: make.seed, train.seed",
+            "-p seed: several stages have this parameter; choose one: make.seed, train.seed",
         ),
         (
             &["-p", "rays=1,,2"],
-            "-p rays=1,,2: a value between commas is empty; leave the comma out, or write null",
+            "-p rays=1,,2: empty value between commas; remove the comma, or write null",
         ),
-        (&["-p", "rays=,"], "between commas is empty"),
-        (&["-i", "data="], "-i data=: no folder is named"),
-        (&["-i", "data=a,"], "-i data=a,: a folder's name between commas is empty"),
+        (&["-p", "rays=,"], "empty value between commas"),
+        (&["-i", "data="], "-i data=: expected a folder after `=`"),
+        (&["-i", "data=a,"], "-i data=a,: empty folder name between commas"),
         (&["-p", "size=0x10"], "stage make: parameter size: \"0x10\" is not of type \"integer\""),
         (&["-p", "size=+2"], "\"+2\" is not of type"),
         (&["-p", "size= 2"], "\" 2\" is not of type"),
@@ -279,7 +276,7 @@ fn command_lines_that_cannot_be_meant() {
         (&["-p", "rays=18446744073709551616"], "maximum of 18446744073709551615"),
         (&["-p", "supersample="], "parameter supersample: null is not of type"),
         (&["-p", "views=1,2"], "report is a sink and shows all points of a sweep at once"),
-        (&["-i", "report.run=x"], "report is a sink, which shows what the run made"),
+        (&["-i", "report.run=x"], "report is a sink, which shows results of the run, no folder"),
         (
             &["-p", "kernel=average", "-p", "prep.scale=2,2.7"],
             "stage prep [scale=2.7]: average needs a whole scale",
@@ -315,82 +312,72 @@ fn files_that_cannot_be_used() {
             "default: [report]",
             "\n\ndefault: [reprot]",
             3,
-            "stage reprot: named in `default`, but there is no such stage; did you mean report?",
+            "default: no stage \"reprot\"; did you mean report?",
         ),
         (
             "{data: make}",
             "{data: maek}",
             5,
-            "no stage \"maek\"; a folder begins with ./ or /; did you mean make?",
+            "no stage \"maek\"; a folder starts with ./ or /; did you mean make?",
         ),
-        ("{data: make}", "{date: make}", 5, "it has no input \"date\"; did you mean data?"),
+        ("{data: make}", "{date: make}", 5, "stage prep: no input \"date\"; did you mean data?"),
         (
             "extends: train",
             "extends: trian",
             11,
-            "extends: there is no stage \"trian\"; did you mean train?",
+            "extends: no stage \"trian\"; did you mean train?",
         ),
-        ("extends: train", "extends: train\n    run: x", 11, "give one of them"),
+        ("extends: train", "extends: train\n    run: x", 11, "remove one of them"),
         ("extends: train", "like: train", 11, "stages.again: unknown field `like`"),
         ("rays: 7", "rays: 0", 14, "parameter rays: 0 is less than the minimum"),
         ("rays: 7", "rayz: 7", 14, "parameter rayz: unknown; did you mean rays?"),
-        (
-            "rays: 7",
-            "rays: .nan",
-            14,
-            "stages.again.parameters.rays: a number is neither NaN nor infinite",
-        ),
-        ("rays: 7", "rays: -.inf", 14, "neither NaN nor infinite"),
+        ("rays: 7", "rays: .nan", 14, "stages.again.parameters.rays: expected a finite number"),
+        ("rays: 7", "rays: -.inf", 14, "expected a finite number"),
         ("rays: 7", "rays: 7\n    prameters: {}", 15, "unknown field `prameters`"),
         (
             "rays: 7",
             "rays: 7\n      rays: 8",
             15,
-            "stages.again.parameters: duplicate entry with key \"rays\"; leave one of them",
+            "stages.again.parameters: duplicate entry with key \"rays\"; remove one of them",
         ),
         (
             "      scene: prep/train",
             "      scene: prep/trian",
             9,
-            "prep has no folder \"trian\"; did you mean train?",
+            "prep has no subtree \"trian\"; did you mean train?",
         ),
         ("truth: prep}", "truth: make}", 16, "input truth takes scene, but make is data"),
         (
             "{run: score}",
             "{run: score}\n  late: {run: report, inputs: {run: report}}",
             19,
-            "input run: report is a sink, which shows a run; nothing can be made of that",
+            "input run: report is a sink, which has no artifact",
         ),
         (
             "{run: score}",
             "{run: score, more: ./x}",
             18,
-            "input more: a sink shows stages, and ./x is a folder",
+            "input more: ./x is a folder, but a sink shows stages",
         ),
         ("{run: score}", "{}", 17, "input run is missing"),
         (
             "    inputs: {scene: prep/train}",
             "    inputs: {scene: prep/train, weights: again}",
             10,
-            "stage again: its inputs lead back to it",
+            "stage again: inputs form a cycle",
         ),
-        (
-            "  make: {}",
-            "  ../make: {}",
-            3,
-            "stage \"../make\": a stage's name begins with a letter",
-        ),
-        ("  make: {}", "  a/b: {}", 3, "stage \"a/b\": a stage's name has no `/`"),
-        ("  make: {}", "  a..b: {}", 3, "no `..`"),
-        ("  make: {}", "  -x: {}", 3, "not with `.` or `-`"),
-        ("  make: {}", "  '': {}", 3, "a stage's name is empty"),
+        ("  make: {}", "  ../make: {}", 3, "stage \"../make\": name must not start with"),
+        ("  make: {}", "  a/b: {}", 3, "stage \"a/b\": name must not contain `/`"),
+        ("  make: {}", "  a..b: {}", 3, "or `..`"),
+        ("  make: {}", "  -x: {}", 3, "start with `.` or `-`"),
+        ("  make: {}", "  '': {}", 3, "name is empty"),
         (
             "  make: {}",
             "  \"a\\nb\": {}",
             3,
-            "stage \"a\\nb\": a stage's name has no white space and no control",
+            "stage \"a\\nb\": name must not contain white space or control",
         ),
-        ("  train:\n", "  train:\n    run: other\n", 8, "stage train: nothing describes other"),
+        ("  train:\n", "  train:\n    run: other\n", 8, "stage train: no description of other"),
     ] {
         let text = PIPELINE.replace(from, to);
         let problem = refused(&text, &[]).to_string();
@@ -404,7 +391,7 @@ fn files_that_cannot_be_used() {
     assert_eq!(unneeded.nodes.len(), 4);
     let problem = refused(&format!("{PIPELINE}  other: {{}}\n"), &["-p", "nothing=1"]).to_string();
     assert!(
-        problem.contains("such a parameter") && problem.contains("other couldn't be asked"),
+        problem.contains("has this parameter") && problem.contains("not described: other"),
         "{problem}"
     );
 }
@@ -475,14 +462,14 @@ fn parent_labels(plan: &Plan, node: &Node) -> Vec<String> {
 /// A task's part of a plan, written and read, is what its job works with.
 #[test]
 fn a_frozen_plan_has_all_that_a_task_needs() {
-    use crate::frozen::Frozen;
+    use crate::frozen::FrozenPlan;
     let plan = plan_of(PIPELINE, &["-p", "supersample=1,2", "report"]).unwrap();
-    let text = serde_json::to_vec(&Frozen::new(&plan, Path::new("/out"))).unwrap();
+    let text = serde_json::to_vec(&FrozenPlan::new(&plan, Path::new("/out"))).unwrap();
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("plan.json"), &text).unwrap();
-    let frozen = Frozen::read(&folder.path().join("plan.json")).unwrap();
+    let frozen = FrozenPlan::read(&folder.path().join("plan.json")).unwrap();
     for (index, node) in plan.nodes.iter().enumerate() {
-        let part = frozen.part(index).unwrap();
+        let part = frozen.task_plan(index).unwrap();
         let last = part.nodes.last().unwrap();
         assert_eq!((last.label(), &last.parameters), (node.label(), &node.parameters));
         assert_eq!(
@@ -490,7 +477,7 @@ fn a_frozen_plan_has_all_that_a_task_needs() {
             (parent_labels(&plan, node), ancestors(&plan, index))
         );
     }
-    let page = frozen.part(plan.nodes.len()).unwrap();
+    let page = frozen.task_plan(plan.nodes.len()).unwrap();
     assert_eq!((page.nodes.len(), page.sinks[0].shows.len()), (plan.nodes.len(), 2));
-    assert!(frozen.part(plan.nodes.len() + 1).is_err());
+    assert!(frozen.task_plan(plan.nodes.len() + 1).is_err());
 }

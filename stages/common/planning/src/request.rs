@@ -3,48 +3,48 @@ use stage_call::Interrupted;
 use store::StoreError;
 
 use crate::experiment::Selection;
-use crate::part::PipelineError;
+use crate::file::PipelineError;
 use crate::sources::SourceError;
 
-/// What is asked for on the command line.
+/// Targets and settings of the command line.
 #[derive(Clone, Debug, Default)]
 pub struct Request {
-    /// Stages to make; empty: the file's default.
+    /// Stages to run; if empty, the file's default.
     pub targets: Vec<String>,
-    /// `name=value[,value…]`, the name with or without its stage.
+    /// Parameters as `[STAGE.]NAME=VALUE[,VALUE…]`.
     pub parameters: Vec<String>,
-    /// `input=DIR[,DIR…]`, likewise.
+    /// Inputs as `[STAGE.]NAME=DIR[,DIR…]`.
     pub inputs: Vec<String>,
-    /// What of an experiment is wanted.
-    pub choice: Selection,
+    /// Selected parts of an experiment.
+    pub selection: Selection,
 }
 
-/// Why there is no plan.
+/// Error returned when there is no plan, or its states can't be found.
 #[derive(Debug, thiserror::Error)]
 pub enum PlanError {
-    /// The file is wrong.
+    /// A pipeline file is invalid.
     #[error(transparent)]
     Pipeline(#[from] PipelineError),
-    /// The command line is wrong.
+    /// The command line is invalid.
     #[error("{0}")]
     Usage(String),
-    /// A source folder is wrong.
+    /// A folder outside the store can't be used.
     #[error("stage {stage}: input {input}: {problem}")]
     Source {
-        /// The stage that takes it.
+        /// Stage with the input.
         stage: String,
-        /// The stage's input.
+        /// Name of the input.
         input: String,
-        /// What is wrong, and what to do.
+        /// Problem and remedy.
         problem: SourceError,
     },
     /// An artifact in the store can't be used.
     #[error("{0}")]
     Artifact(Damage),
-    /// The store can't be read: whether an artifact is there isn't known.
+    /// The store can't be read.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// A signal came while stages were asked what they are, or inputs were hashed.
+    /// A signal came while stages were described or inputs were hashed.
     #[error("interrupted")]
     Interrupted,
 }

@@ -14,7 +14,7 @@ fn store_and_data() -> (tempfile::TempDir, Store, PathBuf) {
 }
 
 fn content(store: &Store, folder: &Path) -> String {
-    Source::read(store, folder, None).unwrap().content()
+    Source::read(store, folder, None).unwrap().content_hash()
 }
 
 /// Gives a file a time of change long ago, as an archive does.
@@ -37,7 +37,7 @@ fn what_is_no_folder_is_refused() {
     fs::write(&file, "x").unwrap();
     let problem = |folder: &Path| Source::read(&store, folder, None).unwrap_err().to_string();
     assert_eq!(problem(&file), format!("{file:?}: not a folder"));
-    let words = "No such file or directory (os error 2); name a folder that is there";
+    let words = "No such file or directory (os error 2); name an existing folder";
     assert_eq!(problem(&absent), format!("{absent:?}: {words}"));
 }
 
@@ -85,7 +85,7 @@ fn files_that_change_places_are_hashed_anew() {
     fs::rename(&b, &a).unwrap();
     fs::rename(&aside, &b).unwrap();
     let now = Source::read(&store, &data, None).unwrap();
-    assert_ne!(now.content(), before.content());
+    assert_ne!(now.content_hash(), before.content_hash());
     assert_eq!(now.change_since(&before).as_deref(), Some("a was changed"));
 }
 
@@ -106,7 +106,7 @@ fn what_was_done_to_a_file_is_seen() {
     unpack(&file, "two");
     assert_eq!(change().as_deref(), Some("a was changed"));
     unpack(&file, "one");
-    assert_eq!(content(&store, &data), before.content());
+    assert_eq!(content(&store, &data), before.content_hash());
     assert_eq!(change().as_deref(), Some("a was changed"));
     fs::remove_file(&file).unwrap();
     assert_eq!(change().as_deref(), Some("a was removed"));
@@ -122,10 +122,10 @@ fn a_known_file_is_not_read_again() {
     let mut files = cache.files();
     files.get_mut("a").unwrap().blake3 = "0".repeat(64);
     cache.write(&files);
-    assert_ne!(content(&store, &data), before.content());
+    assert_ne!(content(&store, &data), before.content_hash());
     // A damaged cache is none.
     fs::write(&cache.path, "{").unwrap();
-    assert_eq!(content(&store, &data), before.content());
+    assert_eq!(content(&store, &data), before.content_hash());
 }
 
 #[test]
@@ -136,10 +136,10 @@ fn hashing_ends_with_the_signal_and_tells_how_far_it_is() {
     let result = Source::read(&store, &data, Some(&stop));
     assert!(matches!(result, Err(SourceError::Interrupted)), "{result:?}");
     let progress = HashProgress::default();
-    assert_eq!(progress.words(Path::new("data")), "listing the files of data");
+    assert_eq!(progress.message(Path::new("data")), "listing the files of data");
     progress.done.store(1_500_000_000, Ordering::Relaxed);
     progress.total.store(30_000_000_000, Ordering::Relaxed);
-    assert_eq!(progress.words(Path::new("data")), "hashing data: 1.5 GB of 30.0 GB");
+    assert_eq!(progress.message(Path::new("data")), "hashing data: 1.5 GB of 30.0 GB");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Folders outside the store: content hashes of their files, and whether they stay as they were.
+//! Folders outside the store: content hashes of their files, and changes since an earlier reading.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -16,50 +16,51 @@ use store::Store;
 
 use crate::stamp::Stamp;
 
-/// Interval between two looks at the signals' flag.
-const LOOK_INTERVAL: Duration = Duration::from_millis(20);
-/// Reading that takes longer than this is reported; again after twice the time, and so on.
+/// Interval between two checks of the stop flag.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+/// Time after which progress is reported, then again after twice that time and so on; chosen by
+/// hand.
 const NOTICE_AFTER: Duration = Duration::from_secs(2);
 
-/// A folder outside the store that has no content hash.
+/// Error returned when a folder outside the store can't be hashed.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// It can't be found.
-    #[error("{folder:?}: {problem}; name a folder that is there")]
-    Absent {
-        /// The folder.
+    /// The folder doesn't exist or can't be accessed.
+    #[error("{folder:?}: {problem}; name an existing folder")]
+    NotFound {
+        /// Path of the folder.
         folder: PathBuf,
-        /// Why.
+        /// Error of the system.
         problem: io::Error,
     },
-    /// It isn't a folder.
+    /// The path is that of a file.
     #[error("{0:?}: not a folder")]
-    NoFolder(PathBuf),
-    /// A file in it can't be read.
+    NotFolder(PathBuf),
+    /// A file in the folder can't be read.
     #[error("{folder:?}: {problem}")]
     Unreadable {
-        /// The folder.
+        /// Path of the folder.
         folder: PathBuf,
-        /// Why.
+        /// Error of the system.
         problem: io::Error,
     },
     /// A file changed while the folder was hashed.
-    #[error("{folder:?}: {change} while it was hashed; run again when nothing writes there")]
-    Changing {
-        /// The folder.
+    #[error("{folder:?}: {change} during hashing; run again when no program writes to the folder")]
+    Changed {
+        /// Path of the folder.
         folder: PathBuf,
-        /// File and change, as text.
+        /// File and kind of change, as text.
         change: String,
     },
-    /// A signal came.
+    /// A signal came during hashing.
     #[error("interrupted")]
     Interrupted,
 }
 
-/// A folder outside the store as it was when it was read.
+/// Content of a folder outside the store at the time of reading.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Source {
-    /// Files by their paths inside the folder.
+    /// Files by path inside the folder.
     files: BTreeMap<String, SourceFile>,
 }
 
@@ -71,8 +72,8 @@ struct SourceFile {
 }
 
 impl Source {
-    /// Reads a folder. Files that the store's cache knows by their stamps aren't hashed again.
-    /// Reports progress if hashing takes long, and ends soon after `stop` is set.
+    /// Reads a folder. Files with the stamps in the store's cache aren't hashed again. Reports progress
+    /// if hashing takes long, and ends soon after `stop` is set.
     pub fn read(
         store: &Store,
         folder: &Path,
@@ -80,20 +81,21 @@ impl Source {
     ) -> Result<Self, SourceError> {
         let absolute = folder
             .canonicalize()
-            .map_err(|problem| SourceError::Absent { folder: folder.to_path_buf(), problem })?;
+            .map_err(|problem| SourceError::NotFound { folder: folder.to_path_buf(), problem })?;
         if !absolute.is_dir() {
-            return Err(SourceError::NoFolder(folder.to_path_buf()));
+            return Err(SourceError::NotFolder(folder.to_path_buf()));
         }
         let cache = CacheFile::new(store, &absolute);
         let progress = Arc::new(HashProgress::default());
         let (sender, receiver) = mpsc::channel();
         let shared = Arc::clone(&progress);
-        // A thread of its own, which may wait for a dead file server for ever.
+        // On another thread, since a dead file server may block it for ever.
         std::thread::spawn(move || sender.send(read(&absolute, &cache, &shared)));
-        let (begun, mut notice) = (Instant::now(), NOTICE_AFTER);
+        let started = Instant::now();
+        let mut notice = NOTICE_AFTER;
         loop {
-            match receiver.recv_timeout(LOOK_INTERVAL) {
-                Ok(result) => return result.map_err(|failure| failure.at(folder)),
+            match receiver.recv_timeout(POLL_INTERVAL) {
+                Ok(result) => return result.map_err(|error| error.in_folder(folder)),
                 Err(RecvTimeoutError::Disconnected) => return Err(SourceError::Interrupted),
                 Err(RecvTimeoutError::Timeout) => {}
             }
@@ -101,15 +103,15 @@ impl Source {
                 progress.is_abandoned.store(true, Ordering::Relaxed);
                 return Err(SourceError::Interrupted);
             }
-            if begun.elapsed() >= notice {
-                report_line!("{}", progress.words(folder));
+            if started.elapsed() >= notice {
+                report_line!("{}", progress.message(folder));
                 notice *= 2;
             }
         }
     }
 
-    /// Returns the content hash: that of each file's path, size and hash.
-    pub fn content(&self) -> String {
+    /// Returns the content hash: the hash of all files' paths, sizes and hashes.
+    pub fn content_hash(&self) -> String {
         let entries: Vec<FileEntry> = self
             .files
             .iter()
@@ -122,17 +124,16 @@ impl Source {
         hash_json(&entries)
     }
 
-    /// Returns a hash of each file's path, size and time of its content's last change. A copy that
-    /// keeps times has the same.
-    pub fn times(&self) -> String {
+    /// Returns the hash of all files' paths, sizes and times of the last change of content. A copy with
+    /// preserved times has an equal one.
+    pub fn times_hash(&self) -> String {
         let files: Vec<_> =
             self.files.iter().map(|(path, file)| (path, file.stamp.of_content())).collect();
         hash_json(&files)
     }
 
-    /// Returns the first file that was changed, added or removed since an earlier reading, as text.
-    /// A file that has its earlier content again counts as changed: what a stage read in between
-    /// isn't known.
+    /// Returns the first file that was changed, added or removed since an earlier reading, as text. A
+    /// file that was changed back counts as changed: a stage may have read it in between.
     pub fn change_since(&self, earlier: &Self) -> Option<String> {
         first_change(&earlier.files, &self.files, |before, now| {
             now.stamp.is_untouched_since(&before.stamp) && now.blake3 == before.blake3
@@ -140,34 +141,36 @@ impl Source {
     }
 }
 
-/// Finds the first name at which two lists differ. Returns the difference as text.
+/// Returns the first difference between two maps of files, as text.
 fn first_change<T>(
     before: &BTreeMap<String, T>,
     now: &BTreeMap<String, T>,
     is_same: impl Fn(&T, &T) -> bool,
 ) -> Option<String> {
-    let changed = before.iter().find_map(|(name, old)| match now.get(name) {
-        None => Some(format!("{name} was removed")),
-        Some(new) if !is_same(old, new) => Some(format!("{name} was changed")),
-        Some(_) => None,
-    });
-    let added = || now.keys().find(|name| !before.contains_key(*name));
-    changed.or_else(|| added().map(|name| format!("{name} was added")))
+    for (name, old) in before {
+        match now.get(name) {
+            None => return Some(format!("{name} was removed")),
+            Some(new) if !is_same(old, new) => return Some(format!("{name} was changed")),
+            Some(_) => {}
+        }
+    }
+    let added = now.keys().find(|name| !before.contains_key(*name))?;
+    Some(format!("{added} was added"))
 }
 
 /// Progress of hashing a folder.
 #[derive(Default)]
 struct HashProgress {
-    /// Bytes hashed.
+    /// Number of bytes hashed so far.
     done: AtomicU64,
-    /// Bytes to hash in all; 0 while files are listed.
+    /// Number of bytes to hash; 0 while files are listed.
     total: AtomicU64,
-    /// True once nobody waits for the hash any more.
+    /// True after the caller has stopped waiting.
     is_abandoned: AtomicBool,
 }
 
 impl HashProgress {
-    fn words(&self, folder: &Path) -> String {
+    fn message(&self, folder: &Path) -> String {
         let (done, total) = (self.done.load(Ordering::Relaxed), self.total.load(Ordering::Relaxed));
         if total == 0 {
             return format!("listing the files of {}", folder.display());
@@ -177,45 +180,45 @@ impl HashProgress {
 }
 
 /// Error returned when a folder's files can't be hashed.
-enum ReadFailure {
+enum ReadError {
     Unreadable(io::Error),
-    Changing(String),
+    Changed(String),
 }
 
-impl ReadFailure {
-    fn at(self, folder: &Path) -> SourceError {
+impl ReadError {
+    fn in_folder(self, folder: &Path) -> SourceError {
         let folder = folder.to_path_buf();
         match self {
             Self::Unreadable(problem) => SourceError::Unreadable { folder, problem },
-            Self::Changing(change) => SourceError::Changing { folder, change },
+            Self::Changed(change) => SourceError::Changed { folder, change },
         }
     }
 }
 
-impl From<io::Error> for ReadFailure {
+impl From<io::Error> for ReadError {
     fn from(problem: io::Error) -> Self {
         Self::Unreadable(problem)
     }
 }
 
-/// Paths and stamps of files, by their paths inside a folder.
+/// Paths and stamps of files, by path inside a folder.
 type Listing = BTreeMap<String, (PathBuf, Stamp)>;
 
 fn list(folder: &Path) -> io::Result<Listing> {
     let files = list_source_files(folder)?.0.into_iter();
     files
         .map(|(relative, file)| {
-            let stamp = Stamp::of(&file).map_err(|e| naming(&file, &e))?;
-            Ok((name_of(&relative), (file, stamp)))
+            let stamp = Stamp::of(&file).map_err(|e| with_path(&file, &e))?;
+            Ok((path_text(&relative), (file, stamp)))
         })
         .collect()
 }
 
-fn naming(file: &Path, error: &io::Error) -> io::Error {
+fn with_path(file: &Path, error: &io::Error) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", file.display()))
 }
 
-fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Source, ReadFailure> {
+fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Source, ReadError> {
     let listing = list(folder)?;
     let mut files = cache.files();
     files.retain(|name, file| listing.get(name).is_some_and(|(_, stamp)| *stamp == file.stamp));
@@ -228,27 +231,27 @@ fn read(folder: &Path, cache: &CacheFile, progress: &HashProgress) -> Result<Sou
     let hashed: Vec<(String, SourceFile)> = unknown
         .into_par_iter()
         .map(|(name, (file, stamp))| {
-            let blake3 = hash_file(file, progress).map_err(|e| naming(file, &e))?;
+            let blake3 = hash_file(file, progress).map_err(|e| with_path(file, &e))?;
             Ok((name.clone(), SourceFile { stamp: *stamp, blake3 }))
         })
         .collect::<io::Result<_>>()?;
     files.extend(hashed);
-    // The hash of a file that is written to meanwhile may be that of no content it ever had.
+    // The hash of a file that is being written may fit no state of the file.
     let is_same = |before: &(PathBuf, Stamp), now: &(PathBuf, Stamp)| before.1 == now.1;
     if let Some(change) = first_change(&listing, &list(folder)?, is_same) {
-        return Err(ReadFailure::Changing(change));
+        return Err(ReadError::Changed(change));
     }
     cache.write(&files);
     Ok(Source { files })
 }
 
-/// Open file that counts the bytes that are read from it.
-struct Counted<'a> {
+/// Reader of a file that counts the bytes read.
+struct CountingReader<'a> {
     file: File,
     progress: &'a HashProgress,
 }
 
-impl Read for Counted<'_> {
+impl Read for CountingReader<'_> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         if self.progress.is_abandoned.load(Ordering::Relaxed) {
             return Err(io::Error::other("interrupted"));
@@ -261,11 +264,11 @@ impl Read for Counted<'_> {
 
 fn hash_file(path: &Path, progress: &HashProgress) -> io::Result<String> {
     let mut hasher = blake3::Hasher::new();
-    hasher.update_reader(Counted { file: File::open(path)?, progress })?;
+    hasher.update_reader(CountingReader { file: File::open(path)?, progress })?;
     Ok(hasher.finalize().to_hex().to_string())
 }
 
-/// File of the store's cache for one folder.
+/// Cache of one folder's hashes in the store.
 struct CacheFile {
     path: PathBuf,
     folder: String,
@@ -280,19 +283,19 @@ struct Cached {
 
 impl CacheFile {
     fn new(store: &Store, folder: &Path) -> Self {
-        let folder = name_of(folder);
+        let folder = path_text(folder);
         let name = format!("{}.json", hash_json(&folder));
         Self { path: store.root().join("cache/sources").join(name), folder }
     }
 
-    /// Reads the known files. A cache that can't be read is empty.
+    /// Reads the hashed files. An unreadable cache counts as empty.
     fn files(&self) -> BTreeMap<String, SourceFile> {
         let bytes = std::fs::read(&self.path).unwrap_or_default();
         let cached: Cached = serde_json::from_slice(&bytes).unwrap_or_default();
         if cached.folder == self.folder { cached.files } else { BTreeMap::new() }
     }
 
-    /// Writes the files whose next change will give them another stamp.
+    /// Writes the files whose next change will change their stamps.
     fn write(&self, files: &BTreeMap<String, SourceFile>) {
         let settled = files.iter().filter(|(_, file)| file.stamp.is_settled());
         let files = settled.map(|(name, file)| (name.clone(), file.clone())).collect();
@@ -300,7 +303,7 @@ impl CacheFile {
         if let Ok(bytes) = serde_json::to_vec(&Cached { folder, files })
             && let Some(parent) = self.path.parent()
         {
-            // Only a cache: without it the next start is slower.
+            // Without a cache, the next start is only slower.
             std::fs::create_dir_all(parent)
                 .and_then(|()| write_atomically(&self.path, &bytes))
                 .ok();
@@ -308,18 +311,14 @@ impl CacheFile {
     }
 }
 
-/// A path as text, another for each path: names that aren't UTF-8 are written in hexadecimal after
-/// a NUL, which no name has.
-fn name_of(path: &Path) -> String {
-    path.to_str().map_or_else(
-        || {
-            path.as_os_str()
-                .as_encoded_bytes()
-                .iter()
-                .fold("\0".to_owned(), |text, byte| text + &format!("{byte:02x}"))
-        },
-        str::to_owned,
-    )
+/// Converts a path to a unique text. Paths that aren't UTF-8 are written in hexadecimal after a NUL,
+/// which no path contains.
+fn path_text(path: &Path) -> String {
+    if let Some(text) = path.to_str() {
+        return text.to_owned();
+    }
+    let bytes = path.as_os_str().as_encoded_bytes();
+    bytes.iter().fold("\0".to_owned(), |text, byte| text + &format!("{byte:02x}"))
 }
 
 #[cfg(test)]

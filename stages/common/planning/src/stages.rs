@@ -1,9 +1,8 @@
-//! Which program each stage is, and what it says of itself: asked once for each build, and kept in
-//! the store.
+//! Stages' programs with their descriptions, which are cached in the store.
 //!
-//! Programs beside the runner are its own. Any other one is somebody's file that a pipeline.yaml
-//! names: `run` alone starts it, and only where it is needed; the other verbs know it by what it
-//! answered then, while its bytes are the same.
+//! Programs in the runner's folder are its own. Any other is a user's file that a pipeline file
+//! names: only `run` starts it, and only for a needed stage. Other verbs know it by its cached
+//! description while its bytes are unchanged (docs/design/030).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -17,71 +16,70 @@ use serde_json::{Map, Value};
 use stage_call::{DescribeError, Interrupted, describe_all};
 use store::Store;
 
-use crate::file::StageBlock;
-use crate::part::{Part, PipelineError};
+use crate::file::{Part, PipelineError, StageBlock};
 use crate::pipeline::Pipeline;
 use crate::stamp::Stamp;
 
-/// A stage's executable and what it says of itself.
+/// Program of a stage, with its description.
 #[derive(Debug)]
 pub struct StageProgram {
-    /// The executable.
+    /// Path of the executable.
     pub path: PathBuf,
-    /// What it says of itself.
+    /// Description from `STAGE describe`.
     pub description: Description,
-    /// Its parameters.
+    /// Schema of the parameters.
     pub schema: Schema,
-    /// Stamp of the executable from before it was asked; `None` in a plan that was read from a
+    /// Stamp of the executable from before it was described; `None` in a plan that was read from a
     /// file.
     pub(crate) stamp: Option<Stamp>,
 }
 
-/// Why a stage's program can't be used.
+/// Error returned when a stage's program can't be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ProgramError {
-    /// Its file can't be used.
+    /// The program's file can't be used.
     #[error("{path}: {problem}")]
     File {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong, and what to do.
+        /// Problem and remedy.
         problem: String,
     },
-    /// It isn't built.
+    /// The program isn't built.
     #[error("{path} isn't built; {remedy}")]
     Unbuilt {
-        /// Where it would be.
+        /// Path of the missing file.
         path: PathBuf,
-        /// What to do.
+        /// Command that builds the program, or an alternative.
         remedy: String,
     },
-    /// It is somebody's file, which only a run may start.
-    #[error("{0} is no part of nerf-sr: `nerf-sr run` starts it; read it first")]
+    /// The program is a user's file, which only `run` may start.
+    #[error("{0} isn't part of nerf-sr; read it first, then start it with `nerf-sr run`")]
     Foreign(PathBuf),
-    /// It doesn't say what it is.
+    /// The program can't be described.
     #[error(transparent)]
     Describe(#[from] DescribeError),
-    /// The program's file changed while the program was asked.
-    #[error("{0} changed while it was asked what it is; run again")]
-    Changing(PathBuf),
-    /// Nobody says what it is.
-    #[error("nothing describes {0}")]
+    /// The program's file changed while the program was described.
+    #[error("{0} changed while it was described; run again")]
+    Changed(PathBuf),
+    /// The given descriptions lack the program.
+    #[error("no description of {0}")]
     Undescribed(PathBuf),
-    /// What it says of itself is wrong.
-    #[error("what {path} says of itself can't be used: {problem}")]
+    /// The description is invalid.
+    #[error("description of {path} is invalid: {problem}")]
     Description {
-        /// The program.
+        /// Path of the program.
         path: PathBuf,
-        /// What is wrong.
+        /// Problem of the description.
         problem: DescriptionError,
     },
-    /// Its parameters can't be checked.
+    /// The schema of the parameters can't be compiled.
     #[error(transparent)]
     Schema(#[from] SchemaError),
 }
 
 impl StageProgram {
-    /// A program by what it says; fails where that can't be used.
+    /// Creates a program from its description. Fails if the description is invalid.
     pub fn new(path: &Path, description: Description) -> Result<Self, ProgramError> {
         description
             .check()
@@ -90,99 +88,104 @@ impl StageProgram {
         Ok(Self { path: path.to_path_buf(), description, schema, stamp: None })
     }
 
-    /// Whether a block of this program gives a parameter itself.
+    /// Returns whether a block of this program gives a parameter itself.
     pub fn is_given(&self, block: &StageBlock, parameter: &str) -> bool {
         block.parameter_layers().any(|layer| self.schema.flattened(layer).contains_key(parameter))
     }
 
-    /// The parameters that a block gives, laid over those that were given before.
+    /// Overrides the `given` parameters with those of a block.
     pub fn lay_over(&self, given: &mut Map<String, Value>, block: &StageBlock) {
-        block.parameter_layers().for_each(|layer| self.schema.lay_over(given, layer));
+        for layer in block.parameter_layers() {
+            self.schema.lay_over(given, layer);
+        }
     }
 }
 
-/// Which programs may be started to ask what they are.
+/// Programs that may be started to describe themselves.
 #[derive(Clone, Copy)]
-pub enum Asking<'a> {
-    /// The runner's own, and others that are needed; ends when the flag is set.
-    Run(&'a AtomicBool),
-    /// The runner's own.
-    Look,
+pub enum Describing<'a> {
+    /// The runner's own programs, and users' files that are needed; setting the flag interrupts.
+    Needed(&'a AtomicBool),
+    /// The runner's own programs only.
+    Own,
 }
 
-/// The stages' programs, or why they aren't known.
+/// Program of each stage, or the error that makes it unusable.
 pub struct Programs(BTreeMap<String, Result<Arc<StageProgram>, PipelineError>>);
 
 impl Programs {
-    /// A stage's program, where it is known.
+    /// Returns a stage's program, if it can be used.
     pub fn get(&self, stage: &str) -> Option<&StageProgram> {
         self.0.get(stage)?.as_deref().ok()
     }
 
-    /// A stage's program, or why it isn't known.
+    /// Returns a stage's program. Fails if it can't be used.
     pub fn require(&self, stage: &str) -> Result<&Arc<StageProgram>, PipelineError> {
         self.0[stage].as_ref().map_err(Clone::clone)
     }
 
-    /// The stages whose programs aren't known.
-    pub fn unknown(&self) -> impl Iterator<Item = &str> {
+    /// Returns the stages whose programs can't be used.
+    pub fn unusable(&self) -> impl Iterator<Item = &str> {
         self.0.iter().filter(|(_, program)| program.is_err()).map(|(stage, _)| stage.as_str())
     }
 
-    /// Programs by what they would answer; nothing is started.
-    pub fn of(pipeline: &Pipeline, descriptions: &BTreeMap<String, Description>) -> Self {
+    /// Creates the programs from given descriptions, by the name or path in the pipeline file.
+    /// Starts no program.
+    pub fn from_descriptions(
+        pipeline: &Pipeline,
+        descriptions: &BTreeMap<String, Description>,
+    ) -> Self {
         Self::new(pipeline, |stage| {
-            let name = program_name(pipeline, stage);
-            let absent = || ProgramError::Undescribed(PathBuf::from(name));
-            let description = descriptions.get(name).cloned().ok_or_else(absent)?;
-            StageProgram::new(Path::new(name), description)
+            let path = Path::new(program_name(pipeline, stage));
+            match descriptions.get(program_name(pipeline, stage)) {
+                Some(description) => StageProgram::new(path, description.clone()),
+                None => Err(ProgramError::Undescribed(path.to_path_buf())),
+            }
         })
     }
 
-    /// Finds the programs of all stages and asks those that aren't known yet; `needed` are the
-    /// stages that the targets come to.
-    pub fn ask(
+    /// Finds the programs of all stages. Describes those that aren't in the store's cache. `needed`
+    /// are the targets and their transitive dependencies.
+    pub fn find(
         pipeline: &Pipeline,
         store: &Store,
         needed: &BTreeSet<String>,
-        asking: Asking,
+        describing: Describing,
     ) -> Result<Self, Interrupted> {
-        let mut cache = DescriptionCache::of(store);
+        let mut cache = DescriptionCache::read(store);
         let mut answers: BTreeMap<PathBuf, Result<Answer, ProgramError>> = BTreeMap::new();
-        let mut unasked = BTreeMap::new();
+        let mut unknown = BTreeMap::new();
         let paths: BTreeMap<&str, PathBuf> =
             pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
         for (stage, path) in &paths {
             let is_needed =
                 paths.iter().any(|(stage, other)| other == path && needed.contains(*stage));
-            match identify(path, program_name(pipeline, stage)) {
-                Err(problem) => _ = answers.insert(path.clone(), Err(problem)),
-                Ok(identity) => match cache.answer(path, &identity) {
-                    Some(description) => {
-                        _ = answers.insert(path.clone(), Ok(Answer { identity, description }));
+            let answer = match identify(path, program_name(pipeline, stage)) {
+                Err(problem) => Err(problem),
+                Ok(identity) => match cache.description(path, &identity) {
+                    Some(description) => Ok(Answer { identity, description }),
+                    None if identity.may_be_started(describing, is_needed) => {
+                        unknown.insert(path.clone(), identity);
+                        continue;
                     }
-                    None if identity.may_be_asked(asking, is_needed) => {
-                        _ = unasked.insert(path.clone(), identity);
-                    }
-                    None => {
-                        answers.insert(path.clone(), Err(ProgramError::Foreign(path.clone())));
-                    }
+                    None => Err(ProgramError::Foreign(path.clone())),
                 },
-            }
+            };
+            answers.insert(path.clone(), answer);
         }
-        let stop = match asking {
-            Asking::Run(stop) => Some(stop),
-            Asking::Look => None,
+        let stop = match describing {
+            Describing::Needed(stop) => Some(stop),
+            Describing::Own => None,
         };
-        let asked = describe_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?;
-        for (path, description) in asked {
-            let answer = answer(&path, unasked[&path].clone(), description);
+        let unknown_paths: Vec<PathBuf> = unknown.keys().cloned().collect();
+        for (path, description) in describe_all(&unknown_paths, stop)? {
+            let answer = check_answer(&path, unknown[&path].clone(), description);
             if let Ok(answer) = &answer {
-                cache.0.insert(id(&path), answer.clone());
+                cache.0.insert(cache_key(&path), answer.clone());
             }
             answers.insert(path, answer);
         }
-        if !unasked.is_empty() {
+        if !unknown.is_empty() {
             cache.write(store);
         }
         Ok(Self::new(pipeline, |stage| {
@@ -192,7 +195,7 @@ impl Programs {
         }))
     }
 
-    /// What each stage's program turns out to be; what is wrong with it, is wrong with the block.
+    /// Finds each stage's program. Errors get the location of the stage's block.
     fn new(pipeline: &Pipeline, find: impl Fn(&str) -> Result<StageProgram, ProgramError>) -> Self {
         let programs = pipeline.stages.keys().map(|stage| {
             let program = find(stage)
@@ -204,8 +207,8 @@ impl Programs {
     }
 }
 
-/// Returns the answer of a program. Fails if its file has changed since it was identified.
-fn answer(
+/// Fails if a program's file has changed since it was identified.
+fn check_answer(
     path: &Path,
     identity: Identity,
     description: Result<Description, DescribeError>,
@@ -214,14 +217,15 @@ fn answer(
     if Stamp::of(path).is_ok_and(|now| now.is_untouched_since(&identity.stamp)) {
         Ok(Answer { identity, description })
     } else {
-        Err(ProgramError::Changing(path.to_path_buf()))
+        Err(ProgramError::Changed(path.to_path_buf()))
     }
 }
 
-/// Answers of `describe` by the program's path.
+/// Cached descriptions by the program's path.
 #[derive(Default, Serialize, Deserialize)]
 pub(crate) struct DescriptionCache(BTreeMap<String, Answer>);
 
+/// Description of a program, with the identity of its file.
 #[derive(Clone, Serialize, Deserialize)]
 struct Answer {
     #[serde(flatten)]
@@ -229,19 +233,19 @@ struct Answer {
     description: Description,
 }
 
-/// By what a program is known again.
+/// Identity of a program's file.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Identity {
     #[serde(flatten)]
     stamp: Stamp,
-    /// The hash of its bytes, where it isn't one of the runner's own: then a run has started it.
+    /// Hash of the bytes of a user's file; `None` for the runner's own programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     blake3: Option<String>,
 }
 
 impl DescriptionCache {
-    /// Reads the cache of a store. A cache that can't be read is empty.
-    fn of(store: &Store) -> Self {
+    /// Reads the cache of a store. An unreadable cache counts as empty.
+    fn read(store: &Store) -> Self {
         let bytes = std::fs::read(Self::file(store)).unwrap_or_default();
         serde_json::from_slice(&bytes).unwrap_or_default()
     }
@@ -252,108 +256,106 @@ impl DescriptionCache {
 
     fn write(&self, store: &Store) {
         if let Ok(bytes) = serde_json::to_vec(self) {
-            // Only a cache: without it the next start is slower.
+            // Without a cache, the next start is only slower.
             write_atomically(&Self::file(store), &bytes).ok();
         }
     }
 
-    /// Removes the answer of a program, so that the next run asks again.
+    /// Removes the description of a program, so that the next run describes it again.
     pub(crate) fn forget(store: &Store, program: &Path) {
-        let mut cache = Self::of(store);
-        if cache.0.remove(&id(program)).is_some() {
+        let mut cache = Self::read(store);
+        if cache.0.remove(&cache_key(program)).is_some() {
             cache.write(store);
         }
     }
 
-    fn answer(&self, path: &Path, identity: &Identity) -> Option<Description> {
-        self.0
-            .get(&id(path))
-            .filter(|answer| answer.identity.is_same(identity))
-            .map(|answer| answer.description.clone())
+    fn description(&self, path: &Path, identity: &Identity) -> Option<Description> {
+        let answer = self.0.get(&cache_key(path))?;
+        answer.identity.is_same(identity).then(|| answer.description.clone())
     }
 }
 
 impl Identity {
-    /// Compares two identities. Somebody's file is identified by its bytes alone: a copy of a
-    /// project has other times.
+    /// Returns whether two identities are equal. A user's file is identified by its bytes alone: a
+    /// copy of a project has other times.
     fn is_same(&self, other: &Self) -> bool {
         self.blake3 == other.blake3 && (self.blake3.is_some() || self.stamp == other.stamp)
     }
 
-    fn may_be_asked(&self, asking: Asking, is_needed: bool) -> bool {
-        self.blake3.is_none() || (is_needed && matches!(asking, Asking::Run(_)))
+    fn may_be_started(&self, describing: Describing, is_needed: bool) -> bool {
+        self.blake3.is_none() || (is_needed && matches!(describing, Describing::Needed(_)))
     }
 }
 
-fn id(path: &Path) -> String {
+fn cache_key(path: &Path) -> String {
     path.display().to_string()
 }
 
-/// What a stage runs: a path, or the name of a program beside the runner.
+/// Returns a stage's program as its block names it: a path, or the name of a program in the runner's
+/// folder.
 fn program_name<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
-    let origin = origin(pipeline, stage);
-    pipeline.stages[origin].run.as_deref().unwrap_or(origin)
+    let block = program_block(pipeline, stage);
+    pipeline.stages[block].run.as_deref().unwrap_or(block)
 }
 
-/// The block that says what a stage runs.
-fn origin<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
+/// Returns the name of the block that names a stage's program.
+fn program_block<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
     pipeline.stages[stage].extends.as_deref().unwrap_or(stage)
 }
 
-/// The executable of a stage.
+/// Returns the path of a stage's executable.
 pub fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
     let name = program_name(pipeline, stage);
     if name.contains('/') {
-        let path = pipeline.resolve(origin(pipeline, stage), Part::Field("run"), name);
+        let block = program_block(pipeline, stage);
+        let path = pipeline.resolve_path(block, Part::Field("run"), name);
         return path.canonicalize().unwrap_or(path);
     }
-    own_folder().join(name)
+    runner_folder().join(name)
 }
 
 /// Returns whether a program is one of the runner's own.
 pub(crate) fn is_own(path: &Path) -> bool {
-    path.parent() == Some(&own_folder())
+    path.parent() == Some(&runner_folder())
 }
 
-/// The runner's own folder.
-fn own_folder() -> PathBuf {
+/// Returns the folder of the running program.
+fn runner_folder() -> PathBuf {
     let exe = std::env::current_exe().and_then(|exe| exe.canonicalize());
     exe.ok().and_then(|exe| exe.parent().map(Path::to_path_buf)).unwrap_or_default()
 }
 
-/// What a program is known by; else what is wrong and what to do.
+/// Returns the identity of a program's file.
 fn identify(path: &Path, name: &str) -> Result<Identity, ProgramError> {
-    let fail = |problem: String| ProgramError::File { path: path.to_path_buf(), problem };
-    let stamp = std::fs::metadata(path).and_then(|meta| {
-        let kind = std::io::ErrorKind::IsADirectory;
-        if meta.is_dir() { Err(std::io::Error::from(kind)) } else { Stamp::of(path) }
-    });
-    match stamp {
-        Ok(stamp) if is_own(path) => Ok(Identity { stamp, blake3: None }),
-        Ok(stamp) => {
-            let hash = hash_file(path).map_err(|e| fail(e.to_string()))?;
-            Ok(Identity { stamp, blake3: Some(hash) })
+    let stamp =
+        if path.is_dir() { Err(std::io::ErrorKind::IsADirectory.into()) } else { Stamp::of(path) };
+    let error = match stamp {
+        Ok(stamp) if is_own(path) => return Ok(Identity { stamp, blake3: None }),
+        Ok(stamp) => match hash_file(path) {
+            Ok(hash) => return Ok(Identity { stamp, blake3: Some(hash) }),
+            Err(error) => error.to_string(),
+        },
+        Err(error) if name.contains('/') => {
+            format!("{error}; set `run:` to the stage's executable")
         }
-        Err(e) if name.contains('/') => {
-            Err(fail(format!("{e}; set `run:` to the stage's executable")))
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+            let suggestion = nearest_program(name)
+                .map(|other| format!("did you mean {other}? "))
+                .unwrap_or_default();
+            let remedy = format!("{suggestion}run `make build`, or set `run:` to another program");
+            return Err(ProgramError::Unbuilt { path: path.to_path_buf(), remedy });
         }
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-            let meant =
-                neighbour(name).map(|other| format!("did you mean {other}? ")).unwrap_or_default();
-            let remedy = format!("{meant}run `make build`, or set `run:` to another program");
-            Err(ProgramError::Unbuilt { path: path.to_path_buf(), remedy })
-        }
-        Err(e) => Err(fail(e.to_string())),
-    }
+        Err(error) => error.to_string(),
+    };
+    Err(ProgramError::File { path: path.to_path_buf(), problem: error })
 }
 
-/// The program beside the runner whose name is meant by another.
-fn neighbour(name: &str) -> Option<String> {
-    let files = std::fs::read_dir(own_folder())
-        .ok()?
-        .flatten()
-        .filter_map(|entry| entry.file_name().into_string().ok());
-    let mut programs: Vec<String> = files.filter(|file| !file.contains('.')).collect();
+/// Returns the program in the runner's folder whose name is most similar to an unknown name.
+fn nearest_program(name: &str) -> Option<String> {
+    let mut programs = Vec::new();
+    for entry in std::fs::read_dir(runner_folder()).ok()?.flatten() {
+        programs.extend(entry.file_name().into_string().ok().filter(|name| !name.contains('.')));
+    }
     programs.sort_unstable();
     nearest(name, programs.iter().map(String::as_str)).map(str::to_owned)
 }

@@ -6,23 +6,23 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
-/// Clocks of file systems tick in steps of up to two seconds (FAT).
-const COARSEST_TICK_SECONDS: u64 = 2;
+/// Maximum step of a file system's clock: FAT has two seconds.
+const MAX_TICK_SECONDS: u64 = 2;
 
-/// Size, times and inode of a file. While they are equal, so is the content.
+/// Size, times and inode of a file. Equal stamps mean equal contents (docs/design/002).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
     /// Size in bytes.
     pub(crate) size: u64,
-    /// Time of the last change of the content, in seconds and nanoseconds since 1970.
+    /// Time of the last change of the content, as seconds and nanoseconds since 1970.
     modified: (i64, i64),
-    /// Time of the last change of content, name, links or rights. No program can set it.
+    /// Time of the last change of content, name, links or permissions. Programs can't set it.
     changed: (i64, i64),
     inode: u64,
 }
 
 impl Stamp {
-    /// Reads the stamp of a file, through links.
+    /// Reads the stamp of a file. Links are followed.
     pub fn of(file: &Path) -> io::Result<Self> {
         let meta = metadata(file)?;
         Ok(Self {
@@ -33,21 +33,22 @@ impl Stamp {
         })
     }
 
-    /// Returns whether nobody has touched the file since `earlier`. Inodes aren't compared: exFAT,
-    /// SMB and SSHFS give new ones to old files.
+    /// Returns whether the file wasn't touched since `earlier`. Inodes aren't compared: exFAT, SMB and
+    /// SSHFS give new ones to old files.
     pub fn is_untouched_since(&self, earlier: &Self) -> bool {
         Self { inode: earlier.inode, ..*self } == *earlier
     }
 
-    /// Returns whether the next change of the file will change the stamp. A change within the same
-    /// tick of the clock would not.
+    /// Returns whether the next change of the file will change the stamp. A change in the same clock
+    /// tick as the last one would not.
     pub(crate) fn is_settled(&self) -> bool {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs() as i64;
-        let age = |time: (i64, i64)| now.abs_diff(time.0);
-        age(self.modified).min(age(self.changed)) > COARSEST_TICK_SECONDS
+        let times = [self.modified.0, self.changed.0];
+        times.iter().all(|time| now.abs_diff(*time) > MAX_TICK_SECONDS)
     }
 
-    /// Returns size and time of the content's last change. A copy of the file may have the same.
+    /// Returns the size and the time of the content's last change. A copy of the file may have equal
+    /// ones.
     pub(crate) fn of_content(&self) -> (u64, (i64, i64)) {
         (self.size, self.modified)
     }

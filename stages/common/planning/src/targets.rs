@@ -1,41 +1,50 @@
-//! Targets by name: blocks of pipeline.yaml, or else of the files in `pipelines/` beside it.
+//! Targets by name: blocks of pipeline.yaml, or else of the files in `pipelines/` next to it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use artifact::known_names;
 
-use crate::part::Part;
-use crate::pipeline::{Pipeline, SHELVES};
+use crate::file::Part;
+use crate::pipeline::{Pipeline, TARGET_FOLDERS};
 use crate::request::PlanError;
 
-/// The pipeline that has all targets, and the blocks that they are. `pipelines/NAME.yaml` is the
-/// target NAME: its block of that name, or its default. A block of such a file is a target, too.
-pub fn find(pipeline: &Pipeline, targets: &[String]) -> Result<(Pipeline, Vec<String>), PlanError> {
-    let (mut all, mut blocks): (Option<Pipeline>, Vec<String>) = (None, Vec::new());
+/// Returns a pipeline that contains all targets, and the targets' blocks. The target NAME is a
+/// block of pipeline.yaml; or the block NAME, or else the default, of `pipelines/NAME.yaml`; or a
+/// block of another file there.
+pub fn find_targets(
+    pipeline: &Pipeline,
+    targets: &[String],
+) -> Result<(Pipeline, Vec<String>), PlanError> {
+    let mut joined: Option<Pipeline> = None;
+    let mut blocks: Vec<String> = Vec::new();
     for target in targets {
-        let (found, named) = if pipeline.stages.contains_key(target) {
+        let (found, target_blocks) = if pipeline.stages.contains_key(target) {
             (pipeline.clone(), vec![target.clone()])
         } else {
-            on_shelf(pipeline, target)?
+            find_in_folders(pipeline, target)?
         };
-        all = Some(match all {
+        joined = Some(match joined {
             None => found,
-            Some(all) => all.joined(found).map_err(|problem| {
+            Some(joined) => joined.joined(found).map_err(|problem| {
                 PlanError::Usage(format!(
-                    "{target} can't be made together with {}: {problem}; make it by itself",
+                    "{target} can't be combined with {}: {problem}; run {target} alone",
                     blocks.join(", ")
                 ))
             })?,
         });
-        blocks.extend(named);
+        blocks.extend(target_blocks);
     }
-    Ok((all.unwrap_or_else(|| pipeline.clone()), blocks))
+    Ok((joined.unwrap_or_else(|| pipeline.clone()), blocks))
 }
 
-/// The file of `pipelines/` that has a target, and its blocks that are meant.
-fn on_shelf(pipeline: &Pipeline, target: &str) -> Result<(Pipeline, Vec<String>), PlanError> {
-    let files = shelf(pipeline);
+/// Returns the pipeline of the file in [`TARGET_FOLDERS`] that has a target, and the target's
+/// blocks.
+fn find_in_folders(
+    pipeline: &Pipeline,
+    target: &str,
+) -> Result<(Pipeline, Vec<String>), PlanError> {
+    let files = target_files(pipeline);
     if let Some(path) = files.get(target) {
         let found = Pipeline::read(path)?;
         let blocks = if found.stages.contains_key(target) {
@@ -45,10 +54,10 @@ fn on_shelf(pipeline: &Pipeline, target: &str) -> Result<(Pipeline, Vec<String>)
         };
         return Ok((found, blocks));
     }
-    // A file that can't be used is reported when it is asked for.
+    // An invalid file is reported only when it is the target.
     let others: Vec<Pipeline> =
         files.values().filter_map(|path| Pipeline::read(path).ok()).collect();
-    if let Some(found) = others.iter().find(|other| other.files[0].says(target, Part::Block)) {
+    if let Some(found) = others.iter().find(|other| other.files[0].has(target, Part::Block)) {
         return Ok((found.clone(), vec![target.to_owned()]));
     }
     let blocks = others.iter().chain([pipeline]).flat_map(|other| other.stages.keys());
@@ -56,13 +65,19 @@ fn on_shelf(pipeline: &Pipeline, target: &str) -> Result<(Pipeline, Vec<String>)
     Err(PlanError::Usage(format!("no stage {target:?}; {}", known_names(target, known))))
 }
 
-/// The files of `pipelines/` and `experiments/`, by name; the former win.
-fn shelf(pipeline: &Pipeline) -> BTreeMap<String, PathBuf> {
-    let folders = SHELVES.iter().rev().map(|shelf| pipeline.home().join(shelf));
-    let entries =
-        folders.flat_map(|folder| std::fs::read_dir(folder).into_iter().flatten().flatten());
-    let paths = entries
-        .map(|entry| entry.path())
-        .filter(|path| path.extension().is_some_and(|e| e == "yaml"));
-    paths.filter_map(|path| Some((path.file_stem()?.to_str()?.to_owned(), path))).collect()
+/// Returns the YAML files of [`TARGET_FOLDERS`] by name. A file of `pipelines/` hides one of
+/// `experiments/`.
+fn target_files(pipeline: &Pipeline) -> BTreeMap<String, PathBuf> {
+    let mut files = BTreeMap::new();
+    for folder in TARGET_FOLDERS.iter().rev().map(|name| pipeline.project_folder().join(name)) {
+        for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.extension().is_some_and(|extension| extension == "yaml")
+                && let Some(name) = path.file_stem().and_then(|name| name.to_str())
+            {
+                files.insert(name.to_owned(), path);
+            }
+        }
+    }
+    files
 }

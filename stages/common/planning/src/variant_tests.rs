@@ -166,7 +166,7 @@ fn wrong_and_foreign_names_are_refused() {
         (&["field={\"mlp\":{\"n_levels\":4}}"], "parameter n_levels: belongs to field: grid"),
         (&["field=voxels"], "parameter field: \"voxels\" is not one of \"grid\", \"mlp\""),
         (&["field=gird"], "did you mean \"grid\"?"),
-        (&["n_level=4"], "-p n_level: no stage has such a parameter; did you mean n_levels?"),
+        (&["n_level=4"], "-p n_level: no stage has this parameter; did you mean n_levels?"),
         (&["train-ss.n_level=4"], "train-ss has no such parameter; did you mean n_levels?"),
         (&["grid.n_levels=4"], "no stage \"grid\""),
         (&["hidden_dim=200"], "200 is greater than the maximum of 128"),
@@ -214,7 +214,7 @@ fn files_with_wrong_variants() {
 
 fn training_key(text: &str, arguments: &[&str]) -> String {
     let plan = plan_of(text, arguments).unwrap();
-    artifact::hash_json(&key::parts(&plan.nodes[1], &[], "cpu"))
+    artifact::hash_json(&key_parts(&plan.nodes[1], &[], "cpu"))
 }
 
 /// The key has the chosen variant's parameters, each by its name, however they were written.

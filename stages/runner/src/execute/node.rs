@@ -63,7 +63,7 @@ impl NodeJob<'_> {
         let inputs =
             find_inputs(self.node, self.store, Some(self.stop), |index| self.output_of(index))
                 .map_err(|e| unusable(&e))?;
-        let key_parts = planning::parts(self.node, &inputs.hashes, self.device());
+        let key_parts = planning::key_parts(self.node, &inputs.hashes, self.device());
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
         self.file.needs(&entered, &self.node.stage, &key).map_err(fail)?;

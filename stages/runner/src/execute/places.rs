@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use artifact::sized;
-use planning::nearest;
+use planning::nearest_record;
 use serde_json::{Map, Value};
 use store::Record;
 
@@ -24,7 +24,7 @@ impl Need {
     pub(crate) fn of(key_parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Self {
         let measured =
             records.iter().filter(|record| record.peak_memory.is_some() && record.stage == stage);
-        nearest(key_parts, measured).map_or(UNKNOWN_NEED, |record| Self {
+        nearest_record(key_parts, measured).map_or(UNKNOWN_NEED, |record| Self {
             cores: record
                 .processor_seconds
                 .map_or(1, |busy| (busy / record.seconds.max(1e-3)).round() as usize)

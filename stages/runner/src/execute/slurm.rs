@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 
 use anyhow::Context as _;
 use artifact::{Failure, counted, hash_json, print_line, report_line};
-use planning::{Frozen, PlanError, State};
+use planning::{FrozenPlan, PlanError, State};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
 use store::Record;
@@ -45,7 +45,7 @@ impl Executor for Cluster {
             slurm: &Slurm::default(),
             site: &self.site,
             command: &[runner.as_os_str(), JOB_VERB.as_ref()],
-            plan: &serde_json::to_vec(&Frozen::new(work.plan, &out))
+            plan: &serde_json::to_vec(&FrozenPlan::new(work.plan, &out))
                 .context("the plan can't be written down")?,
             folder: &std::env::current_dir()?,
             is_stopped: &|| work.stop.load(Ordering::Relaxed),
@@ -118,7 +118,7 @@ fn tasks(work: &Work<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
 fn done(work: &Work<'_>, out: &Path) -> anyhow::Result<Vec<bool>> {
     let (plan, store) = (work.plan, &work.session.store);
     let records: Vec<Option<Record>> =
-        plan.states(store, Some(work.stop))?.into_iter().map(State::record).collect();
+        plan.states(store, Some(work.stop))?.into_iter().map(State::into_record).collect();
     let sinks: Vec<bool> =
         plan.sinks.iter().map(|sink| is_shown(plan, sink, &records, store, out)).collect();
     Ok(records.iter().map(Option::is_some).chain(sinks).collect())

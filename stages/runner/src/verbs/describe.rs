@@ -5,7 +5,7 @@ use planning::{Pipeline, PlanError, executable};
 
 /// Prints the help of a stage's program: what it makes, its inputs and its parameters.
 pub(crate) fn describe(pipeline: &Pipeline, stage: &str) -> anyhow::Result<ExitCode> {
-    let (pipeline, _) = planning::find(pipeline, &[stage.to_owned()])?;
+    let (pipeline, _) = planning::find_targets(pipeline, &[stage.to_owned()])?;
     if !pipeline.stages.contains_key(stage) {
         let known = artifact::known_names(stage, pipeline.stages.keys().map(String::as_str));
         return Err(PlanError::Usage(format!("no stage {stage:?}; {known}")).into());

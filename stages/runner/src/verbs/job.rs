@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
 use artifact::{print_line, report_line, report_text};
-use planning::{Frozen, Node, Plan, Sink, State};
+use planning::{FrozenPlan, Node, Plan, Sink, State};
 use signal_hook::consts::SIGUSR1;
 use slurm::{Slurm, Submission};
 use stage_call::{Display, StageFailure, stop_on_signals};
@@ -28,8 +28,8 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let root =
         folder.ancestors().nth(2).context("a submission lies in a store's folder `slurm`")?;
     let store = Store::open(root)?;
-    let frozen = Frozen::read(&Submission::plan(folder))?;
-    let plan = frozen.part(number)?;
+    let frozen = FrozenPlan::read(&Submission::plan(folder))?;
+    let plan = frozen.task_plan(number)?;
     let result = register(&store, &plan, &stop).and_then(|run| {
         let (out, command) = (&frozen.out, &submitted_by(&store, folder));
         let task = Task { plan: &plan, store: &store, run: &run, out, stop: &stop, command };
@@ -84,7 +84,7 @@ struct Task<'a> {
 impl Task<'_> {
     fn carry_out(&self) -> Result<(), StageFailure> {
         let states = self.plan.states(self.store, Some(self.stop)).map_err(|e| unusable(&e))?;
-        let records: Vec<Option<Record>> = states.into_iter().map(State::record).collect();
+        let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
         match (self.plan.sinks.first(), self.plan.nodes.last()) {
             (Some(sink), _) => self.show(sink, &records),
             (None, Some(node)) => self.make(node, &records),

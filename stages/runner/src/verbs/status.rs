@@ -45,7 +45,7 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
             .chain((!detail.is_empty()).then_some(detail))
             .collect::<Vec<_>>()
             .join("; ");
-        print_line!("{:<40} {:<9} {detail}", node.label(), state.word());
+        print_line!("{:<40} {:<9} {detail}", node.label(), state.name());
     }
     if besides > 0 {
         print_line!(
