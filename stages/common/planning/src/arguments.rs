@@ -1,8 +1,8 @@
 //! Values on the command line: `-p NAME=VALUE[,VALUE…]` (docs/design/030, S3.6).
 //!
-//! A JSON number, `true`, `false` or `null` is parsed as JSON. An empty value is `null`. A value that
-//! starts with `[`, `{` or `"` is JSON and may contain commas. Any other value is a string: also
-//! `0x10`, `+2`, `02` and ` 2`, which the type of a numeric parameter refuses.
+//! A JSON number, `true`, `false` or `null` is parsed as JSON. An empty value is `null`. A value
+//! that starts with `[`, `{` or `"` is JSON and may contain commas. Any other value is a string:
+//! also `0x10`, `+2`, `02` and ` 2`, which the type of a numeric parameter refuses.
 
 use serde_json::Value;
 

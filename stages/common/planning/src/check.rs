@@ -60,7 +60,8 @@ fn check_extends(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<
 /// Checks every block with a usable program against the program's description, and the kinds of its
 /// inputs.
 pub(crate) fn check_blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), PipelineError> {
-    // Blocks that extend others come last: an inherited problem is reported for the inherited block.
+    // Blocks that extend others come last: an inherited problem is reported for the inherited
+    // block.
     let (extending, own): (Vec<_>, Vec<_>) =
         pipeline.stages.iter().partition(|(_, block)| block.extends.is_some());
     for (name, block) in own.into_iter().chain(extending) {

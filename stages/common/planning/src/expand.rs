@@ -1,5 +1,5 @@
-//! Expansion of stages and axes to nodes: each stage has one node for each combination of the values
-//! that reach it.
+//! Expansion of stages and axes to nodes: each stage has one node for each combination of the
+//! values that reach it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -62,8 +62,8 @@ impl<'a> Expansion<'a> {
         })
     }
 
-    /// Creates the nodes of the targets and their dependencies, each after its parents. `order` is a
-    /// topological order of all stages.
+    /// Creates the nodes of the targets and their dependencies, each after its parents. `order` is
+    /// a topological order of all stages.
     pub(crate) fn expand(
         mut self,
         order: &[String],
@@ -198,7 +198,8 @@ impl<'a> Expansion<'a> {
         }
     }
 
-    /// Returns the reason for leaving out a stage at a point: a missing file, its own or a parent's.
+    /// Returns the reason for leaving out a stage at a point: a missing file, its own or a
+    /// parent's.
     fn missing(&mut self, stage: &str, point: &Point, parameters: &Value) -> Option<String> {
         if let Some(reason) = self.required_files.missing(stage, parameters) {
             let data = self.required_files.data.display();

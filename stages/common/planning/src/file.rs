@@ -18,8 +18,8 @@ use crate::experiment::Experiment;
 #[derive(Clone, Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PipelineFile {
-    /// One or more pipeline files whose blocks are inherited. They may share blocks only if these are
-    /// equal.
+    /// One or more pipeline files whose blocks are inherited. They may share blocks only if these
+    /// are equal.
     #[serde(deserialize_with = "one_or_more")]
     #[schemars(with = "OneOrMore")]
     pub extends: Vec<String>,
@@ -54,8 +54,8 @@ fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<String>
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StageBlock {
-    /// Program: a path relative to the file's folder, or the name of a program next to `nerf-sr`. The
-    /// default is the block's name.
+    /// Program: a path relative to the file's folder, or the name of a program next to `nerf-sr`.
+    /// The default is the block's name.
     pub run: Option<String>,
     /// Name of a block with the same program, whose parameters from the file and the command line
     /// are inherited unless they are given here.
@@ -64,7 +64,8 @@ pub struct StageBlock {
     /// folder, which starts with `.` or `/`.
     pub inputs: BTreeMap<String, String>,
     /// Parameters that differ from the stage's defaults. A parameter that selects a variant may
-    /// contain the variant's own: `field: {grid: {n_levels: 4}}` is `field: grid` and `n_levels: 4`.
+    /// contain the variant's own: `field: {grid: {n_levels: 4}}` is `field: grid` and
+    /// `n_levels: 4`.
     pub parameters: Map<String, Value>,
     /// Resources that the stage needs on a cluster.
     #[serde(skip_serializing_if = "Resources::is_empty")]
@@ -91,8 +92,8 @@ impl StageBlock {
         }
     }
 
-    /// Overrides parts of the block with those of `other`, the block of the same name in a file that
-    /// extends this one's.
+    /// Overrides parts of the block with those of `other`, the block of the same name in a file
+    /// that extends this one's.
     pub fn override_with(&mut self, other: &Self) {
         if other.run.is_some() || other.extends.is_some() {
             self.run.clone_from(&other.run);

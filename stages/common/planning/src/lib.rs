@@ -2,8 +2,8 @@
 //!
 //! * [`PipelineFile`]: content of one file. [`Pipeline`]: blocks of a file and of the files that it
 //!   extends. [`find_targets`] also searches the files in `pipelines/` and `experiments/`.
-//! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several parameters
-//!   and inputs.
+//! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several
+//!   parameters and inputs.
 //! * [`Programs`]: description of each stage's program, cached in the store.
 //! * [`Plan`]: nodes (stages × swept values) in topological order, and their states: cached, to run
 //!   or waiting. `check` checks the whole pipeline, `arguments` and `axes` parse the command line,

@@ -36,9 +36,9 @@ impl Pipeline {
         layers.fold(Resources::default(), |resources, layer| resources.changed(layer))
     }
 
-    /// Returns the project's folder, which contains the store, pages and `pipelines/`: the folder of
-    /// the file, or the parent of `pipelines/` and `experiments/` for a file in them that extends
-    /// another.
+    /// Returns the project's folder, which contains the store, pages and `pipelines/`: the folder
+    /// of the file, or the parent of `pipelines/` and `experiments/` for a file in them that
+    /// extends another.
     pub fn project_folder(&self) -> PathBuf {
         let folder = self.files[0].folder();
         let is_inside = folder.canonicalize().is_ok_and(|folder| is_target_folder(&folder));

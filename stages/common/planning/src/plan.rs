@@ -31,8 +31,8 @@ impl Plan {
         goal.plan(pipeline, &programs, request)
     }
 
-    /// Creates a plan from given descriptions, by the program's name or the path in `run`. Starts no
-    /// program and reads no file.
+    /// Creates a plan from given descriptions, by the program's name or the path in `run`. Starts
+    /// no program and reads no file.
     pub fn from_descriptions(
         pipeline: &Pipeline,
         descriptions: &BTreeMap<String, Description>,

@@ -72,8 +72,8 @@ struct SourceFile {
 }
 
 impl Source {
-    /// Reads a folder. Files with the stamps in the store's cache aren't hashed again. Reports progress
-    /// if hashing takes long, and ends soon after `stop` is set.
+    /// Reads a folder. Files with the stamps in the store's cache aren't hashed again. Reports
+    /// progress if hashing takes long, and ends soon after `stop` is set.
     pub fn read(
         store: &Store,
         folder: &Path,
@@ -124,16 +124,16 @@ impl Source {
         hash_json(&entries)
     }
 
-    /// Returns the hash of all files' paths, sizes and times of the last change of content. A copy with
-    /// preserved times has an equal one.
+    /// Returns the hash of all files' paths, sizes and times of the last change of content. A copy
+    /// with preserved times has an equal one.
     pub fn times_hash(&self) -> String {
         let files: Vec<_> =
             self.files.iter().map(|(path, file)| (path, file.stamp.of_content())).collect();
         hash_json(&files)
     }
 
-    /// Returns the first file that was changed, added or removed since an earlier reading, as text. A
-    /// file that was changed back counts as changed: a stage may have read it in between.
+    /// Returns the first file that was changed, added or removed since an earlier reading, as text.
+    /// A file that was changed back counts as changed: a stage may have read it in between.
     pub fn change_since(&self, earlier: &Self) -> Option<String> {
         first_change(&earlier.files, &self.files, |before, now| {
             now.stamp.is_untouched_since(&before.stamp) && now.blake3 == before.blake3
@@ -311,8 +311,8 @@ impl CacheFile {
     }
 }
 
-/// Converts a path to a unique text. Paths that aren't UTF-8 are written in hexadecimal after a NUL,
-/// which no path contains.
+/// Converts a path to a unique text. Paths that aren't UTF-8 are written in hexadecimal after a
+/// NUL, which no path contains.
 fn path_text(path: &Path) -> String {
     if let Some(text) = path.to_str() {
         return text.to_owned();

@@ -291,8 +291,8 @@ fn cache_key(path: &Path) -> String {
     path.display().to_string()
 }
 
-/// Returns a stage's program as its block names it: a path, or the name of a program in the runner's
-/// folder.
+/// Returns a stage's program as its block names it: a path, or the name of a program in the
+/// runner's folder.
 fn program_name<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
     let block = program_block(pipeline, stage);
     pipeline.stages[block].run.as_deref().unwrap_or(block)

@@ -33,22 +33,22 @@ impl Stamp {
         })
     }
 
-    /// Returns whether the file wasn't touched since `earlier`. Inodes aren't compared: exFAT, SMB and
-    /// SSHFS give new ones to old files.
+    /// Returns whether the file wasn't touched since `earlier`. Inodes aren't compared: exFAT, SMB
+    /// and SSHFS give new ones to old files.
     pub fn is_untouched_since(&self, earlier: &Self) -> bool {
         Self { inode: earlier.inode, ..*self } == *earlier
     }
 
-    /// Returns whether the next change of the file will change the stamp. A change in the same clock
-    /// tick as the last one would not.
+    /// Returns whether the next change of the file will change the stamp. A change in the same
+    /// clock tick as the last one would not.
     pub(crate) fn is_settled(&self) -> bool {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs() as i64;
         let times = [self.modified.0, self.changed.0];
         times.iter().all(|time| now.abs_diff(*time) > MAX_TICK_SECONDS)
     }
 
-    /// Returns the size and the time of the content's last change. A copy of the file may have equal
-    /// ones.
+    /// Returns the size and the time of the content's last change. A copy of the file may have
+    /// equal ones.
     pub(crate) fn of_content(&self) -> (u64, (i64, i64)) {
         (self.size, self.modified)
     }

@@ -35,12 +35,13 @@ const ENVIRONMENT: [&str; 12] = [
     stage::SLOW_VARIABLE,
 ];
 
-/// Maximum number of last stderr lines that are searched for the reason of a failure, chosen by hand.
+/// Maximum number of last stderr lines that are searched for the reason of a failure, chosen by
+/// hand.
 const MAX_TAIL_LINES: usize = 8;
 /// Interval between two checks of a running stage.
 const POLL_INTERVAL: Duration = Duration::from_millis(10);
-/// Time that a stopped stage has for its checkpoint after the end of the wrapper script that started
-/// it (docs/design/001).
+/// Time that a stopped stage has for its checkpoint after the end of the wrapper script that
+/// started it (docs/design/001).
 const MAX_CHECKPOINT_TIME: Duration = Duration::from_secs(10);
 
 /// Arguments of one call of a stage.
@@ -67,8 +68,8 @@ pub struct Call<'a> {
     pub device: &'a str,
     /// Value of `--threads`.
     pub threads: usize,
-    /// File of the key's lock. The stage inherits it as standard input, so that the key stays locked
-    /// until the stage ends.
+    /// File of the key's lock. The stage inherits it as standard input, so that the key stays
+    /// locked until the stage ends.
     pub lock: Option<&'a File>,
 }
 

@@ -48,8 +48,8 @@ pub(crate) fn memory_kills() -> Option<u64> {
 }
 
 impl Exit {
-    /// Returns the failure of a stage with an unsuccessful status. `name` is the name that the stage
-    /// may print before its messages.
+    /// Returns the failure of a stage with an unsuccessful status. `name` is the name that the
+    /// stage may print before its messages.
     pub(crate) fn failure(&self, name: &str) -> StageFailure {
         if self.was_stopped && self.status.signal().is_some() {
             return StageFailure { code: 130, message: "interrupted".to_owned() };

@@ -1,5 +1,5 @@
-//! Process groups: a stage with the processes that it starts. Ctrl-C in a terminal signals the runner
-//! alone: the first one makes it terminate its stages, the second one kills them.
+//! Process groups: a stage with the processes that it starts. Ctrl-C in a terminal signals the
+//! runner alone: the first one makes it terminate its stages, the second one kills them.
 
 use std::collections::BTreeSet;
 use std::io::{self, Read as _};
@@ -14,8 +14,8 @@ use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process_group, wa
 use stage::stop_signals;
 use wait4::{ResUse, Wait4 as _};
 
-/// Process ids of the leaders of all running groups. No leader has been waited for, so that no other
-/// process can have the same id.
+/// Process ids of the leaders of all running groups. No leader has been waited for, so that no
+/// other process can have the same id.
 static RUNNING: Mutex<BTreeSet<i32>> = Mutex::new(BTreeSet::new());
 
 fn running() -> MutexGuard<'static, BTreeSet<i32>> {
@@ -81,8 +81,8 @@ fn kill_and_wait(id: Pid, leader: Child) -> io::Result<ResUse> {
     leader.wait4()
 }
 
-/// Returns a flag that SIGINT, SIGTERM and SIGHUP set. The second signal kills all running groups and
-/// ends the process with exit code 130.
+/// Returns a flag that SIGINT, SIGTERM and SIGHUP set. The second signal kills all running groups
+/// and ends the process with exit code 130.
 pub fn stop_on_signals() -> io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let (mut signals, sender) = UnixStream::pair()?;

@@ -6,8 +6,8 @@
 //! * [`StageFailure`]: cause of a failure, found from the stage's messages, its allocator's
 //!   messages, and the signal that ended its process.
 //! * [`stop_on_signals`]: the first signal sets a flag, the second kills all child processes.
-//! * [`Display`]: progress of running stages on a terminal or as lines. Any [`Watcher`] can follow a
-//!   call.
+//! * [`Display`]: progress of running stages on a terminal or as lines. Any [`Watcher`] can follow
+//!   a call.
 //! * [`seconds`], [`utc`]: durations and times as text.
 //!
 //! ```no_run

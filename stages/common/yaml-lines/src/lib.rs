@@ -1,8 +1,8 @@
 //! Encodings, merge keys and key lines of hand-written YAML files.
 //!
 //! * [`decode`]: converts a file's bytes to text, or fails with a [`DecodeError`].
-//! * [`expand_merge_keys`]: replaces merge keys. [`find_non_finite`]: finds a number that JSON can't
-//!   represent.
+//! * [`expand_merge_keys`]: replaces merge keys. [`find_non_finite`]: finds a number that JSON
+//!   can't represent.
 //! * [`line_of`]: line number of a key. [`line_of_duplicate`]: line number of a repeated key.
 //!
 //! serde_yaml reads the values; this crate finds line numbers for error messages.
@@ -47,8 +47,8 @@ pub fn decode(bytes: &[u8]) -> Result<&str, DecodeError> {
     })
 }
 
-/// Replaces merge keys (`<<: *anchor`) by the entries of their anchors. Returns whether the document
-/// has merge keys.
+/// Replaces merge keys (`<<: *anchor`) by the entries of their anchors. Returns whether the
+/// document has merge keys.
 pub fn expand_merge_keys(document: &mut Value) -> Result<bool, serde_yaml::Error> {
     let mut merged = false;
     // A merged mapping may contain merge keys of its own.
@@ -95,8 +95,8 @@ fn found_line(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
     error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
 }
 
-/// Returns the line number of a key, given as a path through nested mappings. If the key is missing,
-/// returns the line of the last existing key of the path.
+/// Returns the line number of a key, given as a path through nested mappings. If the key is
+/// missing, returns the line of the last existing key of the path.
 pub fn line_of(text: &str, path: &[&str]) -> Option<usize> {
     (1..=path.len()).rev().find_map(|length| {
         let search = Search(&path[..length]);
