@@ -6,52 +6,33 @@
 
 use serde_json::Value;
 
-/// Error returned for invalid values of an argument.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum ArgumentError {
-    /// One of several values is empty.
-    #[error("empty value between commas; remove the comma, or write null")]
-    EmptyValue,
-    /// A value starts like JSON, but is invalid.
-    #[error("{value} is invalid JSON: {problem}")]
-    Json {
-        /// Text of the value.
-        value: String,
-        /// Error of the parser.
-        problem: serde_json::Error,
-    },
-    /// No folder is given.
-    #[error("expected a folder after `=`")]
-    NoFolder,
-    /// One of several folders is empty.
-    #[error("empty folder name between commas; remove the comma")]
-    EmptyFolder,
-}
-
-/// Parses a list of values. Returns each with its text.
-pub(crate) fn values(text: &str) -> Result<Vec<(&str, Value)>, ArgumentError> {
+/// Parses a list of values. Returns each with its text, or fails with the problem and a remedy.
+pub(crate) fn values(text: &str) -> Result<Vec<(&str, Value)>, String> {
     if text.is_empty() {
         return Ok(vec![("", Value::Null)]);
     }
     split(text).into_iter().map(|part| Ok((part, parse_value(part)?))).collect()
 }
 
-/// Parses a list of folders.
-pub(crate) fn folders(text: &str) -> Result<Vec<&str>, ArgumentError> {
+/// Parses a list of folders. Fails with the problem and a remedy.
+pub(crate) fn folders(text: &str) -> Result<Vec<&str>, String> {
     if text.is_empty() {
-        return Err(ArgumentError::NoFolder);
+        return Err("expected a folder after `=`".to_owned());
     }
     let folders: Vec<&str> = text.split(',').collect();
-    if folders.contains(&"") { Err(ArgumentError::EmptyFolder) } else { Ok(folders) }
+    if folders.contains(&"") {
+        return Err("empty folder name between commas; remove the comma".to_owned());
+    }
+    Ok(folders)
 }
 
-fn parse_value(text: &str) -> Result<Value, ArgumentError> {
+fn parse_value(text: &str) -> Result<Value, String> {
     if text.is_empty() {
-        return Err(ArgumentError::EmptyValue);
+        return Err("empty value between commas; remove the comma, or write null".to_owned());
     }
     let parsed = serde_json::from_str::<Value>(text);
     if text.starts_with(JSON_START) {
-        return parsed.map_err(|problem| ArgumentError::Json { value: text.to_owned(), problem });
+        return parsed.map_err(|problem| format!("{text} is invalid JSON: {problem}"));
     }
     // A value with white space around it is a string, although JSON allows white space.
     Ok(parsed.ok().filter(|_| text.trim() == text).unwrap_or_else(|| Value::from(text)))
@@ -138,11 +119,11 @@ mod tests {
             ("[1,2", "is invalid JSON"),
             ("\"a", "is invalid JSON"),
         ] {
-            let problem = values(text).unwrap_err().to_string();
+            let problem = values(text).unwrap_err();
             assert!(problem.contains(words), "{text}: {problem}");
         }
         assert_eq!(folders("a,./b").unwrap(), ["a", "./b"]);
-        assert!(folders("").unwrap_err().to_string().contains("expected a folder"));
-        assert!(folders("a,,b").unwrap_err().to_string().contains("remove the comma"));
+        assert!(folders("").unwrap_err().contains("expected a folder"));
+        assert!(folders("a,,b").unwrap_err().contains("remove the comma"));
     }
 }

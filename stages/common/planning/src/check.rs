@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 
 use artifact::known_names;
-use contract::{Description, Input};
+use contract::Description;
 use serde_json::Map;
 
 use crate::file::{InputSource, Part, PipelineError, StageBlock};
@@ -69,7 +69,7 @@ pub(crate) fn check_blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(
         check_parameters(pipeline, program, name, block)?;
         for (input, source) in &block.inputs {
             check_input(&program.description, input, source, programs)
-                .map_err(|e| pipeline.error(name, Part::Input(input), e.to_string()))?;
+                .map_err(|problem| pipeline.error(name, Part::Input(input), problem))?;
         }
         for (input, port) in &program.description.inputs {
             let is_given = block.inputs.contains_key(input)
@@ -101,46 +101,32 @@ fn check_parameters(
     Err(pipeline.error(name, part, problems[0].to_string()))
 }
 
-/// Error returned for an invalid input of a block.
-#[derive(Debug, thiserror::Error)]
-enum InputError<'a> {
-    /// The stage has no such input. `known` lists the stage's inputs.
-    #[error("no input {input:?}; {known}")]
-    Unknown { input: &'a str, known: String },
-    /// The input of a sink refers to a folder.
-    #[error("input {input}: {folder} is a folder, but a sink shows stages; name a stage")]
-    Folder { input: &'a str, folder: &'a str },
-    /// The input refers to a sink, which has no artifact.
-    #[error("input {input}: {stage} is a sink, which has no artifact; name another stage")]
-    Sink { input: &'a str, stage: &'a str },
-    /// The artifact has no such subtree. `known` lists the artifact's subtrees.
-    #[error("input {input}: {stage} has no subtree {subtree:?}; {known}")]
-    Subtree { input: &'a str, stage: &'a str, subtree: &'a str, known: String },
-    /// The source has another kind.
-    #[error("input {input} takes {}, but {origin} is {kind}", port.kinds.join(" or "))]
-    Kind { input: &'a str, port: &'a Input, origin: &'a str, kind: &'a str },
-}
-
-/// Checks one input of a stage against its source.
-fn check_input<'a>(
-    description: &'a Description,
-    input: &'a str,
-    source: &'a str,
-    programs: &'a Programs,
-) -> Result<(), InputError<'a>> {
+/// Checks one input of a stage against its source. Fails with the problem and a remedy.
+fn check_input(
+    description: &Description,
+    input: &str,
+    source: &str,
+    programs: &Programs,
+) -> Result<(), String> {
     // A sink has one input for the record of a run, and its block may choose the names of inputs.
     let run = description.inputs.get("run").filter(|_| description.sink);
     let Some(port) = description.inputs.get(input).or(run) else {
         let known = known_names(input, description.inputs.keys().map(String::as_str));
-        return Err(InputError::Unknown { input, known });
+        return Err(format!("no input {input:?}; {known}"));
     };
     let InputSource::Stage { name: stage, subtree } = InputSource::parse(source) else {
-        let problem = InputError::Folder { input, folder: source };
-        return if description.sink { Err(problem) } else { Ok(()) };
+        if description.sink {
+            return Err(format!(
+                "input {input}: {source} is a folder, but a sink shows stages; name a stage"
+            ));
+        }
+        return Ok(());
     };
     let Some(producer) = programs.get(stage) else { return Ok(()) };
     if producer.description.sink {
-        return Err(InputError::Sink { input, stage });
+        return Err(format!(
+            "input {input}: {stage} is a sink, which has no artifact; name another stage"
+        ));
     }
     if description.sink {
         return Ok(());
@@ -150,13 +136,14 @@ fn check_input<'a>(
         None => &output.kind,
         Some(subtree) => output.subtrees.get(subtree).ok_or_else(|| {
             let known = known_names(subtree, output.subtrees.keys().map(String::as_str));
-            InputError::Subtree { input, stage, subtree, known }
+            format!("input {input}: {stage} has no subtree {subtree:?}; {known}")
         })?,
     };
-    if port.kinds.contains(kind) {
-        return Ok(());
+    if !port.kinds.contains(kind) {
+        let kinds = port.kinds.join(" or ");
+        return Err(format!("input {input} takes {kinds}, but {source} is {kind}"));
     }
-    Err(InputError::Kind { input, port, origin: source, kind })
+    Ok(())
 }
 
 /// Returns the stages that a block names as inputs.

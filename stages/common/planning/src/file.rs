@@ -18,8 +18,8 @@ use crate::experiment::Experiment;
 #[derive(Clone, Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PipelineFile {
-    /// One or more pipeline files whose blocks are inherited. They may share blocks only if these
-    /// are equal.
+    /// One or more pipeline files whose blocks are inherited. Blocks of one name must be equal in
+    /// all of them.
     #[serde(deserialize_with = "one_or_more")]
     #[schemars(with = "OneOrMore")]
     pub extends: Vec<String>,
@@ -57,8 +57,8 @@ pub struct StageBlock {
     /// Program: a path relative to the file's folder, or the name of a program next to `nerf-sr`.
     /// The default is the block's name.
     pub run: Option<String>,
-    /// Name of a block with the same program, whose parameters from the file and the command line
-    /// are inherited unless they are given here.
+    /// Block whose program and parameters are inherited. Parameters given here override inherited
+    /// ones from the file and the command line.
     pub extends: Option<String>,
     /// Inputs by name: a stage (`prep`), a subtree of its artifact (`prep/train`), or the path of a
     /// folder, which starts with `.` or `/`.
