@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{counted, printable, sized};
+use artifact::{counted, printable, sized, unix_time};
 use contract::Description;
 use stage::{Event, SUMMARY_FILE};
 use wait4::ResUse;
@@ -16,7 +16,7 @@ use wait4::ResUse;
 use crate::failure::{Exit, StageFailure, is_noise, memory_kills};
 use crate::group::{Group, Pipes};
 use crate::log::{ProgressFilter, StageLog};
-use crate::seconds;
+use crate::{seconds, utc};
 
 /// Environment variables that every stage gets. A description declares the further variables that
 /// change the stage's result, since they are part of its key.
@@ -125,7 +125,7 @@ impl Call<'_> {
     }
 
     fn log_arguments(&self, log: &StageLog) {
-        log.start(self.label);
+        log.line(format_args!("{}: started {}", self.label, utc(unix_time())));
         log.line(format_args!(
             "program: {} {}, {}",
             self.program.display(),

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitStatus, Stdio};
+use std::process::{Command, ExitStatus, Output, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
@@ -136,13 +136,6 @@ fn describe(
     }
     serde_json::from_slice(&stdout)
         .map_err(|e| DescribeError::Invalid { program, problem: e.to_string() })
-}
-
-/// Exit status and output of a program.
-struct Output {
-    status: ExitStatus,
-    stdout: Vec<u8>,
-    stderr: Vec<u8>,
 }
 
 /// Runs `describe`. Returns `None` if the time limit is exceeded or `stop` is set.

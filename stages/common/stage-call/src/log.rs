@@ -6,9 +6,7 @@ use std::io::{self, Write as _};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
-use artifact::{printable, unix_time};
-
-use crate::utc;
+use artifact::printable;
 
 /// Log file, shared by the readers of stdout and stderr.
 pub(crate) struct StageLog {
@@ -19,11 +17,6 @@ impl StageLog {
     /// Opens a log file to append to the lines of earlier attempts.
     pub(crate) fn open(path: &Path) -> io::Result<Self> {
         Ok(Self { file: Mutex::new(File::options().create(true).append(true).open(path)?) })
-    }
-
-    /// Writes the first line of an attempt.
-    pub(crate) fn start(&self, label: &str) {
-        self.line(format_args!("{label}: started {}", utc(unix_time())));
     }
 
     /// Writes a line with escaped control characters.

@@ -129,9 +129,9 @@ impl<'de> Visitor<'de> for Search<'_> {
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
         let Some((first, rest)) = self.0.split_first() else { return Ok(()) };
-        while let Some(is_match) =
-            map.next_key_seed(Key { name: first, is_last: rest.is_empty() })?
-        {
+        while let Some(is_match) = map.next_key_seed(KeyCheck(|key: &str| {
+            if key == *first && rest.is_empty() { None } else { Some(key == *first) }
+        }))? {
             if is_match {
                 map.next_value_seed(Search(rest))?;
             } else {
@@ -142,13 +142,11 @@ impl<'de> Visitor<'de> for Search<'_> {
     }
 }
 
-/// Comparison of a key with a name. If the name is the last of the path, a match ends the search.
-struct Key<'a> {
-    name: &'a str,
-    is_last: bool,
-}
+/// Check of a mapping's key: `None` ends the search at this key, `Some` continues it and returns
+/// whether the key's value is searched.
+struct KeyCheck<F>(F);
 
-impl<'de> DeserializeSeed<'de> for Key<'_> {
+impl<'de, F: FnOnce(&str) -> Option<bool>> DeserializeSeed<'de> for KeyCheck<F> {
     type Value = bool;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<bool, D::Error> {
@@ -156,7 +154,7 @@ impl<'de> DeserializeSeed<'de> for Key<'_> {
     }
 }
 
-impl Visitor<'_> for Key<'_> {
+impl<F: FnOnce(&str) -> Option<bool>> Visitor<'_> for KeyCheck<F> {
     type Value = bool;
 
     fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
@@ -164,8 +162,7 @@ impl Visitor<'_> for Key<'_> {
     }
 
     fn visit_str<E: Error>(self, key: &str) -> Result<bool, E> {
-        let is_match = key == self.name;
-        if is_match && self.is_last { Err(E::custom(FOUND)) } else { Ok(is_match) }
+        (self.0)(key).ok_or_else(|| E::custom(FOUND))
     }
 }
 
@@ -217,34 +214,14 @@ impl<'de> Visitor<'de> for DuplicateSearch {
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
-        let mut seen = BTreeSet::new();
-        while map.next_key_seed(NewKey(&mut seen))?.is_some() {
+        let mut seen: BTreeSet<String> = BTreeSet::new();
+        while map
+            .next_key_seed(KeyCheck(|key: &str| seen.insert(key.to_owned()).then_some(false)))?
+            .is_some()
+        {
             map.next_value_seed(DuplicateSearch)?;
         }
         Ok(())
-    }
-}
-
-/// Key that ends the search if its mapping has an equal earlier key.
-struct NewKey<'a>(&'a mut BTreeSet<String>);
-
-impl<'de> DeserializeSeed<'de> for NewKey<'_> {
-    type Value = ();
-
-    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
-        deserializer.deserialize_str(self)
-    }
-}
-
-impl Visitor<'_> for NewKey<'_> {
-    type Value = ();
-
-    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str("a key")
-    }
-
-    fn visit_str<E: Error>(self, key: &str) -> Result<(), E> {
-        if self.0.insert(key.to_owned()) { Ok(()) } else { Err(E::custom(FOUND)) }
     }
 }
 
