@@ -71,7 +71,7 @@ fn quality_runs_scenes_and_sweeps() {
     assert_eq!(rows(&project, "quality"), made);
     project
         .run(&["run", "quality", "--scene", "nowhere", "--data", "data"])
-        .fails(2, &["no scene nowhere in data; name its parent folder"]);
+        .fails(2, &["no scene nowhere in data; set the folder"]);
 }
 
 /// Variants form no product, and each is compared with the first.

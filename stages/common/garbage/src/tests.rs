@@ -12,14 +12,14 @@ use store::{
 
 use super::{Collection, Policy, Root};
 
-/// An action of a random store. Numbers name earlier actions, modulo how many there are.
+/// Action of a random store. Numbers refer to earlier actions, modulo their count.
 #[derive(Debug, Clone)]
 struct Action {
     stage: u8,
     parameter: u8,
-    /// Earlier actions that it is made of.
+    /// Earlier actions whose outputs are inputs.
     inputs: Vec<u8>,
-    /// What comes out; equal contents are one object.
+    /// Content of the output; equal contents are one object.
     content: u8,
     days_old: u64,
     state: Finished,
@@ -32,7 +32,7 @@ enum Finished {
     WithoutCheckpoint,
 }
 
-/// What holds actions.
+/// Reason for keeping actions.
 #[derive(Debug, Clone)]
 enum Holder {
     Pin(Vec<u8>),
@@ -96,21 +96,20 @@ fn cases() -> impl Strategy<Value = Case> {
         })
 }
 
-/// A store made by a case, with what holds it open.
+/// Store of a case, with its open locks and runs.
 struct Made {
     _dir: tempfile::TempDir,
     store: Store,
-    /// Each action's key.
+    /// Keys of all actions, in order.
     keys: Vec<String>,
-    /// Every finished action and every unfinished one, by key: its key's parts and what it is made
-    /// of.
+    /// Parts of the key and keys of the inputs' actions, by key of each action, finished or not.
     parts: BTreeMap<String, (Map<String, Value>, Vec<String>)>,
     _locks: Vec<KeyLock>,
     _runs: Vec<RunFile>,
 }
 
-/// Attempts until it is held: other tests start programs, and a file that was open when one started
-/// stays locked until it is loaded.
+/// Repeats an attempt until it gets the lock: other tests start programs, and a file that was open
+/// at such a start stays locked until the program is loaded.
 fn held<T>(mut attempt: impl FnMut() -> Result<Locked<T>, store::StoreError>) -> T {
     loop {
         if let Locked::Held(held) = attempt().unwrap() {
@@ -130,7 +129,7 @@ fn waiting((stage, parameter): (u8, u8)) -> Waiting {
 }
 
 fn make(case: &Case) -> Made {
-    // In memory where there is such a place: objects are synced to disk.
+    // In memory if possible, since objects are synced to disk.
     let memory = std::path::Path::new("/dev/shm");
     let dir =
         if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap();
@@ -146,7 +145,7 @@ fn make(case: &Case) -> Made {
                 action.inputs.iter().map(|earlier| keys[*earlier as usize % keys.len()].clone()),
             );
         }
-        // Actions with equal inputs and parameters are one.
+        // Equal inputs and parameters mean the same action.
         key_parts.insert("input".into(), json!(made_of));
         let key = make_action(&store, action, &key_parts, &made_of);
         parts.insert(key.clone(), (key_parts, made_of));
@@ -178,7 +177,7 @@ fn make(case: &Case) -> Made {
                     drop(run);
                     let text = fs::read_to_string(&path).unwrap()
                         + &format!("{{\"ended\":{{\"unix\":{}}}}}\n", days_ago(*days));
-                    // A file that was never locked.
+                    // Replaced by a file that was never locked.
                     fs::remove_file(&path).unwrap();
                     fs::write(&path, text).unwrap();
                 }
@@ -188,7 +187,7 @@ fn make(case: &Case) -> Made {
     Made { _dir: dir, store, keys, parts, _locks: locks, _runs: runs }
 }
 
-/// Makes one action; gives its key.
+/// Creates an action. Returns its key.
 fn make_action(
     store: &Store,
     action: &Action,
@@ -225,11 +224,11 @@ fn make_action(
     key
 }
 
-/// What has to stay, by the definition: pass after pass until nothing joins.
+/// Returns the keys to keep by definition: repeats passes until a pass adds none.
 fn expected(case: &Case, made: &Made) -> BTreeSet<String> {
     let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
     let recent = |days: u64| days < case.keep_days;
-    // What is named itself, and what is needed with all that it is made of.
+    // `named` keeps single actions, `whole` also all actions behind their inputs.
     let mut named: BTreeSet<String> = case.plan.0.iter().map(key).collect();
     let mut whole: BTreeSet<String> = BTreeSet::new();
     let mut nodes: Vec<(u8, u8)> = case.plan.1.clone();
@@ -275,7 +274,7 @@ fn expected(case: &Case, made: &Made) -> BTreeSet<String> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
-    /// Both ways: what a root reaches is never deleted, and everything else is.
+    /// An entry is kept if and only if a root reaches it.
     #[test]
     fn what_roots_reach_stays_and_all_else_goes(case in cases()) {
         let made = make(&case);
@@ -341,8 +340,8 @@ fn orphans_go() {
     assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
 }
 
-/// What can't be read may be needed, or may say what is. A loop of links stands for it, which not
-/// even root can read.
+/// An unreadable entry may be needed, or may name needed ones. A loop of links is unreadable even
+/// for root.
 #[test]
 fn what_can_not_be_read_is_an_error() {
     let key = hash_json(&json!({"stage": "s0", "unfinished": true}));
@@ -377,7 +376,7 @@ fn old_action(content: u8) -> Action {
     Action { stage: 0, parameter: 0, inputs: vec![], content, days_old: 90, state: Finished::Yes }
 }
 
-/// What has a key of an older version stays, with what it was made of, until it is asked to go.
+/// An artifact with a key of an older version is kept, with its inputs, unless `drop_old` is set.
 #[test]
 fn what_an_older_version_made_stays_until_it_is_dropped() {
     let dir = tempfile::tempdir().unwrap();

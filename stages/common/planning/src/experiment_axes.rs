@@ -92,7 +92,7 @@ impl SelectedExperiment<'_> {
             }
         }
         Err(PlanError::Usage(format!(
-            "no scene {name} in {}; name its parent folder with --data",
+            "no scene {name} in {}; set the folder of data sets with --data",
             data.display()
         )))
     }

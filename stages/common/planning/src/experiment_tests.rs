@@ -1,4 +1,4 @@
-//! Experiments to nodes, with stages that would describe themselves so.
+//! Expansion of experiments to nodes, with given descriptions.
 
 use std::path::{Path, PathBuf};
 
@@ -66,7 +66,7 @@ fn descriptions() -> BTreeMap<String, Description> {
     described.map(whole).into()
 }
 
-/// The plan of an experiment, whose data sets lie in a folder of their own.
+/// Plans an experiment with a folder of data sets.
 fn plan_of(text: &str, data: &Path, change: impl Fn(&mut Request)) -> Result<Plan, PlanError> {
     let mut request = Request {
         selection: Selection { data: Some(data.to_path_buf()), ..Selection::default() },
@@ -100,7 +100,7 @@ fn folder_of(plan: &Plan, node: usize, input: &str) -> PathBuf {
     }
 }
 
-/// Variants form no product, and what they have in common is one node.
+/// Variants form no product, and share nodes with equal settings.
 #[test]
 fn scenes_protocols_and_variants_are_axes() {
     let data = data();
@@ -165,7 +165,7 @@ fn the_command_line_chooses_and_wins() {
         r.parameters = named(&["warmup=7", "lr_width=20,30"]);
     });
     let plan = plan.unwrap();
-    // Both variants come to one node, for what they set is set otherwise.
+    // The command line overrides the settings of both variants, so they share a node.
     assert_eq!(
         labels(&plan)[2..4],
         ["train [variant=as it is, lr_width=20]", "train [variant=as it is, lr_width=30]"]
@@ -180,7 +180,7 @@ fn the_command_line_chooses_and_wins() {
     );
 }
 
-/// The pipeline's own scene sets nothing, and tables name it nonetheless.
+/// The pipeline's own scene has no settings, but tables name it.
 #[test]
 fn an_only_value_is_every_nodes() {
     let data = data();
@@ -210,8 +210,8 @@ fn a_sweep_of_the_file_gives_way() {
     assert_eq!(labels(&plan.unwrap())[1..2], ["train"]);
 }
 
-/// An experiment whose sink shows two fields' scores; one of them is of a scene of its own and
-/// needs a file.
+/// Experiment whose sink shows the scores of two fields. One of them has its own scene and requires
+/// a file.
 const SHOWN: &str = "
   prep-large:
     extends: prep
@@ -263,8 +263,7 @@ fn only_what_is_to_be_shown_is_made() {
         expected.sort_unstable();
         assert_eq!(made, expected, "{show:?}");
     }
-    // The scene is every block's that has the pipeline's own otherwise; sizes follow from the
-    // protocol.
+    // The scene replaces the pipeline's own in every block; sizes follow from the protocol.
     let large = &plan_showing(data.path(), &["large"]).unwrap().nodes;
     let folder = NodeInput {
         name: "dataset".to_owned(),

@@ -7,7 +7,7 @@ use crate::file::Part;
 use crate::request::PlanError;
 use crate::targets;
 
-/// A folder with files.
+/// Creates a folder with files.
 fn folder(files: &[(&str, &str)]) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     for (name, text) in files {
@@ -57,7 +57,7 @@ fn a_file_changes_part_by_part_what_it_extends() {
     assert_eq!(a.inputs.keys().collect::<Vec<_>>(), ["x", "y", "z"]);
     assert_eq!((b.run.as_deref(), b.extends.as_deref()), (None, Some("a")));
     assert_eq!(b.inputs["x"], "a");
-    // Paths begin where they stand, and lines are those of the file that says it.
+    // Paths are relative to the file that contains them; errors name its lines.
     let (lower, upper) = (home.join("pipeline.yaml"), home.join("pipelines/c.yaml"));
     for (stage, part, file, line) in [
         ("a", Part::Input("x"), &lower, 3),
@@ -81,7 +81,7 @@ fn a_file_changes_part_by_part_what_it_extends() {
     assert_eq!(error, format!("{}:1: wrong", lower.display()));
 }
 
-/// Each in one line, with the line of `extends`.
+/// Each error is one line and names the line of `extends`.
 #[test]
 fn files_that_cannot_be_extended() {
     let deep: Vec<(String, String)> = (0..10)
@@ -138,7 +138,7 @@ fn files_that_cannot_be_extended() {
         );
         assert!(!error.contains('\n'), "{error}");
     }
-    // Eight are fine, and so is one file by two ways.
+    // Eight files in a chain are allowed, and so is one file reached by two ways.
     for text in ["extends: 3.yaml", "extends: [y.yaml, pipeline.yaml, z.yaml]"] {
         let shared = "extends: pipeline.yaml\nstages: {d: {}}";
         let folder = base_and(
@@ -158,8 +158,8 @@ fn find(home: &Path, names: &[&str]) -> Result<(Pipeline, Vec<String>), PlanErro
     targets::find_targets(&Pipeline::read(&home.join("pipeline.yaml")).unwrap(), &names)
 }
 
-/// Names are looked for in pipeline.yaml, then among the files of `pipelines/`, then among the
-/// blocks of those.
+/// Targets are searched in pipeline.yaml, then among the files of `pipelines/`, then among the
+/// blocks of these files.
 #[test]
 fn targets_are_found_beside_the_pipeline() {
     let shelf = [
@@ -217,8 +217,8 @@ fn home_of(folder: &Path, file: &str) -> PathBuf {
         .to_owned()
 }
 
-/// A file of `pipelines/` shares store and pages with pipeline.yaml; a pipeline of its own has its
-/// own, wherever it lies.
+/// A file of `pipelines/` shares store and pages with pipeline.yaml. An independent pipeline has
+/// its own, wherever it is.
 #[test]
 fn the_store_lies_beside_the_pipeline() {
     let more = [
@@ -238,7 +238,7 @@ fn the_store_lies_beside_the_pipeline() {
     }
 }
 
-/// The repository's pipelines.
+/// Returns the repository's pipelines.
 fn shipped() -> (Pipeline, Vec<String>) {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..");
     let files =
@@ -249,7 +249,7 @@ fn shipped() -> (Pipeline, Vec<String>) {
     (Pipeline::read(&root.join("pipeline.yaml")).unwrap(), names)
 }
 
-/// Whether a file's names are there and its stages have an order.
+/// Checks the names and the order of a pipeline's stages.
 fn holds_together(pipeline: &Pipeline) -> Result<(), crate::PipelineError> {
     crate::check::check_names(pipeline)?;
     crate::check::topological_order(pipeline).map(drop)
@@ -266,8 +266,7 @@ fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
         let (of_file, _) = targets::find_targets(&pipeline, std::slice::from_ref(name)).unwrap();
         assert_eq!(&of_file.default, std::slice::from_ref(name));
         holds_together(&of_file).unwrap();
-        // It has what it needs, and its blocks are those of pipeline.yaml where it doesn't say
-        // otherwise.
+        // The file is complete, and its blocks are those of pipeline.yaml unless it overrides them.
         assert!(
             pipeline.stages.keys().all(|stage| pipeline.has_equal_block(&of_file, stage)),
             "{name}"

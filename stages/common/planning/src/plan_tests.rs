@@ -1,4 +1,4 @@
-//! Files and command lines to nodes, with stages that would describe themselves so.
+//! Expansion of files and command lines to nodes, with given descriptions.
 
 use std::path::Path;
 
@@ -40,7 +40,7 @@ fn whole(mut one: Value) -> (String, Description) {
     (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
 }
 
-/// What the stages of [`PIPELINE`] say of themselves.
+/// Descriptions of the stages of [`PIPELINE`].
 fn descriptions() -> BTreeMap<String, Description> {
     let seed = json!({"type": "integer", "format": "uint64", "default": 0});
     let described = json!([
@@ -124,13 +124,13 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
                 "train [scale=3, rays=6]",
             ],
         ),
-        // A folder in an input's place needs nothing; two are a sweep.
+        // An input replaced by a folder needs no stage; two folders are a sweep.
         (
             &["train", "-i", "data=one,two"],
             &["prep [data=one]", "prep [data=two]", "train [data=one]", "train [data=two]"],
         ),
         (&["train", "-i", "train.scene=one"], &["train"]),
-        // Which seed is meant follows from the target.
+        // The target decides between parameters of equal names.
         (&["make", "-p", "seed=3"], &["make"]),
     ] {
         let plan = plan_of(PIPELINE, arguments).unwrap();
@@ -159,8 +159,8 @@ fn keys(text: &str, arguments: &[&str]) -> Vec<String> {
     plan.nodes.iter().map(|node| artifact::hash_json(&key_parts(node, &[], "cpu"))).collect()
 }
 
-/// What is equal is one key, however it is written and wherever it is said; a default is the same
-/// said and unsaid.
+/// Equal values have equal keys, in every notation and place. An explicit default and an omitted
+/// parameter have equal keys, too.
 #[test]
 fn equal_values_are_one_key() {
     let same: [(&[&str], &[&str]); 9] = [
@@ -188,7 +188,7 @@ fn equal_values_are_one_key() {
     assert_ne!(keys(PIPELINE, &["-p", "supersample=3"]), keys(PIPELINE, &[]));
 }
 
-/// Of several values for one parameter the last one counts, and the plan says so.
+/// The last of several values for one parameter wins, and the plan notes the others.
 #[test]
 fn the_last_one_wins() {
     for (arguments, notes, name, value) in [
@@ -304,7 +304,7 @@ fn command_lines_that_cannot_be_meant() {
     assert!(problem.to_string().contains("more than 10000 points of train"), "{problem}");
 }
 
-/// Each with its line.
+/// Each error names its line.
 #[test]
 fn files_that_cannot_be_used() {
     for (from, to, line, words) in [
@@ -386,7 +386,7 @@ fn files_that_cannot_be_used() {
             "{to}: {problem}"
         );
     }
-    // What isn't needed needn't be known.
+    // The program of an unneeded stage may be unknown.
     let unneeded = plan_of(&format!("{PIPELINE}  other: {{}}\n"), &[]).unwrap();
     assert_eq!(unneeded.nodes.len(), 4);
     let problem = refused(&format!("{PIPELINE}  other: {{}}\n"), &["-p", "nothing=1"]).to_string();
@@ -410,7 +410,7 @@ fn files_as_editors_write_them() {
             expected
         );
     }
-    // A merged key is a key like others, right or wrong.
+    // A merged key is checked like any other key.
     let problem = refused(&merged, &[]).to_string();
     assert!(
         problem.starts_with("dir/pipeline.yaml:13: ")
@@ -459,7 +459,7 @@ fn parent_labels(plan: &Plan, node: &Node) -> Vec<String> {
     node.parents().map(|p| plan.nodes[p].label()).collect()
 }
 
-/// A task's part of a plan, written and read, is what its job works with.
+/// The plan of a task survives writing and reading.
 #[test]
 fn a_frozen_plan_has_all_that_a_task_needs() {
     use crate::frozen::FrozenPlan;

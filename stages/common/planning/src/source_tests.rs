@@ -17,14 +17,14 @@ fn content(store: &Store, folder: &Path) -> String {
     Source::read(store, folder, None).unwrap().content_hash()
 }
 
-/// Gives a file a time of change long ago, as an archive does.
+/// Writes a file with an old modification time, as unpacking an archive does.
 fn unpack(file: &Path, text: &str) {
     fs::write(file, text).unwrap();
     let time = SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000_000);
     File::options().write(true).open(file).unwrap().set_modified(time).unwrap();
 }
 
-/// Reads a folder once its files are old enough for the cache.
+/// Reads a folder after its files have become old enough for the cache.
 fn settled(store: &Store, folder: &Path) -> Source {
     std::thread::sleep(Duration::from_secs(4));
     Source::read(store, folder, None).unwrap()
@@ -41,7 +41,7 @@ fn what_is_no_folder_is_refused() {
     assert_eq!(problem(&absent), format!("{absent:?}: {words}"));
 }
 
-/// Editors' files come and go without another hash.
+/// Editors' temporary files don't change the hash.
 #[test]
 fn what_is_passed_over_has_no_part_in_the_hash() {
     let (_dir, store, data) = store_and_data();
@@ -52,7 +52,7 @@ fn what_is_passed_over_has_no_part_in_the_hash() {
     assert_eq!(content(&store, &data), before);
 }
 
-/// Any file name is taken, and each makes a hash of its own.
+/// Every file name is allowed, and each gives a different hash.
 #[test]
 fn any_name_has_a_hash() {
     let (_dir, store, data) = store_and_data();
@@ -73,7 +73,7 @@ fn any_name_has_a_hash() {
     }
 }
 
-/// Names, sizes and times stay when two files of one archive are exchanged.
+/// Exchanging two files of one archive changes neither names, sizes nor times.
 #[test]
 fn files_that_change_places_are_hashed_anew() {
     let (_dir, store, data) = store_and_data();
@@ -89,7 +89,7 @@ fn files_that_change_places_are_hashed_anew() {
     assert_eq!(now.change_since(&before).as_deref(), Some("a was changed"));
 }
 
-/// A file that was changed and has its content and time again was changed.
+/// A file that was changed counts as changed, even if content and time were restored.
 #[test]
 fn what_was_done_to_a_file_is_seen() {
     let (_dir, store, data) = store_and_data();
@@ -112,7 +112,7 @@ fn what_was_done_to_a_file_is_seen() {
     assert_eq!(change().as_deref(), Some("a was removed"));
 }
 
-/// Files whose stamps are known aren't read: a cache that says otherwise is believed.
+/// Files with known stamps aren't read: even wrong hashes in the cache are used.
 #[test]
 fn a_known_file_is_not_read_again() {
     let (_dir, store, data) = store_and_data();
@@ -123,7 +123,7 @@ fn a_known_file_is_not_read_again() {
     files.get_mut("a").unwrap().blake3 = "0".repeat(64);
     cache.write(&files);
     assert_ne!(content(&store, &data), before.content_hash());
-    // A damaged cache is none.
+    // A damaged cache counts as empty.
     fs::write(&cache.path, "{").unwrap();
     assert_eq!(content(&store, &data), before.content_hash());
 }

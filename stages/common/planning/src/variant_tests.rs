@@ -1,5 +1,5 @@
-//! Parameters of a stage whose `field` selects a variant, in every form in which files and command
-//! lines give them: with train-ss's own.
+//! Parameters of a stage whose `field` selects a variant, in every notation of files and command
+//! lines, by the example of train-ss.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::*;
 
-/// The shipped pipeline as far as a training and one that extends it.
+/// Part of the shipped pipeline: a training, and one that extends it.
 const PIPELINE: &str = "default: [train-ss]
 stages:
   scene: {}
@@ -56,7 +56,7 @@ fn values(node: &Node, names: &[&str]) -> Vec<Value> {
     names.iter().map(|name| node.parameters.get(name).cloned().unwrap_or(json!("absent"))).collect()
 }
 
-/// The trainings of a plan: point and some parameters.
+/// Returns the trainings of a plan: point and some parameters.
 fn trainings(text: &str, arguments: &[&str], names: &[&str]) -> Vec<(String, Vec<Value>)> {
     let plan = plan_of(text, arguments).unwrap();
     let nodes = plan.nodes.iter().filter(|node| node.stage == "train-ss");
@@ -113,7 +113,7 @@ fn every_form_reaches_a_parameter_of_a_variant() {
         (nested, &[], one(grid(30_000_000, 4))),
         (nested, &["n_levels=6"], one(grid(30_000_000, 6))),
         (beside, &[], one(grid(all, 4))),
-        // The variant comes with its own defaults: what the file says for another one isn't meant.
+        // The variant has its own defaults; the file's parameters for another one don't apply.
         (nested, &["field=mlp"], one(mlp(json!(null), 8))),
         (beside, &["field=mlp"], one(mlp(json!(all), 8))),
         (
@@ -136,7 +136,7 @@ fn of_other(text: &str, arguments: &[&str], name: &str) -> Value {
     node.parameters.get(name).cloned().unwrap_or_default()
 }
 
-/// A block that extends another has its variant, unless it says otherwise.
+/// A block inherits the variant of the block that it extends, unless it selects another.
 #[test]
 fn a_block_that_extends_follows_the_choice() {
     let own = &PIPELINE.replace("ensemble: 2", "field: {grid: {n_levels: 3}}")[..];
@@ -180,7 +180,7 @@ fn wrong_and_foreign_names_are_refused() {
     assert!(plan_of(PIPELINE, &["field=mlp", "hidden_dim=200"]).is_ok());
 }
 
-/// A file's mistakes are named with their lines.
+/// Errors in a file name their lines.
 #[test]
 fn files_with_wrong_variants() {
     for (from, to, line, words) in [
@@ -217,7 +217,7 @@ fn training_key(text: &str, arguments: &[&str]) -> String {
     artifact::hash_json(&key_parts(&plan.nodes[1], &[], "cpu"))
 }
 
-/// The key has the chosen variant's parameters, each by its name, however they were written.
+/// The key contains the selected variant's parameters by name, in every notation.
 #[test]
 fn one_choice_is_one_key() {
     let nested = PIPELINE.replace("rays: 12000000", "field: {grid: {rays: 12000000, n_levels: 4}}");

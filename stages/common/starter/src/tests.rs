@@ -18,7 +18,7 @@ fn set(format: Format, sizes: &[(u32, u32)]) -> Dataset {
     Dataset { format, frames: frames.collect(), split: None, notes: Vec::new() }
 }
 
-/// Large photographs are shrunk; the narrowest decides, since no image is enlarged.
+/// Large photographs are shrunk. The narrowest one decides, since images are never enlarged.
 #[test]
 fn images_keep_their_size_where_a_cpu_can_do_with_it() {
     for (format, sizes, line) in [
@@ -46,7 +46,7 @@ fn what_was_found_is_said() {
     }
 }
 
-/// All of `pipelines/` comes along.
+/// Every file of `pipelines/` is shipped.
 #[test]
 fn no_target_is_missing() {
     let shelf = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../pipelines");
