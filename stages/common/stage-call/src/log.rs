@@ -22,8 +22,8 @@ impl StageLog {
     /// Writes a line with escaped control characters.
     pub(crate) fn line(&self, text: impl Display) {
         let line = format!("{}\n", printable(&text.to_string()));
-        // An error is ignored: the log isn't part of the result, and on a full disk the output can't
-        // be written either.
+        // An error is ignored: the log isn't part of the result, and on a full disk the output
+        // can't be written either.
         self.file.lock().unwrap_or_else(PoisonError::into_inner).write_all(line.as_bytes()).ok();
     }
 }
