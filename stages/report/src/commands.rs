@@ -3,7 +3,7 @@ use std::path::Path;
 use artifact::{RunNode, RunRecord};
 use maud::{Markup, html};
 
-/// The command that the page is of.
+/// Section with the run's command line.
 pub(crate) fn commands(run: &RunRecord) -> Markup {
     html! {
         section id="commands" aria-labelledby="commands-heading" {
@@ -16,26 +16,28 @@ pub(crate) fn commands(run: &RunRecord) -> Markup {
                     "Each stage above has the command that runs it alone."
                 }
             } @else {
-                p { "The run's command line isn't recorded. Each stage above has the command that \
-                    runs it alone." }
+                p {
+                    "The run's command line isn't recorded. Each stage above has the command that "
+                    "runs it alone."
+                }
             }
         }
     }
 }
 
-/// A command to copy.
+/// Box with a command to copy.
 fn command(line: &str) -> Markup {
     html! { div class="command" { pre tabindex="0" { code { (line) } } } }
 }
 
-/// The command line of the run.
+/// Returns the command line of the run, quoted for a shell; `None` if it isn't recorded.
 pub(crate) fn run_command(run: &RunRecord) -> Option<String> {
     let (program, words) = run.command.split_first()?;
     let words = words.iter().map(|word| quoted(word));
-    Some([name_of(program.as_ref())].into_iter().chain(words).collect::<Vec<_>>().join(" "))
+    Some([file_name(program.as_ref())].into_iter().chain(words).collect::<Vec<_>>().join(" "))
 }
 
-/// What runs a stage alone, with the same inputs and parameters; in bash.
+/// Box with the bash command that runs a stage alone, with equal inputs and parameters.
 pub(crate) fn stage_command(run: &RunRecord, node: &RunNode) -> Markup {
     if node.program.is_empty() {
         return html! {};
@@ -50,19 +52,18 @@ pub(crate) fn stage_command(run: &RunRecord, node: &RunNode) -> Markup {
     command(&line)
 }
 
-/// A word as a shell reads it.
+/// Quotes a word for a shell if necessary.
 fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=,:+@%".contains(c);
-    if !word.is_empty() && word.chars().all(is_plain) {
+    let needs_quotes = |c: char| !c.is_ascii_alphanumeric() && !"-_./=,:+@%".contains(c);
+    if !word.is_empty() && !word.contains(needs_quotes) {
         return word.to_owned();
     }
     format!("'{}'", word.replace('\'', r"'\''"))
 }
 
-/// The last part of a path.
-pub(crate) fn name_of(path: &Path) -> String {
-    let name = path.file_name().unwrap_or(path.as_os_str());
-    name.to_string_lossy().into_owned()
+/// Returns the last component of a path.
+pub(crate) fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
 #[cfg(test)]

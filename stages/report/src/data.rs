@@ -1,23 +1,43 @@
 use std::collections::BTreeMap;
 
 use artifact::RunNode;
-use serde::Serialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use stage::Context;
 
-use crate::figures::is_known;
-use crate::gather::Report;
-use crate::layers::{Group, Layer, layers, pixels_of};
-use crate::params::Params;
-use crate::pictures::{Picture, Wanted, pictures};
-use crate::row::Row;
+use crate::gather::{Report, Row, is_known};
+use crate::layers::{Group, Layer, layers, max_pixels};
+use crate::pictures::{Picture, Request, write_pictures};
 use crate::scale::Scale;
 
-/// What the page's script works on.
+/// Parameters of `report`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Maximum number of views with pictures, spread evenly over the test views. A page of many
+    /// results has fewer.
+    #[schemars(range(min = 1, max = 1000))]
+    pub views: u32,
+    /// Name of the view that the page shows first.
+    #[schemars(extend("x-default" = "the first"))]
+    pub compare: Option<String>,
+    /// Square of that view to show first: x, y and side, in pixels.
+    #[schemars(extend("x-default" = "the whole view"))]
+    pub crop: Option<[u32; 3]>,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { views: 50, compare: None, crop: None }
+    }
+}
+
+/// Input of the page's script.
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Data {
-    /// Data sets.
+    /// Names of the data sets.
     scenes: Vec<String>,
     views: Vec<ViewData>,
     figures: Vec<FigureData>,
@@ -26,10 +46,11 @@ pub(crate) struct Data {
     pub(crate) pictures: Vec<PictureData>,
     scales: Vec<Scale>,
     curves: Vec<Curve>,
-    /// The best row.
+    /// Index of the best row.
     best: Option<usize>,
-    /// The view shown first, and the square of it, in its pixels, that pages show side by side.
+    /// Index of the view shown first.
     view: usize,
+    /// Square of that view to show first: x, y and side, in its pixels.
     crop: Option<[u32; 3]>,
 }
 
@@ -54,9 +75,9 @@ struct RowData {
     training: f64,
     rendering: f64,
     axes: BTreeMap<String, String>,
-    /// Means, by figure.
+    /// Mean of each figure.
     mean: Vec<Option<f64>>,
-    /// By view of the page and figure; none for views without scores.
+    /// Figures of each of the page's views; `None` for views without scores.
     scores: Vec<Option<Vec<Option<f64>>>>,
 }
 
@@ -82,19 +103,22 @@ pub(crate) struct PictureData {
     uri: String,
 }
 
-/// A training's PSNR against rays.
+/// PSNR of a training against its rays.
 #[derive(Serialize)]
 struct Curve {
     label: String,
+    /// Pairs of rays and PSNR.
     points: Vec<[f64; 2]>,
 }
 
-/// Pictures of a page at most, and their pixels: more than anybody looks at take long to write.
+/// Maximum number of a page's pictures (docs/design/041).
 const MAX_PICTURES: u64 = 1500;
+/// Maximum number of pixels of all pictures, which bounds the time to write them (docs/design/041).
 const MAX_PIXELS: u64 = 250_000_000;
 
 impl Data {
-    /// With originals beside the page, and copies of them of at most `budget` bytes.
+    /// Writes the pictures' originals next to the page and collects the script's input, with copies
+    /// of at most `budget` bytes.
     pub(crate) fn new(
         context: &Context,
         report: &Report<'_>,
@@ -104,38 +128,35 @@ impl Data {
         let layers = layers(report)?;
         let mut views = Vec::new();
         let mut scales = Scales::default();
-        let mut wanted = Vec::new();
-        for (scene, of_scene) in report.scenes.iter().enumerate() {
+        let mut requests = Vec::new();
+        for (scene, scene_views) in report.scenes.iter().enumerate() {
             let first = views.len();
-            let to_view = |name: &String| ViewData { name: name.clone(), scene };
-            views.extend(of_scene.views.iter().map(to_view));
-            let chosen = chosen(report, &layers, scene, params);
-            let names = || chosen.iter().map(|&view| &of_scene.views[view]);
+            for name in &scene_views.views {
+                views.push(ViewData { name: name.clone(), scene });
+            }
+            let chosen = choose_views(report, &layers, scene, params);
             let mut ranges = Vec::new();
             for layer in layers.iter().filter(|layer| layer.scene == scene) {
-                ranges.extend(layer.depth_range(names())?);
+                let names = chosen.iter().map(|&view| &scene_views.views[view]);
+                ranges.extend(layer.depth_range(names)?);
             }
             let depths = pixels::common_range(ranges).unwrap_or((0.0, 1.0));
             scales.add_scene(report, &layers, scene, depths);
             for &view in &chosen {
-                let name = of_scene.views[view].as_str();
-                let of_view = layers.iter().enumerate().filter(|(_, layer)| layer.scene == scene);
-                wanted.extend(of_view.map(|(layer, _)| Wanted {
-                    view: first + view,
-                    name,
-                    layer,
-                    depths,
-                }));
+                let name = scene_views.views[view].as_str();
+                for (layer, _) in layers.iter().enumerate().filter(|(_, l)| l.scene == scene) {
+                    requests.push(Request { view: first + view, name, layer, depths });
+                }
             }
         }
-        let pictures = pictures(context, &layers, &wanted, budget)?;
-        let is_pictured = |view: &usize| pictures.iter().any(|picture| picture.view == *view);
-        let named = |name: &String| views.iter().position(|view| view.name == *name);
-        let view = params.compare.as_ref().and_then(named).filter(is_pictured);
+        let pictures = write_pictures(context, &layers, &requests, budget)?;
+        let requested = params.compare.as_ref();
+        let requested = requested.and_then(|name| views.iter().position(|v| v.name == *name));
+        let requested = requested.filter(|view| pictures.iter().any(|p| p.view == *view));
         let first = pictures.first().map_or(0, |picture| picture.view);
         Ok(Self {
             scenes: report.scenes.iter().map(|scene| scene.data_set.clone()).collect(),
-            view: view.unwrap_or(first),
+            view: requested.unwrap_or(first),
             crop: params.crop,
             best: report
                 .best()
@@ -150,7 +171,7 @@ impl Data {
         })
     }
 
-    /// As JSON that a page can hold: no tag begins in it.
+    /// Returns JSON without `<`, so that no tag begins in it.
     pub(crate) fn to_json(&self) -> anyhow::Result<String> {
         Ok(serde_json::to_string(self)?.replace('<', "\\u003c"))
     }
@@ -163,34 +184,41 @@ impl From<Picture> for PictureData {
     }
 }
 
-/// The views of a data set that are pictured: spread evenly, the one asked for among them.
-fn chosen(report: &Report<'_>, layers: &[Layer<'_>], scene: usize, params: &Params) -> Vec<usize> {
-    let of_scene = layers.iter().filter(|layer| layer.scene == scene).count() as u64;
+/// Chooses the views of a data set that get pictures: spread evenly, including the requested view.
+fn choose_views(
+    report: &Report<'_>,
+    layers: &[Layer<'_>],
+    scene: usize,
+    params: &Params,
+) -> Vec<usize> {
+    let layer_count = layers.iter().filter(|layer| layer.scene == scene).count() as u64;
     let views = &report.scenes[scene].views;
-    if of_scene == 0 || views.is_empty() {
+    if layer_count == 0 || views.is_empty() {
         return Vec::new();
     }
     let scenes = report.scenes.len() as u64;
-    let by_pixels = MAX_PIXELS / (scenes * of_scene * pixels_of(layers, scene));
-    let room = (MAX_PICTURES / (scenes * of_scene)).min(by_pixels).max(1);
-    let count = room.min(u64::from(params.views)).min(views.len() as u64) as usize;
+    let by_pixels = MAX_PIXELS / (scenes * layer_count * max_pixels(layers, scene));
+    let limit = (MAX_PICTURES / (scenes * layer_count)).min(by_pixels).max(1);
+    let count = limit.min(u64::from(params.views)).min(views.len() as u64) as usize;
     let mut chosen: Vec<usize> = (0..count).map(|k| k * views.len() / count).collect();
-    let asked = params.compare.as_ref().and_then(|name| views.iter().position(|v| v == name));
-    if let Some(asked) = asked.filter(|asked| !chosen.contains(asked)) {
-        chosen[0] = asked;
+    let requested = params.compare.as_ref().and_then(|name| views.iter().position(|v| v == name));
+    if let Some(requested) = requested.filter(|view| !chosen.contains(view)) {
+        chosen[0] = requested;
         chosen.sort_unstable();
     }
     chosen
 }
 
-/// Scales of a page, each once, and which layer has which.
+/// Distinct scales of a page, and the scale of each layer.
 #[derive(Default)]
 struct Scales {
     all: Vec<Scale>,
-    of_layer: BTreeMap<usize, usize>,
+    /// Index of a scale in `all`, by a layer's index.
+    by_layer: BTreeMap<usize, usize>,
 }
 
 impl Scales {
+    /// Adds the scales of a data set's layers.
     fn add_scene(
         &mut self,
         report: &Report<'_>,
@@ -204,11 +232,12 @@ impl Scales {
                 (Group::Error, Some(row)) => error_scale(row),
                 _ => continue,
             };
-            let place = self.all.iter().position(|other| *other == scale).unwrap_or_else(|| {
-                self.all.push(scale);
-                self.all.len() - 1
-            });
-            self.of_layer.insert(index, place);
+            let scale_index =
+                self.all.iter().position(|other| *other == scale).unwrap_or_else(|| {
+                    self.all.push(scale);
+                    self.all.len() - 1
+                });
+            self.by_layer.insert(index, scale_index);
         }
     }
 
@@ -219,13 +248,13 @@ impl Scales {
             kind: layer.group.kind(),
             scene: layer.scene,
             row: layer.row,
-            scale: self.of_layer.get(&index).copied(),
+            scale: self.by_layer.get(&index).copied(),
         });
         data.collect()
     }
 }
 
-/// Without HR truth, error maps show errors at LR.
+/// Returns the scale of a row's error maps; without HR truth they show errors at LR.
 fn error_scale(row: &Row<'_>) -> Scale {
     let range = row.node.parameters.get("error_range").and_then(Value::as_f64);
     Scale::error(range.unwrap_or(0.25), !row.metrics.has_hr_truth())
@@ -243,25 +272,26 @@ fn figures(report: &Report<'_>) -> Vec<FigureData> {
 }
 
 fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
-    let known = || report.figures.iter().filter(|figure| is_known(figure, &report.rows));
-    let views = report.scenes.iter().enumerate();
-    let views = views.flat_map(|(scene, views)| views.views.iter().map(move |name| (scene, name)));
-    let scores = views.map(|(scene, name)| {
-        let view = row.view(name).filter(|_| scene == row.scene)?;
-        Some(known().map(|figure| figure.of(&view["scores"])).collect())
-    });
+    let known: Vec<_> = report.figures.iter().filter(|f| is_known(f, &report.rows)).collect();
+    let mut scores = Vec::new();
+    for (scene, scene_views) in report.scenes.iter().enumerate() {
+        for name in &scene_views.views {
+            let view = row.view(name).filter(|_| scene == row.scene);
+            scores.push(view.map(|v| known.iter().map(|f| f.of(&v["scores"])).collect()));
+        }
+    }
     RowData {
         label: row.label.clone(),
         scene: row.scene,
         training: row.training,
         rendering: row.rendering,
         axes: row.node.values.clone(),
-        mean: known().map(|figure| row.mean(figure)).collect(),
-        scores: scores.collect(),
+        mean: known.iter().map(|figure| row.mean(figure)).collect(),
+        scores,
     }
 }
 
-/// Curves of all trainings that left one.
+/// Returns the training curves of all artifacts that have one.
 fn curves(nodes: &[RunNode]) -> Vec<Curve> {
     nodes.iter().filter_map(curve).collect()
 }
@@ -269,8 +299,9 @@ fn curves(nodes: &[RunNode]) -> Vec<Curve> {
 fn curve(node: &RunNode) -> Option<Curve> {
     let text = std::fs::read_to_string(node.folder.join("training.json")).ok()?;
     let log: Value = serde_json::from_str(&text).ok()?;
-    let point = |point: &Value| Some([point["rays"].as_f64()?, point["psnr"].as_f64()?]);
-    let points: Vec<_> = log["curve"].as_array()?.iter().filter_map(point).collect();
+    let points = log["curve"].as_array()?.iter();
+    let points: Vec<[f64; 2]> =
+        points.filter_map(|p| Some([p["rays"].as_f64()?, p["psnr"].as_f64()?])).collect();
     let label = artifact::label(&node.stage, &node.point);
     (points.len() > 1).then_some(Curve { label, points })
 }

@@ -1,36 +1,70 @@
 use artifact::{RunNode, RunRecord};
 use metrics::{AnyMetrics, Figure};
+use serde_json::Value;
 
-use crate::figures::figures;
-use crate::results::scored;
-use crate::row::Row;
+use crate::results::scored_nodes;
 
-/// What a page shows of a run.
+/// Content of a page: results, data sets and figures of a run.
 pub(crate) struct Report<'a> {
     pub(crate) run: &'a RunRecord,
-    /// Results, the ones that came through fewer stages first.
+    /// Results, those with fewer stages before them first.
     pub(crate) rows: Vec<Row<'a>>,
-    /// Data sets of which there are results, in the rows' order.
+    /// Data sets that have results, in the rows' order.
     pub(crate) scenes: Vec<SceneViews>,
-    /// What the results are judged by.
+    /// Figures of the results.
     pub(crate) figures: Vec<Figure>,
-    /// Results whose figures can't be read, with why.
+    /// Reasons why results can't be read.
     pub(crate) unread: Vec<String>,
 }
 
-/// The views of a data set.
+/// Views of a data set.
 pub(crate) struct SceneViews {
-    /// The data set's folder or block.
+    /// Folder or block of the data set.
     pub(crate) data_set: String,
-    /// Names of views, in the order of the scores.
+    /// Names of the views, in the order of the scores.
     pub(crate) views: Vec<String>,
 }
 
+/// A result: scores of the views that one method made.
+pub(crate) struct Row<'a> {
+    pub(crate) node: &'a RunNode,
+    /// Index of the node in the run.
+    pub(crate) index: usize,
+    /// Content of `metrics.json`.
+    pub(crate) metrics: AnyMetrics,
+    /// Name that is unique among the rows.
+    pub(crate) label: String,
+    /// Index of the data set in the report.
+    pub(crate) scene: usize,
+    /// Seconds of training.
+    pub(crate) training: f64,
+    /// Seconds of rendering, refinement included.
+    pub(crate) rendering: f64,
+}
+
+impl Row<'_> {
+    /// Returns the mean of a figure over the views.
+    pub(crate) fn mean(&self, figure: &Figure) -> Option<f64> {
+        figure.of(self.metrics.mean())
+    }
+
+    /// Returns the scores of a view.
+    pub(crate) fn view(&self, name: &str) -> Option<&Value> {
+        self.metrics.views().iter().find(|view| view["name"] == name)
+    }
+
+    /// Returns the number of views.
+    pub(crate) fn view_count(&self) -> usize {
+        self.metrics.views().len()
+    }
+}
+
 impl<'a> Report<'a> {
+    /// Reads the scores of a run.
     pub(crate) fn new(run: &'a RunRecord) -> Self {
         let mut report =
             Self { run, rows: vec![], scenes: vec![], figures: vec![], unread: vec![] };
-        for (index, node) in scored(run) {
+        for (index, node) in scored_nodes(run) {
             match AnyMetrics::read(&node.folder) {
                 Ok(metrics) => report.add(index, node, metrics),
                 Err(error) => report.unread.push(error.to_string()),
@@ -41,6 +75,7 @@ impl<'a> Report<'a> {
         report
     }
 
+    /// Adds a result, and its data set and views if they are new.
     fn add(&mut self, index: usize, node: &'a RunNode, metrics: AnyMetrics) {
         let data_set = data_set(self.run, index);
         let scene = self.scenes.iter().position(|scene| scene.data_set == data_set);
@@ -49,9 +84,9 @@ impl<'a> Report<'a> {
             self.scenes.len() - 1
         });
         let views = &mut self.scenes[scene].views;
-        for name in view_names(&metrics) {
-            if !views.contains(&name) {
-                views.push(name);
+        for name in metrics.views().iter().filter_map(|view| view["name"].as_str()) {
+            if !views.iter().any(|view| view == name) {
+                views.push(name.to_owned());
             }
         }
         let [training, rendering] = times(self.run, node, index);
@@ -59,7 +94,7 @@ impl<'a> Report<'a> {
         self.rows.push(Row { node, index, metrics, label, scene, training, rendering });
     }
 
-    /// A row's values in the sweep and, where several blocks score, whose scores they are
+    /// Labels rows by their values in the sweep and, if several blocks score, by the scored method
     /// (`eval-refined`: refined).
     fn label_rows(&mut self) {
         let Some(first) = self.rows.first() else { return };
@@ -67,35 +102,87 @@ impl<'a> Report<'a> {
         let has_blocks = self.rows.iter().any(|row| row.node.stage != *stage);
         for row in &mut self.rows {
             let (stage, point) = (row.node.stage.as_str(), row.node.point.as_str());
-            let whose = stage.strip_prefix("eval-").unwrap_or(stage);
+            let method = stage.strip_prefix("eval-").unwrap_or(stage);
             row.label = match (has_blocks, point) {
                 (false, "") => "default".to_owned(),
                 (false, point) => point.to_owned(),
-                (true, "") => whose.to_owned(),
-                (true, point) => format!("{whose}, {point}"),
+                (true, "") => method.to_owned(),
+                (true, point) => format!("{method}, {point}"),
             };
         }
     }
 
-    /// The row that is best by the first figure; the first one without figures.
+    /// Returns the row with the best mean of the first figure; the first row without figures.
     pub(crate) fn best(&self) -> Option<&Row<'a>> {
-        let by = self.figures.first();
-        let value = |row: &Row<'_>| by.and_then(|figure| row.mean(figure));
-        let lower_is_better = by.and_then(|f| f.higher_is_better) == Some(false);
-        let is_better = |a: f64, b: f64| if lower_is_better { a < b } else { a > b };
-        self.rows.iter().reduce(|best, row| match (value(best), value(row)) {
-            (Some(held), Some(new)) if is_better(new, held) => row,
-            (None, Some(_)) => row,
-            _ => best,
-        })
+        let figure = self.figures.first();
+        let lower_is_better = figure.and_then(|f| f.higher_is_better) == Some(false);
+        let mut best: Option<(&Row<'a>, Option<f64>)> = None;
+        for row in &self.rows {
+            let value = figure.and_then(|figure| row.mean(figure));
+            let is_better = match (best, value) {
+                (None, _) | (Some((_, None)), Some(_)) => true,
+                (Some((_, Some(held))), Some(new)) if lower_is_better => new < held,
+                (Some((_, Some(held))), Some(new)) => new > held,
+                (Some(_), None) => false,
+            };
+            if is_better {
+                best = Some((row, value));
+            }
+        }
+        best.map(|(row, _)| row)
     }
 }
 
-fn view_names(metrics: &AnyMetrics) -> Vec<String> {
-    metrics.views().iter().filter_map(|view| view["name"].as_str().map(str::to_owned)).collect()
+/// True if some row has a figure.
+pub(crate) fn is_known(figure: &Figure, rows: &[Row<'_>]) -> bool {
+    rows.iter().any(|row| row.mean(figure).is_some())
 }
 
-/// The data set that a node was made of.
+/// True if a row has the best value of a figure among the rows of its data set; false if the data
+/// set has only this row.
+pub(crate) fn is_best(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> bool {
+    let rivals: Vec<&Row<'_>> = rows.iter().filter(|other| other.scene == row.scene).collect();
+    let values = rivals.iter().filter_map(|row| row.mean(figure));
+    let best = match figure.higher_is_better {
+        _ if rivals.len() < 2 => None,
+        Some(true) => values.reduce(f64::max),
+        Some(false) => values.reduce(f64::min),
+        None => None,
+    };
+    best.is_some() && row.mean(figure) == best
+}
+
+/// Returns the figures that rows have, or would have with more inputs, as their metrics declare
+/// them; of metrics without declarations, the numbers among their means.
+fn figures(rows: &[Row<'_>]) -> Vec<Figure> {
+    let mut figures: Vec<Figure> = Vec::new();
+    for row in rows {
+        let declared = row.metrics.figures();
+        for figure in declared.unwrap_or_else(|| numbers(row.metrics.mean())) {
+            if figures.iter().all(|other| other.path != figure.path) {
+                figures.push(figure);
+            }
+        }
+    }
+    figures.retain(|figure| figure.missing.is_some() || is_known(figure, rows));
+    figures
+}
+
+/// Returns a figure for each number of an object.
+fn numbers(mean: &Value) -> Vec<Figure> {
+    let entries = mean.as_object().into_iter().flatten().filter(|(_, value)| value.is_number());
+    entries
+        .map(|(name, _)| Figure {
+            path: name.clone(),
+            label: name.clone(),
+            digits: 4,
+            higher_is_better: None,
+            missing: None,
+        })
+        .collect()
+}
+
+/// Names the data sets that a node was made from: their folders, or the blocks that made them.
 fn data_set(run: &RunRecord, index: usize) -> String {
     let mut found: Vec<String> = Vec::new();
     for node in run.ancestors(index).into_iter().map(|i| &run.nodes[i]) {
@@ -114,21 +201,21 @@ fn data_set(run: &RunRecord, index: usize) -> String {
     found.join(", ")
 }
 
-/// Seconds of training and of rendering. What was rendered on the way to a refiner belongs to its
+/// Returns the seconds of training and of rendering. Views that a refiner was trained on count as
 /// training.
 fn times(run: &RunRecord, node: &RunNode, index: usize) -> [f64; 2] {
-    let mut rendered = Vec::new();
+    let mut rendering = Vec::new();
     let mut next = node.inputs.get("views").and_then(|input| input.node);
     while let Some(index) = next {
-        rendered.push(index);
+        rendering.push(index);
         next = run.nodes[index].inputs.get("views").and_then(|input| input.node);
     }
-    let seconds = |i: &usize| run.nodes[*i].seconds;
-    let mut trained = run.ancestors(index);
-    trained.retain(|i| {
+    let mut training = run.ancestors(index);
+    training.retain(|i| {
         ["field", "refiner", "views"].contains(&run.nodes[*i].kind.as_str())
-            && !rendered.contains(i)
+            && !rendering.contains(i)
     });
-    let of = |seconds: f64| seconds + 0.0; // a sum of nothing is -0
-    [of(trained.iter().map(seconds).sum()), of(rendered.iter().map(seconds).sum())]
+    // 0 is added because the sum of nothing is -0.
+    [training, rendering]
+        .map(|nodes| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0)
 }

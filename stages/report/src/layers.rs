@@ -5,21 +5,20 @@ use pixels::{DepthMap, ExrImage, Rgba8, common_range, read_exr, read_png};
 use scene::{View, Views};
 use serde_json::Value;
 
-use crate::gather::Report;
-use crate::row::Row;
+use crate::gather::{Report, Row};
 
-/// One picture of every view of a data set, such as ground truth or a method's error maps.
+/// Pictures of a data set's views, one for each view, such as ground truth or a method's error maps.
 pub(crate) struct Layer<'a> {
     pub(crate) label: String,
     pub(crate) group: Group,
-    /// Its place among the report's data sets.
+    /// Index of the data set in the report.
     pub(crate) scene: usize,
-    /// The row that it belongs to; none for observations.
+    /// Index of the row that made the pictures; `None` for observations.
     pub(crate) row: Option<usize>,
     source: Source<'a>,
 }
 
-/// Label of the layers of a method without others.
+/// Label of a method's layers if the page has only one method.
 pub(crate) const ONLY_RENDER: &str = "Render";
 
 /// Kinds of pictures.
@@ -30,19 +29,19 @@ pub(crate) enum Group {
     Render,
     Error,
     Depth,
-    /// Pictures that a metric made.
+    /// Pictures made by a metric.
     Metric {
         name: String,
         title: String,
     },
 }
 
-/// Where a layer's pictures lie.
+/// Location of a layer's pictures.
 enum Source<'a> {
     Image(Arc<Folder>),
     LowResolution(Arc<Folder>),
     Depth(Arc<Folder>),
-    /// Files that a result names: the pointer of their names among a view's scores.
+    /// Files of a result, and the JSON pointer of their names in a view's scores.
     Scored(&'a Row<'a>, String),
 }
 
@@ -62,11 +61,12 @@ impl Folder {
         self.views.views.iter().find(|view| view.camera.name == name)
     }
 
-    /// An image of it over the background.
+    /// Reads an image of the folder over the background.
     fn colour(&self, file: &str) -> anyhow::Result<Rgba8> {
         Ok(self.views.read_over(&self.path.join(file))?.to_rgba8())
     }
 
+    /// Reads the depth map of a view, if available.
     fn depth(&self, name: &str) -> anyhow::Result<Option<ExrImage>> {
         let file = self.view(name).and_then(|view| view.depth.as_ref());
         Ok(file.map(|file| read_exr(&self.path.join(file))).transpose()?)
@@ -74,7 +74,7 @@ impl Folder {
 }
 
 impl Layer<'_> {
-    /// Its picture of a view, where there is one. Depths are shown within a range.
+    /// Draws the picture of a view, if available; `range` is that of the depths' colours.
     pub(crate) fn picture(&self, view: &str, range: (f32, f32)) -> anyhow::Result<Option<Rgba8>> {
         match &self.source {
             Source::Image(folder) => {
@@ -91,14 +91,14 @@ impl Layer<'_> {
             }
             Source::Scored(row, pointer) => {
                 let file = row.view(view).and_then(|scores| scores.pointer(pointer)?.as_str());
-                // Without truth of its size there is no error map, though it has a name.
+                // Without truth of equal size the named error map doesn't exist.
                 let path = file.map(|file| row.node.folder.join(file)).filter(|path| path.exists());
                 Ok(path.map(|path| read_png(&path)).transpose()?)
             }
         }
     }
 
-    /// The range of depths that it shows of views; none where it shows none.
+    /// Returns the range of the views' depths; `None` for layers without depths.
     pub(crate) fn depth_range<'a>(
         &self,
         views: impl Iterator<Item = &'a String>,
@@ -113,36 +113,36 @@ impl Layer<'_> {
     }
 }
 
-/// Pixels of a data set's largest view; 1 where that isn't known.
-pub(crate) fn pixels_of(layers: &[Layer<'_>], scene: usize) -> u64 {
-    let of_scene = layers.iter().filter(|layer| layer.scene == scene);
-    let sizes = of_scene.flat_map(|layer| match &layer.source {
-        Source::Image(folder) => folder.views.views.as_slice(),
-        _ => &[],
-    });
-    let pixels = sizes.map(|view| {
-        let k = view.camera.intrinsics;
-        u64::from(k.width) * u64::from(k.height)
-    });
-    pixels.max().unwrap_or(1).max(1)
+/// Returns the number of pixels of a data set's largest view; 1 if unknown.
+pub(crate) fn max_pixels(layers: &[Layer<'_>], scene: usize) -> u64 {
+    let mut pixels = 1;
+    for layer in layers.iter().filter(|layer| layer.scene == scene) {
+        let Source::Image(folder) = &layer.source else { continue };
+        for view in &folder.views.views {
+            let intrinsics = view.camera.intrinsics;
+            pixels = pixels.max(u64::from(intrinsics.width) * u64::from(intrinsics.height));
+        }
+    }
+    pixels
 }
 
-/// All layers: observations first, then what each method made.
+/// Returns all layers: observations first, then those of each method.
 pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>>> {
     let mut layers = Vec::new();
     let mut truths: Vec<(PathBuf, usize, Option<Arc<Folder>>)> = Vec::new();
     for row in &report.rows {
         let Some(path) = folder_of(report, row, "truth") else { continue };
         if !truths.iter().any(|(other, scene, _)| *other == path && *scene == row.scene) {
-            let folder = is_views(&path).then(|| Folder::read(path.clone())).transpose()?;
+            let folder = has_views(&path).then(|| Folder::read(path.clone())).transpose()?;
             truths.push((path, row.scene, folder));
         }
     }
     for (path, scene, folder) in &truths {
         let Some(folder) = folder else { continue };
         let is_alone = truths.iter().filter(|(_, other, _)| other == scene).count() == 1;
-        let whose = if is_alone { String::new() } else { format!(" of {}", users(report, path)) };
-        add_observations(&mut layers, *scene, folder, &whose);
+        let suffix =
+            if is_alone { String::new() } else { format!(" of {}", scored_on(report, path)) };
+        add_observations(&mut layers, *scene, folder, &suffix);
     }
     for index in 0..report.rows.len() {
         add_method(&mut layers, report, index)?;
@@ -150,60 +150,67 @@ pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>
     Ok(layers)
 }
 
-/// Ground truth, photographs and true depth, where there are any.
-fn add_observations(layers: &mut Vec<Layer<'_>>, scene: usize, folder: &Arc<Folder>, whose: &str) {
+/// Adds photographs, ground truth and true depth, if available.
+fn add_observations(layers: &mut Vec<Layer<'_>>, scene: usize, folder: &Arc<Folder>, suffix: &str) {
     let views = &folder.views.views;
-    let layer = |label, group, source| Layer { label, group, scene, row: None, source };
+    let mut found = Vec::new();
     if views.iter().any(|view| view.low_resolution.is_some()) {
         let source = Source::LowResolution(Arc::clone(folder));
-        layers.push(layer(format!("LR photograph{whose}"), Group::LowResolution, source));
+        found.push(("LR photograph", Group::LowResolution, source));
     }
     if views.iter().any(|view| view.image.is_some()) {
-        let source = Source::Image(Arc::clone(folder));
-        layers.push(layer(format!("Ground truth{whose}"), Group::Truth, source));
+        found.push(("Ground truth", Group::Truth, Source::Image(Arc::clone(folder))));
     }
     if views.iter().any(|view| view.depth.is_some()) {
-        let source = Source::Depth(Arc::clone(folder));
-        layers.push(layer(format!("Ground truth{whose}"), Group::Depth, source));
+        found.push(("Ground truth", Group::Depth, Source::Depth(Arc::clone(folder))));
+    }
+    for (name, group, source) in found {
+        layers.push(Layer { label: format!("{name}{suffix}"), group, scene, row: None, source });
     }
 }
 
-/// What a method made, and what its scores show.
+/// Adds a method's renders, depths, error maps and pictures of metrics.
 fn add_method<'a>(
     layers: &mut Vec<Layer<'a>>,
     report: &'a Report<'a>,
     index: usize,
 ) -> anyhow::Result<()> {
     let row = &report.rows[index];
-    if let Some(path) = folder_of(report, row, "views").filter(|path| is_views(path)) {
+    if let Some(path) = folder_of(report, row, "views").filter(|path| has_views(path)) {
         let folder = Folder::read(path)?;
         let has_depth = folder.views.views.iter().any(|view| view.depth.is_some());
         let render = Source::Image(Arc::clone(&folder));
-        layers.push(of_method(report, index, Group::Render, render));
+        layers.push(method_layer(report, index, Group::Render, render));
         if has_depth {
-            layers.push(of_method(report, index, Group::Depth, Source::Depth(folder)));
+            layers.push(method_layer(report, index, Group::Depth, Source::Depth(folder)));
         }
     }
-    let of_metrics = row.metrics.picture_titles().into_iter().map(|(name, title)| {
+    let mut scored = vec![(Group::Error, "/error_map".to_owned())];
+    for (name, title) in row.metrics.picture_titles() {
         let pointer = format!("/pictures/{}", name.replace('~', "~0").replace('/', "~1"));
-        (Group::Metric { name: name.to_owned(), title: title.to_owned() }, pointer)
-    });
-    for (group, pointer) in [(Group::Error, "/error_map".to_owned())].into_iter().chain(of_metrics)
-    {
-        if names_files(row, &pointer) {
-            layers.push(of_method(report, index, group, Source::Scored(row, pointer)));
+        scored.push((Group::Metric { name: name.to_owned(), title: title.to_owned() }, pointer));
+    }
+    for (group, pointer) in scored {
+        if has_files(row, &pointer) {
+            layers.push(method_layer(report, index, group, Source::Scored(row, pointer)));
         }
     }
     Ok(())
 }
 
-fn of_method<'a>(report: &Report<'_>, index: usize, group: Group, source: Source<'a>) -> Layer<'a> {
+fn method_layer<'a>(
+    report: &Report<'_>,
+    index: usize,
+    group: Group,
+    source: Source<'a>,
+) -> Layer<'a> {
     let row = &report.rows[index];
     let label = if report.rows.len() == 1 { ONLY_RENDER.to_owned() } else { row.label.clone() };
     Layer { label, group, scene: row.scene, row: Some(index), source }
 }
 
-fn names_files(row: &Row<'_>, pointer: &str) -> bool {
+/// True if the scores of some view name a file at `pointer`.
+fn has_files(row: &Row<'_>, pointer: &str) -> bool {
     let mut views = row.metrics.views().iter();
     views.any(|view| view.pointer(pointer).is_some_and(Value::is_string))
 }
@@ -212,17 +219,15 @@ fn folder_of(report: &Report<'_>, row: &Row<'_>, input: &str) -> Option<PathBuf>
     row.node.inputs.get(input).map(|input| report.run.folder_of(input))
 }
 
-fn is_views(folder: &Path) -> bool {
+fn has_views(folder: &Path) -> bool {
     folder.join(scene::VIEWS_FILE).is_file()
 }
 
-/// The rows that are scored on a truth, in words.
-fn users(report: &Report<'_>, truth: &Path) -> String {
-    let users = report
-        .rows
-        .iter()
-        .filter(|row| folder_of(report, row, "truth").is_some_and(|path| path == truth));
-    let labels: Vec<&str> = users.map(|row| row.label.as_str()).collect();
+/// Names the rows that are scored on a ground truth.
+fn scored_on(report: &Report<'_>, truth: &Path) -> String {
+    let rows = report.rows.iter();
+    let rows = rows.filter(|row| folder_of(report, row, "truth").as_deref() == Some(truth));
+    let labels: Vec<&str> = rows.map(|row| row.label.as_str()).collect();
     match labels.as_slice() {
         [one] => (*one).to_owned(),
         [first, ..] => format!("{first} and {} more", labels.len() - 1),
@@ -231,7 +236,7 @@ fn users(report: &Report<'_>, truth: &Path) -> String {
 }
 
 impl Group {
-    /// Heading of its layers in lists.
+    /// Returns the heading of the group's layers in lists.
     pub(crate) fn heading(&self) -> &str {
         match self {
             Self::LowResolution | Self::Truth => "Observations",
@@ -242,7 +247,7 @@ impl Group {
         }
     }
 
-    /// Which layers the page lists together.
+    /// Returns the identifier of the layers that the page lists together.
     pub(crate) fn kind(&self) -> String {
         match self {
             Self::Metric { name, .. } => format!("metric-{name}"),
@@ -250,7 +255,7 @@ impl Group {
         }
     }
 
-    /// Stem of its originals' names.
+    /// Returns the stem of the originals' file names.
     pub(crate) fn file_name(&self) -> &str {
         match self {
             Self::LowResolution => "low-resolution",

@@ -1,39 +1,47 @@
-//! A layered drawing of a graph without circles, from top to bottom, after Sugiyama: edges that
-//! skip layers get a lane of their own in each, so that they pass beside boxes.
+//! Layered drawing of an acyclic graph from top to bottom (Sugiyama et al. 1981). An edge that skips
+//! layers gets a lane in each of them, so that it passes between the boxes.
 
-/// Size of a box, in CSS pixels.
+/// Width of a box in CSS pixels.
 pub(crate) const WIDTH: f64 = 184.0;
+/// Height of a box in CSS pixels.
 pub(crate) const HEIGHT: f64 = 74.0;
-/// Between two boxes of a layer, and between layers.
+/// Distance between two boxes of a layer.
 const BOX_GAP: f64 = 24.0;
+/// Distance between two layers.
 const LAYER_GAP: f64 = 34.0;
-/// Between a lane and what is beside it.
+/// Distance between a lane and a box or another lane.
 const LANE_GAP: f64 = 16.0;
-/// Rounds of moving things towards what they are joined to.
+/// Number of passes that move items towards their neighbours; chosen by hand.
 const ROUNDS: usize = 12;
 
-/// Where boxes and edges are.
+/// Positions of boxes and edges.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Drawing {
     pub(crate) width: f64,
     pub(crate) height: f64,
-    /// Left upper corner of each node's box.
+    /// Upper left corner of each node's box.
     pub(crate) boxes: Vec<[f64; 2]>,
-    /// Paths of the edges, in SVG's words.
+    /// SVG path of each edge.
     pub(crate) edges: Vec<String>,
 }
 
-/// A box, or the lane of an edge in a layer that it skips.
+/// A box, or the lane of an edge in a skipped layer.
 struct Item {
     layer: usize,
     is_lane: bool,
     /// Centre.
     x: f64,
+    /// Connected items in the layers above.
     above: Vec<usize>,
+    /// Connected items in the layers below.
     below: Vec<usize>,
 }
 
 impl Item {
+    fn new(layer: usize, is_lane: bool) -> Self {
+        Self { layer, is_lane, x: 0.0, above: Vec::new(), below: Vec::new() }
+    }
+
     fn half_width(&self) -> f64 {
         if self.is_lane { 1.0 } else { WIDTH / 2.0 }
     }
@@ -46,14 +54,13 @@ pub(crate) fn draw(count: usize, edges: &[(usize, usize)]) -> Drawing {
         let parents = edges.iter().filter(|edge| edge.1 == to);
         layer_of[to] = parents.map(|edge| layer_of[edge.0] + 1).max().unwrap_or(0);
     }
-    let item = |layer, is_lane| Item { layer, is_lane, x: 0.0, above: vec![], below: vec![] };
-    let mut items: Vec<Item> = layer_of.iter().map(|&layer| item(layer, false)).collect();
+    let mut items: Vec<Item> = layer_of.iter().map(|&layer| Item::new(layer, false)).collect();
     let mut routes = Vec::new();
     for &(from, to) in edges {
         let mut route = vec![from];
         for layer in layer_of[from] + 1..layer_of[to] {
             route.push(items.len());
-            items.push(item(layer, true));
+            items.push(Item::new(layer, true));
         }
         route.push(to);
         for pair in route.windows(2) {
@@ -62,29 +69,36 @@ pub(crate) fn draw(count: usize, edges: &[(usize, usize)]) -> Drawing {
         }
         routes.push(route);
     }
-    let count_of_layers = layer_of.iter().max().map_or(0, |last| last + 1);
-    let mut layers: Vec<Vec<usize>> = vec![Vec::new(); count_of_layers];
+    let layer_count = layer_of.iter().max().map_or(0, |last| last + 1);
+    let mut layers: Vec<Vec<usize>> = vec![Vec::new(); layer_count];
     for (index, item) in items.iter().enumerate() {
         layers[item.layer].push(index);
     }
     arrange(&mut items, &mut layers);
     let left = items.iter().map(|item| item.x - item.half_width()).fold(f64::INFINITY, f64::min);
     let left = if left.is_finite() { left } else { 0.0 };
-    items.iter_mut().for_each(|item| item.x -= left);
-    let top = |layer: usize| layer as f64 * (HEIGHT + LAYER_GAP);
+    for item in &mut items {
+        item.x -= left;
+    }
     Drawing {
         width: items.iter().map(|item| item.x + item.half_width()).fold(0.0, f64::max),
-        height: top(count_of_layers.max(1) - 1) + HEIGHT,
+        height: top(layer_count.max(1) - 1) + HEIGHT,
         boxes: items[..count].iter().map(|item| [item.x - WIDTH / 2.0, top(item.layer)]).collect(),
-        edges: routes.iter().map(|route| path(&items, route, top)).collect(),
+        edges: routes.iter().map(|route| path(&items, route)).collect(),
     }
 }
 
-/// Orders the layers so that few edges cross, and moves all towards what it is joined to.
+/// Returns the y coordinate of a layer's upper edge.
+fn top(layer: usize) -> f64 {
+    layer as f64 * (HEIGHT + LAYER_GAP)
+}
+
+/// Orders the items of each layer so that few edges cross, and moves items towards their neighbours.
 fn arrange(items: &mut [Item], layers: &mut [Vec<usize>]) {
     for layer in layers.iter_mut() {
-        let mean = |index: usize| mean_x(items, &items[index].above);
-        layer.sort_by(|&a, &b| mean(a).total_cmp(&mean(b)));
+        layer.sort_by(|&a, &b| {
+            mean_x(items, &items[a].above).total_cmp(&mean_x(items, &items[b].above))
+        });
         let mut x = 0.0;
         for &index in layer.iter() {
             let half = items[index].half_width();
@@ -104,43 +118,46 @@ fn arrange(items: &mut [Item], layers: &mut [Vec<usize>]) {
     }
 }
 
-fn mean_x(items: &[Item], of: &[usize]) -> f64 {
-    of.iter().map(|&index| items[index].x).sum::<f64>() / of.len().max(1) as f64
+/// Returns the mean x coordinate of some items.
+fn mean_x(items: &[Item], indices: &[usize]) -> f64 {
+    indices.iter().map(|&index| items[index].x).sum::<f64>() / indices.len().max(1) as f64
 }
 
-/// Moves a layer's boxes to the mean of the boxes that they are joined to, as near as their widths
-/// allow, and lanes to where nothing is, near the ends of their edges.
+/// Moves a layer's boxes to the mean of their neighbours, as near as their widths allow, and its lanes
+/// to free positions near the ends of their edges.
 fn settle(items: &mut [Item], layer: &[usize]) {
-    let (lanes, boxes): (Vec<usize>, Vec<usize>) =
-        layer.iter().partition(|&&index| items[index].is_lane);
-    let mut wishes: Vec<(usize, f64)> =
-        boxes.into_iter().map(|index| (index, wish(items, index))).collect();
-    wishes.sort_by(|a, b| a.1.total_cmp(&b.1));
-    // Pushed to the right as far as needed, and to the left: the mean keeps the distances.
-    let mut right: Vec<f64> = wishes.iter().map(|wish| wish.1).collect();
+    let boxes = with_targets(items, layer, false);
+    // Boxes are pushed apart to the right and to the left; the mean of both keeps the distances.
+    let mut right: Vec<f64> = boxes.iter().map(|(_, target)| *target).collect();
     let mut left = right.clone();
-    for i in 1..wishes.len() {
+    for i in 1..boxes.len() {
         right[i] = right[i].max(right[i - 1] + WIDTH + BOX_GAP);
     }
-    for i in (1..wishes.len()).rev() {
+    for i in (1..boxes.len()).rev() {
         left[i - 1] = left[i - 1].min(left[i] - WIDTH - BOX_GAP);
     }
     let mut taken: Vec<(f64, f64)> = Vec::new();
-    for (place, (index, _)) in wishes.iter().enumerate() {
-        items[*index].x = (left[place] + right[place]) / 2.0;
+    for (i, (index, _)) in boxes.iter().enumerate() {
+        items[*index].x = (left[i] + right[i]) / 2.0;
         taken.push((items[*index].x, WIDTH / 2.0));
     }
-    let mut lanes: Vec<(usize, f64)> =
-        lanes.into_iter().map(|index| (index, wish(items, index))).collect();
-    lanes.sort_by(|a, b| a.1.total_cmp(&b.1));
-    for (index, wish) in lanes {
-        items[index].x = free_place(&taken, wish);
+    for (index, target) in with_targets(items, layer, true) {
+        items[index].x = nearest_free(&taken, target);
         taken.push((items[index].x, 0.0));
     }
 }
 
-/// Where an item wants to be: at the mean of what it is joined to, a box of boxes alone if it can.
-fn wish(items: &[Item], index: usize) -> f64 {
+/// Returns a layer's boxes or lanes with their target positions, from left to right.
+fn with_targets(items: &[Item], layer: &[usize], are_lanes: bool) -> Vec<(usize, f64)> {
+    let chosen = layer.iter().filter(|&&index| items[index].is_lane == are_lanes);
+    let mut found: Vec<(usize, f64)> = chosen.map(|&index| (index, target(items, index))).collect();
+    found.sort_by(|a, b| a.1.total_cmp(&b.1));
+    found
+}
+
+/// Returns an item's target position: the mean of its neighbours; for a box, of neighbouring boxes
+/// if it has any.
+fn target(items: &[Item], index: usize) -> f64 {
     let Item { above, below, x, is_lane, .. } = &items[index];
     let all = [above.as_slice(), below.as_slice()].concat();
     let boxes: Vec<usize> = all.iter().copied().filter(|&other| !items[other].is_lane).collect();
@@ -151,17 +168,24 @@ fn wish(items: &[Item], index: usize) -> f64 {
     }
 }
 
-/// The place for a lane next to a wish, beside what is taken (centre and half its width).
-fn free_place(taken: &[(f64, f64)], wish: f64) -> f64 {
-    let room = |half: f64| half + LANE_GAP;
-    let beside = taken.iter().flat_map(|(x, half)| [x + room(*half), x - room(*half)]);
-    let is_free = |at: &f64| taken.iter().all(|(x, half)| (x - at).abs() > room(*half) - 1e-6);
-    let near = |a: &f64, b: &f64| (a - wish).abs().total_cmp(&(b - wish).abs());
-    [wish].into_iter().chain(beside).filter(is_free).min_by(near).unwrap_or(wish)
+/// Returns the free position of a lane that is nearest to its target; `taken` has centre and half
+/// width of each occupied interval.
+fn nearest_free(taken: &[(f64, f64)], target: f64) -> f64 {
+    let mut candidates = vec![target];
+    for (x, half) in taken {
+        candidates.extend([x + (half + LANE_GAP), x - (half + LANE_GAP)]);
+    }
+    candidates.retain(|candidate| {
+        taken.iter().all(|(x, half)| (x - candidate).abs() > half + LANE_GAP - 1e-6)
+    });
+    let nearest =
+        candidates.into_iter().min_by(|a, b| (a - target).abs().total_cmp(&(b - target).abs()));
+    nearest.unwrap_or(target)
 }
 
-/// From the bottom of the first box to the top of the last, down through the lanes between.
-fn path(items: &[Item], route: &[usize], top: impl Fn(usize) -> f64) -> String {
+/// Returns the SVG path from the bottom of the first box to the top of the last, through the lanes
+/// between them.
+fn path(items: &[Item], route: &[usize]) -> String {
     let mut text = String::new();
     for pair in route.windows(2) {
         let (from, to) = (&items[pair[0]], &items[pair[1]]);

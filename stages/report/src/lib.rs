@@ -1,38 +1,36 @@
-//! `report`: the record of a run as one HTML page. It opens from disk without a network; pictures
-//! at full size lie beside it in `views/`, and without them the page works, too.
+//! `report`: the record of a run as one HTML page. A browser opens the page from disk, without a
+//! network. Pictures at full size are in `views/` next to the page, which also works without them.
 //!
-//! A sink: it reads `run.json`, looks into the artifacts it names, and is never cached, since it
-//! shows times and hashes.
+//! The stage is a sink: it reads `run.json` and the artifacts listed there, and is never cached,
+//! since the page contains times and hashes.
 //!
-//! * `gather`: results, data sets and figures of a run. `figures`: numbers and how they are shown.
-//! * `layers`: the pictures that there are of each view. `pictures`: their originals, and copies
-//!   that a page has room for. `scale`: colour scales of error and depth maps.
-//! * `data`: all that the page's script works on, as JSON.
+//! * `gather`: results, data sets and figures of a run.
+//! * `layers`: available pictures of each view. `pictures`: originals, and copies within the page's
+//!   byte budget. `scale`: colour scales of error and depth maps.
+//! * `data`: input of the page's script, as JSON.
 //! * `page`: the page's frame. `tables`, `viewer`, `pipeline`, `commands`: its parts. `layout`:
-//!   draws the pipeline's graph.
-//! * `page.css`; `chart.js`: charts as SVG; `viewer.js`: the comparison; `plots.js`: what is
-//!   plotted; `page.js`: starts them.
-//! * [`ResultRow`]: the same figures as `results.json` beside the page, for scripts.
+//!   drawing of the pipeline's graph.
+//! * `page.css`; `chart.js`: charts as SVG; `viewer.js`: the comparison; `plots.js`: choice of
+//!   plots; `page.js`: entry point.
+//! * [`ResultRow`]: a row of `results.json`, the page's figures for scripts.
 //!
 //! ```
-//! use stage::Stage as _;
-//! let params = report::Params { views: 8, ..report::Params::default() };
-//! assert_eq!(report::Report::NAME, "report");
+//! let params: report::Params = serde_json::from_str(r#"{"views": 8}"#)?;
+//! assert_eq!(params.views, 8);
 //! assert!(params.compare.is_none());
+//! assert!(serde_json::from_str::<report::Params>(r#"{"pictures": 8}"#).is_err());
+//! # Ok::<(), serde_json::Error>(())
 //! ```
 
 mod commands;
 mod data;
-mod figures;
 mod gather;
 mod layers;
 mod layout;
 mod page;
-mod params;
 mod pictures;
 mod pipeline;
 mod results;
-mod row;
 mod scale;
 mod tables;
 mod viewer;
@@ -41,15 +39,16 @@ use artifact::{Failure, RunRecord, counted, sized};
 use contract::{Input, Output};
 use stage::{Context, Stage};
 
-pub use params::Params;
+pub use data::Params;
 pub use results::{ResultRow, StageResult};
 
 /// The stage.
 pub struct Report;
 
-/// Bytes that a page has at most, but for the text of very long runs.
-const MOST_PAGE_BYTES: usize = 15_000_000;
-/// Bytes of all that is said of the pictures beside the pictures themselves.
+/// Maximum size of a page in bytes, unless the text of a very long run is larger
+/// (docs/design/041).
+const MAX_PAGE_BYTES: usize = 15_000_000;
+/// Bytes reserved for labels and file names of the pictures; chosen by hand.
 const CAPTION_BYTES: usize = 700_000;
 
 impl Stage for Report {
@@ -64,8 +63,8 @@ impl Stage for Report {
             "run",
             Input::required(
                 &["run"],
-                "folder with run.json, the record of a run; in pipeline.yaml: scores, and more \
-                under any name",
+                "folder with run.json, the record of a run; in pipeline.yaml: the scores, and \
+                further artifacts under any name",
             ),
         )]
     }
@@ -79,7 +78,7 @@ impl Stage for Report {
         run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
         let report = gather::Report::new(&run);
         let text = page::page(&report, None)?.into_string().len();
-        let budget = MOST_PAGE_BYTES.saturating_sub(text + CAPTION_BYTES);
+        let budget = MAX_PAGE_BYTES.saturating_sub(text + CAPTION_BYTES);
         let data = data::Data::new(context, &report, params, budget)?;
         let html = page::page(&report, Some(&data))?.into_string();
         std::fs::write(context.output_path("index.html")?, &html)?;

@@ -2,27 +2,28 @@ use artifact::{RunRecord, counted};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use stage_call::utc;
 
-use crate::commands::{commands, name_of};
+use crate::commands::{commands, file_name};
 use crate::data::Data;
-use crate::gather::{Report, SceneViews};
+use crate::gather::Report;
 use crate::pipeline::pipeline;
 use crate::results::warnings_by_node;
-use crate::tables::{conventions, numbers_of_views, scores, summary};
+use crate::tables::{conventions, scores, summary, view_figures};
 use crate::viewer::{plots, viewer};
 
 const STYLE: &str = include_str!("page.css");
-/// In this order: what stands first is used by what follows.
+/// Scripts in the order of their dependencies.
 const SCRIPTS: [&str; 4] = [
     include_str!("chart.js"),
     include_str!("viewer.js"),
     include_str!("plots.js"),
     include_str!("page.js"),
 ];
-/// Nothing is fetched from anywhere: pictures come from the page and from files beside it.
+/// Content security policy: pictures come from the page and from files next to it, and nothing else
+/// is fetched.
 const POLICY: &str = "default-src 'none'; img-src data: 'self' file:; style-src 'unsafe-inline'; \
     script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'";
 
-/// The page; without its pictures it shows all but these.
+/// Renders the page; without `data`, all of the page but the pictures.
 pub(crate) fn page(report: &Report<'_>, data: Option<&Data>) -> anyhow::Result<Markup> {
     let json = data.map(Data::to_json).transpose()?.unwrap_or_default();
     let has_pictures = data.is_some_and(|data| !data.pictures.is_empty());
@@ -47,7 +48,7 @@ pub(crate) fn page(report: &Report<'_>, data: Option<&Data>) -> anyhow::Result<M
                     @if has_pictures { (viewer(data)) }
                     (scores(report))
                     (plots(report))
-                    (numbers_of_views(report))
+                    (view_figures(report))
                     (conventions(report))
                     @if !report.run.nodes.is_empty() || !report.run.unfinished.is_empty() {
                         (pipeline(report.run))
@@ -62,13 +63,14 @@ pub(crate) fn page(report: &Report<'_>, data: Option<&Data>) -> anyhow::Result<M
     })
 }
 
-/// Most data sets that a title names.
+/// Maximum number of data sets in a title; chosen by hand.
 const MAX_NAMES: usize = 4;
 
-/// The data sets' short names.
+/// Lists the data sets' short names.
 fn title(report: &Report<'_>) -> String {
     let sets = data_sets(report);
-    let names: Vec<String> = sets.iter().take(MAX_NAMES).map(|set| name_of(set.as_ref())).collect();
+    let names: Vec<String> =
+        sets.iter().take(MAX_NAMES).map(|set| file_name(set.as_ref())).collect();
     match sets.len() {
         0 => "A run".to_owned(),
         1..=MAX_NAMES => names.join(", "),
@@ -80,11 +82,11 @@ fn data_sets(report: &Report<'_>) -> Vec<String> {
     if !report.run.data_sets.is_empty() {
         return report.run.data_sets.clone();
     }
-    report.scenes.iter().map(|scene: &SceneViews| scene.data_set.clone()).collect()
+    report.scenes.iter().map(|scene| scene.data_set.clone()).collect()
 }
 
-/// When the last stage ended, seconds since 1970.
-fn ended(run: &RunRecord) -> Option<u64> {
+/// Returns the time at which the last stage ended, in seconds since 1970.
+fn end_time(run: &RunRecord) -> Option<u64> {
     run.nodes.iter().map(|node| node.started_unix + node.seconds.max(0.0) as u64).max()
 }
 
@@ -109,7 +111,7 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
                         @for set in data_sets(report).iter().take(MAX_NAMES) { code { (set) } " " }
                     }
                 }
-                @if let Some(ended) = ended(run) {
+                @if let Some(ended) = end_time(run) {
                     div { dt { "Date" } dd { time { (utc(ended)) } } }
                 }
                 @if let Some(commit) = run.commit() {
@@ -129,19 +131,19 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
     }
 }
 
-/// What failed and what stages warned of, before anything else.
+/// Sections with failures and warnings, at the top of the page.
 fn notices(report: &Report<'_>) -> Markup {
     let run = report.run;
     let warnings = warnings_by_node(run);
-    let left_out = run.failed.iter().filter_map(|point| Some((point, point.reason.as_ref()?)));
-    let left_out: Vec<_> = left_out.collect();
+    let left_out: Vec<_> =
+        run.failed.iter().filter_map(|point| Some((point, point.reason.as_ref()?))).collect();
     let failures = run.unfinished.iter().filter_map(|node| Some((node, node.message.as_ref()?)));
     let is_partial = run.failed.iter().any(|point| point.reason.is_none());
     html! {
         @if is_partial {
             section class="notice bad" id="failures" aria-labelledby="failures-heading" {
                 h2 id="failures-heading" { "This run failed" }
-                p { "The page shows what had finished." }
+                p { "The page has the results that were finished." }
                 ul {
                     @for (node, message) in failures {
                         li { b { (artifact::label(&node.stage, &node.point)) } ": " (message) }

@@ -11,32 +11,37 @@ use stage::Context;
 
 use crate::layers::{Group, Layer, ONLY_RENDER};
 
-/// A picture on the page.
+/// A picture of the page.
 pub(crate) struct Picture {
-    /// The view's place among all views of the page.
+    /// Index of the view in the page.
     pub(crate) view: usize,
-    /// The layer's place.
+    /// Index of the layer.
     pub(crate) layer: usize,
-    /// Pixels of the original.
+    /// Width of the original in pixels.
     pub(crate) width: usize,
+    /// Height of the original in pixels.
     pub(crate) height: usize,
-    /// Pixels across of the copy in the page.
+    /// Width of the copy in pixels.
     pub(crate) shown_width: usize,
-    /// The original beside the page.
+    /// Path of the original, relative to the page.
     pub(crate) original: String,
-    /// The copy in the page.
+    /// Data URI of the copy in the page.
     pub(crate) uri: String,
 }
 
-/// A picture that is wanted: view and layer by place, and the view's name.
-pub(crate) struct Wanted<'a> {
+/// Request for the picture of a view in a layer.
+pub(crate) struct Request<'a> {
+    /// Index of the view in the page.
     pub(crate) view: usize,
+    /// Name of the view.
     pub(crate) name: &'a str,
+    /// Index of the layer.
     pub(crate) layer: usize,
+    /// Range of the colours of depths.
     pub(crate) depths: (f32, f32),
 }
 
-/// An original that was written.
+/// A written original.
 struct Original {
     view: usize,
     layer: usize,
@@ -48,22 +53,23 @@ struct Original {
     bytes: usize,
 }
 
-/// A way to make pictures smaller.
+/// Compression of a picture's copy.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Quality {
-    /// The original.
+    /// Copy of the original.
     Lossless,
-    /// JPEG of at most so many pixels across or down.
+    /// JPEG of at most `side` pixels in width and height.
     Jpeg { side: usize, quality: u8 },
 }
 
-/// Bytes of pictures in a page up to which they are the originals: such a page opens at once.
+/// Maximum number of bytes of a page's pictures for which copies are lossless: such a page opens
+/// immediately (docs/design/041).
 const LOSSLESS_BYTES: usize = 6_000_000;
-/// Pixels across and down up to which LR photographs are shown as they are: a reader looks at their
-/// single pixels.
+/// Maximum width and height in pixels of LR photographs that are always lossless, because readers
+/// compare their single pixels; chosen by hand.
 const LOSSLESS_SIDE: usize = 128;
 
-/// From the best to what a page of any run has room for.
+/// Qualities from the best to one that fits into the page of any run (docs/design/041).
 const QUALITIES: [Quality; 11] = [
     Quality::Lossless,
     Quality::Jpeg { side: 800, quality: 90 },
@@ -78,61 +84,61 @@ const QUALITIES: [Quality; 11] = [
     Quality::Jpeg { side: 96, quality: 55 },
 ];
 
-/// Pictures whose size tells that of all.
-const SAMPLE_PICTURES: usize = 16;
+/// Number of pictures from which the size of all copies is predicted (docs/design/041).
+const SAMPLE_COUNT: usize = 16;
 
-/// Writes originals to `views/` and returns copies that have room in `budget` bytes of a page.
-pub(crate) fn pictures(
+/// Writes originals to `views/` and returns copies of at most `budget` bytes in total.
+pub(crate) fn write_pictures(
     context: &Context,
     layers: &[Layer<'_>],
-    wanted: &[Wanted<'_>],
+    requests: &[Request<'_>],
     budget: usize,
 ) -> anyhow::Result<Vec<Picture>> {
-    let files = file_names(layers, wanted);
-    let progress = context.progress("pictures", 2 * wanted.len() as u64);
-    let originals = wanted
+    let files = file_names(layers, requests);
+    let progress = context.progress("pictures", 2 * requests.len() as u64);
+    let originals = requests
         .par_iter()
         .zip(files)
-        .map(|(wanted, file)| {
+        .map(|(request, file)| {
             context.check_interrupt()?;
-            let original = write_original(context, layers, wanted, file)?;
+            let original = write_original(context, layers, request, file)?;
             progress.add(1);
             anyhow::Ok(original)
         })
         .collect::<anyhow::Result<Vec<_>>>()?;
     let originals: Vec<Original> = originals.into_iter().flatten().collect();
-    let mut first = first_quality(&originals, budget)?;
+    let mut quality = predict_quality(&originals, budget)?;
     loop {
         let pictures = originals
             .par_iter()
             .map(|original| {
                 context.check_interrupt()?;
                 progress.add(1);
-                copy(original, QUALITIES[first])
+                copy(original, QUALITIES[quality])
             })
             .collect::<anyhow::Result<Vec<Picture>>>()?;
         let bytes: usize = pictures.iter().map(|picture| picture.uri.len()).sum();
-        if bytes <= budget || first + 1 == QUALITIES.len() {
+        if bytes <= budget || quality + 1 == QUALITIES.len() {
             return Ok(pictures);
         }
-        first += 1;
+        quality += 1;
     }
 }
 
 fn write_original(
     context: &Context,
     layers: &[Layer<'_>],
-    wanted: &Wanted<'_>,
+    request: &Request<'_>,
     file: String,
 ) -> anyhow::Result<Option<Original>> {
-    let layer = &layers[wanted.layer];
-    let Some(image) = layer.picture(wanted.name, wanted.depths)? else { return Ok(None) };
+    let layer = &layers[request.layer];
+    let Some(image) = layer.picture(request.name, request.depths)? else { return Ok(None) };
     let path = context.output_path(&file)?;
     let bytes = encode_png(&image);
     std::fs::write(&path, &bytes).with_context(|| path.display().to_string())?;
     Ok(Some(Original {
-        view: wanted.view,
-        layer: wanted.layer,
+        view: request.view,
+        layer: request.layer,
         group: layer.group.clone(),
         width: image.width,
         height: image.height,
@@ -142,22 +148,22 @@ fn write_original(
     }))
 }
 
-/// The first quality that some of the pictures say has room.
-fn first_quality(originals: &[Original], budget: usize) -> anyhow::Result<usize> {
+/// Predicts from a sample of the pictures the index of the best quality that fits into the budget.
+fn predict_quality(originals: &[Original], budget: usize) -> anyhow::Result<usize> {
     let all: usize = originals.iter().map(|original| base64_length(original.bytes)).sum();
     if all <= budget.min(LOSSLESS_BYTES) {
         return Ok(0);
     }
-    let sample: Vec<&Original> =
-        originals.iter().step_by(originals.len().div_ceil(SAMPLE_PICTURES).max(1)).collect();
-    for place in 1..QUALITIES.len() {
+    let step = originals.len().div_ceil(SAMPLE_COUNT).max(1);
+    let sample: Vec<&Original> = originals.iter().step_by(step).collect();
+    for quality in 1..QUALITIES.len() {
         let copies: Vec<Picture> = sample
             .par_iter()
-            .map(|original| copy(original, QUALITIES[place]))
+            .map(|original| copy(original, QUALITIES[quality]))
             .collect::<anyhow::Result<_>>()?;
         let bytes: usize = copies.iter().map(|picture| picture.uri.len()).sum();
         if bytes * originals.len() <= budget * sample.len() {
-            return Ok(place);
+            return Ok(quality);
         }
     }
     Ok(QUALITIES.len() - 1)
@@ -167,7 +173,7 @@ fn base64_length(bytes: usize) -> usize {
     bytes.div_ceil(3) * 4
 }
 
-/// The copy of an original.
+/// Makes the copy of an original.
 fn copy(original: &Original, quality: Quality) -> anyhow::Result<Picture> {
     let is_small = original.width.max(original.height) <= LOSSLESS_SIDE;
     let quality = match &original.group {
@@ -177,7 +183,7 @@ fn copy(original: &Original, quality: Quality) -> anyhow::Result<Picture> {
     let (kind, bytes, shown_width) = match quality {
         Quality::Lossless => ("png", std::fs::read(&original.path)?, original.width),
         Quality::Jpeg { side, quality } => {
-            let small = at_most(&read_png(&original.path)?, side);
+            let small = shrunk(&read_png(&original.path)?, side);
             ("jpeg", encode_jpeg(&small, quality, &original.group)?, small.width)
         }
     };
@@ -192,20 +198,21 @@ fn copy(original: &Original, quality: Quality) -> anyhow::Result<Picture> {
     })
 }
 
-/// An image with so many pixels across and down at most.
-fn at_most(image: &Rgba8, side: usize) -> Rgba8 {
+/// Shrinks an image to at most `side` pixels in width and height.
+fn shrunk(image: &Rgba8, side: usize) -> Rgba8 {
     let longest = image.width.max(image.height);
     if longest <= side {
         return image.clone();
     }
-    let less = |size: usize| (size * side).div_ceil(longest).max(1);
-    resize_pillow(image, less(image.width), less(image.height), Filter::Bicubic)
+    let [width, height] =
+        [image.width, image.height].map(|size| (size * side).div_ceil(longest).max(1));
+    resize_pillow(image, width, height, Filter::Bicubic)
 }
 
 fn encode_jpeg(image: &Rgba8, quality: u8, group: &Group) -> anyhow::Result<Vec<u8>> {
     let rgb: Vec<u8> =
         image.data.as_chunks::<4>().0.iter().flat_map(|p| [p[0], p[1], p[2]]).collect();
-    // A pixel of an LR photograph covers several of the screen's.
+    // A pixel of an LR photograph covers several pixels of the screen.
     let (quality, sampling) = match group {
         Group::LowResolution => ((quality + 6).min(95), SamplingFactor::R_4_4_4),
         _ => (quality, SamplingFactor::R_4_2_0),
@@ -215,40 +222,46 @@ fn encode_jpeg(image: &Rgba8, quality: u8, group: &Group) -> anyhow::Result<Vec<
     encoder.set_sampling_factor(sampling);
     encoder.set_progressive(true);
     encoder.set_optimized_huffman_tables(true);
-    let size = |pixels: usize| u16::try_from(pixels).context("a copy is smaller than 65,536");
-    encoder.encode(&rgb, size(image.width)?, size(image.height)?, ColorType::Rgb)?;
+    let width = u16::try_from(image.width).context("copy wider than 65,535 pixels")?;
+    let height = u16::try_from(image.height).context("copy higher than 65,535 pixels")?;
+    encoder.encode(&rgb, width, height, ColorType::Rgb)?;
     Ok(bytes)
 }
 
-/// Names of originals, each once: a folder a view, with plain letters alone.
-fn file_names(layers: &[Layer<'_>], wanted: &[Wanted<'_>]) -> Vec<String> {
+/// Returns unique file names of the originals: one folder per view, with plain letters only.
+fn file_names(layers: &[Layer<'_>], requests: &[Request<'_>]) -> Vec<String> {
     let mut taken = BTreeSet::new();
-    let mut names = Vec::with_capacity(wanted.len());
-    for wanted in wanted {
-        let stem = stem(&layers[wanted.layer], wanted.name);
-        let numbered = (2usize..).map(|number| format!("{stem}-{number}.png"));
-        let mut files = [format!("{stem}.png")].into_iter().chain(numbered);
-        let free = files.find(|file| !taken.contains(file)).unwrap_or_default();
-        taken.insert(free.clone());
-        names.push(free);
+    let mut names = Vec::with_capacity(requests.len());
+    for request in requests {
+        let stem = stem(&layers[request.layer], request.name);
+        let mut name = format!("{stem}.png");
+        let mut number = 2;
+        while !taken.insert(name.clone()) {
+            name = format!("{stem}-{number}.png");
+            number += 1;
+        }
+        names.push(name);
     }
     names
 }
 
-/// Path of a view's original without its ending; other originals may have the same.
+/// Returns the path of a view's original without extension, which needn't be unique.
 fn stem(layer: &Layer<'_>, view: &str) -> String {
-    let whose = match (layer.row, &layer.group) {
+    let suffix = match (layer.row, &layer.group) {
         (None, _) => String::new(),
         (Some(_), Group::Render) if layer.label == ONLY_RENDER => String::new(),
         (Some(_), _) => format!("-{}", plain(&layer.label.to_lowercase())),
     };
-    format!("views/{}/{}{whose}", plain(view), plain(layer.group.file_name()))
+    format!("views/{}/{}{suffix}", plain(view), plain(layer.group.file_name()))
 }
 
-/// Letters that are plain in paths and addresses, 60 at most.
+/// Replaces characters that aren't plain in paths and URLs, and keeps at most 60.
 fn plain(text: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
-    let text: String = text.chars().map(|c| if is_plain(c) { c } else { '-' }).take(60).collect();
+    let text: String = text
+        .chars()
+        .map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '-' })
+        .take(60)
+        .collect();
     let text = text.trim_matches(['-', '.']);
     if text.is_empty() { "view".to_owned() } else { text.to_owned() }
 }

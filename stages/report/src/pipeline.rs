@@ -7,10 +7,10 @@ use maud::{Markup, html};
 use serde_json::Value;
 use stage_call::{seconds, utc};
 
-use crate::commands::{name_of, stage_command};
+use crate::commands::{file_name, stage_command};
 use crate::layout::{Drawing, HEIGHT, WIDTH, draw};
 
-/// All nodes of a block, at every point of a sweep.
+/// Nodes of a block at all points of a sweep.
 #[derive(Default)]
 struct Block<'a> {
     name: &'a str,
@@ -18,7 +18,7 @@ struct Block<'a> {
     undone: Vec<&'a UnfinishedNode>,
 }
 
-/// How a node stands.
+/// State of a node, the worst first.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum State {
     Failed,
@@ -41,7 +41,7 @@ impl State {
         if node.message.is_some() { Self::Failed } else { Self::Waiting }
     }
 
-    fn words(self) -> &'static str {
+    fn name(self) -> &'static str {
         match self {
             Self::Failed => "failed",
             Self::Waiting => "not run",
@@ -51,8 +51,8 @@ impl State {
         }
     }
 
-    /// A sign, so that colour alone says nothing.
-    fn sign(self) -> &'static str {
+    /// Returns a symbol, so that states don't differ by colour alone.
+    fn symbol(self) -> &'static str {
         match self {
             Self::Failed => "✕",
             Self::Waiting => "–",
@@ -62,7 +62,7 @@ impl State {
     }
 }
 
-/// The graph of blocks, and what is known of each node.
+/// Section with the graph of blocks and the details of each node.
 pub(crate) fn pipeline(run: &RunRecord) -> Markup {
     let (blocks, edges, folders) = graph(run);
     let drawing = draw(folders.len() + blocks.len(), &edges);
@@ -70,8 +70,8 @@ pub(crate) fn pipeline(run: &RunRecord) -> Markup {
         section id="pipeline" aria-labelledby="pipeline-heading" {
             h2 id="pipeline-heading" { "Pipeline" }
             p class="note" {
-                "Time and peak memory are those of when a stage ran. "
-                "A stage that is cached was made by an earlier run."
+                "Time and peak memory were measured when a stage ran. "
+                "A cached stage ran in an earlier run."
             }
             div class="pipeline" {
                 div class="graph" tabindex="0" role="region" aria-label="Graph of the stages" {
@@ -87,14 +87,15 @@ pub(crate) fn pipeline(run: &RunRecord) -> Markup {
     }
 }
 
-/// Blocks, edges between them, and the folders outside that they read, which come first.
+/// Returns the blocks, the edges, and the input folders outside the store, which are the graph's
+/// first nodes.
 fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>) {
     let mut blocks: Vec<Block<'_>> = Vec::new();
     let mut block_of: Vec<usize> = Vec::new();
     let names = run.nodes.iter().map(|node| &node.stage);
     for name in names.chain(run.unfinished.iter().map(|node| &node.stage)) {
-        let place = blocks.iter().position(|block| block.name == name);
-        block_of.push(place.unwrap_or_else(|| {
+        let known = blocks.iter().position(|block| block.name == name);
+        block_of.push(known.unwrap_or_else(|| {
             blocks.push(Block { name, ..Block::default() });
             blocks.len() - 1
         }));
@@ -119,7 +120,7 @@ fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>
         blocks[block].undone.push(node);
         edges.extend(node.needs.iter().map(|&needed| (first + block_of[needed], first + block)));
     }
-    // A block is after all it needs, as nodes are.
+    // Blocks follow their inputs, as nodes do.
     edges.retain(|(from, to)| from < to);
     edges.sort_unstable();
     edges.dedup();
@@ -137,31 +138,31 @@ fn boxes(blocks: &[Block<'_>], folders: &[&PathBuf], drawing: &Drawing) -> Marku
                 }
                 @for edge in edges { path class="edge" d=(edge) marker-end="url(#arrow)" {} }
             }
-            @for (folder, corner) in folders.iter().zip(boxes) {
-                div class="box folder" style=(place(*corner)) title=(folder.display()) {
-                    b { (name_of(folder)) } small { "folder" }
+            @for (number, folder) in folders.iter().enumerate() {
+                div class="box folder" style=(box_style(boxes[number])) title=(folder.display()) {
+                    b { (file_name(folder)) } small { "folder" }
                 }
             }
-            @let of_blocks = blocks.iter().zip(&boxes[folders.len()..]);
-            @for (number, (block, corner)) in of_blocks.enumerate() {
+            @for (number, block) in blocks.iter().enumerate() {
                 @let state = block.states().next().map_or(State::Done, |(state, _)| state);
-                a class={ "box " (state.words().replace(' ', "-")) } style=(place(*corner))
+                a class={ "box " (state.name().replace(' ', "-")) }
+                    style=(box_style(boxes[folders.len() + number]))
                     href={ "#stage-" (number) } {
                     b { (block.name) }
                     small { (block.cost()) }
-                    small class="state" { (block.stand()) }
+                    small class="state" { (block.status()) }
                 }
             }
         }
     }
 }
 
-fn place([x, y]: [f64; 2]) -> String {
+fn box_style([x, y]: [f64; 2]) -> String {
     format!("left:{x:.0}px;top:{y:.0}px;width:{WIDTH}px;height:{HEIGHT}px")
 }
 
 impl Block<'_> {
-    /// How many nodes stand how, the worst first.
+    /// Counts the nodes in each state, the worst first.
     fn states(&self) -> impl Iterator<Item = (State, usize)> {
         let mut states: BTreeMap<State, usize> = BTreeMap::new();
         let done = self.done.iter().map(|node| State::of(node));
@@ -176,7 +177,7 @@ impl Block<'_> {
         self.done.len() + self.undone.len()
     }
 
-    /// Time and memory.
+    /// Returns time and peak memory as text.
     fn cost(&self) -> String {
         if self.done.is_empty() {
             return String::new();
@@ -186,23 +187,19 @@ impl Block<'_> {
         memory.map_or(time.clone(), |bytes| format!("{time} · {}", sized(bytes)))
     }
 
-    /// State and hash, or the number of points.
-    fn stand(&self) -> String {
+    /// Returns state and hash as text; for several points, their number in each state.
+    fn status(&self) -> String {
         let states = self.states().map(|(state, count)| match self.count() {
-            1 => format!("{} {}", state.sign(), state.words()),
-            _ => format!("{} {count} {}", state.sign(), state.words()),
+            1 => format!("{} {}", state.symbol(), state.name()),
+            _ => format!("{} {count} {}", state.symbol(), state.name()),
         });
         let states: Vec<String> = states.collect();
         let hash = match self.done.as_slice() {
-            [node] if self.count() == 1 => short(&node.output),
+            [node] if self.count() == 1 => node.output.get(..10).unwrap_or(&node.output),
             _ => "",
         };
         if hash.is_empty() { states.join(" ") } else { format!("{} · {hash}", states.join(" ")) }
     }
-}
-
-fn short(hash: &str) -> &str {
-    hash.get(..10).unwrap_or(hash)
 }
 
 fn block_details(run: &RunRecord, block: &Block<'_>, number: usize) -> Markup {
@@ -213,11 +210,11 @@ fn block_details(run: &RunRecord, block: &Block<'_>, number: usize) -> Markup {
                 b { (block.name) }
                 @if !program.is_empty() && program != block.name { " " small { "(" (program) ")" } }
                 " " small {
-                    (block.stand())
+                    (block.status())
                     @if block.count() == 1 && block.undone.is_empty() { " · " (block.cost()) }
                 }
             }
-            // A link's target, which opens what it is in.
+            // Target of the graph's links; following a link opens the details around the target.
             span id={ "stage-" (number) } class="target" {}
             @for node in &block.done {
                 (at_point(block, &node.point, &node_details(run, node)))
@@ -229,7 +226,7 @@ fn block_details(run: &RunRecord, block: &Block<'_>, number: usize) -> Markup {
     }
 }
 
-/// A block's node, below its point where there are several.
+/// Details of a block's node, below its point if the block has several.
 fn at_point(block: &Block<'_>, point: &str, node: &Markup) -> Markup {
     html! {
         @if block.count() == 1 {
@@ -242,7 +239,7 @@ fn at_point(block: &Block<'_>, point: &str, node: &Markup) -> Markup {
 
 fn node_details(run: &RunRecord, node: &RunNode) -> Markup {
     let state = match State::of(node) {
-        State::Cached => "cached: an earlier run made it",
+        State::Cached => "cached: made by an earlier run",
         State::Ran => "ran in this run",
         _ => "done",
     };
@@ -277,7 +274,7 @@ fn unfinished_details(node: &UnfinishedNode) -> Markup {
         @if let Some(message) = &node.message {
             p class="failure" { b { "Failed: " } (message) }
         } @else {
-            p { "Not run: a stage that it needs failed, or the run ended before." }
+            p { "Not run: an input's stage failed, or the run ended before." }
         }
         (parameters(&node.parameters, &serde_json::Map::new()))
     }
@@ -293,7 +290,7 @@ fn source(run: &RunRecord, input: &RunInput) -> String {
 
 type Values = serde_json::Map<String, Value>;
 
-/// Parameters with the values in use.
+/// Table of parameters with the values in use.
 fn parameters(given: &Values, resolved: &Values) -> Markup {
     html! {
         @if !given.is_empty() {
@@ -312,7 +309,7 @@ fn parameters(given: &Values, resolved: &Values) -> Markup {
     }
 }
 
-/// A parameter's value; where that was left to the scene, the one in use.
+/// Value of a parameter; for a default by scene, the value in use.
 fn parameter(given: &Value, resolved: Option<&Value>) -> Markup {
     html! {
         @match resolved {

@@ -8,37 +8,38 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use stage::SUMMARY_FILE;
 
-/// `results.json`: the page's figures for scripts, one row a point of the sweep.
+/// Row of `results.json`: the page's figures for scripts, one row per point of the sweep.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ResultRow {
-    /// The block that scored.
+    /// Block that scored the views.
     pub stage: String,
-    /// The sweep's point, e.g. `supersample=2`; empty without a sweep.
+    /// Point of the sweep, such as `supersample=2`; empty without a sweep.
     pub point: String,
-    /// Means over the views, as `metrics.json` has them.
+    /// Means over the views, as in `metrics.json`; null if the scores can't be read.
     pub mean: Value,
     /// Number of views.
     pub views: usize,
-    /// Every stage that the figures came through.
+    /// All stages that the figures depend on.
     pub stages: BTreeMap<String, StageResult>,
 }
 
-/// What a stage did for a row.
+/// Parameters and cost of a stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StageResult {
-    /// All its parameters.
+    /// All parameters of the stage.
     pub parameters: Map<String, Value>,
-    /// How long it took when it ran.
+    /// Seconds that the stage took when it ran.
     pub seconds: f64,
-    /// Threads it had.
+    /// Number of threads.
     pub threads: usize,
-    /// The artifact's folder.
+    /// Folder of the artifact.
     pub folder: PathBuf,
 }
 
-/// What each node's stage warned of in its summary, with the node's name, in the order of the run.
+/// Returns the warnings in the stages' summaries, each with its node's name, in the order of the
+/// run.
 pub(crate) fn warnings_by_node(run: &RunRecord) -> Vec<(String, String)> {
     run.nodes.iter().flat_map(warnings_of_node).collect()
 }
@@ -53,26 +54,26 @@ fn warnings_of_node(node: &RunNode) -> Vec<(String, String)> {
     warnings_of(&summary).map(|warning| (name.clone(), warning.to_owned())).collect()
 }
 
-/// The nodes that scored, each with its place in the list: what came through fewer stages first, so
-/// that what is rendered stands before what is refined.
-pub(crate) fn scored(run: &RunRecord) -> Vec<(usize, &RunNode)> {
-    let mut scored: Vec<_> =
+/// Returns the nodes that scored views, each with its index: those with fewer stages before them
+/// first, so that rendered views precede refined ones.
+pub(crate) fn scored_nodes(run: &RunRecord) -> Vec<(usize, &RunNode)> {
+    let mut nodes: Vec<_> =
         run.nodes.iter().enumerate().filter(|(_, node)| node.kind == "metrics").collect();
-    scored.sort_by_key(|(index, _)| run.ancestors(*index).len());
-    scored
+    nodes.sort_by_key(|(index, _)| run.ancestors(*index).len());
+    nodes
 }
 
+/// Returns the rows of `results.json`.
 pub(crate) fn results(run: &RunRecord) -> Vec<ResultRow> {
-    let rows = scored(run).into_iter().map(|(index, node)| {
-        // The page says why scores can't be read; here they are null.
+    let rows = scored_nodes(run).into_iter().map(|(index, node)| {
+        // The page reports why scores can't be read.
         let metrics = AnyMetrics::read(&node.folder).unwrap_or_default();
         let stages = run.ancestors(index).into_iter().chain([index]).map(|i| {
             let node = &run.nodes[i];
-            let (seconds, threads) = (node.seconds, node.threads);
             let result = StageResult {
                 parameters: node.parameters.clone(),
-                seconds,
-                threads,
+                seconds: node.seconds,
+                threads: node.threads,
                 folder: node.folder.clone(),
             };
             (node.stage.clone(), result)
@@ -96,7 +97,9 @@ mod tests {
     fn node(work: &Path, stage: &str, point: &str, summary: Option<&str>) -> RunNode {
         let folder = work.join(stage);
         std::fs::create_dir(&folder).unwrap();
-        summary.iter().for_each(|text| std::fs::write(folder.join(SUMMARY_FILE), text).unwrap());
+        if let Some(text) = summary {
+            std::fs::write(folder.join(SUMMARY_FILE), text).unwrap();
+        }
         let node = serde_json::json!({
             "stage": stage, "point": point, "kind": "cameras", "key": "", "output": "",
             "folder": folder, "parameters": {},

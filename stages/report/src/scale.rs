@@ -1,42 +1,45 @@
 use pixels::{DepthMap, Palette, heat};
 use serde::Serialize;
 
-/// A colour scale with numbers beside it.
+/// Colour scale of error or depth maps, with numbers.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct Scale {
     label: String,
     /// Colours from left to right, evenly spaced.
     colours: Vec<String>,
-    /// Numbers: place from left (0) to right (1), and text.
+    /// Position from left (0) to right (1) and text of each number.
     ticks: Vec<(f64, String)>,
 }
 
-/// Colours of a scale: what a browser puts between two can't be told from the true ones.
+/// Number of a scale's colours; a browser's interpolation between two neighbours is
+/// indistinguishable from the exact colours. Chosen by hand.
 const COLOURS: usize = 24;
-/// Numbers beside a scale, at least: they are round.
-const LEAST_TICKS: f64 = 4.0;
+/// Minimum number of intervals between the round numbers of a scale; chosen by hand.
+const MIN_INTERVALS: f64 = 4.0;
 
 impl Scale {
-    /// Of error maps, up to the error that has their brightest colour.
+    /// Creates the scale of error maps; `range` is the error with the brightest colour, and `at_lr`
+    /// states that errors are those of LR images.
     pub(crate) fn error(range: f64, at_lr: bool) -> Self {
-        let colour = |i: usize| css(heat(Palette::Error, i as f32 / (COLOURS - 1) as f32));
-        let of = if at_lr { "Absolute error at LR" } else { "Absolute error" };
+        let subject = if at_lr { "Absolute error at LR" } else { "Absolute error" };
         let mut ticks = ticks(0.0, range);
         // Larger errors have the brightest colour, too.
-        if let Some((_, text)) = ticks.last_mut().filter(|(place, _)| *place > 0.999) {
+        if let Some((_, text)) = ticks.last_mut().filter(|(position, _)| *position > 0.999) {
             text.insert_str(0, "≥ ");
         }
         Self {
-            label: format!("{of}, mean of R, G, B"),
-            colours: (0..COLOURS).map(colour).collect(),
+            label: format!("{subject}, mean of R, G, B"),
+            colours: (0..COLOURS)
+                .map(|i| css(heat(Palette::Error, i as f32 / (COLOURS - 1) as f32)))
+                .collect(),
             ticks,
         }
     }
 
-    /// Of depth maps, from near to far.
+    /// Creates the scale of depth maps, from near to far.
     pub(crate) fn depth((near, far): (f32, f32)) -> Self {
-        let depth = |i: usize| near + (far - near) * i as f32 / (COLOURS - 1) as f32;
-        let depths: Vec<f32> = (0..COLOURS).map(depth).collect();
+        let depths: Vec<f32> =
+            (0..COLOURS).map(|i| near + (far - near) * i as f32 / (COLOURS - 1) as f32).collect();
         let map = DepthMap { depth: &depths, opacity: &[1.0; COLOURS] };
         let drawn = map.draw(COLOURS, (near, far));
         Self {
@@ -51,15 +54,16 @@ fn css([r, g, b]: [u8; 3]) -> String {
     format!("#{r:02x}{g:02x}{b:02x}")
 }
 
-/// Round numbers between two.
+/// Returns round numbers between `low` and `high`, with their positions.
 fn ticks(low: f64, high: f64) -> Vec<(f64, String)> {
     let span = high - low;
     if !(span > 0.0 && span.is_finite()) {
         return vec![(0.0, format!("{low}"))];
     }
-    let power = 10f64.powf((span / LEAST_TICKS).log10().floor());
+    let power = 10f64.powf((span / MIN_INTERVALS).log10().floor());
     let factors = [5.0, 2.0, 1.0].map(|factor| factor * power);
-    let step = factors.into_iter().find(|step| span / step >= LEAST_TICKS - 0.01).unwrap_or(power);
+    let step =
+        factors.into_iter().find(|step| span / step >= MIN_INTERVALS - 0.01).unwrap_or(power);
     let digits = (-step.log10().floor()).max(0.0) as usize;
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;

@@ -2,16 +2,15 @@ use maud::{Markup, html};
 use metrics::Figure;
 use stage_call::seconds;
 
-use crate::figures::{is_best, is_known};
-use crate::gather::Report;
-use crate::row::Row;
+use crate::gather::{Report, Row, is_best, is_known};
 
-/// Figures in the summary.
+/// Number of figures in the summary; chosen by hand.
 const SUMMARY_FIGURES: usize = 4;
-/// Cells of the table of all views' figures, from which on a page leaves it out.
+/// Maximum number of cells in the table of all views' figures; a page omits a larger table. Chosen
+/// by hand.
 const MAX_CELLS: usize = 12_000;
 
-/// The most important figures of the best result.
+/// Section with the most important figures of the best result.
 pub(crate) fn summary(report: &Report<'_>) -> Markup {
     let Some(best) = report.best() else {
         return html! { p class="note" { "There are no scores." } };
@@ -20,7 +19,7 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
     html! {
         section class="summary" aria-label="Summary" {
             @if report.rows.len() > 1 {
-                p { "Best by " (plain(&report.figures[0].label)) " of "
+                p { "Best by " (without_arrow(&report.figures[0].label)) " of "
                     (report.rows.len()) " results: " b { (best.label) } }
             }
             dl {
@@ -35,12 +34,12 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
     }
 }
 
-/// A label without the arrow that says which way is better.
-fn plain(label: &str) -> String {
+/// Removes the arrow of the better direction from a label.
+fn without_arrow(label: &str) -> String {
     label.replace(['↑', '↓'], "").split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// A table of means, one row a result, the best of each column marked.
+/// Table of means, one row per result, with the best value of each column marked.
 pub(crate) fn scores(report: &Report<'_>) -> Markup {
     let rows = &report.rows;
     if rows.is_empty() {
@@ -86,10 +85,10 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
     }
 }
 
-/// A cell of that table.
+/// Cell of the table of means.
 fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
     let Some(value) = row.mean(figure) else {
-        // Without HR truth no weights would help.
+        // Without HR truth, weights of LPIPS wouldn't help.
         let has_truth = row.metrics.has_hr_truth();
         let missing = figure.missing.as_deref().filter(|_| has_truth);
         return html! { td class="n" { (missing.unwrap_or("–")) } };
@@ -105,7 +104,7 @@ fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
     }
 }
 
-/// Figures that no result has, and why.
+/// Note on figures that no result has, with the reasons.
 fn missing(report: &Report<'_>) -> Markup {
     let has_truth = report.rows.iter().any(|row| row.metrics.has_hr_truth());
     let unknown = report.figures.iter().filter(|figure| !is_known(figure, &report.rows));
@@ -116,7 +115,7 @@ fn missing(report: &Report<'_>) -> Markup {
                 "Not measured: "
                 @for (i, (figure, why)) in unknown.iter().enumerate() {
                     @if i > 0 { "; " }
-                    (plain(&figure.label)) " (" (why) ")"
+                    (without_arrow(&figure.label)) " (" (why) ")"
                 }
                 "."
             }
@@ -124,8 +123,8 @@ fn missing(report: &Report<'_>) -> Markup {
     }
 }
 
-/// Every view's figures, for reading without a pointer or a script.
-pub(crate) fn numbers_of_views(report: &Report<'_>) -> Markup {
+/// Table of every view's figures, which needs neither pointer nor script.
+pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
     let known: Vec<&Figure> =
         report.figures.iter().filter(|figure| is_known(figure, &report.rows)).collect();
     let views: usize = report.rows.iter().map(Row::view_count).sum();
@@ -165,16 +164,16 @@ pub(crate) fn numbers_of_views(report: &Report<'_>) -> Markup {
     }
 }
 
-/// How figures were made, in the metrics' own words.
+/// Definitions of the figures, as stated by the metrics.
 pub(crate) fn conventions(report: &Report<'_>) -> Markup {
     let Some(row) = report.rows.first() else { return html! {} };
-    let said = row.metrics.conventions().as_object();
+    let conventions = row.metrics.conventions().as_object();
     html! {
-        @if let Some(said) = said {
+        @if let Some(conventions) = conventions {
             details class="more" {
-                summary { "How the figures are made" }
+                summary { "Definitions of the figures" }
                 dl class="facts" {
-                    @for (name, text) in said {
+                    @for (name, text) in conventions {
                         dt { (name.replace('_', " ")) } dd { (text.as_str().unwrap_or_default()) }
                     }
                 }

@@ -5,10 +5,12 @@ use maud::{Markup, html};
 use crate::data::{Data, PictureData};
 use crate::gather::Report;
 
-/// Views that a reader without scripts sees.
+/// Number of views shown without scripts; chosen by hand.
 const STATIC_VIEWS: usize = 4;
+/// Maximum number of pictures per view shown without scripts; chosen by hand.
+const STATIC_PICTURES: usize = 6;
 
-/// The comparison of pictures; its script fills it in.
+/// Section with the comparison of pictures, filled in by a script.
 pub(crate) fn viewer(data: Option<&Data>) -> Markup {
     html! {
         section id="compare" aria-labelledby="compare-heading" {
@@ -36,7 +38,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                 div class="controls under" {
                     label class="split" { span { "Divide" }
                         input type="range" id="split" min="0" max="100" step="0.5" value="50"
-                            aria-label="Place of the division between left and right, per cent";
+                            aria-label="Position of the division between left and right, per cent";
                     }
                     div class="field modes" role="group" aria-label="Zoom" {
                         button type="button" id="zoom-out" aria-label="Zoom out" { "−" }
@@ -61,17 +63,17 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
     }
 }
 
-/// The originals of some views, for readers without scripts.
+/// Originals of some views, for readers without scripts.
 fn static_pictures(data: Option<&Data>) -> Markup {
-    let mut of_view: BTreeMap<usize, Vec<&PictureData>> = BTreeMap::new();
+    let mut by_view: BTreeMap<usize, Vec<&PictureData>> = BTreeMap::new();
     for picture in data.into_iter().flat_map(|data| &data.pictures) {
-        of_view.entry(picture.view).or_default().push(picture);
+        by_view.entry(picture.view).or_default().push(picture);
     }
     html! {
         p { "The comparison needs JavaScript. These are pictures from the folder views/:" }
-        @for pictures in of_view.values().take(STATIC_VIEWS) {
+        @for pictures in by_view.values().take(STATIC_VIEWS) {
             div class="static" {
-                @for picture in pictures.iter().take(6) {
+                @for picture in pictures.iter().take(STATIC_PICTURES) {
                     figure {
                         img src=(picture.original) alt="" loading="lazy";
                         figcaption { (picture.original) }
@@ -82,7 +84,7 @@ fn static_pictures(data: Option<&Data>) -> Markup {
     }
 }
 
-/// Plots of scores, of trade-offs and of training; their script draws them.
+/// Section with plots of scores, trade-offs and training, drawn by a script.
 pub(crate) fn plots(report: &Report<'_>) -> Markup {
     if report.rows.is_empty() {
         return html! { section id="plots" hidden {} };
