@@ -43,7 +43,7 @@ pub(crate) struct Data {
     figures: Vec<FigureData>,
     rows: Vec<RowData>,
     layers: Vec<LayerData>,
-    pub(crate) pictures: Vec<PictureData>,
+    pub(crate) pictures: Vec<Picture>,
     scales: Vec<Scale>,
     curves: Vec<Curve>,
     /// Index of the best row.
@@ -89,18 +89,6 @@ struct LayerData {
     scene: usize,
     row: Option<usize>,
     scale: Option<usize>,
-}
-
-#[derive(Serialize)]
-#[serde(rename_all = "camelCase")]
-pub(crate) struct PictureData {
-    pub(crate) view: usize,
-    layer: usize,
-    width: usize,
-    height: usize,
-    shown_width: usize,
-    pub(crate) original: String,
-    uri: String,
 }
 
 /// PSNR of a training against its rays.
@@ -166,7 +154,7 @@ impl Data {
             layers: scales.layer_data(&layers),
             scales: scales.all,
             curves: curves(&report.run.nodes),
-            pictures: pictures.into_iter().map(PictureData::from).collect(),
+            pictures,
             views,
         })
     }
@@ -174,13 +162,6 @@ impl Data {
     /// Returns JSON without `<`, so that no tag begins in it.
     pub(crate) fn to_json(&self) -> anyhow::Result<String> {
         Ok(serde_json::to_string(self)?.replace('<', "\\u003c"))
-    }
-}
-
-impl From<Picture> for PictureData {
-    fn from(picture: Picture) -> Self {
-        let Picture { view, layer, width, height, shown_width, original, uri } = picture;
-        Self { view, layer, width, height, shown_width, original, uri }
     }
 }
 

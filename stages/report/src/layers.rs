@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::gather::{Report, Row};
 
-/// Pictures of a data set's views, one for each view, such as ground truth or a method's error maps.
+/// Pictures of a data set, one per view, such as ground truth or a method's error maps.
 pub(crate) struct Layer<'a> {
     pub(crate) label: String,
     pub(crate) group: Group,

@@ -1,5 +1,5 @@
-//! Layered drawing of an acyclic graph from top to bottom (Sugiyama et al. 1981). An edge that skips
-//! layers gets a lane in each of them, so that it passes between the boxes.
+//! Layered drawing of an acyclic graph from top to bottom (Sugiyama et al. 1981). An edge that
+//! skips layers gets a lane in each of them, so that it passes between the boxes.
 
 /// Width of a box in CSS pixels.
 pub(crate) const WIDTH: f64 = 184.0;
@@ -93,7 +93,7 @@ fn top(layer: usize) -> f64 {
     layer as f64 * (HEIGHT + LAYER_GAP)
 }
 
-/// Orders the items of each layer so that few edges cross, and moves items towards their neighbours.
+/// Orders each layer's items so that few edges cross, and moves items towards their neighbours.
 fn arrange(items: &mut [Item], layers: &mut [Vec<usize>]) {
     for layer in layers.iter_mut() {
         layer.sort_by(|&a, &b| {
@@ -123,8 +123,8 @@ fn mean_x(items: &[Item], indices: &[usize]) -> f64 {
     indices.iter().map(|&index| items[index].x).sum::<f64>() / indices.len().max(1) as f64
 }
 
-/// Moves a layer's boxes to the mean of their neighbours, as near as their widths allow, and its lanes
-/// to free positions near the ends of their edges.
+/// Moves a layer's boxes to the mean of their neighbours, as near as their widths allow, and its
+/// lanes to free positions near the ends of their edges.
 fn settle(items: &mut [Item], layer: &[usize]) {
     let boxes = with_targets(items, layer, false);
     // Boxes are pushed apart to the right and to the left; the mean of both keeps the distances.

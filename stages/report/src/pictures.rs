@@ -7,11 +7,14 @@ use base64::engine::general_purpose::STANDARD;
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use pixels::{Filter, Rgba8, encode_png, read_png, resize_pillow};
 use rayon::prelude::*;
+use serde::Serialize;
 use stage::Context;
 
 use crate::layers::{Group, Layer, ONLY_RENDER};
 
-/// A picture of the page.
+/// A picture of the page, as the page's script reads it.
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
 pub(crate) struct Picture {
     /// Index of the view in the page.
     pub(crate) view: usize,

@@ -2,8 +2,9 @@ use std::collections::BTreeMap;
 
 use maud::{Markup, html};
 
-use crate::data::{Data, PictureData};
+use crate::data::Data;
 use crate::gather::Report;
+use crate::pictures::Picture;
 
 /// Number of views shown without scripts; chosen by hand.
 const STATIC_VIEWS: usize = 4;
@@ -65,7 +66,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
 
 /// Originals of some views, for readers without scripts.
 fn static_pictures(data: Option<&Data>) -> Markup {
-    let mut by_view: BTreeMap<usize, Vec<&PictureData>> = BTreeMap::new();
+    let mut by_view: BTreeMap<usize, Vec<&Picture>> = BTreeMap::new();
     for picture in data.into_iter().flat_map(|data| &data.pictures) {
         by_view.entry(picture.view).or_default().push(picture);
     }

@@ -1,14 +1,15 @@
-//! How values are shown: figures of metrics as these say it, and what tables add.
+//! Titles, digits and directions of values: as declared by metrics, and the table's own.
 
 use std::collections::BTreeMap;
 
 use metrics::{AnyMetrics, Figure};
 
-/// Figures by their names in rows: their paths with `.` between keys.
+/// Figures by their names in rows: paths with `.` between keys.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Figures(BTreeMap<String, Figure>);
 
-/// Values that tables add: name, title, digits and whether more is better.
+/// Values that the table adds to those of metrics: name, title, digits, and true if higher values
+/// are better.
 const ADDED: [(&str, &str, usize, bool); 8] = [
     ("least_gain", "least gain", 2, true),
     ("near_psnr", "near psnr", 2, true),
@@ -21,24 +22,24 @@ const ADDED: [(&str, &str, usize, bool); 8] = [
 ];
 
 impl Figures {
-    /// Takes those of a `metrics.json`; none where it says nothing of figures, or leaves out which
-    /// way one of them is better.
+    /// Adds the figures declared in a `metrics.json`; none if one of them has no direction.
     pub(crate) fn add(&mut self, metrics: &AnyMetrics) {
-        let is_whole = |said: &Vec<Figure>| said.iter().all(|f| f.higher_is_better.is_some());
-        let said = metrics.figures().filter(is_whole).unwrap_or_default();
-        self.0.extend(said.into_iter().map(|figure| (figure.path.replace('/', "."), figure)));
-    }
-
-    /// Whether less of it is better.
-    pub(crate) fn is_less_better(&self, name: &str) -> bool {
-        match self.0.get(name) {
-            Some(figure) => figure.higher_is_better == Some(false),
-            None => !added(name).is_some_and(|(.., higher)| higher),
+        let Some(declared) = metrics.figures() else { return };
+        if declared.iter().all(|figure| figure.higher_is_better.is_some()) {
+            self.0.extend(declared.into_iter().map(|f| (f.path.replace('/', "."), f)));
         }
     }
 
-    /// A value as people read it.
-    pub(crate) fn shown(&self, name: &str, value: f64) -> String {
+    /// True if lower values are better.
+    pub(crate) fn lower_is_better(&self, name: &str) -> bool {
+        match self.0.get(name) {
+            Some(figure) => figure.higher_is_better == Some(false),
+            None => !added(name).is_some_and(|(.., higher_is_better)| higher_is_better),
+        }
+    }
+
+    /// Formats a value with its digits and unit.
+    pub(crate) fn format(&self, name: &str, value: f64) -> String {
         if let Some(figure) = self.0.get(name) {
             return figure.text(value);
         }
@@ -52,14 +53,15 @@ impl Figures {
         }
     }
 
-    /// Column titles of values.
+    /// Returns the column titles of values.
     pub(crate) fn titles(&self, names: &[&String]) -> Vec<String> {
         names.iter().map(|name| self.title(name)).collect()
     }
 
+    /// Returns the column title of a value.
     pub(crate) fn title(&self, name: &str) -> String {
         if let Some(figure) = self.0.get(name) {
-            // The best of a column is in bold: that shows the direction.
+            // The best value of a column is bold, which shows the direction.
             return figure.label.replace(" ↑ dB", "").replace(" ↑", "").replace(" ↓", "");
         }
         match (name, added(name)) {
@@ -87,9 +89,9 @@ mod tests {
 
     use super::*;
 
-    /// A metric that the table has never heard of is shown as it says.
+    /// Figures of an unknown metric have the declared title, digits and direction.
     #[test]
-    fn a_new_metric_says_how_it_is_shown() {
+    fn a_new_metric_declares_its_format() {
         let mut figures = Figures::default();
         figures.add(&AnyMetrics::from(json!({"figures": [
             {
@@ -101,8 +103,8 @@ mod tests {
             {"path": "blur", "label": "blur ↓", "digits": 3, "higher_is_better": false},
         ]})));
         assert_eq!(figures.titles(&[&"sharpness.mean".to_owned()]), ["sharpness"]);
-        assert_eq!(figures.shown("sharpness.mean", 2.34), "2.3");
-        assert!(!figures.is_less_better("sharpness.mean") && figures.is_less_better("blur"));
+        assert_eq!(figures.format("sharpness.mean", 2.34), "2.3");
+        assert!(!figures.lower_is_better("sharpness.mean") && figures.lower_is_better("blur"));
     }
 
     #[test]
@@ -117,9 +119,9 @@ mod tests {
             ("something", 3.0, "3"),
             ("something", 0.12345, "0.1235"),
         ] {
-            assert_eq!(figures.shown(name, value), text, "{name}");
+            assert_eq!(figures.format(name, value), text, "{name}");
         }
-        assert!(figures.is_less_better("train_s") && !figures.is_less_better("gain"));
+        assert!(figures.lower_is_better("train_s") && !figures.lower_is_better("gain"));
         assert_eq!(figures.title("rays_per_s"), "rays/s");
     }
 }

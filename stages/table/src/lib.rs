@@ -1,13 +1,13 @@
 //! `table`: figures of an experiment as Markdown, CSV and JSON.
 //!
-//! * [`Params`]: what makes a row, what makes a column, and what values are shown.
-//! * `rows`: a row for every result of a run, with its scores, its times, and where it was made.
-//! * `markdown`: these rows as tables for people.
-//! * `grid`: one of them, means where several results fall into one cell, the best marked.
-//! * `values`: a row, and values of rows by their names.
+//! * [`Params`]: keys of rows and columns, and the values in their cells.
+//! * `rows`: a row for every result of a run, with scores, times, commit and machine.
+//! * `markdown`: the document: tables, gains, spreads, failed points.
+//! * `grid`: one table, with means where several results share a cell, and the best marked.
+//! * `values`: a row, and values of rows by name.
 //!
-//! A sink: it gets the run's record and is never cached. What a failed point would have shown is
-//! named; what was left out says why.
+//! The stage is a sink: it gets the run's record and is never cached. Failed points are listed, and
+//! left-out results have a row with the reason.
 
 mod figures;
 mod grid;
@@ -31,14 +31,14 @@ pub struct Table;
 impl Stage for Table {
     type Params = Params;
     const NAME: &'static str = "table";
-    const SUMMARY: &'static str = "Shows figures of an experiment as Markdown, CSV and JSON.";
+    const SUMMARY: &'static str = "Writes figures of an experiment as Markdown, CSV and JSON.";
     const SINK: bool = true;
     const PARTIAL: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "run",
-            Input::required(&["run"], "folder with run.json: the record of what was scored"),
+            Input::required(&["run"], "folder with run.json, the record of the scored results"),
         )]
     }
 
@@ -52,7 +52,7 @@ impl Stage for Table {
         let mut figures = Figures::default();
         let rows = rows::rows(&run, params, &mut figures)?;
         if rows.is_empty() && run.failed.is_empty() {
-            return Err(Failure::BadInput("run.json: nothing in it was scored".to_owned()).into());
+            return Err(Failure::BadInput("run.json has no scored results".to_owned()).into());
         }
         context.write_json("rows.json", &rows)?;
         write_csv(context, &rows)?;
@@ -63,21 +63,21 @@ impl Stage for Table {
     }
 }
 
-/// Writes the rows with all keys and values that any of them has.
+/// Writes rows as CSV, with a column for every name that any row has.
 fn write_csv(context: &Context, rows: &[Row]) -> anyhow::Result<()> {
     let path = context.output_path("rows.csv")?;
-    let place = || format!("cannot write {}", path.display());
+    let message = format!("cannot write {}", path.display());
     let mut names: Vec<&String> = Vec::new();
     for name in rows.iter().flat_map(|row| row.keys()) {
         if !names.contains(&name) {
             names.push(name);
         }
     }
-    let mut writer = csv::Writer::from_path(&path).with_context(place)?;
-    writer.write_record(&names).with_context(place)?;
+    let mut writer = csv::Writer::from_path(&path).with_context(|| message.clone())?;
+    writer.write_record(&names).with_context(|| message.clone())?;
     for row in rows {
         let cells = names.iter().map(|name| row.get(*name).map(plain).unwrap_or_default());
-        writer.write_record(cells).with_context(place)?;
+        writer.write_record(cells).with_context(|| message.clone())?;
     }
-    writer.flush().with_context(place)
+    writer.flush().with_context(|| message)
 }

@@ -86,7 +86,7 @@ fn columns_hold_all_values_of_a_key() {
 | as it is | **30.00** / **0.0500** | 32.00 / **0.0400** | abc1234 | 2 cores |
 | no warm-up | 29.50 / – | **32.25** / – | abc1234 | 2 cores |
 
-Failed, or waiting for what failed:
+Failed, or waiting for a failed stage:
 
 * eval [scene=ship]
 ";

@@ -12,48 +12,48 @@ use crate::values::Row;
 pub struct Params {
     /// Heading of the table.
     pub title: String,
-    /// Keys that make a row: axes of the run (`scene`, `protocol`, `variant`, a swept parameter),
-    /// or `method` for the block that was scored. Results that differ in other keys alone are
+    /// Keys whose values make a row: axes of the run (`scene`, `protocol`, `variant`, a swept
+    /// parameter), or `method` for the scored block. Results that differ only in other keys are
     /// averaged. Default: all keys that differ, except `scene`.
     #[schemars(extend("x-default" = "all keys that differ, except `scene`"))]
     pub rows: Vec<String>,
-    /// Keys that make a column each, with all values in one cell.
+    /// Keys whose values make a column, with all `values` in one cell.
     #[schemars(extend("x-default" = "a column for each value"))]
     pub columns: Vec<String>,
-    /// Values to show, in this order: `psnr`, `ssim`, `lpips`, `train_s`, `render_s`, and all
-    /// others that `rows.json` has.
+    /// Values in the table, in this order: `psnr`, `ssim`, `lpips`, `train_s`, `render_s`, or any
+    /// other value of `rows.json`.
     pub values: Vec<String>,
-    /// The row that others are compared with, by its keys. A further column has the first of
-    /// `values` minus that row's.
+    /// Keys of the row that others are compared with. An additional column has the difference in
+    /// the first of `values`.
     #[schemars(extend("x-default" = "no comparison"))]
     pub relative_to: BTreeMap<String, String>,
-    /// Values whose mean, standard deviation, least and greatest are stated over all results.
+    /// Values whose mean, standard deviation, minimum and maximum over all results are stated.
     #[schemars(extend("x-default" = "none of them"))]
     pub spread: Vec<String>,
-    /// Names of methods, by the block that was scored: `{eval: rendered, eval-refined: refined}`.
+    /// Names of methods, by scored block: `{eval: rendered, eval-refined: refined}`.
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
-    /// Further entries of rows for programs, by the block that was scored: `{eval: {refined:
-    /// false}}`. `"{variant}"` is the value of that key.
+    /// Additional fields of rows in `rows.json` and `rows.csv`, by scored block: `{eval: {refined:
+    /// false}}`. `"{variant}"` is replaced by the value of that key.
     #[schemars(extend("x-default" = "none"))]
     pub fields: BTreeMap<String, Map<String, Value>>,
-    /// Groups of methods that may be compared, in the order of the table: `[{name: LR images,
-    /// methods: [eval]}]`, the methods by the block that was scored. A column names the group, and
-    /// the best is marked in each.
+    /// Groups of comparable methods, in the order of the table: `[{name: LR images, methods:
+    /// [eval]}]`, with methods by scored block. A column names the group, and the best value is
+    /// marked in each.
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
-    /// Heading of the groups' column, and their key.
+    /// Heading and key of the groups' column.
     pub grouped_by: String,
-    /// Rows from elsewhere, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:
-    /// 29.77}]`. Such a row stands where the results have its keys, and is never the best.
+    /// Rows from other sources, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:
+    /// 29.77}]`. Such a row is in tables whose results have its keys, and is never the best.
     #[schemars(extend("x-default" = "none"))]
     pub further: Vec<Row>,
     /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over:
-    /// eval-nerf}]`. Methods are blocks, or those of `further`.
+    /// eval-nerf}]`. Methods are blocks, or methods of `further`.
     #[schemars(extend("x-default" = "none"))]
     pub gains: Vec<Gain>,
-    /// A key; each of its values has a table of its own, too, where there are several. Of
-    /// `further`, it has the rows with this key.
+    /// Key with an additional table for each of its values, if it has several. These tables have
+    /// the rows of `further` with this key.
     #[schemars(extend("x-default" = "one table of all"))]
     pub each: String,
     /// Remarks below the table.
@@ -61,31 +61,31 @@ pub struct Params {
     pub notes: Vec<String>,
 }
 
-/// Methods that may be compared.
+/// A group of comparable methods.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Group {
-    /// What they have in common.
+    /// Name of the group.
     pub name: String,
-    /// The blocks that were scored.
+    /// Scored blocks.
     pub methods: Vec<String>,
 }
 
-/// A difference in PSNR between two methods.
+/// Difference in PSNR between two methods.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Gain {
-    /// Its name.
+    /// Name of the difference.
     pub name: String,
-    /// The method that gains.
+    /// Method whose PSNR is the minuend.
     pub of: String,
-    /// The method that it is compared with.
+    /// Method whose PSNR is subtracted.
     pub over: String,
 }
 
 impl Params {
-    /// The value by which rows are compared: the first that is shown.
-    pub(crate) fn compared(&self) -> &str {
+    /// Returns the value by which rows are compared: the first of `values`.
+    pub(crate) fn compared_value(&self) -> &str {
         self.values.first().map_or("psnr", String::as_str)
     }
 }

@@ -10,13 +10,11 @@ use crate::figures::Figures;
 use crate::params::Params;
 use crate::values::Row;
 
-/// Why a row has no values.
+/// Name of the reason why a row has no values.
 pub(crate) const MISSING: &str = "missing";
 
-/// A row for every result of a run, and for what was left out of it: in the order of the groups,
-/// and otherwise of the run.
-///
-/// Figures of their metrics go into `figures`.
+/// Returns a row for every result of a run and for every left-out one, in the order of the groups
+/// and then of the run. Figures of their metrics are added to `figures`.
 pub(crate) fn rows(
     run: &RunRecord,
     params: &Params,
@@ -25,7 +23,7 @@ pub(crate) fn rows(
     let commit = run.commit().unwrap_or_default();
     let mut scored: Vec<(usize, &RunNode)> =
         run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
-    // Blocks that come through fewer stages stand first: rendered views before refined ones.
+    // Blocks with fewer stages before them come first: rendered views before refined ones.
     scored.sort_by_key(|(_, node)| depth(run, &node.stage));
     let mut rows: Vec<(usize, Row)> = Vec::new();
     for (index, node) in scored {
@@ -35,25 +33,25 @@ pub(crate) fn rows(
         row.extend(seconds_per_view(&row));
         row.insert("commit".to_owned(), json!(commit));
         row.insert("machine".to_owned(), json!(node.host));
-        rows.push((place(params, &node.stage), row));
+        rows.push((group_rank(params, &node.stage), row));
     }
     for point in &run.failed {
         let Some(reason) = &point.reason else { continue };
         let mut row = keys(params, &point.stage, &point.values);
         row.insert(MISSING.to_owned(), json!(reason));
-        rows.push((place(params, &point.stage), row));
+        rows.push((group_rank(params, &point.stage), row));
     }
-    rows.sort_by_key(|(place, _)| *place);
+    rows.sort_by_key(|(rank, _)| *rank);
     Ok(rows.into_iter().map(|(_, row)| row).collect())
 }
 
-/// How many nodes a stage's results were made of, at most.
+/// Returns the maximum number of nodes that a stage's results depend on.
 fn depth(run: &RunRecord, stage: &str) -> Option<usize> {
-    let of_stage = run.nodes.iter().enumerate().filter(|(_, node)| node.stage == stage);
-    of_stage.map(|(index, _)| run.ancestors(index).len()).max()
+    let nodes = run.nodes.iter().enumerate().filter(|(_, node)| node.stage == stage);
+    nodes.map(|(index, _)| run.ancestors(index).len()).max()
 }
 
-/// What a result is of: values of axes, method and its group.
+/// Returns the keys of a result (values of axes, method and group) and its additional fields.
 fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> Row {
     let mut row: Row = values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
     row.insert("method".to_owned(), json!(params.methods.get(stage).unwrap_or(stage)));
@@ -62,26 +60,26 @@ fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> R
         row.insert(params.grouped_by.clone(), json!(group.map_or("", |group| group.name.as_str())));
     }
     for (name, value) in params.fields.get(stage).into_iter().flatten() {
-        let value = of_key(&row, value);
+        let value = substituted(&row, value);
         row.insert(name.clone(), value);
     }
     row
 }
 
-/// A value, or that of the key which it names in braces: a number where it is one.
-fn of_key(row: &Row, value: &Value) -> Value {
+/// Returns the value of a field; `{key}` is replaced by the key's value, as a number if possible.
+fn substituted(row: &Row, value: &Value) -> Value {
     let named = value.as_str().and_then(|text| text.strip_prefix('{')?.strip_suffix('}'));
     let Some(text) = named.and_then(|name| row.get(name)?.as_str()) else { return value.clone() };
     text.parse::<u64>().map_or_else(|_| json!(text), |number| json!(number))
 }
 
-/// The place of a method in the table; those of no group come last.
-fn place(params: &Params, stage: &String) -> usize {
+/// Returns the rank of a method in the table; methods without a group are last.
+fn group_rank(params: &Params, stage: &String) -> usize {
     let mut all = params.groups.iter().flat_map(|group| &group.methods);
     all.position(|method| method == stage).unwrap_or(usize::MAX)
 }
 
-/// What a view took to render, or where it was refined, to refine.
+/// Returns the seconds per view of refining, or of rendering if nothing was refined.
 fn seconds_per_view(row: &Row) -> Option<(String, Value)> {
     let [views, rendering, refining] =
         ["views", "render_s", "refine_s"].map(|name| row.get(name).and_then(Value::as_f64));
@@ -89,17 +87,16 @@ fn seconds_per_view(row: &Row) -> Option<(String, Value)> {
     Some(("seconds_per_view".to_owned(), json!(seconds / views.filter(|views| *views > 0.0)?)))
 }
 
-/// What a result's own file says: means of metrics, or what a refiner's training says of itself.
+/// Returns the values of a result's own file: means of metrics, or a refiner's scores.
 fn scores(node: &RunNode, figures: &mut Figures) -> anyhow::Result<Row> {
     let mut found = Row::new();
     if node.kind == "refiner" {
         let file = read(&node.folder.join("refiner.json"))?;
         numbers("", &file, &mut found);
-        let gain = file["refined_psnr"]
-            .as_f64()
-            .zip(file["rendered_psnr"].as_f64())
-            .map(|(after, before)| after - before);
-        found.extend(gain.map(|gain| ("gain".to_owned(), json!(gain))));
+        let scores = (file["refined_psnr"].as_f64(), file["rendered_psnr"].as_f64());
+        if let (Some(refined), Some(rendered)) = scores {
+            found.insert("gain".to_owned(), json!(refined - rendered));
+        }
         return Ok(found);
     }
     if node.kind != "metrics" {
@@ -120,7 +117,7 @@ fn scores(node: &RunNode, figures: &mut Figures) -> anyhow::Result<Row> {
     Ok(found)
 }
 
-/// Every number inside a value, by its path.
+/// Adds every number inside a value, by its path.
 fn numbers(name: &str, value: &Value, found: &mut Row) {
     match value {
         Value::Number(_) => _ = found.insert(name.to_owned(), value.clone()),
@@ -139,32 +136,32 @@ fn read(path: &Path) -> anyhow::Result<Value> {
     serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
 }
 
-/// Seconds of what a result came through. What fields and refiners were made of counts as training;
-/// other views count as rendering, and those of them that no field made directly as refining.
+/// Returns the seconds of training, rendering and refining, and the training's speed. Views that a
+/// field or refiner depends on count as training; other views count as rendering, and those of them
+/// that weren't rendered from a field also as refining.
 fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     let ancestors = run.ancestors(index);
-    let is_trained = |node: &RunNode| ["field", "refiner"].contains(&node.kind.as_str());
-    let trained: Vec<usize> =
-        ancestors.iter().copied().filter(|&i| is_trained(&run.nodes[i])).collect();
+    let mut trained = ancestors.clone();
+    trained.retain(|&i| ["field", "refiner"].contains(&run.nodes[i].kind.as_str()));
     let in_training: Vec<usize> = trained.iter().flat_map(|&i| run.ancestors(i)).collect();
-    let is_views = |i: &usize| run.nodes[*i].kind == "views";
-    let training: Vec<usize> = ancestors
-        .iter()
-        .copied()
-        .filter(|i| in_training.contains(i) && (is_views(i) || trained.contains(i)))
-        .collect();
-    let rendering: Vec<usize> =
-        ancestors.iter().copied().filter(|i| is_views(i) && !in_training.contains(i)).collect();
-    let refining: Vec<usize> =
-        rendering.iter().copied().filter(|&i| !is_by_field(run, i)).collect();
-    // 0 is added since the sum of nothing is -0.
-    let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0;
-    let mut row = Row::new();
-    for (name, nodes) in [("train_s", &training), ("render_s", &rendering), ("refine_s", &refining)]
-    {
-        row.insert(name.to_owned(), json!(seconds(nodes)));
+    // The sums start from 0.0 since that of nothing is -0.
+    let [mut training, mut rendering, mut refining] = [0.0; 3];
+    for &i in &ancestors {
+        let node = &run.nodes[i];
+        let is_views = node.kind == "views";
+        if in_training.contains(&i) && (is_views || trained.contains(&i)) {
+            training += node.seconds;
+        } else if is_views && !in_training.contains(&i) {
+            rendering += node.seconds;
+            refining += if is_from_field(run, i) { 0.0 } else { node.seconds };
+        }
     }
-    // Of the field that the views show: the first one of the run that isn't there for a refiner.
+    let mut row = Row::new();
+    for (name, seconds) in [("train_s", training), ("render_s", rendering), ("refine_s", refining)]
+    {
+        row.insert(name.to_owned(), json!(seconds));
+    }
+    // The first field of the run is the one that the views show; a refiner's field is later.
     let field = trained.iter().map(|&i| &run.nodes[i]).find(|node| node.kind == "field");
     if let Some(field) = field {
         let path = field.folder.join("training.json");
@@ -180,8 +177,8 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     Ok(row)
 }
 
-/// Whether a node was made of a field directly.
-fn is_by_field(run: &RunRecord, index: usize) -> bool {
+/// True if a field is an input of a node.
+fn is_from_field(run: &RunRecord, index: usize) -> bool {
     let mut parents = run.nodes[index].inputs.values().filter_map(|input| input.node);
     parents.any(|parent| run.nodes[parent].kind == "field")
 }

@@ -1,13 +1,13 @@
-//! Values of rows by their names: means, combinations, and what rows have in common.
+//! Values of rows by name: means, combinations, selections.
 
 use contract::plain;
 use serde_json::{Map, Value};
 
-/// A result: its keys (axes of the run, `method`), then its values, by name.
+/// A result: keys (axes of the run, `method`) and values, by name.
 pub type Row = Map<String, Value>;
 
-/// Combinations of values that keys have, in the order of the rows; a single empty one without
-/// keys.
+/// Returns the combinations of the keys' values, in the order of the rows; without keys, one empty
+/// combination.
 pub(crate) fn distinct(rows: &[Row], keys: &[String]) -> Vec<Vec<String>> {
     let mut found: Vec<Vec<String>> = Vec::new();
     for row in rows {
@@ -19,24 +19,23 @@ pub(crate) fn distinct(rows: &[Row], keys: &[String]) -> Vec<Vec<String>> {
     if found.is_empty() && keys.is_empty() { vec![Vec::new()] } else { found }
 }
 
-/// The rows whose keys have these values.
-pub(crate) fn of(rows: &[Row], keys: &[String], values: &[String]) -> Vec<Row> {
-    let fitting = rows.iter().filter(|row| {
-        keys.iter()
-            .zip(values)
-            .all(|(key, value)| row.get(key).map(plain).unwrap_or_default() == *value)
-    });
-    fitting.cloned().collect()
+/// Returns the rows whose keys have the given values.
+pub(crate) fn select(rows: &[Row], keys: &[String], values: &[String]) -> Vec<Row> {
+    let mut selected = rows.to_vec();
+    for (key, value) in keys.iter().zip(values) {
+        selected.retain(|row| row.get(key).map(plain).unwrap_or_default() == *value);
+    }
+    selected
 }
 
-/// The mean of a value over the rows that have it.
+/// Returns the mean of a value over the rows that have it.
 pub(crate) fn mean(rows: &[Row], name: &str) -> Option<f64> {
     let values: Vec<f64> = rows.iter().filter_map(|row| row.get(name)?.as_f64()).collect();
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// What rows have in common, or all that they have.
-pub(crate) fn together(rows: &[Row], name: &str) -> String {
+/// Lists the distinct values that rows have under a name.
+pub(crate) fn listed(rows: &[Row], name: &str) -> String {
     let with: Vec<Row> = rows.iter().filter(|row| row.contains_key(name)).cloned().collect();
     distinct(&with, &[name.to_owned()]).concat().join(", ")
 }
