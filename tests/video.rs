@@ -35,9 +35,7 @@ fn a_flight_is_rendered_and_filmed() {
     assert!(!first.stdout.contains("eval"), "{}", first.stdout);
     let film = std::fs::read(project.path("out/video/video.mp4"));
     if Command::new("ffmpeg").arg("-version").output().is_err() {
-        assert!(
-            first.stderr.contains("no video.mp4, since ffmpeg isn't installed") && film.is_err()
-        );
+        assert!(first.stderr.contains("no video.mp4: ffmpeg isn't installed") && film.is_err());
         eprintln!("skipped: no ffmpeg");
         return;
     }

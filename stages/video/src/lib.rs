@@ -1,7 +1,7 @@
 //! `video`: rendered views as a film, colour and depth side by side.
 //!
-//! A sink: it writes one PNG a frame and, where `ffmpeg` is installed, `video.mp4`; without it the
-//! frames are the film. A sweep's points get a folder each.
+//! The stage is a sink. It writes a PNG per frame and, if `ffmpeg` is installed, `video.mp4`. Each
+//! point of a sweep has its own folder.
 
 use std::io::{self, Read as _};
 use std::path::Path;
@@ -22,7 +22,7 @@ use stage::{Context, Stage};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Frames a second.
+    /// Frames per second.
     #[schemars(range(min = 1, max = 240))]
     pub frames_per_second: u32,
 }
@@ -33,8 +33,8 @@ impl Default for Params {
     }
 }
 
-/// Time between two checks whether ffmpeg has ended.
-const INTERVAL: Duration = Duration::from_millis(20);
+/// Interval at which ffmpeg and interruptions are checked; chosen by hand.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// The stage.
 pub struct Video;
@@ -42,16 +42,13 @@ pub struct Video;
 impl Stage for Video {
     type Params = Params;
     const NAME: &'static str = "video";
-    const SUMMARY: &'static str = "Shows rendered views as a film, colour and depth side by side.";
+    const SUMMARY: &'static str = "Makes a film of rendered views, colour and depth side by side.";
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "run",
-            Input::required(
-                &["run"],
-                "folder with run.json: the record of what rendered the views",
-            ),
+            Input::required(&["run"], "folder with run.json, the record of the rendered views"),
         )]
     }
 
@@ -64,30 +61,32 @@ impl Stage for Video {
         run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
         let rendered: Vec<&RunNode> = run.nodes.iter().filter(|n| n.kind == "views").collect();
         if rendered.is_empty() {
-            return Err(
-                Failure::BadInput("run.json: nothing in it rendered views".to_owned()).into()
-            );
+            return Err(Failure::BadInput("run.json has no rendered views".to_owned()).into());
         }
         for (node, prefix) in rendered.iter().zip(folders_of(&rendered)) {
-            film(context, params, &node.folder, &prefix)
+            make_film(context, params, &node.folder, &prefix)
                 .with_context(|| label(&node.stage, &node.point))?;
         }
         Ok(())
     }
 }
 
-/// Frames, and the film where that can be made.
-fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyhow::Result<()> {
+/// Writes the frames, and the film if ffmpeg is available.
+fn make_film(
+    context: &Context,
+    params: &Params,
+    folder: &Path,
+    prefix: &str,
+) -> anyhow::Result<()> {
     let views = Views::of_folder(folder)?;
-    let size = |view: &View| (view.camera.intrinsics.width, view.camera.intrinsics.height);
-    if views.views.iter().any(|view| size(view) != size(&views.views[0])) {
+    if views.views.iter().any(|view| size_of_view(view) != size_of_view(&views.views[0])) {
         return Err(Failure::BadInput(
-            "the views have several sizes; set size in render-depth".to_owned(),
+            "views have different sizes; set render-depth.size".to_owned(),
         )
         .into());
     }
     let progress = context.progress("drawing", 2 * views.views.len() as u64);
-    // One range of depths for all frames: colours that change with the frame would flicker.
+    // All frames have one range of depths: with a range per frame, colours would flicker.
     let ranges = views.views.par_iter().map(|view| -> anyhow::Result<Option<(f32, f32)>> {
         progress.add(1);
         let Some(file) = &view.depth else { return Ok(None) };
@@ -96,56 +95,65 @@ fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyh
     });
     let ranges = ranges.collect::<anyhow::Result<Vec<_>>>()?;
     let range = common_range(ranges.into_iter().flatten());
-    views
-        .views
-        .par_iter()
-        .enumerate()
-        .map(|(i, view)| {
-            context.check_interrupt()?;
-            let image = view
-                .image
-                .as_ref()
-                .with_context(|| format!("view {}: it has no image", view.camera.name))?;
-            let colour = views.read_over(&folder.join(image))?.to_rgba8();
-            let depth = match (&view.depth, range) {
-                (Some(file), Some(range)) => {
-                    let image = read_exr(&folder.join(file))?;
-                    DepthMap::of(&image).map(|map| map.draw(image.width, range))
-                }
-                _ => None,
-            };
-            let frame = depth.map_or_else(|| colour.clone(), |depth| side_by_side(&colour, &depth));
-            write_png(&context.output_path(&format!("{prefix}frames/{i:05}.png"))?, &even(&frame))?;
-            progress.add(1);
-            Ok(())
-        })
-        .collect::<anyhow::Result<Vec<()>>>()?;
+    views.views.par_iter().enumerate().try_for_each(|(i, view)| {
+        context.check_interrupt()?;
+        let frame = draw_frame(&views, view, folder, range)?;
+        let path = context.output_path(&format!("{prefix}frames/{i:05}.png"))?;
+        write_png(&path, &with_even_size(&frame))?;
+        progress.add(1);
+        anyhow::Ok(())
+    })?;
     let frames = context.output_path(&format!("{prefix}frames/%05d.png"))?;
     encode(context, params, &frames, &context.output_path(&format!("{prefix}video.mp4"))?)
 }
 
-/// Two images of one height as one.
+fn size_of_view(view: &View) -> (u32, u32) {
+    (view.camera.intrinsics.width, view.camera.intrinsics.height)
+}
+
+/// Draws a view's colour and, with a range of depths, its depth on the right.
+fn draw_frame(
+    views: &Views,
+    view: &View,
+    folder: &Path,
+    range: Option<(f32, f32)>,
+) -> anyhow::Result<Rgba8> {
+    let image = view.image.as_ref();
+    let image = image.with_context(|| format!("view {} has no image", view.camera.name))?;
+    let colour = views.read_over(&folder.join(image))?.to_rgba8();
+    let (Some(file), Some(range)) = (&view.depth, range) else { return Ok(colour) };
+    let image = read_exr(&folder.join(file))?;
+    Ok(match DepthMap::of(&image) {
+        Some(map) => side_by_side(&colour, &map.draw(image.width, range)),
+        None => colour,
+    })
+}
+
+/// Joins two images of equal height.
 fn side_by_side(left: &Rgba8, right: &Rgba8) -> Rgba8 {
-    let rows = left.data.chunks_exact(4 * left.width).zip(right.data.chunks_exact(4 * right.width));
-    Rgba8::new(
-        left.width + right.width,
-        left.height,
-        rows.flat_map(|(a, b)| [a, b].concat()).collect(),
-    )
+    let mut data = Vec::with_capacity(left.data.len() + right.data.len());
+    let right_rows = right.data.chunks_exact(4 * right.width);
+    for (left_row, right_row) in left.data.chunks_exact(4 * left.width).zip(right_rows) {
+        data.extend_from_slice(left_row);
+        data.extend_from_slice(right_row);
+    }
+    Rgba8::new(left.width + right.width, left.height, data)
 }
 
-/// With a last column and row twice where sizes are odd, which films can't have.
-fn even(image: &Rgba8) -> Rgba8 {
+/// Repeats the last column and row of an image with odd sizes, which yuv420p doesn't allow.
+fn with_even_size(image: &Rgba8) -> Rgba8 {
     let (width, height) = (image.width.next_multiple_of(2), image.height.next_multiple_of(2));
-    let pixels = (0..width * height).flat_map(|i| {
-        let (x, y) = ((i % width).min(image.width - 1), (i / width).min(image.height - 1));
-        let at = 4 * (y * image.width + x);
-        [image.data[at], image.data[at + 1], image.data[at + 2], image.data[at + 3]]
-    });
-    Rgba8::new(width, height, pixels.collect())
+    let mut data = Vec::with_capacity(4 * width * height);
+    for y in 0..height {
+        for x in 0..width {
+            let pixel = y.min(image.height - 1) * image.width + x.min(image.width - 1);
+            data.extend_from_slice(&image.data[4 * pixel..4 * (pixel + 1)]);
+        }
+    }
+    Rgba8::new(width, height, data)
 }
 
-/// Makes the film by ffmpeg; without it, or where it fails, says so: the frames are there.
+/// Encodes the film by ffmpeg; without ffmpeg, or if it fails, logs that only the frames exist.
 fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> anyhow::Result<()> {
     let rate = params.frames_per_second.to_string();
     let mut command = Command::new("ffmpeg");
@@ -157,30 +165,30 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
     match output {
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
-            let said = String::from_utf8_lossy(&output.stderr);
+            let message = String::from_utf8_lossy(&output.stderr);
             context.say(format!(
-                "no video.mp4: ffmpeg said {:?}; the frames are there",
-                said.lines().next().unwrap_or("nothing")
+                "no video.mp4: ffmpeg failed: {}; only frames are written",
+                message.lines().next().unwrap_or("no message")
             ));
-            // What it left is no film.
+            // A partial film can't be played.
             std::fs::remove_file(film).or_else(|e| {
                 if e.kind() == std::io::ErrorKind::NotFound { Ok(()) } else { Err(e) }
             })?;
             Ok(())
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-            context.say("no video.mp4, since ffmpeg isn't installed; the frames are there");
+            context.say("no video.mp4: ffmpeg isn't installed; only frames are written");
             Ok(())
         }
-        Err(e) => Err(e).with_context(|| format!("cannot start ffmpeg for {folder}")),
+        Err(e) => Err(e).with_context(|| format!("cannot run ffmpeg for {folder}")),
     }
 }
 
-/// Runs a program that says little, and kills it when a signal asks the stage to stop.
+/// Runs a program and collects its stderr; kills the program if the stage is interrupted.
 fn output_of(context: &Context, command: &mut Command) -> io::Result<process::Output> {
     let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn()?;
     let pipe = child.stderr.take();
-    let words = std::thread::spawn(|| {
+    let reader = std::thread::spawn(|| {
         let mut bytes = Vec::new();
         pipe.map_or(Ok(0), |mut pipe| pipe.read_to_end(&mut bytes)).map(|_| bytes)
     });
@@ -191,9 +199,9 @@ fn output_of(context: &Context, command: &mut Command) -> io::Result<process::Ou
         if context.interrupted() {
             child.kill()?;
         }
-        std::thread::sleep(INTERVAL);
+        std::thread::sleep(POLL_INTERVAL);
     };
-    let stderr = words.join().unwrap_or_else(|_| Ok(Vec::new()))?;
+    let stderr = reader.join().unwrap_or_else(|_| Ok(Vec::new()))?;
     Ok(process::Output { status, stdout: Vec::new(), stderr })
 }
 
@@ -204,7 +212,7 @@ mod tests {
     #[test]
     fn frames_have_even_sizes_and_both_images() {
         let one = |width: usize, level: u8| Rgba8::new(width, 3, vec![level; 4 * width * 3]);
-        let frame = even(&side_by_side(&one(3, 10), &one(2, 20)));
+        let frame = with_even_size(&side_by_side(&one(3, 10), &one(2, 20)));
         assert_eq!((frame.width, frame.height), (6, 4));
         let row: Vec<u8> = frame.data[3 * 6 * 4..].chunks_exact(4).map(|p| p[0]).collect();
         assert_eq!(row, [10, 10, 10, 20, 20, 20]);

@@ -1,9 +1,8 @@
-//! The volume as bytes, as the page reads them.
+//! The volume in the bytes that the page reads, deflated (zlib).
 //!
-//! First a byte for each place of the grid of bricks, x fastest: how far the next brick is, 0 in
-//! one. Then one plane a channel, each with a byte for every voxel of all bricks: opacity, red,
-//! green and blue (premultiplied), then the view's components, 128 for 0, premultiplied, too. The
-//! whole is deflated (zlib).
+//! First a byte for each grid position of bricks, x fastest: the distance to the nearest brick.
+//! Then one plane per channel, with a byte for every voxel of all bricks: opacity; premultiplied
+//! red, green and blue; premultiplied components of view dependence, 128 for 0.
 
 use std::io::Write as _;
 
@@ -14,21 +13,23 @@ use crate::bake::Volume;
 use crate::bricks::{Bricks, SIDE, VOXELS};
 use crate::view::Components;
 
-/// Components of the view dependence that voxels have: those of one texture.
+/// Number of components of view dependence: the channels of one texture (docs/design/042).
 pub(crate) const COMPONENTS: usize = 4;
-/// Channels of a voxel.
+/// Number of a voxel's channels.
 const CHANNELS: usize = 4 + COMPONENTS;
 
-/// Bytes that are deflated at once.
+/// Bytes that are deflated between two updates of the progress.
 const BYTES_PER_STEP: usize = 1 << 20;
 
-/// A volume, packed.
+/// A packed volume.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Atlas {
+    /// Voxels along each side of the unit cube.
     pub(crate) resolution: usize,
+    /// Number of bricks.
     pub(crate) bricks: usize,
     pub(crate) components: Components,
-    /// Deflated.
+    /// Deflated content.
     pub(crate) bytes: Vec<u8>,
 }
 
@@ -41,7 +42,7 @@ impl Atlas {
         let side = volume.resolution / SIDE;
         let mut is_kept = vec![false; side * side * side];
         for voxel in &volume.voxels {
-            let [x, y, z] = voxel.place.map(|c| usize::from(c) / SIDE);
+            let [x, y, z] = voxel.position.map(|c| usize::from(c) / SIDE);
             is_kept[x + side * (y + side * z)] = true;
         }
         let bricks = Bricks::new(volume.resolution, |[x, y, z]| is_kept[x + side * (y + side * z)]);
@@ -64,23 +65,26 @@ impl Atlas {
     }
 }
 
-/// All channels of all voxels.
+/// Returns all channels of all voxels.
 fn planes(volume: &Volume, bricks: &Bricks, components: &Components) -> Vec<u8> {
     let count = bricks.len() * VOXELS;
     let mut planes = vec![0; 4 * count];
     planes.resize(CHANNELS * count, 128);
     for voxel in &volume.voxels {
-        let Some(at) = bricks.voxel(voxel.place.map(usize::from)) else { continue };
-        let level = |x: f32| (255.0 * x.max(0.0).min(1.0)).round() as u8;
-        planes[at] = level(voxel.opacity);
+        let Some(i) = bricks.voxel(voxel.position.map(usize::from)) else { continue };
+        planes[i] = to_byte(voxel.opacity);
         for c in 0..3 {
-            planes[(1 + c) * count + at] = level(voxel.opacity * voxel.colour[c]);
+            planes[(1 + c) * count + i] = to_byte(voxel.opacity * voxel.colour[c]);
         }
-        for (k, value) in components.of_voxel(&voxel.view).enumerate() {
-            planes[(4 + k) * count + at] = (128.0 + 127.0 * voxel.opacity * value).round() as u8;
+        for (k, value) in components.project(&voxel.view).enumerate() {
+            planes[(4 + k) * count + i] = (128.0 + 127.0 * voxel.opacity * value).round() as u8;
         }
     }
     planes
+}
+
+fn to_byte(level: f32) -> u8 {
+    (255.0 * level.max(0.0).min(1.0)).round() as u8
 }
 
 #[cfg(test)]
@@ -110,7 +114,7 @@ mod tests {
         let count = atlas.bricks * VOXELS;
         let mut opaque = 0;
         for voxel in &volume.voxels {
-            let at = bricks.voxel(voxel.place.map(usize::from)).unwrap();
+            let at = bricks.voxel(voxel.position.map(usize::from)).unwrap();
             let byte = |plane: usize| f32::from(planes[plane * count + at]);
             opaque += usize::from(byte(0) > 0.0);
             assert!((byte(0) / 255.0 - voxel.opacity).abs() < 0.51 / 255.0);
@@ -118,7 +122,7 @@ mod tests {
                 let expected = voxel.opacity * voxel.colour[c];
                 assert!((byte(1 + c) / 255.0 - expected).abs() < 0.51 / 255.0);
             }
-            for (k, value) in atlas.components.of_voxel(&voxel.view).enumerate() {
+            for (k, value) in atlas.components.project(&voxel.view).enumerate() {
                 let found = (byte(4 + k) - 128.0) / 127.0;
                 assert!((found - voxel.opacity * value).abs() < 0.51 / 127.0);
             }

@@ -1,47 +1,78 @@
-//! A field as a volume of voxels. A voxel has the opacity of a step as long as itself, the mean
-//! colour it shows to the cameras that see it, and how this colour changes with the direction.
+//! Baking a field into a volume of voxels. A voxel has the opacity of a step of its own length, its
+//! mean colour in the directions of the cameras that see it, and the colour's view dependence.
 
 use glam::DVec3;
-use radiance::{PointSample, spec::VIEW_FEATURES};
+use radiance::{Field, PointSample, spec::VIEW_FEATURES};
 use rayon::prelude::*;
 use scene::{Bounds, Camera};
 use stage::Progress;
 
 use crate::bricks::{Bricks, SIDE, VOXELS};
-use crate::source::Source;
-use crate::view::{NUMBERS, fit};
-use crate::visibility::seen_by;
+use crate::view::{COEFFICIENTS, fit};
+use crate::visibility::visible_from;
 
-/// Places along a voxel's side at which the field is asked.
-const PLACES_PER_SIDE: usize = 2;
-/// Places of a voxel.
-const PLACES_PER_VOXEL: usize = PLACES_PER_SIDE * PLACES_PER_SIDE * PLACES_PER_SIDE;
-/// Directions at most for which a voxel's colour is fitted.
-const MOST_DIRECTIONS: usize = 16;
-/// Opacity below which a voxel is empty: less than half a step of a byte.
-const LEAST_OPACITY: f32 = 0.5 / 255.0;
+/// Samples along each side of a voxel (docs/design/042).
+const SAMPLES_PER_SIDE: usize = 2;
+/// Samples in a voxel.
+const SAMPLES_PER_VOXEL: usize = SAMPLES_PER_SIDE * SAMPLES_PER_SIDE * SAMPLES_PER_SIDE;
+/// Maximum number of directions to which a voxel's colour is fitted; chosen by hand.
+const MAX_DIRECTIONS: usize = 16;
+/// Minimum opacity of a stored voxel: a smaller one rounds to byte 0.
+const MIN_OPACITY: f32 = 0.5 / 255.0;
+
+/// Field that is baked, a trait for tests. Positions are those of the unit cube.
+pub(crate) trait Source: Sync {
+    /// True if density is possible between two corners.
+    fn may_hold(&self, low: [f32; 3], high: [f32; 3]) -> bool;
+    /// Evaluates density, raw colour and view features at some positions.
+    fn sample(&self, positions: &[[f32; 3]]) -> Vec<PointSample>;
+    /// Evaluates the view network's raw colours for view features and some directions.
+    fn view_colours(
+        &self,
+        features: &[f32; VIEW_FEATURES],
+        directions: &[[f32; 3]],
+    ) -> Vec<[f32; 3]>;
+}
+
+impl Source for Field {
+    fn may_hold(&self, low: [f32; 3], high: [f32; 3]) -> bool {
+        Self::may_hold(self, low, high)
+    }
+
+    fn sample(&self, positions: &[[f32; 3]]) -> Vec<PointSample> {
+        self.sample_points(positions)
+    }
+
+    fn view_colours(
+        &self,
+        features: &[f32; VIEW_FEATURES],
+        directions: &[[f32; 3]],
+    ) -> Vec<[f32; 3]> {
+        Self::view_colours(self, features, directions)
+    }
+}
 
 /// A baked field.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Volume {
+    /// Voxels along each side of the unit cube.
     pub(crate) resolution: usize,
     pub(crate) voxels: Vec<Voxel>,
 }
 
-/// A voxel that some camera sees.
+/// A visible voxel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Voxel {
-    pub(crate) place: [u16; 3],
+    pub(crate) position: [u16; 3],
     /// Share of the light that a step of a voxel's length stops.
     pub(crate) opacity: f32,
-    /// Display-encoded sRGB, the mean over the directions it is seen from.
+    /// Display-encoded sRGB, the mean over the directions of cameras that see the voxel.
     pub(crate) colour: [f32; 3],
-    /// What is added to the colour's logit, by direction: see [`crate::view`].
-    pub(crate) view: [f32; NUMBERS],
+    /// View dependence of the colour's logit: see [`crate::view`].
+    pub(crate) view: [f32; COEFFICIENTS],
 }
 
-/// Voxels of some bricks: their opacities, and the cameras that see them as bits. They have no
-/// colours yet.
+/// Voxels of some bricks without colours: opacities, and bits of the cameras that see each voxel.
 pub(crate) struct Shape {
     bricks: Bricks,
     opacity: Vec<f32>,
@@ -58,17 +89,18 @@ impl Shape {
 
     /// Bytes that [`Baker::volume`] needs: visible voxels, twice while they are collected.
     pub(crate) fn volume_memory_need(&self) -> u64 {
-        let count = (0..self.seen.len()).into_par_iter().filter(|&voxel| self.keeps(voxel)).count();
+        let count =
+            (0..self.seen.len()).into_par_iter().filter(|&voxel| self.is_visible(voxel)).count();
         (2 * size_of::<Voxel>() * count) as u64
     }
 
     /// True if a voxel is visible.
-    fn keeps(&self, voxel: usize) -> bool {
-        self.opacity[voxel] >= LEAST_OPACITY && self.seen[voxel] != 0
+    fn is_visible(&self, voxel: usize) -> bool {
+        self.opacity[voxel] >= MIN_OPACITY && self.seen[voxel] != 0
     }
 }
 
-/// Bakes sources, whose mean is shown, as far as cameras see them.
+/// Bakes the mean of some sources where cameras see it.
 pub(crate) struct Baker<'a, S> {
     pub(crate) sources: &'a [S],
     pub(crate) bounds: &'a Bounds,
@@ -77,51 +109,50 @@ pub(crate) struct Baker<'a, S> {
 }
 
 impl<S: Source> Baker<'_, S> {
-    /// Returns the bricks in which a source may have something.
+    /// Returns the bricks in which some source may have density.
     pub(crate) fn bricks(&self) -> Bricks {
         Bricks::new(self.resolution, |brick| {
-            let corner =
-                |more: usize| brick.map(|c| ((c + more) * SIDE) as f32 / self.resolution as f32);
+            let low = brick.map(|c| (c * SIDE) as f32 / self.resolution as f32);
             // The upper corner itself belongs to the next brick.
-            let high = corner(1).map(|c| c - 1e-6);
-            self.sources.iter().any(|source| source.may_hold(corner(0), high))
+            let high = brick.map(|c| ((c + 1) * SIDE) as f32 / self.resolution as f32 - 1e-6);
+            self.sources.iter().any(|source| source.may_hold(low, high))
         })
     }
 
-    /// Steps of progress that baking takes.
+    /// Returns the number of progress steps of baking.
     pub(crate) fn steps(&self, bricks: &Bricks) -> u64 {
         (2 * bricks.len() + self.cameras.len()) as u64
     }
 
-    /// Finds the voxels' opacities and the cameras that see them.
+    /// Computes the voxels' opacities and the cameras that see each voxel.
     pub(crate) fn shape(&self, bricks: Bricks, progress: &Progress) -> Shape {
         let opacity: Vec<f32> = bricks
-            .places()
+            .positions()
             .par_iter()
             .flat_map_iter(|&brick| {
                 progress.add(1);
                 opacities(self.sources, brick, self.resolution)
             })
             .collect();
-        let seen = seen_by(&bricks, &opacity, (self.cameras, self.bounds), progress);
-        Shape { seen: with_neighbours(&bricks, &seen), bricks, opacity }
+        let seen = visible_from(&bricks, &opacity, (self.cameras, self.bounds), progress);
+        Shape { seen: spread_to_neighbours(&bricks, &seen), bricks, opacity }
     }
 
-    /// Finds the colours of the visible voxels.
+    /// Computes the colours of the visible voxels.
     pub(crate) fn volume(&self, shape: &Shape, progress: &Progress) -> Volume {
         let bricks = &shape.bricks;
         let voxels = (0..bricks.len())
             .into_par_iter()
             .flat_map_iter(|slot| {
                 progress.add(1);
-                let wanted: Vec<usize> =
-                    (slot * VOXELS..(slot + 1) * VOXELS).filter(|&v| shape.keeps(v)).collect();
-                let found = self.of_brick(bricks.places()[slot], &wanted, &shape.seen);
-                let voxels = wanted.into_iter().zip(found).map(|(v, (colour, view))| Voxel {
-                    place: bricks.place_of(v).map(|c| c as u16),
-                    opacity: shape.opacity[v],
-                    colour,
-                    view,
+                let visible: Vec<usize> =
+                    (slot * VOXELS..(slot + 1) * VOXELS).filter(|&v| shape.is_visible(v)).collect();
+                let shaded = self.shade_brick(bricks.positions()[slot], &visible, &shape.seen);
+                let voxels = visible.into_iter().zip(shaded).map(|(voxel, shaded)| Voxel {
+                    position: bricks.position(voxel).map(|c| c as u16),
+                    opacity: shape.opacity[voxel],
+                    colour: shaded.colour,
+                    view: shaded.view,
                 });
                 voxels.collect::<Vec<_>>()
             })
@@ -129,48 +160,45 @@ impl<S: Source> Baker<'_, S> {
         Volume { resolution: self.resolution, voxels }
     }
 
-    /// Colour and view dependence of some of a brick's voxels; each source counts as much as it is
-    /// opaque.
-    fn of_brick(
-        &self,
-        brick: [usize; 3],
-        voxels: &[usize],
-        seen: &[u64],
-    ) -> Vec<([f32; 3], [f32; NUMBERS])> {
-        let places = places(brick, voxels.iter().copied(), self.resolution);
-        let directions: Vec<Vec<[f32; 3]>> = voxels
-            .iter()
-            .zip(places.chunks_exact(PLACES_PER_VOXEL))
-            .map(|(&voxel, places)| self.directions(places[PLACES_PER_VOXEL / 2], seen[voxel]))
-            .collect();
-        let mut sums = vec![([0.0f32; 3], [0.0f32; NUMBERS], 0.0f32); voxels.len()];
+    /// Computes colour and view dependence of some of a brick's voxels: the mean over sources,
+    /// weighted by opacity.
+    fn shade_brick(&self, brick: [usize; 3], voxels: &[usize], seen: &[u64]) -> Vec<Shaded> {
+        let positions = sample_positions(brick, voxels.iter().copied(), self.resolution);
+        let mut directions = Vec::with_capacity(voxels.len());
+        for (i, &voxel) in voxels.iter().enumerate() {
+            let centre = positions[i * SAMPLES_PER_VOXEL + SAMPLES_PER_VOXEL / 2];
+            directions.push(self.directions(centre, seen[voxel]));
+        }
+        let mut means = vec![Shaded { colour: [0.0; 3], view: [0.0; COEFFICIENTS] }; voxels.len()];
+        let mut weights = vec![0.0f32; voxels.len()];
         for source in self.sources {
-            let samples = source.sample(&places);
-            let voxels = samples.chunks_exact(PLACES_PER_VOXEL).zip(&directions);
-            for ((samples, directions), (colour, view, weight)) in voxels.zip(&mut sums) {
-                let own = opacity_of(samples, self.resolution);
-                let (c, v) = shade(source, samples, directions, self.resolution);
-                colour.iter_mut().zip(c).for_each(|(sum, c)| *sum += own * c);
-                view.iter_mut().zip(v).for_each(|(sum, v)| *sum += own * v);
-                *weight += own;
+            let samples = source.sample(&positions);
+            for (i, samples) in samples.chunks_exact(SAMPLES_PER_VOXEL).enumerate() {
+                let opacity = opacity_of(samples, self.resolution);
+                let shaded = shade(source, samples, &directions[i], self.resolution);
+                for c in 0..3 {
+                    means[i].colour[c] += opacity * shaded.colour[c];
+                }
+                for k in 0..COEFFICIENTS {
+                    means[i].view[k] += opacity * shaded.view[k];
+                }
+                weights[i] += opacity;
             }
         }
-        sums.into_iter()
-            .map(|(colour, view, weight)| (colour.map(|c| c / weight), view.map(|v| v / weight)))
-            .collect()
+        for (i, mean) in means.iter_mut().enumerate() {
+            mean.colour = mean.colour.map(|c| c / weights[i]);
+            mean.view = mean.view.map(|v| v / weights[i]);
+        }
+        means
     }
 
-    /// Directions from some of the cameras that see a place to it, unit length in the world.
-    fn directions(&self, place: [f32; 3], seen: u64) -> Vec<[f32; 3]> {
-        let point = in_box(self.bounds, DVec3::from(place.map(f64::from)));
-        let seeing: Vec<&Camera> = self
-            .cameras
-            .iter()
-            .enumerate()
-            .filter(|(i, _)| seen >> i & 1 == 1)
-            .map(|c| c.1)
-            .collect();
-        let count = seeing.len().min(MOST_DIRECTIONS);
+    /// Returns unit world directions to a position from some of the cameras that see it.
+    fn directions(&self, position: [f32; 3], seen: u64) -> Vec<[f32; 3]> {
+        let point = to_world(self.bounds, DVec3::from(position.map(f64::from)));
+        let cameras = self.cameras.iter().enumerate();
+        let seeing: Vec<&Camera> =
+            cameras.filter(|(i, _)| seen >> i & 1 == 1).map(|(_, camera)| camera).collect();
+        let count = seeing.len().min(MAX_DIRECTIONS);
         (0..count)
             .filter_map(|k| (point - seeing[k * seeing.len() / count].centre()).try_normalize())
             .map(|direction| direction.as_vec3().to_array())
@@ -178,8 +206,15 @@ impl<S: Source> Baker<'_, S> {
     }
 }
 
-/// The places at which a brick's voxels are looked at: voxel by voxel, x fastest.
-fn places(
+/// Colour and view dependence of a voxel, as in [`Voxel`].
+#[derive(Clone)]
+struct Shaded {
+    colour: [f32; 3],
+    view: [f32; COEFFICIENTS],
+}
+
+/// Returns the positions at which a brick's voxels are sampled: voxel by voxel, x fastest.
+fn sample_positions(
     brick: [usize; 3],
     voxels: impl Iterator<Item = usize>,
     resolution: usize,
@@ -188,14 +223,14 @@ fn places(
     voxels
         .flat_map(|voxel| {
             let own = [voxel % SIDE, voxel / SIDE % SIDE, voxel / (SIDE * SIDE) % SIDE];
-            (0..PLACES_PER_VOXEL).map(move |i| {
+            (0..SAMPLES_PER_VOXEL).map(move |i| {
                 let sub = [
-                    i % PLACES_PER_SIDE,
-                    i / PLACES_PER_SIDE % PLACES_PER_SIDE,
-                    i / (PLACES_PER_SIDE * PLACES_PER_SIDE),
+                    i % SAMPLES_PER_SIDE,
+                    i / SAMPLES_PER_SIDE % SAMPLES_PER_SIDE,
+                    i / (SAMPLES_PER_SIDE * SAMPLES_PER_SIDE),
                 ];
                 std::array::from_fn(|axis| {
-                    let within = (sub[axis] as f32 + 0.5) / PLACES_PER_SIDE as f32;
+                    let within = (sub[axis] as f32 + 0.5) / SAMPLES_PER_SIDE as f32;
                     ((corner[axis] + own[axis]) as f32 + within) / resolution as f32
                 })
             })
@@ -203,54 +238,53 @@ fn places(
         .collect()
 }
 
-/// Opacity of each of a brick's voxels, the mean over sources.
+/// Returns the opacity of each of a brick's voxels, the mean over sources.
 fn opacities<S: Source>(sources: &[S], brick: [usize; 3], resolution: usize) -> Vec<f32> {
-    let places = places(brick, 0..VOXELS, resolution);
-    let share = 1.0 / sources.len() as f32;
+    let positions = sample_positions(brick, 0..VOXELS, resolution);
+    let weight = 1.0 / sources.len() as f32;
     let mut opacity = vec![0.0; VOXELS];
     for source in sources {
-        let samples = source.sample(&places);
-        for (sum, samples) in opacity.iter_mut().zip(samples.chunks_exact(PLACES_PER_VOXEL)) {
-            *sum += share * opacity_of(samples, resolution);
+        let samples = source.sample(&positions);
+        for (i, samples) in samples.chunks_exact(SAMPLES_PER_VOXEL).enumerate() {
+            opacity[i] += weight * opacity_of(samples, resolution);
         }
     }
     opacity
 }
 
-/// Opacity of a voxel, of the samples in it: light that crosses it along an axis is stopped by what
-/// lies one behind the other. Of the three axes the one counts that stops most, so that a thin wall
-/// lets nothing through.
+/// Computes a voxel's opacity from its samples: the mean over columns along an axis, for the axis
+/// that stops most light. A mean over positions would let light through a wall thinner than the
+/// voxel.
 fn opacity_of(samples: &[PointSample], resolution: usize) -> f32 {
-    let length = 1.0 / (PLACES_PER_SIDE * resolution) as f32;
+    let length = 1.0 / (SAMPLES_PER_SIDE * resolution) as f32;
     (0..3).map(|axis| stopped_along(axis, samples, length)).fold(0.0, f32::max)
 }
 
-/// Share of the light along an axis that a voxel's samples stop, each over a length.
+/// Returns the share of light along an axis that a voxel's samples stop, each over `length`.
 fn stopped_along(axis: u32, samples: &[PointSample], length: f32) -> f32 {
-    let step = PLACES_PER_SIDE.pow(axis);
-    let columns = (0..PLACES_PER_VOXEL).filter(|i| (i / step).is_multiple_of(PLACES_PER_SIDE));
+    let step = SAMPLES_PER_SIDE.pow(axis);
+    let columns = (0..SAMPLES_PER_VOXEL).filter(|i| (i / step).is_multiple_of(SAMPLES_PER_SIDE));
     let stopped: f32 = columns
         .map(|first| {
-            let depth: f32 = (0..PLACES_PER_SIDE).map(|k| samples[first + k * step].density).sum();
+            let depth: f32 = (0..SAMPLES_PER_SIDE).map(|k| samples[first + k * step].density).sum();
             -(-depth * length).exp_m1()
         })
         .sum();
-    stopped / (PLACES_PER_SIDE * PLACES_PER_SIDE) as f32
+    stopped / (SAMPLES_PER_SIDE * SAMPLES_PER_SIDE) as f32
 }
 
-/// Cameras of each voxel and of those around it: what one sees of a voxel's neighbour it sees of
-/// the voxel from a little aside.
-fn with_neighbours(bricks: &Bricks, seen: &[u64]) -> Vec<u64> {
+/// Adds to each voxel the cameras that see its neighbours, so that no holes appear between the
+/// cameras' positions.
+fn spread_to_neighbours(bricks: &Bricks, seen: &[u64]) -> Vec<u64> {
     let last = bricks.resolution - 1;
-    let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(last);
     (0..seen.len())
         .into_par_iter()
         .map(|voxel| {
-            let [x, y, z] = bricks.place_of(voxel);
+            let [x, y, z] = bricks.position(voxel).map(|c| c.saturating_sub(1)..=(c + 1).min(last));
             let mut all = 0;
-            for k in around(z) {
-                for j in around(y) {
-                    for i in around(x) {
+            for k in z {
+                for j in y.clone() {
+                    for i in x.clone() {
                         all |= bricks.voxel([i, j, k]).map_or(0, |v| seen[v]);
                     }
                 }
@@ -260,31 +294,34 @@ fn with_neighbours(bricks: &Bricks, seen: &[u64]) -> Vec<u64> {
         .collect()
 }
 
-/// Mean colour of a voxel's samples, and how it changes with the direction.
+/// Computes mean colour and view dependence of a voxel's samples.
 fn shade<S: Source>(
     source: &S,
     samples: &[PointSample],
     directions: &[[f32; 3]],
     resolution: usize,
-) -> ([f32; 3], [f32; NUMBERS]) {
-    // What stops no light has no colour.
+) -> Shaded {
+    // Samples are weighted by the light that they stop.
     let weights: Vec<f32> =
         samples.iter().map(|s| -(-s.density / resolution as f32).exp_m1()).collect();
-    let share = 1.0 / weights.iter().sum::<f32>().max(1e-9);
+    let scale = 1.0 / weights.iter().sum::<f32>().max(1e-9);
     let features: [f32; VIEW_FEATURES] = std::array::from_fn(|f| {
-        share * samples.iter().zip(&weights).map(|(s, w)| w * s.view_features[f]).sum::<f32>()
+        scale * samples.iter().zip(&weights).map(|(s, w)| w * s.view_features[f]).sum::<f32>()
     });
     let (mean, view) = fit(directions, &source.view_colours(&features, directions));
     let colour = std::array::from_fn(|c| {
-        let colour = |s: &PointSample| 1.0 / (1.0 + (-s.raw_colour[c] - mean[c]).exp());
-        share * samples.iter().zip(&weights).map(|(s, w)| w * colour(s)).sum::<f32>()
+        let mut sum = 0.0;
+        for (sample, weight) in samples.iter().zip(&weights) {
+            sum += weight * (1.0 / (1.0 + (-sample.raw_colour[c] - mean[c]).exp()));
+        }
+        scale * sum
     });
-    (colour, view)
+    Shaded { colour, view }
 }
 
-/// The world point at a place of the unit cube of a box.
-pub(crate) fn in_box(bounds: &Bounds, place: DVec3) -> DVec3 {
-    DVec3::from(bounds.min) + bounds.longest_side() * place
+/// Maps a position in the unit cube of a box to the world.
+pub(crate) fn to_world(bounds: &Bounds, position: DVec3) -> DVec3 {
+    DVec3::from(bounds.min) + bounds.longest_side() * position
 }
 
 #[cfg(test)]
@@ -327,8 +364,8 @@ pub(crate) mod tests {
             true
         }
 
-        fn sample(&self, places: &[[f32; 3]]) -> Vec<PointSample> {
-            places.iter().map(|p| ball_sample(self, p)).collect()
+        fn sample(&self, positions: &[[f32; 3]]) -> Vec<PointSample> {
+            positions.iter().map(|p| ball_sample(self, p)).collect()
         }
 
         fn view_colours(
@@ -361,12 +398,12 @@ pub(crate) mod tests {
         [(0.0, 0.0), (0.5, 0.1), (-0.4, 0.3), (0.1, -0.6), (-0.7, -0.7)].map(camera).into()
     }
 
-    /// The ball's front is kept, opaque and coloured as it is seen; its back and its inside aren't.
+    /// The ball's front is stored, opaque and in its visible colours; its back and inside aren't.
     #[test]
     fn a_ball_is_baked_where_cameras_see_it() {
         let ball = Ball { radius: 0.3, density: 1e4 };
         let volume = bake(&[ball], &bounds(), &cameras(), 64);
-        let middle = |v: &Voxel| v.place.map(|c| (f32::from(c) + 0.5) / 64.0 - 0.5);
+        let middle = |v: &Voxel| v.position.map(|c| (f32::from(c) + 0.5) / 64.0 - 0.5);
         let away = |v: &Voxel| middle(v).iter().map(|c| c * c).sum::<f32>().sqrt();
         assert!(volume.voxels.len() > 1000);
         for voxel in &volume.voxels {
@@ -382,7 +419,7 @@ pub(crate) mod tests {
             assert!((voxel.colour[2] - blue).abs() < 1e-3, "{voxel:?}");
         }
         // Straight from above, where all cameras look: green is that of the direction.
-        let top = volume.voxels.iter().find(|v| v.place == [32, 32, 50]).unwrap();
+        let top = volume.voxels.iter().find(|v| v.position == [32, 32, 50]).unwrap();
         let logit = |c: f32| (c / (1.0 - c)).ln();
         for camera in cameras() {
             let direction = camera.forward().as_vec3().to_array();
@@ -394,15 +431,15 @@ pub(crate) mod tests {
     }
 
     fn wall(along: usize, k: usize) -> Vec<PointSample> {
-        (0..PLACES_PER_VOXEL)
+        (0..SAMPLES_PER_VOXEL)
             .map(|i| {
-                let is_in = i / PLACES_PER_SIDE.pow(along as u32) % PLACES_PER_SIDE == k;
+                let is_in = i / SAMPLES_PER_SIDE.pow(along as u32) % SAMPLES_PER_SIDE == k;
                 PointSample { density: if is_in { 5e3 } else { 0.0 }, ..PointSample::default() }
             })
             .collect()
     }
 
-    /// A wall thinner than a voxel is as opaque as it is, wherever in the voxel it lies.
+    /// A wall thinner than a voxel has its full opacity at any position in the voxel.
     #[test]
     fn thin_walls_are_opaque() {
         for (along, k) in [(0, 0), (1, 1), (2, 0)] {
@@ -410,7 +447,7 @@ pub(crate) mod tests {
             let expected = 1.0 - (-5e3f32 / 512.0).exp();
             assert!((opacity - expected).abs() < 1e-5, "{opacity} {expected}");
         }
-        assert_eq!(opacity_of(&[PointSample::default(); PLACES_PER_VOXEL], 256), 0.0);
+        assert_eq!(opacity_of(&[PointSample::default(); SAMPLES_PER_VOXEL], 256), 0.0);
     }
 
     fn baked_with(threads: usize) -> Volume {

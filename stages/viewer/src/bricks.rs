@@ -1,86 +1,87 @@
-//! A sparse grid of voxels over the unit cube: bricks of 8³ where there may be something.
+//! Sparse grid of voxels over the unit cube: bricks of 8³ voxels where density is possible.
 
 /// Voxels along a brick's side.
 pub(crate) const SIDE: usize = 8;
-/// Voxels of a brick.
+/// Number of voxels in a brick.
 pub(crate) const VOXELS: usize = SIDE * SIDE * SIDE;
-/// No brick.
+/// Slot of a grid position without brick.
 const NO_BRICK: u32 = u32::MAX;
 
-/// Which bricks there are of a grid of `resolution`³ voxels. Voxel (x, y, z) has its centre at
-/// (x + 0.5, y + 0.5, z + 0.5) / resolution. Bricks are numbered in the order of their places, x
+/// Existing bricks of a grid of `resolution`³ voxels. Voxel (x, y, z) has its centre at
+/// (x + 0.5, y + 0.5, z + 0.5) / resolution. Bricks are numbered in the order of their positions, x
 /// fastest; so are voxels in a brick.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Bricks {
     pub(crate) resolution: usize,
+    /// Index of the brick at each grid position, or [`NO_BRICK`].
     slots: Vec<u32>,
-    places: Vec<[usize; 3]>,
+    /// Grid position of each brick.
+    positions: Vec<[usize; 3]>,
 }
 
 impl Bricks {
-    /// The bricks whose place fulfils a condition.
+    /// Creates the bricks whose grid position fulfils a condition.
     ///
     /// # Panics
     /// When the resolution isn't a multiple of [`SIDE`].
     pub(crate) fn new(resolution: usize, is_kept: impl Fn([usize; 3]) -> bool) -> Self {
         assert_eq!(resolution % SIDE, 0, "whole bricks");
-        let mut bricks = Self { resolution, slots: Vec::new(), places: Vec::new() };
+        let mut bricks = Self { resolution, slots: Vec::new(), positions: Vec::new() };
         let side = bricks.side();
-        bricks.slots = (0..side * side * side)
-            .map(|i| {
-                let place = [i % side, i / side % side, i / (side * side)];
-                if !is_kept(place) {
-                    return NO_BRICK;
-                }
-                bricks.places.push(place);
-                bricks.places.len() as u32 - 1
-            })
-            .collect();
+        for i in 0..side * side * side {
+            let position = [i % side, i / side % side, i / (side * side)];
+            if is_kept(position) {
+                bricks.slots.push(bricks.positions.len() as u32);
+                bricks.positions.push(position);
+            } else {
+                bricks.slots.push(NO_BRICK);
+            }
+        }
         bricks
     }
 
-    /// Bricks along the grid's side.
+    /// Returns the number of grid positions along each side.
     pub(crate) fn side(&self) -> usize {
         self.resolution / SIDE
     }
 
-    /// How many there are.
+    /// Returns the number of bricks.
     pub(crate) fn len(&self) -> usize {
-        self.places.len()
+        self.positions.len()
     }
 
-    /// Places of the bricks, in their order.
-    pub(crate) fn places(&self) -> &[[usize; 3]] {
-        &self.places
+    /// Returns the bricks' grid positions, in their order.
+    pub(crate) fn positions(&self) -> &[[usize; 3]] {
+        &self.positions
     }
 
-    /// Number of a brick, where there is one.
+    /// Returns the index of the brick at a grid position, if any.
     pub(crate) fn slot(&self, [x, y, z]: [usize; 3]) -> Option<usize> {
         let slot = self.slots[x + self.side() * (y + self.side() * z)];
         (slot != NO_BRICK).then_some(slot as usize)
     }
 
-    /// Number of a voxel among those of all bricks, where there is one.
-    pub(crate) fn voxel(&self, place: [usize; 3]) -> Option<usize> {
-        let slot = self.slot(place.map(|c| c / SIDE))?;
-        let [x, y, z] = place.map(|c| c % SIDE);
+    /// Returns the index of a voxel among those of all bricks; `None` outside of bricks.
+    pub(crate) fn voxel(&self, position: [usize; 3]) -> Option<usize> {
+        let slot = self.slot(position.map(|c| c / SIDE))?;
+        let [x, y, z] = position.map(|c| c % SIDE);
         Some(slot * VOXELS + x + SIDE * (y + SIDE * z))
     }
 
-    /// Place of a voxel, by its number.
-    pub(crate) fn place_of(&self, voxel: usize) -> [usize; 3] {
-        let (brick, own) = (self.places[voxel / VOXELS], voxel % VOXELS);
-        let own = [own % SIDE, own / SIDE % SIDE, own / (SIDE * SIDE)];
-        std::array::from_fn(|i| brick[i] * SIDE + own[i])
+    /// Returns the position of a voxel by its index.
+    pub(crate) fn position(&self, voxel: usize) -> [usize; 3] {
+        let [x, y, z] = self.positions[voxel / VOXELS].map(|c| c * SIDE);
+        let i = voxel % VOXELS;
+        [x + i % SIDE, y + i / SIDE % SIDE, z + i / (SIDE * SIDE)]
     }
 
-    /// How far each place of the grid is from the nearest brick: 0 in a brick, 1 beside one; the
-    /// largest of the differences along the axes, 255 at most.
+    /// Returns the distance from each grid position to the nearest brick: the maximum of the
+    /// differences along the axes, 0 in a brick, at most 255.
     pub(crate) fn distances(&self) -> Vec<u8> {
         let side = self.side();
         let mut distances: Vec<u8> =
             self.slots.iter().map(|&slot| if slot == NO_BRICK { 255 } else { 0 }).collect();
-        // The largest difference of three: one axis after the other, as long as something changes.
+        // The maximum of three differences can be found axis by axis, until nothing changes.
         for _ in 0..side {
             let mut next = distances.clone();
             for axis in 0..3 {
@@ -93,16 +94,14 @@ impl Bricks {
                     *value = (*value).min(low).min(high);
                 }
             }
-            // `next` is the smallest value within one step along all axes.
-            let grown: Vec<u8> = distances
-                .iter()
-                .zip(&next)
-                .map(|(&own, &near)| own.min(near.saturating_add(1)))
-                .collect();
-            if grown == distances {
+            // `next` is now the minimum within one step along all axes.
+            for (i, value) in next.iter_mut().enumerate() {
+                *value = distances[i].min(value.saturating_add(1));
+            }
+            if next == distances {
                 break;
             }
-            distances = grown;
+            distances = next;
         }
         distances
     }
@@ -113,11 +112,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn voxels_have_numbers_and_places() {
+    fn voxels_have_indices_and_positions() {
         let bricks = Bricks::new(32, |[x, y, z]| (x + y + z) % 3 == 1);
         assert_eq!((bricks.side(), bricks.len()), (4, 21));
         for voxel in 0..bricks.len() * VOXELS {
-            assert_eq!(bricks.voxel(bricks.place_of(voxel)), Some(voxel));
+            assert_eq!(bricks.voxel(bricks.position(voxel)), Some(voxel));
         }
         assert_eq!(bricks.voxel([7, 7, 7]), None);
         assert!(bricks.voxel([8, 7, 7]).is_some());

@@ -1,26 +1,25 @@
 //! `viewer`: a trained field as one HTML page to look around in, without the field or a network.
 //!
-//! A sink. It bakes the field into a sparse volume and puts this volume, the training cameras,
-//! their LR photographs and a small WebGL2 renderer into `index.html`. A sweep's points get a
-//! folder each.
+//! The stage is a sink. It bakes the field into a sparse volume and writes this volume, the
+//! training cameras, their LR photographs and a small WebGL2 renderer into `index.html`. Each point
+//! of a sweep has its own folder.
 //!
-//! * `bake`: the field as voxels: opacity, mean colour, and how this changes with the direction
-//!   (`view`). As in SNeRG (Hedman et al. 2021) the direction changes a ray's composited colour,
-//!   once a ray. Voxels that no training camera sees are left out (`visibility`).
+//! * `bake`: the field as voxels with opacity, mean colour and view dependence (`view`). As in
+//!   SNeRG (Hedman et al. 2021), view dependence is added once per ray, to the composited colour.
+//!   Voxels that no training camera sees are left out (`visibility`).
 //! * `bricks`, `atlas`: voxels in bricks of 8³, packed into deflated bytes.
-//! * `page`: the HTML file; script, style and shader lie in `src/page/`.
-//! * `overview`: where the view starts, and around what it turns.
+//! * `page`: the HTML file; script, style and shader are in `src/page/`.
+//! * `overview`: initial camera and centre of rotation.
 //!
-//! Places are those of the field's unit cube ([`scene::Space`]), and the shader maps its rays there
-//! as the field does for a box. The other spaces are refused: their fields are too hazy to be baked
-//! so.
+//! Positions are those of the field's unit cube ([`scene::Space`]), and the shader maps its rays
+//! into the cube as the field does for a box. The other spaces are refused, because their fields
+//! are too hazy to be baked (docs/design/042).
 
 mod atlas;
 mod bake;
 mod bricks;
 mod overview;
 mod page;
-mod source;
 mod view;
 mod visibility;
 
@@ -45,14 +44,14 @@ use crate::page::{ImageSize, PageCamera, PageScene};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Voxels along each side of the field's unit cube; a multiple of 8. Memory and file grow with
-    /// its square, the time to bake with its cube.
+    /// Voxels along each side of the field's unit cube; a multiple of 8. Memory and file size grow
+    /// with its square, the time to bake with its cube.
     #[schemars(range(min = 32, max = 512), extend("multipleOf" = 8))]
     pub resolution: u32,
-    /// Number of LR photographs in the page at most, spread evenly over the training views.
+    /// Maximum number of LR photographs in the page, spread evenly over the training views.
     #[schemars(range(min = 0, max = 1000))]
     pub photographs: u32,
-    /// Width of these photographs at most; wider ones are shrunk.
+    /// Maximum width of these photographs in pixels; wider ones are shrunk.
     #[schemars(range(min = 16, max = 4096))]
     pub photograph_width: u32,
 }
@@ -78,7 +77,7 @@ impl Stage for Viewer {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "run",
-            Input::required(&["run"], "folder with run.json: the record of what trained the field"),
+            Input::required(&["run"], "folder with run.json, the record of the field's training"),
         )]
     }
 
@@ -92,19 +91,19 @@ impl Stage for Viewer {
         let fields: Vec<&RunNode> =
             run.nodes.iter().filter(|n| n.is_shown && n.kind == "field").collect();
         if fields.is_empty() {
-            let message = "run.json: nothing that it shows is a field; give `run: train-ss`";
+            let message = "run.json has no field to show; set input `run: train-ss`";
             return Err(Failure::BadInput(message.to_owned()).into());
         }
         for (node, prefix) in fields.iter().zip(folders_of(&fields)) {
-            show(context, params, &run, node, &prefix)
+            write_page(context, params, &run, node, &prefix)
                 .with_context(|| format!("{} {}", node.stage, node.point).trim_end().to_owned())?;
         }
         Ok(())
     }
 }
 
-/// Writes the page of one field.
-fn show(
+/// Bakes one field and writes its page.
+fn write_page(
     context: &Context,
     params: &Params,
     run: &RunRecord,
@@ -113,36 +112,36 @@ fn show(
 ) -> anyhow::Result<()> {
     let (file, fields) = read_fields(&node.folder)?;
     check_space(&file.bounds)?;
-    let scene = node.inputs.get("scene").map(|input| run.folder_of(input));
-    let scene = scene.with_context(|| "the field's training has no input `scene`")?;
-    let views = Views::of_folder(&scene)?;
+    let folder = node.inputs.get("scene").map(|input| run.folder_of(input));
+    let folder = folder.context("the field's training has no input `scene`")?;
+    let views = Views::of_folder(&folder)?;
     let cameras: Vec<&Camera> = views.views.iter().map(|view| &view.camera).collect();
     let resolution = params.resolution as usize;
-    let looking = visibility::looking(&cameras, resolution);
-    let baker = Baker { sources: &fields, bounds: &file.bounds, cameras: &looking, resolution };
+    let observers = visibility::observers(&cameras, resolution);
+    let baker = Baker { sources: &fields, bounds: &file.bounds, cameras: &observers, resolution };
     let volume = bake(context, &baker)?;
     let atlas = Atlas::pack(&volume, |bytes| context.progress("packing", bytes))?;
-    let (centre, size) = overview::middle(&file.bounds, &volume);
-    let up = overview::up(&cameras);
-    let described = PageScene {
+    let (centre, size) = overview::centre_and_size(&file.bounds, &volume);
+    let up = overview::up_direction(&cameras);
+    let scene = PageScene {
         resolution,
         bricks: atlas.bricks,
         components: atlas.components.for_shader(),
         background: file.background.shown(),
-        // A box's faces alone limit rays: people come nearer than cameras did, and go farther away.
+        // Only the box's faces limit rays: a viewer may be nearer or farther than the cameras were.
         bounds: Bounds { near: 0.0, far: 1e30, ..file.bounds },
         centre: centre.to_array(),
         size,
         up: up.to_array(),
-        start: overview::start(&cameras, up),
-        cameras: page_cameras(params, &scene, &views)?,
+        start: overview::start_camera(&cameras, up),
+        cameras: page_cameras(params, &folder, &views)?,
     };
-    let html = page::page(&described, &atlas)?.into_string();
+    let html = page::page(&scene, &atlas)?.into_string();
     let path = context.output_path(&format!("{prefix}index.html"))?;
     std::fs::write(&path, html).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Bakes a field as far as memory suffices.
+/// Bakes a field. Fails if memory is short.
 fn bake(context: &Context, baker: &Baker<'_, Field>) -> anyhow::Result<Volume> {
     let bricks = baker.bricks();
     context.check_memory("baking", Shape::memory_need(&bricks), REMEDY)?;
@@ -152,8 +151,8 @@ fn bake(context: &Context, baker: &Baker<'_, Field>) -> anyhow::Result<Volume> {
     Ok(baker.volume(&shape, &progress))
 }
 
-/// Refuses the spaces of scenes without end. Their fields are hazy: a voxel's own view features say
-/// too little of what a ray through haze composites, and pages look washed out.
+/// Refuses NDC and contraction. Their fields are hazy: a voxel's own view features lack what a ray
+/// through haze composites, and pages look washed out (docs/design/042).
 fn check_space(bounds: &Bounds) -> Result<(), Failure> {
     let space = match bounds.space {
         Space::Box => return Ok(()),
@@ -161,12 +160,12 @@ fn check_space(bounds: &Bounds) -> Result<(), Failure> {
         Space::Contraction => "contraction",
     };
     Err(Failure::BadInput(format!(
-        "field.json: the field's space is {space}; the viewer shows only a box: give prep `space: \
-        box` where the scene ends"
+        "field.json: the viewer can't show a field with space {space}; if the scene fits into a \
+        box, set prep.space to box"
     )))
 }
 
-/// All fields of an artifact.
+/// Reads all fields of an artifact.
 fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
     let input = GivenInput::open("field", folder)?;
     let file = fields::read_file(&input)?;
@@ -181,20 +180,21 @@ fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
     Ok((file, fields))
 }
 
-/// The training cameras, some of them with their photograph.
+/// Returns the training cameras, some of them with their photograph.
 fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result<Vec<PageCamera>> {
-    let (count, most) = (views.views.len(), params.photographs as usize);
+    let count = views.views.len();
+    let photographs = params.photographs as usize;
     let mut cameras = Vec::with_capacity(count);
     for (i, view) in views.views.iter().enumerate() {
-        // One in so many: where the share so far passes a whole number.
-        let is_shown = (i + 1) * most / count > i * most / count;
-        let taken_with = view.camera.intrinsics;
-        let drawn = drawn_with(&taken_with);
+        // Spread evenly: a photograph wherever i * photographs / count reaches the next integer.
+        let has_photograph = (i + 1) * photographs / count > i * photographs / count;
+        let intrinsics = view.camera.intrinsics;
+        let pinhole = pinhole_of_fisheye(&intrinsics);
         let photograph = match &view.image {
-            Some(file) if is_shown => {
+            Some(file) if has_photograph => {
                 let image = views.read_over(&folder.join(file))?.to_rgba8();
-                let image = match drawn {
-                    Some(pinhole) => undistorted(&image, &taken_with, &pinhole),
+                let image = match pinhole {
+                    Some(pinhole) => undistorted(&image, &intrinsics, &pinhole),
                     None => image,
                 };
                 Some(shrunk(image, params.photograph_width as usize))
@@ -204,7 +204,7 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
         cameras.push(PageCamera {
             name: view.camera.name.clone(),
             camera_to_world: view.camera.camera_to_world,
-            intrinsics: drawn.unwrap_or(taken_with),
+            intrinsics: pinhole.unwrap_or(intrinsics),
             photograph: photograph.as_ref().map(data_uri),
             photograph_size: photograph.map(|p| ImageSize { width: p.width, height: p.height }),
         });
@@ -212,20 +212,20 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
     Ok(cameras)
 }
 
-/// Returns the pinhole camera that the page draws in place of a fisheye camera. Other distortion is
-/// small enough to be left out.
-fn drawn_with(taken_with: &Intrinsics) -> Option<Intrinsics> {
-    if taken_with.distortion.is_fisheye() { taken_with.pinhole() } else { None }
+/// Returns the pinhole camera that the page draws instead of a fisheye camera. The page ignores
+/// other distortion, which is small enough.
+fn pinhole_of_fisheye(intrinsics: &Intrinsics) -> Option<Intrinsics> {
+    if intrinsics.distortion.is_fisheye() { intrinsics.pinhole() } else { None }
 }
 
-/// An image of at most a width, a whole number of times smaller.
-fn shrunk(image: Rgba8, most: usize) -> Rgba8 {
-    let times = image.width.div_ceil(most);
-    if times < 2 {
+/// Shrinks an image by a whole factor to at most `max_width` pixels in width.
+fn shrunk(image: Rgba8, max_width: usize) -> Rgba8 {
+    let factor = image.width.div_ceil(max_width);
+    if factor < 2 {
         return image;
     }
-    let less = |size: usize| size.div_ceil(times).max(1);
-    resize_pillow(&image, less(image.width), less(image.height), Filter::Box)
+    let [width, height] = [image.width, image.height].map(|size| size.div_ceil(factor).max(1));
+    resize_pillow(&image, width, height, Filter::Box)
 }
 
 fn data_uri(image: &Rgba8) -> String {

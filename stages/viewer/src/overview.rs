@@ -1,44 +1,45 @@
-//! Where a view of the scene starts, and around what it turns.
+//! Initial camera, up direction and centre of rotation of the page's view.
 
 use glam::{DMat3, DVec3};
 use nalgebra::{Matrix3, SymmetricEigen};
 use scene::{Bounds, Camera, common_direction};
 
-use crate::bake::{Volume, in_box};
+use crate::bake::{Volume, to_world};
 
-/// Sine of the angle above the horizon from which things look best.
+/// Sine of the preferred elevation above the horizon; chosen by hand.
 const ELEVATION_SINE: f64 = 0.4;
 
-/// Middle and extent of a scene, in scene units: where voxels lie, or the box without any.
-pub(crate) fn middle(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
-    let of_box = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
+/// Returns centre and extent of the voxels, in scene units; of the box if there are no voxels.
+pub(crate) fn centre_and_size(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
+    let box_centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
     if volume.voxels.is_empty() {
-        return (of_box, bounds.longest_side());
+        return (box_centre, bounds.longest_side());
     }
     let resolution = volume.resolution as f64;
     let points: Vec<DVec3> = volume
         .voxels
         .iter()
         .map(|v| {
-            let place = DVec3::from(v.place.map(|c| (f64::from(c) + 0.5) / resolution));
-            in_box(bounds, place)
+            let position = DVec3::from(v.position.map(|c| (f64::from(c) + 0.5) / resolution));
+            to_world(bounds, position)
         })
         .collect();
-    // A floater or two, and what lies far behind, don't move a median.
+    // The median ignores floaters and distant background.
     let centre =
         DVec3::from([0, 1, 2].map(|axis| quantile(points.iter().map(|p| p[axis]).collect(), 0.5)));
     let reach = quantile(points.iter().map(|p| p.distance(centre)).collect(), 0.9);
     (centre, (2.0 * reach).max(f64::MIN_POSITIVE))
 }
 
-fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
+/// Returns the value below which the given fraction of values is.
+fn quantile(mut values: Vec<f64>, fraction: f64) -> f64 {
     values.sort_by(f64::total_cmp);
-    values[((values.len() - 1) as f64 * share) as usize]
+    values[((values.len() - 1) as f64 * fraction) as usize]
 }
 
-/// The scene's up direction: level cameras have their x axes across it. Where these say too little,
-/// the mean of the cameras' own up directions.
-pub(crate) fn up(cameras: &[&Camera]) -> DVec3 {
+/// Returns the scene's up direction, to which the x axes of level cameras are perpendicular. If the
+/// axes don't determine it, returns the mean of the cameras' own up directions.
+pub(crate) fn up_direction(cameras: &[&Camera]) -> DVec3 {
     let axis = |i: usize| cameras.iter().map(move |c: &&Camera| c.rotation().col(i));
     let mean = axis(1).sum::<DVec3>().try_normalize().unwrap_or(DVec3::Z);
     let moments: DMat3 =
@@ -54,23 +55,23 @@ pub(crate) fn up(cameras: &[&Camera]) -> DVec3 {
     if across.dot(mean) < 0.0 { -across } else { across }
 }
 
-/// The camera to begin with: one that looks from a little above; of cameras that look one way the
-/// one in their middle.
-pub(crate) fn start(cameras: &[&Camera], up: DVec3) -> usize {
+/// Returns the index of the initial camera: one that looks from slightly above; of cameras that
+/// look in one direction, the middle one.
+pub(crate) fn start_camera(cameras: &[&Camera], up: DVec3) -> usize {
     let middle = cameras.iter().map(|c| c.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
-    let off: Vec<f64> = if common_direction(cameras.iter().copied()).is_some() {
+    let deviations: Vec<f64> = if common_direction(cameras.iter().copied()).is_some() {
         cameras.iter().map(|camera| camera.centre().distance(middle)).collect()
     } else {
         cameras.iter().map(|camera| (-camera.forward().dot(up) - ELEVATION_SINE).abs()).collect()
     };
-    (0..cameras.len()).min_by(|&a, &b| off[a].total_cmp(&off[b])).unwrap_or_default()
+    (0..cameras.len()).min_by(|&a, &b| deviations[a].total_cmp(&deviations[b])).unwrap_or_default()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::bake::Voxel;
-    use crate::view::NUMBERS;
+    use crate::view::COEFFICIENTS;
     use scene::Intrinsics;
 
     /// A level camera at a place, looking at the origin.
@@ -97,21 +98,27 @@ mod tests {
         });
         let cameras: Vec<Camera> = places.map(|p| camera(p, up_is)).collect();
         let cameras: Vec<&Camera> = cameras.iter().collect();
-        assert!(up(&cameras).dot(up_is) > 0.9999, "{}", up(&cameras));
-        let start = cameras[start(&cameras, up_is)];
+        let found = up_direction(&cameras);
+        assert!(found.dot(up_is) > 0.9999, "{found}");
+        let start = cameras[start_camera(&cameras, up_is)];
         assert!((-start.forward().dot(up_is) - ELEVATION_SINE).abs() < 0.1);
-        // One camera alone says it by itself.
-        assert!(up(&cameras[..1]).dot(cameras[0].rotation().y_axis) > 0.9999);
+        // A single camera has its own up direction.
+        assert!(up_direction(&cameras[..1]).dot(cameras[0].rotation().y_axis) > 0.9999);
     }
 
     #[test]
     fn the_middle_is_that_of_most_voxels() {
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() };
-        let voxel = |place| Voxel { place, opacity: 1.0, colour: [0.5; 3], view: [0.0; NUMBERS] };
+        let voxel = |position| Voxel {
+            position,
+            opacity: 1.0,
+            colour: [0.5; 3],
+            view: [0.0; COEFFICIENTS],
+        };
         let mut voxels: Vec<Voxel> = (0..100).map(|i| voxel([40 + i % 5, 20, 32])).collect();
         voxels.push(voxel([0, 63, 63]));
-        let (centre, size) = middle(&bounds, &Volume { resolution: 64, voxels });
+        let (centre, size) = centre_and_size(&bounds, &Volume { resolution: 64, voxels });
         let at = |c: f64| (c + 0.5) / 32.0 - 1.0;
         assert!(centre.distance(DVec3::new(at(42.0), at(20.0), at(32.0))) < 1e-9, "{centre}");
         assert!(size < 0.2, "{size}");

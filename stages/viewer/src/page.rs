@@ -1,4 +1,4 @@
-//! The page: one HTML file that needs nothing beside it and asks no network.
+//! The page: one HTML file that needs neither other files nor a network.
 
 use base64::{Engine as _, engine::general_purpose::STANDARD};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
@@ -15,27 +15,29 @@ const SCRIPTS: [&str; 3] = [
     include_str!("page/camera.js"),
     include_str!("page/viewer.js"),
 ];
-/// What the page may do: run its own script and style, and show images that it has in itself.
+/// Content security policy: the page's own scripts and styles, and embedded images.
 const POLICY: &str =
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:";
 
-/// What the page's script is told of the scene, beside the volume's bytes.
+/// Description of the scene for the page's script, in addition to the volume's bytes.
 #[derive(Debug, Serialize)]
 pub(crate) struct PageScene {
+    /// Voxels along each side of the unit cube.
     pub(crate) resolution: usize,
+    /// Number of bricks.
     pub(crate) bricks: usize,
-    /// Red, green and blue of nine spherical harmonics, for each component.
+    /// Red, green and blue of nine spherical harmonics for each component.
     pub(crate) components: Vec<f32>,
     /// Grey level behind the scene.
     pub(crate) background: f32,
     pub(crate) bounds: Bounds,
-    /// Around what the view turns, in the world.
+    /// Centre of rotation, in world coordinates.
     pub(crate) centre: [f64; 3],
     /// Extent of the scene, in scene units.
     pub(crate) size: f64,
-    /// Unit length.
+    /// Up direction, unit length.
     pub(crate) up: [f64; 3],
-    /// The camera that is shown first.
+    /// Index of the camera that is shown first.
     pub(crate) start: usize,
     pub(crate) cameras: Vec<PageCamera>,
 }
@@ -46,7 +48,7 @@ pub(crate) struct PageCamera {
     pub(crate) name: String,
     pub(crate) camera_to_world: [[f64; 4]; 3],
     pub(crate) intrinsics: Intrinsics,
-    /// The LR photograph as a data URL.
+    /// Data URL of the LR photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) photograph: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -60,10 +62,10 @@ pub(crate) struct ImageSize {
     pub(crate) height: usize,
 }
 
-/// The page of a scene.
+/// Renders the page of a scene.
 pub(crate) fn page(scene: &PageScene, atlas: &Atlas) -> anyhow::Result<Markup> {
-    // Inside a script element only `<` could end it.
-    let described = serde_json::to_string(scene)?.replace('<', "\\u003c");
+    // Only `<` could end a script element.
+    let scene_json = serde_json::to_string(scene)?.replace('<', "\\u003c");
     Ok(html! {
         (DOCTYPE)
         html lang="en" {
@@ -88,7 +90,7 @@ pub(crate) fn page(scene: &PageScene, atlas: &Atlas) -> anyhow::Result<Markup> {
                 }
                 (controls(scene))
                 noscript { p { "The view needs JavaScript." } }
-                script id="scene" type="application/json" { (PreEscaped(described)) }
+                script id="scene" type="application/json" { (PreEscaped(scene_json)) }
                 script id="vertex-shader" type="text/plain" { (PreEscaped(VERTEX_SHADER)) }
                 script id="fragment-shader" type="text/plain" { (PreEscaped(FRAGMENT_SHADER)) }
                 script id="volume" type="text/plain" { (STANDARD.encode(&atlas.bytes)) }
@@ -101,10 +103,10 @@ pub(crate) fn page(scene: &PageScene, atlas: &Atlas) -> anyhow::Result<Markup> {
 const LABEL: &str = "View of the scene. Arrow keys turn it, with Shift they move it; plus and \
     minus zoom; N and P go to the next and previous training camera.";
 
-/// What the view can show, and the words for it.
+/// Contents of the view, with their labels.
 const MODES: [(&str, &str); 3] = [("colour", "Colour"), ("depth", "Depth"), ("opacity", "Opacity")];
 
-/// What is under the view.
+/// Controls below the view.
 fn controls(scene: &PageScene) -> Markup {
     html! {
         nav aria-label="View" {
@@ -160,8 +162,12 @@ mod tests {
                 photograph_size: None,
             }],
         };
-        let components = Components { axes: Vec::new(), scales: Vec::new() };
-        let atlas = Atlas { resolution: 64, bricks: 0, components, bytes: vec![1, 2, 3] };
+        let atlas = Atlas {
+            resolution: 64,
+            bricks: 0,
+            components: Components::default(),
+            bytes: vec![1, 2, 3],
+        };
         let text = page(&scene, &atlas).unwrap().into_string();
         assert!(!text.contains("<b onclick") && text.contains("&lt;b onclick"));
         let from = text.find("id=\"scene\"").unwrap();
