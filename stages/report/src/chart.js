@@ -1,6 +1,6 @@
 "use strict";
-// Charts as SVG: lines and points with round numbers on their axes. A pointer or the arrow keys read points; a click
-// or Enter picks one.
+// Charts as SVG: lines and points with round numbers on the axes. A pointer or the arrow keys read points; a click or
+// Enter picks one.
 
 const SVG = "http://www.w3.org/2000/svg";
 const MARKS = [
@@ -11,11 +11,11 @@ const MARKS = [
   "M-4.2-4.2L4.2 4.2M4.2-4.2L-4.2 4.2",
   "M0-4.6v9.2M-4.6 0h9.2",
 ];
-/** Series with a colour and a mark of their own; of more, those that are chosen are told apart. */
-const MOST_COLOURS = MARKS.length;
+/** Maximum number of series with distinct colours and marks; of more series, only chosen ones are distinct. */
+const MAX_COLOURS = MARKS.length;
 const MARGIN = { left: 54, right: 14, top: 12, bottom: 42 };
 const HEIGHT = 270;
-/** Pixels from a point at which it is read. */
+/** Maximum distance in pixels at which a pointer reads a point. */
 const REACH = 44;
 
 function element(name, attributes, parent, text) {
@@ -34,7 +34,7 @@ function shape(name, attributes, parent, text) {
   return made;
 }
 
-/** Round numbers from `low` to `high`, about `count` of them. */
+/** Returns about `count` round numbers from `low` to `high`. */
 function roundNumbers(low, high, count) {
   const span = high - low;
   const power = 10 ** Math.floor(Math.log10(span / count));
@@ -61,7 +61,7 @@ function shortNumber(value) {
   return String(Number(value.toPrecision(4)));
 }
 
-/** An axis: where a value is between 0 and 1, and its numbers. */
+/** Axis: maps values to 0..1, and has round numbers. */
 function axis(values, { log = false, names = null, count = 5 }) {
   if (names) {
     const place = (value) => (names.length < 2 ? 0.5 : 0.04 + (0.92 * value) / (names.length - 1));
@@ -83,9 +83,9 @@ function axis(values, { log = false, names = null, count = 5 }) {
 }
 
 /**
- * A chart in `home`. `spec`: `title`; `x` and `y`, each with `label`, and `log` or `names` for x; `series`, each with
- * `label`, `points` of `x`, `y`, `text` and `key`, and `chosen` where it stands out; `lines`; `named` where points bear
- * their series' names as far as there is room; `pick(point)`.
+ * Chart in the element `home`. `spec` has: `title`; `x` and `y`, each with `label`, and for x `log` or `names`; `series`,
+ * each with `label`, `points` of `x`, `y`, `text` and `key`, and `chosen` if it is highlighted; `lines`; `named` if points
+ * are labelled with their series' names where there is room; `pick(point)`.
  */
 class Chart {
   constructor(home) {
@@ -130,7 +130,7 @@ class Chart {
     this.svg = shape("svg", { width: this.width, height: HEIGHT, "aria-hidden": "true" }, plot);
     this.at = (point) => [MARGIN.left + x.place(point.x) * inner[0], MARGIN.top + (1 - y.place(point.y)) * inner[1]];
     this.frame(x, y, inner);
-    const isCrowded = spec.series.length > MOST_COLOURS;
+    const isCrowded = spec.series.length > MAX_COLOURS;
     const order = spec.series
       .map((series, i) => ({ series, i }))
       .sort((a, b) => (a.series.chosen ? 1 : 0) - (b.series.chosen ? 1 : 0));
@@ -138,7 +138,7 @@ class Chart {
     for (const { series, i } of order)
       this.drawSeries(
         series,
-        isCrowded && !series.chosen ? "rest" : `c${(isCrowded ? series.chosen - 1 : i) % MOST_COLOURS}`,
+        isCrowded && !series.chosen ? "rest" : `c${(isCrowded ? series.chosen - 1 : i) % MAX_COLOURS}`,
         i,
       );
     this.ring = shape("circle", { class: "ring", r: 8, visibility: "hidden" }, this.svg);
@@ -187,7 +187,7 @@ class Chart {
     });
   }
 
-  /** Writes series' names beside their points where there is room, chosen ones first. Returns whether all have room. */
+  /** Labels points with their series' names where there is room, chosen series first. True if all have room. */
   drawNames() {
     const box = ([x, y], [width, height]) => ({ left: x, right: x + width, top: y, bottom: y + height });
     const overlap = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
@@ -195,7 +195,7 @@ class Chart {
     const isInside = ({ left, right, top, bottom }) =>
       left >= inside.left && right <= inside.right && top >= inside.top && bottom <= inside.bottom;
     const taken = this.points.map(({ place: [x, y] }) => box([x - 6, y - 6], [12, 12]));
-    // Points are in the order in which they are drawn: chosen ones last.
+    // Points are in drawing order: chosen ones last.
     const placed = this.points.toReversed().filter(({ place: [x, y], series }) => {
       const text = shape("text", { class: "name" }, this.svg, series.label);
       const size = [text.getComputedTextLength(), 13];
@@ -226,7 +226,7 @@ class Chart {
     if (this.spec.series.length < 2) return;
     for (const [i, series] of this.spec.series.entries()) {
       if (isCrowded && !series.chosen) continue;
-      const colour = (isCrowded ? series.chosen - 1 : i) % MOST_COLOURS;
+      const colour = (isCrowded ? series.chosen - 1 : i) % MAX_COLOURS;
       const entry = element("span", {}, this.legend);
       const svg = shape("svg", { width: 14, height: 14, viewBox: "-7 -7 14 14", "aria-hidden": "true" }, entry);
       shape("path", { class: "mark", d: MARKS[colour] }, shape("g", { class: `series c${colour}` }, svg));
@@ -245,7 +245,7 @@ class Chart {
     return near && far(near) <= REACH ? near : null;
   }
 
-  /** Shows what a point says; null hides it. */
+  /** Shows a point's text; null hides it. */
   read(point) {
     this.current = point;
     this.tip.textContent = point ? point.text : "";

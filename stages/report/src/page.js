@@ -1,5 +1,5 @@
 "use strict";
-// Starts the page's parts.
+// Entry point: starts the page's parts.
 
 function copyButtons() {
   for (const command of document.querySelectorAll(".command")) {
@@ -16,7 +16,7 @@ function copyButtons() {
   }
 }
 
-/** A link into a folded part opens it. */
+/** Opens the folded part that a link leads to. */
 function openTargets() {
   for (const link of document.querySelectorAll(".graph a")) {
     link.addEventListener("click", () => {

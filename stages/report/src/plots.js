@@ -1,10 +1,10 @@
 "use strict";
-// What is plotted: figures of every view, trade-offs, sweeps and trainings.
+// Choice of plots: figures of every view, trade-offs, sweeps and trainings.
 
-/** The first is best seen on a line; from a tenfold range on, powers of ten are. */
+/** Minimum ratio of the largest to the smallest value for a logarithmic axis. */
 const LOG_RANGE = 10;
-/** Points of a plot that bear names. */
-const MOST_NAMES = 12;
+/** Maximum number of labelled points in a plot. */
+const MAX_NAMES = 12;
 
 const isLog = (values) => Math.min(...values) > 0 && Math.max(...values) / Math.min(...values) >= LOG_RANGE;
 
@@ -13,7 +13,7 @@ function duration(seconds) {
 }
 
 class Plots {
-  /** `show(view)` shows a view above. */
+  /** `show(view)` shows a view in the comparison. */
   constructor(data, show) {
     this.data = data;
     this.show = show;
@@ -41,7 +41,7 @@ class Plots {
     this.draw();
   }
 
-  /** Results that the comparison shows stand out. */
+  /** Highlights the results that the comparison shows. */
   choose(rows) {
     this.chosen = rows;
     this.draw();
@@ -61,13 +61,13 @@ class Plots {
     this.charts.training?.show(this.trainingSpec());
   }
 
-  /** 1 and 2 for the left and the right result, nothing for others. */
+  /** Returns 1 for the left and 2 for the right result, otherwise undefined. */
   mark(row) {
     const place = this.chosen.indexOf(row);
     return place < 0 ? undefined : place + 1;
   }
 
-  /** A figure in words: its label may end in its unit. */
+  /** Formats a figure; its label may end in its unit. */
   text(value, figure) {
     const { label, digits } = this.data.figures[figure];
     const words = label.replace(/ ?[↑↓]/, "");
@@ -109,7 +109,7 @@ class Plots {
     });
     return {
       title: `${figures[figure].label} against training time`,
-      named: series.length <= MOST_NAMES,
+      named: series.length <= MAX_NAMES,
       x: { label: "Training time, s", log: isLog(times) },
       y: { label: figures[figure].label },
       series,

@@ -1,12 +1,12 @@
 "use strict";
-// The comparison: two pictures of a view with a division between them, or many side by side; zoom and pan are one for
-// all, and stay when the view changes.
+// Comparison of pictures: two of a view with a division between them, or many side by side. All share zoom and pan,
+// which stay when the view changes.
 
-/** Pictures side by side at most. */
-const MOST_PANES = 24;
-/** Screen pixels from the division at which it is taken hold of, where a picture can be panned, too. */
+/** Maximum number of pictures side by side. */
+const MAX_PANES = 24;
+/** Maximum distance in screen pixels at which a drag moves the division instead of panning. */
 const GRIP = 18;
-const MOST_ZOOM = 40;
+const MAX_ZOOM = 40;
 
 class Viewer {
   constructor(data, changed) {
@@ -36,7 +36,7 @@ class Viewer {
     if (data.crop) this.showCrop(data.crop);
   }
 
-  // What can be chosen.
+  // Choices.
 
   fillViews() {
     const { scenes, views } = this.data;
@@ -46,7 +46,7 @@ class Viewer {
     this.part("view").replaceChildren(...(shown.length > 1 ? shown : [...shown[0].children]));
   }
 
-  /** Layers with a picture of the view. */
+  /** Returns the layers with a picture of the view. */
   layers() {
     const { view } = this.state;
     return this.data.layers
@@ -58,7 +58,7 @@ class Viewer {
     return this.pictures.get(`${view}/${layer}`);
   }
 
-  /** Keeps the layers that are there, and otherwise takes the LR photograph and the best render. */
+  /** Keeps available layers; replaces missing ones by the LR photograph and the best render. */
   chooseLayers() {
     const { state } = this;
     const layers = this.layers();
@@ -89,14 +89,14 @@ class Viewer {
     this.part("kind").value = state.kind;
   }
 
-  /** A layer in words, by itself; of a metric's title, what stands before the brackets. */
+  /** Returns a layer's full name; a metric's title is cut before its brackets. */
   name({ kind, group, label }) {
     if (["low-resolution", "ground-truth", "render"].includes(kind)) return label;
     const words = { error: "Error", depth: "Depth" }[kind] ?? group.split(" (")[0];
     return label === "Render" ? words : `${words}: ${label}`;
   }
 
-  // What is shown.
+  // Display.
 
   show(change) {
     Object.assign(this.state, change);
@@ -116,7 +116,7 @@ class Viewer {
     this.changed(state);
   }
 
-  /** A picture in a window of its own. */
+  /** Creates the window of one picture within a pane. */
   window(layer, parent) {
     const picture = this.picture(layer);
     const half = element("div", { class: "half" }, parent);
@@ -150,8 +150,8 @@ class Viewer {
     const isChosen = ({ index }) => index === this.state.left || index === this.state.right;
     const all = kinds.flatMap((kind) => this.layers().filter((layer) => layer.kind === kind));
     const some =
-      all.length > MOST_PANES
-        ? [...all.filter(isChosen), ...all.filter((layer) => !isChosen(layer))].slice(0, MOST_PANES)
+      all.length > MAX_PANES
+        ? [...all.filter(isChosen), ...all.filter((layer) => !isChosen(layer))].slice(0, MAX_PANES)
         : all;
     const figure = this.data.figures[0];
     this.panes = [];
@@ -183,7 +183,7 @@ class Viewer {
     );
   }
 
-  /** Puts pictures where zoom and pan have them. */
+  /** Positions the pictures by zoom and pan. */
   place() {
     const { state } = this;
     this.limit();
@@ -212,19 +212,19 @@ class Viewer {
   limit() {
     const { state } = this;
     const one = this.oneToOne();
-    state.zoom = Math.min(Math.max(state.zoom, Math.min(1, one)), Math.max(8, MOST_ZOOM * one));
+    state.zoom = Math.min(Math.max(state.zoom, Math.min(1, one)), Math.max(8, MAX_ZOOM * one));
     const edge = state.zoom > 1 ? 0.5 / state.zoom : 0.5;
     state.x = Math.min(Math.max(state.x, edge), 1 - edge);
     state.y = Math.min(Math.max(state.y, edge), 1 - edge);
   }
 
-  /** The zoom at which a pixel of the first picture is one of the screen. */
+  /** Returns the zoom at which a pixel of the first picture is a pixel of the screen. */
   oneToOne() {
     const { pane, windows } = this.panes[0];
     return windows[0].picture.width / Math.max(1, pane.clientWidth);
   }
 
-  /** The original in the place of a smaller copy; copies stay where there are no originals. */
+  /** Replaces smaller copies by originals, if available. */
   sharpen(window) {
     const { image, picture } = window;
     if (!this.hasOriginals || window.isSharp || window.isLoading || picture.uri.startsWith("data:image/png")) return;
@@ -294,7 +294,7 @@ class Viewer {
     });
   }
 
-  // What a reader does.
+  // Input.
 
   listen() {
     const number = (event) => Number(event.target.value);
@@ -347,7 +347,7 @@ class Viewer {
     this.move({ zoom: Math.min(width, height) / side, x: (x + side / 2) / width, y: (y + side / 2) / height });
   }
 
-  /** Zooms about a place of the pane, from its left upper corner (0, 0) to the right lower one (1, 1). */
+  /** Zooms about a position in the pane, from its upper left (0, 0) to its lower right corner (1, 1). */
   zoomBy(times, [atX, atY] = [0.5, 0.5]) {
     const { zoom, x, y } = this.state;
     this.state.zoom = zoom * times;
@@ -356,14 +356,14 @@ class Viewer {
     this.move({ x: x + (atX - 0.5) * (1 / zoom - 1 / after), y: y + (atY - 0.5) * (1 / zoom - 1 / after) });
   }
 
-  /** The pane under a pointer, and where in it. */
+  /** Returns the pane under a pointer, and the position in it. */
   under(event) {
     const pane = event.target.closest(".pane") ?? this.panes[0].pane;
     const box = pane.getBoundingClientRect();
     return { box, at: [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height] };
   }
 
-  /** The wheel zooms with Ctrl, as a pinch on a trackpad does, or once the stage is in use. */
+  /** The wheel zooms with Ctrl (a trackpad's pinch sets it), or after the stage has got the focus. */
   wheel(event) {
     if (!event.ctrlKey && !event.metaKey && document.activeElement !== this.stage) return;
     event.preventDefault();

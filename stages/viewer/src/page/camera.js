@@ -7,7 +7,7 @@ const scaled = (a, times) => a.map((x) => x * times);
 const length = (a) => Math.sqrt(dot(a, a));
 const unit = (a) => scaled(a, 1 / Math.max(length(a), 1e-12));
 
-/** A vector turned about a unit axis (Rodrigues). */
+/** Rotates a vector about a unit axis (Rodrigues). */
 function turned(v, axis, angle) {
   const [c, s] = [Math.cos(angle), Math.sin(angle)];
   const across = [
@@ -16,34 +16,34 @@ function turned(v, axis, angle) {
   return v.map((x, i) => x * c + across[i] * s + axis[i] * along);
 }
 
-/** Rows from columns. */
+/** Converts columns to rows. */
 const poseOf = (columns) => [0, 1, 2].map((i) => columns.map((v) => v[i]));
 
-/** A pose turned about the point `distance` before it: by `across` about the scene's `up`, by `down` about its own right. */
+/** Rotates a pose about the point at `distance` in front of it: by `across` about `up`, by `down` about its right axis. */
 function orbited(pose, distance, up, across, down) {
   const [right, above, back, centre] = [0, 1, 2, 3].map((c) => column(pose, c));
   const target = plus(centre, back, -distance);
   const turn = (v) => turned(turned(v, right, down), up, across);
-  // Not over the top: there left and right would change places.
+  // The pose stays below the pole, where left and right would be exchanged.
   const next = turn(back);
   const steep = Math.abs(dot(next, up)) > 0.999 && Math.abs(dot(next, up)) > Math.abs(dot(back, up));
   if (steep || dot(turn(above), up) * dot(above, up) < 0) return down === 0 ? pose : orbited(pose, distance, up, across, 0);
   return poseOf([turn(right), turn(above), next, plus(target, next, distance)]);
 }
 
-/** A pose moved sideways and upwards. */
+/** Moves a pose sideways and upwards. */
 function panned(pose, right, up) {
   const centre = plus(plus(column(pose, 3), column(pose, 0), right), column(pose, 1), up);
   return pose.map((row, i) => [...row.slice(0, 3), centre[i]]);
 }
 
-/** A pose moved towards the point `distance` before it, which is `factor` times as far then. */
+/** Moves a pose towards the point at `distance` in front of it, so that `factor` times the distance remains. */
 function zoomed(pose, distance, factor) {
   const centre = plus(column(pose, 3), column(pose, 2), distance * (factor - 1));
   return pose.map((row, i) => [...row.slice(0, 3), centre[i]]);
 }
 
-/** Intrinsics with which all of a camera's image fits into so many pixels. */
+/** Returns intrinsics with which a camera's whole image fits into the given number of pixels. */
 function fitted({ width: w, height: h, fx, fy, cx, cy }, width, height) {
   const scale = Math.min(width / w, height / h);
   return {
@@ -52,14 +52,14 @@ function fitted({ width: w, height: h, fx, fy, cx, cy }, width, height) {
   };
 }
 
-/** Where a camera sees a point: x, y in pixels, and its depth. */
+/** Projects a point: x and y in pixels, and depth. */
 function projected({ camera_to_world: pose, intrinsics: k }, point) {
   const from = plus(point, column(pose, 3), -1);
   const [x, y, z] = [0, 1, 2].map((c) => dot(from, column(pose, c)));
   return [k.cx - (k.fx * x) / z, k.cy + (k.fy * y) / z, -z];
 }
 
-/** A camera's frustum: its centre and the corners of its image at some depth. */
+/** Returns a camera's frustum: its centre and its image's corners at a depth. */
 function frustumOf({ camera_to_world: pose, intrinsics: k }, depth) {
   const corner = ([u, v]) => {
     const own = [((u - k.cx) / k.fx) * depth, (-(v - k.cy) / k.fy) * depth, -depth];

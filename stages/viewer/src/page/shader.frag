@@ -1,14 +1,14 @@
 #version 300 es
-// One ray a pixel through the volume: opacity, colour and view components of every step are
-// composited; then the direction changes the colour, once a ray (deferred shading, as the field
-// has it itself).
+// Marches one ray per pixel through the volume and composites opacity, colour and view components of
+// each step. View dependence is then added to the colour, once per ray (deferred shading, as in the
+// field itself).
 precision highp float;
 precision highp int;
 precision highp sampler3D;
 precision highp usampler3D;
 
-// The volume. A place of `bricks` has the brick's place in the atlas (rgb) and the distance to the
-// next brick in bricks (a), 0 in one. A brick is 8³ voxels and the first of its neighbours behind.
+// The volume. A texel of `bricks` has the brick's position in the atlas (rgb) and the distance to the
+// nearest brick in bricks (a), 0 in a brick. A brick has 8³ voxels and its upper neighbours' first ones.
 uniform usampler3D bricks;
 uniform sampler3D colours;  // rgb: colour times opacity; a: opacity of a step of a voxel's length
 uniform sampler3D views;    // components of the view dependence times opacity
@@ -16,12 +16,12 @@ uniform vec3 atlas_size;    // of both textures, in texels
 uniform float resolution;   // voxels along the cube's side
 uniform vec3 components[36];  // four times nine spherical harmonics' red, green and blue
 
-// The box in the unit cube. All lengths are in its longest side: single precision can't hold the
-// world's coordinates far from the origin, so the page computes with them.
+// The box in the unit cube. All lengths are relative to its longest side: single precision is too
+// coarse for world coordinates far from the origin, which only the page's script uses.
 uniform vec3 extent;
 uniform vec2 range;  // distances between which there is anything
 
-// The camera: OpenGL's axes; pixels from the top left corner.
+// The camera: OpenGL's axes; pixels from the upper left corner.
 uniform mat3 rotation;
 uniform vec3 centre;  // in the unit cube
 uniform vec4 intrinsics;  // fx, fy, cx, cy
@@ -35,21 +35,21 @@ uniform vec2 depth_range;
 out vec4 shown;
 
 const float FAR = 1e30;
-// Steps in voxels. Shorter ones show the same, with more reads.
+// Length of a step in voxels. Shorter steps render nearly the same with more reads (docs/design/042).
 const float STEP = 1.0;
-// Light below which a ray ends.
+// Transmittance below which a ray ends (docs/design/042).
 const float DARK = 1.0 / 256.0;
-const int MOST_STEPS = 4096;
+const int MAX_STEPS = 4096;
 
 int reads = 0;
 
-// A ray in the cube, by a parameter t: its distance over the box's longest side.
+// Ray in the cube; its parameter t is the distance over the box's longest side.
 struct CubeRay {
   vec3 origin, direction;
   float enter, leave;
 };
 
-// Limits [enter, leave] to where offset + slope * x >= 0.
+// Limits [enter, leave] to the interval with offset + slope * x >= 0.
 void clip_to(float offset, float slope, inout vec2 part) {
   if (slope > 0.0) part.x = max(part.x, -offset / slope);
   else if (slope < 0.0) part.y = min(part.y, -offset / slope);
@@ -67,8 +67,8 @@ CubeRay clipped(vec3 origin, vec3 along) {
 
 vec3 place_at(CubeRay ray, float t) { return ray.origin + t * ray.direction; }
 
-// How far t goes until a ray leaves the empty bricks around, at least: `low` and `high` are their
-// corners in voxels.
+// Returns the minimum increase of t after which a ray leaves the surrounding empty bricks, whose
+// corners in voxels are `low` and `high`.
 float way_out(CubeRay ray, vec3 at, vec3 low, vec3 high) {
   vec3 speed = ray.direction * resolution;
   vec3 wall = mix(low, high, step(0.0, speed));
@@ -76,7 +76,7 @@ float way_out(CubeRay ray, vec3 at, vec3 low, vec3 high) {
   return min(min(way.x, way.y), way.z);
 }
 
-// What is added to the colour's logit along a direction, for composited components.
+// Returns the view dependence of the colour's logit for composited components and a direction.
 vec3 view_part(vec4 weights, vec3 d) {
   float basis[9] = float[9](
     0.2820948, -0.4886025 * d.y, 0.4886025 * d.z, -0.4886025 * d.x, 1.0925484 * d.x * d.y,
@@ -103,7 +103,7 @@ Seen march(CubeRay ray) {
   ivec3 last = ivec3(resolution) / 8 - 1, current = ivec3(-1);
   uvec4 brick;
   float t = ray.enter + 0.5 * h;
-  for (int i = 0; i < MOST_STEPS && t < ray.leave && seen.through > DARK; i++) {
+  for (int i = 0; i < MAX_STEPS && t < ray.leave && seen.through > DARK; i++) {
     vec3 at = clamp(place_at(ray, t) * resolution - 0.5, 0.0, resolution - 1.0);
     ivec3 own = min(ivec3(at) / 8, last);
     if (own != current) {
@@ -128,7 +128,7 @@ Seen march(CubeRay ray) {
       reads++;
       float through = seen.through * max(kept, 1e-6);
       if (seen.through > 0.5 && through <= 0.5) {
-        // Within the step light fades evenly.
+        // Light decreases evenly within the step.
         seen.median = t + h * (log(2.0 * seen.through) / log(seen.through / through) - 0.5);
       }
       seen.through = through;
@@ -138,7 +138,7 @@ Seen march(CubeRay ray) {
   return seen;
 }
 
-// Colours of depth from near (warm) to far.
+// Returns the colour of a depth, from near (warm) to far.
 vec3 of_depth(float share) {
   const vec3 stops[5] = vec3[5](
     vec3(0.75, 0.15, 0.10), vec3(0.95, 0.60, 0.20), vec3(0.90, 0.90, 0.55), vec3(0.25, 0.65, 0.70),
@@ -164,7 +164,7 @@ void main() {
     shown = vec4(vec3(opacity), 1.0);
   } else if (mode == DEPTH) {
     float z = -own.z * seen.median;
-    // Even in disparity, so that what is near has most colours.
+    // Colours are uniform in disparity, so that near depths have most of them.
     vec2 ends = 1.0 / depth_range;
     vec3 colour = of_depth((1.0 / z - ends.x) / (ends.y - ends.x));
     shown = vec4(seen.median > -FAR ? mix(vec3(1), colour, opacity) : vec3(1), 1.0);

@@ -1,13 +1,13 @@
-// The page: what is shown from where, and what moves it.
+// The page: camera, displayed content, and input.
 
 const text = (id) => document.getElementById(id).textContent.trim();
 const part = (id) => document.getElementById(id);
 
-// A drawing that takes longer is drawn with fewer pixels while something moves.
+// Maximum milliseconds of a drawing during motion; slower views are drawn with fewer pixels.
 const SMOOTH_MS = 40;
-// As long after the last movement all pixels are drawn.
+// Milliseconds after the last motion at which all pixels are drawn.
 const STILL_MS = 180;
-const MOST_PIXEL_RATIO = 2;
+const MAX_PIXEL_RATIO = 2;
 
 class Viewer {
   constructor(scene, bytes) {
@@ -16,13 +16,13 @@ class Viewer {
     this.volume = new Volume(this.canvas, scene, bytes);
     this.mode = "colour";
     this.showsFrusta = false;
-    // Milliseconds for each pixel drawn.
+    // Milliseconds per drawn pixel.
     this.cost = 0;
     this.listen();
     this.goTo(scene.start);
   }
 
-  /** Takes a training camera's place. */
+  /** Moves the view to a training camera. */
   goTo(index) {
     const count = this.scene.cameras.length;
     this.at = (index + count) % count;
@@ -50,14 +50,14 @@ class Viewer {
 
   zoom(factor) { this.move(zoomed(this.pose, this.distance, factor), this.distance * factor); }
 
-  /** The camera that is shown, with `ratio` pixels to a pixel of the page. */
+  /** Returns the view's camera, with `ratio` pixels per pixel of the page. */
   camera(ratio) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const size = [width, height].map((n) => Math.max(1, Math.round(n * ratio)));
     return { camera_to_world: this.pose, intrinsics: fitted(this.lens, ...size) };
   }
 
-  /** Draws soon; while something moves perhaps with fewer pixels, and later with all of them. */
+  /** Schedules a drawing: with fewer pixels during motion if necessary, and later with all of them. */
   changed(isMoving) {
     this.isMoving = isMoving;
     clearTimeout(this.still);
@@ -67,9 +67,9 @@ class Viewer {
     this.isBusy = true;
   }
 
-  /** Draws until nothing has changed meanwhile. */
+  /** Draws again until nothing has changed during a drawing. */
   async draw() {
-    const ratio = Math.min(devicePixelRatio || 1, MOST_PIXEL_RATIO);
+    const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
     while (this.isStale) {
       this.isStale = false;
       const time = this.cost * this.canvas.clientWidth * this.canvas.clientHeight * ratio ** 2;
@@ -81,7 +81,7 @@ class Viewer {
     this.isBusy = false;
   }
 
-  /** The range of depths that colours show: around the scene. */
+  /** Returns the range of the depth colours, around the scene. */
   depths({ camera_to_world: pose }) {
     const { centre, size } = this.scene;
     const middle = length(plus(centre, column(pose, 3), -1));
@@ -112,7 +112,7 @@ class Viewer {
     });
   }
 
-  /** Says where the view is from, and shows the photograph that was taken there, or at the last place where one was. */
+  /** Updates the camera's name, and shows the photograph of this or of the last camera that has one. */
   say() {
     if (this.at >= 0) this.last = this.at;
     const { name, photograph, photograph_size: size } = this.scene.cameras[this.last];
@@ -148,7 +148,7 @@ class Viewer {
     this.listenToPointers();
   }
 
-  /** The training camera so many after the last one. */
+  /** Moves to the training camera that is `by` after the last one. */
   step(by) { this.goTo(this.last + by); }
 
   key(event) {
@@ -165,7 +165,7 @@ class Viewer {
     event.preventDefault();
   }
 
-  /** One pointer orbits, with Shift or another button it pans; two pan and zoom. */
+  /** One pointer orbits, or pans with Shift or another button; two pointers pan and zoom. */
   listenToPointers() {
     const { canvas } = this;
     const pointers = new Map();
@@ -195,9 +195,9 @@ class Viewer {
     }
   }
 
-  // For scripts, such as tests.
+  // Interface for scripts, such as tests.
 
-  /** Draws what a camera sees, `{camera_to_world, intrinsics}` as in views.json, pixel by pixel; the milliseconds it takes. */
+  /** Draws the view of a camera, `{camera_to_world, intrinsics}` as in views.json; returns the milliseconds taken. */
   async show(camera, mode = "colour") {
     const from = performance.now();
     this.volume.draw(camera, mode, this.depths(camera));
@@ -207,13 +207,13 @@ class Viewer {
     return time;
   }
 
-  /** What a camera sees, as a PNG's data URL. */
+  /** Returns the view of a camera as a PNG's data URL. */
   image(camera, mode = "colour") {
     this.volume.draw(camera, mode, this.depths(camera));
     return this.canvas.toDataURL("image/png");
   }
 
-  /** Texture reads a pixel, the mean over a camera's image. */
+  /** Returns the mean number of texture reads per pixel of a camera's image. */
   reads(camera) {
     this.volume.draw(camera, "reads", this.depths(camera));
     const pixels = this.volume.pixels();

@@ -1,11 +1,11 @@
-// The volume on the GPU: textures from the page's bytes, and one program that draws it.
+// The volume on the GPU: textures from the page's bytes, and the program that draws them.
 
 const BRICK = 8;
-// With the first neighbours behind, between which and the last own voxels places are interpolated.
+// Side of a tile: a brick and its upper neighbours' first voxels, for interpolation.
 const TILE = BRICK + 1;
 const MODES = { colour: 0, depth: 1, opacity: 2, reads: 3 };
 
-/** Bytes of a base64 text, inflated. */
+/** Decodes and inflates a base64 text. */
 async function inflated(text) {
   const raw = atob(text);
   const bytes = new Uint8Array(raw.length);
@@ -14,14 +14,14 @@ async function inflated(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Tiles along each axis of an atlas that is as even as can be. */
+/** Returns the number of tiles along each axis of an atlas that is as cubic as possible. */
 function tilesOf(count, most) {
   const x = Math.min(most, Math.ceil(Math.cbrt(count)));
   const y = Math.min(most, Math.ceil(Math.sqrt(count / x)));
   return [x, y, Math.max(1, Math.ceil(count / (x * y)))];
 }
 
-/** The volume's bytes as three textures' worth: where bricks lie in the atlas, colours, and view components. */
+/** Splits the volume's bytes into three textures: bricks' positions in the atlas, colours, and view components. */
 function unpacked(bytes, resolution, count, most) {
   const side = resolution / BRICK;
   const distances = bytes.subarray(0, side ** 3);
@@ -42,7 +42,7 @@ function unpacked(bytes, resolution, count, most) {
   const size = tiles.map((n) => n * TILE);
   const texels = size[0] * size[1] * size[2];
   const [colours, views] = [new Uint8Array(4 * texels), new Uint8Array(4 * texels).fill(128)];
-  // Where a voxel of a tile comes from: the tile's own brick, or one of those behind it.
+  // Source of a tile's voxel: the tile's own brick, or an upper neighbour.
   places.forEach((place, slot) => {
     const at = [place % side, Math.floor(place / side) % side, Math.floor(place / side ** 2)];
     const behind = (bits) => {
@@ -122,7 +122,7 @@ class Volume {
     gl.uniform1i(this.at(name), unit);
   }
 
-  /** Lengths on the GPU are in the box's longest side, positions from its corner: the world's may be too large for floats. */
+  /** Lengths on the GPU are relative to the box's longest side and corner: world coordinates may be too large for floats. */
   setBox({ min, max, near, far }) {
     const { gl } = this;
     const sides = plus(max, min, -1);
@@ -133,8 +133,8 @@ class Volume {
   }
 
   /**
-   * Draws what a pinhole camera sees, `camera_to_world` three rows of four numbers and `intrinsics` as in views.json.
-   * `width` × `height` are the canvas's pixels.
+   * Draws the view of a pinhole camera, with `camera_to_world` (three rows of four numbers) and `intrinsics` as in
+   * views.json, into `width` × `height` pixels of the canvas.
    */
   draw({ camera_to_world: m, intrinsics: k }, mode, depths) {
     const { gl, canvas } = this;
@@ -149,7 +149,7 @@ class Volume {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** Waits until all is drawn. Reading a pixel would do so, too, but stops everything meanwhile. */
+  /** Waits until drawing has finished. Reading a pixel would wait, too, but blocks the page. */
   async finished() {
     const { gl } = this;
     const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -160,7 +160,7 @@ class Volume {
     gl.deleteSync(fence);
   }
 
-  /** The pixels drawn: RGBA, row by row from the top. */
+  /** Returns the drawn pixels: RGBA, row by row from the top. */
   pixels() {
     const { width, height } = this.canvas;
     const context = new OffscreenCanvas(width, height).getContext("2d");
