@@ -115,7 +115,7 @@ impl Data {
     ) -> anyhow::Result<Self> {
         let layers = layers(report)?;
         let mut views = Vec::new();
-        let mut scales = Scales::default();
+        let mut depth_ranges = Vec::new();
         let mut requests = Vec::new();
         for (scene, scene_views) in report.scenes.iter().enumerate() {
             let first = views.len();
@@ -129,7 +129,7 @@ impl Data {
                 ranges.extend(layer.depth_range(names)?);
             }
             let depths = pixels::common_range(ranges).unwrap_or((0.0, 1.0));
-            scales.add_scene(report, &layers, scene, depths);
+            depth_ranges.push(depths);
             for &view in &chosen {
                 let name = scene_views.views[view].as_str();
                 for (layer, _) in layers.iter().enumerate().filter(|(_, l)| l.scene == scene) {
@@ -142,6 +142,7 @@ impl Data {
         let requested = requested.and_then(|name| views.iter().position(|v| v.name == *name));
         let requested = requested.filter(|view| pictures.iter().any(|p| p.view == *view));
         let first = pictures.first().map_or(0, |picture| picture.view);
+        let (layer_data, scales) = layer_data(report, &layers, &depth_ranges);
         Ok(Self {
             scenes: report.scenes.iter().map(|scene| scene.data_set.clone()).collect(),
             view: requested.unwrap_or(first),
@@ -151,8 +152,8 @@ impl Data {
                 .and_then(|best| report.rows.iter().position(|r| r.index == best.index)),
             figures: figures(report),
             rows: report.rows.iter().map(|row| row_data(report, row)).collect(),
-            layers: scales.layer_data(&layers),
-            scales: scales.all,
+            layers: layer_data,
+            scales,
             curves: curves(&report.run.nodes),
             pictures,
             views,
@@ -190,49 +191,36 @@ fn choose_views(
     chosen
 }
 
-/// Distinct scales of a page, and the scale of each layer.
-#[derive(Default)]
-struct Scales {
-    all: Vec<Scale>,
-    /// Index of a scale in `all`, by a layer's index.
-    by_layer: BTreeMap<usize, usize>,
-}
-
-impl Scales {
-    /// Adds the scales of a data set's layers.
-    fn add_scene(
-        &mut self,
-        report: &Report<'_>,
-        layers: &[Layer<'_>],
-        scene: usize,
-        depths: (f32, f32),
-    ) {
-        for (index, layer) in layers.iter().enumerate().filter(|(_, layer)| layer.scene == scene) {
-            let scale = match (&layer.group, layer.row.map(|row| &report.rows[row])) {
-                (Group::Depth, _) => Scale::depth(depths),
-                (Group::Error, Some(row)) => error_scale(row),
-                _ => continue,
-            };
-            let scale_index =
-                self.all.iter().position(|other| *other == scale).unwrap_or_else(|| {
-                    self.all.push(scale);
-                    self.all.len() - 1
-                });
-            self.by_layer.insert(index, scale_index);
-        }
-    }
-
-    fn layer_data(&self, layers: &[Layer<'_>]) -> Vec<LayerData> {
-        let data = layers.iter().enumerate().map(|(index, layer)| LayerData {
+/// Returns the layers' data and their distinct scales; `depths` has the range of each data set.
+fn layer_data(
+    report: &Report<'_>,
+    layers: &[Layer<'_>],
+    depths: &[(f32, f32)],
+) -> (Vec<LayerData>, Vec<Scale>) {
+    let mut data = Vec::with_capacity(layers.len());
+    let mut scales: Vec<Scale> = Vec::new();
+    for layer in layers {
+        let scale = match (&layer.group, layer.row.map(|row| &report.rows[row])) {
+            (Group::Depth, _) => Some(Scale::depth(depths[layer.scene])),
+            (Group::Error, Some(row)) => Some(error_scale(row)),
+            _ => None,
+        };
+        let index = scale.map(|scale| {
+            scales.iter().position(|other| *other == scale).unwrap_or_else(|| {
+                scales.push(scale);
+                scales.len() - 1
+            })
+        });
+        data.push(LayerData {
             label: layer.label.clone(),
             group: layer.group.heading().to_owned(),
             kind: layer.group.kind(),
             scene: layer.scene,
             row: layer.row,
-            scale: self.by_layer.get(&index).copied(),
+            scale: index,
         });
-        data.collect()
     }
+    (data, scales)
 }
 
 /// Returns the scale of a row's error maps; without HR truth they show errors at LR.

@@ -61,9 +61,10 @@ impl Folder {
         self.views.views.iter().find(|view| view.camera.name == name)
     }
 
-    /// Reads an image of the folder over the background.
-    fn colour(&self, file: &str) -> anyhow::Result<Rgba8> {
-        Ok(self.views.read_over(&self.path.join(file))?.to_rgba8())
+    /// Reads an image of the folder, if any, over the background.
+    fn colour(&self, file: Option<&String>) -> anyhow::Result<Option<Rgba8>> {
+        let Some(file) = file else { return Ok(None) };
+        Ok(Some(self.views.read_over(&self.path.join(file))?.to_rgba8()))
     }
 
     /// Reads the depth map of a view, if available.
@@ -78,12 +79,10 @@ impl Layer<'_> {
     pub(crate) fn picture(&self, view: &str, range: (f32, f32)) -> anyhow::Result<Option<Rgba8>> {
         match &self.source {
             Source::Image(folder) => {
-                let file = folder.view(view).and_then(|view| view.image.as_ref());
-                file.map(|file| folder.colour(file)).transpose()
+                folder.colour(folder.view(view).and_then(|view| view.image.as_ref()))
             }
             Source::LowResolution(folder) => {
-                let file = folder.view(view).and_then(|view| view.low_resolution.as_ref());
-                file.map(|file| folder.colour(file)).transpose()
+                folder.colour(folder.view(view).and_then(|view| view.low_resolution.as_ref()))
             }
             Source::Depth(folder) => {
                 let image = folder.depth(view)?;

@@ -13,7 +13,7 @@ use stage::Context;
 use crate::layers::{Group, Layer, ONLY_RENDER};
 
 /// A picture of the page, as the page's script reads it.
-#[derive(Serialize)]
+#[derive(Clone, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Picture {
     /// Index of the view in the page.
@@ -46,12 +46,9 @@ pub(crate) struct Request<'a> {
 
 /// A written original.
 struct Original {
-    view: usize,
-    layer: usize,
+    /// Picture without copy.
+    picture: Picture,
     group: Group,
-    width: usize,
-    height: usize,
-    file: String,
     path: PathBuf,
     bytes: usize,
 }
@@ -139,16 +136,16 @@ fn write_original(
     let path = context.output_path(&file)?;
     let bytes = encode_png(&image);
     std::fs::write(&path, &bytes).with_context(|| path.display().to_string())?;
-    Ok(Some(Original {
+    let picture = Picture {
         view: request.view,
         layer: request.layer,
-        group: layer.group.clone(),
         width: image.width,
         height: image.height,
-        file,
-        path,
-        bytes: bytes.len(),
-    }))
+        shown_width: image.width,
+        original: file,
+        uri: String::new(),
+    };
+    Ok(Some(Original { picture, group: layer.group.clone(), path, bytes: bytes.len() }))
 }
 
 /// Predicts from a sample of the pictures the index of the best quality that fits into the budget.
@@ -178,27 +175,22 @@ fn base64_length(bytes: usize) -> usize {
 
 /// Makes the copy of an original.
 fn copy(original: &Original, quality: Quality) -> anyhow::Result<Picture> {
-    let is_small = original.width.max(original.height) <= LOSSLESS_SIDE;
+    let mut picture = original.picture.clone();
+    let is_small = picture.width.max(picture.height) <= LOSSLESS_SIDE;
     let quality = match &original.group {
         Group::LowResolution if is_small => Quality::Lossless,
         _ => quality,
     };
-    let (kind, bytes, shown_width) = match quality {
-        Quality::Lossless => ("png", std::fs::read(&original.path)?, original.width),
+    let (kind, bytes) = match quality {
+        Quality::Lossless => ("png", std::fs::read(&original.path)?),
         Quality::Jpeg { side, quality } => {
             let small = shrunk(&read_png(&original.path)?, side);
-            ("jpeg", encode_jpeg(&small, quality, &original.group)?, small.width)
+            picture.shown_width = small.width;
+            ("jpeg", encode_jpeg(&small, quality, &original.group)?)
         }
     };
-    Ok(Picture {
-        view: original.view,
-        layer: original.layer,
-        width: original.width,
-        height: original.height,
-        shown_width,
-        original: original.file.clone(),
-        uri: format!("data:image/{kind};base64,{}", STANDARD.encode(bytes)),
-    })
+    picture.uri = format!("data:image/{kind};base64,{}", STANDARD.encode(bytes));
+    Ok(picture)
 }
 
 /// Shrinks an image to at most `side` pixels in width and height.
