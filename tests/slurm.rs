@@ -664,10 +664,13 @@ fn resources_are_checked_with_the_file() {
     for (block, words) in [
         (
             "{mem: 8}",
-            "pipeline.yaml:3: stages.first.resources.mem: \"8\" is no amount of memory; write a \
+            "pipeline.yaml:3: stages.first.resources.mem: invalid amount of memory \"8\"; write a \
             number with M, G or T",
         ),
-        ("{time: 2 hours}", "pipeline.yaml:3: stages.first.resources.time: \"2 hours\" is no time"),
+        (
+            "{time: 2 hours}",
+            "pipeline.yaml:3: stages.first.resources.time: invalid duration \"2 hours\"",
+        ),
         ("{cores: 2}", "unknown field `cores`, expected one of `cpus`, `mem`, `gpus`, `time`"),
     ] {
         let project = project(&format!(

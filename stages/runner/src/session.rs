@@ -63,7 +63,7 @@ impl Session {
     /// The queued or running job of each node, where there is one, and how many there are besides.
     /// Slurm is asked once, and only where this store has had jobs.
     pub(crate) fn jobs(&self, plan: &Plan) -> (Vec<Option<Job>>, usize) {
-        let queue = Queue::look(&Slurm::default(), self.store.root()).unwrap_or_else(|error| {
+        let queue = Queue::read(&Slurm::default(), self.store.root()).unwrap_or_else(|error| {
             report_text(&format!("nerf-sr: whether jobs are queued isn't known: {error}"));
             Queue::default()
         });
@@ -72,7 +72,7 @@ impl Session {
         }
         let identities = identities(plan, &self.store, None).unwrap_or_default();
         let jobs: Vec<Option<Job>> =
-            identities.iter().map(|identity| queue.job_of(identity).cloned()).collect();
+            identities.iter().map(|identity| queue.find_job(identity).cloned()).collect();
         let besides = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
         (jobs, besides)
     }

@@ -91,14 +91,14 @@ pub(crate) fn find_roots(
 pub(crate) fn outstanding_submissions(
     store: &Store,
 ) -> Result<BTreeMap<String, String>, StoreError> {
-    let (reason, ids) = match Queue::look(&Slurm::default(), store.root()) {
+    let (reason, ids) = match Queue::read(&Slurm::default(), store.root()) {
         Ok(queue) => (
             "a submitted job needs it".to_owned(),
             queue.submissions().into_iter().map(str::to_owned).collect::<Vec<_>>(),
         ),
         Err(error) => {
             let path = store.root().join("slurm");
-            let submissions = slurm::all(store.root())
+            let submissions = slurm::list_submissions(store.root())
                 .map_err(|e| StoreError::Io { path, source: std::io::Error::other(e) })?;
             let reason = format!("a submitted job may need it ({error})");
             (reason, submissions.into_iter().map(|(id, _)| id).collect())

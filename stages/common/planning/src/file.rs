@@ -102,7 +102,7 @@ impl StageBlock {
         self.inputs.extend(other.inputs.clone());
         let layers = other.parameter_layers().filter(|layer| !layer.is_empty());
         self.overrides.extend(layers.cloned());
-        self.resources = self.resources.changed(&other.resources);
+        self.resources = self.resources.overridden_by(&other.resources);
     }
 }
 

@@ -33,7 +33,7 @@ impl Pipeline {
     /// Returns the resources that a stage needs, from all its layers.
     pub fn resources(&self, stage: &str) -> Resources {
         let layers = self.layers(stage).map(|layer| &self.stages[layer].resources);
-        layers.fold(Resources::default(), |resources, layer| resources.changed(layer))
+        layers.fold(Resources::default(), |resources, layer| resources.overridden_by(layer))
     }
 
     /// Returns the project's folder, which contains the store, pages and `pipelines/`: the folder

@@ -1,4 +1,4 @@
-//! Amounts as people write them: `8G`, `1h30m`.
+//! Human-readable amounts of memory and time: `8G`, `1h30m`.
 
 use std::fmt::{self, Display, Formatter};
 use std::marker::PhantomData;
@@ -6,14 +6,14 @@ use std::str::FromStr;
 
 use serde::de::{Deserializer, Error, Visitor};
 
-/// A text that is no amount.
+/// Error returned when a text is not an amount.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum AmountError {
-    /// It is no amount of memory.
-    #[error("{0:?} is no amount of memory; write a number with M, G or T, such as 8G")]
+    /// The text is not an amount of memory.
+    #[error("invalid amount of memory {0:?}; write a number with M, G or T, such as 8G")]
     Memory(String),
-    /// It is no time.
-    #[error("{0:?} is no time; write numbers with d, h, m or s, such as 2h or 1h30m")]
+    /// The text is not a duration.
+    #[error("invalid duration {0:?}; write numbers with d, h, m or s, such as 2h or 1h30m")]
     Period(String),
 }
 
@@ -23,39 +23,62 @@ pub struct Memory {
     pub(crate) mib: u64,
 }
 
-/// A time in whole seconds: `90s`, `30m`, `2h`, `1d12h`.
+/// A duration in whole seconds: `90s`, `30m`, `2h`, `1d12h`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Period {
     pub(crate) seconds: u64,
 }
 
+const MEMORY_UNITS: [(char, u64); 3] = [('T', 1 << 20), ('G', 1 << 10), ('M', 1)];
+const PERIOD_UNITS: [(char, u64); 4] = [('d', 86_400), ('h', 3600), ('m', 60), ('s', 1)];
+
 impl Memory {
-    /// In bytes.
+    /// Returns the amount in bytes.
     pub fn bytes(self) -> u64 {
         self.mib.saturating_mul(1 << 20)
+    }
+
+    fn parse(text: &str) -> Option<Self> {
+        let (count, letter) = split_unit(text)?;
+        let (_, unit) = MEMORY_UNITS.iter().find(|(unit, _)| *unit == letter)?;
+        // Slurm reads `--mem=0` as all memory of a node.
+        count.checked_mul(*unit).filter(|&mib| mib > 0).map(|mib| Self { mib })
     }
 }
 
 impl Period {
-    /// In minutes, a begun one counted: Slurm's unit.
+    /// Returns the duration in minutes, Slurm's unit, rounded up.
     pub(crate) fn minutes(self) -> u64 {
         self.seconds.div_ceil(60)
     }
+
+    fn parse(text: &str) -> Option<Self> {
+        let mut units = PERIOD_UNITS.iter();
+        let mut seconds = 0u64;
+        for piece in text.split_inclusive(|c: char| !c.is_ascii_digit()) {
+            let (count, letter) = split_unit(piece)?;
+            // The iterator only advances: each unit occurs at most once, larger units first.
+            let (_, unit) = units.find(|(unit, _)| *unit == letter)?;
+            seconds = seconds.checked_add(count.checked_mul(*unit)?)?;
+        }
+        (seconds > 0).then_some(Self { seconds })
+    }
 }
 
-const MEMORY_UNITS: [(char, u64); 3] = [('T', 1 << 20), ('G', 1 << 10), ('M', 1)];
-const PERIOD_UNITS: [(char, u64); 4] = [('d', 86_400), ('h', 3600), ('m', 60), ('s', 1)];
+/// Splits an amount into its number and the letter of its unit.
+fn split_unit(text: &str) -> Option<(u64, char)> {
+    let letter = text.chars().next_back()?;
+    let digits = &text[..text.len() - letter.len_utf8()];
+    // `u64::from_str` would accept a leading `+`.
+    let is_number = digits.bytes().all(|b| b.is_ascii_digit());
+    Some((digits.parse().ok().filter(|_| is_number)?, letter))
+}
 
 impl FromStr for Memory {
     type Err = AmountError;
 
     fn from_str(text: &str) -> Result<Self, AmountError> {
-        let problem = || AmountError::Memory(text.to_owned());
-        let (count, last) = split_unit(text).ok_or_else(problem)?;
-        let unit = MEMORY_UNITS.iter().find(|(unit, _)| *unit == last).ok_or_else(problem)?.1;
-        let mib = count.parse::<u64>().ok().and_then(|count| count.checked_mul(unit));
-        // Slurm takes 0 as all there is.
-        mib.filter(|&mib| mib > 0).map(|mib| Self { mib }).ok_or_else(problem)
+        Self::parse(text).ok_or_else(|| AmountError::Memory(text.to_owned()))
     }
 }
 
@@ -63,25 +86,8 @@ impl FromStr for Period {
     type Err = AmountError;
 
     fn from_str(text: &str) -> Result<Self, AmountError> {
-        let problem = || AmountError::Period(text.to_owned());
-        let mut units = PERIOD_UNITS.iter();
-        let mut seconds = 0u64;
-        for piece in text.split_inclusive(|c: char| !c.is_ascii_digit()) {
-            let (count, last) = split_unit(piece).ok_or_else(problem)?;
-            // Each unit comes once, the larger one first.
-            let unit = units.find(|(unit, _)| *unit == last).ok_or_else(problem)?.1;
-            let more = count.parse::<u64>().ok().and_then(|count| count.checked_mul(unit));
-            seconds = more.and_then(|more| seconds.checked_add(more)).ok_or_else(problem)?;
-        }
-        if seconds == 0 { Err(problem()) } else { Ok(Self { seconds }) }
+        Self::parse(text).ok_or_else(|| AmountError::Period(text.to_owned()))
     }
-}
-
-/// A number's digits and the one letter after them.
-fn split_unit(text: &str) -> Option<(&str, char)> {
-    let last = text.chars().next_back()?;
-    let count = &text[..text.len() - last.len_utf8()];
-    (!count.is_empty() && count.bytes().all(|b| b.is_ascii_digit())).then_some((count, last))
 }
 
 impl Display for Memory {
@@ -107,12 +113,12 @@ impl Display for Period {
     }
 }
 
-/// Reads an amount; a bare number gets the amount's own error, which says what is missing.
-pub(crate) fn read<'de, D: Deserializer<'de>, T: FromStr<Err = AmountError>>(
+/// Reads an amount. A bare number gets the amount's own error, which asks for the missing unit.
+fn deserialize_amount<'de, D: Deserializer<'de>, T: FromStr<Err = AmountError>>(
     deserializer: D,
 ) -> Result<T, D::Error> {
-    struct Words<T>(PhantomData<T>);
-    impl<T: FromStr<Err = AmountError>> Visitor<'_> for Words<T> {
+    struct AmountVisitor<T>(PhantomData<T>);
+    impl<T: FromStr<Err = AmountError>> Visitor<'_> for AmountVisitor<T> {
         type Value = T;
 
         fn expecting(&self, f: &mut Formatter<'_>) -> fmt::Result {
@@ -135,10 +141,10 @@ pub(crate) fn read<'de, D: Deserializer<'de>, T: FromStr<Err = AmountError>>(
             self.visit_str(&number.to_string())
         }
     }
-    deserializer.deserialize_any(Words(PhantomData))
+    deserializer.deserialize_any(AmountVisitor(PhantomData))
 }
 
-macro_rules! as_text {
+macro_rules! serde_as_text {
     ($type:ty) => {
         impl serde::Serialize for $type {
             fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
@@ -147,13 +153,13 @@ macro_rules! as_text {
         }
         impl<'de> serde::Deserialize<'de> for $type {
             fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-                read(deserializer)
+                deserialize_amount(deserializer)
             }
         }
     };
 }
-as_text!(Memory);
-as_text!(Period);
+serde_as_text!(Memory);
+serde_as_text!(Period);
 
 #[cfg(test)]
 mod tests {

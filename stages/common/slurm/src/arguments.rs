@@ -1,81 +1,86 @@
-//! What `sbatch` is told.
+//! Arguments of `sbatch`.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
+use std::os::unix::ffi::{OsStrExt as _, OsStringExt as _};
 use std::path::Path;
 
 use crate::resources::Resources;
 use crate::site::Site;
 
-/// Longer names make the queue's table unreadable.
-const LONGEST_NAME: usize = 100;
+/// Maximum length of a job's name in characters, so that `squeue`'s table stays readable; chosen by
+/// hand.
+const MAX_NAME_CHARS: usize = 100;
 
-/// One job, as it is asked for.
-pub(crate) struct Order<'a> {
+/// One job to submit.
+pub(crate) struct JobRequest<'a> {
     pub(crate) name: &'a str,
     pub(crate) resources: &'a Resources,
     pub(crate) site: &'a Site,
-    /// Jobs that must have ended well.
+    /// Jobs that must succeed first.
     pub(crate) after: &'a [&'a str],
-    /// Where it runs.
+    /// Working directory.
     pub(crate) folder: &'a Path,
     pub(crate) log: &'a Path,
     pub(crate) script: &'a Path,
+    /// Index of the task, passed to the script.
     pub(crate) number: usize,
 }
 
-impl Order<'_> {
+impl JobRequest<'_> {
+    /// Returns the arguments of `sbatch`. The site's own come last, so that they win.
     pub(crate) fn arguments(&self) -> Vec<OsString> {
         let Self { resources, site, .. } = self;
-        let name: String = self
-            .name
-            .chars()
-            .map(|c| if c.is_control() { ' ' } else { c })
-            .take(LONGEST_NAME)
-            .collect();
-        let mut words: Vec<OsString> =
+        let printable = self.name.chars().map(|c| if c.is_control() { ' ' } else { c });
+        let name: String = printable.take(MAX_NAME_CHARS).collect();
+        let mut arguments: Vec<OsString> =
             ["--parsable", "--nodes=1", "--ntasks=1", "--requeue", "--open-mode=append"]
                 .map(OsString::from)
                 .into();
-        words.push(pair("--job-name", name));
-        words.push(pair("--chdir", self.folder));
-        words.push(pair("--output", verbatim(self.log)));
-        words.push(pair("--signal", format!("B:USR1@{}", site.notice.seconds)));
-        let numbers = [
+        arguments.push(option("--job-name", name));
+        arguments.push(option("--chdir", self.folder));
+        arguments.push(option("--output", escape_patterns(self.log)));
+        arguments.push(option("--signal", format!("B:USR1@{}", site.notice.seconds)));
+        let optional = [
             ("--cpus-per-task", resources.cpus.map(|n| n.to_string())),
             ("--mem", resources.mem.map(|memory| format!("{}M", memory.mib))),
             ("--gres", resources.gpus.filter(|&n| n > 0).map(|n| format!("gpu:{n}"))),
             ("--time", resources.time.map(|time| time.minutes().to_string())),
+            ("--partition", site.partition.clone()),
+            ("--account", site.account.clone()),
+            ("--qos", site.qos.clone()),
         ];
-        let places =
-            [("--partition", &site.partition), ("--account", &site.account), ("--qos", &site.qos)];
-        let given = numbers.into_iter().chain(places.map(|(name, value)| (name, value.clone())));
-        words.extend(given.filter_map(|(name, value)| Some(pair(name, value?))));
-        if !self.after.is_empty() {
-            words.push(pair("--dependency", format!("afterok:{}", self.after.join(":"))));
-            words.push("--kill-on-invalid-dep=yes".into());
+        for (name, value) in optional {
+            arguments.extend(value.map(|value| option(name, value)));
         }
-        // The site's own come last, so that they win.
-        words.extend(site.arguments.iter().map(OsString::from));
-        words.push(self.script.into());
-        words.push(self.number.to_string().into());
-        words
+        if !self.after.is_empty() {
+            arguments.push(option("--dependency", format!("afterok:{}", self.after.join(":"))));
+            arguments.push("--kill-on-invalid-dep=yes".into());
+        }
+        arguments.extend(site.arguments.iter().map(OsString::from));
+        arguments.push(self.script.into());
+        arguments.push(self.number.to_string().into());
+        arguments
     }
 }
 
-fn pair(name: &str, value: impl AsRef<std::ffi::OsStr>) -> OsString {
-    let mut word = OsString::from(name);
-    word.push("=");
-    word.push(value);
-    word
+/// Returns `NAME=VALUE`.
+fn option(name: &str, value: impl AsRef<OsStr>) -> OsString {
+    let mut argument = OsString::from(name);
+    argument.push("=");
+    argument.push(value);
+    argument
 }
 
-/// A log's path in which Slurm replaces nothing: `%` begins a pattern.
-fn verbatim(path: &Path) -> OsString {
-    use std::os::unix::ffi::{OsStrExt as _, OsStringExt as _};
-    let bytes = path.as_os_str().as_bytes().iter();
-    OsString::from_vec(
-        bytes.flat_map(|&b| if b == b'%' { vec![b'%', b'%'] } else { vec![b] }).collect(),
-    )
+/// Doubles each `%` of a log's path, which Slurm would read as a filename pattern.
+fn escape_patterns(path: &Path) -> OsString {
+    let mut escaped = Vec::new();
+    for &byte in path.as_os_str().as_bytes() {
+        escaped.push(byte);
+        if byte == b'%' {
+            escaped.push(byte);
+        }
+    }
+    OsString::from_vec(escaped)
 }
 
 #[cfg(test)]
@@ -85,7 +90,7 @@ mod tests {
     fn words(resources: &str, site: &str, after: &[&str]) -> String {
         let resources: Resources = serde_yaml::from_str(resources).unwrap();
         let site: Site = serde_yaml::from_str(site).unwrap();
-        let order = Order {
+        let job = JobRequest {
             name: "train-ss [supersample=2]",
             resources: &resources,
             site: &site,
@@ -96,7 +101,7 @@ mod tests {
             number: 7,
         };
         let words: Vec<String> =
-            order.arguments().into_iter().map(|word| word.into_string().unwrap()).collect();
+            job.arguments().into_iter().map(|word| word.into_string().unwrap()).collect();
         words.join("|")
     }
 
@@ -105,7 +110,7 @@ mod tests {
         --signal=B:USR1@90";
 
     #[test]
-    fn each_wish_is_an_argument() {
+    fn each_request_is_an_argument() {
         for (resources, site, after, expected) in [
             ("{}", "{}", &[][..], ""),
             (

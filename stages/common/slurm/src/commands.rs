@@ -4,83 +4,84 @@ use std::ffi::{OsStr, OsString};
 use std::path::PathBuf;
 use std::process::Command;
 
-use crate::error::SlurmError;
+use crate::SlurmError;
 
-/// Most jobs that one call names: a command line has an end.
-const MOST_IDS: usize = 500;
+/// Maximum number of jobs in one call of `scancel`, which keeps its command line short; chosen by
+/// hand.
+const MAX_IDS_PER_CALL: usize = 500;
 
 /// Slurm's programs.
 #[derive(Clone, Debug, Default)]
 pub struct Slurm {
-    /// Their folder; without one they are found by PATH.
+    /// Folder of the programs; `None` if they are found by PATH.
     folder: Option<PathBuf>,
 }
 
-/// The job that this process runs in.
-pub fn this_job() -> Option<String> {
+/// Returns the ID of the job that this process runs in.
+pub fn current_job_id() -> Option<String> {
     std::env::var("SLURM_JOB_ID").ok()
 }
 
-/// The cores that this job may use; outside of a job all of the machine.
-pub fn cores() -> usize {
-    let given = std::env::var("SLURM_CPUS_ON_NODE")
-        .ok()
-        .and_then(|text| text.parse().ok())
-        .filter(|&n| n > 0);
-    given.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, std::num::NonZero::get))
+/// Returns the number of cores of this job, or of the machine outside a job.
+pub fn available_cores() -> usize {
+    let allocated = std::env::var("SLURM_CPUS_ON_NODE").ok().and_then(|text| text.parse().ok());
+    allocated
+        .filter(|&n| n > 0)
+        .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, std::num::NonZero::get))
 }
 
 impl Slurm {
-    /// The programs in a folder.
+    /// Returns the programs in a folder.
     pub fn in_folder(folder: impl Into<PathBuf>) -> Self {
         Self { folder: Some(folder.into()) }
     }
 
-    /// Submits a job; its number.
+    /// Submits a job and returns its ID.
     pub(crate) fn sbatch(&self, arguments: &[OsString]) -> Result<String, SlurmError> {
-        let said = self.call("sbatch", arguments)?;
-        // `NUMBER`, or `NUMBER;CLUSTER`. A site's own filter may have talked before.
-        let last = said.trim().lines().last().unwrap_or_default();
+        let stdout = self.call("sbatch", arguments)?;
+        // `ID`, or `ID;CLUSTER`. A site's submit filter may print lines before it.
+        let last = stdout.trim().lines().last().unwrap_or_default();
         let id = last.split(';').next().unwrap_or_default();
         if id.is_empty() || !id.bytes().all(|b| b.is_ascii_digit()) {
             return Err(SlurmError::Refused {
                 program: "sbatch",
-                said: format!("it gave no job's number but {last:?}"),
+                reason: format!("expected a job ID, found {last:?}"),
             });
         }
         Ok(id.to_owned())
     }
 
-    /// What the queue says of some users' jobs, in lines of a format.
+    /// Lists the jobs of some users, one line a job in the given format.
     pub(crate) fn squeue(&self, users: &[String], format: &str) -> Result<String, SlurmError> {
         self.call("squeue", &["--noheader", "--user", &users.join(","), "--format", format])
     }
 
     /// Cancels jobs.
     pub fn cancel(&self, ids: &[&str]) -> Result<(), SlurmError> {
-        ids.chunks(MOST_IDS).try_for_each(|some| self.call("scancel", some).map(drop))
+        ids.chunks(MAX_IDS_PER_CALL).try_for_each(|some| self.call("scancel", some).map(drop))
     }
 
-    /// Puts a running job into the queue once more; it is ended.
+    /// Ends a running job and puts it back into the queue.
     pub fn requeue(&self, id: &str) -> Result<(), SlurmError> {
         self.call("scontrol", &["requeue", id]).map(drop)
     }
 
+    /// Calls a program and returns its stdout.
     fn call(
         &self,
         program: &'static str,
         arguments: &[impl AsRef<OsStr>],
     ) -> Result<String, SlurmError> {
-        let path = self
-            .folder
-            .as_ref()
-            .map_or_else(|| PathBuf::from(program), |folder| folder.join(program));
+        let path = match &self.folder {
+            Some(folder) => folder.join(program),
+            None => PathBuf::from(program),
+        };
         let mut command = Command::new(path);
-        // What a user wants to see of the queue by default hides nothing here.
-        for (name, _) in
-            std::env::vars_os().filter(|(name, _)| name.as_encoded_bytes().starts_with(b"SQUEUE_"))
-        {
-            command.env_remove(name);
+        // A user's defaults for `squeue`, such as a state filter, would hide jobs.
+        for (name, _) in std::env::vars_os() {
+            if name.as_encoded_bytes().starts_with(b"SQUEUE_") {
+                command.env_remove(name);
+            }
         }
         let output = command
             .args(arguments)
@@ -89,11 +90,13 @@ impl Slurm {
         if output.status.success() {
             return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
         }
-        let said = String::from_utf8_lossy(&output.stderr);
+        let stderr = String::from_utf8_lossy(&output.stderr);
         let lines: Vec<&str> =
-            said.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
-        let said = lines.join("; ").replace(&format!("{program}: "), "");
-        let said = if said.is_empty() { format!("it failed ({})", output.status) } else { said };
-        Err(SlurmError::Refused { program, said })
+            stderr.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+        let mut reason = lines.join("; ").replace(&format!("{program}: "), "");
+        if reason.is_empty() {
+            reason = format!("failed ({})", output.status);
+        }
+        Err(SlurmError::Refused { program, reason })
     }
 }

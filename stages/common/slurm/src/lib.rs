@@ -1,26 +1,25 @@
-//! Slurm from outside: tasks that need one another become jobs, and nobody stays to watch them.
+//! Interface to Slurm: submits tasks with dependencies as jobs and exits, so that no process has to
+//! stay.
 //!
-//! * [`Resources`]: what a stage needs, as a pipeline file says it, in [`Memory`] and [`Period`].
-//!   [`Site`]: what a cluster wants besides.
-//! * [`Submission`]: a folder with the [`Task`]s, the job's script and the jobs' logs; a task is
-//!   known again by its identity.
-//! * [`Queue`]: the jobs of a store, asked for once. Slurm's queue is the only place in which it
-//!   stands what is queued.
-//! * [`Submission::submit`]: a job for each task that isn't done and isn't queued. [`Slurm`] calls
-//!   Slurm's programs.
+//! * [`Resources`]: cores, memory, GPUs and time of a stage, as a pipeline file states them, in
+//!   [`Memory`] and [`Period`]. [`Site`]: settings of a cluster.
+//! * [`Submission`]: a folder with the [`Task`]s, the jobs' script and the jobs' logs. Tasks of all
+//!   submissions are recognised by their identities.
+//! * [`Queue`]: the jobs of a store, read from Slurm once. No file of ours lists queued jobs.
+//! * [`Submission::submit`]: submits a job for each task that is neither done nor queued.
+//!   [`Slurm`] calls Slurm's programs.
 //!
-//! This crate knows neither stages nor artifacts. What a job does is the command's affair that its
-//! script runs.
+//! This crate knows neither stages nor artifacts: a job runs a command given by the caller.
 //!
 //! ```
 //! use slurm::{Resources, Site};
 //!
 //! let default: Resources = serde_yaml::from_str("{cpus: 4, mem: 8G}")?;
 //! let stage: Resources = serde_yaml::from_str("{mem: 16G, gpus: 1, time: 1d12h}")?;
-//! let resources = default.changed(&stage);
+//! let resources = default.overridden_by(&stage);
 //! assert!(resources.has_gpu());
 //! assert_eq!(resources.mem.unwrap().to_string(), "16G");
-//! assert_eq!(Site::default().problem(&resources), None);
+//! assert_eq!(Site::default().problem_with(&resources), None);
 //! # Ok::<(), serde_yaml::Error>(())
 //! ```
 
@@ -29,7 +28,6 @@
 mod amounts;
 mod arguments;
 mod commands;
-mod error;
 mod queue;
 mod resources;
 mod script;
@@ -37,11 +35,47 @@ mod site;
 mod submission;
 mod submit;
 
+use std::path::{Path, PathBuf};
+
 pub use amounts::{AmountError, Memory, Period};
-pub use commands::{Slurm, cores, this_job};
-pub use error::SlurmError;
+pub use commands::{Slurm, available_cores, current_job_id};
 pub use queue::{Job, Queue};
 pub use resources::Resources;
 pub use site::Site;
-pub use submission::{Submission, Task, all, job_logs};
-pub use submit::{Submitted, Terms};
+pub use submission::{Submission, Task, list_submissions, newest_logs};
+pub use submit::{SubmitOptions, Submitted};
+
+/// Error of a call of Slurm, or of a file of a submission or site.
+#[derive(Debug, thiserror::Error)]
+pub enum SlurmError {
+    /// A program of Slurm can't be started.
+    #[error("{program}: {source}; run this where Slurm's programs are on PATH")]
+    Absent {
+        /// Name of the program.
+        program: &'static str,
+        /// Reason why the program can't be started.
+        source: std::io::Error,
+    },
+    /// A program of Slurm failed.
+    #[error("{program}: {reason}")]
+    Refused {
+        /// Name of the program.
+        program: &'static str,
+        /// The program's stderr on one line.
+        reason: String,
+    },
+    /// A file can't be used.
+    #[error("{path}: {problem}")]
+    File {
+        /// Path of the file.
+        path: PathBuf,
+        /// Reason why the file can't be used.
+        problem: String,
+    },
+}
+
+impl SlurmError {
+    pub(crate) fn file(path: &Path, problem: impl std::fmt::Display) -> Self {
+        Self::File { path: path.to_path_buf(), problem: problem.to_string() }
+    }
+}

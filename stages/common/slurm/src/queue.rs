@@ -1,28 +1,30 @@
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::{self, Display, Formatter};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 use serde::Serialize;
 
+use crate::SlurmError;
 use crate::commands::Slurm;
-use crate::error::SlurmError;
-use crate::submission::{Submission, Task, all};
+use crate::submission::{Submission, Task, list_submissions};
 
-/// Number, state, reason, and the script with its argument, by which a job is known.
-const FORMAT: &str = "%i|%T|%r|%o";
+/// Format of `squeue`: ID, state, reason, and the script with its argument, which identifies a
+/// task's job (docs/design/032).
+const SQUEUE_FORMAT: &str = "%i|%T|%r|%o";
 
 /// A job in the queue.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Job {
-    /// Its number.
+    /// Slurm's job ID.
     pub id: String,
-    /// Slurm's word: `PENDING`, `RUNNING`.
+    /// Slurm's state: `PENDING`, `RUNNING`.
     pub state: String,
-    /// Why it waits; `None` where it doesn't.
+    /// Slurm's reason for waiting; `None` if the job doesn't wait.
     pub reason: String,
-    /// Its submission.
+    /// ID of the job's submission.
     pub submission: String,
-    /// What it does; nothing where the submission can't be read.
+    /// The job's task; the default task if the submission can't be read.
     #[serde(skip)]
     pub task: Task,
     #[serde(skip)]
@@ -32,31 +34,21 @@ pub struct Job {
 /// The jobs of a store that haven't ended.
 #[derive(Clone, Debug, Default)]
 pub struct Queue {
-    /// As Slurm lists them.
+    /// Jobs in Slurm's order.
     pub jobs: Vec<Job>,
 }
 
 impl Job {
-    /// Whether the task may still become done by it.
-    fn is_live(&self) -> bool {
+    /// True if the job may still finish its task.
+    fn can_finish_task(&self) -> bool {
         !["COMPLETING", "STAGE_OUT"].contains(&self.state.as_str())
             && self.reason != "DependencyNeverSatisfied"
     }
 
-    /// As people read it: `job 17 pending: Dependency`.
-    pub fn words(&self) -> String {
-        let state = self.state.to_lowercase();
-        match self.reason.as_str() {
-            "None" | "" => format!("job {} {state}", self.id),
-            reason => format!("job {} {state}: {reason}", self.id),
-        }
-    }
-
-    /// A line of the queue, where it is of a job of this store.
+    /// Parses a line of `squeue`; `None` if the line isn't a job of this store.
     fn parse(line: &str, root: &str) -> Option<Self> {
-        let mut fields = line.splitn(4, '|');
-        let (id, state, reason, command) =
-            (fields.next()?, fields.next()?, fields.next()?, fields.next()?);
+        let fields: Vec<&str> = line.splitn(4, '|').collect();
+        let &[id, state, reason, command] = fields.as_slice() else { return None };
         let (script, number) = command.trim_end().rsplit_once(' ')?;
         let submission =
             script.strip_prefix(root)?.strip_prefix("/slurm/")?.strip_suffix("/job.sh")?;
@@ -74,38 +66,50 @@ impl Job {
     }
 }
 
+impl Display for Job {
+    /// Writes `job 17 pending: Dependency`.
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        write!(f, "job {} {}", self.id, self.state.to_lowercase())?;
+        match self.reason.as_str() {
+            "None" | "" => Ok(()),
+            reason => write!(f, ": {reason}"),
+        }
+    }
+}
+
 impl Queue {
-    /// Asks Slurm once for the jobs of all who have submitted from this store; not at all where
-    /// nobody has.
-    pub fn look(slurm: &Slurm, root: &Path) -> Result<Self, SlurmError> {
-        let folders = all(root)?;
-        let users: BTreeSet<u32> =
-            folders.iter().filter_map(|(_, folder)| Some(folder.metadata().ok()?.uid())).collect();
-        if users.is_empty() {
+    /// Reads the jobs of all users who have submitted from this store, by one call of `squeue`.
+    /// Slurm isn't called if the store has no submission.
+    pub fn read(slurm: &Slurm, root: &Path) -> Result<Self, SlurmError> {
+        let submissions = list_submissions(root)?;
+        let owners =
+            submissions.iter().filter_map(|(_, folder)| Some(folder.metadata().ok()?.uid()));
+        let owners: BTreeSet<u32> = owners.collect();
+        if owners.is_empty() {
             return Ok(Self::default());
         }
-        let users: Vec<String> = users.iter().map(u32::to_string).collect();
-        let text = slurm.squeue(&users, FORMAT)?;
-        let shown = root.to_string_lossy();
-        let mut jobs: Vec<Job> = text.lines().filter_map(|line| Job::parse(line, &shown)).collect();
-        let ids: BTreeSet<&str> = jobs.iter().map(|job| job.submission.as_str()).collect();
-        let read = |id: &str| Some((id.to_owned(), Submission::read(root, id)?));
-        let submissions: BTreeMap<String, Submission> = ids.into_iter().filter_map(read).collect();
+        let users: Vec<String> = owners.iter().map(u32::to_string).collect();
+        let text = slurm.squeue(&users, SQUEUE_FORMAT)?;
+        let root_text = root.to_string_lossy();
+        let mut jobs: Vec<Job> =
+            text.lines().filter_map(|line| Job::parse(line, &root_text)).collect();
+        let mut submissions: BTreeMap<String, Option<Submission>> = BTreeMap::new();
         for job in &mut jobs {
-            let task = submissions
-                .get(&job.submission)
-                .and_then(|submission| submission.tasks.get(job.number));
+            let submission = submissions
+                .entry(job.submission.clone())
+                .or_insert_with(|| Submission::read(root, &job.submission));
+            let task = submission.as_ref().and_then(|submission| submission.tasks.get(job.number));
             job.task = task.cloned().unwrap_or_default();
         }
         Ok(Self { jobs })
     }
 
-    /// The job by which a task may become done.
-    pub fn job_of(&self, identity: &str) -> Option<&Job> {
-        self.jobs.iter().find(|job| job.task.identity == identity && job.is_live())
+    /// Finds the job that may still finish a task.
+    pub fn find_job(&self, identity: &str) -> Option<&Job> {
+        self.jobs.iter().find(|job| job.task.identity == identity && job.can_finish_task())
     }
 
-    /// The submissions of which a job hasn't ended.
+    /// Returns the IDs of the submissions with jobs in the queue.
     pub fn submissions(&self) -> BTreeSet<&str> {
         self.jobs.iter().map(|job| job.submission.as_str()).collect()
     }
@@ -143,9 +147,9 @@ mod tests {
             ("", None),
         ] {
             let job = Job::parse(line, "/a b/s");
-            let found = job
-                .as_ref()
-                .map(|j| (j.id.as_str(), j.submission.as_str(), j.number, j.words(), j.is_live()));
+            let found = job.as_ref().map(|j| {
+                (j.id.as_str(), j.submission.as_str(), j.number, j.to_string(), j.can_finish_task())
+            });
             assert_eq!(
                 found,
                 expected.map(|(id, run, number, words, live)| (
@@ -163,10 +167,10 @@ mod tests {
     #[test]
     fn without_submissions_nobody_is_asked() {
         let root = tempfile::tempdir().unwrap();
-        assert!(Queue::look(&Slurm::in_folder("/nowhere"), root.path()).unwrap().jobs.is_empty());
+        assert!(Queue::read(&Slurm::in_folder("/nowhere"), root.path()).unwrap().jobs.is_empty());
         std::fs::create_dir_all(root.path().join("slurm/1-2-0")).unwrap();
         let problem =
-            Queue::look(&Slurm::in_folder("/nowhere"), root.path()).unwrap_err().to_string();
+            Queue::read(&Slurm::in_folder("/nowhere"), root.path()).unwrap_err().to_string();
         assert!(
             problem.starts_with("squeue: No such file") && problem.ends_with("on PATH"),
             "{problem}"

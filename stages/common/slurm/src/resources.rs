@@ -5,45 +5,45 @@ use serde::{Deserialize, Serialize};
 
 use crate::amounts::{Memory, Period};
 
-/// What a stage needs of a machine. It changes no result and is in no key; a GPU does change the
-/// device.
+/// Resources that a stage needs. Results and keys don't depend on them, except that a GPU changes
+/// the device.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Resources {
-    /// Cores, and as many threads.
+    /// Number of cores, and of threads.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpus: Option<NonZeroU32>,
     /// Memory: `512M`, `8G`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<String>")]
     pub mem: Option<Memory>,
-    /// GPUs; with one or more the stage computes on `cuda:0`.
+    /// Number of GPUs; with one or more the stage computes on `cuda:0`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gpus: Option<u32>,
-    /// The longest that it may take: `30m`, `2h`, `1d12h`.
+    /// Time limit: `30m`, `2h`, `1d12h`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(with = "Option<String>")]
     pub time: Option<Period>,
 }
 
 impl Resources {
-    /// These, where another doesn't say otherwise.
+    /// Returns these resources with each one that `other` states taken from `other`.
     #[must_use]
-    pub fn changed(&self, by: &Self) -> Self {
+    pub fn overridden_by(&self, other: &Self) -> Self {
         Self {
-            cpus: by.cpus.or(self.cpus),
-            mem: by.mem.or(self.mem),
-            gpus: by.gpus.or(self.gpus),
-            time: by.time.or(self.time),
+            cpus: other.cpus.or(self.cpus),
+            mem: other.mem.or(self.mem),
+            gpus: other.gpus.or(self.gpus),
+            time: other.time.or(self.time),
         }
     }
 
-    /// Whether it computes on a GPU.
+    /// True if at least one GPU is required.
     pub fn has_gpu(&self) -> bool {
         self.gpus.unwrap_or(0) > 0
     }
 
-    /// Whether nothing is said.
+    /// True if no resource is stated.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()
     }
@@ -54,10 +54,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_block_says_what_it_wants_otherwise() {
+    fn a_block_overrides_single_resources() {
         let read = |text: &str| serde_yaml::from_str::<Resources>(text).unwrap();
-        let both =
-            read("{cpus: 4, mem: 8G, gpus: 1}").changed(&read("{cpus: 8, gpus: 0, time: 2h}"));
+        let both = read("{cpus: 4, mem: 8G, gpus: 1}")
+            .overridden_by(&read("{cpus: 8, gpus: 0, time: 2h}"));
         assert_eq!(both, read("{cpus: 8, mem: 8G, gpus: 0, time: 2h}"));
         assert!(!both.has_gpu() && read("gpus: 2").has_gpu() && !Resources::default().has_gpu());
         let text = serde_json::to_string(&both).unwrap();
@@ -66,11 +66,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_resource_is_refused_in_one_line() {
+    fn invalid_resources_are_refused_in_one_line() {
         for (text, words) in [
-            ("mem: 8", "mem: \"8\" is no amount of memory"),
-            ("time: 90", "time: \"90\" is no time"),
-            ("time: 1.5", "time: \"1.5\" is no time"),
+            ("mem: 8", "mem: invalid amount of memory \"8\""),
+            ("time: 90", "time: invalid duration \"90\""),
+            ("time: 1.5", "time: invalid duration \"1.5\""),
             ("time: [2h]", "a number with its unit"),
             ("cpus: 0", "cpus: invalid value: integer `0`"),
             ("gpus: -1", "gpus: invalid type: integer `-1`"),

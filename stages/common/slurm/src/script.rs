@@ -1,10 +1,10 @@
-//! The script of a submission's jobs. A job's argument is the number of its task.
+//! The script of a submission's jobs. A job's argument is the index of its task.
 
 use std::ffi::OsStr;
 
 use crate::site::Site;
 
-/// The script: the site's lines, and then the command in the shell's place. So Slurm's signals
+/// Returns the script: the site's set-up lines, then `exec` of the command, so that Slurm's signals
 /// reach the command.
 pub(crate) fn script(site: &Site, command: &[&OsStr]) -> Vec<u8> {
     let mut text =
@@ -16,14 +16,14 @@ pub(crate) fn script(site: &Site, command: &[&OsStr]) -> Vec<u8> {
     text.extend_from_slice(b"exec");
     for word in command {
         text.push(b' ');
-        text.extend(quoted(word.as_encoded_bytes()));
+        text.extend(shell_quoted(word.as_encoded_bytes()));
     }
     text.extend_from_slice(b" \"$1\"\n");
     text
 }
 
-/// A word as a shell reads it, whatever is in it.
-fn quoted(word: &[u8]) -> Vec<u8> {
+/// Returns a word in single quotes for a POSIX shell.
+fn shell_quoted(word: &[u8]) -> Vec<u8> {
     let mut quoted = vec![b'\''];
     for &byte in word {
         if byte == b'\'' {
@@ -43,7 +43,7 @@ mod tests {
 
     /// The shell itself says what it read.
     #[test]
-    fn a_shell_reads_the_words_that_were_meant() {
+    fn a_shell_reads_the_same_words() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("job.sh");
         let site = Site { setup: vec!["export GREETING='good day'".to_owned()], ..Site::default() };

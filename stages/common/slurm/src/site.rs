@@ -2,11 +2,11 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use crate::SlurmError;
 use crate::amounts::Period;
-use crate::error::SlurmError;
 use crate::resources::Resources;
 
-/// What a cluster wants that is no pipeline's affair: it stands outside of it, and outside every
+/// Settings of a cluster, such as partition and account. They belong to no pipeline and enter no
 /// key.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -17,13 +17,13 @@ pub struct Site {
     pub account: Option<String>,
     /// `sbatch --qos`.
     pub qos: Option<String>,
-    /// Further arguments of `sbatch`.
+    /// Additional arguments of `sbatch`.
     pub arguments: Vec<String>,
-    /// Lines of the job's script that come before the stage, such as `module load cuda`.
+    /// Lines of the job's script before the stage, such as `module load cuda`.
     pub setup: Vec<String>,
-    /// Most jobs of a store that are in the queue at once.
+    /// Maximum number of a store's jobs in the queue.
     pub max_submit: usize,
-    /// So long before its time is up a job is told, so that its stage leaves a checkpoint.
+    /// Time between Slurm's signal and the end of a job, in which the stage writes a checkpoint.
     pub notice: Period,
 }
 
@@ -35,48 +35,49 @@ impl Default for Site {
             qos: None,
             arguments: Vec::new(),
             setup: Vec::new(),
+            // Both chosen by hand.
             max_submit: 1000,
             notice: Period { seconds: 90 },
         }
     }
 }
 
-/// Slurm takes no longer notice.
-const LONGEST_NOTICE: u64 = 65_535;
+/// Maximum notice in seconds: the limit of `sbatch --signal`.
+const MAX_NOTICE_SECONDS: u64 = 65_535;
 
 impl Site {
-    /// The site of a file; without one that of `~/.config/nerf-sr/slurm.yaml`, where that is.
+    /// Reads a site file. Without one, reads `~/.config/nerf-sr/slurm.yaml` if that file exists.
     pub fn find(file: Option<&Path>) -> Result<Self, SlurmError> {
         if let Some(file) = file {
             return Self::read(file);
         }
-        let usual = std::env::var_os("HOME")
+        let default = std::env::var_os("HOME")
             .map(|home| PathBuf::from(home).join(".config/nerf-sr/slurm.yaml"));
-        usual
-            .filter(|file| file.exists())
-            .map_or_else(|| Ok(Self::default()), |file| Self::read(&file))
+        match default.filter(|file| file.exists()) {
+            Some(file) => Self::read(&file),
+            None => Ok(Self::default()),
+        }
     }
 
-    /// Why a job with these resources could never get anywhere.
-    pub fn problem(&self, resources: &Resources) -> Option<String> {
+    /// Returns the reason why jobs with these resources could never make progress.
+    pub fn problem_with(&self, resources: &Resources) -> Option<String> {
         let time = resources.time.filter(|time| time.seconds <= self.notice.seconds)?;
         Some(format!(
-            "resources: time: {time} is no longer than the site's notice of {}; give it more",
+            "resources: time: {time} must be longer than the site's notice of {}",
             self.notice
         ))
     }
 
     fn read(path: &Path) -> Result<Self, SlurmError> {
         let text = std::fs::read_to_string(path).map_err(|e| SlurmError::file(path, e))?;
+        // A file of comments alone would be YAML's null, which is not a mapping.
         if text.lines().all(|line| line.trim().is_empty() || line.trim_start().starts_with('#')) {
             return Ok(Self::default());
         }
         let site: Self = serde_yaml::from_str(&text).map_err(|e| SlurmError::file(path, e))?;
-        if site.notice.seconds > LONGEST_NOTICE {
-            return Err(SlurmError::file(
-                path,
-                format!("notice: {} is too long; Slurm takes at most 18h", site.notice),
-            ));
+        if site.notice.seconds > MAX_NOTICE_SECONDS {
+            let problem = format!("notice: {} is too long; Slurm's maximum is 18h", site.notice);
+            return Err(SlurmError::file(path, problem));
         }
         Ok(site)
     }
@@ -106,15 +107,16 @@ mod tests {
             (site.partition.as_deref(), site.max_submit, site.notice.seconds),
             (Some("gpu"), 5, 300)
         );
-        let problem =
-            |time: &str| site.problem(&serde_yaml::from_str(&format!("time: {time}")).unwrap());
+        let problem = |time: &str| {
+            site.problem_with(&serde_yaml::from_str(&format!("time: {time}")).unwrap())
+        };
         assert!(
             problem("6m").is_none() && problem("5m").unwrap().contains("the site's notice of 5m")
         );
         for (text, words) in [
             ("partitions: gpu", "unknown field `partitions`"),
-            ("notice: 90", "notice: \"90\" is no time"),
-            ("notice: 1d", "at most 18h"),
+            ("notice: 90", "notice: invalid duration \"90\""),
+            ("notice: 1d", "maximum is 18h"),
             ("setup: module load cuda", "setup: invalid type"),
         ] {
             let problem = site_of(&file, text).unwrap_err().to_string();

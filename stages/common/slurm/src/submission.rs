@@ -7,41 +7,41 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::SlurmError;
+use crate::SlurmError;
 use crate::resources::Resources;
 use crate::script::script;
 use crate::site::Site;
 
-/// Something to be done by a job.
+/// A task for a job.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Task {
-    /// Name of its stage.
+    /// Name of the stage.
     pub stage: String,
-    /// As people read it; the job's name.
+    /// Human-readable label, used as the job's name.
     pub label: String,
-    /// Tasks of any submission with one identity are one task.
+    /// Identity of the task: equal identities in two submissions mean the same task.
     pub identity: String,
-    /// The tasks that must be done first, by their numbers, which are smaller.
+    /// Indices of the tasks that must be done first. All are smaller than this task's index.
     pub parents: Vec<usize>,
-    /// What it needs.
+    /// Resources that the job requests.
     #[serde(default, skip_serializing_if = "Resources::is_empty")]
     pub resources: Resources,
 }
 
-/// Tasks that were submitted at once: `slurm/ID` in a store.
+/// Tasks submitted together: the folder `slurm/ID` of a store.
 ///
 /// ```text
-/// slurm/ID/tasks.json   the tasks; a task's number is its place
-/// slurm/ID/plan.json    what the job's command reads; the caller's own
-/// slurm/ID/job.sh       the script of every job; its argument is the number
-/// slurm/ID/N.log        what the job of task N said
-/// slurm/lock            held while somebody submits
+/// slurm/ID/tasks.json   the tasks, in order of their numbers
+/// slurm/ID/plan.json    the caller's data for the jobs' command
+/// slurm/ID/job.sh       the script of every job; its argument is the task's number
+/// slurm/ID/N.log        output of task N's job
+/// slurm/lock            locked while a process submits
 /// ```
 #[derive(Debug)]
 pub struct Submission {
-    /// Its name.
+    /// Name of the folder.
     pub id: String,
-    /// Its tasks, each after those it needs.
+    /// Tasks, each after its parents.
     pub tasks: Vec<Task>,
     folder: PathBuf,
 }
@@ -49,64 +49,65 @@ pub struct Submission {
 const TASKS: &str = "tasks.json";
 const SCRIPT: &str = "job.sh";
 
-/// Between two attempts at the lock.
+/// Interval between two attempts to lock.
 const ATTEMPT_INTERVAL: Duration = Duration::from_millis(50);
 
 impl Submission {
-    /// A submission to be, in a store's folder.
+    /// Creates a submission in memory; [`Self::submit`] writes its folder.
     pub fn new(root: &Path, id: &str, tasks: Vec<Task>) -> Self {
         Self { id: id.to_owned(), tasks, folder: root.join("slurm").join(id) }
     }
 
-    /// One that was made; `None` where it isn't whole.
+    /// Reads a submission; `None` if its tasks can't be read.
     pub fn read(root: &Path, id: &str) -> Option<Self> {
         let empty = Self::new(root, id, Vec::new());
         let tasks = serde_json::from_slice(&fs::read(empty.folder.join(TASKS)).ok()?).ok()?;
         Some(Self { tasks, ..empty })
     }
 
-    /// Where the command's own file lies in a submission's folder.
-    pub fn plan(folder: &Path) -> PathBuf {
+    /// Returns the path of the command's data in a submission's folder.
+    pub fn plan_path(folder: &Path) -> PathBuf {
         folder.join("plan.json")
     }
 
-    /// What the job of a task says.
-    pub fn log(&self, number: usize) -> PathBuf {
+    /// Returns the path of the log of a task's job.
+    pub fn log_path(&self, number: usize) -> PathBuf {
         self.folder.join(format!("{number}.log"))
     }
 
-    pub(crate) fn script(&self) -> PathBuf {
+    pub(crate) fn script_path(&self) -> PathBuf {
         self.folder.join(SCRIPT)
     }
 
-    /// Writes the folder, whole or not at all. The command gets the folder and a task's number.
+    /// Writes the folder, whole or not at all. The script calls `command` with the folder and a
+    /// task's number.
     pub(crate) fn write(
         &self,
         plan: &[u8],
         site: &Site,
         command: &[&OsStr],
     ) -> Result<(), SlurmError> {
-        let fresh = self.folder.with_file_name(format!(".{}.new", self.id));
+        let partial = self.folder.with_file_name(format!(".{}.new", self.id));
         let command = [command, &[self.folder.as_os_str()]].concat();
         let tasks =
             serde_json::to_vec(&self.tasks).map_err(|e| SlurmError::file(&self.folder, e))?;
-        fs::create_dir_all(&fresh)
-            .and_then(|()| fs::write(fresh.join(TASKS), tasks))
-            .and_then(|()| fs::write(Self::plan(&fresh), plan))
-            .and_then(|()| fs::write(fresh.join(SCRIPT), script(site, &command)))
-            .and_then(|()| fs::rename(&fresh, &self.folder))
+        fs::create_dir_all(&partial)
+            .and_then(|()| fs::write(partial.join(TASKS), tasks))
+            .and_then(|()| fs::write(Self::plan_path(&partial), plan))
+            .and_then(|()| fs::write(partial.join(SCRIPT), script(site, &command)))
+            .and_then(|()| fs::rename(&partial, &self.folder))
             .map_err(|e| SlurmError::file(&self.folder, e))
     }
 }
 
-/// The names of all submissions in a store, sorted, with their folders.
-pub fn all(root: &Path) -> Result<Vec<(String, PathBuf)>, SlurmError> {
+/// Lists the IDs and folders of a store's submissions, oldest first.
+pub fn list_submissions(root: &Path) -> Result<Vec<(String, PathBuf)>, SlurmError> {
     let folder = root.join("slurm");
     let entries = match fs::read_dir(&folder) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         entries => entries.map_err(|e| SlurmError::file(&folder, e))?,
     };
-    let mut named = Vec::new();
+    let mut submissions = Vec::new();
     for entry in entries {
         let path = entry.map_err(|e| SlurmError::file(&folder, e))?.path();
         let is_folder = match fs::metadata(&path) {
@@ -115,44 +116,46 @@ pub fn all(root: &Path) -> Result<Vec<(String, PathBuf)>, SlurmError> {
         };
         let id = path.file_name().and_then(OsStr::to_str).filter(|id| !id.starts_with('.'));
         if let Some(id) = id.filter(|_| is_folder) {
-            named.push((id.to_owned(), path));
+            submissions.push((id.to_owned(), path));
         }
     }
-    named.sort();
-    Ok(named)
+    // IDs begin with the time of submission.
+    submissions.sort();
+    Ok(submissions)
 }
 
-/// The newest job's log of each task that a job has begun, by the task's identity.
-pub fn job_logs(root: &Path) -> Result<BTreeMap<String, PathBuf>, SlurmError> {
+/// Finds the newest log of each task whose job has started, by the task's identity.
+pub fn newest_logs(root: &Path) -> Result<BTreeMap<String, PathBuf>, SlurmError> {
     let mut logs = BTreeMap::new();
-    // Names begin with the time: the newest comes last.
-    for submission in all(root)?.iter().filter_map(|(id, _)| Submission::read(root, id)) {
-        let numbered = submission
-            .tasks
-            .iter()
-            .enumerate()
-            .map(|(number, task)| (task, submission.log(number)));
-        logs.extend(
-            numbered
-                .filter(|(_, log)| log.is_file())
-                .map(|(task, log)| (task.identity.clone(), log)),
-        );
+    for (id, _) in list_submissions(root)? {
+        let Some(submission) = Submission::read(root, &id) else { continue };
+        for (number, task) in submission.tasks.iter().enumerate() {
+            let log = submission.log_path(number);
+            if log.is_file() {
+                logs.insert(task.identity.clone(), log);
+            }
+        }
     }
     Ok(logs)
 }
 
-/// One submits at a time, so that two don't submit the same. `None` where the wait was given up.
-pub(crate) fn lock(root: &Path, is_stopped: &dyn Fn() -> bool) -> Result<Option<File>, SlurmError> {
-    let path = root.join("slurm/lock");
-    let fail = |e: io::Error| SlurmError::file(&path, e);
-    fs::create_dir_all(root.join("slurm")).map_err(fail)?;
-    let file = File::options().create(true).append(true).open(&path).map_err(fail)?;
+/// Locks a store's submissions, so that two processes don't submit the same task. `None` if
+/// `is_stopped` became true first.
+pub(crate) fn lock_submissions(
+    root: &Path,
+    is_stopped: &dyn Fn() -> bool,
+) -> Result<Option<File>, SlurmError> {
+    let folder = root.join("slurm");
+    let path = folder.join("lock");
+    let file = fs::create_dir_all(&folder)
+        .and_then(|()| File::options().create(true).append(true).open(&path))
+        .map_err(|e| SlurmError::file(&path, e))?;
     loop {
         match file.try_lock() {
             Ok(()) => return Ok(Some(file)),
             Err(TryLockError::WouldBlock) if is_stopped() => return Ok(None),
             Err(TryLockError::WouldBlock) => std::thread::sleep(ATTEMPT_INTERVAL),
-            Err(TryLockError::Error(error)) => return Err(fail(error)),
+            Err(TryLockError::Error(error)) => return Err(SlurmError::file(&path, error)),
         }
     }
 }
@@ -173,18 +176,19 @@ mod tests {
     #[test]
     fn a_submission_is_read_again() {
         let root = tempfile::tempdir().unwrap();
-        assert!(all(root.path()).unwrap().is_empty());
+        assert!(list_submissions(root.path()).unwrap().is_empty());
         for id in ["b", "a"] {
             let submission = Submission::new(root.path(), id, vec![task("x"), task(id)]);
             submission.write(b"{}", &Site::default(), &[OsStr::new("true")]).unwrap();
-            fs::write(submission.log(1), id).unwrap();
+            fs::write(submission.log_path(1), id).unwrap();
         }
         fs::create_dir(root.path().join("slurm/.c.new")).unwrap();
-        let ids: Vec<String> = all(root.path()).unwrap().into_iter().map(|(id, _)| id).collect();
+        let ids: Vec<String> =
+            list_submissions(root.path()).unwrap().into_iter().map(|(id, _)| id).collect();
         assert_eq!(ids, ["a", "b"]);
         assert_eq!(Submission::read(root.path(), "a").unwrap().tasks, [task("x"), task("a")]);
         assert!(Submission::read(root.path(), "c").is_none());
-        let logs = job_logs(root.path()).unwrap();
+        let logs = newest_logs(root.path()).unwrap();
         assert_eq!(logs.keys().collect::<Vec<_>>(), ["a", "b"], "x has none");
         assert!(logs["b"].ends_with("slurm/b/1.log"));
     }
@@ -192,9 +196,9 @@ mod tests {
     #[test]
     fn one_submits_at_a_time() {
         let root = tempfile::tempdir().unwrap();
-        let held = lock(root.path(), &|| false).unwrap();
-        assert!(held.is_some() && lock(root.path(), &|| true).unwrap().is_none());
+        let held = lock_submissions(root.path(), &|| false).unwrap();
+        assert!(held.is_some() && lock_submissions(root.path(), &|| true).unwrap().is_none());
         drop(held);
-        assert!(lock(root.path(), &|| true).unwrap().is_some());
+        assert!(lock_submissions(root.path(), &|| true).unwrap().is_some());
     }
 }

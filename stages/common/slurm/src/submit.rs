@@ -2,80 +2,80 @@ use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::Path;
 
-use crate::arguments::Order;
+use crate::SlurmError;
+use crate::arguments::JobRequest;
 use crate::commands::Slurm;
-use crate::error::SlurmError;
 use crate::queue::Queue;
 use crate::site::Site;
-use crate::submission::{Submission, lock};
+use crate::submission::{Submission, lock_submissions};
 
-/// What jobs are submitted with.
-pub struct Terms<'a> {
+/// Options of [`Submission::submit`].
+pub struct SubmitOptions<'a> {
     /// Slurm's programs.
     pub slurm: &'a Slurm,
-    /// The cluster's own wishes.
+    /// Settings of the cluster.
     pub site: &'a Site,
-    /// What a job runs, with the submission's folder and the task's number as further arguments.
+    /// Command of a job. The submission's folder and the task's number are appended.
     pub command: &'a [&'a OsStr],
-    /// What that reads besides.
+    /// Data that the command reads from [`Submission::plan_path`].
     pub plan: &'a [u8],
-    /// Where it runs.
+    /// Working directory of the jobs.
     pub folder: &'a Path,
-    /// Whether to stop here.
+    /// Callback that returns true to stop submitting.
     pub is_stopped: &'a dyn Fn() -> bool,
 }
 
-/// What submitting came to.
+/// Result of [`Submission::submit`].
 #[derive(Debug, Default)]
 pub struct Submitted {
-    /// The jobs that are new: the task's number, the job's own.
+    /// Task index and job ID of each new job.
     pub jobs: Vec<(usize, String)>,
-    /// Tasks that a job in the queue will do.
-    pub queued: usize,
-    /// Tasks left out, for want of room or because of an error.
-    pub left: usize,
-    /// Why it ended early.
+    /// Number of tasks for which a job was queued before.
+    pub already_queued: usize,
+    /// Number of tasks without a job, because the queue is full or submitting failed.
+    pub remaining: usize,
+    /// Error that ended submitting.
     pub error: Option<SlurmError>,
 }
 
 impl Submission {
-    /// Submits a job for each task that isn't done and isn't queued. `done` says what is; it is
-    /// asked after the queue, so that no task falls between both. The folder is written before the
-    /// first job is submitted, and only then.
+    /// Submits a job for each task that is neither done nor queued. `find_done` returns for each
+    /// task whether it is done. It is called after the queue was read, so that a task that ends in
+    /// between counts as done. The folder is written only if a job is submitted, and before the
+    /// first one.
     pub fn submit<E: From<SlurmError>>(
         &self,
         root: &Path,
-        terms: &Terms<'_>,
-        done: impl FnOnce() -> Result<Vec<bool>, E>,
+        options: &SubmitOptions<'_>,
+        find_done: impl FnOnce() -> Result<Vec<bool>, E>,
     ) -> Result<Submitted, E> {
-        let Some(_lock) = lock(root, terms.is_stopped)? else { return Ok(Submitted::default()) };
-        let queue = Queue::look(terms.slurm, root)?;
-        let done = done()?;
+        let Some(_lock) = lock_submissions(root, options.is_stopped)? else {
+            return Ok(Submitted::default());
+        };
+        let queue = Queue::read(options.slurm, root)?;
+        let done = find_done()?;
         let mut submitted = Submitted::default();
-        let mut room = terms.site.max_submit.saturating_sub(queue.jobs.len());
+        let mut room = options.site.max_submit.saturating_sub(queue.jobs.len());
         let mut new: BTreeMap<&str, String> = BTreeMap::new();
         let mut ids: Vec<Option<String>> = vec![None; self.tasks.len()];
         for number in (0..self.tasks.len()).filter(|&number| !done[number]) {
             let task = &self.tasks[number];
-            // Two blocks of a pipeline may come to one task.
-            let before = queue
-                .job_of(&task.identity)
-                .map(|job| &job.id)
-                .or_else(|| new.get(task.identity.as_str()));
-            if let Some(id) = before {
+            // Two blocks of a pipeline may be the same task, so `new` is searched, too.
+            let queued = queue.find_job(&task.identity).map(|job| &job.id);
+            if let Some(id) = queued.or_else(|| new.get(task.identity.as_str())) {
                 ids[number] = Some(id.clone());
-                submitted.queued += 1;
+                submitted.already_queued += 1;
                 continue;
             }
             let is_ready = task.parents.iter().all(|&parent| done[parent] || ids[parent].is_some());
-            if room == 0 || !is_ready || submitted.error.is_some() || (terms.is_stopped)() {
-                submitted.left += 1;
+            if room == 0 || !is_ready || submitted.error.is_some() || (options.is_stopped)() {
+                submitted.remaining += 1;
                 continue;
             }
             if submitted.jobs.is_empty() {
-                self.write(terms.plan, terms.site, terms.command)?;
+                self.write(options.plan, options.site, options.command)?;
             }
-            match self.submit_one(number, &ids, terms) {
+            match self.submit_task(number, &ids, options) {
                 Ok(id) => {
                     room -= 1;
                     ids[number] = Some(id.clone());
@@ -83,7 +83,7 @@ impl Submission {
                     submitted.jobs.push((number, id));
                 }
                 Err(error) => {
-                    submitted.left += 1;
+                    submitted.remaining += 1;
                     submitted.error = Some(error);
                 }
             }
@@ -91,35 +91,36 @@ impl Submission {
         Ok(submitted)
     }
 
-    fn submit_one(
+    /// Submits the job of one task and returns its ID. `ids` are the jobs of earlier tasks.
+    fn submit_task(
         &self,
         number: usize,
         ids: &[Option<String>],
-        terms: &Terms<'_>,
+        options: &SubmitOptions<'_>,
     ) -> Result<String, SlurmError> {
         let task = &self.tasks[number];
         let mut after: Vec<&str> =
             task.parents.iter().filter_map(|&parent| ids[parent].as_deref()).collect();
         after.sort_unstable_by_key(|id| (id.len(), *id));
         after.dedup();
-        let order = Order {
+        let job = JobRequest {
             name: &task.label,
             resources: &task.resources,
-            site: terms.site,
+            site: options.site,
             after: &after,
-            folder: terms.folder,
-            log: &self.log(number),
-            script: &self.script(),
+            folder: options.folder,
+            log: &self.log_path(number),
+            script: &self.script_path(),
             number,
         };
-        terms.slurm.sbatch(&order.arguments())
+        options.slurm.sbatch(&job.arguments())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::submission::{Task, all};
+    use crate::submission::{Task, list_submissions};
     use std::path::PathBuf;
     use std::process::Command;
 
@@ -188,7 +189,7 @@ mod tests {
             let tasks = vec![task("prep", &[]), task("train", &[0, 0]), task("other", &[])];
             let (slurm, site) =
                 (Slurm::in_folder(self.path("bin")), Site { max_submit: most, ..Site::default() });
-            let terms = Terms {
+            let options = SubmitOptions {
                 slurm: &slurm,
                 site: &site,
                 command: &[OsStr::new("run")],
@@ -197,7 +198,9 @@ mod tests {
                 is_stopped: &|| false,
             };
             let submission = Submission::new(self.dir.path(), id, tasks);
-            submission.submit::<SlurmError>(self.dir.path(), &terms, || Ok(done.to_vec())).unwrap()
+            submission
+                .submit::<SlurmError>(self.dir.path(), &options, || Ok(done.to_vec()))
+                .unwrap()
         }
 
         /// What stands in the queue: jobs of the submission "one".
@@ -240,7 +243,7 @@ mod tests {
         assert_eq!(fake.argv(), ["--job-name=train"]);
         let nothing = fake.submit("two", [true; 3], 10);
         assert!(
-            nothing.jobs.is_empty() && all(fake.dir.path()).unwrap().len() == 1,
+            nothing.jobs.is_empty() && list_submissions(fake.dir.path()).unwrap().len() == 1,
             "a submission without jobs leaves nothing"
         );
     }
@@ -252,7 +255,7 @@ mod tests {
         fake.queue(&[("101", "RUNNING", 0), ("103", "PENDING", 2)]);
         let second = fake.submit("two", [false, false, false], 10);
         // The fake refuses a fourth call: train was cancelled, and waits for the queued job.
-        assert_eq!((second.queued, second.left), (2, 1));
+        assert_eq!((second.already_queued, second.remaining), (2, 1));
         assert_eq!(
             fake.argv()[3],
             "--job-name=train --dependency=afterok:101 --kill-on-invalid-dep=yes"
@@ -260,9 +263,9 @@ mod tests {
         assert_eq!(second.error.unwrap().to_string(), "sbatch: error: QOSMaxSubmitJobPerUserLimit");
         fake.queue(&[("101", "COMPLETING", 0)]);
         assert_eq!(
-            fake.submit("three", [false, true, true], 10).queued,
+            fake.submit("three", [false, true, true], 10).already_queued,
             0,
-            "a job at its end makes nothing any more"
+            "a completing job finishes no task"
         );
         let asked = std::fs::read_to_string(fake.path("asked")).unwrap();
         assert_eq!(
@@ -276,12 +279,12 @@ mod tests {
     fn the_queue_is_bounded() {
         let fake = Fake::new();
         let first = fake.submit("one", [false; 3], 1);
-        assert_eq!((first.jobs.len(), first.left), (1, 2));
+        assert_eq!((first.jobs.len(), first.remaining), (1, 2));
         fake.queue(&[("101", "RUNNING", 0)]);
         let second = fake.submit("two", [false; 3], 1);
-        assert_eq!((second.jobs.len(), second.queued, second.left), (0, 1, 2));
+        assert_eq!((second.jobs.len(), second.already_queued, second.remaining), (0, 1, 2));
         fake.queue(&[]);
         let third = fake.submit("three", [true, false, false], 2);
-        assert_eq!((third.jobs.len(), third.left), (2, 0));
+        assert_eq!((third.jobs.len(), third.remaining), (2, 0));
     }
 }

@@ -9,7 +9,7 @@ use anyhow::Context as _;
 use artifact::{Failure, counted, hash_json, print_line, report_line};
 use planning::{FrozenPlan, PlanError, State};
 use serde_json::json;
-use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
+use slurm::{Site, Slurm, Submission, SubmitOptions, Submitted, Task};
 use store::Record;
 
 use super::work::{Executor, Work};
@@ -34,14 +34,14 @@ impl Executor for Cluster {
         check_name("the folder of pages", &out)?;
         let submission = Submission::new(root, work.run.id(), tasks(work, &out)?);
         if let Some((task, problem)) =
-            submission.tasks.iter().find_map(|t| Some((t, self.site.problem(&t.resources)?)))
+            submission.tasks.iter().find_map(|t| Some((t, self.site.problem_with(&t.resources)?)))
         {
             return Err(PlanError::Usage(format!("stage {}: {problem}", task.stage)).into());
         }
         let runner = std::env::current_exe()
             .and_then(|exe| exe.canonicalize())
             .context("the runner's own path")?;
-        let terms = Terms {
+        let terms = SubmitOptions {
             slurm: &Slurm::default(),
             site: &self.site,
             command: &[runner.as_os_str(), JOB_VERB.as_ref()],
@@ -62,7 +62,7 @@ impl Cluster {
         submission: &Submission,
         submitted: &Submitted,
     ) -> anyhow::Result<ExitCode> {
-        let Submitted { jobs, queued, left, error } = submitted;
+        let Submitted { jobs, already_queued: queued, remaining: left, error } = submitted;
         for (number, id) in jobs {
             print_line!("{}: job {id}", submission.tasks[*number].label);
         }

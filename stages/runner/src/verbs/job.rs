@@ -28,7 +28,7 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let root =
         folder.ancestors().nth(2).context("a submission lies in a store's folder `slurm`")?;
     let store = Store::open(root)?;
-    let frozen = FrozenPlan::read(&Submission::plan(folder))?;
+    let frozen = FrozenPlan::read(&Submission::plan_path(folder))?;
     let plan = frozen.task_plan(number)?;
     let result = register(&store, &plan, &stop).and_then(|run| {
         let (out, command) = (&frozen.out, &submitted_by(&store, folder));
@@ -57,7 +57,7 @@ fn go_on_later(plan: &Plan, store: &Store) -> anyhow::Result<()> {
     let state = plan.states(store, None)?.pop();
     let key = state.and_then(|state| state.key());
     let has_checkpoint = key.map_or(Ok(false), |key| store.has_checkpoint(&key))?;
-    let Some(id) = slurm::this_job().filter(|_| has_checkpoint) else {
+    let Some(id) = slurm::current_job_id().filter(|_| has_checkpoint) else {
         report_line!(
             "nerf-sr: its time is up, and it left no checkpoint to go on from; give it more \
             (resources: time)"
@@ -100,7 +100,7 @@ impl Task<'_> {
         self.check(&node.label(), node.parents(), records)?;
         let parents =
             node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
-        let (threads, display) = (slurm::cores(), Display::new());
+        let (threads, display) = (slurm::available_cores(), Display::new());
         let Self { plan, store, run: file, stop, .. } = *self;
         NodeJob { plan, node, parents, store, file, threads, display: &display, stop, watch: None }
             .run()
@@ -110,7 +110,7 @@ impl Task<'_> {
     fn show(&self, sink: &Sink, records: &[Option<Record>]) -> Result<(), StageFailure> {
         self.check(&sink.stage, sink.shows.iter().copied(), records)?;
         let Self { plan, store, run, out, stop, command } = *self;
-        let showing = Showing { plan, store, run, out, threads: slurm::cores(), stop };
+        let showing = Showing { plan, store, run, out, threads: slurm::available_cores(), stop };
         let course = Course { command, ..Course::before(records) };
         match show(&showing, sink, &course)? {
             Shown::Written { folder, aside } => {

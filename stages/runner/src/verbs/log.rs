@@ -71,7 +71,7 @@ fn logs_of(
 
 /// What the newest job of each node said, where nodes were submitted.
 fn job_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
-    let logs = slurm::job_logs(session.store.root()).unwrap_or_default();
+    let logs = slurm::newest_logs(session.store.root()).unwrap_or_default();
     // Without submissions no source is hashed.
     let identities =
         (!logs.is_empty()).then(|| identities(plan, &session.store, None).unwrap_or_default());

@@ -21,7 +21,7 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
     }
     let mut jobs = jobs.into_iter();
     for (node, state) in plan.nodes.iter().zip(states) {
-        let job = jobs.next().flatten().map(|job| job.words());
+        let job = jobs.next().flatten().map(|job| job.to_string());
         let detail = match &state {
             State::Cached(record) => {
                 let size = session.store.manifest(&record.output).map_or(0, |m| m.size());
