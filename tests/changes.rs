@@ -185,8 +185,8 @@ fn folders_that_a_run_can_not_use_are_refused_first() {
     let around = ["-i", "copies.from=."].map(Into::into);
     let elsewhere = ["-i", "copies.from=data", "--out", "data/pages"].map(Into::into);
     let table: [(&[std::ffi::OsString], i32, &[&str]); 5] = [
-        (&store, 3, &[r"f\xFF", "the store must have a name in UTF-8"]),
-        (&queued, 3, &[r"f\xFF", "the folder of pages must have a name in UTF-8"]),
+        (&store, 3, &[r"f\xFF", "the path of the store must be UTF-8"]),
+        (&queued, 3, &[r"f\xFF", "the path of the folder of pages must be UTF-8"]),
         (&pipe, 3, &["piped/a", "is a FIFO, socket or device"]),
         (&around, 2, &["input from", "contains the store", ".nerf-sr"]),
         (&elsewhere, 2, &["input from", "contains the folder of pages", "data/pages"]),
@@ -201,7 +201,7 @@ fn folders_that_a_run_can_not_use_are_refused_first() {
     fs::create_dir(&folder).unwrap();
     fs::copy(project.path("pipeline.yaml"), folder.join("pipeline.yaml")).unwrap();
     let finished = project.command(&["run"]).current_dir(&folder).output().unwrap();
-    Finished::of(finished).fails(3, &[r"f\xFF", "the pipeline's folder must have a name in UTF-8"]);
+    Finished::of(finished).fails(3, &[r"f\xFF", "the path of the pipeline's folder must be UTF-8"]);
     assert!(!folder.join(".nerf-sr").exists());
 }
 
@@ -225,7 +225,7 @@ fn checkpoints_of_inputs_that_were_written_to_are_not_trusted() {
     fs::write(&views, text).unwrap();
     let last = project.run(&arguments);
     assert_eq!(last.code, 0, "{}", last.stderr);
-    let said = "train-ss: an input was written to since its checkpoint; it starts over";
+    let said = "train-ss: an input was written to after the checkpoint; starting over";
     assert!(last.stderr.contains(said), "{}", last.stderr);
     assert!(!last.stderr.contains("going on from step"), "{}", last.stderr);
     // Without that it goes on.

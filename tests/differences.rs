@@ -96,13 +96,13 @@ fn why_tells_each_difference() {
     project.ok(&["run", "other", "--store", "empty"]);
     assert_eq!(
         said(&project, &["why", "first", "--store", "empty"])[0],
-        "first: will run: it never ran before"
+        "first: will run: no earlier run of this stage"
     );
     project.write("pipeline.yaml", PIPELINE);
     project.ok(&["run", "first"]);
     assert_eq!(
         said(&project, &["why", "second"]),
-        ["second: will run: it never ran before", "    by scene: steps"]
+        ["second: will run: no earlier run of this stage", "    by scene: steps"]
     );
     project.ok(&["run"]);
     let why = |arguments: &[&str]| said(&project, &[&["why", "first"], arguments].concat());
@@ -135,7 +135,7 @@ fn why_tells_each_difference() {
     assert_eq!(why(&[])[0], "first: will run: input a: ########## → ##########");
     let second = said(&project, &["why", "second"]);
     let expected = [
-        "second: waits for first; if that comes out as before, it stays cached",
+        "second: waits for first; stays cached if results don't change",
         "    by scene: steps",
         "  first: will run: input a: ########## → ##########",
     ];
@@ -149,7 +149,7 @@ fn why_tells_each_difference() {
     project.write("pipeline.yaml", PIPELINE);
     // What is stored.
     std::fs::remove_file(project.artifact("first", &[]).join("1.txt")).unwrap();
-    assert_eq!(why(&[])[0], "first: will run: its artifact ########## is gone or incomplete");
+    assert_eq!(why(&[])[0], "first: will run: its artifact ########## is missing or incomplete");
     project.ok(&["run"]);
     // Records of another version, and of another program under the block's name.
     change_key(&project, "first", "key version", &json!(1));
@@ -190,7 +190,7 @@ fn diff_tells_each_difference() {
     // An input's hash follows from what made it, and isn't told.
     let of_both = [&two[..], &["second: file 1.txt: ########## → ##########"]].concat();
     assert_eq!(diff("second", "second -p first.count=2"), of_both);
-    assert_eq!(diff("first", "first"), ["nothing differs"]);
+    assert_eq!(diff("first", "first"), ["no differences"]);
     assert_eq!(diff("first", "second"), ["second: stage: absent → \"mix\""]);
     assert_eq!(diff("second", "first"), ["second: stage: \"mix\" → absent"]);
     let told: Value =

@@ -79,7 +79,7 @@ fn the_second_signal_kills_a_stage_that_ignores_the_first() {
     );
     let again = project.run(&["run"]);
     assert_eq!(again.code, 0, "{}", again.stderr);
-    assert!(!again.stderr.contains("is being made"), "{}", again.stderr);
+    assert!(!again.stderr.contains("is being created"), "{}", again.stderr);
 }
 
 /// The fast pipeline, its training behind a script that doesn't replace itself.

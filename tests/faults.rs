@@ -95,7 +95,7 @@ fn a_runner_killed_or_interrupted_goes_on() {
     let said = interrupted.stderr;
     assert!(interrupted.code == 130 && said.contains("interrupted"), "{said}");
     let status = project.ok(&["status"]);
-    assert!(status.contains("has a checkpoint to go on from"), "{status}{said}");
+    assert!(status.contains("has a checkpoint to resume from"), "{status}{said}");
     let last = project.run(&["run"]);
     assert_eq!(last.code, 0, "{}", last.stderr);
     assert!(last.stderr.contains("going on from step"), "{}", last.stderr);

@@ -59,7 +59,7 @@ fn plan_status_and_why_say_the_same_to_programs() {
 #[test]
 fn path_leads_into_an_artifact() {
     let project = Project::new(PIPELINE);
-    project.run(&["path", "prep"]).fails(3, &["prep isn't made yet; run it first"]);
+    project.run(&["path", "prep"]).fails(3, &["prep has no artifact yet; run it first"]);
     project.ok(&["run", "-p", "kernel=lanczos,box"]);
     let two = project.ok(&["path", "prep/train", "-p", "kernel=lanczos,box"]);
     assert_eq!(two.lines().count(), 2);
@@ -85,7 +85,7 @@ fn diff_tells_what_differs() {
     project.ok(&["run", "-p", "kernel=lanczos,box"]);
     assert_eq!(
         project.ok(&["diff", "prep -p kernel=box", "prep -p kernel=box"]).trim(),
-        "nothing differs"
+        "no differences"
     );
     let kernels = project.ok(&["diff", "prep -p kernel=lanczos", "prep -p kernel=box"]);
     let lines: Vec<&str> = kernels.lines().collect();
@@ -121,13 +121,13 @@ fn diff_tells_what_differs() {
     project.ok(&["pin", "two", "-p", "kernel=box", "-p", "demo-scene.seed=1"]);
     assert_eq!(project.ok(&["diff", "one", "two"]), scenes);
     for (arguments, code, words) in [
-        (["diff", "prep", "prep -p kernel=average"], 3, "isn't made yet; run it first"),
+        (["diff", "prep", "prep -p kernel=average"], 3, "has no artifact yet; run it first"),
         (
             ["diff", "prep -p kernel=box,lanczos", "prep -p kernel=box"],
             2,
             "a sweep has several results",
         ),
-        (["diff", "prep --kernel box", "prep"], 2, "is neither -p nor -i"),
+        (["diff", "prep --kernel box", "prep"], 2, "expected -p or -i, found --kernel"),
         (["diff", "", "prep"], 2, "expected a stage, an artifact's hash, or a run"),
         (["diff", "nothing", "prep"], 2, "no stage \"nothing\""),
     ] {
@@ -147,5 +147,5 @@ fn gc_says_the_same_to_programs() {
     assert_eq!(goes[0]["stage"], "prep [kernel=box]");
     assert_eq!(goes[0]["bytes"], told["bytes_gone"]);
     let plain = project.ok(&["gc", "--dry-run", "--keep-days", "0", "-p", "kernel=lanczos"]);
-    assert!(plain.lines().last().unwrap().contains("MB would go"), "{plain}");
+    assert!(plain.lines().last().unwrap().contains("MB would be deleted"), "{plain}");
 }

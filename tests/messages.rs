@@ -207,7 +207,7 @@ fn a_log_is_found_whatever_the_stage_was_run_with() {
     // A stage that the default targets don't come to, and one that ran with another parameter.
     project.ok(&["run", "other"]);
     project.run(&["log", "nobody"]).fails(2, &["no stage \"nobody\""]);
-    assert_eq!(project.ok(&["log", "talk"]), "talk: it has not run yet\n");
+    assert_eq!(project.ok(&["log", "talk"]), "talk: has not run yet\n");
     project.ok(&["run", "-p", "word=bye"]);
     for (stage, word) in [("other", "\"other\""), ("talk", "\"bye\"")] {
         let log = project.ok(&["log", stage]);
@@ -409,7 +409,7 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
         "{}",
         stopped.stderr
     );
-    assert!(project.ok(&["status"]).contains("has a checkpoint to go on from"));
+    assert!(project.ok(&["status"]).contains("has a checkpoint to resume from"));
     let again = project.run(&["run"]);
     assert!(
         again.code == 0 && again.stderr.contains("train-ss: going on from step"),

@@ -316,7 +316,7 @@ fn a_run_that_failed_has_a_page() {
     let whole = std::fs::read(project.path("out/report/index.html")).unwrap();
     let failed = project.run(&["run", "-p", "train-ss.rays=1"]);
     assert_ne!(failed.code, 0);
-    assert!(failed.stdout.contains("what was there before is now"), "{}", failed.stdout);
+    assert!(failed.stdout.contains("moved the earlier page to"), "{}", failed.stdout);
     assert_eq!(std::fs::read(project.path("out/report-demo-scene/index.html")).unwrap(), whole);
     let page = project.path("out/report/index.html");
     let text = std::fs::read_to_string(&page).unwrap();

@@ -148,10 +148,10 @@ fn graph_status_log_gc_and_verify() {
     // What another kernel left is garbage, what the pipeline comes to is not.
     project.ok(&["run", "-p", "kernel=box"]);
     let before = project.store_listing();
-    assert!(project.ok(&["gc"]).contains("0.0 MB freed"), "young things stay");
+    assert!(project.ok(&["gc"]).contains("0.0 MB deleted"), "young things stay");
     assert_eq!(project.store_listing(), before);
     let dry = project.ok(&["gc", "--dry-run", "--keep-days", "0"]);
-    assert!(dry.contains("train-ss") && dry.contains("would go"), "{dry}");
+    assert!(dry.contains("train-ss") && dry.contains("would be deleted"), "{dry}");
     assert_eq!(project.store_listing(), before);
     project.ok(&["gc", "--keep-days", "0"]);
     assert_eq!(project.store_listing().len(), before.len() - 4 * 3);

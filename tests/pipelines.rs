@@ -30,19 +30,19 @@ fn every_verb_finds_a_target_of_its_own_file() {
         (&["why", "train-refine", "refined"], &["train-refine: waits for ", "downscaled-views"]),
         (
             &["why", "video", "video"],
-            &["video: shows path-views; a run writes it anew", "\n  path-views: waits for "],
+            &["video: shows path-views; a run writes the page again", "\n  path-views: waits for "],
         ),
         (&["status", "refined"], &["downscaled-views"]),
         (&["graph", "video"], &["camera-path"]),
         (&["plan", "viewer"], &["train-ss", "viewer"]),
         (&["log", "camera-path", "video"], &["has not run yet"]),
-        (&["gc", "refined", "--dry-run"], &["would stay"]),
+        (&["gc", "refined", "--dry-run"], &["would be kept"]),
         (&["describe", "train-refine"], &["Usage: train-refine ", "\nParameters: "]),
     ] {
         let said = project.ok(arguments);
         assert!(words.iter().all(|word| said.contains(word)), "{arguments:?}: {said}");
     }
-    project.run(&["pin", "kept", "video"]).fails(2, &["isn't cached"]);
+    project.run(&["pin", "kept", "video"]).fails(2, &["has no artifact to pin yet"]);
 }
 
 /// What pipeline.yaml made is there for a file of `pipelines/`, however that is named; pages are,

@@ -240,8 +240,10 @@ fn sinks_are_part_of_the_picture() {
     for (arguments, words) in [
         (
             &["why", "report"][..],
-            &["report: shows eval; a run writes it anew where they change", "\n  eval: waits for"]
-                [..],
+            &[
+                "report: shows eval; a run writes the page again if results change",
+                "\n  eval: waits for",
+            ][..],
         ),
         (&["plan"], &["shows eval"]),
         (&["graph"], &["report (shows the run)  ← eval\n"]),

@@ -81,15 +81,15 @@ fn memory_gives_places() {
     refused.fails(
         1,
         &[
-            "hungry: failed: it took 2",
-            "MB of memory when it last ran, and there are 104.9 MB; --memory says otherwise",
+            "hungry: failed: needs 2",
+            "MB of memory, as in its last run, but the limit is 104.9 MB; change the limit with",
         ],
     );
     let sweep = ["-p", "x=1,2"];
     let waited = project
         .run(&[&["run", "-j", "2", "--threads", "8", "--memory", "400M"][..], &sweep].concat());
     assert_eq!(waited.code, 0, "{}", waited.stderr);
-    let said = waited.stderr.lines().filter(|line| line.contains("hungry [x=2]: waits: it took 2"));
+    let said = waited.stderr.lines().filter(|line| line.contains("hungry [x=2]: waiting: needs 2"));
     assert_eq!(said.count(), 1, "{}", waited.stderr);
     assert!(lie_apart(&written(&project, &sweep)), "one after the other");
     let sweep = ["-p", "x=3,4"];

@@ -81,9 +81,9 @@ fn a_runner_that_waits_says_for_whom_and_ends_at_a_signal() {
             signal(&first, "-STOP");
         }
         let mut second = project.spawn(&[&["run"][..], &ENDLESS].concat());
-        let line = said(&mut second, "is being made");
+        let line = said(&mut second, "is being created");
         assert!(
-            line.contains(&format!("train-ss: is being made by process {}", first.id())),
+            line.contains(&format!("train-ss: is being created by process {}", first.id())),
             "{line}"
         );
         signal(&second, name);
@@ -161,14 +161,14 @@ fn another_point_goes_unless_it_is_pinned() {
     project.ok(&[&["pin", "boxes"][..], &point].concat());
     project.ok(&["gc", "--keep-days", "0"]);
     assert_eq!(project.store_listing(), both);
-    project.run(&["unpin", "box"]).fails(2, &["no pin \"box\"; pinned: boxes"]);
-    project.run(&["pin", "../x"]).fails(2, &["a name has letters"]);
-    project.run(&["pin", "new", "-p", "kernel=bicubic"]).fails(2, &["isn't cached"]);
+    project.run(&["unpin", "box"]).fails(2, &["no pin \"box\"; pins: boxes"]);
+    project.run(&["pin", "../x"]).fails(2, &["invalid pin name"]);
+    project.run(&["pin", "new", "-p", "kernel=bicubic"]).fails(2, &["has no artifact to pin yet"]);
     project.ok(&["unpin", "boxes"]);
     // Used within the days to keep: it stays.
     project.ok(&["gc"]);
     assert_eq!(project.store_listing(), both);
-    assert!(project.ok(&["gc", "--keep-days", "0", "--dry-run"]).contains("would go"));
+    assert!(project.ok(&["gc", "--keep-days", "0", "--dry-run"]).contains("would be deleted"));
     assert_eq!(project.store_listing(), both);
     project.ok(&["gc", "--keep-days", "0"]);
     assert_eq!(project.store_listing(), own);
@@ -202,7 +202,9 @@ fn somebody_elses_folder_is_not_replaced() {
     for (file, text) in [("mine/report/notes.txt", "precious"), ("mine/report/index.html", "hi")] {
         project.write(file, text);
     }
-    project.run(&["run", "--out", "mine"]).fails(1, &["mine/report/", "is not nerf-sr's", "--out"]);
+    project
+        .run(&["run", "--out", "mine"])
+        .fails(1, &["mine/report/", "was not written by nerf-sr", "--out"]);
     assert_eq!(std::fs::read_to_string(project.path("mine/report/notes.txt")).unwrap(), "precious");
     assert_eq!(std::fs::read_dir(project.path("mine")).unwrap().count(), 1);
     // Notes laid beside a page stay, too, when the page would change.
@@ -211,7 +213,7 @@ fn somebody_elses_folder_is_not_replaced() {
     assert!(project.ok(&["run"]).contains("up to date"));
     project
         .run(&["run", "-p", "render-depth.samples_per_axis=2"])
-        .fails(1, &["out/report/notes.txt", "is not nerf-sr's"]);
+        .fails(1, &["out/report/notes.txt", "was not written by nerf-sr"]);
     assert!(is_whole(&project.path("out/report")));
     std::fs::remove_file(project.path("out/report/notes.txt")).unwrap();
     project.ok(&["run", "-p", "render-depth.samples_per_axis=2"]);
@@ -240,10 +242,7 @@ fn a_page_that_a_kill_left_is_put_aside() {
         copy.arg("-r").arg(project.path("page"));
         assert!(copy.arg(out(".report.nerf-sr-new")).status().unwrap().success());
         let said = project.ok(&[&run[..], more].concat());
-        assert!(
-            said.contains("what was there before is now") && said.contains("report-a"),
-            "{said}"
-        );
+        assert!(said.contains("moved the earlier page to") && said.contains("report-a"), "{said}");
         assert!(std::fs::read(out("report-a/index.html")).unwrap() == page);
         assert!(is_whole(&out("report")));
         std::fs::remove_dir_all(out("report-a")).unwrap();

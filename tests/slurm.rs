@@ -317,9 +317,7 @@ fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
     assert_eq!(jobs.len(), 3);
     cluster.drain();
     assert_eq!(cluster.state(&jobs["eval"]), "COMPLETED 0:0");
-    assert!(
-        cluster.ok(&project, &[&["log", "eval"][..], &hit].concat()).contains("eval: is cached")
-    );
+    assert!(cluster.ok(&project, &[&["log", "eval"][..], &hit].concat()).contains("eval: cached"));
     assert_eq!(ran(&project).len(), 6, "{:?}", ran(&project));
 }
 
@@ -345,7 +343,7 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     assert_eq!(jobs.keys().collect::<Vec<_>>(), ["last"], "what is cached is not submitted");
     wait_until(|| shows_running(&cluster, &project, &held, &jobs["last"]));
     let second = cluster.ok(&project, &[&["run"][..], &held].concat());
-    assert!(second.contains("0 jobs submitted, 1 queued before"), "{second}");
+    assert!(second.contains("0 jobs submitted, 1 already queued"), "{second}");
     // What the job needs stays, though the plan without arguments doesn't name it.
     let said = cluster.ok(&project, &["gc", "other", "--keep-days", "0", "--drop-unfinished"]);
     assert!(
@@ -413,7 +411,7 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
             cluster.slurm("scancel", &["--batch", "--signal=USR1", &job]);
         }
         let is_queued = happens(|| {
-            log().matches("goes on from the checkpoint later").count() == round
+            log().matches("will resume from the checkpoint").count() == round
                 && state().starts_with("PENDING")
         });
         assert!(is_queued, "{} {}", state(), log());
@@ -528,7 +526,7 @@ fn a_dependency_that_slurm_has_forgotten_is_caught() {
     cluster.drain();
     assert_eq!(cluster.state(&job), "FAILED 3:0");
     let said = std::fs::read_to_string(log).unwrap();
-    assert!(said.contains("last needs first, which isn't there"), "{said}");
+    assert!(said.contains("last needs first, which has no artifact"), "{said}");
 }
 
 /// A stage that asks for a GPU computes on the first of its own; here that is another kind of
@@ -579,14 +577,13 @@ fn what_slurm_is_told() {
     let said = run_on_path(&project, &path, &["run"]);
     assert_eq!(
         (said.code, said.stdout.as_str()),
-        (0, "first: job 41\nlast: job 42\n2 jobs submitted, 0 queued before\n"),
+        (0, "first: job 41\nlast: job 42\n2 jobs submitted, 0 already queued\n"),
         "{}",
         said.stderr
     );
     assert!(
-        said.stderr.contains(
-            "1 job left: at most 2 jobs are queued at once (max_submit); run this again to go on"
-        ),
+        said.stderr
+            .contains("1 job not submitted: at most 2 jobs may be queued at once (max_submit)"),
         "{}",
         said.stderr
     );
@@ -612,11 +609,13 @@ fn what_slurm_is_told() {
     project
         .write("queue", &format!("41|RUNNING|None|{script} 0\n42|PENDING|Dependency|{script} 1\n"));
     assert!(
-        run_on_path(&project, &path, &["run"]).stdout.contains("0 jobs submitted, 2 queued before")
+        run_on_path(&project, &path, &["run"])
+            .stdout
+            .contains("0 jobs submitted, 2 already queued")
     );
     project.write("site.yaml", "max_submit: 3\n");
     let said = run_on_path(&project, &path, &["run"]);
-    assert_eq!(said.stdout, "page: job 43\n1 job submitted, 2 queued before\n");
+    assert_eq!(said.stdout, "page: job 43\n1 job submitted, 2 already queued\n");
     assert!(
         std::fs::read_to_string(project.path("sbatch.called"))
             .unwrap()
@@ -642,7 +641,7 @@ fn what_slurm_is_told() {
     run_on_path(&project, &path, &["run"])
         .fails(1, &["3 jobs left: sbatch: error: invalid partition; run this again"]);
     run_on_path(&project, &path, &["run", "-j", "2"])
-        .fails(2, &["--jobs, --threads, --memory and --keep-going are for --executor local"]);
+        .fails(2, &["--jobs, --threads, --memory and --keep-going need --executor local"]);
     project.write("site.yaml", "partitions: gpu\n");
     run_on_path(&project, &path, &["run"]).fails(2, &["site.yaml", "unknown field `partitions`"]);
     std::fs::remove_file(project.path("bin/squeue")).unwrap();

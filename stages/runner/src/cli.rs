@@ -1,423 +1,399 @@
+//! The command line.
+//!
+//! Structs that are flattened into a command, and values of options, have `//` comments: clap would
+//! print doc comments as the verb's help, or give every verb's help its long form.
+
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use artifact::report_line;
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use garbage::Policy;
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::{Memory, Site};
-use stage::machine_memory;
 
 use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
-use crate::limits::capped;
-use crate::remedy::Remedy;
+use crate::run_messages::FailureHint;
 use crate::session::Session;
-use crate::verbs::{self, GraphFormat, Style};
+use crate::verbs::{self, GcOutput, GraphFormat};
 use crate::watch::Watch;
 
-/// Where the pipeline is looked for.
-const PIPELINE: &str = "pipeline.yaml";
-/// Where stages compute.
-const DEVICE: &str = "cpu";
-/// Who runs them.
-const EXECUTOR: &str = "local";
+const DEFAULT_PIPELINE: &str = "pipeline.yaml";
+const DEFAULT_DEVICE: &str = "cpu";
+const DEFAULT_EXECUTOR: &str = "local";
 
-/// Runs pipeline.yaml: makes what isn't there, skips what is, and says why.
+/// Run the stages of pipeline.yaml, reuse cached results, and explain each decision
 #[derive(Parser)]
 #[command(name = "nerf-sr", version)]
 struct Cli {
     #[command(subcommand)]
     verb: Verb,
-    /// The pipeline
-    #[arg(long, global = true, default_value = PIPELINE, value_name = "FILE")]
-    pipeline: PathBuf,
-    /// Where artifacts are kept [default: .nerf-sr beside the pipeline]
-    #[arg(long, global = true, value_name = "DIR", env = "NERF_SR_STORE")]
-    store: Option<PathBuf>,
-    /// Where to compute: cpu or cuda:N
-    #[arg(long, global = true, default_value = DEVICE)]
-    device: String,
-    /// Who runs the stages: this machine, or a cluster's jobs; there a stage that needs GPUs
-    /// (`resources`) computes on cuda:0
-    #[arg(long, global = true, value_enum, default_value = EXECUTOR, env = "NERF_SR_EXECUTOR")]
-    executor: Choose,
+    #[command(flatten)]
+    global: GlobalArgs,
 }
 
-/// An executor's name.
+// Options of every verb.
+#[derive(Args)]
+struct GlobalArgs {
+    /// Pipeline file
+    #[arg(long, global = true, default_value = DEFAULT_PIPELINE, value_name = "FILE")]
+    pipeline: PathBuf,
+    /// Folder of the artifacts [default: .nerf-sr next to the pipeline file]
+    #[arg(long, global = true, value_name = "DIR", env = "NERF_SR_STORE")]
+    store: Option<PathBuf>,
+    /// Compute device: cpu or cuda:N
+    #[arg(long, global = true, default_value = DEFAULT_DEVICE)]
+    device: String,
+    /// Run stages on this machine, or as jobs of a Slurm cluster; there, stages that request GPUs
+    /// (`resources`) compute on cuda:0
+    #[arg(long, global = true, value_enum, default_value = DEFAULT_EXECUTOR,
+        env = "NERF_SR_EXECUTOR")]
+    executor: ExecutorKind,
+}
+
 #[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum Choose {
-    // Without texts of their own: clap would give every verb's help its long form.
+enum ExecutorKind {
     Local,
     Slurm,
 }
 
+// Arguments from which a plan is created.
 #[derive(Args, Default)]
-struct What {
-    /// Targets: stages of the pipeline, or files of pipelines/ beside it [default: the pipeline's
-    /// `default`]
+struct PlanArgs {
+    /// Targets: stages of the pipeline, or files in pipelines/ or experiments/ next to it [default:
+    /// the pipeline's `default`]
     targets: Vec<String>,
-    /// Sets a parameter; several values run all combinations, sharing what they share. A value is a
-    /// JSON number, true, false or null, else a word; nothing at all is null. The last of several
-    /// for the same parameter counts
+    /// Set a parameter. Several values run all combinations; stages that don't depend on the
+    /// parameter run once. A value is JSON, such as a number, true or null, or plain text; an empty
+    /// value is null. If a parameter is given twice, the last value wins
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
-    /// Takes an input from a folder instead, e.g. -i dataset=scenes/lego
+    /// Read an input from a folder instead, e.g. -i dataset=scenes/lego
     #[arg(short = 'i', long = "input", value_name = "[STAGE.]NAME=DIR[,DIR…]")]
     inputs: Vec<String>,
     #[command(flatten)]
-    experiment: OfExperiment,
+    experiment: ExperimentArgs,
 }
 
-/// What of an experiment is wanted
+// Selection from an experiment.
 #[derive(Args, Default)]
-struct OfExperiment {
-    /// Scenes of an experiment: folders of --data, or `demo` [default: those that its file names]
+struct ExperimentArgs {
+    /// Scenes of an experiment: folders in --data, or `demo` [default: those that its file names]
     #[arg(long = "scene", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     scenes: Vec<String>,
-    /// Protocols of an experiment: its presets, or WIDTHxSCALE [default: those that its file names]
+    /// Protocols of an experiment: presets of its file, or WIDTHxSCALE [default: those that its
+    /// file names]
     #[arg(long = "protocol", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     protocols: Vec<String>,
-    /// A variant of an experiment; repeat for more [default: all]
+    /// Variant of an experiment; repeat for more [default: all]
     #[arg(long = "variant", value_name = "NAME")]
     variants: Vec<String>,
-    /// Only so many variants of an experiment, the first
+    /// Use only the first N variants of an experiment
     #[arg(long, value_name = "N")]
     first_variants: Option<usize>,
-    /// Of what a sink shows only these: names of its inputs, or blocks [default: all]
+    /// Limit sinks to these of their inputs, or to these blocks [default: all]
     #[arg(long = "show", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     show: Vec<String>,
-    /// Folder of an experiment's data sets [default: the file's]
+    /// Folder of an experiment's data sets [default: the one that its file names]
     #[arg(long, value_name = "DIR", env = "NERF_SR_DATA")]
     data: Option<PathBuf>,
 }
 
-// Without a text of its own: clap would give it to the verb.
+// Options of `run`.
 #[derive(Args)]
 struct RunOptions {
-    /// Stages at once [default: the number of cores, at most 4]
+    /// Maximum number of stages that run at once [default: number of cores, at most 4]
     #[arg(short, long, value_name = "N")]
     jobs: Option<usize>,
-    /// Threads of each stage, and cores of all together; results don't depend on it [default:
-    /// all cores]
+    /// Number of threads of each stage, and of cores for all stages together; results don't depend
+    /// on it [default: all cores]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
-    /// Memory of all stages together, such as 8G, by what each took when it last ran [default:
-    /// all there is]
+    /// Memory limit for all stages together, such as 8G; each stage counts with the peak memory of
+    /// its last run [default: all memory]
     #[arg(long, value_name = "AMOUNT")]
     memory: Option<Memory>,
-    /// Go on with what doesn't need a failed stage
+    /// Continue with stages that don't depend on a failed one
     #[arg(short, long)]
     keep_going: bool,
-    /// Where pages and watched views are written [default: out beside the pipeline]
+    /// Folder of pages and watched views [default: out next to the pipeline file]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Show a test view and its scores while a field trains, for about 2 % of the processor
+    /// Show a test view and its scores while a field trains, using about 2 % of the processor
     /// time; needs a target that scores views, such as eval [default view: the first]
     #[arg(long, value_name = "VIEW", num_args = 0..=1, require_equals = true,
         default_missing_value = "")]
     watch: Option<String>,
-    /// What a cluster wants besides: partition, account, set-up lines [default:
-    /// ~/.config/nerf-sr/slurm.yaml if it is there]
+    /// Site file of the cluster: partition, account, set-up lines [default:
+    /// ~/.config/nerf-sr/slurm.yaml if it exists]
     #[arg(long, value_name = "FILE", env = "NERF_SR_SITE")]
     site: Option<PathBuf>,
 }
 
 #[derive(Subcommand)]
 enum Verb {
-    /// Make the targets; what is cached isn't run again
+    /// Run the stages that the targets need; cached ones are skipped
     Run {
         #[command(flatten)]
-        what: What,
+        plan: PlanArgs,
         #[command(flatten)]
-        how: RunOptions,
+        options: RunOptions,
     },
-    /// Cancel jobs that were submitted to a cluster, and those that need them
+    /// Cancel submitted jobs of a cluster and the jobs that depend on them
     Cancel {
-        /// The stage [default: all jobs of this store]
+        /// Stage whose jobs are cancelled [default: all jobs of this store]
         stage: Option<String>,
     },
-    /// Do one task of a submission; the script of its jobs calls this
+    /// Run one task of a submission; called by its jobs' script
     #[command(name = JOB_VERB, hide = true)]
     Job {
-        /// The submission's folder
+        /// Folder of the submission
         submission: PathBuf,
-        /// The task's number
+        /// Number of the task
         number: usize,
     },
     /// Write a commented pipeline for a folder of posed photographs
     Init {
-        /// The folder; its form is found by looking
+        /// Folder of the data set, whose format is detected
         #[arg(value_name = "DIR")]
         folder: PathBuf,
     },
-    /// Show what `run` would do, and run nothing
+    /// Show what `run` would do, without running anything
     Plan {
         #[command(flatten)]
-        what: What,
-        /// Print JSON, for programs
+        plan: PlanArgs,
+        /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Say why a stage is cached, would run, or waits
+    /// Explain why a stage is cached, would run, or waits
     Why {
-        /// The stage
+        /// Stage to explain
         stage: String,
         #[command(flatten)]
-        what: What,
-        /// Print JSON, for programs
+        plan: PlanArgs,
+        /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Show every stage with its artifact, age and time
+    /// Show every stage with its artifact, age and running time
     Status {
         #[command(flatten)]
-        what: What,
-        /// Print JSON, for programs
+        plan: PlanArgs,
+        /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Print the folder of a stage's artifact, or a folder or file inside it
+    /// Print the path of a stage's artifact, or of a folder or file in it
     Path {
-        /// The stage, e.g. eval, or with a folder or file, e.g. prep/train
+        /// Stage, e.g. eval, or a folder or file in its artifact, e.g. prep/train
         #[arg(value_name = "STAGE[/FOLDER]")]
         stage: String,
         #[command(flatten)]
-        what: What,
+        plan: PlanArgs,
     },
-    /// Tell what differs between two results: parameters, defaults in use, metrics, images
+    /// Compare two results: parameters, defaults in use, metrics, images
     Diff {
-        /// A stage with its arguments as one word ("eval -p kernel=box"), the beginning of an
-        /// artifact's hash, or a recorded run or pin
+        /// Stage with its arguments as one word ("eval -p kernel=box"), first characters of an
+        /// artifact's hash, ID of a recorded run, or name of a pin
         before: String,
-        /// Likewise
+        /// Result to compare with, in one of these forms
         now: String,
-        /// Print JSON, for programs
+        /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Draw the graph
+    /// Draw the stages and their inputs as a graph
     Graph {
         #[command(flatten)]
-        what: What,
-        /// As what
+        plan: PlanArgs,
+        /// Output format
         #[arg(long, value_enum, default_value = "ascii")]
         format: GraphFormat,
     },
-    /// Print what a stage said when it ran
+    /// Print the log of a stage
     Log {
-        /// The stage
+        /// Stage whose log is printed
         stage: String,
         #[command(flatten)]
-        what: What,
+        plan: PlanArgs,
     },
-    /// Read every artifact and record again, and compare hashes
+    /// Read all artifacts and records, and compare their contents with their hashes
     Verify {
-        /// Remove damaged artifacts and records, so that the next run makes them again
+        /// Delete damaged artifacts and records, so that the next run creates them again
         #[arg(long)]
         remove: bool,
     },
-    /// Keep what targets have, whatever `gc` is told
+    /// Protect the targets' artifacts from `gc`
     Pin {
-        /// What to call it
+        /// Name of the pin
         name: String,
         #[command(flatten)]
-        what: What,
+        plan: PlanArgs,
     },
-    /// Take a pin away
+    /// Remove a pin
     Unpin {
-        /// What it is called
+        /// Name of the pin
         name: String,
     },
-    /// Delete artifacts that nothing needs: no pin, no run in progress or of late, no target
+    /// Delete artifacts that no pin, recent or running run, or target needs
     Gc {
         #[command(flatten)]
-        what: What,
-        /// Only say what would go
+        plan: PlanArgs,
+        /// Only print what would be deleted
         #[arg(long)]
         dry_run: bool,
-        /// Keep what was made or used within so many days
+        /// Keep artifacts that were created or used in the last N days
         #[arg(long, default_value_t = 7, value_name = "N")]
         keep_days: u64,
-        /// Delete checkpoints, too, of stages that were stopped
+        /// Delete checkpoints of interrupted stages, too
         #[arg(long)]
         drop_unfinished: bool,
-        /// Delete what older versions of nerf-sr made, too: its keys can't be met any more
+        /// Delete artifacts of older versions of nerf-sr, too; no plan can use them any more
         #[arg(long)]
         drop_old: bool,
-        /// Print JSON, for programs
+        /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Print the help of a stage's program: what it makes, its inputs and its parameters
+    /// Print the help of a stage's program: its output, inputs and parameters
     Describe {
-        /// The stage
+        /// Stage to describe
         stage: String,
     },
-    /// Write man pages of all verbs into a folder; `make install` calls this
+    /// Write man pages of all verbs into a folder; called by `make install`
     #[command(hide = true)]
     Man {
-        /// The folder
+        /// Folder of the man pages
         folder: PathBuf,
     },
     /// Print shell completions
     Completions {
-        /// For which shell
+        /// Name of the shell
         shell: clap_complete::Shell,
     },
 }
 
-/// The program: exit code 0 when all is there, a failed stage's own code, 2 for a wrong file or
-/// command line, 70 for a panic. None of them changes where stdout is closed.
-pub fn main() -> ExitCode {
-    stage::install_panic_hook("nerf-sr");
-    match run(Cli::parse()) {
-        Ok(code) => code,
-        Err(error) => {
-            report_line!("nerf-sr: {}", artifact::one_line(&error));
-            let plan_code =
-                error.chain().find_map(|e| e.downcast_ref::<PlanError>()).map(|e| match e {
-                    PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
-                    PlanError::Store(_) => 1,
-                    PlanError::Source { .. } | PlanError::Artifact(_) => 3,
-                    PlanError::Interrupted => 130,
-                });
-            ExitCode::from(plan_code.unwrap_or_else(|| artifact::exit_code(&error)))
-        }
-    }
-}
-
-impl From<What> for Request {
-    fn from(what: What) -> Self {
-        let OfExperiment { scenes, protocols, variants, first_variants, show, data } =
-            what.experiment;
+impl From<PlanArgs> for Request {
+    fn from(args: PlanArgs) -> Self {
+        let ExperimentArgs { scenes, protocols, variants, first_variants, show, data } =
+            args.experiment;
         let selection =
             Selection { data, scenes, protocols, variants, max_variants: first_variants, show };
-        Self { targets: what.targets, parameters: what.parameters, inputs: what.inputs, selection }
+        Self { targets: args.targets, parameters: args.parameters, inputs: args.inputs, selection }
     }
 }
 
-fn run(cli: Cli) -> anyhow::Result<ExitCode> {
-    match &cli.verb {
-        Verb::Completions { shell } => {
-            return Ok(verbs::completions(*shell, &mut Cli::command()));
+/// Parses the command line and carries out its verb.
+pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
+    let Cli { verb, global } = Cli::parse();
+    match verb {
+        Verb::Run { plan, options } => run(&global, plan, options),
+        Verb::Cancel { stage } => verbs::cancel(&global.open_session()?.store, stage.as_deref()),
+        Verb::Job { submission, number } => verbs::job(&submission, number),
+        Verb::Init { folder } => verbs::init(&folder, &global.pipeline),
+        Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json),
+        Verb::Why { stage, plan, json } => {
+            verbs::why(&global.open_session()?, &stage, &plan.into(), json)
+        }
+        Verb::Status { plan, json } => verbs::status(&global.open_session()?, &plan.into(), json),
+        Verb::Path { stage, plan } => verbs::path(&global.open_session()?, &stage, &plan.into()),
+        Verb::Diff { before, now, json } => {
+            verbs::diff(&global.open_session()?, &before, &now, json)
+        }
+        Verb::Graph { plan, format } => verbs::graph(&global.open_session()?, &plan.into(), format),
+        Verb::Log { stage, plan } => verbs::log(&global.open_session()?, &stage, &plan.into()),
+        Verb::Verify { remove } => verbs::verify(&global.open_session()?.store, remove),
+        Verb::Pin { name, plan } => verbs::pin(&global.open_session()?, &name, &plan.into()),
+        Verb::Unpin { name } => verbs::unpin(&global.open_session()?, &name),
+        Verb::Gc { plan, dry_run, keep_days, drop_unfinished, drop_old, json } => {
+            let policy = Policy { keep_days, drop_unfinished, drop_old };
+            verbs::gc(&global.open_session()?, &plan.into(), policy, GcOutput { dry_run, json })
         }
         Verb::Describe { stage } => {
-            return verbs::describe(
-                &Pipeline::read(&cli.pipeline).map_err(PlanError::from)?,
-                stage,
-            );
+            verbs::describe(&Pipeline::read(&global.pipeline).map_err(PlanError::from)?, &stage)
         }
-        Verb::Init { folder } => return verbs::init(folder, &cli.pipeline),
-        Verb::Man { folder } => return verbs::man(Cli::command(), folder),
-        Verb::Job { submission, number } => return verbs::job(submission, *number),
-        _ => {}
-    }
-    let devices =
-        Devices { given: cli.device.clone(), by_resources: cli.executor == Choose::Slurm };
-    let session = Session::open(&cli.pipeline, cli.store.as_deref(), devices)?;
-    match cli.verb {
-        Verb::Run { what, how } => {
-            let home = session.pipeline.project_folder();
-            let out = how.out.clone().unwrap_or_else(|| home.join("out"));
-            let words = given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device);
-            let executor = executor(cli.executor, &how, Remedy::new(words), &out)?;
-            verbs::run(&session, &what.into(), &out, executor.as_ref())
-        }
-        Verb::Cancel { stage } => verbs::cancel(&session.store, stage.as_deref()),
-        Verb::Plan { what, json } => verbs::plan(&session, &what.into(), json),
-        Verb::Why { stage, what, json } => verbs::why(&session, &stage, &what.into(), json),
-        Verb::Status { what, json } => verbs::status(&session, &what.into(), json),
-        Verb::Path { stage, what } => verbs::path(&session, &stage, &what.into()),
-        Verb::Diff { before, now, json } => verbs::diff(&session, &before, &now, json),
-        Verb::Graph { what, format } => verbs::graph(&session, &what.into(), format),
-        Verb::Log { stage, what } => verbs::log(&session, &stage, &what.into()),
-        Verb::Verify { remove } => verbs::verify(&session.store, remove),
-        Verb::Pin { name, what } => verbs::pin(&session, &name, &what.into()),
-        Verb::Unpin { name } => verbs::unpin(&session, &name),
-        Verb::Gc { what, dry_run, keep_days, drop_unfinished, drop_old, json } => {
-            let policy = Policy { keep_days, drop_unfinished, drop_old };
-            verbs::gc(&session, &what.into(), policy, Style { dry_run, json })
-        }
-        Verb::Completions { .. }
-        | Verb::Describe { .. }
-        | Verb::Init { .. }
-        | Verb::Job { .. }
-        | Verb::Man { .. } => {
-            unreachable!("handled before the session")
-        }
+        Verb::Man { folder } => verbs::man(Cli::command(), &folder),
+        Verb::Completions { shell } => Ok(verbs::completions(shell, &mut Cli::command())),
     }
 }
 
-/// Who carries out a run. `remedy` is what to say after a failure, `out` where pages go.
-fn executor(
-    choice: Choose,
-    how: &RunOptions,
-    remedy: Remedy,
+fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Result<ExitCode> {
+    let session = global.open_session()?;
+    let out = options.out.clone().unwrap_or_else(|| session.pipeline.project_folder().join("out"));
+    let hint = FailureHint::new(global.arguments_of_log(&plan));
+    let executor = new_executor(global.executor, options, hint, &out)?;
+    verbs::run(&session, &plan.into(), &out, executor.as_ref())
+}
+
+impl GlobalArgs {
+    fn open_session(&self) -> anyhow::Result<Session> {
+        let by_resources = self.executor == ExecutorKind::Slurm;
+        let devices = Devices { given: self.device.clone(), by_resources };
+        Session::open(&self.pipeline, self.store.as_deref(), devices)
+    }
+
+    /// Returns the arguments with which `log` finds the stages of a run of this plan.
+    fn arguments_of_log(&self, plan: &PlanArgs) -> Vec<String> {
+        let mut arguments = plan.targets.clone();
+        for (option, values) in [("-p", &plan.parameters), ("-i", &plan.inputs)] {
+            arguments.extend(values.iter().flat_map(|value| [option.to_owned(), value.clone()]));
+        }
+        let experiment = &plan.experiment;
+        for (option, names) in [
+            ("--scene", &experiment.scenes),
+            ("--protocol", &experiment.protocols),
+            ("--show", &experiment.show),
+        ] {
+            if !names.is_empty() {
+                arguments.extend([option.to_owned(), names.join(",")]);
+            }
+        }
+        for name in &experiment.variants {
+            arguments.extend(["--variant".to_owned(), name.clone()]);
+        }
+        let pipeline = Some(&self.pipeline).filter(|file| *file != Path::new(DEFAULT_PIPELINE));
+        for (option, value) in [
+            ("--first-variants", experiment.first_variants.map(|count| count.to_string())),
+            ("--data", experiment.data.as_deref().map(path_text)),
+            ("--pipeline", pipeline.map(|file| path_text(file))),
+            ("--store", self.store.as_deref().map(path_text)),
+            ("--device", Some(self.device.clone()).filter(|device| device != DEFAULT_DEVICE)),
+        ] {
+            if let Some(value) = value {
+                arguments.extend([option.to_owned(), value]);
+            }
+        }
+        arguments
+    }
+}
+
+fn path_text(path: &Path) -> String {
+    path.to_string_lossy().into_owned()
+}
+
+/// Creates the executor of a run. `hint` is printed after a failure; pages are written to `out`.
+fn new_executor(
+    kind: ExecutorKind,
+    options: RunOptions,
+    hint: FailureHint,
     out: &Path,
 ) -> Result<Box<dyn Executor>, PlanError> {
-    let RunOptions { jobs, threads, memory, keep_going, site, watch, .. } = how;
-    if choice == Choose::Local {
-        let watch = watch.clone().map(|view| Watch { view, folder: out.join("watch") });
-        let budget = budget(*jobs, *threads, *memory)?;
-        return Ok(Box::new(Local { budget, keep_going: *keep_going, remedy, watch }));
+    let RunOptions { jobs, threads, memory, keep_going, site, watch, .. } = options;
+    if kind == ExecutorKind::Local {
+        let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
+        let budget = Budget::new(jobs, threads, memory.map(Memory::bytes))?;
+        return Ok(Box::new(Local { budget, keep_going, hint, watch }));
     }
-    if jobs.is_some() || threads.is_some() || memory.is_some() || *keep_going {
-        let problem = "--jobs, --threads, --memory and --keep-going are for --executor local; say \
-            `resources` in the pipeline";
-        return Err(PlanError::Usage(problem.to_owned()));
-    }
-    if watch.is_some() {
-        let problem = "--watch is for --executor local: no runner stays while jobs run";
-        return Err(PlanError::Usage(problem.to_owned()));
-    }
-    let site = Site::find(site.as_deref()).map_err(|e| PlanError::Usage(e.to_string()))?;
-    Ok(Box::new(Cluster { site }))
-}
-
-/// What a run may take, as far as the machine can use it.
-fn budget(
-    jobs: Option<usize>,
-    threads: Option<usize>,
-    memory: Option<Memory>,
-) -> Result<Budget, PlanError> {
-    if jobs == Some(0) || threads == Some(0) {
-        return Err(PlanError::Usage("--jobs and --threads must be at least 1".to_owned()));
-    }
-    let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    let (stages, less_jobs) = capped("--jobs", jobs.unwrap_or(cores.min(4)), cores);
-    let (threads, less_threads) = capped("--threads", threads.unwrap_or(cores), cores);
-    less_jobs.into_iter().chain(less_threads).for_each(|said| report_line!("{said}"));
-    Ok(Budget {
-        stages,
-        threads,
-        memory: memory.map(Memory::bytes).or_else(machine_memory).unwrap_or(u64::MAX),
-    })
-}
-
-/// The words with which another verb is asked for the same.
-fn given(what: &What, pipeline: &Path, store: Option<&Path>, device: &str) -> Vec<String> {
-    let mut words = what.targets.clone();
-    words.extend(what.parameters.iter().flat_map(|value| ["-p".to_owned(), value.clone()]));
-    words.extend(what.inputs.iter().flat_map(|value| ["-i".to_owned(), value.clone()]));
-    let file = |path: &Path| path.to_string_lossy().into_owned();
-    let OfExperiment { scenes, protocols, variants, first_variants, show, data } = &what.experiment;
-    let lists = [("--scene", scenes), ("--protocol", protocols), ("--show", show)];
-    let lists = lists.into_iter().filter(|(_, names)| !names.is_empty());
-    words.extend(lists.flat_map(|(option, names)| [option.to_owned(), names.join(",")]));
-    words.extend(variants.iter().flat_map(|name| ["--variant".to_owned(), name.clone()]));
-    let options = [
-        ("--first-variants", first_variants.map(|count| count.to_string())),
-        ("--data", data.as_deref().map(file)),
-        ("--pipeline", (pipeline != Path::new(PIPELINE)).then(|| file(pipeline))),
-        ("--store", store.map(file)),
-        ("--device", (device != DEVICE).then(|| device.to_owned())),
-    ];
-    words.extend(
-        options
-            .into_iter()
-            .flat_map(|(name, value)| value.into_iter().flat_map(|v| [name.to_owned(), v])),
-    );
-    words
+    let problem = if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
+        "--jobs, --threads, --memory and --keep-going need --executor local; on a cluster, set \
+        `resources` in the pipeline"
+    } else if watch.is_some() {
+        "--watch needs --executor local: on a cluster, the runner exits before jobs run"
+    } else {
+        let site = Site::find(site.as_deref()).map_err(|e| PlanError::Usage(e.to_string()))?;
+        return Ok(Box::new(Cluster { site }));
+    };
+    Err(PlanError::Usage(problem.to_owned()))
 }
 
 #[cfg(test)]

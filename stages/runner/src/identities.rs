@@ -4,9 +4,9 @@ use artifact::hash_json;
 use planning::{Origin, Plan, PlanError, read_source};
 use store::Store;
 
-/// By what nodes are known before their keys are: a key's parts, with what a parent is in the place
-/// of what it made. Ends soon after `stop` is set.
-pub(crate) fn identities(
+/// Computes identities of nodes whose keys may not be known yet: hashes of the key's parts, with
+/// parents' identities instead of their outputs (docs/design/032). Fails soon after `stop` is set.
+pub(crate) fn node_identities(
     plan: &Plan,
     store: &Store,
     stop: Option<&AtomicBool>,
@@ -15,7 +15,7 @@ pub(crate) fn identities(
     for node in &plan.nodes {
         let mut inputs = Vec::new();
         for input in &node.inputs {
-            let from = match &input.from {
+            let content = match &input.from {
                 Origin::Node { index, subtree } => {
                     format!("{}/{}", identities[*index], subtree.as_deref().unwrap_or_default())
                 }
@@ -23,7 +23,7 @@ pub(crate) fn identities(
                     read_source(store, node, &input.name, folder, stop)?.content_hash()
                 }
             };
-            inputs.push((input.name.clone(), from));
+            inputs.push((input.name.clone(), content));
         }
         identities.push(hash_json(&planning::key_parts(node, &inputs, plan.device(&node.stage))));
     }

@@ -1,4 +1,4 @@
-//! What is known of a plan's nodes, for programs: the JSON of `plan`, `why` and `status`.
+//! JSON of `plan`, `why` and `status`.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use store::{Record, StoreError};
 
 use crate::session::Session;
 
-/// A plan's nodes, each after those that it needs, and its sinks.
+/// A plan's nodes, each after its parents, and its sinks.
 #[derive(Debug, Serialize)]
 pub(crate) struct PlanReport {
     pub(crate) nodes: Vec<NodeReport>,
@@ -23,43 +23,43 @@ pub(crate) struct PlanReport {
 #[derive(Debug, Serialize)]
 pub(crate) struct SinkReport {
     pub(crate) stage: String,
-    /// The nodes that it shows, by number.
+    /// Numbers of the nodes that the sink shows.
     pub(crate) shows: Vec<usize>,
 }
 
 /// A node: a stage at one point of a sweep.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Default, Serialize)]
 pub(crate) struct NodeReport {
-    /// By which other nodes name it.
+    /// Number by which other nodes refer to this one.
     pub(crate) number: usize,
     pub(crate) stage: String,
     pub(crate) point: String,
     /// `cached`, `will run` or `waits`.
     pub(crate) state: &'static str,
-    /// All parameters, by name.
+    /// All parameters by name.
     pub(crate) parameters: Map<String, Value>,
-    /// Parameters that the scene decides: the values in use, null until they are known.
+    /// Parameters that the scene decides, with the values in use; null until they are known.
     #[serde(skip_serializing_if = "Map::is_empty")]
     pub(crate) by_scene: Map<String, Value>,
-    /// Inputs by name: the number of another node, or a folder.
+    /// Inputs by name: another node's number, or a folder.
     pub(crate) inputs: BTreeMap<String, RunInput>,
-    /// The action's key, once its inputs are known.
+    /// Key of the action; absent until its inputs are known.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) key: Option<String>,
-    /// The finished artifact.
+    /// Artifact of a cached node.
     #[serde(flatten)]
     pub(crate) artifact: Option<ArtifactReport>,
-    /// Nodes, by number, that must run before its key is known.
+    /// Numbers of the nodes that must run before the key is known.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(crate) waits_on: Vec<usize>,
-    /// Whether an earlier run left a checkpoint.
+    /// True if an interrupted run left a checkpoint.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(crate) has_checkpoint: bool,
-    /// The cluster's job that is to make it, where one is queued or running. `status` alone asks.
+    /// Queued or running job of a cluster; only `status` reports it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) job: Option<Job>,
-    /// What differs from the nearest earlier run of the stage; absent where it never ran, or wasn't
-    /// asked for.
+    /// Differences from the stage's earlier run with the nearest key; absent if there is none, or
+    /// if no records were given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) changes: Option<Vec<Change>>,
 }
@@ -80,7 +80,7 @@ pub(crate) struct ArtifactReport {
 }
 
 impl PlanReport {
-    /// With records, what differs from earlier runs, too.
+    /// Creates the report. With records, the nodes' `changes` are filled in.
     pub(crate) fn new(
         session: &Session,
         plan: &Plan,
@@ -88,8 +88,8 @@ impl PlanReport {
         records: &[Record],
     ) -> Result<Self, StoreError> {
         let mut nodes = Vec::with_capacity(plan.nodes.len());
-        for number in 0..plan.nodes.len() {
-            nodes.push(NodeReport::new(session, plan, (number, &states[number]), records)?);
+        for (number, state) in states.iter().enumerate() {
+            nodes.push(NodeReport::new(session, plan, number, state, records)?);
         }
         let sinks = plan
             .sinks
@@ -98,8 +98,8 @@ impl PlanReport {
         Ok(Self { nodes, sinks: sinks.collect() })
     }
 
-    /// The nodes of a stage alone, or of the stages that a sink shows.
-    pub(crate) fn only(mut self, stage: &str) -> Self {
+    /// Keeps the nodes of a stage, or those that a sink shows.
+    pub(crate) fn for_stage(mut self, stage: &str) -> Self {
         self.sinks.retain(|sink| sink.stage == stage);
         let shown: Vec<usize> = self.sinks.iter().flat_map(|sink| sink.shows.clone()).collect();
         self.nodes.retain(|node| shown.contains(&node.number) || node.stage == stage);
@@ -111,7 +111,8 @@ impl NodeReport {
     fn new(
         session: &Session,
         plan: &Plan,
-        (number, state): (usize, &State),
+        number: usize,
+        state: &State,
         records: &[Record],
     ) -> Result<Self, StoreError> {
         let (store, node) = (&session.store, &plan.nodes[number]);
@@ -121,14 +122,8 @@ impl NodeReport {
             point: node.point.clone(),
             state: state.name(),
             parameters: node.parameters.as_object().cloned().unwrap_or_default(),
-            by_scene: Map::new(),
             inputs: node.run_inputs(Some),
-            key: None,
-            artifact: None,
-            waits_on: Vec::new(),
-            has_checkpoint: false,
-            job: None,
-            changes: None,
+            ..Self::default()
         };
         let mut folder = PathBuf::new();
         match state {

@@ -1,14 +1,14 @@
-//! Publishing of what a sink made: written whole next to the old folder, then put in its place at
-//! once. A folder is replaced only where all in it is ours and untouched ([`crate::owned`]). One
-//! that shows another data set, or a whole run where the new one shows a part, is put aside
-//! ([`crate::aside`]).
+//! Publishing of a sink's page: the page is copied next to the old one, then exchanged for it
+//! atomically. A folder is replaced only if a sink wrote all of it and nobody has changed it
+//! ([`crate::page`]). A page of another data set, or a complete page that a partial one
+//! replaces, is archived ([`crate::archive`]).
 //!
-//! A kill may leave one of these next to a target `NAME`; the next publishing ends what was begun:
+//! A kill may leave one of these next to a target `NAME`; the next publishing finishes the work:
 //!
 //! ```text
-//! .NAME.nerf-sr-scrap   half a copy, or a folder half deleted: of no value
-//! .NAME.nerf-sr-new     a whole page: the new one, or the old one in exchange for it
-//! .NAME.nerf-sr-old     the old page, where the file system can't exchange two folders
+//! .NAME.nerf-sr-scrap   a partial copy or a partially deleted folder, without value
+//! .NAME.nerf-sr-new     a complete page: the new one, or the old one after the exchange
+//! .NAME.nerf-sr-old     the old page, if the file system can't exchange two folders
 //! ```
 
 use std::fs::{self, File};
@@ -17,183 +17,182 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use artifact::{Manifest, list_files};
+use rustix::fs::{CWD, RenameFlags, renameat_with};
 use stage_call::StageFailure;
 use store::{Locked, StoreError, is_taken};
 
-use crate::aside::{Mark, place_aside};
-use crate::owned::owned;
-use crate::waiting::until_held;
+use crate::archive::archive_path;
+use crate::failure;
+use crate::page::{PageMark, check_ownership};
+use crate::waiting::wait_for_lock;
 
-/// Returns whether a folder shows this already, with all its files, and no killed publishing left
-/// anything of value next to it.
-pub(crate) fn shows(target: &Path, identity: &str) -> bool {
-    let is_marked = Mark::read(target).ok().flatten().is_some_and(|mark| mark.identity == identity);
-    let leftovers = [hidden(target, "new"), hidden(target, "old")];
-    is_marked && is_whole(target) && leftovers.iter().all(|path| matches!(exists(path), Ok(false)))
+/// True if the target is a page with this identity and all its files, and a killed publishing left
+/// nothing of value next to it.
+pub(crate) fn has_current_page(target: &Path, identity: &str) -> bool {
+    let mark = PageMark::read(target).ok().flatten();
+    mark.is_some_and(|mark| mark.identity == identity)
+        && has_all_files(target)
+        && ["new", "old"].iter().all(|suffix| matches!(exists(&hidden(target, suffix)), Ok(false)))
 }
 
-/// Returns whether all files of a page's manifest are there.
-fn is_whole(page: &Path) -> bool {
+/// True if all files of a page's manifest exist with their sizes.
+fn has_all_files(page: &Path) -> bool {
     Manifest::read(page).is_ok_and(|manifest| manifest.check_sizes(page).is_ok())
 }
 
-/// A folder that was put in its place.
-pub(crate) struct Published {
-    pub(crate) folder: PathBuf,
-    /// Folders of pages that were put aside: the replaced page, and one that a killed publishing
-    /// left.
-    pub(crate) aside: Vec<PathBuf>,
-}
-
-/// Puts a made folder, with its mark, in a target's place. `out` is the target's folder, `kind`
-/// what the sink makes.
+/// Publishes a sink's output, which contains its mark, as `target`. `kind` is the output's kind.
+/// Returns the new paths of earlier pages that were archived.
 pub(crate) fn publish(
-    made: &Path,
-    out: &Path,
-    name: &str,
+    output: &Path,
+    target: &Path,
     kind: &str,
     stop: &AtomicBool,
-) -> Result<Published, StageFailure> {
+) -> Result<Vec<PathBuf>, StageFailure> {
+    let out = target.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(out).map_err(|e| StageFailure::at(out, &e))?;
     let _lock = lock_folder(out, stop)?;
-    let mark = Mark::read(made).map_err(|e| StageFailure::at(made, &e))?.unwrap_or_default();
-    let spot = Spot { target: out.join(name), kind };
-    let mut aside = spot.settle(&mark)?;
-    let replaced = spot.replace(made, &mark);
-    remove(&spot.hidden("scrap")).ok();
-    aside.extend(replaced?);
-    Ok(Published { folder: spot.target, aside })
+    let mark = PageMark::read(output).map_err(|e| StageFailure::at(output, &e))?;
+    let publishing = Publishing { target, kind, mark: mark.unwrap_or_default() };
+    let mut archived = publishing.finish_earlier()?;
+    let replaced = publishing.replace(output);
+    remove_folder(&publishing.hidden("scrap")).ok();
+    archived.extend(replaced?);
+    Ok(archived)
 }
 
-/// The place of a sink's page, its folder locked.
-struct Spot<'a> {
-    target: PathBuf,
+/// A publishing in progress; the target's parent folder is locked.
+struct Publishing<'a> {
+    target: &'a Path,
     kind: &'a str,
+    /// Mark of the new page.
+    mark: PageMark,
 }
 
-impl Spot<'_> {
-    fn hidden(&self, what: &str) -> PathBuf {
-        hidden(&self.target, what)
+impl Publishing<'_> {
+    fn hidden(&self, suffix: &str) -> PathBuf {
+        hidden(self.target, suffix)
     }
 
-    /// Ends what a killed publishing began; returns where whole pages went that it left. `made` is
-    /// the mark of the page that comes next.
-    fn settle(&self, made: &Mark) -> Result<Vec<PathBuf>, StageFailure> {
-        let fail = |e: io::Error| StageFailure::at(&self.target, &e);
+    fn failure(&self, error: &io::Error) -> StageFailure {
+        StageFailure::at(self.target, error)
+    }
+
+    /// Finishes a killed publishing. Returns the new paths of its pages that were archived.
+    fn finish_earlier(&self) -> Result<Vec<PathBuf>, StageFailure> {
         let (old, new) = (self.hidden("old"), self.hidden("new"));
-        if exists(&old).map_err(fail)? && !exists(&self.target).map_err(fail)? {
-            fs::rename(&old, &self.target).map_err(fail)?;
+        let is_target_missing = !exists(self.target).map_err(|e| self.failure(&e))?;
+        if is_target_missing && exists(&old).map_err(|e| self.failure(&e))? {
+            fs::rename(&old, self.target).map_err(|e| self.failure(&e))?;
         }
-        let mut aside = Vec::new();
+        let mut archived = Vec::new();
         for leftover in [old, new] {
-            if exists(&leftover).map_err(fail)? {
-                self.check_owned(&leftover)?;
-                aside.extend(self.retire_leftover(&leftover, made).map_err(fail)?);
+            if exists(&leftover).map_err(|e| self.failure(&e))? {
+                self.check_ownership(&leftover)?;
+                archived.extend(
+                    self.archive_or_delete_leftover(&leftover).map_err(|e| self.failure(&e))?,
+                );
             }
         }
-        Ok(aside)
+        Ok(archived)
     }
 
-    /// Retires a leftover as its own publishing would have: it was to be replaced by what the target
-    /// shows now, or to replace that.
-    fn retire_leftover(&self, leftover: &Path, made: &Mark) -> io::Result<Option<PathBuf>> {
-        let mark = Mark::read(leftover)?.unwrap_or_default();
-        if !is_whole(leftover) || mark.identity == made.identity {
-            return self.discard(leftover).map(|()| None);
+    /// Archives or deletes a leftover, as its own publishing would have done: the leftover either
+    /// was replaced by the target's page, or was to replace it.
+    fn archive_or_delete_leftover(&self, leftover: &Path) -> io::Result<Option<PathBuf>> {
+        let mark = PageMark::read(leftover)?.unwrap_or_default();
+        if !has_all_files(leftover) || mark.identity == self.mark.identity {
+            return self.delete(leftover).map(|()| None);
         }
-        let shown = Mark::read(&self.target)?.unwrap_or_else(|| made.clone());
-        self.retire(leftover, &shown)
+        let shown = PageMark::read(self.target)?;
+        self.archive_or_delete(leftover, shown.as_ref().unwrap_or(&self.mark))
     }
 
-    /// Puts a page in the target's place and retires the one that was there; returns where that went
-    /// if it was put aside.
-    fn replace(&self, made: &Path, mark: &Mark) -> Result<Option<PathBuf>, StageFailure> {
+    /// Replaces the target's page by a copy of `output`. Returns the new path of the old page if
+    /// that was archived.
+    fn replace(&self, output: &Path) -> Result<Option<PathBuf>, StageFailure> {
         let (scrap, page) = (self.hidden("scrap"), self.hidden("new"));
-        remove(&scrap)
-            .and_then(|()| copy_folder(made, &scrap))
+        remove_folder(&scrap)
+            .and_then(|()| copy_folder(output, &scrap))
             .and_then(|()| fs::rename(&scrap, &page))
             .map_err(|e| StageFailure::at(&scrap, &e))?;
-        if let Err(refused) = self.put(&page) {
-            self.discard(&page).ok();
+        if let Err(refused) = self.exchange(&page) {
+            self.delete(&page).ok();
             return Err(refused);
         }
-        self.retire(&page, mark).map_err(|e| StageFailure::at(&page, &e))
+        self.archive_or_delete(&page, &self.mark).map_err(|e| StageFailure::at(&page, &e))
     }
 
-    /// Puts a whole page in the target's place; what was there takes the page's name.
-    fn put(&self, page: &Path) -> Result<(), StageFailure> {
-        let target = &self.target;
-        let fail = |e: io::Error| StageFailure::at(target, &e);
-        if !exists(target).map_err(fail)? {
-            return fs::rename(page, target).map_err(fail);
+    /// Exchanges a page and the target's page. If the target doesn't exist, the page is moved.
+    fn exchange(&self, page: &Path) -> Result<(), StageFailure> {
+        if !exists(self.target).map_err(|e| self.failure(&e))? {
+            return fs::rename(page, self.target).map_err(|e| self.failure(&e));
         }
-        self.check_owned(target)?;
-        let flags = rustix::fs::RenameFlags::EXCHANGE;
-        match rustix::fs::renameat_with(rustix::fs::CWD, page, rustix::fs::CWD, target, flags) {
-            Ok(()) => Ok(()),
-            // Not every file system can exchange: there the target is missing for a moment.
-            Err(_) => {
-                let old = self.hidden("old");
-                fs::rename(target, &old).map_err(fail)?;
-                let placed = fs::rename(page, target);
-                fs::rename(&old, if placed.is_ok() { page } else { target }).map_err(fail)?;
-                placed.map_err(fail)
-            }
+        self.check_ownership(self.target)?;
+        let flags = RenameFlags::EXCHANGE;
+        if renameat_with(CWD, page, CWD, self.target, flags).is_ok() {
+            return Ok(());
         }
+        // Not every file system can exchange two folders. Without that, the target doesn't exist
+        // for a moment.
+        let old = self.hidden("old");
+        fs::rename(self.target, &old).map_err(|e| self.failure(&e))?;
+        let moved = fs::rename(page, self.target);
+        let destination = if moved.is_ok() { page } else { self.target };
+        fs::rename(&old, destination).and(moved).map_err(|e| self.failure(&e))
     }
 
-    /// Puts a page aside if its mark says that it is worth keeping from what came instead; otherwise
-    /// deletes it. Returns where the page is, if there was one and it was kept.
-    fn retire(&self, page: &Path, newer: &Mark) -> io::Result<Option<PathBuf>> {
+    /// Archives a page that one with the mark `newer` replaces, or deletes it if it isn't worth
+    /// archiving. Returns the page's new path.
+    fn archive_or_delete(&self, page: &Path, newer: &PageMark) -> io::Result<Option<PathBuf>> {
         if !exists(page)? {
             return Ok(None);
         }
-        let is_ours = |folder: &Path| owned(folder, self.kind).is_ok();
-        let Some(aside) = place_aside(page, newer, &self.target, is_ours)? else {
-            return self.discard(page).map(|()| None);
+        let Some(archived) = archive_path(page, newer, self.target, self.kind)? else {
+            return self.delete(page).map(|()| None);
         };
-        if exists(&aside)? {
-            self.discard(&aside)?;
+        if exists(&archived)? {
+            self.delete(&archived)?;
         }
-        fs::rename(page, &aside)?;
-        Ok(Some(aside))
+        fs::rename(page, &archived)?;
+        Ok(Some(archived))
     }
 
-    /// Deletes a folder that is ours. It is given up at once: a kill leaves no half of it under a
-    /// page's name.
-    fn discard(&self, folder: &Path) -> io::Result<()> {
+    /// Deletes a folder that a sink wrote. The folder is renamed first, so that a kill leaves no
+    /// partial page under a page's name.
+    fn delete(&self, folder: &Path) -> io::Result<()> {
         let scrap = self.hidden("scrap");
-        remove(&scrap)?;
+        remove_folder(&scrap)?;
         fs::rename(folder, &scrap)?;
-        remove(&scrap)
+        remove_folder(&scrap)
     }
 
-    fn check_owned(&self, folder: &Path) -> Result<(), StageFailure> {
-        owned(folder, self.kind).map_err(|reason| StageFailure {
-            code: 1,
-            message: format!(
-                "{reason}; nothing was replaced: move it away, or choose another folder with --out"
-            ),
+    fn check_ownership(&self, folder: &Path) -> Result<(), StageFailure> {
+        check_ownership(folder, self.kind).map_err(|reason| {
+            failure(format!(
+                "{reason}; nothing was replaced: move this away, or choose another folder with \
+                --out"
+            ))
         })
     }
 }
 
-/// A hidden name next to a target.
-fn hidden(target: &Path, what: &str) -> PathBuf {
+/// Returns the path of a hidden folder next to the target.
+fn hidden(target: &Path, suffix: &str) -> PathBuf {
     let name = target.file_name().unwrap_or_default().to_string_lossy();
-    target.with_file_name(format!(".{name}.nerf-sr-{what}"))
+    target.with_file_name(format!(".{name}.nerf-sr-{suffix}"))
 }
 
-/// One publishes into a folder at a time, whatever store it works with.
+/// Locks a folder of pages. Runs with different stores may publish into the same folder, so the
+/// store's locks aren't enough.
 fn lock_folder(folder: &Path, stop: &AtomicBool) -> Result<File, StageFailure> {
-    let io = |source| StoreError::Io { path: folder.to_path_buf(), source };
-    until_held(stop, &|_, _| {}, || {
-        let file = File::open(folder).map_err(io)?;
+    wait_for_lock(stop, &|_, _| {}, || {
+        let file = File::open(folder)
+            .map_err(|source| StoreError::Io { path: folder.to_path_buf(), source })?;
         Ok(if is_taken(folder, file.try_lock())? { Locked::Held(file) } else { Locked::By(None) })
     })
 }
 
-/// Copies, so that a full disk is noticed before anything is replaced.
+/// Copies a folder and syncs its files, so that a full disk is noticed before a page is replaced.
 fn copy_folder(from: &Path, to: &Path) -> io::Result<()> {
     fs::create_dir_all(to)?;
     for (relative, file) in list_files(from)? {
@@ -214,7 +213,7 @@ fn exists(path: &Path) -> io::Result<bool> {
     }
 }
 
-fn remove(path: &Path) -> io::Result<()> {
+fn remove_folder(path: &Path) -> io::Result<()> {
     match fs::remove_dir_all(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
         result => result,

@@ -1,34 +1,34 @@
 //! Publishing next to pages, leftovers of kills and somebody's files.
 
 use super::*;
-use crate::aside::MARK;
+use crate::page::MARK_FILE;
 use artifact::{MANIFEST_FILE, write_json};
 use std::ffi::OsString;
 
 /// A folder as a sink leaves it.
 fn made(dir: &Path, text: &str) -> PathBuf {
     let folder = dir.join("made");
-    remove(&folder).unwrap();
+    remove_folder(&folder).unwrap();
     fs::create_dir_all(folder.join("views")).unwrap();
     fs::write(folder.join("index.html"), text).unwrap();
     fs::write(folder.join("views/a.png"), "png").unwrap();
     write_json(&folder.join(MANIFEST_FILE), &Manifest::of_folder("page", &folder).unwrap())
         .unwrap();
-    let mark = Mark { identity: text.to_owned(), is_whole: true, data_sets: Vec::new() };
+    let mark = PageMark { identity: text.to_owned(), is_complete: true, data_sets: Vec::new() };
     mark.write(&folder).unwrap();
     folder
 }
 
 fn published(dir: &Path, text: &str) -> Result<PathBuf, StageFailure> {
-    publish(&made(dir, text), &dir.join("out"), "report", "page", &AtomicBool::new(false))
-        .map(|published| published.folder)
+    let target = dir.join("out/report");
+    publish(&made(dir, text), &target, "page", &AtomicBool::new(false)).map(|_| target)
 }
 
 #[test]
 fn a_page_replaces_a_page() {
     let dir = tempfile::tempdir().unwrap();
     let target = published(dir.path(), "one").unwrap();
-    assert!(shows(&target, "one") && !shows(&target, "two"));
+    assert!(has_current_page(&target, "one") && !has_current_page(&target, "two"));
     published(dir.path(), "two").unwrap();
     assert_eq!(fs::read_to_string(target.join("index.html")).unwrap(), "two");
     // One that lost a file is no longer whole, but ours.
@@ -37,25 +37,25 @@ fn a_page_replaces_a_page() {
     assert!(target.join("views/a.png").exists());
     assert_eq!(fs::read_dir(dir.path().join("out")).unwrap().count(), 1, "nothing is left beside");
     let empty = dir.path().join("out/report");
-    remove(&empty).unwrap();
+    remove_folder(&empty).unwrap();
     fs::create_dir(&empty).unwrap();
     published(dir.path(), "three").unwrap();
 }
 
 /// A page of a data set as a sink leaves it.
-fn page(dir: &Path, text: &str, data_set: &str, is_whole: bool) -> PathBuf {
+fn page(dir: &Path, text: &str, data_set: &str, is_complete: bool) -> PathBuf {
     let folder = made(dir, text);
     let data_sets = vec![data_set.to_owned()];
-    let mark = Mark { identity: text.to_owned(), is_whole, data_sets };
+    let mark = PageMark { identity: text.to_owned(), is_complete, data_sets };
     mark.write(&folder).unwrap();
     folder
 }
 
-fn publish_page(dir: &Path, text: &str, data_set: &str, is_whole: bool) -> Option<OsString> {
-    let (folder, out) = (page(dir, text, data_set, is_whole), dir.join("out"));
-    let published = publish(&folder, &out, "report", "page", &AtomicBool::new(false)).unwrap();
-    assert!(published.aside.len() <= 1);
-    published.aside.first().map(|aside| aside.file_name().unwrap().to_owned())
+fn publish_page(dir: &Path, text: &str, data_set: &str, is_complete: bool) -> Option<OsString> {
+    let (folder, target) = (page(dir, text, data_set, is_complete), dir.join("out/report"));
+    let archived = publish(&folder, &target, "page", &AtomicBool::new(false)).unwrap();
+    assert!(archived.len() <= 1);
+    archived.first().map(|page| page.file_name().unwrap().to_owned())
 }
 
 fn page_text(dir: &Path, folder: &str) -> String {
@@ -64,7 +64,7 @@ fn page_text(dir: &Path, folder: &str) -> String {
 
 /// Pages of data sets, one after the other: what was whole before is found again.
 #[test]
-fn what_shows_something_else_is_put_aside() {
+fn pages_of_other_data_sets_are_archived() {
     let dir = tempfile::tempdir().unwrap();
     assert_eq!(publish_page(dir.path(), "lego 1", "data/lego", true), None);
     assert_eq!(
@@ -107,14 +107,14 @@ fn pages(dir: &Path) -> Vec<String> {
 
 /// What a kill leaves of a publishing is ended by the next one: whole pages are found again.
 #[test]
-fn pages_left_by_a_kill_are_put_aside() {
+fn pages_left_by_a_kill_are_archived() {
     const NEW: &str = ".report.nerf-sr-new";
     const OLD: &str = ".report.nerf-sr-old";
     type Lying<'a> = &'a [(&'a str, &'a str, &'a str, bool)];
     let lego = ("lego 1", "lego", true);
     let cases: [(&str, Lying<'_>, &[&str]); 8] = [
         (
-            "exchanged, and killed before the old page was put aside",
+            "exchanged, and killed before the old page was archived",
             &[("report", "chair 1", "chair", true), (NEW, lego.0, lego.1, lego.2)],
             &["report-lego: lego 1", "report: chair 2"],
         ),
@@ -157,8 +157,8 @@ fn pages_left_by_a_kill_are_put_aside() {
     for (what, lying, expected) in cases {
         let dir = tempfile::tempdir().unwrap();
         fs::create_dir(dir.path().join("out")).unwrap();
-        for (name, text, data_set, is_whole) in lying {
-            let made = page(dir.path(), text, data_set, *is_whole);
+        for (name, text, data_set, is_complete) in lying {
+            let made = page(dir.path(), text, data_set, *is_complete);
             fs::rename(made, dir.path().join("out").join(name)).unwrap();
         }
         publish_page(dir.path(), "chair 2", "chair", true);
@@ -174,15 +174,15 @@ fn a_page_with_a_leftover_beside_it_is_not_up_to_date() {
     for name in [".report.nerf-sr-new", ".report.nerf-sr-old"] {
         let leftover = target.with_file_name(name);
         fs::create_dir(&leftover).unwrap();
-        assert!(!shows(&target, "one"), "{name}");
+        assert!(!has_current_page(&target, "one"), "{name}");
         published(dir.path(), "one").unwrap();
-        assert!(shows(&target, "one") && !leftover.exists(), "{name}");
+        assert!(has_current_page(&target, "one") && !leftover.exists(), "{name}");
     }
 }
 
 /// Half a copy is no page; somebody's files are nobody else's to delete.
 #[test]
-fn leftovers_that_are_no_pages_are_not_put_aside() {
+fn leftovers_that_are_no_pages_are_not_archived() {
     let dir = tempfile::tempdir().unwrap();
     publish_page(dir.path(), "chair 1", "chair", true);
     let leftover = dir.path().join("out/.report.nerf-sr-new");
@@ -190,16 +190,17 @@ fn leftovers_that_are_no_pages_are_not_put_aside() {
     fs::remove_file(leftover.join("index.html")).unwrap();
     publish_page(dir.path(), "chair 2", "chair", true);
     assert_eq!(pages(dir.path()), ["report: chair 2"]);
-    for (file, words) in
-        [("notes.txt", "notes.txt is not nerf-sr's"), ("index.html", "index.html was changed")]
-    {
+    for (file, words) in [
+        ("notes.txt", "notes.txt was not written by nerf-sr"),
+        ("index.html", "index.html was changed"),
+    ] {
         fs::rename(page(dir.path(), "lego 1", "lego", true), &leftover).unwrap();
         fs::write(leftover.join(file), "precious").unwrap();
         let message = published(dir.path(), "chair 3").unwrap_err().message;
-        assert!(message.contains(words) && message.contains("move it away"), "{message}");
+        assert!(message.contains(words) && message.contains("move this away"), "{message}");
         assert_eq!(fs::read_to_string(leftover.join(file)).unwrap(), "precious");
         assert_eq!(page_text(dir.path(), "report"), "chair 2");
-        remove(&leftover).unwrap();
+        remove_folder(&leftover).unwrap();
     }
 }
 
@@ -214,21 +215,25 @@ fn what_is_not_ours_is_not_replaced() {
     type Damage = fn(&Path);
     let cases: [(&str, Damage); 9] = [
         ("cannot read ", |t| {
-            fs::remove_file(t.join(MARK)).unwrap();
-            fs::create_dir(t.join(MARK)).unwrap();
+            fs::remove_file(t.join(MARK_FILE)).unwrap();
+            fs::create_dir(t.join(MARK_FILE)).unwrap();
         }),
-        ("report/notes.txt is not nerf-sr's", |t| {
+        ("report/notes.txt was not written by nerf-sr", |t| {
             fs::write(t.join("notes.txt"), "precious").unwrap();
         }),
-        ("report/views/mine.png is not nerf-sr's", |t| {
+        ("report/views/mine.png was not written by nerf-sr", |t| {
             fs::write(t.join("views/mine.png"), "precious").unwrap();
         }),
         ("report/index.html was changed", |t| {
             fs::write(t.join("index.html"), "my own words").unwrap();
         }),
-        ("index.html is not nerf-sr's", |t| fs::remove_file(t.join(MANIFEST_FILE)).unwrap()),
-        ("index.html is not nerf-sr's", |t| fs::write(t.join(MANIFEST_FILE), "{}").unwrap()),
-        ("index.html is not nerf-sr's", |t| {
+        ("index.html was not written by nerf-sr", |t| {
+            fs::remove_file(t.join(MANIFEST_FILE)).unwrap();
+        }),
+        ("index.html was not written by nerf-sr", |t| {
+            fs::write(t.join(MANIFEST_FILE), "{}").unwrap();
+        }),
+        ("index.html was not written by nerf-sr", |t| {
             let manifest = Manifest { kind: "scene".into(), ..Manifest::read(t).unwrap() };
             write_json(&t.join(MANIFEST_FILE), &manifest).unwrap();
         }),
@@ -237,7 +242,7 @@ fn what_is_not_ours_is_not_replaced() {
             std::os::unix::fs::symlink(t.with_extension("real"), t).unwrap();
         }),
         ("report is not a folder", |t| {
-            remove(t).unwrap();
+            remove_folder(t).unwrap();
             fs::write(t, "precious").unwrap();
         }),
     ];

@@ -7,11 +7,11 @@ use artifact::{Failure, report_text};
 use planning::{Describing, Devices, Origin, Pipeline, Plan, PlanError, Request, State};
 use slurm::{Job, Queue, Slurm};
 use stage::check_device;
-use store::Store;
+use store::{RunFile, Store};
 
-use crate::identities::identities;
+use crate::identities::node_identities;
 
-/// What every verb works with.
+/// Pipeline, store and devices of a verb.
 pub(crate) struct Session {
     pub(crate) pipeline: Pipeline,
     pub(crate) store: Store,
@@ -19,6 +19,8 @@ pub(crate) struct Session {
 }
 
 impl Session {
+    /// Reads the pipeline and opens the store. The default store is `.nerf-sr` next to the
+    /// pipeline.
     pub(crate) fn open(
         pipeline: &Path,
         store: Option<&Path>,
@@ -26,84 +28,101 @@ impl Session {
     ) -> anyhow::Result<Self> {
         check_device(&devices.given).map_err(|e| PlanError::Usage(e.to_string()))?;
         let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
-        check_name("the pipeline's folder", &pipeline.project_folder())?;
+        check_utf8_path("the pipeline's folder", &pipeline.project_folder())?;
         let root =
             store.map_or_else(|| pipeline.project_folder().join(".nerf-sr"), Path::to_path_buf);
-        check_name("the store", &root)?;
+        check_utf8_path("the store", &root)?;
         std::fs::create_dir_all(&root).with_context(|| {
-            format!("cannot open the store {}; name another with --store", root.display())
+            format!("cannot open the store {}; choose another with --store", root.display())
         })?;
-        // Stages get absolute paths, whatever folder they run in.
+        // Stages may run in another folder, so they get absolute paths.
         let root = root.canonicalize().with_context(|| root.display().to_string())?;
         let store =
-            Store::open(&root).context("cannot open the store; name another with --store")?;
+            Store::open(&root).context("cannot open the store; choose another with --store")?;
         Ok(Self { pipeline, store, devices })
     }
 
-    /// The plan, to look at: no program is started that isn't the runner's own.
-    pub(crate) fn plan(&self, what: &Request) -> anyhow::Result<Plan> {
-        self.plan_asking(what, Describing::Own)
+    /// Creates a plan for a verb that runs nothing. No program except the runner's own stages is
+    /// started.
+    pub(crate) fn plan(&self, request: &Request) -> anyhow::Result<Plan> {
+        self.new_plan(request, Describing::Own)
     }
 
-    /// The plan, to be run; asking stages what they are ends when `stop` is set.
-    pub(crate) fn plan_to_run(&self, what: &Request, stop: &AtomicBool) -> anyhow::Result<Plan> {
-        self.plan_asking(what, Describing::Needed(stop))
+    /// Creates a plan as [`Self::plan`] does, and finds the states of its nodes.
+    pub(crate) fn plan_with_states(&self, request: &Request) -> anyhow::Result<(Plan, Vec<State>)> {
+        let plan = self.plan(request)?;
+        let states = plan.states(&self.store, None)?;
+        Ok((plan, states))
     }
 
-    fn plan_asking(&self, what: &Request, describing: Describing) -> anyhow::Result<Plan> {
-        let (pipeline, targets) = planning::find_targets(&self.pipeline, &what.targets)?;
-        let plan =
-            Plan::new(&pipeline, &self.store, &Request { targets, ..what.clone() }, describing)?;
+    /// Creates a plan. `describing` states which programs may be started to describe themselves.
+    pub(crate) fn new_plan(
+        &self,
+        request: &Request,
+        describing: Describing,
+    ) -> anyhow::Result<Plan> {
+        let (pipeline, targets) = planning::find_targets(&self.pipeline, &request.targets)?;
+        let request = Request { targets, ..request.clone() };
+        let plan = Plan::new(&pipeline, &self.store, &request, describing)?;
         let plan = Plan { devices: self.devices.clone(), ..plan };
-        check_apart(&plan, "the store", self.store.root())?;
-        plan.notes.iter().for_each(|note| report_text(note));
+        check_not_in_input(&plan, "the store", self.store.root())?;
+        for note in &plan.notes {
+            report_text(note);
+        }
         Ok(plan)
     }
 
-    /// The queued or running job of each node, where there is one, and how many there are besides.
-    /// Slurm is asked once, and only where this store has had jobs.
+    /// Finds the queued or running job of each node, and the number of this store's other jobs.
+    /// Slurm is called once, and only if this store has submissions.
     pub(crate) fn jobs(&self, plan: &Plan) -> (Vec<Option<Job>>, usize) {
         let queue = Queue::read(&Slurm::default(), self.store.root()).unwrap_or_else(|error| {
-            report_text(&format!("nerf-sr: whether jobs are queued isn't known: {error}"));
+            report_text(&format!("nerf-sr: cannot read the queue of jobs: {error}"));
             Queue::default()
         });
         if queue.jobs.is_empty() {
             return (Vec::new(), 0);
         }
-        let identities = identities(plan, &self.store, None).unwrap_or_default();
+        let identities = node_identities(plan, &self.store, None).unwrap_or_default();
         let jobs: Vec<Option<Job>> =
             identities.iter().map(|identity| queue.find_job(identity).cloned()).collect();
-        let besides = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
-        (jobs, besides)
-    }
-
-    pub(crate) fn states(&self, plan: &Plan) -> anyhow::Result<Vec<State>> {
-        Ok(plan.states(&self.store, None)?)
+        let others = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
+        (jobs, others)
     }
 }
 
-/// Refuses a folder whose name isn't UTF-8: the records of runs are JSON and contain folders'
-/// names.
-pub(crate) fn check_name(what: &str, folder: &Path) -> Result<(), Failure> {
-    let (named, real) = (absolute(folder), real(folder));
-    if named.to_str().is_some() && real.to_str().is_some() {
+/// A run in progress.
+#[derive(Clone, Copy)]
+pub(crate) struct Run<'a> {
+    pub(crate) plan: &'a Plan,
+    pub(crate) store: &'a Store,
+    /// File of the actions that the run needs, which protects them from garbage collection.
+    pub(crate) file: &'a RunFile,
+    /// Folder of pages.
+    pub(crate) out: &'a Path,
+    pub(crate) stop: &'a AtomicBool,
+}
+
+/// Fails if a folder's path isn't UTF-8: the records of runs are JSON and contain paths.
+pub(crate) fn check_utf8_path(role: &str, folder: &Path) -> Result<(), Failure> {
+    let resolved = resolved_path(folder);
+    if absolute_path(folder).to_str().is_some() && resolved.to_str().is_some() {
         return Ok(());
     }
     Err(Failure::BadInput(format!(
-        "{real:?}: {what} must have a name in UTF-8; rename the folder, or use another"
+        "{resolved:?}: the path of {role} must be UTF-8; rename the folder, or choose another"
     )))
 }
 
-/// Refuses a plan with an input folder that contains the folder `written`, which is the store or the
-/// folder of pages, named by `what`: each run would change its own input.
-pub(crate) fn check_apart(plan: &Plan, what: &str, written: &Path) -> Result<(), PlanError> {
-    let written = real(written);
+/// Fails if an input folder of the plan contains `written`, which is the store or the folder of
+/// pages: each run would change its own input.
+pub(crate) fn check_not_in_input(plan: &Plan, role: &str, written: &Path) -> Result<(), PlanError> {
+    let written = resolved_path(written);
     for node in &plan.nodes {
         for input in &node.inputs {
             let Origin::Folder(folder) = &input.from else { continue };
-            if written.starts_with(real(folder)) {
+            if written.starts_with(resolved_path(folder)) {
                 return Err(PlanError::Usage(format!(
-                    "stage {}: input {}: {} contains {what}, {}, which runs write to; name a \
+                    "stage {}: input {}: {} contains {role}, {}, to which runs write; choose a \
                     folder without results",
                     node.stage,
                     input.name,
@@ -117,48 +136,42 @@ pub(crate) fn check_apart(plan: &Plan, what: &str, written: &Path) -> Result<(),
 }
 
 /// Returns the absolute path of a file; the empty path means the current folder.
-fn absolute(path: &Path) -> PathBuf {
+fn absolute_path(path: &Path) -> PathBuf {
     let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
     std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 
 /// Returns the absolute path of a file, with links resolved as far as the file exists.
-fn real(path: &Path) -> PathBuf {
-    let absolute = absolute(path);
-    let mut existing = absolute.as_path();
-    loop {
-        match (existing.canonicalize(), existing.parent()) {
-            (Ok(found), _) => {
-                let rest = absolute.strip_prefix(existing).unwrap_or(Path::new(""));
-                // Joined by parts: an empty rest would leave a slash at the end.
-                return found.components().chain(rest.components()).collect();
-            }
-            (Err(_), Some(parent)) => existing = parent,
-            (Err(_), None) => return absolute,
+fn resolved_path(path: &Path) -> PathBuf {
+    let absolute = absolute_path(path);
+    for existing in absolute.ancestors() {
+        if let Ok(found) = existing.canonicalize() {
+            let rest = absolute.strip_prefix(existing).unwrap_or(Path::new(""));
+            // Joined by components: joining an empty rest would append a slash.
+            return found.components().chain(rest.components()).collect();
         }
     }
+    absolute
 }
 
-/// The command line, for people: what isn't UTF-8 in it is shown as well as can be.
+/// Returns the command line as text. Bytes that aren't UTF-8 are replaced.
 pub(crate) fn command_line() -> Vec<String> {
     std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect()
 }
 
-/// The nodes of a stage, by the stage's name.
-pub(crate) fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError> {
+/// Returns the indices of a stage's nodes.
+pub(crate) fn nodes_of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError> {
     let found: Vec<usize> =
         (0..plan.nodes.len()).filter(|&i| plan.nodes[i].stage == stage).collect();
-    if found.is_empty() {
-        if plan.sinks.iter().any(|sink| sink.stage == stage) {
-            return Err(PlanError::Usage(format!(
-                "{stage} is a sink: each run shows by it what it made; nothing of it is kept"
-            )));
-        }
-        let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
+    if !found.is_empty() {
+        return Ok(found);
+    }
+    if plan.sinks.iter().any(|sink| sink.stage == stage) {
         return Err(PlanError::Usage(format!(
-            "no stage {stage:?} in this plan; {}",
-            artifact::known_names(stage, known)
+            "{stage} is a sink, which shows each run and has no artifact"
         )));
     }
-    Ok(found)
+    let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
+    let known = artifact::known_names(stage, known);
+    Err(PlanError::Usage(format!("no stage {stage:?} in this plan; {known}")))
 }

@@ -1,104 +1,90 @@
-//! Sinks show a run: they get its record and write a folder beside pipeline.yaml. They are never
-//! cached, but a sink that has shown this very record already isn't called again.
+//! Sinks show a run: each gets the run's record and writes a folder of its own. Sinks are never
+//! cached, but a sink whose page shows the same record already isn't called again.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
 
-use artifact::{MANIFEST_FILE, Manifest, RunRecord, hash_json, plain_files, write_json};
-use planning::{Plan, Sink};
+use artifact::{
+    MANIFEST_FILE, Manifest, RunRecord, hash_json, plain_files, print_line, write_json,
+};
+use planning::Sink;
 use serde_json::json;
 use stage_call::{Call, Display, StageFailure};
-use store::{Record, RunFile, Store};
+use store::Record;
 
-use crate::aside::Mark;
-use crate::publish;
-use crate::recorded::{Course, record, with_details};
+use crate::failure;
+use crate::page::PageMark;
+use crate::publish::{has_current_page, publish};
+use crate::run_record::{RunProgress, add_details, run_record};
+use crate::session::Run;
 use crate::unchanged::ConfirmedProgram;
 
-/// By what a page is known to show a record: what scenes decide follows from the rest.
-fn identity(sink: &Sink, record: &RunRecord) -> String {
+/// Returns the identity of a sink's page: a hash of the record, the sink's code and its parameters.
+/// Values that the scene decides follow from these, so they aren't hashed.
+fn page_identity(sink: &Sink, record: &RunRecord) -> String {
     hash_json(&json!({"record": record, "code": sink.program.description.code,
             "parameters": sink.parameters}))
 }
 
-/// Whether a sink's page shows these records already.
-pub(crate) fn is_shown(
-    plan: &Plan,
-    sink: &Sink,
-    records: &[Option<Record>],
-    store: &Store,
-    out: &Path,
-) -> bool {
-    let record = record(plan, sink, &Course::before(records), store, out);
-    record.is_some_and(|record| publish::shows(&out.join(&sink.stage), &identity(sink, &record)))
+/// True if a sink's page already shows these records.
+pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, records: &[Option<Record>]) -> bool {
+    let record = run_record(run, sink, &RunProgress::not_started(records));
+    record.is_some_and(|record| {
+        has_current_page(&run.out.join(&sink.stage), &page_identity(sink, &record))
+    })
 }
 
-/// What became of a sink.
-pub(crate) enum Shown {
-    /// It ran and wrote this folder. Pages that show something else were put aside.
-    Written { folder: PathBuf, aside: Vec<PathBuf> },
-    /// The folder shows this record already.
+/// Result of [`run_sink`].
+pub(crate) enum SinkResult {
+    /// The sink wrote its folder. `archived` are the new paths of earlier pages.
+    Written { folder: PathBuf, archived: Vec<PathBuf> },
+    /// The folder already shows this record.
     UpToDate(PathBuf),
-    /// Something it shows isn't there.
-    Missing,
+    /// A node that the sink shows has no record.
+    Incomplete,
 }
 
-/// What all sinks of a run have in common.
-pub(crate) struct Showing<'a> {
-    pub(crate) plan: &'a Plan,
-    pub(crate) store: &'a Store,
-    pub(crate) run: &'a RunFile,
-    /// Where pages go.
-    pub(crate) out: &'a Path,
-    pub(crate) threads: usize,
-    pub(crate) stop: &'a AtomicBool,
-}
-
-/// Calls a sink; it writes `out/STAGE`.
-pub(crate) fn show(
-    showing: &Showing<'_>,
-    sink: &Sink,
-    course: &Course<'_>,
-) -> Result<Shown, StageFailure> {
-    let Showing { plan, store, run, out, threads, stop } = *showing;
-    let Some(record) = record(plan, sink, course, store, out) else { return Ok(Shown::Missing) };
-    let target = out.join(&sink.stage);
-    let identity = identity(sink, &record);
-    if publish::shows(&target, &identity) {
-        return Ok(Shown::UpToDate(target));
+impl SinkResult {
+    /// Prints the path of the sink's page, and the new paths of earlier pages.
+    pub(crate) fn print(&self, stage: &str) {
+        match self {
+            Self::Written { folder, archived } => {
+                for folder in archived {
+                    print_line!("{stage}: moved the earlier page to {}", page_path(folder));
+                }
+                print_line!("{stage}: {}", page_path(folder));
+            }
+            Self::UpToDate(folder) => print_line!("{stage}: {} (up to date)", page_path(folder)),
+            Self::Incomplete => print_line!("{stage}: nothing to show"),
+        }
     }
-    let record = with_details(record, plan, course);
-    let scratch = store.scratch(run.id()).join(&sink.stage);
-    let (folder, params, output) =
-        (scratch.join("run"), scratch.join("params.json"), scratch.join("output"));
-    std::fs::create_dir_all(&folder)
-        .and_then(|()| write_json(&folder.join("run.json"), &record))
-        .and_then(|()| write_json(&params, &sink.parameters))
-        .map_err(|e| StageFailure::at(&scratch, &e))?;
-    let program = ConfirmedProgram::new(&sink.program, store, stop)?;
-    let display = Display::new();
-    let view = display.start(&sink.stage);
-    let inputs = [("run".to_owned(), folder)];
-    let call = Call {
-        label: &sink.stage,
-        program: &sink.program.path,
-        description: &sink.program.description,
-        params: &params,
-        inputs: &inputs,
-        hashes: &[],
-        output: &output,
-        work: None,
-        from_checkpoint: false,
-        device: plan.device(&sink.stage),
-        threads,
-        lock: None,
+}
+
+/// Returns the path of the page in a sink's folder, or the folder if it has no page.
+fn page_path(folder: &Path) -> String {
+    let page = folder.join("index.html");
+    if page.exists() { page.display().to_string() } else { folder.display().to_string() }
+}
+
+/// Calls a sink and publishes its page as `out/STAGE`.
+pub(crate) fn run_sink(
+    run: &Run<'_>,
+    sink: &Sink,
+    threads: usize,
+    progress: &RunProgress<'_>,
+) -> Result<SinkResult, StageFailure> {
+    let Some(mut record) = run_record(run, sink, progress) else {
+        return Ok(SinkResult::Incomplete);
     };
-    let result = call.run(&scratch.join("log"), &view, stop);
-    view.end();
-    result?;
-    program.confirm_again()?;
-    plain_files(&output)
-        .map_err(|problem| StageFailure { code: 1, message: problem.to_string() })?;
+    let target = run.out.join(&sink.stage);
+    let identity = page_identity(sink, &record);
+    if has_current_page(&target, &identity) {
+        return Ok(SinkResult::UpToDate(target));
+    }
+    add_details(&mut record, run.plan, progress);
+    let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
+    let output = scratch.join("output");
+    call(run, sink, threads, &record, &scratch, &output)?;
+    plain_files(&output).map_err(failure)?;
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
     if !manifest.exists() {
@@ -106,14 +92,52 @@ pub(crate) fn show(
             Manifest::of_folder(kind, &output).map_err(|e| StageFailure::at(&output, &e))?;
         write_json(&manifest, &found).map_err(|e| StageFailure::at(&manifest, &e))?;
     }
-    let mark = Mark {
+    let mark = PageMark {
         identity,
-        is_whole: record.failed.iter().all(|point| point.reason.is_some()),
+        is_complete: record.failed.iter().all(|point| point.reason.is_some()),
         data_sets: record.data_sets,
     };
     mark.write(&output).map_err(|e| StageFailure::at(&output, &e))?;
-    let published = publish::publish(&output, out, &sink.stage, kind, stop)?;
-    // A sink's leftovers have no value.
+    let archived = publish(&output, &target, kind, run.stop)?;
+    // Leftovers of a sink have no value.
     std::fs::remove_dir_all(&scratch).ok();
-    Ok(Shown::Written { folder: published.folder, aside: published.aside })
+    Ok(SinkResult::Written { folder: target, archived })
+}
+
+/// Calls a sink's program, which reads `run.json` and writes `output`.
+fn call(
+    run: &Run<'_>,
+    sink: &Sink,
+    threads: usize,
+    record: &RunRecord,
+    scratch: &Path,
+    output: &Path,
+) -> Result<(), StageFailure> {
+    let folder = scratch.join("run");
+    let params = scratch.join("params.json");
+    std::fs::create_dir_all(&folder)
+        .and_then(|()| write_json(&folder.join("run.json"), record))
+        .and_then(|()| write_json(&params, &sink.parameters))
+        .map_err(|e| StageFailure::at(scratch, &e))?;
+    let program = ConfirmedProgram::new(&sink.program, run.store, run.stop)?;
+    let display = Display::new();
+    let view = display.start(&sink.stage);
+    let call = Call {
+        label: &sink.stage,
+        program: &sink.program.path,
+        description: &sink.program.description,
+        params: &params,
+        inputs: &[("run".to_owned(), folder)],
+        hashes: &[],
+        output,
+        work: None,
+        from_checkpoint: false,
+        device: run.plan.device(&sink.stage),
+        threads,
+        lock: None,
+    };
+    let result = call.run(&scratch.join("log"), &view, run.stop);
+    view.end();
+    result?;
+    program.confirm_again()
 }

@@ -1,12 +1,12 @@
-//! Checks that a stage's program and inputs are those of its key from before its start to its end;
-//! otherwise no result is recorded. Local runs and a cluster's jobs share this.
+//! Checks that a stage's program and inputs are those of its key from start to end; otherwise no
+//! result is recorded. Local runs and a cluster's jobs share these checks.
 
 use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{Damage, FileEntry, MANIFEST_FILE, Manifest};
+use artifact::{Damage, MANIFEST_FILE, Manifest};
 use planning::{
     ConfirmError, FoundInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp,
     read_source,
@@ -14,7 +14,7 @@ use planning::{
 use stage_call::StageFailure;
 use store::{Attempt, Store};
 
-/// Program that was confirmed before its start.
+/// A program that was confirmed before its start.
 pub(crate) struct ConfirmedProgram<'a> {
     program: &'a StageProgram,
     store: &'a Store,
@@ -29,24 +29,24 @@ impl<'a> ConfirmedProgram<'a> {
         store: &'a Store,
         stop: &'a AtomicBool,
     ) -> Result<Self, StageFailure> {
-        let stamp = program.confirm(store, Some(stop)).map_err(|e| unconfirmed(&e))?;
+        let stamp = program.confirm(store, Some(stop)).map_err(|e| confirmation_failure(&e))?;
         Ok(Self { program, store, stop, stamp })
     }
 
-    /// Confirms after the program's end that the program was the planned one all the time.
+    /// Confirms after the program's end that the program was not changed since [`Self::new`].
     pub(crate) fn confirm_again(&self) -> Result<(), StageFailure> {
         let confirmed = self.program.confirm_since(&self.stamp, self.store, Some(self.stop));
-        confirmed.map_err(|e| unconfirmed(&e))
+        confirmed.map_err(|e| confirmation_failure(&e))
     }
 }
 
-fn unconfirmed(problem: &ConfirmError) -> StageFailure {
+fn confirmation_failure(problem: &ConfirmError) -> StageFailure {
     let code = if matches!(problem, ConfirmError::Interrupted) { 130 } else { 2 };
     StageFailure { code, message: problem.to_string() }
 }
 
 /// Returns the failure of a stage whose inputs can't be used.
-pub(crate) fn unusable(problem: &PlanError) -> StageFailure {
+pub(crate) fn input_failure(problem: &PlanError) -> StageFailure {
     let code = match problem {
         PlanError::Source { .. } | PlanError::Artifact(_) => 3,
         PlanError::Interrupted => 130,
@@ -55,18 +55,18 @@ pub(crate) fn unusable(problem: &PlanError) -> StageFailure {
     StageFailure { code, message: problem.to_string() }
 }
 
-/// Inputs of a node when its key was computed.
+/// Inputs of a node, as they were when the key was computed.
 pub(crate) struct Inputs<'a> {
     node: &'a Node,
     store: &'a Store,
-    /// Content hashes by the inputs' names.
+    /// Name and content hash of each input.
     pub(crate) hashes: Vec<(String, String)>,
     sources: BTreeMap<String, Source>,
     artifacts: Vec<StoredInput>,
 }
 
 impl<'a> Inputs<'a> {
-    /// Reads the stamps of artifacts' files. `output_of` returns a parent's artifact.
+    /// Reads the stamps of the artifacts' files. `output_of` returns a parent's artifact.
     pub(crate) fn new(
         node: &'a Node,
         store: &'a Store,
@@ -77,7 +77,7 @@ impl<'a> Inputs<'a> {
         for input in &node.inputs {
             if let Origin::Node { index, subtree } = &input.from {
                 let stored = StoredInput::new(store, &output_of(*index), subtree.as_deref());
-                artifacts.push(stored.map_err(|e| damaged(&e))?);
+                artifacts.push(stored.map_err(|e| damage_failure(&e))?);
             }
         }
         let FoundInputs { hashes, sources } = found;
@@ -85,7 +85,7 @@ impl<'a> Inputs<'a> {
         if !node.program.is_own() {
             // The runner's own programs compare files with manifests themselves.
             for artifact in &inputs.artifacts {
-                artifact.check_contents().map_err(|e| damaged(&e))?;
+                artifact.check_contents().map_err(|e| damage_failure(&e))?;
             }
         }
         Ok(inputs)
@@ -96,7 +96,7 @@ impl<'a> Inputs<'a> {
         for NodeInput { name, from } in &self.node.inputs {
             let Origin::Folder(folder) = from else { continue };
             let now = read_source(self.store, self.node, name, folder, Some(stop))
-                .map_err(|e| unusable(&e))?;
+                .map_err(|e| input_failure(&e))?;
             if let Some(change) = now.change_since(&self.sources[name]) {
                 let message = format!(
                     "input {name} ({}): {change} since it was hashed, so no result is recorded; \
@@ -106,12 +106,12 @@ impl<'a> Inputs<'a> {
                 return Err(StageFailure { code: 3, message });
             }
         }
-        self.artifacts.iter().try_for_each(StoredInput::check).map_err(|e| damaged(&e))
+        self.artifacts.iter().try_for_each(StoredInput::check).map_err(|e| damage_failure(&e))
     }
 
     /// Removes checkpoints of an earlier attempt if a folder outside the store was written to since
-    /// that attempt began: the content is the same again, but not what the attempt read. Returns
-    /// whether there were any.
+    /// that attempt began: the content is the same now, but the attempt may have read other
+    /// content. Returns whether checkpoints were removed.
     pub(crate) fn drop_doubtful_checkpoints(&self, attempt: &Attempt) -> io::Result<bool> {
         let times: BTreeMap<&str, String> = self
             .sources
@@ -133,15 +133,15 @@ impl<'a> Inputs<'a> {
     }
 }
 
-fn damaged(damage: &Damage) -> StageFailure {
+fn damage_failure(damage: &Damage) -> StageFailure {
     StageFailure { code: 3, message: damage.to_string() }
 }
 
-/// Input from the store.
+/// An input from the store.
 struct StoredInput {
     folder: PathBuf,
     manifest: Manifest,
-    /// Stamps of the manifest's files, in order.
+    /// Stamps of the manifest's files, in the same order.
     stamps: Vec<Stamp>,
 }
 
@@ -158,8 +158,8 @@ impl StoredInput {
         Ok(Self { folder, manifest, stamps })
     }
 
-    /// Fails if the content of a file has changed. Contents are only read if a stamp has changed: a
-    /// backup may have made links.
+    /// Fails if the content of a file has changed. Contents are read only if a stamp has changed,
+    /// since a backup that creates hard links changes stamps, too.
     fn check(&self) -> Result<(), Damage> {
         let now = stamps(&self.folder, &self.manifest)?;
         let is_untouched =
@@ -173,9 +173,10 @@ impl StoredInput {
 }
 
 fn stamps(folder: &Path, manifest: &Manifest) -> Result<Vec<Stamp>, Damage> {
-    let stamp = |file: &FileEntry| {
+    let mut stamps = Vec::with_capacity(manifest.files.len());
+    for file in &manifest.files {
         let path = folder.join(&file.path);
-        Stamp::of(&path).map_err(|source| Damage::Unreadable { path, source })
-    };
-    manifest.files.iter().map(stamp).collect()
+        stamps.push(Stamp::of(&path).map_err(|source| Damage::Unreadable { path, source })?);
+    }
+    Ok(stamps)
 }

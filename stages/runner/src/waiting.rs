@@ -1,4 +1,4 @@
-//! Waits that look at signals and say whom they wait for.
+//! Waits for locks, which end on signals and report the lock's holder.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -6,32 +6,34 @@ use std::time::{Duration, Instant};
 use stage_call::{StageFailure, seconds};
 use store::{Entered, Holder, Locked, Store, StoreError, host_name};
 
-/// Between two attempts.
-const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
-/// So long nothing is said: most waits are over by then. Each later word comes after twice the
-/// time.
-const NOTICE_AFTER: Duration = Duration::from_secs(1);
+use crate::failure;
 
-/// Attempts until it is held. `say` is told by whom it is held, and since when it is waited for.
-pub(crate) fn until_held<T>(
+/// Interval between two attempts to lock; chosen by hand.
+const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
+/// Delay before the first notice, since most waits are shorter; chosen by hand. The delay doubles
+/// with each notice.
+const NOTICE_DELAY: Duration = Duration::from_secs(1);
+
+/// Attempts to lock until this succeeds or `stop` is set. `report` gets the holder and the time
+/// waited so far.
+pub(crate) fn wait_for_lock<T>(
     stop: &AtomicBool,
-    say: &dyn Fn(Option<&Holder>, Duration),
+    report: &dyn Fn(Option<&Holder>, Duration),
     mut attempt: impl FnMut() -> Result<Locked<T>, StoreError>,
 ) -> Result<T, StageFailure> {
-    let (since, mut next) = (Instant::now(), NOTICE_AFTER);
+    let begin = Instant::now();
+    let mut next_notice = NOTICE_DELAY;
     loop {
-        match attempt().map_err(|e| StageFailure { code: 1, message: e.to_string() })? {
+        match attempt().map_err(failure)? {
             Locked::Held(held) => return Ok(held),
             Locked::By(holder) => {
                 if stop.load(Ordering::Relaxed) {
-                    return Err(StageFailure {
-                        code: 130,
-                        message: "interrupted while it waited".to_owned(),
-                    });
+                    let message = "interrupted while waiting for a lock".to_owned();
+                    return Err(StageFailure { code: 130, message });
                 }
-                if since.elapsed() >= next {
-                    say(holder.as_ref(), since.elapsed());
-                    next *= 2;
+                if begin.elapsed() >= next_notice {
+                    report(holder.as_ref(), begin.elapsed());
+                    next_notice *= 2;
                 }
                 std::thread::sleep(ATTEMPT_INTERVAL);
             }
@@ -39,18 +41,18 @@ pub(crate) fn until_held<T>(
     }
 }
 
-/// Enters the store; waits while garbage is collected.
-pub(crate) fn enter(
+/// Enters the store; waits while garbage collection runs.
+pub(crate) fn enter_store(
     store: &Store,
     stop: &AtomicBool,
-    say: &dyn Fn(&str),
+    report: &dyn Fn(&str),
 ) -> Result<Entered, StageFailure> {
-    until_held(
+    wait_for_lock(
         stop,
         &|holder, waited| {
-            say(&format!(
-                "waits for garbage collection{}, for {} now",
-                by(holder),
+            report(&format!(
+                "waiting for garbage collection{} ({} so far)",
+                holder_text(holder),
                 seconds(waited.as_secs_f64())
             ));
         },
@@ -58,29 +60,28 @@ pub(crate) fn enter(
     )
 }
 
-/// Enters the store for a verb that doesn't wait.
-pub(crate) fn enter_at_once(store: &Store) -> anyhow::Result<Entered> {
+/// Enters the store, or fails if garbage collection runs.
+pub(crate) fn try_enter_store(store: &Store) -> anyhow::Result<Entered> {
     match store.try_enter()? {
         Locked::Held(entered) => Ok(entered),
-        Locked::By(_) => {
-            Err(anyhow::anyhow!("garbage is being collected just now; try again when that is done"))
-        }
+        Locked::By(_) => Err(anyhow::anyhow!("garbage collection is running; try again later")),
     }
 }
 
-/// Who holds a lock, in words.
-pub(crate) fn by(holder: Option<&Holder>) -> String {
-    let Some(holder) = holder else { return String::new() };
-    if holder.host != host_name() {
-        return format!(" by process {} on {}", holder.pid, holder.host);
+/// Returns ` by process …` for a lock's holder; empty if the holder is unknown.
+pub(crate) fn holder_text(holder: Option<&Holder>) -> String {
+    let Some(Holder { pid, host, .. }) = holder else { return String::new() };
+    if *host != host_name() {
+        return format!(" by process {pid} on {host}");
     }
-    let pid = i32::try_from(holder.pid).ok().and_then(rustix::process::Pid::from_raw);
-    let lives = pid
+    let raw = i32::try_from(*pid).ok().and_then(rustix::process::Pid::from_raw);
+    let is_alive = raw
         .is_some_and(|pid| rustix::process::test_kill_process(pid) != Err(rustix::io::Errno::SRCH));
-    if lives {
-        format!(" by process {}", holder.pid)
+    if is_alive {
+        format!(" by process {pid}")
     } else {
-        format!(" by a stage that process {} left, which has ended", holder.pid)
+        // A killed runner's stage inherited the lock.
+        format!(" by a stage of process {pid}, which has ended")
     }
 }
 
@@ -89,32 +90,32 @@ mod tests {
     use super::*;
     use std::cell::RefCell;
 
-    /// A wait ends with the signal, however long the lock is held, and says whom it waits for.
+    /// A wait reports the holder and ends with the signal, however long the lock is held.
     #[test]
-    fn a_wait_looks_at_signals() {
+    fn a_signal_ends_a_wait() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let Locked::Held(_lock) = store.try_lock("k").unwrap() else { panic!("held") };
         let stop = AtomicBool::new(false);
         let said = RefCell::new(Vec::new());
         let say = |holder: Option<&Holder>, _: Duration| {
-            said.borrow_mut().push(by(holder));
+            said.borrow_mut().push(holder_text(holder));
             stop.store(true, Ordering::Relaxed);
         };
-        let failure = until_held(&stop, &say, || store.try_lock("k")).unwrap_err();
+        let failure = wait_for_lock(&stop, &say, || store.try_lock("k")).unwrap_err();
         assert_eq!(failure.code, 130);
         assert_eq!(said.into_inner(), [format!(" by process {}", std::process::id())]);
     }
 
     #[test]
-    fn holders_are_told_by_machine_and_life() {
+    fn holders_are_named_by_machine_and_process() {
         let holder = Holder::this_process();
         assert_eq!(
-            by(Some(&Holder { host: "far".into(), ..holder.clone() })),
+            holder_text(Some(&Holder { host: "far".into(), ..holder.clone() })),
             format!(" by process {} on far", holder.pid)
         );
-        let gone = by(Some(&Holder { pid: 0x7fff_fff0, ..holder }));
+        let gone = holder_text(Some(&Holder { pid: 0x7fff_fff0, ..holder }));
         assert!(gone.ends_with("which has ended"), "{gone}");
-        assert_eq!(by(None), "");
+        assert_eq!(holder_text(None), "");
     }
 }

@@ -1,261 +1,272 @@
-//! The local executor: runs a plan's nodes whose parents are done, some at once, and then its
-//! sinks.
+//! The local executor: runs nodes whose parents are done, several at once, and then the sinks.
 
 use std::cell::OnceCell;
-use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::collections::{BTreeMap, BTreeSet};
 use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc;
 
 use anyhow::{Context as _, anyhow};
 use artifact::{Failure, print_line, print_lines, report_line, report_text};
-use planning::{Plan, Sink};
+use planning::{Node, Sink};
 use stage::SUMMARY_FILE;
 use stage_call::{Display, StageFailure};
 use store::Record;
 
-use super::node::{Action, Found, NodeJob, folder_of};
-use super::places::{Budget, Need, Place, Places};
-use super::work::{Executor, Work};
-use crate::counts;
-use crate::recorded::Course;
-use crate::remedy::Remedy;
-use crate::session::{Session, command_line};
-use crate::sink::{Showing, Shown, show};
+use super::Executor;
+use super::budget::{Admission, Budget, Demand};
+use super::node::{Lookup, NodeJob, PendingAction, input_folder};
+use crate::failure;
+use crate::run_messages::{FailureHint, end_message};
+use crate::run_record::RunProgress;
+use crate::session::{Run, command_line};
+use crate::sink::{SinkResult, run_sink};
 use crate::watch::{Chain, Watch};
 
 /// This machine.
 pub(crate) struct Local {
-    /// What stages may take of it together.
+    /// Limits of the stages that run at the same time.
     pub(crate) budget: Budget,
-    /// Whether to go on with what doesn't need a failed stage.
+    /// True if stages that don't depend on a failed one still run.
     pub(crate) keep_going: bool,
-    /// What to say after a failure.
-    pub(crate) remedy: Remedy,
-    /// How trainings are watched, where that is asked for.
+    /// Message after a failure.
+    pub(crate) hint: FailureHint,
+    /// Options of `--watch`.
     pub(crate) watch: Option<Watch>,
 }
 
 impl Executor for Local {
-    fn carry_out(&self, work: &Work<'_>) -> anyhow::Result<ExitCode> {
-        let Work { session, plan, run, out, stop } = *work;
-        let outcome = self::run(work, self);
-        if stop.load(Ordering::Relaxed) {
+    fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
+        let plan = run.plan;
+        let outcome = run_nodes(run, self);
+        if run.stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
         }
-        let showing =
-            Showing { plan, store: &session.store, run, out, threads: self.budget.threads, stop };
         if let Some((index, failure)) = outcome.failures.first() {
-            // Without any result there is hardly a page; a table names what failed.
+            // Without any result, pages are written only with --keep-going: a table then names the
+            // failed stages.
             if self.keep_going || outcome.records.iter().any(Option::is_some) {
-                // Of two failures, the stage's is the run's.
-                show_partly(&showing, &outcome)
-                    .unwrap_or_else(|error| report_line!("nerf-sr: {error:#}"));
+                let partial = plan.sinks.iter().filter(|sink| sink.program.description.partial);
+                // A sink's failure doesn't replace the stage's exit code.
+                if let Err(error) = self.run_sinks(run, partial, &outcome) {
+                    report_line!("nerf-sr: {error:#}");
+                }
             }
             let node = &plan.nodes[*index];
-            report_text(&self.remedy.after_failure(
-                &node.label(),
-                &node.stage,
-                outcome.skipped.len(),
-            ));
+            let skipped = outcome.skipped;
+            report_text(&self.hint.message(&node.label(), &node.stage, skipped));
             return Ok(ExitCode::from(failure.code));
         }
-        say_results(session, plan, &outcome)?;
-        show_all(&showing, &outcome).map(|()| ExitCode::SUCCESS)
+        print_summaries(run, &outcome)?;
+        let has_written = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
+        print_line!("{}", end_message(outcome.ran.len(), plan.nodes.len(), has_written));
+        Ok(ExitCode::SUCCESS)
     }
 }
 
-/// What came of a run.
+impl Local {
+    /// Runs sinks and prints the paths of their pages. Returns whether a page was written.
+    fn run_sinks<'a>(
+        &self,
+        run: &Run<'_>,
+        sinks: impl Iterator<Item = &'a Sink>,
+        outcome: &Outcome,
+    ) -> anyhow::Result<bool> {
+        let progress = RunProgress {
+            records: &outcome.records,
+            ran: Some(&outcome.ran),
+            failures: &outcome.failures,
+            command: &command_line(),
+        };
+        let mut has_written = false;
+        for sink in sinks {
+            let result = run_sink(run, sink, self.budget.threads, &progress);
+            if run.stop.load(Ordering::Relaxed) {
+                return Err(Failure::Interrupted.into());
+            }
+            let result = result.map_err(|e| anyhow!("{}: {e}", sink.stage))?;
+            result.print(&sink.stage);
+            has_written |= matches!(result, SinkResult::Written { .. });
+        }
+        Ok(has_written)
+    }
+}
+
+/// Outcome of a run's nodes.
 struct Outcome {
-    /// Each node's record, where it is done.
+    /// Records by node index; `None` if the node isn't done.
     records: Vec<Option<Record>>,
     /// Nodes that ran.
     ran: BTreeSet<usize>,
-    /// Nodes that failed, and how.
+    /// Nodes that failed.
     failures: Vec<(usize, StageFailure)>,
-    /// Nodes left out because of these.
-    skipped: Vec<usize>,
+    /// Number of nodes that were skipped because of the failures.
+    skipped: usize,
 }
 
-/// How far a node is.
-enum NodeProgress {
-    /// Its parents aren't done, or it hasn't been looked at since.
-    Pending,
-    /// It isn't cached, and has no place yet. It is said once that it waits for memory.
-    Ready {
-        action: Action,
-        need: Need,
-        said: bool,
-    },
-    Running,
-    Over,
-}
+/// Report of a worker: the node, its record, and whether the stage ran.
+type WorkerReport = (usize, Result<(Record, bool), StageFailure>);
 
-/// What a worker reports: the node, its record and whether it had to run.
-type Report = (usize, Result<(Record, bool), StageFailure>);
-
-fn run(work: &Work<'_>, options: &Local) -> Outcome {
+fn run_nodes(run: &Run<'_>, options: &Local) -> Outcome {
     let display = Display::new();
-    let mut schedule = Schedule::new(work, options, &display);
-    let (sender, reports) = mpsc::channel::<Report>();
+    let mut schedule = Schedule::new(run, options, &display);
+    let (sender, reports) = mpsc::channel::<WorkerReport>();
     std::thread::scope(|scope| {
         loop {
-            schedule.look();
-            for (job, index, action) in schedule.starting() {
+            schedule.look_up_nodes();
+            for (index, job, action) in schedule.admit_nodes() {
                 let sender = sender.clone();
-                // The receiver lives as long as the scope. A panic doesn't come here: it ends the
-                // program (`panics`).
+                // The receiver lives as long as the scope. A panic ends the whole process.
                 scope.spawn(move || sender.send((index, job.carry_out(action))).ok());
             }
-            if schedule.places.is_idle() {
+            if schedule.running.is_empty() {
                 break;
             }
             let Ok(report) = reports.recv() else { break };
-            schedule.take_in(report);
+            schedule.finish(report);
         }
     });
-    schedule.end()
+    let skipped = schedule.pending.len() + schedule.ready.len();
+    Outcome { skipped, ..schedule.outcome }
 }
 
-/// Which nodes are done, run, or wait for a place. One that is cached takes none.
+/// Progress of a run's nodes.
 struct Schedule<'a> {
-    work: &'a Work<'a>,
+    run: &'a Run<'a>,
     options: &'a Local,
     display: &'a Display,
-    progress: Vec<NodeProgress>,
-    places: Places,
-    /// All records, once there is something to run.
+    /// Nodes whose cache lookup is outstanding.
+    pending: BTreeSet<usize>,
+    /// Nodes that wait for admission, by node index.
+    ready: BTreeMap<usize, ReadyNode>,
+    /// Demands of the running nodes, by node index.
+    running: BTreeMap<usize, Demand>,
+    /// All records of the store, read when the first node isn't cached.
     records: OnceCell<Vec<Record>>,
     outcome: Outcome,
 }
 
+/// A node that isn't cached and whose parents are done.
+struct ReadyNode {
+    action: PendingAction,
+    demand: Demand,
+    /// True after a line was printed that the node waits for memory.
+    is_reported: bool,
+}
+
 impl<'a> Schedule<'a> {
-    fn new(work: &'a Work<'a>, options: &'a Local, display: &'a Display) -> Self {
-        let count = work.plan.nodes.len();
+    fn new(run: &'a Run<'a>, options: &'a Local, display: &'a Display) -> Self {
+        let count = run.plan.nodes.len();
         Self {
-            work,
+            run,
             options,
             display,
-            progress: (0..count).map(|_| NodeProgress::Pending).collect(),
-            places: Places::new(options.budget),
+            pending: (0..count).collect(),
+            ready: BTreeMap::new(),
+            running: BTreeMap::new(),
             records: OnceCell::new(),
             outcome: Outcome {
                 records: vec![None; count],
                 ran: BTreeSet::new(),
                 failures: Vec::new(),
-                skipped: Vec::new(),
+                skipped: 0,
             },
         }
     }
 
-    fn gives_up(&self) -> bool {
-        self.work.stop.load(Ordering::Relaxed)
+    /// True if no further node may start.
+    fn is_stopping(&self) -> bool {
+        self.run.stop.load(Ordering::Relaxed)
             || (!self.options.keep_going && !self.outcome.failures.is_empty())
     }
 
+    fn report(&self, index: usize, text: &str) {
+        self.display.line(&format!("{}: {text}", self.run.plan.nodes[index].label()));
+    }
+
     fn job(&self, index: usize) -> NodeJob<'a> {
-        let Work { session, plan, run: file, stop, .. } = *self.work;
-        let node = &plan.nodes[index];
+        let node = &self.run.plan.nodes[index];
         let parents = node
             .parents()
             .filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?)))
             .collect();
         let threads = self.options.budget.threads;
-        NodeJob {
-            plan,
-            node,
-            parents,
-            store: &session.store,
-            file,
-            threads,
-            display: self.display,
-            stop,
-            watch: None,
-        }
+        NodeJob { run: self.run, node, parents, threads, display: self.display, watch: None }
     }
 
-    /// What shows a node's checkpoints, where that is asked for and there are any.
+    /// Finds the stages that render and score a node's checkpoints, if `--watch` is given.
     fn watch(&self, index: usize) -> Option<(&'a Watch, Chain)> {
-        let Work { session, plan, .. } = *self.work;
-        let node = &plan.nodes[index];
-        let watch =
-            self.options.watch.as_ref().filter(|_| node.program.description.from_checkpoint)?;
-        let output_of =
-            |index: usize| self.outcome.records[index].as_ref().map(|r| r.output.clone());
-        let chain = Chain::find(plan, index, &|from| folder_of(from, &session.store, &output_of))
-            .map(|chain| (watch, chain));
+        let plan = self.run.plan;
+        let has_checkpoints = plan.nodes[index].program.description.from_checkpoint;
+        let watch = self.options.watch.as_ref().filter(|_| has_checkpoints)?;
+        let chain = Chain::find(plan, index, &|origin| {
+            input_folder(origin, self.run.store, &|index| {
+                self.outcome.records[index].as_ref().map(|record| record.output.clone())
+            })
+        });
         if chain.is_none() {
             let problem = "no stage of this run can score its views yet; add a target such as eval";
-            self.display.line(&format!("{}: not watched: {problem}", node.label()));
+            self.report(index, &format!("not watched: {problem}"));
         }
-        chain
+        Some((watch, chain?))
     }
 
-    /// Looks at the nodes whose parents are done. Parents come before what needs them, so one pass
-    /// finds all that is cached.
-    fn look(&mut self) {
-        for (index, node) in self.work.plan.nodes.iter().enumerate() {
-            let is_pending = matches!(self.progress[index], NodeProgress::Pending);
-            if self.gives_up()
-                || !is_pending
+    /// Looks up the pending nodes whose parents are done. Parents come first in the plan, so one
+    /// pass finds all cached nodes.
+    fn look_up_nodes(&mut self) {
+        for index in self.pending.clone() {
+            let node = &self.run.plan.nodes[index];
+            if self.is_stopping()
                 || node.parents().any(|parent| self.outcome.records[parent].is_none())
             {
                 continue;
             }
-            match self.job(index).find() {
-                Ok(Found::Cached(record)) => {
-                    self.outcome.records[index] = Some(record);
-                    self.progress[index] = NodeProgress::Over;
-                }
-                Ok(Found::ToDo(action)) => {
-                    // Without records every stage counts as unknown.
-                    let records = self
-                        .records
-                        .get_or_init(|| self.work.session.store.records().unwrap_or_default());
-                    let need = Need::of(action.key_parts(), &node.stage, records);
-                    self.progress[index] = NodeProgress::Ready { action, need, said: false };
+            self.pending.remove(&index);
+            match self.job(index).look_up() {
+                Ok(Lookup::Cached(record)) => self.outcome.records[index] = Some(record),
+                Ok(Lookup::Pending(action)) => {
+                    // If records can't be read, every stage gets the default demand.
+                    let records =
+                        self.records.get_or_init(|| self.run.store.records().unwrap_or_default());
+                    let demand = Demand::estimate(&action.key_parts, &node.stage, records);
+                    self.ready.insert(index, ReadyNode { action, demand, is_reported: false });
                 }
                 Err(failure) => self.fail(index, failure),
             }
         }
     }
 
-    /// Gives places to nodes that are ready, in the plan's order.
-    fn starting(&mut self) -> Vec<(NodeJob<'a>, usize, Action)> {
-        let mut starting = Vec::new();
-        for index in 0..self.progress.len() {
-            let NodeProgress::Ready { need, ref mut said, .. } = self.progress[index] else {
-                continue;
-            };
-            match self.places.place(need) {
-                Place::LaterForMemory(why) if !*said => {
-                    *said = true;
-                    self.display
-                        .line(&format!("{}: waits: {why}", self.work.plan.nodes[index].label()));
-                }
-                Place::Never(message) if !self.gives_up() => {
-                    self.fail(index, StageFailure { code: 1, message });
-                }
-                Place::Free if !self.gives_up() => {
-                    let progress =
-                        std::mem::replace(&mut self.progress[index], NodeProgress::Running);
-                    let NodeProgress::Ready { action, .. } = progress else { continue };
-                    self.places.take(index, need);
+    /// Admits ready nodes in the plan's order and returns the new jobs.
+    fn admit_nodes(&mut self) -> Vec<(usize, NodeJob<'a>, PendingAction)> {
+        let mut admitted = Vec::new();
+        for (index, mut node) in std::mem::take(&mut self.ready) {
+            match self.options.budget.admission(&self.running, node.demand) {
+                Admission::Start if !self.is_stopping() => {
+                    self.running.insert(index, node.demand);
                     let job = NodeJob { watch: self.watch(index), ..self.job(index) };
-                    starting.push((job, index, action));
+                    admitted.push((index, job, node.action));
+                    continue;
+                }
+                Admission::TooLarge(message) if !self.is_stopping() => {
+                    self.fail(index, failure(message));
+                    continue;
+                }
+                Admission::WaitForMemory(reason) if !node.is_reported => {
+                    self.report(index, &format!("waiting: {reason}"));
+                    node.is_reported = true;
                 }
                 _ => {}
             }
+            self.ready.insert(index, node);
         }
-        starting
+        admitted
     }
 
-    fn take_in(&mut self, (index, result): Report) {
-        self.places.give_back(index);
+    /// Takes in a worker's report.
+    fn finish(&mut self, (index, result): WorkerReport) {
+        self.running.remove(&index);
         match result {
             Ok((record, ran)) => {
-                self.progress[index] = NodeProgress::Over;
                 self.outcome.records[index] = Some(record);
                 if ran {
                     self.outcome.ran.insert(index);
@@ -266,96 +277,28 @@ impl<'a> Schedule<'a> {
     }
 
     fn fail(&mut self, index: usize, failure: StageFailure) {
-        self.progress[index] = NodeProgress::Over;
-        self.display.line(&format!(
-            "{}: failed: {}",
-            self.work.plan.nodes[index].label(),
-            failure.message
-        ));
+        self.report(index, &format!("failed: {}", failure.message));
         self.outcome.failures.push((index, failure));
     }
-
-    /// What came of it.
-    fn end(mut self) -> Outcome {
-        let is_over = |index: &usize| matches!(self.progress[*index], NodeProgress::Over);
-        self.outcome.skipped = (0..self.progress.len()).filter(|index| !is_over(index)).collect();
-        self.outcome
-    }
 }
 
-/// Prints a few words on each result that nothing else is made of.
-fn say_results(session: &Session, plan: &Plan, outcome: &Outcome) -> anyhow::Result<()> {
-    let ends: BTreeSet<usize> = (0..plan.nodes.len())
-        .filter(|&i| !plan.nodes.iter().any(|n| n.parents().any(|p| p == i)))
-        .collect();
-    for index in ends {
-        let record = outcome.records[index].as_ref().context("every node is done")?;
-        let file = session.store.object(&record.output).join(SUMMARY_FILE);
-        let stored = || std::fs::read_to_string(&file).ok();
-        if let Some(summary) = record.summary.clone().or_else(stored) {
-            print_lines(&format!("{}: {summary}", plan.nodes[index].label()));
+/// Prints the summary of each node that is no other node's parent.
+fn print_summaries(run: &Run<'_>, outcome: &Outcome) -> anyhow::Result<()> {
+    let plan = run.plan;
+    let parents: BTreeSet<usize> = plan.nodes.iter().flat_map(Node::parents).collect();
+    for (index, node) in plan.nodes.iter().enumerate() {
+        if parents.contains(&index) {
+            continue;
+        }
+        let record = outcome.records[index]
+            .as_ref()
+            .with_context(|| format!("{} has no record", node.label()))?;
+        let file = run.store.object(&record.output).join(SUMMARY_FILE);
+        if let Some(summary) =
+            record.summary.clone().or_else(|| std::fs::read_to_string(&file).ok())
+        {
+            print_lines(&format!("{}: {summary}", node.label()));
         }
     }
     Ok(())
-}
-
-/// Calls the sinks that show what there is, where some of it failed.
-fn show_partly(showing: &Showing<'_>, outcome: &Outcome) -> anyhow::Result<()> {
-    let mut partial = showing.plan.sinks.iter().filter(|sink| sink.program.description.partial);
-    partial.try_for_each(|sink| show_one(showing, sink, outcome).map(|_| ()))
-}
-
-/// Calls a sink and says where its page is; whether it wrote one.
-fn show_one(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> anyhow::Result<bool> {
-    let command = command_line();
-    let course = Course {
-        records: &outcome.records,
-        ran: Some(&outcome.ran),
-        failures: &outcome.failures,
-        command: &command,
-    };
-    let shown = show(showing, sink, &course);
-    if showing.stop.load(Ordering::Relaxed) {
-        return Err(Failure::Interrupted.into());
-    }
-    let shown = shown.map_err(|e| anyhow!("{}: {e}", sink.stage))?;
-    match &shown {
-        Shown::Written { folder, aside } => {
-            say_aside(sink, aside);
-            print_line!("{}: {}", sink.stage, page(folder).display());
-        }
-        Shown::UpToDate(folder) => {
-            print_line!("{}: {} (up to date)", sink.stage, page(folder).display());
-        }
-        Shown::Missing => print_line!("{}: nothing to show", sink.stage),
-    }
-    Ok(matches!(shown, Shown::Written { .. }))
-}
-
-/// Says where what stood in a sink's place is now.
-pub(crate) fn say_aside(sink: &Sink, aside: &[PathBuf]) {
-    for folder in aside {
-        print_line!("{}: what was there before is now {}", sink.stage, page(folder).display());
-    }
-}
-
-/// Calls the sinks and says what the run came to.
-fn show_all(showing: &Showing<'_>, outcome: &Outcome) -> anyhow::Result<()> {
-    let plan = showing.plan;
-    let mut wrote = false;
-    for sink in &plan.sinks {
-        wrote |= show_one(showing, sink, outcome)?;
-    }
-    let (ran, all) = (outcome.ran.len(), plan.nodes.len());
-    print_line!(
-        "{}",
-        if ran == 0 && !wrote { counts::all_cached(all) } else { counts::ran(ran, all) }
-    );
-    Ok(())
-}
-
-/// The page in a sink's folder, or the folder.
-fn page(folder: &Path) -> PathBuf {
-    let page = folder.join("index.html");
-    if page.exists() { page } else { folder.to_path_buf() }
 }

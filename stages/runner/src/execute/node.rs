@@ -1,4 +1,4 @@
-//! Makes one node, under its key's lock.
+//! Runs one node under its key's lock.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -6,79 +6,77 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{hash_json, unix_time};
-use planning::{FoundInputs, Node, NodeInput, Origin, Plan, find_inputs};
+use planning::{FoundInputs, Node, Origin, find_inputs};
 use serde_json::{Map, Value};
 use stage_call::{Call, Display, StageFailure, StageView, Usage, read_summary, seconds};
-use store::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, host_name};
+use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
 
-use crate::unchanged::{ConfirmedProgram, Inputs, unusable};
-use crate::waiting::{by, enter, until_held};
+use crate::failure;
+use crate::session::Run;
+use crate::unchanged::{ConfirmedProgram, Inputs, input_failure};
+use crate::waiting::{enter_store, holder_text, wait_for_lock};
 use crate::watch::{Chain, Watch, Watching};
 
-/// A node's action that isn't done.
-pub(crate) struct Action {
-    key_parts: Map<String, Value>,
+/// Action of a node that isn't cached.
+pub(crate) struct PendingAction {
+    pub(super) key_parts: Map<String, Value>,
     inputs: FoundInputs,
 }
 
-impl Action {
-    pub(crate) fn key_parts(&self) -> &Map<String, Value> {
-        &self.key_parts
-    }
-}
-
-/// What there is of a node whose parents are done.
-pub(crate) enum Found {
+/// Cache lookup result of a node whose parents are done.
+pub(crate) enum Lookup {
     Cached(Record),
-    ToDo(Action),
+    Pending(PendingAction),
 }
 
-/// One node's work.
+/// A node to run, with everything that running it needs.
 pub(crate) struct NodeJob<'a> {
-    pub(crate) plan: &'a Plan,
+    pub(crate) run: &'a Run<'a>,
     pub(crate) node: &'a Node,
-    /// Of the nodes that it needs.
+    /// Records of the parents by node index.
     pub(crate) parents: BTreeMap<usize, Record>,
-    pub(crate) store: &'a Store,
-    pub(crate) file: &'a RunFile,
     pub(crate) threads: usize,
     pub(crate) display: &'a Display,
-    pub(crate) stop: &'a AtomicBool,
-    /// How its checkpoints are shown, where they are.
+    /// Stages that render and score the node's checkpoints, if the node is watched.
     pub(crate) watch: Option<(&'a Watch, Chain)>,
 }
 
 impl NodeJob<'_> {
-    /// Finds the record or makes it.
-    pub(crate) fn run(&self) -> Result<Record, StageFailure> {
-        match self.find()? {
-            Found::Cached(record) => Ok(record),
-            Found::ToDo(action) => self.carry_out(action).map(|(record, _)| record),
+    /// Returns the node's record, after running the node if it isn't cached.
+    pub(crate) fn find_or_run(&self) -> Result<Record, StageFailure> {
+        match self.look_up()? {
+            Lookup::Cached(record) => Ok(record),
+            Lookup::Pending(action) => self.carry_out(action).map(|(record, _)| record),
         }
     }
 
-    /// Looks whether it is cached. Either way it is written down that this run needs it, so that it
-    /// can't go meanwhile.
-    pub(crate) fn find(&self) -> Result<Found, StageFailure> {
-        let inputs =
-            find_inputs(self.node, self.store, Some(self.stop), |index| self.output_of(index))
-                .map_err(|e| unusable(&e))?;
+    /// Looks up the node's record. Either way, the run's file gets the node's key first, which
+    /// protects the artifact from garbage collection.
+    pub(crate) fn look_up(&self) -> Result<Lookup, StageFailure> {
+        let inputs = find_inputs(self.node, self.run.store, Some(self.run.stop), |index| {
+            self.output_of(index)
+        })
+        .map_err(|e| input_failure(&e))?;
         let key_parts = planning::key_parts(self.node, &inputs.hashes, self.device());
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
-        self.file.needs(&entered, &self.node.stage, &key).map_err(fail)?;
-        let record = self.store.hit(&key).map_err(fail)?;
-        Ok(record.map_or(Found::ToDo(Action { key_parts, inputs }), Found::Cached))
+        self.run.file.needs(&entered, &self.node.stage, &key).map_err(failure)?;
+        Ok(match self.run.store.hit(&key).map_err(failure)? {
+            Some(record) => Lookup::Cached(record),
+            None => Lookup::Pending(PendingAction { key_parts, inputs }),
+        })
     }
 
-    /// Makes it; whether it had to.
-    pub(crate) fn carry_out(&self, action: Action) -> Result<(Record, bool), StageFailure> {
-        let Action { key_parts, inputs } = action;
+    /// Runs the node unless another runner has done so meanwhile. Returns the record and whether
+    /// the stage ran.
+    pub(crate) fn carry_out(&self, action: PendingAction) -> Result<(Record, bool), StageFailure> {
+        let PendingAction { key_parts, inputs } = action;
         let key = hash_json(&key_parts);
-        let lock =
-            until_held(self.stop, &|holder, waited| self.say_waiting(holder, waited), || {
-                self.store.try_lock(&key)
-            })?;
+        let lock = wait_for_lock(
+            self.run.stop,
+            &|holder, waited| self.report_waiting(holder, waited),
+            || self.run.store.try_lock(&key),
+        )?;
         let action = Unfinished {
             stage: self.node.stage.clone(),
             point: self.node.point.clone(),
@@ -88,16 +86,15 @@ impl NodeJob<'_> {
         };
         let attempt = {
             let entered = self.enter()?;
-            // Another runner may have made it while this one waited.
             let kind = &self.node.program.description.output.kind;
-            let record = self.store.hit_or_repair(&entered, &key, kind).map_err(fail)?;
+            let record = self.run.store.hit_or_repair(&entered, &key, kind).map_err(failure)?;
             if let Some(record) = record {
                 return Ok((record, false));
             }
-            self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?
+            self.run.store.begin(&entered, &action, &self.node.parameters).map_err(failure)?
         };
-        let inputs = Inputs::new(self.node, self.store, inputs, |index| self.output_of(index))?;
-        self.make(&lock, attempt, action, &inputs).map(|record| (record, true))
+        let inputs = Inputs::new(self.node, self.run.store, inputs, |index| self.output_of(index))?;
+        self.run_and_publish(&lock, attempt, action, &inputs).map(|record| (record, true))
     }
 
     fn output_of(&self, index: usize) -> String {
@@ -105,26 +102,24 @@ impl NodeJob<'_> {
     }
 
     fn device(&self) -> &str {
-        self.plan.device(&self.node.stage)
+        self.run.plan.device(&self.node.stage)
+    }
+
+    fn report(&self, text: &str) {
+        self.display.line(&format!("{}: {text}", self.node.label()));
     }
 
     fn enter(&self) -> Result<Entered, StageFailure> {
-        enter(self.store, self.stop, &|text| {
-            self.display.line(&format!("{}: {text}", self.node.label()));
-        })
+        enter_store(self.run.store, self.run.stop, &|text| self.report(text))
     }
 
-    fn say_waiting(&self, holder: Option<&Holder>, waited: Duration) {
+    fn report_waiting(&self, holder: Option<&Holder>, waited: Duration) {
         let waited = seconds(waited.as_secs_f64());
-        self.display.line(&format!(
-            "{}: is being made{}; waits for it, for {waited} now",
-            self.node.label(),
-            by(holder)
-        ));
+        self.report(&format!("is being created{}; waiting ({waited} so far)", holder_text(holder)));
     }
 
-    /// Calls the stage and takes in what it made.
-    fn make(
+    /// Calls the stage and publishes its artifact.
+    fn run_and_publish(
         &self,
         lock: &KeyLock,
         attempt: Attempt,
@@ -139,27 +134,22 @@ impl NodeJob<'_> {
             made_of: action.made_of,
             output: String::new(),
             started_unix: action.started_unix,
-            seconds: milliseconds(time.as_secs_f64()),
+            seconds: round_to_milliseconds(time.as_secs_f64()),
             threads: self.threads,
             peak_memory: Some(usage.peak_memory),
-            processor_seconds: Some(milliseconds(usage.processor_seconds)),
+            processor_seconds: Some(round_to_milliseconds(usage.processor_seconds)),
             host: host_name(),
             summary: read_summary(&attempt.output),
         };
-        let checked =
-            self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
-        let record = self.store.publish(&self.enter()?, checked, record).map_err(fail)?;
-        self.display.line(&format!(
-            "{}: done in {} → {}",
-            self.node.label(),
-            seconds(record.seconds),
-            &record.output[..10]
-        ));
+        let kind = &self.node.program.description.output.kind;
+        let checked = self.run.store.check(attempt, kind).map_err(failure)?;
+        let record = self.run.store.publish(&self.enter()?, checked, record).map_err(failure)?;
+        self.report(&format!("done in {} → {}", seconds(record.seconds), &record.output[..10]));
         Ok(record)
     }
 
-    /// Calls the stage. Fails unless program and inputs are those of the key from before the start
-    /// to the end. Returns the stage's usage and its running time.
+    /// Calls the stage and returns its usage and running time. Fails if the program or an input
+    /// differs from the key's at any time from start to end.
     fn call(
         &self,
         lock: &KeyLock,
@@ -167,19 +157,17 @@ impl NodeJob<'_> {
         inputs: &Inputs<'_>,
     ) -> Result<(Usage, Duration), StageFailure> {
         let label = self.node.label();
-        let program = ConfirmedProgram::new(&self.node.program, self.store, self.stop)?;
-        inputs.check(self.stop)?;
-        if inputs.drop_doubtful_checkpoints(attempt).map_err(fail)? {
-            self.display.line(&format!(
-                "{label}: an input was written to since its checkpoint; it starts over"
-            ));
+        let program = ConfirmedProgram::new(&self.node.program, self.run.store, self.run.stop)?;
+        inputs.check(self.run.stop)?;
+        if inputs.drop_doubtful_checkpoints(attempt).map_err(failure)? {
+            self.report("an input was written to after the checkpoint; starting over");
         }
-        let folders: Vec<(String, PathBuf)> = self
-            .node
-            .inputs
-            .iter()
-            .filter_map(|input| Some((input.name.clone(), self.folder_of(input)?)))
-            .collect();
+        let mut folders: Vec<(String, PathBuf)> = Vec::new();
+        for input in &self.node.inputs {
+            let folder =
+                input_folder(&input.from, self.run.store, &|index| Some(self.output_of(index)));
+            folders.extend(folder.map(|folder| (input.name.clone(), folder)));
+        }
         let call = Call {
             label: &label,
             program: &self.node.program.path,
@@ -201,14 +189,14 @@ impl NodeJob<'_> {
         view.end();
         let usage = result?;
         program.confirm_again()?;
-        inputs.check(self.stop).inspect_err(|_| {
+        inputs.check(self.run.stop).inspect_err(|_| {
             // Checkpoints may contain the changed input, even if it gets its old content back.
             std::fs::remove_dir_all(&attempt.work).ok();
         })?;
         Ok((usage, time))
     }
 
-    /// Runs the stage; whoever watches its checkpoints ends when it does.
+    /// Runs the stage. If the node is watched, a second thread takes looks until the stage ends.
     fn run_watched(
         &self,
         call: &Call<'_>,
@@ -216,32 +204,30 @@ impl NodeJob<'_> {
         view: &StageView<'_>,
     ) -> Result<Usage, StageFailure> {
         let Some((watch, chain)) = &self.watch else {
-            return call.run(&attempt.log, view, self.stop);
+            return call.run(&attempt.log, view, self.run.stop);
         };
         let is_over = AtomicBool::new(false);
-        let scratch = self.store.scratch(self.file.id()).join(format!("watch-{}", call.label));
+        let scratch =
+            self.run.store.scratch(self.run.file.id()).join(format!("watch-{}", call.label));
         let (label, display, is_over) = (call.label, self.display, &is_over);
         let watching = Watching { watch, chain, label, scratch, display, is_over };
         std::thread::scope(|scope| {
             scope.spawn(|| watching.run(call));
-            let result = call.run(&attempt.log, view, self.stop);
+            let result = call.run(&attempt.log, view, self.run.stop);
             is_over.store(true, Ordering::Relaxed);
             result
         })
     }
-
-    fn folder_of(&self, input: &NodeInput) -> Option<PathBuf> {
-        folder_of(&input.from, self.store, &|index| Some(self.output_of(index)))
-    }
 }
 
-/// Where an input lies; none where it isn't made yet.
-pub(super) fn folder_of(
-    from: &Origin,
+/// Returns the folder of an input; `None` if its artifact doesn't exist yet. `output_of` returns
+/// the artifact of a node.
+pub(super) fn input_folder(
+    origin: &Origin,
     store: &Store,
     output_of: &dyn Fn(usize) -> Option<String>,
 ) -> Option<PathBuf> {
-    match from {
+    match origin {
         Origin::Node { index, subtree } => {
             let object = store.object(&output_of(*index)?);
             Some(subtree.as_ref().map_or(object.clone(), |s| object.join(s)))
@@ -250,12 +236,6 @@ pub(super) fn folder_of(
     }
 }
 
-/// Seconds to the millisecond.
-fn milliseconds(seconds: f64) -> f64 {
+fn round_to_milliseconds(seconds: f64) -> f64 {
     (seconds * 1e3).round() / 1e3
-}
-
-/// A failure that is neither the input's nor the numbers'.
-fn fail(error: impl std::fmt::Display) -> StageFailure {
-    StageFailure { code: 1, message: error.to_string() }
 }

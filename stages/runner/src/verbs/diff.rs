@@ -3,106 +3,104 @@ use std::process::ExitCode;
 use artifact::{Failure, print_line};
 use planning::{Change, PlanError, Request, State};
 
-use super::print::print_json;
+use super::print_json;
 use crate::lineage::{Lineage, StageDifference};
-use crate::session::{Session, of_stage};
+use crate::session::{Session, nodes_of_stage};
 
-/// More files than these are counted, not listed.
-const MOST_FILES: usize = 4;
-/// The fewest letters by which a hash is known.
-const LEAST_HASH_LETTERS: usize = 6;
+/// Maximum number of files of a stage that are listed; more are counted. Chosen by hand.
+const MAX_LISTED_FILES: usize = 4;
+/// Minimum length of a hash's prefix in characters; chosen by hand.
+const MIN_HASH_CHARS: usize = 6;
 
-/// Tells what differs between two results and all that they were made of.
+/// Prints the differences between two results and the actions that they depend on.
 pub(crate) fn diff(
     session: &Session,
     before: &str,
     now: &str,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let (before, now) = (side(session, before)?, side(session, now)?);
+    let (before, now) = (read_side(session, before)?, read_side(session, now)?);
     let differences = now.differences(&before, &session.store)?;
     if json {
         return print_json(&differences);
     }
-    differences.iter().flat_map(lines).for_each(|line| print_line!("{line}"));
+    for line in differences.iter().flat_map(lines) {
+        print_line!("{line}");
+    }
     if differences.is_empty() {
-        print_line!("nothing differs");
+        print_line!("no differences");
     }
     Ok(ExitCode::SUCCESS)
 }
 
-/// A stage's differences, a line each; many files have one line together.
+/// Returns one line per difference of a stage; many files share one line.
 fn lines(difference: &StageDifference) -> Vec<String> {
-    let (files, others): (Vec<&Change>, Vec<&Change>) =
+    let stage = &difference.stage;
+    let (files, mut listed): (Vec<&Change>, Vec<&Change>) =
         difference.changes.iter().partition(|change| change.name.starts_with("file "));
-    let mut lines: Vec<String> =
-        others.iter().map(|change| format!("{}: {change}", difference.stage)).collect();
-    if files.len() > MOST_FILES {
+    let summary = (files.len() > MAX_LISTED_FILES).then(|| {
         let first = files[0].name.trim_start_matches("file ");
-        lines.push(format!("{}: {} files differ, such as {first}", difference.stage, files.len()));
-    } else {
-        lines.extend(files.iter().map(|change| format!("{}: {change}", difference.stage)));
+        format!("{stage}: {} files differ, such as {first}", files.len())
+    });
+    if summary.is_none() {
+        listed.extend(files);
     }
-    lines
+    listed.iter().map(|change| format!("{stage}: {change}")).chain(summary).collect()
 }
 
-/// A side of the comparison: a recorded run or pin, the beginning of an artifact's hash or of a
-/// key, or a stage with `-p` and `-i`.
-fn side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
+/// Reads one side of the comparison: a recorded run or pin, the beginning of an artifact's hash or
+/// of a key, or a stage with `-p` and `-i`.
+fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let store = &session.store;
     if let Some(run) = store.run_or_pin(text)? {
-        return Lineage::of(store, run.keys);
+        return Lineage::read(store, run.keys);
     }
-    let is_hash = text.len() >= LEAST_HASH_LETTERS && text.bytes().all(|b| b.is_ascii_hexdigit());
-    if is_hash {
-        let records = store.records()?;
-        let mut found = records
-            .iter()
-            .filter(|record| record.output.starts_with(text) || record.key().starts_with(text));
-        if let Some(record) = found.next() {
-            if found.any(|other| other.output != record.output) {
-                return Err(PlanError::Usage(format!(
-                    "{text}: more than one artifact begins so; give more of it"
-                ))
-                .into());
+    if text.len() >= MIN_HASH_CHARS && text.bytes().all(|b| b.is_ascii_hexdigit()) {
+        let mut records = store.records()?;
+        records.retain(|r| r.output.starts_with(text) || r.key().starts_with(text));
+        if let Some(record) = records.first() {
+            if records.iter().any(|other| other.output != record.output) {
+                return Err(usage(text, "several artifacts begin with this; give more characters"));
             }
-            return Lineage::of(store, [record.key()]);
+            return Lineage::read(store, [record.key()]);
         }
     }
-    stage(session, text)
+    read_stage(session, text)
 }
 
-/// The result of a stage with the parameters and inputs that follow it.
-fn stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
-    let usage = |problem: String| PlanError::Usage(format!("{text:?}: {problem}"));
-    let mut words = text.split_whitespace().map(str::to_owned);
-    let stage = words
-        .next()
-        .ok_or_else(|| usage("expected a stage, an artifact's hash, or a run".to_owned()))?;
-    let mut what = Request { targets: vec![stage.clone()], ..Request::default() };
+/// Reads the result of a stage with the parameters and inputs that follow its name.
+fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
+    let mut words = text.split_whitespace();
+    let Some(stage) = words.next() else {
+        return Err(usage(text, "expected a stage, an artifact's hash, or a run"));
+    };
+    let mut request = Request { targets: vec![stage.to_owned()], ..Request::default() };
     while let Some(word) = words.next() {
-        let list = match word.as_str() {
-            "-p" => &mut what.parameters,
-            "-i" => &mut what.inputs,
+        let list = match word {
+            "-p" => &mut request.parameters,
+            "-i" => &mut request.inputs,
             _ => {
-                return Err(usage(format!(
-                    "{word} is neither -p nor -i; quote each side as one word of the shell"
-                ))
-                .into());
+                let problem =
+                    format!("expected -p or -i, found {word}; quote each side as one word");
+                return Err(usage(text, &problem));
             }
         };
-        list.push(words.next().ok_or_else(|| usage(format!("{word} needs NAME=VALUE")))?);
+        let Some(value) = words.next() else {
+            return Err(usage(text, &format!("{word} needs NAME=VALUE")));
+        };
+        list.push(value.to_owned());
     }
-    let plan = session.plan(&what)?;
-    let states = session.states(&plan)?;
-    match of_stage(&plan, &stage)?[..] {
-        [index] => match &states[index] {
-            State::Cached(record) => Lineage::of(&session.store, [record.key()]),
-            _ => Err(Failure::BadInput(format!("{text} isn't made yet; run it first")).into()),
-        },
-        _ => {
-            Err(usage("a sweep has several results; give one value for each parameter".to_owned())
-                .into())
-        }
-    }
+    let (plan, states) = session.plan_with_states(&request)?;
+    let nodes = nodes_of_stage(&plan, stage)?;
+    let &[index] = nodes.as_slice() else {
+        return Err(usage(text, "a sweep has several results; give one value for each parameter"));
+    };
+    let State::Cached(record) = &states[index] else {
+        return Err(Failure::BadInput(format!("{text} has no artifact yet; run it first")).into());
+    };
+    Lineage::read(&session.store, [record.key()])
+}
+
+fn usage(text: &str, problem: &str) -> anyhow::Error {
+    PlanError::Usage(format!("{text:?}: {problem}")).into()
 }

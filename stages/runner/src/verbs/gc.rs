@@ -9,90 +9,91 @@ use serde_json::json;
 use stage::stop_on_signals;
 use stage_call::seconds;
 
-use super::print::print_json;
+use super::print_json;
 use crate::session::Session;
-use crate::waiting::until_held;
+use crate::waiting::wait_for_lock;
 
-/// Removes what nothing needs any more.
+/// Deletes artifacts that nothing needs (docs/design/029).
 pub(crate) fn gc(
     session: &Session,
-    what: &Request,
+    request: &Request,
     policy: Policy,
-    style: Style,
+    output: GcOutput,
 ) -> anyhow::Result<ExitCode> {
     let store = &session.store;
-    let needed = needed(session, what)?;
-    if style.dry_run {
-        return style.tell(&Collection::new(store, needed, policy).context(UNREAD)?);
+    let root = plan_root(session, request)?;
+    if output.dry_run {
+        return output.print(&Collection::new(store, root, policy).context(UNREADABLE)?);
     }
     let stop = stop_on_signals()?;
-    let closed = match until_held(&stop, &|_, waited| say_wait(waited), || store.try_close()) {
+    let closed = match wait_for_lock(&stop, &|_, waited| report_wait(waited), || store.try_close())
+    {
         Ok(closed) => closed,
         Err(failure) if failure.code == 130 => return Err(Failure::Interrupted.into()),
         Err(failure) => return Err(failure.into()),
     };
-    let collection = Collection::new(store, needed, policy).context(UNREAD)?;
+    let collection = Collection::new(store, root, policy).context(UNREADABLE)?;
     collection.carry_out(store, &closed)?;
     drop(closed);
     store.empty_trash()?;
-    style.tell(&collection)
+    output.print(&collection)
 }
 
-/// Context of an error that comes before anything is deleted.
-const UNREAD: &str =
-    "nothing was deleted: gc must read the whole store; make this readable or move it away";
+/// Context of an error before anything is deleted.
+const UNREADABLE: &str = "nothing was deleted, because gc must read the whole store; make this \
+    file readable or move it away";
 
-fn say_wait(waited: Duration) {
+fn report_wait(waited: Duration) {
     report_line!(
-        "nerf-sr: waits until no run looks for artifacts, for {} now",
+        "nerf-sr: waiting for runs that look up artifacts ({} so far)",
         seconds(waited.as_secs_f64())
     );
 }
 
-/// What to do beside deciding, and how to tell of it.
+/// Options of the output of `gc`.
 #[derive(Clone, Copy)]
-pub(crate) struct Style {
-    /// Only say what would go.
+pub(crate) struct GcOutput {
+    /// True if nothing is deleted.
     pub(crate) dry_run: bool,
-    /// For programs.
+    /// True if JSON is printed.
     pub(crate) json: bool,
 }
 
-impl Style {
-    fn tell(self, collection: &Collection) -> anyhow::Result<ExitCode> {
-        let (goes, stays) = collection.bytes();
+impl GcOutput {
+    fn print(self, collection: &Collection) -> anyhow::Result<ExitCode> {
+        let (deleted, kept) = collection.bytes();
         if self.json {
-            let told = json!({"dry_run": self.dry_run, "bytes_gone": goes, "bytes_left": stays,
-                "items": collection.decisions()});
-            return print_json(&told);
+            return print_json(&json!({"dry_run": self.dry_run, "bytes_gone": deleted,
+                "bytes_left": kept, "items": collection.decisions()}));
         }
         for decision in collection.decisions() {
             print_line!("{decision}");
         }
-        let verbs = if self.dry_run { ("would go", "would stay") } else { ("freed", "stay") };
-        print_line!(
-            "{:.1} MB {}, {:.1} MB {}",
-            goes as f64 / 1e6,
-            verbs.0,
-            stays as f64 / 1e6,
-            verbs.1
-        );
+        let deleted = deleted as f64 / 1e6;
+        let kept = kept as f64 / 1e6;
+        if self.dry_run {
+            print_line!("{deleted:.1} MB would be deleted, {kept:.1} MB would be kept");
+        } else {
+            print_line!("{deleted:.1} MB deleted, {kept:.1} MB kept");
+        }
         Ok(ExitCode::SUCCESS)
     }
 }
 
-/// What the pipeline needs with these arguments.
-fn needed(session: &Session, what: &Request) -> anyhow::Result<Root> {
-    let plan = session.plan(what)?;
+/// Returns the root that keeps the plan's actions.
+fn plan_root(session: &Session, request: &Request) -> anyhow::Result<Root> {
+    let plan = session.plan(request)?;
     let states = match plan.states(&session.store, None) {
-        Err(error @ PlanError::Store(_)) => return Err(anyhow::Error::from(error).context(UNREAD)),
+        Err(error @ PlanError::Store(_)) => {
+            return Err(anyhow::Error::from(error).context(UNREADABLE));
+        }
         states => states?,
     };
     let mut root = Root { reason: "the pipeline needs it".to_owned(), ..Root::default() };
-    for (node, state) in plan.nodes.iter().zip(states) {
+    for (index, state) in states.iter().enumerate() {
         match state.key() {
             Some(key) => _ = root.keys.insert(key),
-            None => root.waiting.push(node.waiting()),
+            None => root.waiting.push(plan.nodes[index].waiting()),
         }
     }
     Ok(root)

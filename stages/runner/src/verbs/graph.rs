@@ -5,126 +5,96 @@ use planning::{Origin, Plan, Request, State};
 
 use crate::session::Session;
 
-/// How a plan is drawn.
-// Its values are without texts of their own: clap would give every verb's help its long form.
+/// Output format of `graph`.
+// Values have no doc comments: clap would give every verb's help its long form.
 #[derive(Clone, Copy, clap::ValueEnum)]
 pub(crate) enum GraphFormat {
     Ascii,
     Dot,
 }
 
-/// Draws the plan: as text, or for Graphviz.
+/// Draws the plan as text or for Graphviz.
 pub(crate) fn graph(
     session: &Session,
-    what: &Request,
+    request: &Request,
     format: GraphFormat,
 ) -> anyhow::Result<ExitCode> {
-    let plan = session.plan(what)?;
-    let states = session.states(&plan)?;
+    let (plan, states) = session.plan_with_states(request)?;
+    let vertices = vertices(&plan, &states);
     print_lines(&match format {
-        GraphFormat::Ascii => ascii(&plan, &states),
-        GraphFormat::Dot => dot(&plan, &states),
+        GraphFormat::Ascii => draw_as_text(&vertices),
+        GraphFormat::Dot => draw_for_graphviz(&vertices),
     });
     Ok(ExitCode::SUCCESS)
 }
 
-/// A node or a sink, as it is drawn.
-struct Drawn<'a> {
+/// A node or sink in the graph.
+struct Vertex<'a> {
     label: String,
-    state: Drawing,
-    /// What it is made of, in words: `scene = prep/train`.
-    made_of: Vec<String>,
-    /// The ones drawn before it that it is made of, and the folder of each that is meant.
+    state: &'static str,
+    is_sink: bool,
+    /// Inputs as text, such as `scene = prep/train`; a sink's nodes.
+    inputs: Vec<String>,
+    /// Index and subtree of each parent. Parents come before their children.
     parents: Vec<(usize, &'a str)>,
 }
 
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Drawing {
-    Cached,
-    WillRun,
-    Waits,
-    Sink,
-}
-
-impl Drawing {
-    fn of(state: &State) -> Self {
-        match state {
-            State::Cached(_) => Self::Cached,
-            State::WillRun { .. } => Self::WillRun,
-            State::Waits { .. } => Self::Waits,
-        }
-    }
-
-    fn word(self) -> &'static str {
-        match self {
-            Self::Cached => "cached",
-            Self::WillRun => "will run",
-            Self::Waits => "waits",
-            Self::Sink => "shows the run",
-        }
-    }
-}
-
-/// The nodes in their order, and after them the sinks.
-fn drawn<'a>(plan: &'a Plan, states: &[State]) -> Vec<Drawn<'a>> {
-    let nodes = plan.nodes.iter().zip(states).map(|(node, state)| {
-        let mut drawn = Drawn {
-            label: node.label(),
-            state: Drawing::of(state),
-            made_of: Vec::new(),
-            parents: Vec::new(),
-        };
+/// Returns the nodes in the plan's order, then the sinks.
+fn vertices<'a>(plan: &'a Plan, states: &[State]) -> Vec<Vertex<'a>> {
+    let mut vertices = Vec::with_capacity(plan.nodes.len() + plan.sinks.len());
+    for (index, node) in plan.nodes.iter().enumerate() {
+        let (mut inputs, mut parents) = (Vec::new(), Vec::new());
         for input in &node.inputs {
             let source = match &input.from {
-                Origin::Node { index, subtree: Some(folder) } => {
-                    format!("{}/{folder}", plan.nodes[*index].label())
+                Origin::Node { index, subtree } => {
+                    parents.push((*index, subtree.as_deref().unwrap_or_default()));
+                    let slash = if subtree.is_some() { "/" } else { "" };
+                    let subtree = subtree.as_deref().unwrap_or_default();
+                    format!("{}{slash}{subtree}", plan.nodes[*index].label())
                 }
-                Origin::Node { index, subtree: None } => plan.nodes[*index].label(),
                 Origin::Folder(folder) => folder.display().to_string(),
             };
-            drawn.made_of.push(format!("{} = {source}", input.name));
-            if let Origin::Node { index, subtree } = &input.from {
-                drawn.parents.push((*index, subtree.as_deref().unwrap_or_default()));
-            }
+            inputs.push(format!("{} = {source}", input.name));
         }
-        drawn
-    });
-    let sinks = plan.sinks.iter().map(|sink| Drawn {
-        label: sink.stage.clone(),
-        state: Drawing::Sink,
-        made_of: sink.shows.iter().map(|&index| plan.nodes[index].label()).collect(),
-        parents: sink.shows.iter().map(|&index| (index, "")).collect(),
-    });
-    nodes.chain(sinks).collect()
+        let state = states[index].name();
+        vertices.push(Vertex { label: node.label(), state, is_sink: false, inputs, parents });
+    }
+    for sink in &plan.sinks {
+        vertices.push(Vertex {
+            label: sink.stage.clone(),
+            state: "shows the run",
+            is_sink: true,
+            inputs: sink.shows.iter().map(|&index| plan.nodes[index].label()).collect(),
+            parents: sink.shows.iter().map(|&index| (index, "")).collect(),
+        });
+    }
+    vertices
 }
 
-fn ascii(plan: &Plan, states: &[State]) -> String {
-    let all = drawn(plan, states);
-    let lines = all.iter().zip(depths(&all)).map(|(drawn, depth)| {
-        let made_of = drawn.made_of.join(", ");
-        let arrow = if made_of.is_empty() { String::new() } else { format!("  ← {made_of}") };
-        format!("{}{} ({}){arrow}\n", "  ".repeat(depth), drawn.label, drawn.state.word())
-    });
-    lines.collect()
+/// Draws each vertex on a line of its own, indented by the length of the longest path to it.
+fn draw_as_text(vertices: &[Vertex]) -> String {
+    let mut depths: Vec<usize> = Vec::with_capacity(vertices.len());
+    let mut text = String::new();
+    for vertex in vertices {
+        let depth = vertex.parents.iter().map(|(parent, _)| depths[*parent] + 1).max().unwrap_or(0);
+        depths.push(depth);
+        text += &format!("{}{} ({})", "  ".repeat(depth), vertex.label, vertex.state);
+        if !vertex.inputs.is_empty() {
+            text += &format!("  ← {}", vertex.inputs.join(", "));
+        }
+        text.push('\n');
+    }
+    text
 }
 
-fn dot(plan: &Plan, states: &[State]) -> String {
+fn draw_for_graphviz(vertices: &[Vertex]) -> String {
     let mut text = "digraph pipeline {\n  rankdir=LR;\n  node [shape=box];\n".to_owned();
-    for (i, drawn) in drawn(plan, states).iter().enumerate() {
-        let shape = if drawn.state == Drawing::Sink { ", shape=note" } else { "" };
-        text += &format!("  n{i} [label={:?}{shape}];\n", drawn.label);
-        for (parent, folder) in &drawn.parents {
-            text += &format!("  n{parent} -> n{i} [label={folder:?}];\n");
+    for (i, vertex) in vertices.iter().enumerate() {
+        let shape = if vertex.is_sink { ", shape=note" } else { "" };
+        text += &format!("  n{i} [label={:?}{shape}];\n", vertex.label);
+        for (parent, subtree) in &vertex.parents {
+            text += &format!("  n{parent} -> n{i} [label={subtree:?}];\n");
         }
     }
     text + "}\n"
-}
-
-/// Longest way from a source, for each.
-fn depths(all: &[Drawn]) -> Vec<usize> {
-    let mut depths: Vec<usize> = Vec::with_capacity(all.len());
-    for drawn in all {
-        depths.push(drawn.parents.iter().map(|(parent, _)| depths[*parent] + 1).max().unwrap_or(0));
-    }
-    depths
 }

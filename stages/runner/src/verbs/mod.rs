@@ -1,38 +1,35 @@
-//! What the command line can ask for, a file each.
+//! The verbs of the command line.
 
-mod cancel;
-mod completions;
-mod describe;
 mod diff;
 mod gc;
 mod graph;
-mod init;
-mod job;
+mod jobs;
 mod log;
-mod man;
 mod path;
 mod pin;
-mod plan;
-mod print;
 mod run;
-mod status;
+mod standalone;
+mod states;
 mod verify;
-mod why;
 
-pub(crate) use cancel::cancel;
-pub(crate) use completions::completions;
-pub(crate) use describe::describe;
+use std::process::ExitCode;
+
+use serde::Serialize;
+
 pub(crate) use diff::diff;
-pub(crate) use gc::{Style, gc};
+pub(crate) use gc::{GcOutput, gc};
 pub(crate) use graph::{GraphFormat, graph};
-pub(crate) use init::init;
-pub(crate) use job::job;
+pub(crate) use jobs::{cancel, job};
 pub(crate) use log::log;
-pub(crate) use man::man;
 pub(crate) use path::path;
 pub(crate) use pin::{pin, unpin};
-pub(crate) use plan::plan;
 pub(crate) use run::run;
-pub(crate) use status::status;
+pub(crate) use standalone::{completions, describe, init, man};
+pub(crate) use states::{plan, status, why};
 pub(crate) use verify::verify;
-pub(crate) use why::why;
+
+/// Prints a value as JSON.
+fn print_json(value: &impl Serialize) -> anyhow::Result<ExitCode> {
+    artifact::print_lines(&serde_json::to_string_pretty(value)?);
+    Ok(ExitCode::SUCCESS)
+}

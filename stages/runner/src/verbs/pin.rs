@@ -1,56 +1,56 @@
 use std::process::ExitCode;
 
-use artifact::print_line;
+use artifact::{counted, print_line};
 use planning::{PlanError, Request, State};
 
 use crate::session::{Session, command_line};
-use crate::waiting::enter_at_once;
+use crate::waiting::try_enter_store;
 
-/// Keeps what the targets have, until `unpin`.
-pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Result<ExitCode> {
-    check(name)?;
-    let plan = session.plan(what)?;
-    let entered = enter_at_once(&session.store)?;
+/// Maximum length of a pin's name in bytes; chosen by hand, below the limit of file systems.
+const MAX_NAME_BYTES: usize = 100;
+
+/// Protects the targets' artifacts from garbage collection.
+pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::Result<ExitCode> {
+    check_name(name)?;
+    let plan = session.plan(request)?;
+    let entered = try_enter_store(&session.store)?;
     let mut actions = Vec::new();
-    for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
-        match state {
-            State::Cached(record) => actions.push((node.stage.clone(), record.key())),
-            _ => {
-                let message = format!(
-                    "{} isn't cached, and only what is made can be pinned; run it first",
-                    node.label()
-                );
-                return Err(PlanError::Usage(message).into());
-            }
-        }
+    for (index, state) in plan.states(&session.store, None)?.into_iter().enumerate() {
+        let node = &plan.nodes[index];
+        let State::Cached(record) = state else {
+            let message = format!("{} has no artifact to pin yet; run it first", node.label());
+            return Err(PlanError::Usage(message).into());
+        };
+        actions.push((node.stage.clone(), record.key()));
     }
     session.store.pin(&entered, name, command_line(), &actions)?;
-    print_line!("pinned {} artifacts as {name}", actions.len());
+    print_line!("pinned {} as {name}", counted(actions.len(), "artifact"));
     Ok(ExitCode::SUCCESS)
 }
 
-/// Takes a pin away.
+/// Removes a pin.
 pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<ExitCode> {
-    check(name)?;
+    check_name(name)?;
     if session.store.unpin(name)? {
-        print_line!("{name} is no longer pinned");
+        print_line!("removed pin {name}");
         return Ok(ExitCode::SUCCESS);
     }
-    let known = session.store.pin_names()?;
-    let known = if known.is_empty() {
-        "nothing is pinned".to_owned()
+    let pins = session.store.pin_names()?;
+    let known = if pins.is_empty() {
+        "there are no pins".to_owned()
     } else {
-        format!("pinned: {}", known.join(", "))
+        format!("pins: {}", pins.join(", "))
     };
     Err(PlanError::Usage(format!("no pin {name:?}; {known}")).into())
 }
 
-/// A pin's name is a file's.
-fn check(name: &str) -> Result<(), PlanError> {
-    let is_plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
-    if name.is_empty() || name.starts_with('.') || name.len() > 100 || !name.chars().all(is_plain) {
+/// Fails unless a pin's name is valid as a file name.
+fn check_name(name: &str) -> Result<(), PlanError> {
+    let is_plain = name.chars().all(|c| c.is_alphanumeric() || "-_.".contains(c));
+    if name.is_empty() || name.starts_with('.') || name.len() > MAX_NAME_BYTES || !is_plain {
         return Err(PlanError::Usage(format!(
-            "pin {name:?}: a name has letters, digits, -, _ and ., and doesn't begin with a dot"
+            "invalid pin name {name:?}; use letters, digits, -, _ and ., but no dot at the \
+            beginning"
         )));
     }
     Ok(())

@@ -8,41 +8,41 @@ use artifact::{Damage, counted, print_line};
 use indicatif::{ProgressBar, ProgressStyle};
 use store::{Entered, Store, StoreError};
 
-use crate::waiting::enter;
+use crate::waiting::enter_store;
 
-/// Reads every artifact and every record again.
+/// Reads all artifacts and records, and compares their contents with their hashes.
 pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
     for path in store.foreign_entries()? {
-        print_line!("{}: not an artifact; it is left alone, move it elsewhere", path.display());
+        print_line!("{}: not an artifact, ignored; move it elsewhere", path.display());
     }
-    let objects = store.objects()?;
-    let sizes: Vec<u64> = objects
-        .iter()
-        .map(|object| store.manifest(object).map_or(0, |manifest| manifest.size()))
-        .collect();
-    let bar = bar(sizes.iter().sum());
-    let mut verifying = Verifying { store, remove, bar: &bar, tally: Tally::default() };
-    for (object, size) in objects.iter().zip(sizes) {
-        verifying.object(object)?;
-        bar.inc(size);
+    let mut objects = Vec::new();
+    for object in store.objects()? {
+        let bytes = store.manifest(&object).map_or(0, |manifest| manifest.size());
+        objects.push((object, bytes));
+    }
+    let bar = new_progress_bar(objects.iter().map(|(_, bytes)| bytes).sum());
+    let mut verification = Verification { store, remove, bar: &bar, tally: Tally::default() };
+    for (object, bytes) in &objects {
+        verification.check_object(object)?;
+        bar.inc(*bytes);
     }
     for key in store.action_files()? {
-        verifying.record(&key)?;
+        verification.check_record(&key)?;
     }
     bar.finish_and_clear();
-    Ok(verifying.tally.tell())
+    Ok(verification.tally.print())
 }
 
 /// A verification in progress.
-struct Verifying<'a> {
+struct Verification<'a> {
     store: &'a Store,
-    /// True if damaged artifacts and records are to be removed.
+    /// True if damaged artifacts and records are removed.
     remove: bool,
     bar: &'a ProgressBar,
     tally: Tally,
 }
 
-/// Numbers of artifacts and records, by what was found.
+/// Numbers of artifacts and records by result.
 #[derive(Default)]
 struct Tally {
     artifacts: usize,
@@ -51,17 +51,17 @@ struct Tally {
     unreadable: usize,
 }
 
-impl Verifying<'_> {
-    /// Re-hashes an object. Garbage collection may take the object meanwhile, so a problem counts
-    /// only if it is there while garbage collection is kept away.
-    fn object(&mut self, identity: &str) -> anyhow::Result<()> {
+impl Verification<'_> {
+    /// Hashes an object again. Garbage collection may delete the object meanwhile, so a problem
+    /// counts only if the object still exists after entering the store.
+    fn check_object(&mut self, identity: &str) -> anyhow::Result<()> {
         let store = self.store;
         if store.verify(identity).is_ok() {
             self.tally.artifacts += 1;
             return Ok(());
         }
         let _entered = self.enter()?;
-        if is_gone(&store.object(identity)) {
+        if is_deleted(&store.object(identity)) {
             return Ok(());
         }
         self.tally.artifacts += 1;
@@ -69,14 +69,14 @@ impl Verifying<'_> {
             Ok(()) => {}
             Err(problem @ Damage::Unreadable { .. }) => {
                 self.tally.unreadable += 1;
-                self.say(&problem);
+                self.print(&problem);
             }
             Err(damage) => {
                 self.tally.damaged += 1;
-                self.say(&damage);
+                self.print(&damage);
                 if self.remove {
                     store.remove_object(identity)?;
-                    self.say(&REMOVED);
+                    self.print(&REMOVED_NOTE);
                 }
             }
         }
@@ -84,9 +84,9 @@ impl Verifying<'_> {
     }
 
     /// Reads the record of a key.
-    fn record(&mut self, key: &str) -> anyhow::Result<()> {
+    fn check_record(&mut self, key: &str) -> anyhow::Result<()> {
         let Err(problem) = self.store.undamaged_record(key) else { return Ok(()) };
-        self.say(&problem);
+        self.print(&problem);
         if !matches!(problem, StoreError::Content { .. }) {
             self.tally.unreadable += 1;
             return Ok(());
@@ -95,25 +95,25 @@ impl Verifying<'_> {
         if self.remove {
             let _entered = self.enter()?;
             self.store.remove_record(key)?;
-            self.say(&REMOVED);
+            self.print(&REMOVED_NOTE);
         }
         Ok(())
     }
 
-    /// Enters the store. What is damage to this program may be whole to a newer one, which has the
-    /// store by now: then this fails.
+    /// Enters the store. This fails if a newer version of nerf-sr has upgraded the store meanwhile:
+    /// content that looks damaged to this version may then be intact.
     fn enter(&self) -> anyhow::Result<Entered> {
-        Ok(enter(self.store, &AtomicBool::new(false), &|text| self.say(&text))?)
+        Ok(enter_store(self.store, &AtomicBool::new(false), &|text| self.print(&text))?)
     }
 
-    fn say(&self, words: &dyn Display) {
-        self.bar.suspend(|| print_line!("{words}"));
+    fn print(&self, line: &dyn Display) {
+        self.bar.suspend(|| print_line!("{line}"));
     }
 }
 
 impl Tally {
-    /// Prints the numbers; exit code 3 if anything is damaged or can't be read.
-    fn tell(&self) -> ExitCode {
+    /// Prints the numbers. The exit code is 3 if anything is damaged or unreadable.
+    fn print(&self) -> ExitCode {
         let Self { artifacts, damaged, damaged_records, unreadable } = *self;
         let mut line = format!("{}, {damaged} damaged", counted(artifacts, "artifact"));
         if damaged_records > 0 {
@@ -131,14 +131,14 @@ impl Tally {
     }
 }
 
-const REMOVED: &str = "  removed; the next run makes it again";
+const REMOVED_NOTE: &str = "  removed; the next run creates it again";
 
-fn is_gone(path: &Path) -> bool {
+fn is_deleted(path: &Path) -> bool {
     path.symlink_metadata().is_err_and(|error| error.kind() == io::ErrorKind::NotFound)
 }
 
-/// Shows itself on a terminal alone.
-fn bar(bytes: u64) -> ProgressBar {
+/// Creates a progress bar, which is visible only on a terminal.
+fn new_progress_bar(bytes: u64) -> ProgressBar {
     let style =
         ProgressStyle::with_template("reading [{bar:30}] {bytes} of {total_bytes}, {eta} left");
     ProgressBar::new(bytes)

@@ -1,7 +1,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use planning::{NodeInput, Origin, Plan, StageProgram};
+use planning::{Origin, Plan, StageProgram};
 use serde_json::Value;
 
 /// The two blocks of a plan that render a checkpoint's field and score the view.
@@ -10,20 +10,20 @@ pub(crate) struct Chain {
     pub(super) score: Link,
 }
 
-/// One block of a chain. Its optional inputs are omitted.
+/// One block of a chain, without its optional inputs.
 pub(super) struct Link {
     pub(super) program: Arc<StageProgram>,
     pub(super) parameters: Value,
     pub(super) device: String,
-    /// Name of the input that takes the previous block's output.
-    pub(super) fed: String,
-    /// The other inputs, with their folders.
+    /// Name of the input that gets the previous block's output.
+    pub(super) chained_input: String,
+    /// Names and folders of the other inputs.
     pub(super) inputs: Vec<(String, PathBuf)>,
 }
 
 impl Chain {
-    /// Finds the first block that renders a node's field, and a block that scores those views.
-    /// Their other required inputs must exist; `folder_of` gives the folders.
+    /// Finds the first block that renders a node's field, and a block that scores those views. The
+    /// blocks' other required inputs must exist; `folder_of` returns their folders.
     pub(crate) fn find(
         plan: &Plan,
         node: usize,
@@ -39,7 +39,8 @@ impl Chain {
 }
 
 impl Link {
-    /// Node `index`, if it takes node `before` and makes an artifact of this kind.
+    /// Creates the link of node `index` if node `before` is one of its inputs and `kind` is its
+    /// output's kind.
     fn new(
         plan: &Plan,
         index: usize,
@@ -52,18 +53,20 @@ impl Link {
         if description.output.kind != kind {
             return None;
         }
-        let made = Origin::Node { index: before, subtree: None };
-        let fed = node.inputs.iter().find(|input| input.from == made)?.name.clone();
-        let is_optional = |input: &&NodeInput| description.inputs[&input.name].optional;
-        let others = node.inputs.iter().filter(|input| input.name != fed && !is_optional(input));
-        let inputs: Option<Vec<(String, PathBuf)>> =
-            others.map(|input| Some((input.name.clone(), folder_of(&input.from)?))).collect();
+        let output = Origin::Node { index: before, subtree: None };
+        let chained_input = &node.inputs.iter().find(|input| input.from == output)?.name;
+        let mut inputs = Vec::new();
+        for input in &node.inputs {
+            if input.name != *chained_input && !description.inputs[&input.name].optional {
+                inputs.push((input.name.clone(), folder_of(&input.from)?));
+            }
+        }
         Some(Self {
             program: Arc::clone(&node.program),
             parameters: node.parameters.clone(),
             device: plan.device(&node.stage).to_owned(),
-            fed,
-            inputs: inputs?,
+            chained_input: chained_input.clone(),
+            inputs,
         })
     }
 }

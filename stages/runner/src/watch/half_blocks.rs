@@ -2,29 +2,30 @@ use std::fmt::Write as _;
 
 use pixels::{Filter, Rgba8, resize_pillow};
 
-/// Maximum width of a picture in characters.
-const MOST_COLUMNS: usize = 64;
+/// Maximum width of a picture in characters; chosen by hand.
+const MAX_COLUMNS: usize = 64;
 const RESET: &str = "\x1b[0m";
 
-/// A picture as text for a terminal of some size. Each character is `▀`: the foreground is the
-/// upper pixel, the background the lower one.
+/// Draws an image as text for a terminal of the given size. Each character is `▀`, whose foreground
+/// is the upper pixel and whose background is the lower one.
 pub(super) fn half_blocks(image: &Rgba8, columns: u16, rows: u16) -> String {
-    let columns = usize::from(columns).min(MOST_COLUMNS).min(image.width).max(1);
-    // A third of the terminal is left for the lines above.
+    let columns = usize::from(columns).min(MAX_COLUMNS).min(image.width).max(1);
+    // A third of the terminal is left for earlier lines.
     let lines = (usize::from(rows) * 2 / 3).max(1);
     let scale = (columns as f64 / image.width as f64).min(2.0 * lines as f64 / image.height as f64);
-    let size = |side: usize| ((side as f64 * scale).round() as usize).max(1);
-    let (width, height) = (size(image.width), size(image.height).next_multiple_of(2));
+    let [width, height] =
+        [image.width, image.height].map(|side| ((side as f64 * scale).round() as usize).max(1));
+    let height = height.next_multiple_of(2);
     let small = resize_pillow(image, width, height, Filter::Box);
+    let (pixels, _) = small.data.as_chunks::<4>();
     let mut text = String::new();
-    for (line, pair) in small.data.chunks_exact(width * 8).enumerate() {
-        let (upper, lower) = pair.split_at(width * 4);
-        if line > 0 {
+    for y in (0..height).step_by(2) {
+        if y > 0 {
             text.push('\n');
         }
-        for ([r, g, b, _], [down_r, down_g, down_b, _]) in
-            upper.as_chunks().0.iter().zip(lower.as_chunks().0)
-        {
+        for x in 0..width {
+            let [r, g, b, _] = pixels[y * width + x];
+            let [down_r, down_g, down_b, _] = pixels[(y + 1) * width + x];
             // Writing to a string can't fail.
             write!(text, "\x1b[38;2;{r};{g};{b};48;2;{down_r};{down_g};{down_b}m▀").ok();
         }

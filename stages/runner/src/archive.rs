@@ -1,0 +1,94 @@
+//! Archiving of pages that a new one replaces.
+
+use std::ffi::OsStr;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use crate::page::{PageMark, check_ownership};
+
+impl PageMark {
+    /// True if the page should be archived before a page with the mark `newer` replaces it.
+    fn is_worth_archiving(&self, newer: &Self) -> bool {
+        let is_of_other_data = !self.data_sets.is_empty() && self.data_sets != newer.data_sets;
+        is_of_other_data || (self.is_complete && !newer.is_complete)
+    }
+
+    /// True if the page may replace an archived page with the mark `archived`.
+    fn can_replace(&self, archived: &Self) -> bool {
+        self.data_sets == archived.data_sets && (self.is_complete || !archived.is_complete)
+    }
+}
+
+/// Returns the path to which a page is moved when one with the mark `newer` replaces it: next to
+/// the target, named after the data sets. `None` if the page may be deleted. `kind` is the kind of
+/// the sink's output.
+pub(crate) fn archive_path(
+    page: &Path,
+    newer: &PageMark,
+    target: &Path,
+    kind: &str,
+) -> io::Result<Option<PathBuf>> {
+    let old = PageMark::read(page)?.filter(|old| old.is_worth_archiving(newer));
+    let (Some(old), Some(name)) = (old, target.file_name().and_then(OsStr::to_str)) else {
+        return Ok(None);
+    };
+    let name = format!("{name}-{}", data_sets_name(&old.data_sets));
+    let mut path = target.with_file_name(&name);
+    let mut number = 1;
+    while !is_free(&path, &old, kind) {
+        number += 1;
+        path = target.with_file_name(format!("{name}-{number}"));
+    }
+    Ok(Some(path))
+}
+
+/// True if a page with the mark `old` may be archived as `path`.
+fn is_free(path: &Path, old: &PageMark, kind: &str) -> bool {
+    match PageMark::read(path) {
+        Ok(Some(mark)) => old.can_replace(&mark) && check_ownership(path, kind).is_ok(),
+        _ => path.symlink_metadata().is_err(),
+    }
+}
+
+/// Maximum number of data sets in a folder's name; chosen by hand.
+const MAX_NAMED_DATA_SETS: usize = 3;
+/// Maximum length of a data set's name in characters; chosen by hand.
+const MAX_NAME_CHARS: usize = 60;
+
+/// Returns a name for data sets that is valid on every file system.
+fn data_sets_name(data_sets: &[String]) -> String {
+    let mut names: Vec<String> =
+        data_sets.iter().take(MAX_NAMED_DATA_SETS).map(|path| plain_file_name(path)).collect();
+    match data_sets.len() {
+        0 => names.push("before".to_owned()),
+        1..=MAX_NAMED_DATA_SETS => {}
+        n => names.push(format!("{}-more", n - MAX_NAMED_DATA_SETS)),
+    }
+    names.join("-")
+}
+
+/// Returns a path's last component with `-` for each special character.
+fn plain_file_name(path: &str) -> String {
+    let name = Path::new(path).file_name().and_then(OsStr::to_str).unwrap_or("data");
+    let plain =
+        name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' });
+    plain.take(MAX_NAME_CHARS).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn name_of(paths: &[&str]) -> String {
+        data_sets_name(&paths.iter().map(|&path| path.to_owned()).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn names_are_short_and_plain() {
+        assert_eq!(name_of(&["/data/my lego"]), "my-lego");
+        assert_eq!(name_of(&["a", "b", "c", "d", "e"]), "a-b-c-2-more");
+        assert_eq!(name_of(&["/"]), "data");
+        assert_eq!(name_of(&[]), "before");
+        assert_eq!(name_of(&[&"x".repeat(300)]).len(), 60);
+    }
+}
