@@ -124,7 +124,7 @@ fn mistakes_are_one_line() {
         .fails(2, &["--device cuda:99"]);
     let on_gpu = stage("train-ss", r#"{"rays": 1000}"#, &inputs, &out, &["--device", "cuda:0"]);
     if on_gpu.code != 0 {
-        on_gpu.fails(2, &["--device cuda:0", "leave --device away"]);
+        on_gpu.fails(2, &["--device cuda:0", "omit --device"]);
     }
     stage("train-ss", r#"{"field": "mlp", "n_levels": 4}"#, &inputs, &out, &[])
         .fails(2, &["parameter n_levels", "belongs to field: grid"]);

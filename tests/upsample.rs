@@ -129,7 +129,7 @@ fn views_are_enlarged_and_scored() {
         r#"{"method": "imdn", "file": "liif.safetensors"}"#,
         Some(&weights),
         3,
-        &["fea_conv", "the right network"],
+        &["fea_conv", "of this network"],
     );
     fails_to_upsample(
         &project,

@@ -1,13 +1,13 @@
-//! libtorch glue that stages with networks share: determinism and weights. The networks themselves
-//! live where they are used.
+//! libtorch code shared by stages with networks; the networks themselves are in the crates that use
+//! them.
 //!
-//! * [`deterministic`]: one intra-op thread; stages work in parallel over images instead, so bytes
-//!   don't depend on threads.
-//! * [`device`]: the device that a stage was asked to use, or why it can't be.
-//! * [`tensor_of`], [`image_of`]: images as tensors.
-//! * [`Adam`]: the optimiser, on gradients that are given.
-//! * [`Weights`], [`write()`]: tensors of a safetensors file, by name, each with the shape it must
-//!   have; [`Conv`]: a layer of them.
+//! * [`deterministic`]: restricts libtorch to one thread within an operation. Stages parallelise
+//!   over images instead, so bytes don't depend on the number of threads.
+//! * [`device`]: parses and checks `--device`.
+//! * [`tensor_of`], [`image_of`]: convert between images and tensors.
+//! * [`Adam`]: the optimiser, on gradients that the caller computes.
+//! * [`Weights`], [`write()`]: named tensors of a safetensors file, with checked shapes; [`Conv`]:
+//!   a convolution with such tensors.
 //!
 //! ```no_run,standalone_crate
 //! nets::deterministic();
@@ -17,23 +17,20 @@
 //! ```
 
 mod adam;
-mod conv;
-mod image;
 mod weights;
 
-use tch::{Cuda, Device, TchError};
+use pixels::Image;
+use tch::{Cuda, Device, TchError, Tensor};
 
 pub use adam::{Adam, all_finite};
-pub use conv::Conv;
-pub use image::{image_of, tensor_of};
-pub use weights::{Weights, WeightsError, write};
+pub use weights::{Conv, Weights, WeightsError, write};
 
-/// Makes libtorch repeat its bytes: sums are split by thread, so it gets one.
+/// Makes libtorch's results reproducible: libtorch splits sums by thread, so it gets one thread.
 pub fn deterministic() {
     tch::set_num_threads(1);
 }
 
-/// A device that can't be used.
+/// Error returned when `--device` names an unknown or unusable device.
 #[derive(Debug, thiserror::Error)]
 #[error("--device {name}: {reason}")]
 pub struct DeviceError {
@@ -41,36 +38,37 @@ pub struct DeviceError {
     reason: String,
 }
 
-/// The device of `--device`: `cpu`, `cuda` or `cuda:N`.
+/// Returns the device that `--device` names: `cpu`, `cuda` or `cuda:N`.
 pub fn device(name: &str) -> Result<Device, DeviceError> {
-    let refuse = |reason: String| Err(DeviceError { name: name.to_owned(), reason });
     let index = match name.strip_prefix("cuda") {
         None if name == "cpu" => return Ok(Device::Cpu),
         Some("") => Some(0),
         Some(index) => index.strip_prefix(':').and_then(|i| i.parse::<usize>().ok()),
         None => None,
     };
+    usable_cuda_device(index).map_err(|reason| DeviceError { name: name.to_owned(), reason })
+}
+
+/// Returns the GPU with this index, or the reason why it can't be used.
+fn usable_cuda_device(index: Option<usize>) -> Result<Device, String> {
     let Some(index) = index else {
-        return refuse("no such device; cpu, cuda or cuda:N is expected".to_owned());
+        return Err("no such device; cpu, cuda or cuda:N is expected".to_owned());
     };
     load_cuda();
-    let found = Cuda::device_count();
-    if !Cuda::is_available() || found == 0 {
-        return refuse(
-            "no GPU can be used here; leave --device away, or build with LIBTORCH_USE_PYTORCH=1 \
-            beside a PyTorch that has CUDA, on a \
-             machine with an NVIDIA driver"
-                .to_owned(),
-        );
+    let count = Cuda::device_count();
+    if !Cuda::is_available() || count == 0 {
+        return Err("no usable GPU; omit --device, or build with LIBTORCH_USE_PYTORCH=1 and a \
+                    PyTorch with CUDA, on a machine with an NVIDIA driver"
+            .to_owned());
     }
-    if index as i64 >= found {
-        return refuse(format!("there are {found} GPUs, counted from 0"));
+    if index as i64 >= count {
+        return Err(format!("GPU not found; this machine has {count}, numbered from 0"));
     }
     Ok(Device::Cuda(index))
 }
 
-/// Loads libtorch's part for CUDA, where there is one. Linkers leave it out, since a program uses
-/// none of its symbols.
+/// Loads libtorch's CUDA library if it is installed. Linkers drop it, since programs use none of
+/// its symbols.
 #[cfg(unix)]
 fn load_cuda() {
     // SAFETY: loading runs the library's constructors, which register its kernels with libtorch, as
@@ -81,9 +79,25 @@ fn load_cuda() {
 #[cfg(not(unix))]
 fn load_cuda() {}
 
-/// Whether libtorch failed for want of memory: then a smaller piece may do.
+/// Returns whether libtorch ran out of memory, so that a smaller batch may succeed.
 pub fn is_out_of_memory(error: &TchError) -> bool {
     error.to_string().contains("out of memory")
+}
+
+/// Converts an image to a tensor (1 × channels × rows × columns).
+pub fn tensor_of(image: &Image) -> Result<Tensor, TchError> {
+    let shape = [image.height, image.width, image.channels].map(|d| d as i64);
+    Tensor::f_from_slice(&image.data)?.f_reshape(shape)?.f_permute([2, 0, 1])?.f_unsqueeze(0)
+}
+
+/// Converts a tensor (1 × channels × rows × columns) to an image.
+pub fn image_of(tensor: &Tensor) -> Result<Image, TchError> {
+    let [_, channels, height, width] = tensor.size()[..] else {
+        let reason = format!("expected four dimensions, found shape {:?}", tensor.size());
+        return Err(TchError::Shape(reason));
+    };
+    let flat = tensor.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
+    Ok(Image::new(width as usize, height as usize, channels as usize, Vec::<f32>::try_from(&flat)?))
 }
 
 #[cfg(test)]
@@ -94,11 +108,11 @@ mod tests {
     fn devices_are_named_or_refused() {
         assert_eq!(device("cpu").unwrap(), Device::Cpu);
         for name in ["gpu", "cuda:x", "cuda0", "cuda:99", ""] {
-            let said = device(name).unwrap_err().to_string();
-            assert!(said.starts_with(&format!("--device {name}: ")), "{said}");
+            let message = device(name).unwrap_err().to_string();
+            assert!(message.starts_with(&format!("--device {name}: ")), "{message}");
         }
         if !Cuda::is_available() {
-            assert!(device("cuda").unwrap_err().to_string().contains("leave --device away"));
+            assert!(device("cuda").unwrap_err().to_string().contains("omit --device"));
         }
     }
 }

@@ -5,28 +5,28 @@ use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use tch::{Device, Kind, TchError, Tensor};
 
-/// Weights that can't be used.
+/// Error returned when weights can't be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
-    /// The file can't be opened.
+    /// The file can't be opened or written.
     #[error("{path}: {source}")]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: std::io::Error,
     },
     /// The file isn't safetensors, or its tensors aren't those of the network.
-    #[error("{path}: {reason}; is it the right network's weights?")]
+    #[error("{path}: {reason}; check that the weights are those of this network")]
     Format {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Reason, as a sentence fragment.
         reason: String,
     },
 }
 
-/// The tensors of a safetensors file, in f32, i64 or u8 on the CPU.
+/// Tensors of a safetensors file, in f32, i64 or u8 on the CPU.
 #[derive(Debug)]
 pub struct Weights {
     path: PathBuf,
@@ -34,12 +34,11 @@ pub struct Weights {
 }
 
 impl Weights {
-    /// Reads a file of f32, f16, i64 or u8 tensors.
+    /// Reads a file of f32, f16, i64 or u8 tensors; f16 becomes f32.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
-        let format = |reason: String| WeightsError::Format { path: path.to_path_buf(), reason };
         let bytes = std::fs::read(path)
             .map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })?;
-        let file = SafeTensors::deserialize(&bytes).map_err(|e| format(e.to_string()))?;
+        let file = SafeTensors::deserialize(&bytes).map_err(|e| format_error(path, e.to_string()))?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.tensors() {
             let shape: Vec<i64> = view.shape().iter().map(|&d| d as i64).collect();
@@ -49,9 +48,9 @@ impl Weights {
                 Dtype::I64 => Kind::Int64,
                 Dtype::U8 => Kind::Uint8,
                 other => {
-                    return Err(format(format!(
-                        "tensor {name} is {other:?}; f32, f16, i64 or u8 is expected"
-                    )));
+                    let reason =
+                        format!("tensor {name}: expected f32, f16, i64 or u8, found {other:?}");
+                    return Err(format_error(path, reason));
                 }
             };
             let tensor = Tensor::from_data_size(view.data(), &shape, kind);
@@ -63,94 +62,116 @@ impl Weights {
         Ok(Self { path: path.to_path_buf(), tensors })
     }
 
-    /// Whole numbers, of which there must be so many.
+    /// Returns the i64 tensor of this name, which must have `count` elements.
     pub fn integers(&self, name: &str, count: usize) -> Result<Vec<i64>, WeightsError> {
-        let integers = self
-            .tensors
-            .get(name)
-            .filter(|t| t.kind() == Kind::Int64)
-            .and_then(|t| Vec::<i64>::try_from(t).ok());
-        integers.filter(|i| i.len() == count).ok_or_else(|| WeightsError::Format {
-            path: self.path.clone(),
-            reason: format!("no tensor {name} of {count} whole numbers"),
-        })
+        let tensor = self.tensors.get(name).filter(|t| t.kind() == Kind::Int64);
+        let integers = tensor.and_then(|t| Vec::<i64>::try_from(t).ok());
+        integers
+            .filter(|i| i.len() == count)
+            .ok_or_else(|| self.error(format!("no tensor {name} of {count} i64 values")))
     }
 
-    /// Bytes, of which there must be so many.
+    /// Returns the u8 tensor of this name, which must have `count` elements.
     pub fn bytes(&self, name: &str, count: i64) -> Result<Tensor, WeightsError> {
         let bytes =
             self.tensors.get(name).filter(|t| t.kind() == Kind::Uint8 && t.size() == [count]);
-        bytes.map(Tensor::shallow_clone).ok_or_else(|| WeightsError::Format {
-            path: self.path.clone(),
-            reason: format!("no tensor {name} of {count} bytes"),
-        })
+        bytes
+            .map(Tensor::shallow_clone)
+            .ok_or_else(|| self.error(format!("no tensor {name} of {count} bytes")))
     }
 
-    /// Whether there is a tensor of that name.
+    /// Returns whether the file has a tensor of this name.
     pub fn has(&self, name: &str) -> bool {
         self.tensors.contains_key(name)
     }
 
-    /// The shape of a tensor that must have so many dimensions: for networks whose size is what
-    /// their file says.
+    /// Returns the shape of a tensor, which must have `N` dimensions: for networks whose size is
+    /// read from their file.
     pub fn shape<const N: usize>(&self, name: &str) -> Result<[i64; N], WeightsError> {
-        let format = |reason: String| WeightsError::Format { path: self.path.clone(), reason };
-        let size =
-            self.tensors.get(name).ok_or_else(|| format(format!("no tensor {name}")))?.size();
+        let tensor =
+            self.tensors.get(name).ok_or_else(|| self.error(format!("no tensor {name}")))?;
+        let size = tensor.size();
         size.as_slice().try_into().map_err(|_| {
-            format(format!("tensor {name} is {size:?} where {N} dimensions are expected"))
+            self.error(format!("tensor {name}: expected {N} dimensions, found shape {size:?}"))
         })
     }
 
-    /// A tensor of floats that must have a shape.
+    /// Returns the f32 tensor of this name, which must have the given shape.
     pub fn tensor(&self, name: &str, shape: &[i64]) -> Result<Tensor, WeightsError> {
-        let format = |reason: String| WeightsError::Format { path: self.path.clone(), reason };
         let tensor = self.tensors.get(name).filter(|t| t.kind() == Kind::Float);
-        let tensor = tensor.ok_or_else(|| format(format!("no tensor {name}")))?;
-        if tensor.size() != shape {
-            return Err(format(format!(
-                "tensor {name} is {:?} where {shape:?} is expected",
-                tensor.size()
-            )));
+        let tensor = tensor.ok_or_else(|| self.error(format!("no f32 tensor {name}")))?;
+        let found = tensor.size();
+        if found != shape {
+            return Err(
+                self.error(format!("tensor {name}: expected shape {shape:?}, found {found:?}"))
+            );
         }
         Ok(tensor.shallow_clone())
     }
+
+    fn error(&self, reason: String) -> WeightsError {
+        format_error(&self.path, reason)
+    }
 }
 
-/// Writes tensors of f32, i64 or u8, by name, as safetensors without metadata, so that bytes
-/// repeat.
+fn format_error(path: &Path, reason: String) -> WeightsError {
+    WeightsError::Format { path: path.to_path_buf(), reason }
+}
+
+/// Writes named tensors of f32, i64 or u8 as safetensors without metadata, so that equal tensors
+/// give equal bytes.
 pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
-    let io = |source| WeightsError::Io { path: path.to_path_buf(), source };
-    let refused = |e: TchError| io(std::io::Error::other(e.to_string()));
-    let mut bytes = Vec::with_capacity(tensors.len());
+    let bytes = serialized(tensors)
+        .map_err(std::io::Error::other)
+        .and_then(|bytes| std::fs::write(path, bytes));
+    bytes.map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })
+}
+
+/// Serialises named tensors as safetensors.
+fn serialized(
+    tensors: &[(String, Tensor)],
+) -> Result<Vec<u8>, Box<dyn std::error::Error + Send + Sync>> {
+    let mut entries = Vec::with_capacity(tensors.len());
     for (name, tensor) in tensors {
         let dtype = match tensor.kind() {
             Kind::Int64 => Dtype::I64,
             Kind::Uint8 => Dtype::U8,
             _ => Dtype::F32,
         };
-        let flat = tensor
-            .f_detach()
-            .and_then(|t| t.f_to_device(Device::Cpu)?.f_contiguous())
-            .map_err(refused)?;
+        let flat = tensor.f_detach()?.f_to_device(Device::Cpu)?.f_contiguous()?;
         let mut data = vec![0u8; flat.numel() * flat.kind().elt_size_in_bytes()];
-        flat.f_copy_data_u8(&mut data, flat.numel()).map_err(refused)?;
-        bytes.push((
-            name.as_str(),
-            dtype,
-            tensor.size().iter().map(|&d| d as usize).collect::<Vec<_>>(),
-            data,
-        ));
+        flat.f_copy_data_u8(&mut data, flat.numel())?;
+        let shape: Vec<usize> = tensor.size().iter().map(|&d| d as usize).collect();
+        entries.push((name.as_str(), dtype, shape, data));
     }
-    let views = bytes.iter().map(|(name, dtype, shape, data)| {
-        (
-            *name,
-            TensorView::new(*dtype, shape.clone(), data).expect("the data is that of the shape"),
-        )
-    });
-    let whole = safetensors::serialize(views, None)
-        .map_err(|e| io(std::io::Error::other(e.to_string())))?;
-    std::fs::write(path, whole).map_err(io)
+    let mut views = Vec::with_capacity(entries.len());
+    for (name, dtype, shape, data) in &entries {
+        views.push((*name, TensorView::new(*dtype, shape.clone(), data)?));
+    }
+    Ok(safetensors::serialize(views, None)?)
+}
+
+/// A 2-D convolution with zero padding, with PyTorch's names and layout: `NAME.weight` (outputs ×
+/// inputs × rows × columns) and `NAME.bias`.
+#[derive(Debug)]
+pub struct Conv {
+    kernel: Tensor,
+    bias: Tensor,
+}
+
+impl Conv {
+    /// Reads the kernel, which must have the given shape, and the bias.
+    pub fn read(weights: &Weights, name: &str, shape: [i64; 4]) -> Result<Self, WeightsError> {
+        Ok(Self {
+            kernel: weights.tensor(&format!("{name}.weight"), &shape)?,
+            bias: weights.tensor(&format!("{name}.bias"), &shape[..1])?,
+        })
+    }
+
+    /// Convolves images (count × inputs × rows × columns).
+    pub fn forward(&self, x: &Tensor, stride: i64, padding: i64) -> Result<Tensor, TchError> {
+        x.f_conv2d(&self.kernel, Some(&self.bias), [stride; 2], [padding; 2], [1, 1], 1)
+    }
 }
 
 #[cfg(test)]
