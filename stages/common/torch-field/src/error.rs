@@ -1,39 +1,39 @@
 use std::path::PathBuf;
 
-/// A field that can't be read, written, rendered or trained.
+/// Error of a libtorch field that can't be read, written, rendered or trained.
 #[derive(Debug, thiserror::Error)]
 pub enum TorchFieldError {
-    /// libtorch refused.
+    /// A libtorch operation failed.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
-    /// A file of weights can't be used.
+    /// A weights file can't be used.
     #[error(transparent)]
     Weights(#[from] nets::WeightsError),
     /// The file isn't a field.
     #[error("{path}: {reason}")]
     Format {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Reason, as a sentence fragment.
         reason: String,
     },
-    /// Numbers went wrong twice within a hundred steps.
+    /// The gradient wasn't finite in two of 100 steps.
     #[error(
         "step {step}: the gradient is not finite, for the second time within 100 steps; lower the \
-        rate"
+        learning rate"
     )]
     NotFinite {
-        /// The step.
+        /// Index of the step.
         step: u64,
     },
-    /// A network sees the same whatever the ray, and can't learn any more.
-    #[error("step {step}: the {network} network has collapsed: {why}; try another seed")]
+    /// A network's output no longer depends on the ray, so it gets no useful gradient.
+    #[error("step {step}: the {network} network has collapsed: {reason}; try another seed")]
     Collapsed {
-        /// The step.
+        /// Index of the step.
         step: u64,
-        /// Which network.
+        /// Name of the network: `coarse` or `fine`.
         network: &'static str,
-        /// What it sees instead.
-        why: &'static str,
+        /// Kind of collapse.
+        reason: &'static str,
     },
 }

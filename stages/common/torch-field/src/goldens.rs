@@ -7,12 +7,12 @@ use safetensors::SafeTensors;
 use scene::Bounds;
 use tch::{Device, Kind, Tensor};
 
-use crate::encoding::encode;
 use crate::mlp::{Batch, Mlp, SampleDraws};
 use crate::mlp_trainer::{MlpTrainer, MlpTraining};
 use crate::network::MlpNetwork;
-use crate::sampling::{importance, middles, stratified};
-use crate::schedule::Schedule;
+use crate::network::encode;
+use crate::sampling::{importance, midpoints, stratified};
+use crate::step::Schedule;
 
 const GOLDENS: &[u8] = include_bytes!("../tests/goldens/mlp.safetensors");
 
@@ -100,15 +100,19 @@ fn sampling_and_compositing_in_f64() {
     let ends = [2.0, 6.0].map(|x| Tensor::full([8, 1], x, (Kind::Double, Device::Cpu)));
     let t = stratified(&ends[0], &ends[1], 8, Some(&draws.coarse)).unwrap();
     close("stratified", &t, 1e-12);
-    let seen = field.see(&batch, Some(&draws)).unwrap();
+    let seen = field.forward(&batch, Some(&draws)).unwrap();
     // The reference multiplies by 1 - α + 1e-10, we add optical depths.
     close("coarse.weights", &seen.coarse.weights, 1e-8);
     let inner = seen.coarse.weights.narrow(1, 1, 6);
-    close("importance", &importance(&middles(&t).unwrap(), &inner, &draws.fine).unwrap(), 1e-9);
+    close("importance", &importance(&midpoints(&t).unwrap(), &inner, &draws.fine).unwrap(), 1e-9);
     let even = stratified(&ends[0], &ends[1], 8, None).unwrap();
     let shares =
         Tensor::linspace(0, 1, 8, (Kind::Double, Device::Cpu)).expand([8, 8], false).contiguous();
-    close("importance.even", &importance(&middles(&even).unwrap(), &inner, &shares).unwrap(), 1e-9);
+    close(
+        "importance.even",
+        &importance(&midpoints(&even).unwrap(), &inner, &shares).unwrap(),
+        1e-9,
+    );
     close("fine.weights", &seen.fine.weights, 1e-8);
     close("coarse.colour", &seen.coarse.colour, 1e-8);
     close("fine.colour", &seen.fine.colour, 1e-8);
@@ -139,7 +143,7 @@ fn gradients_and_three_steps_in_f64() {
     let mut trainer = MlpTrainer::new(field, options).unwrap();
     let target = draw(6, &[2, 3]);
     for step in 0..3 {
-        let seen = trainer.field().see(&batch, Some(&draws)).unwrap();
+        let seen = trainer.field().forward(&batch, Some(&draws)).unwrap();
         let loss =
             image_loss(&seen.coarse.colour, &target) + image_loss(&seen.fine.colour, &target);
         let parameters: Vec<Tensor> = trainer.field().parameters().collect();
@@ -148,7 +152,7 @@ fn gradients_and_three_steps_in_f64() {
             close("loss", &loss.reshape([1]), 1e-9);
             close("gradient", &flat(&gradients), 1e-7);
         }
-        trainer.take(&gradients, 0.0).unwrap();
+        trainer.apply_gradients(&gradients, 0.0).unwrap();
     }
     close("parameters", &flat(&trainer.field().parameters().collect::<Vec<_>>()), 1e-9);
 }

@@ -7,96 +7,132 @@ use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
 use crate::error::TorchFieldError;
-use crate::ray_maps::{RayMaps, fused};
-use crate::transfer::{host, matrix};
+use crate::ray_maps::{RayMaps, matrix, multiply_add, to_host};
+use crate::step::run_in_pieces;
 
-/// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same
-/// description and the same numbers, that judges the hand-written one, and its way to CUDA.
+/// The hash-grid field, [`radiance::Field`], in libtorch: an independent implementation on the same
+/// parameters that checks the hand-written one, and its way to CUDA (design note 023).
 #[derive(Debug)]
 pub struct TorchGrid {
     pub(crate) architecture: Architecture,
     pub(crate) bounds: Bounds,
     pub(crate) device: Device,
     pub(crate) levels: Vec<TorchLevel>,
-    /// Entries × 4, of all levels.
+    /// Features of all levels' entries: entries × 4.
     pub(crate) table: Tensor,
-    /// Five layers, each inputs × outputs.
+    /// Weights of the five layers: inputs × outputs each.
     pub(crate) layers: [Tensor; 5],
-    /// What each of 128³ cells holds, x fastest: 0 is empty, 1 thin, 2 dense.
+    /// States of the 128³ occupancy cells, x fastest: 0 is empty, 1 thin, 2 dense.
     pub(crate) cells: Tensor,
 }
 
-/// One level of the grid: Müller et al. 2022, "Instant neural graphics primitives".
+/// Level of the grid (Müller et al. 2022, "Instant neural graphics primitives").
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct TorchLevel {
-    /// Cells along each axis.
+    /// Number of cells along each axis.
     resolution: [i64; 3],
-    /// Bricks of 2³ vertices along each axis.
+    /// Number of bricks of 2³ vertices along each axis.
     bricks: [i64; 3],
-    pub(crate) first: i64,
-    pub(crate) entries: i64,
-    hashed: bool,
+    /// Index of the level's first entry in the table.
+    first: i64,
+    entries: i64,
+    is_hashed: bool,
 }
 
 impl TorchLevel {
-    /// Fraction of a cell and the cell of positions in the unit cube (n × 3) along an axis: n each.
-    fn along(&self, positions: &Tensor, axis: usize) -> Result<(Tensor, Tensor), TchError> {
+    /// Returns the level's rows of a table.
+    pub(crate) fn rows(&self, table: &Tensor) -> Result<Tensor, TchError> {
+        table.f_narrow(0, self.first, self.entries)
+    }
+
+    /// Returns the cell indices along an axis of positions in the unit cube (n × 3), and the
+    /// fractions within those cells: n each.
+    fn cells(&self, positions: &Tensor, axis: usize) -> Result<Axis, TchError> {
         let cells = self.resolution[axis] as f64;
-        let at = positions.i((.., axis as i64)).f_mul_scalar(cells)?;
-        let cell = at.f_floor()?.f_clamp_max(cells - 1.0)?;
-        Ok((at.f_sub(&cell)?, cell.f_to_kind(Kind::Int64)?))
+        let scaled = positions.i((.., axis as i64)).f_mul_scalar(cells)?;
+        let cell = scaled.f_floor()?.f_clamp_max(cells - 1.0)?;
+        Ok(Axis { fraction: scaled.f_sub(&cell)?, cell: cell.f_to_kind(Kind::Int64)? })
+    }
+
+    /// Returns the table indices (n) of vertices, given their indices along each axis (n each).
+    fn entry_index(&self, vertex: &[Tensor; 3]) -> Result<Tensor, TchError> {
+        let [x, y, z] = vertex;
+        let (brick_x, brick_y) = (x.f_floor_divide_scalar(2)?, y.f_floor_divide_scalar(2)?);
+        let brick_z = z.f_floor_divide_scalar(2)?;
+        let brick = if self.is_hashed {
+            let [factor_y, factor_z] = HASH_FACTORS.map(i64::from);
+            brick_x
+                .f_bitwise_xor_tensor(&brick_y.f_mul_scalar(factor_y)?)?
+                .f_bitwise_xor_tensor(&brick_z.f_mul_scalar(factor_z)?)?
+                .f_bitwise_and(self.entries / BRICK as i64 - 1)?
+        } else {
+            let [bricks_x, bricks_y, _] = self.bricks;
+            let row = brick_z.f_mul_scalar(bricks_y)?.f_add(&brick_y)?;
+            row.f_mul_scalar(bricks_x)?.f_add(&brick_x)?
+        };
+        let row = z.f_bitwise_and(1)?.f_mul_scalar(2)?.f_add(&y.f_bitwise_and(1)?)?;
+        let within = row.f_mul_scalar(2)?.f_add(&x.f_bitwise_and(1)?)?;
+        brick.f_mul_scalar(BRICK as i64)?.f_add(&within)?.f_add_scalar(self.first)
     }
 }
 
-/// Samples of n rays, of at most `count` steps each.
+/// Cell indices along an axis and fractions within the cells: n each.
+struct Axis {
+    cell: Tensor,
+    fraction: Tensor,
+}
+
+/// Samples of n rays of at most `count` steps each.
 struct Marched {
-    /// Distance in the cube of every step (n × count).
+    /// Parameter t of every step (n × count).
     t: Tensor,
-    /// Numbers of the steps that are samples, and their positions (… × 3) and lengths.
+    /// Linear indices of the steps that are samples, with their positions (… × 3) and lengths.
     kept: Tensor,
     positions: Tensor,
     length: Tensor,
     count: i64,
 }
 
-/// Sums of samples' rows over each of n rays.
+/// Sums samples' rows over each of n rays.
 fn sum_by_ray(rows: &Tensor, ray: &Tensor, n: i64) -> Result<Tensor, TchError> {
     Tensor::f_zeros([n, rows.size()[1]], (Kind::Float, rows.device()))?.f_index_add(0, ray, rows)
 }
 
-/// What rays see.
-pub(crate) struct GridSeen {
-    /// n × 3, of the scene alone.
+/// Samples and colours of n rays.
+pub(crate) struct GridForward {
+    /// Premultiplied colours of the scene alone: n × 3.
     pub(crate) premultiplied: Tensor,
-    /// n: light that comes through.
+    /// Transmittance of each whole ray: n.
     pub(crate) transmittance: Tensor,
-    /// n × steps: weights, and t along the rays.
+    /// Weights and parameters t of the steps: n × steps each.
     pub(crate) weights: Tensor,
     pub(crate) t: Tensor,
-    /// n × steps, bool: samples that count.
+    /// True for samples that are composited: n × steps.
     pub(crate) counted: Tensor,
-    /// Samples that got a colour: it (s × 3), their weights (s × 1), and whose ray's they are (s).
+    /// Colours (s × 3), weights (s × 1) and ray indices (s) of the composited samples.
     pub(crate) shaded_colour: Tensor,
     pub(crate) shaded_weight: Tensor,
     pub(crate) shaded_ray: Tensor,
-    /// In training: cells where samples stop light.
+    /// Densities of cells in which samples stop light; only in training.
     pub(crate) met: Vec<Met>,
-    /// Samples where there may be something.
+    /// Number of samples in occupied cells; only in training.
     pub(crate) samples: usize,
     maps: RayMaps,
 }
 
-/// Cells where samples stop light, by the weights (s × 1), positions (s × 3) and raw densities (s)
-/// of samples.
-fn cells_met(weight: &Tensor, positions: &Tensor, raw: &Tensor) -> Result<Vec<Met>, TchError> {
+/// Returns the densities of cells in which samples stop light, from the samples' weights (s × 1),
+/// positions (s × 3) and raw densities (s).
+fn met_cells(weight: &Tensor, positions: &Tensor, raw: &Tensor) -> Result<Vec<Met>, TchError> {
     let met = weight.f_squeeze_dim(-1)?.f_gt(f64::from(MET))?.f_nonzero()?.f_squeeze_dim(-1)?;
     let density = raw.f_index_select(0, &met)?.f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?;
-    let (places, densities) = (host(&positions.f_index_select(0, &met)?)?, host(&density)?);
-    let places = places.as_chunks::<3>().0.iter();
-    Ok(places.zip(densities).map(|(&place, density)| Met::at(place, density)).collect())
+    let positions = to_host(&positions.f_index_select(0, &met)?)?;
+    let positions = positions.as_chunks::<3>().0;
+    let densities = to_host(&density)?;
+    Ok(positions.iter().zip(densities).map(|(&p, density)| Met::at(p, density)).collect())
 }
 
-fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
+/// Returns the levels, from the coarsest to the finest.
+fn build_levels(architecture: &Architecture) -> Vec<TorchLevel> {
     let (coarsest, finest) = (f64::from(architecture.coarsest), f64::from(architecture.finest));
     let ratio = libm::pow(finest / coarsest, 1.0 / f64::from(architecture.levels.max(2) - 1));
     let mut levels = Vec::with_capacity(architecture.levels as usize);
@@ -106,20 +142,21 @@ fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
         let resolution = [cells, cells, cells.min(i64::from(architecture.finest_z))];
         let bricks = resolution.map(|n| n / 2 + 1);
         let vertices = bricks.iter().product::<i64>() * BRICK as i64;
-        let hashed = vertices > 1 << architecture.log2_entries;
-        let entries = if hashed { 1 << architecture.log2_entries } else { vertices };
-        levels.push(TorchLevel { resolution, bricks, first, entries, hashed });
+        let is_hashed = vertices > 1 << architecture.log2_entries;
+        let entries = if is_hashed { 1 << architecture.log2_entries } else { vertices };
+        levels.push(TorchLevel { resolution, bricks, first, entries, is_hashed });
         first += entries;
     }
     levels
 }
 
-/// Outputs of the density network.
+/// Number of outputs of the density network.
 const OUTPUTS: i64 = DENSITY_OUTPUTS as i64;
 
+/// Returns inputs and outputs of the five layers.
 fn layer_shapes(architecture: &Architecture) -> [(i64, i64); 5] {
-    let (features, hidden) =
-        (FEATURES as i64 * i64::from(architecture.levels), i64::from(architecture.hidden));
+    let features = FEATURES as i64 * i64::from(architecture.levels);
+    let hidden = i64::from(architecture.hidden);
     [
         (features, hidden),
         (hidden, OUTPUTS),
@@ -129,10 +166,26 @@ fn layer_shapes(architecture: &Architecture) -> [(i64, i64); 5] {
     ]
 }
 
-/// Real spherical harmonics up to degree 2 of unit directions (n × 3): n × 9.
+/// Returns the trilinear weights (n) of a cell's corner at `offset` (0 or 1 along each axis).
+fn corner_weight(axes: &[Axis; 3], offset: [i64; 3]) -> Result<Tensor, TchError> {
+    let [x, y, z] = axes;
+    let weight = axis_weight(x, offset[0])?;
+    let weight = axis_weight(y, offset[1])?.f_mul(&weight)?;
+    axis_weight(z, offset[2])?.f_mul(&weight)
+}
+
+/// Returns the linear weights (n) of the cells' lower (0) or upper (1) ends along an axis.
+fn axis_weight(axis: &Axis, offset: i64) -> Result<Tensor, TchError> {
+    if offset == 1 {
+        Ok(axis.fraction.shallow_clone())
+    } else {
+        axis.fraction.f_neg()?.f_add_scalar(1.0)
+    }
+}
+
+/// Returns the real spherical harmonics up to degree 2 of unit directions (n × 3): n × 9.
 fn harmonics(direction: &Tensor) -> Result<Tensor, TchError> {
     let [x, y, z] = [0, 1, 2].map(|i| direction.i((.., i)));
-    let product = |a: &Tensor, b: &Tensor, factor: f64| a.f_mul(b)?.f_mul_scalar(factor);
     let pi = std::f64::consts::PI;
     let (one, two) = ((3.0 / (4.0 * pi)).sqrt(), (15.0 / (4.0 * pi)).sqrt());
     Tensor::f_stack(
@@ -141,55 +194,55 @@ fn harmonics(direction: &Tensor) -> Result<Tensor, TchError> {
             y.f_mul_scalar(-one)?,
             z.f_mul_scalar(one)?,
             x.f_mul_scalar(-one)?,
-            product(&x, &y, two)?,
-            product(&y, &z, -two)?,
+            x.f_mul(&y)?.f_mul_scalar(two)?,
+            y.f_mul(&z)?.f_mul_scalar(-two)?,
             z.f_square()?
                 .f_mul_scalar(3.0)?
                 .f_sub_scalar(1.0)?
                 .f_mul_scalar((5.0 / (16.0 * pi)).sqrt())?,
-            product(&x, &z, -two)?,
+            x.f_mul(&z)?.f_mul_scalar(-two)?,
             x.f_square()?.f_sub(&y.f_square()?)?.f_mul_scalar(0.5 * two)?,
         ],
         -1,
     )
 }
 
-/// Numbers as a matrix on a device, which takes gradients.
-fn learnable(numbers: &[f32], shape: [i64; 2], device: Device) -> Result<Tensor, TchError> {
-    Ok(matrix(numbers, shape, device)?.set_requires_grad(true))
+/// Copies values to a device as a matrix that requires gradients.
+fn trainable_matrix(values: &[f32], shape: [i64; 2], device: Device) -> Result<Tensor, TchError> {
+    Ok(matrix(values, shape, device)?.set_requires_grad(true))
 }
 
-/// Optical depths up to the ends of steps, and the steps' transmittances and weights (rays × count
-/// each), where the samples `kept` have the optical depths `density`.
-fn optical(
-    density: &Tensor,
+/// Returns optical depths up to the ends of steps, and the steps' transmittances and weights (rays ×
+/// count each), given the optical depths `sample_tau` of the samples `kept`.
+fn optical_depths(
+    sample_tau: &Tensor,
     kept: &Tensor,
     rays: i64,
     count: i64,
 ) -> Result<[Tensor; 3], TchError> {
-    let nothing = Tensor::f_zeros([rays * count], (Kind::Float, density.device()))?;
-    let tau = nothing.f_index_put(&[Some(kept)], density, false)?.f_reshape([rays, count])?;
+    let zeros = Tensor::f_zeros([rays * count], (Kind::Float, sample_tau.device()))?;
+    let tau = zeros.f_index_put(&[Some(kept)], sample_tau, false)?.f_reshape([rays, count])?;
     let through = tau.f_cumsum(1, None::<Kind>)?;
     let transmittance = through.f_sub(&tau)?.f_neg()?.f_exp()?;
     let weights = transmittance.f_mul(&tau.f_neg()?.f_expm1()?.f_neg()?)?;
     Ok([through, transmittance, weights])
 }
 
-/// Counts the samples that a training takes: of each ray, those of `kept` up to the end of the
-/// round in which the ray becomes dark. Its optical depth is `through`.
+/// Counts the samples that a training step evaluates: on each ray, those of `kept` up to the end of
+/// the round in which the ray becomes dark. `through` is the optical depth up to each step's end.
 fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
     let exists = through.f_zeros_like()?.f_reshape([-1])?.f_index_fill(0, kept, 1.0)?;
     let exists = exists.f_reshape_as(through)?;
-    let number = exists.f_cumsum(1, None::<Kind>)?;
+    let ordinal = exists.f_cumsum(1, None::<Kind>)?;
     let [first @ .., later] = TRAINING_ROUNDS.map(|samples| samples as i64);
     let mut end = 0;
     let mut is_end = exists.f_lt(0.0)?;
     for samples in first {
         end += samples;
-        is_end = is_end.f_logical_or(&number.f_eq(end)?)?;
+        is_end = is_end.f_logical_or(&ordinal.f_eq(end)?)?;
     }
-    let is_later = number.f_sub_scalar(end)?.f_remainder(later)?.f_eq(0)?;
-    is_end = is_end.f_logical_or(&is_later.f_logical_and(&number.f_gt(end)?)?)?;
+    let is_later = ordinal.f_sub_scalar(end)?.f_remainder(later)?.f_eq(0)?;
+    is_end = is_end.f_logical_or(&is_later.f_logical_and(&ordinal.f_gt(end)?)?)?;
     let is_dark = through.f_ge(f64::from(DARK))?.f_logical_and(&is_end)?.f_mul(&exists)?;
     let is_over = is_dark.f_cumsum(1, None::<Kind>)?.f_sub(&is_dark)?.f_gt(0.0)?;
     let marched = exists.f_logical_and(&is_over.f_logical_not()?)?;
@@ -197,107 +250,83 @@ fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
 }
 
 impl TorchGrid {
-    /// A field's numbers on a device.
+    /// Copies a field's parameters and occupancy to a device.
     pub fn new(field: &Field, device: Device) -> Result<Self, TorchFieldError> {
         let (grid, network, occupancy) = field.parts();
-        let levels = levels(&field.architecture);
+        let levels = build_levels(&field.architecture);
         let entries: i64 = levels.iter().map(|l| l.entries).sum();
         let mut first = 0;
         let mut layers = Vec::with_capacity(5);
         for (inputs, outputs) in layer_shapes(&field.architecture) {
-            let numbers = (inputs * outputs) as usize;
-            layers.push(learnable(&network[first..first + numbers], [inputs, outputs], device)?);
-            first += numbers;
+            let weights = &network[first..first + (inputs * outputs) as usize];
+            layers.push(trainable_matrix(weights, [inputs, outputs], device)?);
+            first += weights.len();
         }
-        let mut made = Self {
+        let mut copy = Self {
             architecture: field.architecture,
             bounds: field.bounds,
             device,
             levels,
-            table: learnable(grid, [entries, FEATURES as i64], device)?,
+            table: trainable_matrix(grid, [entries, FEATURES as i64], device)?,
             layers: layers.try_into().expect("five layers"),
             cells: Tensor::new(),
         };
-        made.set_occupancy(occupancy)?;
-        Ok(made)
+        copy.set_occupancy(occupancy)?;
+        Ok(copy)
     }
 
-    /// Takes over what cells hold.
+    /// Copies the states of the occupancy cells.
     pub(crate) fn set_occupancy(&mut self, occupancy: &Occupancy) -> Result<(), TchError> {
         self.cells = Tensor::f_from_slice(&occupancy.to_bytes())?.f_to_device(self.device)?;
         Ok(())
     }
 
-    /// The table and the five layers.
+    /// Returns handles to the table and the five layers.
     pub(crate) fn parameters(&self) -> Vec<Tensor> {
         std::iter::once(&self.table).chain(&self.layers).map(Tensor::shallow_clone).collect()
     }
 
-    /// Distance between samples, in cube sides.
+    /// Returns the distance between samples in sides of the cube.
     pub(crate) fn step(&self) -> f64 {
         f64::from(self.architecture.step())
     }
 
-    /// Density for a cube side at positions in the unit cube (n × 3).
+    /// Returns densities, per side of the cube, at positions in the unit cube (n × 3).
     pub(crate) fn densities(&self, positions: &Tensor) -> Result<Tensor, TchError> {
         no_grad(|| {
             self.outputs(positions)?.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()
         })
     }
 
-    /// Outputs of the density network at positions (n × 3): n × 16.
+    /// Returns outputs of the density network at positions (n × 3): n × 16.
     fn outputs(&self, positions: &Tensor) -> Result<Tensor, TchError> {
         self.encode(positions)?.f_matmul(&self.layers[0])?.f_relu()?.f_matmul(&self.layers[1])
     }
 
-    /// Interpolated features of positions in the unit cube (n × 3): n × 4·levels.
+    /// Interpolates the features at positions in the unit cube (n × 3): n × 4·levels.
     fn encode(&self, positions: &Tensor) -> Result<Tensor, TchError> {
         let mut features = Vec::with_capacity(self.levels.len());
         let positions = positions.f_clamp(0.0, 1.0)?;
         for level in &self.levels {
-            let along = |axis: usize| level.along(&positions, axis);
-            let axes = [along(0)?, along(1)?, along(2)?];
+            let axes = [
+                level.cells(&positions, 0)?,
+                level.cells(&positions, 1)?,
+                level.cells(&positions, 2)?,
+            ];
             let mut sum: Option<Tensor> = None;
             for corner in 0..8i64 {
-                let d = [corner & 1, corner >> 1 & 1, corner >> 2];
-                let mut share = None;
-                let mut index = Vec::with_capacity(3);
-                for ((fraction, cell), d) in axes.iter().zip(d) {
-                    let f = if d == 1 {
-                        fraction.shallow_clone()
-                    } else {
-                        fraction.f_neg()?.f_add_scalar(1.0)?
-                    };
-                    share = Some(match share {
-                        None => f,
-                        Some(product) => f.f_mul(&product)?,
-                    });
-                    index.push(cell.f_add_scalar(d)?);
-                }
-                let half = |axis: usize| index[axis].f_floor_divide_scalar(2);
-                let brick = if level.hashed {
-                    let [y, z] = HASH_FACTORS.map(i64::from);
-                    let mixed = half(0)?
-                        .f_bitwise_xor_tensor(&half(1)?.f_mul_scalar(y)?)?
-                        .f_bitwise_xor_tensor(&half(2)?.f_mul_scalar(z)?)?;
-                    mixed.f_bitwise_and(level.entries / BRICK as i64 - 1)?
-                } else {
-                    let [across, down, _] = level.bricks;
-                    half(2)?
-                        .f_mul_scalar(down)?
-                        .f_add(&half(1)?)?
-                        .f_mul_scalar(across)?
-                        .f_add(&half(0)?)?
-                };
-                let odd = |axis: usize| index[axis].f_bitwise_and(1);
-                let within =
-                    odd(2)?.f_mul_scalar(2)?.f_add(&odd(1)?)?.f_mul_scalar(2)?.f_add(&odd(0)?)?;
-                let index = brick.f_mul_scalar(BRICK as i64)?.f_add(&within)?;
-                let entry = self.table.f_index_select(0, &index.f_add_scalar(level.first)?)?;
-                let part = entry.f_mul(&share.expect("three axes").f_unsqueeze(-1)?)?;
+                let offset = [corner & 1, corner >> 1 & 1, corner >> 2];
+                let weight = corner_weight(&axes, offset)?;
+                let vertex = [
+                    axes[0].cell.f_add_scalar(offset[0])?,
+                    axes[1].cell.f_add_scalar(offset[1])?,
+                    axes[2].cell.f_add_scalar(offset[2])?,
+                ];
+                let entry = self.table.f_index_select(0, &level.entry_index(&vertex)?)?;
+                let weighted = entry.f_mul(&weight.f_unsqueeze(-1)?)?;
                 sum = Some(match sum {
-                    None => part,
-                    Some(sum) => sum.f_add(&part)?,
+                    None => weighted,
+                    Some(sum) => sum.f_add(&weighted)?,
                 });
             }
             features.push(sum.expect("eight corners"));
@@ -305,47 +334,45 @@ impl TorchGrid {
         Tensor::f_cat(&features, -1)
     }
 
-    /// What rays see, with samples `offsets` (n) of a step along.
-    pub(crate) fn see(
+    /// Marches rays, with samples shifted by `offsets` (n) of a step, and composites the samples.
+    pub(crate) fn forward(
         &self,
         rays: &[Ray],
         offsets: &Tensor,
         strides: Strides,
-    ) -> Result<GridSeen, TchError> {
+    ) -> Result<GridForward, TchError> {
         let n = rays.len() as i64;
         let maps = RayMaps::new(&self.bounds, rays, self.device, false)?;
         let Marched { t, kept, positions, length, count } = self.march(&maps, offsets, strides)?;
 
         let outputs = self.outputs(&positions)?;
-        let density =
+        let tau =
             outputs.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?.f_mul(&length)?;
-        let optical = |density: &Tensor| optical(density, &kept, n, count);
-        // What counts is found first; the rest gets no gradient.
+        // Samples that are not composited get no gradient.
         let counted = no_grad(|| -> Result<Tensor, TchError> {
-            let [_, transmittance, weights] = optical(&density)?;
+            let [_, transmittance, weights] = optical_depths(&tau, &kept, n, count)?;
             transmittance.f_gt(f64::from(FAINT))?.f_logical_and(&weights.f_gt(f64::from(FAINT))?)
         })?;
         let counts = counted.f_reshape([-1])?.f_index_select(0, &kept)?;
-        let [through, _, weights] = optical(&density.f_where_self(&counts, &density.f_detach()?)?)?;
+        let tau = tau.f_where_self(&counts, &tau.f_detach()?)?;
+        let [through, _, weights] = optical_depths(&tau, &kept, n, count)?;
 
         let shaded = counts.f_nonzero()?.f_squeeze_dim(-1)?;
-        let at = kept.f_index_select(0, &shaded)?;
-        let ray = at.f_div_scalar_mode(count, "floor")?;
-        let weight = weights.f_reshape([-1])?.f_index_select(0, &at)?.f_unsqueeze(-1)?;
+        let step = kept.f_index_select(0, &shaded)?;
+        let ray = step.f_div_scalar_mode(count, "floor")?;
+        let weight = weights.f_reshape([-1])?.f_index_select(0, &step)?.f_unsqueeze(-1)?;
         let outputs = outputs.f_index_select(0, &shaded)?;
-        let met = match strides {
-            Strides::Even => Vec::new(),
-            Strides::ByCell | Strides::Double => no_grad(|| {
-                cells_met(&weight, &positions.f_index_select(0, &shaded)?, &outputs.i((.., 0)))
+        let (met, samples) = match strides {
+            // Rendering needs neither.
+            Strides::Even => (Vec::new(), 0),
+            Strides::ByCell | Strides::Double => no_grad(|| -> Result<_, TchError> {
+                let positions = positions.f_index_select(0, &shaded)?;
+                let met = met_cells(&weight, &positions, &outputs.i((.., 0)))?;
+                Ok((met, count_marched(&through, &kept)?))
             })?,
         };
-        let samples = match strides {
-            // Nobody asks.
-            Strides::Even => 0,
-            Strides::ByCell | Strides::Double => no_grad(|| count_marched(&through, &kept))?,
-        };
         let colour = self.shade(&maps, &outputs, &weight, &ray, n)?;
-        Ok(GridSeen {
+        Ok(GridForward {
             premultiplied: sum_by_ray(&weight.f_mul(&colour)?, &ray, n)?,
             transmittance: through.i((.., count - 1)).f_neg()?.f_exp()?,
             weights,
@@ -360,7 +387,7 @@ impl TorchGrid {
         })
     }
 
-    /// Samples of rays where cells are occupied.
+    /// Returns the samples of rays in occupied cells.
     fn march(
         &self,
         maps: &RayMaps,
@@ -371,31 +398,32 @@ impl TorchGrid {
         let count = ((longest / self.step()).ceil() as i64).max(1);
         let steps = Tensor::f_arange(count, (Kind::Float, self.device))?;
         let k = steps.f_add(&offsets.f_unsqueeze(-1)?)?;
-        let at = |k: &Tensor| fused(k, &k.f_full_like(self.step())?, &maps.enter);
-        let t = at(&k)?;
-        let held = self
-            .held(&maps.positions(&t)?)?
+        let step = k.f_full_like(self.step())?;
+        let t = multiply_add(&k, &step, &maps.enter)?;
+        let states = self
+            .cell_states(&maps.positions(&t)?)?
             .f_where_self(&t.f_lt_tensor(&maps.leave)?, &t.f_zeros_like()?)?;
-        // There every other step is one sample, in the middle of both.
-        let double = match strides {
-            // Nowhere.
-            Strides::Even => held.f_lt(0.0)?,
-            Strides::ByCell => held.f_eq(1.0)?,
-            Strides::Double => held.f_gt(0.0)?,
+        // With double strides every other step is one sample, in the middle of two steps.
+        let is_double = match strides {
+            // False everywhere.
+            Strides::Even => states.f_lt(0.0)?,
+            Strides::ByCell => states.f_eq(1.0)?,
+            Strides::Double => states.f_gt(0.0)?,
         };
-        let middle = at(&k.f_add_scalar(0.5)?)?;
-        let (t, length) =
-            (middle.f_where_self(&double, &t)?, double.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?);
-        let odd = steps.f_remainder(2.0)?.f_ne(0.0)?;
-        let inside = held.f_gt(0.0)?.f_logical_and(&t.f_lt_tensor(&maps.leave)?)?;
-        let inside = inside.f_logical_and(&double.f_logical_and(&odd)?.f_logical_not()?)?;
+        let middle = multiply_add(&k.f_add_scalar(0.5)?, &step, &maps.enter)?;
+        let t = middle.f_where_self(&is_double, &t)?;
+        let length = is_double.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?;
+        let is_odd = steps.f_remainder(2.0)?.f_ne(0.0)?;
+        let inside = states.f_gt(0.0)?.f_logical_and(&t.f_lt_tensor(&maps.leave)?)?;
+        let inside = inside.f_logical_and(&is_double.f_logical_and(&is_odd)?.f_logical_not()?)?;
         let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
         let positions = maps.positions(&t)?.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
         let length = length.f_reshape([-1])?.f_index_select(0, &kept)?.f_mul_scalar(self.step())?;
         Ok(Marched { t, kept, positions, length, count })
     }
 
-    /// Colours of shaded samples: each one's own raw colour and its ray's part of it.
+    /// Returns the colours of composited samples: the sigmoid of the sample's own raw colour plus its
+    /// ray's (deferred shading).
     fn shade(
         &self,
         maps: &RayMaps,
@@ -409,12 +437,12 @@ impl TorchGrid {
         let input = Tensor::f_cat(&[&features, &harmonics(&maps.view)?], -1)?;
         let hidden =
             input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
-        let added = hidden.f_matmul(&self.layers[4])?.f_index_select(0, ray)?;
-        outputs.f_narrow(1, RAW_COLOUR as i64, 3)?.f_add(&added)?.f_sigmoid()
+        let ray_colour = hidden.f_matmul(&self.layers[4])?.f_index_select(0, ray)?;
+        outputs.f_narrow(1, RAW_COLOUR as i64, 3)?.f_add(&ray_colour)?.f_sigmoid()
     }
 
-    /// What the cells at positions (… × 3) hold, as numbers.
-    fn held(&self, positions: &Tensor) -> Result<Tensor, TchError> {
+    /// Returns the states of the occupancy cells at positions (n × m × 3), as f32: n × m.
+    fn cell_states(&self, positions: &Tensor) -> Result<Tensor, TchError> {
         const CELLS: i64 = OCCUPANCY_CELLS as i64;
         let cell = positions.f_nan_to_num(0.0, 0.0, 0.0)?.f_mul_scalar(CELLS as f64)?.f_floor()?;
         let cell = cell.f_clamp(0.0, CELLS as f64 - 1.0)?.f_to_kind(Kind::Int64)?;
@@ -423,44 +451,37 @@ impl TorchGrid {
         self.cells.f_take(&cell)?.f_to_kind(Kind::Float)
     }
 
-    /// Colour, opacity and depth of each ray, in pieces as large as memory allows.
+    /// Renders colour, opacity and depth of each ray, in pieces as large as memory allows.
     pub fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TorchFieldError> {
-        let mut pixels = Vec::with_capacity(rays.len());
-        let mut piece = if self.device == Device::Cpu { 1 << 10 } else { 1 << 15 };
-        while pixels.len() < rays.len() {
-            let end = (pixels.len() + piece).min(rays.len());
-            match no_grad(|| self.pixels(&rays[pixels.len()..end])) {
-                Ok(more) => pixels.extend(more),
-                Err(error) if piece > 64 && nets::is_out_of_memory(&error) => piece /= 2,
-                Err(error) => return Err(error.into()),
-            }
-        }
-        Ok(pixels)
+        const MIN_RAYS: usize = 64;
+        let size = if self.device == Device::Cpu { 1 << 10 } else { 1 << 15 };
+        let pieces = run_in_pieces(rays.len(), size, MIN_RAYS, |range| {
+            no_grad(|| self.render_piece(&rays[range]))
+        })?;
+        Ok(pieces.concat())
     }
 
-    fn pixels(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
+    fn render_piece(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
         let offsets = Tensor::f_full([rays.len() as i64], 0.5, (Kind::Float, self.device))?;
-        let seen = self.see(rays, &offsets, Strides::Even)?;
-        let weights = seen.weights.f_mul(&seen.counted)?;
-        let distances =
-            seen.maps.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
-        let sum = |of: &Tensor| of.f_sum_dim_intlist([1i64].as_slice(), false, None::<Kind>);
-        let (weight, distance) =
-            (host(&sum(&weights)?)?, host(&sum(&weights.f_mul(&distances)?)?)?);
-        let half = seen.weights.f_cumsum(1, None::<Kind>)?.f_ge(0.5)?;
+        let forward = self.forward(rays, &offsets, Strides::Even)?;
+        let maps = &forward.maps;
+        let weights = forward.weights.f_mul(&forward.counted)?;
+        let distances = maps
+            .distances(&forward.t)?
+            .f_where_self(&forward.counted, &forward.t.f_zeros_like()?)?;
+        let weight = to_host(&sum_over_steps(&weights)?)?;
+        let distance = to_host(&sum_over_steps(&weights.f_mul(&distances)?)?)?;
+        let is_half = forward.weights.f_cumsum(1, None::<Kind>)?.f_ge(0.5)?;
         let before =
-            half.f_logical_not()?.f_sum_dim_intlist([1i64].as_slice(), true, Kind::Int64)?;
-        let last = seen.t.size()[1] - 1;
-        let is_half = host(&before.f_le(last)?)?;
-        let median = host(&seen.maps.distances(&seen.t.f_gather(
-            1,
-            &before.f_clamp_max(last)?,
-            false,
-        )?)?)?;
-        let (premultiplied, transmittance) =
-            (host(&seen.premultiplied)?, host(&seen.transmittance)?);
-        let (hits, leave) =
-            (host(&seen.maps.hits()?)?, host(&seen.maps.distances(&seen.maps.leave)?)?);
+            is_half.f_logical_not()?.f_sum_dim_intlist([1i64].as_slice(), true, Kind::Int64)?;
+        let last = forward.t.size()[1] - 1;
+        let has_median = to_host(&before.f_le(last)?)?;
+        let median = forward.t.f_gather(1, &before.f_clamp_max(last)?, false)?;
+        let median = to_host(&maps.distances(&median)?)?;
+        let premultiplied = to_host(&forward.premultiplied)?;
+        let transmittance = to_host(&forward.transmittance)?;
+        let hits = to_host(&maps.hits()?)?;
+        let leave = to_host(&maps.distances(&maps.leave)?)?;
         let pixels = rays.iter().enumerate().map(|(i, ray)| {
             let own: [f32; 3] = std::array::from_fn(|c| premultiplied[3 * i + c]);
             let far = if hits[i] > 0.0 { leave[i] } else { self.bounds.far as f32 };
@@ -471,11 +492,16 @@ impl TorchGrid {
                 premultiplied: own,
                 opacity: 1.0 - transmittance[i],
                 depth: if weight[i] > UNSEEN { distance[i] / weight[i] } else { far },
-                median_depth: if is_half[i] > 0.0 { median[i] } else { far },
+                median_depth: if has_median[i] > 0.0 { median[i] } else { far },
             }
         });
         Ok(pixels.collect())
     }
+}
+
+/// Sums a matrix (n × steps) over the steps: n.
+fn sum_over_steps(values: &Tensor) -> Result<Tensor, TchError> {
+    values.f_sum_dim_intlist([1i64].as_slice(), false, None::<Kind>)
 }
 
 impl RayField for TorchGrid {
@@ -556,7 +582,7 @@ mod tests {
             for &device in &devices {
                 let judge = TorchGrid::new(&field, device).unwrap();
                 let seen = judge
-                    .see(&rays, &Tensor::full([300], 0.5, (Kind::Float, device)), Strides::Even)
+                    .forward(&rays, &Tensor::full([300], 0.5, (Kind::Float, device)), Strides::Even)
                     .unwrap();
                 let background = seen.transmittance.unsqueeze(-1);
                 let gradients = Tensor::run_backward(
@@ -565,10 +591,11 @@ mod tests {
                     false,
                     false,
                 );
-                let flat: Vec<f32> = gradients[1..].iter().flat_map(|g| host(g).unwrap()).collect();
+                let flat: Vec<f32> =
+                    gradients[1..].iter().flat_map(|g| to_host(g).unwrap()).collect();
                 let said = format!("spread {spread} on {device:?}");
                 let (by_table, by_network) = (
-                    error(&table, &host(&gradients[0]).unwrap()),
+                    error(&table, &to_host(&gradients[0]).unwrap()),
                     error(&network[..flat.len()], &flat),
                 );
                 assert!(

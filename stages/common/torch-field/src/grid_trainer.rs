@@ -7,70 +7,71 @@ use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::error::TorchFieldError;
 use crate::grid::TorchGrid;
+use crate::ray_maps::{columns, to_host};
 use crate::regularisers::add_regularisers;
 use crate::step::Step;
-use crate::transfer::host;
 
-/// Trains a [`radiance::Field`] as [`radiance::Trainer`] does, by libtorch's operations and
-/// autograd: the same draws, steps, rates and looks at the occupancy. Only
-/// [`TrainingOptions::roulette`] is left out: gradients of all samples go back. On the CPU in one
-/// thread, to judge that trainer by; on CUDA to be fast.
+/// Trains a [`radiance::Field`] like [`radiance::Trainer`], in libtorch: with equal random numbers,
+/// steps, learning rates and occupancy updates, but without [`TrainingOptions::roulette`], so that
+/// all samples get gradients. On the CPU it runs in one thread and checks that trainer; on CUDA it is
+/// fast (design note 023).
 pub struct GridTrainer {
     grid: TorchGrid,
     options: TrainingOptions,
     occupancy: Occupancy,
+    /// First and second moments of Adam.
     first: Vec<Tensor>,
     second: Vec<Tensor>,
-    /// Running average of the parameters, once there is one.
+    /// Moving average of the parameters, late in the training.
     average: Option<Vec<Tensor>>,
     tally: Tally,
     samples_per_ray: f64,
 }
 
-/// Places that are looked at together.
-const PLACES_AT_ONCE: usize = 1 << 18;
+/// Number of positions at which the density is evaluated in one call; chosen by hand.
+const POSITIONS_PER_CALL: usize = 1 << 18;
 
-/// What a piece of a step leaves.
+/// Gradients and statistics of a piece of a step.
 struct GridPiece {
     gradients: Vec<Tensor>,
     colours: Vec<[f32; 3]>,
+    /// Sum of the bundles' losses.
     loss: f64,
     samples: usize,
     met: Vec<Met>,
 }
 
 impl GridTrainer {
-    /// Starts from a field.
+    /// Creates a trainer of a copy of `field` on a device.
     pub fn new(
         field: &Field,
         options: TrainingOptions,
         device: Device,
     ) -> Result<Self, TorchFieldError> {
         let grid = TorchGrid::new(field, device)?;
-        let (first, second) = (zeros(&grid.parameters())?, zeros(&grid.parameters())?);
         Ok(Self {
             occupancy: field.parts().2.clone(),
             samples_per_ray: field.architecture.full_ray(),
+            first: zero_moments(&grid.parameters())?,
+            second: zero_moments(&grid.parameters())?,
             grid,
             options,
-            first,
-            second,
             average: None,
             tally: Tally::default(),
         })
     }
 
-    /// Steps taken.
+    /// Returns the number of steps taken.
     pub fn steps(&self) -> u64 {
         self.tally.steps
     }
 
-    /// Rays cast so far.
+    /// Returns the number of rays cast.
     pub fn rays_done(&self) -> u64 {
         self.tally.rays
     }
 
-    /// The field: at the end of a training with the average of its weights, where one was kept.
+    /// Returns the field, with the average of its weights if one is maintained.
     pub fn field(&self) -> Result<Field, TorchFieldError> {
         let mut field = Field::new(self.grid.architecture, self.grid.bounds, 0);
         let (grid, network, occupancy) = field.parts_mut();
@@ -78,64 +79,59 @@ impl GridTrainer {
             || self.grid.parameters(),
             |a| a.iter().map(Tensor::shallow_clone).collect(),
         );
-        grid.copy_from_slice(&host(&parameters[0])?);
+        grid.copy_from_slice(&to_host(&parameters[0])?);
         let layers: Vec<f32> =
-            parameters[1..].iter().map(host).collect::<Result<Vec<_>, _>>()?.concat();
+            parameters[1..].iter().map(to_host).collect::<Result<Vec<_>, _>>()?.concat();
         network[..layers.len()].copy_from_slice(&layers);
         *occupancy = self.occupancy.clone();
         Ok(field)
     }
 
-    /// Takes a step; `None` once all rays are spent.
+    /// Takes one step; returns `None` after all rays are used.
     pub fn step(
         &mut self,
         supervision: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
         supervision.set_progress(self.tally.done(self.options.rays));
-        let bundle = supervision.rays_per_bundle();
-        let wanted = self.options.rays_of_step(&self.tally, self.samples_per_ray);
-        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else {
-            return Ok(None);
-        };
-        self.look()?;
-        let step = Step::new(&self.tally, bundles, bundle);
-        let pieces = step.in_pieces(|range| self.run(&*supervision, step, range))?;
-        let rays = bundles * bundle;
-        let samples = pieces.iter().map(|p| p.samples).sum::<usize>();
-        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / bundles as f64;
-        self.tally.count(bundles, bundle);
+        let rays_per_bundle = supervision.rays_per_bundle();
+        let target = self.options.rays_of_step(&self.tally, self.samples_per_ray);
+        let bundles = self.tally.bundles_of_step(self.options.rays, target, rays_per_bundle);
+        let Some(bundles) = bundles else { return Ok(None) };
+        self.update_occupancy()?;
+        let step = Step::new(&self.tally, bundles, rays_per_bundle);
+        let rays = step.rays();
+        let pieces = step.run_in_pieces(|range| self.run(&*supervision, step, range))?;
+        self.tally.count(bundles, rays_per_bundle);
+        let (mut samples, mut loss) = (0, 0.0);
+        let (mut met, mut colours, mut sum) = (Vec::new(), Vec::new(), Vec::new());
+        for piece in pieces {
+            samples += piece.samples;
+            loss += piece.loss;
+            met.extend(piece.met);
+            colours.push(piece.colours);
+            if sum.is_empty() {
+                sum = piece.gradients;
+            } else {
+                no_grad(|| add_gradients(&mut sum, &piece.gradients))?;
+            }
+        }
+        loss /= bundles as f64;
         self.samples_per_ray = samples as f64 / rays as f64;
-        let mut met = Vec::new();
-        let (colours, gradients): (Vec<_>, Vec<_>) = pieces
-            .into_iter()
-            .map(|piece| {
-                met.extend(piece.met);
-                (piece.colours, piece.gradients)
-            })
-            .unzip();
-        let mut gradients = gradients.into_iter();
-        let mut sum = gradients.next().unwrap_or_default();
-        no_grad(|| {
-            gradients.flatten().enumerate().try_for_each(|(i, g)| {
-                let i = i % sum.len();
-                sum[i].f_add_(&g).map(drop)
-            })
-        })?;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum)?;
         if skipped {
             if !self.tally.forgives() {
                 return Err(TorchFieldError::NotFinite { step: self.tally.steps });
             }
         } else {
-            no_grad(|| self.apply(&sum))?;
+            no_grad(|| self.apply_gradients(&sum))?;
             self.occupancy.keep(&met);
-            step.remember(supervision, colours.iter().map(Vec::as_slice));
+            step.remember(supervision, &colours);
         }
         self.tally.steps += 1;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
     }
 
-    /// Some bundles forward and back.
+    /// Runs the forward and backward pass of a range of bundles.
     fn run(
         &self,
         supervision: &impl Supervisor,
@@ -147,160 +143,171 @@ impl GridTrainer {
         let offsets: Vec<f32> =
             (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
         let offsets = Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?;
-        let seen = self.grid.see(&rays, &offsets, self.occupancy.strides(self.tally.steps))?;
-        let backgrounds: Vec<f32> = rays.iter().flat_map(|r| r.background).collect();
-        let backgrounds = Tensor::f_from_slice(&backgrounds)?
-            .f_reshape([-1, 3])?
-            .f_to_device(self.grid.device)?;
-        let colour =
-            seen.transmittance.f_unsqueeze(-1)?.f_mul(&backgrounds)?.f_add(&seen.premultiplied)?;
-        let judged = step.loss_and_gradient(supervision, &range, &colour)?;
-        let towards = add_regularisers(
-            judged.towards,
+        let strides = self.occupancy.strides(self.tally.steps);
+        let forward = self.grid.forward(&rays, &offsets, strides)?;
+        let backgrounds = columns(&rays, self.grid.device, |r| r.background)?;
+        let colour = forward
+            .transmittance
+            .f_unsqueeze(-1)?
+            .f_mul(&backgrounds)?
+            .f_add(&forward.premultiplied)?;
+        let loss = step.loss(supervision, &range, &colour)?;
+        let surrogate = add_regularisers(
+            loss.surrogate,
             &self.options.regularisers,
-            &seen,
+            &forward,
             &backgrounds,
             self.grid.step(),
-            step.bundles * step.bundle,
+            step.rays(),
         )?;
-        let gradients = if towards.requires_grad() {
-            Tensor::f_run_backward(&[towards], &self.grid.parameters(), false, false)?
+        let gradients = if surrogate.requires_grad() {
+            Tensor::f_run_backward(&[surrogate], &self.grid.parameters(), false, false)?
         } else {
-            // No sample was met: nothing is learnt.
+            // Every ray passed through empty cells only.
             self.first.iter().map(Tensor::f_zeros_like).collect::<Result<_, _>>()?
         };
         Ok(GridPiece {
             gradients,
-            colours: judged.colours,
-            loss: judged.loss,
-            samples: seen.samples,
-            met: seen.met,
+            colours: loss.colours,
+            loss: loss.sum,
+            samples: forward.samples,
+            met: forward.met,
         })
     }
 
-    /// Moves the parameters, and late in the training their average.
-    fn apply(&mut self, gradients: &[Tensor]) -> Result<(), TchError> {
+    /// Updates the parameters and, late in the training, their average.
+    fn apply_gradients(&mut self, gradients: &[Tensor]) -> Result<(), TchError> {
         let options = &self.options;
         let schedule = options.schedule(&self.tally);
         let t = self.tally.steps + 1;
-        let moments = |i: usize| (&gradients[i], &self.first[i], &self.second[i]);
         for (i, level) in self.grid.levels.iter().enumerate() {
-            let part = |of: &Tensor| of.f_narrow(0, level.first, level.entries);
-            let (g, first, second) = moments(0);
-            let rate = options.rate_of_level(i, schedule);
-            let moments = [part(first)?, part(second)?];
-            lazy_adam(t, rate, 0.0, part(&self.grid.table)?, &part(g)?, moments)?;
+            let learning_rate = options.rate_of_level(i, schedule);
+            lazy_adam(
+                t,
+                learning_rate,
+                0.0,
+                level.rows(&self.grid.table)?,
+                &level.rows(&gradients[0])?,
+                [level.rows(&self.first[0])?, level.rows(&self.second[0])?],
+            )?;
         }
         for (i, layer) in self.grid.layers.iter().enumerate() {
-            let (g, first, second) = moments(i + 1);
-            let moments = [first.shallow_clone(), second.shallow_clone()];
             lazy_adam(
                 t,
                 options.mlp_learning_rate * schedule,
                 options.network_decay,
                 layer.shallow_clone(),
-                g,
-                moments,
+                &gradients[i + 1],
+                [self.first[i + 1].shallow_clone(), self.second[i + 1].shallow_clone()],
             )?;
         }
         if options.averages(&self.tally) {
-            let now = self.grid.parameters();
-            match &mut self.average {
-                None => {
-                    self.average =
-                        Some(now.iter().map(Tensor::f_detach_copy).collect::<Result<_, _>>()?);
+            let current = self.grid.parameters();
+            if let Some(average) = &mut self.average {
+                let weight = 1.0 - f64::from(options.ema_decay);
+                for (average, current) in average.iter_mut().zip(&current) {
+                    let _ = average.f_lerp_(current, weight)?;
                 }
-                Some(average) => {
-                    let new = 1.0 - f64::from(options.ema_decay);
-                    for (average, now) in average.iter_mut().zip(&now) {
-                        let _ = average.f_lerp_(now, new)?;
-                    }
-                }
+            } else {
+                let copies = current.iter().map(Tensor::f_detach_copy);
+                self.average = Some(copies.collect::<Result<_, _>>()?);
             }
         }
         Ok(())
     }
 
-    /// Looks at the density of cells where it is time to.
-    fn look(&mut self) -> Result<(), TchError> {
-        let (seed, at) = (self.options.seed, self.tally.steps);
-        let cells = self.occupancy.cells_to_update(at);
+    /// Evaluates the density of the occupancy cells that are due in this step.
+    fn update_occupancy(&mut self) -> Result<(), TchError> {
+        let (seed, step) = (self.options.seed, self.tally.steps);
+        let cells = self.occupancy.cells_to_update(step);
         if cells.is_empty() {
             return Ok(());
         }
-        let mut found = Vec::with_capacity(cells.len());
-        for cells in cells.chunks(PLACES_AT_ONCE) {
-            let positions: Vec<f32> =
-                cells.iter().flat_map(|&cell| Occupancy::place_in(cell, seed, at)).collect();
-            let positions = Tensor::f_from_slice(&positions)?
-                .f_reshape([-1, 3])?
-                .f_to_device(self.grid.device)?;
-            found.extend(host(&self.grid.densities(&positions)?)?);
+        let mut densities = Vec::with_capacity(cells.len());
+        for cells in cells.chunks(POSITIONS_PER_CALL) {
+            let positions =
+                columns(cells, self.grid.device, |&cell| Occupancy::place_in(cell, seed, step))?;
+            densities.extend(to_host(&self.grid.densities(&positions)?)?);
         }
-        self.occupancy.update(&cells, &found, self.grid.step() as f32);
+        self.occupancy.update(&cells, &densities, self.grid.step() as f32);
         self.grid.set_occupancy(&self.occupancy)
     }
 
-    /// Writes all that a resumed training needs. The caller makes it atomic.
+    /// Writes a checkpoint, from which a training resumes. The caller makes the write atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
-        let mut all = named("parameter", &self.grid.parameters());
-        all.extend(named("first", &self.first));
-        all.extend(named("second", &self.second));
-        all.extend(self.average.iter().flat_map(|a| named("average", a)));
-        all.push((DENSITY.to_owned(), Tensor::f_from_slice(self.occupancy.density())?));
-        all.push((OCCUPIED.to_owned(), Tensor::f_from_slice(&self.occupancy.to_bytes())?));
-        let counts = self.tally.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
-        all.push((
-            COUNTS.to_owned(),
-            Tensor::f_from_slice(&counts.map(|c| c as i64).collect::<Vec<_>>())?,
-        ));
-        Ok(nets::write(path, &all)?)
+        let mut tensors = numbered("parameter", &self.grid.parameters());
+        tensors.extend(numbered("first", &self.first));
+        tensors.extend(numbered("second", &self.second));
+        tensors.extend(self.average.iter().flat_map(|a| numbered("average", a)));
+        tensors.push((DENSITY.to_owned(), Tensor::f_from_slice(self.occupancy.density())?));
+        tensors.push((OCCUPIED.to_owned(), Tensor::f_from_slice(&self.occupancy.to_bytes())?));
+        let mut counts = self.tally.counters().map(|c| c as i64).to_vec();
+        counts.push(self.samples_per_ray.to_bits() as i64);
+        tensors.push((COUNTS.to_owned(), Tensor::f_from_slice(&counts)?));
+        Ok(nets::write(path, &tensors)?)
     }
 
-    /// The step a checkpoint was written at.
+    /// Reads the step at which a checkpoint was written.
     pub fn checkpoint_step(path: &Path) -> Result<u64, TorchFieldError> {
-        let [steps, ..] = counts(&nets::Weights::read(path)?)?;
+        let [steps, ..] = read_counts(&nets::Weights::read(path)?)?;
         Ok(steps)
     }
 
-    /// Goes on from a checkpoint of a trainer made with the same field and options.
+    /// Resumes from a checkpoint of a trainer with the same field and options.
     pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
         let weights = nets::Weights::read(path)?;
-        let [tally @ .., samples_per_ray] = counts(&weights)?;
-        let now = self.grid.parameters();
-        let read = |kind: &str| read(&weights, kind, &now, self.grid.device);
-        let (parameters, first, second) = (read("parameter")?, read("first")?, read("second")?);
-        let average = weights.has("average.0").then(|| read("average")).transpose()?;
+        let [tally @ .., samples_per_ray] = read_counts(&weights)?;
+        let current = self.grid.parameters();
+        let device = self.grid.device;
+        let parameters = read_numbered(&weights, "parameter", &current, device)?;
+        let first = read_numbered(&weights, "first", &current, device)?;
+        let second = read_numbered(&weights, "second", &current, device)?;
+        let average = if weights.has("average.0") {
+            Some(read_numbered(&weights, "average", &current, device)?)
+        } else {
+            None
+        };
         let cells = self.occupancy.density().len() as i64;
-        let density = host(&weights.tensor(DENSITY, &[cells])?)?;
+        let density = to_host(&weights.tensor(DENSITY, &[cells])?)?;
         let occupied = Vec::<u8>::try_from(weights.bytes(OCCUPIED, cells)?)?;
-        no_grad(|| {
-            now.iter()
-                .zip(&parameters)
-                .try_for_each(|(to, from)| to.shallow_clone().f_copy_(from).map(drop))
+        no_grad(|| -> Result<(), TchError> {
+            for (mut current, saved) in current.into_iter().zip(&parameters) {
+                current.f_copy_(saved)?;
+            }
+            Ok(())
         })?;
         self.occupancy.restore(density, &occupied);
         self.grid.set_occupancy(&self.occupancy)?;
-        (self.first, self.second, self.average) = (first, second, average);
-        (self.tally, self.samples_per_ray) =
-            (Tally::from_counters(tally), f64::from_bits(samples_per_ray));
+        self.first = first;
+        self.second = second;
+        self.average = average;
+        self.tally = Tally::from_counters(tally);
+        self.samples_per_ray = f64::from_bits(samples_per_ray);
         Ok(())
     }
 }
 
-/// Names in a checkpoint.
+/// Adds gradients to their sum.
+fn add_gradients(sum: &mut [Tensor], gradients: &[Tensor]) -> Result<(), TchError> {
+    for (sum, gradient) in sum.iter_mut().zip(gradients) {
+        let _ = sum.f_add_(gradient)?;
+    }
+    Ok(())
+}
+
+/// Names of tensors in a checkpoint.
 const DENSITY: &str = "density";
 const OCCUPIED: &str = "occupied";
 const COUNTS: &str = "counts";
 
-/// Tensors by the names `KIND.0`, `KIND.1` and so on.
-fn named(kind: &str, tensors: &[Tensor]) -> Vec<(String, Tensor)> {
-    let name = |(i, t): (usize, &Tensor)| (format!("{kind}.{i}"), t.shallow_clone());
-    tensors.iter().enumerate().map(name).collect()
+/// Names tensors `KIND.0`, `KIND.1` and so on.
+fn numbered(kind: &str, tensors: &[Tensor]) -> Vec<(String, Tensor)> {
+    let tensors = tensors.iter().enumerate();
+    tensors.map(|(i, t)| (format!("{kind}.{i}"), t.shallow_clone())).collect()
 }
 
-/// The tensors that [`named`] named, of the shapes of given ones.
-fn read(
+/// Reads tensors that [`numbered`] named, with the shapes of `like`.
+fn read_numbered(
     weights: &nets::Weights,
     kind: &str,
     like: &[Tensor],
@@ -314,38 +321,40 @@ fn read(
     Ok(tensors)
 }
 
-fn counts(weights: &nets::Weights) -> Result<[u64; 6], nets::WeightsError> {
+/// Reads the training's counters.
+fn read_counts(weights: &nets::Weights) -> Result<[u64; 6], nets::WeightsError> {
     let counts = weights.integers(COUNTS, 6)?;
     Ok(std::array::from_fn(|i| counts[i] as u64))
 }
 
-/// Moments of parameters that haven't been trained.
-fn zeros(parameters: &[Tensor]) -> Result<Vec<Tensor>, TchError> {
+/// Returns the zero moments of untrained parameters.
+fn zero_moments(parameters: &[Tensor]) -> Result<Vec<Tensor>, TchError> {
     parameters.iter().map(|p| p.f_detach()?.f_zeros_like()).collect()
 }
 
-/// One lazy Adam step: what has no gradient keeps its value and its moments.
+/// Takes a lazy Adam step: elements without a gradient keep their value and moments.
 fn lazy_adam(
     t: u64,
-    rate: f64,
+    learning_rate: f64,
     decay: f32,
     mut parameter: Tensor,
     gradient: &Tensor,
     [mut first, mut second]: [Tensor; 2],
 ) -> Result<(), TchError> {
     let t = t.min(100_000) as i32;
-    let rate = rate * (1.0 - ADAM_BETA[1].powi(t)).sqrt() / (1.0 - ADAM_BETA[0].powi(t));
+    let rate = learning_rate * (1.0 - ADAM_BETA[1].powi(t)).sqrt() / (1.0 - ADAM_BETA[0].powi(t));
     let touched = gradient.f_ne(0.0)?;
     let gradient = parameter.f_mul_scalar(f64::from(decay))?.f_add(gradient)?;
     let first1 = gradient.f_lerp(&first, ADAM_BETA[0])?;
     let second1 = gradient.f_square()?.f_lerp(&second, ADAM_BETA[1])?;
-    let by = first1.f_div(&second1.f_sqrt()?.f_add_scalar(ADAM_EPSILON)?)?.f_mul_scalar(rate)?;
-    let moved = parameter.f_sub(&by)?.f_where_self(&touched, &parameter)?;
-    parameter.f_copy_(&moved)?;
-    let kept = first1.f_where_self(&touched, &first)?;
-    first.f_copy_(&kept)?;
-    let kept = second1.f_where_self(&touched, &second)?;
-    second.f_copy_(&kept)
+    let change =
+        first1.f_div(&second1.f_sqrt()?.f_add_scalar(ADAM_EPSILON)?)?.f_mul_scalar(rate)?;
+    let updated = parameter.f_sub(&change)?.f_where_self(&touched, &parameter)?;
+    parameter.f_copy_(&updated)?;
+    let updated = first1.f_where_self(&touched, &first)?;
+    first.f_copy_(&updated)?;
+    let updated = second1.f_where_self(&touched, &second)?;
+    second.f_copy_(&updated)
 }
 
 #[cfg(test)]

@@ -1,17 +1,16 @@
-//! Radiance fields through libtorch's operations and autograd, on the CPU or on CUDA.
+//! Radiance fields in libtorch, with autograd, on the CPU or on CUDA.
 //!
 //! * [`Mlp`]: NeRF-SR's own field as published (Wang et al. 2022; Mildenhall et al. 2020):
 //!   positional encoding, a coarse and a fine network of eight layers, stratified and importance
-//!   sampling. [`Mlp::render`] gives colour, opacity and depth of rays.
-//! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: its training, driven by the same
-//!   [`radiance::Supervisor`] as the fast field's.
+//!   sampling. [`Mlp::render`] returns colour, opacity and depth of rays.
+//! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: training of the paper's field, driven by the
+//!   same [`radiance::Supervisor`] as the hash-grid field's.
+//! * [`TorchGrid`], [`GridTrainer`]: the hash-grid field of `radiance` and its training, on the same
+//!   parameters: a check of the hand-written engine, and its way to CUDA.
 //!
-//! * [`TorchGrid`], [`GridTrainer`]: the fast field of `radiance` and its training, on the same
-//!   numbers: their judge, and their way to CUDA.
-//!
-//! On the CPU a batch is cut into shards by index, each of which goes through libtorch in one
-//! thread, and their gradients are added in order: bytes don't depend on the number of threads. On
-//! CUDA results hold to a tolerance.
+//! On the CPU a batch is cut into shards by index. Each shard runs in one thread, and gradients are
+//! added in order, so bytes don't depend on the number of threads. On CUDA results agree to a
+//! tolerance.
 //!
 //! Units: positions and distances are scene units, directions have unit length, colours are
 //! display-encoded sRGB.
@@ -32,7 +31,6 @@
 //! ```
 
 mod composite;
-mod encoding;
 mod error;
 #[cfg(test)]
 mod goldens;
@@ -44,13 +42,11 @@ mod network;
 mod ray_maps;
 mod regularisers;
 mod sampling;
-mod schedule;
 mod step;
-mod transfer;
 
 pub use error::TorchFieldError;
 pub use grid::TorchGrid;
 pub use grid_trainer::GridTrainer;
 pub use mlp::Mlp;
 pub use mlp_trainer::{MlpTrainer, MlpTraining};
-pub use schedule::Schedule;
+pub use step::Schedule;

@@ -10,17 +10,16 @@ use scene::{Bounds, Space};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::composite::{Composite, composite};
-use crate::encoding::encode;
 use crate::error::TorchFieldError;
-use crate::network::{MlpNetwork, normal};
-use crate::ray_maps::RayMaps;
-use crate::sampling::{importance, middles, stratified};
-use crate::transfer::{columns, host, matrix};
+use crate::network::{MlpNetwork, encode, normal};
+use crate::ray_maps::{RayMaps, columns, matrix, to_host};
+use crate::sampling::{importance, midpoints, stratified};
+use crate::step::run_in_pieces;
 
-/// The paper's field: a coarse network that says where to look and a fine one that is looked at. In
-/// a box, positions are those of [`MlpFrame`], and rays run from `near` to `far` of the bounds;
-/// in NDC and in a contraction they are those of the unit cube stretched to -1..1, and rays run
-/// through it evenly, as the paper has it for forward-facing scenes. Directions are the world's.
+/// The paper's field: a coarse network, whose weights place the samples of a fine network. In a box,
+/// positions are in [`MlpFrame`], and rays run from `near` to `far` of the bounds. In NDC and in a
+/// contraction, positions are in the unit cube stretched to -1..1, and samples are evenly spaced
+/// through it, as in the paper for forward-facing scenes. Directions are in world space.
 #[derive(Debug)]
 pub struct Mlp {
     pub(crate) architecture: MlpArchitecture,
@@ -30,19 +29,20 @@ pub struct Mlp {
     pub(crate) device: Device,
 }
 
-/// What a training step draws for its rays; without it samples lie at equal steps and at equal
-/// shares of what stops the light.
+/// Random numbers of a training step's n rays. Without them the coarse samples are evenly spaced,
+/// and the fine ones are at evenly spaced quantiles of the coarse weights.
 #[derive(Debug)]
 pub(crate) struct SampleDraws {
-    /// In 0..1: n × coarse samples.
+    /// Positions of coarse samples, in 0..1: n × coarse samples.
     pub(crate) coarse: Tensor,
-    /// In 0..1: n × fine samples.
+    /// Quantiles of fine samples, in 0..1: n × fine samples.
     pub(crate) fine: Tensor,
-    /// Added to raw densities: n × coarse samples, and n × (coarse + fine) samples.
+    /// Noise on raw densities: n × coarse samples, and n × (coarse + fine) samples.
     pub(crate) noise: Option<[Tensor; 2]>,
 }
 
-/// Frame of the networks' positions in a box: a world point and a unit, in which t is counted, too.
+/// Frame of the networks' positions in a box: its origin and unit in world space. The unit is also
+/// that of t.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct MlpFrame {
     origin: DVec3,
@@ -50,37 +50,38 @@ struct MlpFrame {
 }
 
 impl MlpFrame {
-    /// Returns the origin of a ray in this frame, rounded to single precision at last.
+    /// Returns the origin of a ray in this frame, computed in f64 and then rounded to f32.
     fn origin_of(&self, ray: &Ray) -> [f32; 3] {
         ((DVec3::from(ray.origin) - self.origin) / self.unit).as_vec3().to_array()
     }
 }
 
-/// Rays as tensors.
+/// Rays as tensors (n × 3 each).
 #[derive(Debug)]
 pub(crate) struct Batch {
     pub(crate) origin: Tensor,
     pub(crate) direction: Tensor,
     pub(crate) background: Tensor,
-    /// How they run where the field's space isn't a box.
+    /// Rays in the unit cube, unless the field's space is a box.
     pub(crate) maps: Option<RayMaps>,
 }
 
-/// What both networks see, and where the fine one looked: distances in scene units.
+/// Composites of both networks along n rays.
 #[derive(Debug)]
-pub(crate) struct Seen {
+pub(crate) struct MlpForward {
     pub(crate) coarse: Composite,
     pub(crate) fine: Composite,
+    /// Distances of the fine network's samples in scene units: n × (coarse + fine) samples.
     pub(crate) distances: Tensor,
 }
 
-/// Purposes of draws.
+/// Streams of random numbers.
 const STRATIFIED: u64 = 201;
 const IMPORTANCE: u64 = 202;
 const NOISE: u64 = 203;
 
 impl SampleDraws {
-    /// Those of the rays `first..first + n` of a training.
+    /// Draws the numbers of the rays `first..first + n` of a training.
     pub(crate) fn new(
         field: &Mlp,
         seed: u64,
@@ -88,12 +89,13 @@ impl SampleDraws {
         n: usize,
         noise: f64,
     ) -> Result<Self, TchError> {
-        let (coarse, fine) =
-            (field.architecture.coarse_samples as usize, field.architecture.fine_samples as usize);
+        let coarse = field.architecture.coarse_samples as usize;
+        let fine = field.architecture.fine_samples as usize;
         let (rays, device) = (first..first + n as u64, field.device);
-        let scaled = |rng: &mut CounterRng| (noise * normal(rng)) as f32;
         let noise = if noise > 0.0 {
-            let all = rows(seed, NOISE, rays.clone(), 2 * coarse + fine, device, scaled)?;
+            let all = draw_rows(seed, NOISE, rays.clone(), 2 * coarse + fine, device, |rng| {
+                (noise * normal(rng)) as f32
+            })?;
             Some([
                 all.f_narrow(1, 0, coarse as i64)?,
                 all.f_narrow(1, coarse as i64, (coarse + fine) as i64)?,
@@ -102,17 +104,17 @@ impl SampleDraws {
             None
         };
         Ok(Self {
-            coarse: rows(seed, STRATIFIED, rays.clone(), coarse, device, CounterRng::uniform)?,
-            fine: rows(seed, IMPORTANCE, rays, fine, device, CounterRng::uniform)?,
+            coarse: draw_rows(seed, STRATIFIED, rays.clone(), coarse, device, CounterRng::uniform)?,
+            fine: draw_rows(seed, IMPORTANCE, rays, fine, device, CounterRng::uniform)?,
             noise,
         })
     }
 }
 
-/// A row of so many draws for each of the rays, which has numbers of its own for every purpose.
-fn rows(
+/// Draws a row of `width` numbers for each ray from the ray's own generator.
+fn draw_rows(
     seed: u64,
-    purpose: u64,
+    stream: u64,
     rays: Range<u64>,
     width: usize,
     device: Device,
@@ -121,14 +123,14 @@ fn rows(
     let n = rays.end - rays.start;
     let mut values = Vec::with_capacity(n as usize * width);
     for ray in rays {
-        let mut rng = CounterRng::new(seed, purpose, ray);
+        let mut rng = CounterRng::new(seed, stream, ray);
         values.extend((0..width).map(|_| draw(&mut rng)));
     }
     matrix(&values, [n as i64, width as i64], device)
 }
 
 impl Batch {
-    /// Rays as a field sees them.
+    /// Converts rays to a field's frame and device.
     pub(crate) fn new(rays: &[Ray], field: &Mlp) -> Result<Self, TchError> {
         let frame = field.frame();
         let Mlp { bounds, device, architecture: MlpArchitecture { ndc_directions, .. }, .. } =
@@ -145,19 +147,20 @@ impl Batch {
 }
 
 impl Mlp {
-    /// A field before training, drawn from a seed.
+    /// Creates an untrained field with random weights.
     pub fn new(
         architecture: MlpArchitecture,
         bounds: Bounds,
         seed: u64,
         device: Device,
     ) -> Result<Self, TorchFieldError> {
-        let network = |index| MlpNetwork::new(architecture, seed, index, device);
-        Ok(Self { architecture, bounds, coarse: network(0)?, fine: network(1)?, device })
+        let coarse = MlpNetwork::new(architecture, seed, 0, device)?;
+        let fine = MlpNetwork::new(architecture, seed, 1, device)?;
+        Ok(Self { architecture, bounds, coarse, fine, device })
     }
 
-    /// Reads what [`Mlp::write`] wrote, or `scripts/convert-checkpoint.py` made of the reference's
-    /// files.
+    /// Reads a file that [`Mlp::write`] wrote, or that `scripts/convert-checkpoint.py` converted from
+    /// the reference's checkpoints.
     pub fn read(
         path: &Path,
         architecture: MlpArchitecture,
@@ -169,34 +172,29 @@ impl Mlp {
             reason: error.to_string(),
         })?;
         let weights = nets::Weights::read(path)?;
-        let network = |prefix| read_network(&weights, prefix, path, architecture, device);
-        Ok(Self {
-            architecture,
-            bounds,
-            coarse: network("coarse")?,
-            fine: network("fine")?,
-            device,
-        })
+        let coarse = read_network(&weights, "coarse", path, architecture, device)?;
+        let fine = read_network(&weights, "fine", path, architecture, device)?;
+        Ok(Self { architecture, bounds, coarse, fine, device })
     }
 
     /// Writes both networks as safetensors: `coarse.NAME` and `fine.NAME`, with the reference's
-    /// names of layers.
+    /// layer names.
     pub fn write(&self, path: &Path) -> Result<(), TorchFieldError> {
-        nets::write(path, &self.named())?;
-        Ok(())
+        Ok(nets::write(path, &self.named_parameters())?)
     }
 
-    /// All parameters by name.
-    pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
+    /// Returns all parameters with their names.
+    pub(crate) fn named_parameters(&self) -> Vec<(String, Tensor)> {
         let mut all = Vec::new();
         for (prefix, network) in [("coarse", &self.coarse), ("fine", &self.fine)] {
-            let named = MlpNetwork::names(&self.architecture).zip(network.share().parameters);
-            all.extend(named.map(|((name, _), t)| (format!("{prefix}.{name}"), t)));
+            for (i, (name, _)) in MlpNetwork::parameter_shapes(&self.architecture).enumerate() {
+                all.push((format!("{prefix}.{name}"), network.parameters[i].shallow_clone()));
+            }
         }
         all
     }
 
-    /// Makes every parameter the mean of its own and of another field's of the same architecture.
+    /// Averages every parameter with that of another field of the same architecture, in place.
     pub fn average_with(&self, other: &Self) -> Result<(), TorchFieldError> {
         no_grad(|| {
             for (mut own, other) in self.parameters().zip(other.parameters()) {
@@ -206,23 +204,23 @@ impl Mlp {
         })
     }
 
-    /// Numbers in both networks.
+    /// Returns the number of weights in both networks.
     pub fn parameter_count(&self) -> usize {
         self.parameters().map(|p| p.numel()).sum()
     }
 
-    /// Handles on the parameters of both networks, in the order of [`Mlp::named`].
+    /// Returns handles to the parameters of both networks, in the order of
+    /// [`Mlp::named_parameters`].
     pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
         self.coarse.parameters.iter().chain(&self.fine.parameters).map(Tensor::shallow_clone)
     }
 
-    /// Another handle on the same networks, for another thread.
-    pub(crate) fn share(&self) -> Self {
-        let Self { architecture, bounds, device, .. } = *self;
-        Self { architecture, bounds, coarse: self.coarse.share(), fine: self.fine.share(), device }
+    /// Returns another handle to the same networks, for another thread.
+    pub(crate) fn shallow_clone(&self) -> Self {
+        Self { coarse: self.coarse.shallow_clone(), fine: self.fine.shallow_clone(), ..*self }
     }
 
-    /// Returns the frame of positions; in other spaces than a box it isn't used.
+    /// Returns the frame of positions, which only fields in a box use.
     fn frame(&self) -> MlpFrame {
         if self.architecture.scaled_positions {
             MlpFrame { origin: self.bounds.middle(), unit: self.bounds.unit() }
@@ -231,41 +229,50 @@ impl Mlp {
         }
     }
 
-    /// What rays see; `noise` and places of samples by `draws`.
-    pub(crate) fn see(&self, batch: &Batch, draws: Option<&SampleDraws>) -> Result<Seen, TchError> {
+    /// Evaluates both networks along rays and composites their samples.
+    pub(crate) fn forward(
+        &self,
+        batch: &Batch,
+        draws: Option<&SampleDraws>,
+    ) -> Result<MlpForward, TchError> {
         let n = batch.origin.size()[0];
-        let like = |value: f64| Tensor::f_full([n, 1], value, (batch.origin.kind(), self.device));
         let unit = self.frame().unit;
         let (near, far) = match &batch.maps {
-            None => (like(self.bounds.near / unit)?, like(self.bounds.far / unit)?),
+            None => {
+                let options = (batch.origin.kind(), self.device);
+                (
+                    Tensor::f_full([n, 1], self.bounds.near / unit, options)?,
+                    Tensor::f_full([n, 1], self.bounds.far / unit, options)?,
+                )
+            }
             Some(maps) => (maps.enter.shallow_clone(), maps.leave.shallow_clone()),
         };
         let count = i64::from(self.architecture.coarse_samples);
         let direction = encode(&batch.direction, self.architecture.direction_octaves)?;
-        let noise = |i: usize| draws.and_then(|d| d.noise.as_ref()).map(|n| &n[i]);
+        let noise = draws.and_then(|d| d.noise.as_ref());
 
         let t = stratified(&near, &far, count, draws.map(|d| &d.coarse))?;
-        let coarse = self.look(&self.coarse, batch, &direction, &t, noise(0))?;
+        let coarse = self.composite(&self.coarse, batch, &direction, &t, noise.map(|n| &n[0]))?;
         let fine_count = i64::from(self.architecture.fine_samples);
-        let shares = match draws {
+        let quantiles = match draws {
             Some(draws) => draws.fine.shallow_clone(),
             None => Tensor::f_linspace(0, 1, fine_count, (t.kind(), self.device))?
                 .f_expand([n, fine_count], false)?
                 .f_contiguous()?,
         };
         let inner = coarse.weights.f_detach()?.f_narrow(1, 1, count - 2)?;
-        let finer = importance(&middles(&t)?, &inner, &shares)?;
+        let finer = importance(&midpoints(&t)?, &inner, &quantiles)?;
         let t = Tensor::f_cat(&[&t, &finer], 1)?.f_sort(1, false)?.0;
-        let fine = self.look(&self.fine, batch, &direction, &t, noise(1))?;
+        let fine = self.composite(&self.fine, batch, &direction, &t, noise.map(|n| &n[1]))?;
         let distances = match &batch.maps {
             None => t.f_mul_scalar(unit)?,
             Some(maps) => maps.distances(&t)?,
         };
-        Ok(Seen { coarse, fine, distances })
+        Ok(MlpForward { coarse, fine, distances })
     }
 
-    /// What one network sees at t.
-    fn look(
+    /// Evaluates one network at t (n × m) and composites the samples.
+    fn composite(
         &self,
         network: &MlpNetwork,
         batch: &Batch,
@@ -294,51 +301,46 @@ impl Mlp {
         composite(t, &colour.f_reshape([n, m, 3])?, &raw, &batch.background)
     }
 
-    /// Colour, opacity and depth of each ray. On the CPU in parallel, with results that don't
-    /// depend on the number of threads; on a GPU in pieces as large as its memory allows.
+    /// Renders colour, opacity and depth of each ray. On the CPU in parallel, with results that
+    /// don't depend on the number of threads; on a GPU in pieces as large as its memory allows.
     pub fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TorchFieldError> {
         const CPU_RAYS: usize = 32;
+        const GPU_RAYS: usize = 1 << 14;
         if self.device == Device::Cpu {
             let pieces: Vec<(Self, &[Ray])> =
-                rays.chunks(CPU_RAYS).map(|rays| (self.share(), rays)).collect();
+                rays.chunks(CPU_RAYS).map(|rays| (self.shallow_clone(), rays)).collect();
             let rendered: Result<Vec<_>, TchError> =
-                pieces.into_par_iter().map(|(field, rays)| field.pixels(rays)).collect();
+                pieces.into_par_iter().map(|(field, rays)| field.render_piece(rays)).collect();
             return Ok(rendered?.concat());
         }
-        let mut pixels = Vec::with_capacity(rays.len());
-        let mut piece = 1 << 14;
-        while pixels.len() < rays.len() {
-            let end = (pixels.len() + piece).min(rays.len());
-            match self.pixels(&rays[pixels.len()..end]) {
-                Ok(more) => pixels.extend(more),
-                Err(error) if piece > CPU_RAYS && nets::is_out_of_memory(&error) => piece /= 2,
-                Err(error) => return Err(error.into()),
-            }
-        }
-        Ok(pixels)
+        let pieces =
+            run_in_pieces(rays.len(), GPU_RAYS, CPU_RAYS, |range| self.render_piece(&rays[range]))?;
+        Ok(pieces.concat())
     }
 
-    fn pixels(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
-        let tame = |r: &Ray| Ray { background: r.background, ..Ray::default() };
-        let tame: Vec<Ray> =
-            rays.iter().map(|r| if r.is_usable() { *r } else { tame(r) }).collect();
-        let batch = Batch::new(&tame, self)?;
-        let hits = batch.maps.as_ref().map(|c| host(&c.hits()?)).transpose()?;
-        let usable = |i: usize, r: &Ray| r.is_usable() && hits.as_ref().is_none_or(|h| h[i] > 0.0);
+    fn render_piece(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
+        let mut usable_rays = rays.to_vec();
+        for ray in &mut usable_rays {
+            if !ray.is_usable() {
+                *ray = Ray { background: ray.background, ..Ray::default() };
+            }
+        }
+        let batch = Batch::new(&usable_rays, self)?;
+        let hits = batch.maps.as_ref().map(|maps| to_host(&maps.hits()?)).transpose()?;
         let [colour, premultiplied, weights, t] =
             no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
-                let seen = self.see(&batch, None)?;
+                let MlpForward { fine, distances, .. } = self.forward(&batch, None)?;
                 Ok([
-                    host(&seen.fine.colour)?,
-                    host(&seen.fine.premultiplied)?,
-                    host(&seen.fine.weights)?,
-                    host(&seen.distances)?,
+                    to_host(&fine.colour)?,
+                    to_host(&fine.premultiplied)?,
+                    to_host(&fine.weights)?,
+                    to_host(&distances)?,
                 ])
             })?;
         let samples = weights.len() / rays.len().max(1);
         let far = self.bounds.far as f32;
         let pixels = rays.iter().enumerate().map(|(i, ray)| {
-            if !usable(i, ray) {
+            if !ray.is_usable() || hits.as_ref().is_some_and(|hits| hits[i] <= 0.0) {
                 return Pixel {
                     colour: ray.background,
                     depth: far,
@@ -346,21 +348,20 @@ impl Mlp {
                     ..Pixel::default()
                 };
             }
-            let three = |of: &[f32]| std::array::from_fn(|c| of[3 * i + c]);
             let (weights, t) = (&weights[i * samples..][..samples], &t[i * samples..][..samples]);
             let opacity: f32 = weights.iter().sum();
-            let distance: f32 = weights.iter().zip(t).map(|(w, t)| w * t).sum();
-            let mut light = 1.0;
-            let median = weights.iter().zip(t).find(|(w, _)| {
-                light -= *w;
-                light <= 0.5
+            let distance: f32 = (0..samples).map(|k| weights[k] * t[k]).sum();
+            let mut transmittance = 1.0;
+            let median = (0..samples).find(|&k| {
+                transmittance -= weights[k];
+                transmittance <= 0.5
             });
             Pixel {
-                colour: three(&colour),
-                premultiplied: three(&premultiplied),
+                colour: std::array::from_fn(|c| colour[3 * i + c]),
+                premultiplied: std::array::from_fn(|c| premultiplied[3 * i + c]),
                 opacity: opacity.clamp(0.0, 1.0),
                 depth: if opacity > UNSEEN { distance / opacity } else { far },
-                median_depth: median.map_or(far, |(_, &t)| t),
+                median_depth: median.map_or(far, |k| t[k]),
             }
         });
         Ok(pixels.collect())
@@ -373,7 +374,7 @@ impl RayField for Mlp {
     }
 }
 
-/// One of the networks of a file, whose numbers must be finite.
+/// Reads one of a file's networks, whose weights must be finite.
 fn read_network(
     weights: &nets::Weights,
     prefix: &str,
@@ -381,16 +382,16 @@ fn read_network(
     architecture: MlpArchitecture,
     device: Device,
 ) -> Result<MlpNetwork, TorchFieldError> {
-    let read = MlpNetwork::read(architecture, |name, shape| {
+    let network = MlpNetwork::read(architecture, |name, shape| {
         Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?)
     })?;
-    for (parameter, (name, _)) in read.parameters.iter().zip(MlpNetwork::names(&architecture)) {
-        if parameter.f_isfinite()?.f_all()?.f_int64_value(&[])? == 0 {
+    for (i, (name, _)) in MlpNetwork::parameter_shapes(&architecture).enumerate() {
+        if network.parameters[i].f_isfinite()?.f_all()?.f_int64_value(&[])? == 0 {
             let reason = format!("tensor {prefix}.{name} is not finite");
             return Err(TorchFieldError::Format { path: path.to_path_buf(), reason });
         }
     }
-    Ok(read.to(device, Kind::Float)?)
+    Ok(network.to(device, Kind::Float)?)
 }
 
 #[cfg(test)]
@@ -421,8 +422,9 @@ mod tests {
         for space in [Space::Ndc(frustum), Space::Contraction] {
             let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 90.0, space };
             let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
-            let seen = no_grad(|| field.see(&Batch::new(&rays, &field).unwrap(), None)).unwrap();
-            for (i, distances) in host(&seen.distances).unwrap().chunks_exact(24).enumerate() {
+            let seen =
+                no_grad(|| field.forward(&Batch::new(&rays, &field).unwrap(), None)).unwrap();
+            for (i, distances) in to_host(&seen.distances).unwrap().chunks_exact(24).enumerate() {
                 let ray = clip(&bounds, &rays[i]);
                 let ends = [ray.distance(ray.enter), ray.distance(ray.leave)];
                 let close = |a: f32, b: f32| (a / b - 1.0).abs() < 2e-3;
@@ -500,7 +502,8 @@ mod tests {
             .map(|seed| Mlp::new(architecture, Bounds::default(), seed, Device::Cpu).unwrap());
         mean.average_with(&b).unwrap();
         for ((mean, a), b) in mean.parameters().zip(a.parameters()).zip(b.parameters()) {
-            let (mean, a, b) = (host(&mean).unwrap(), host(&a).unwrap(), host(&b).unwrap());
+            let (mean, a, b) =
+                (to_host(&mean).unwrap(), to_host(&a).unwrap(), to_host(&b).unwrap());
             assert!(
                 mean.iter()
                     .zip(a.iter().zip(&b))

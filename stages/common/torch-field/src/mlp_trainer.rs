@@ -1,31 +1,31 @@
+use std::ops::Range;
 use std::path::Path;
 
 use nets::Adam;
-use radiance::{StepReport, Supervisor, Tally};
+use radiance::{MlpArchitecture, StepReport, Supervisor, Tally};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::error::TorchFieldError;
 use crate::mlp::{Batch, Mlp, SampleDraws};
-use crate::schedule::Schedule;
-use crate::step::Step;
+use crate::step::{Schedule, Step};
 
-/// How to train an [`Mlp`].
+/// Options for training an [`Mlp`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MlpTraining {
-    /// Rays in all.
+    /// Total number of rays.
     pub rays: u64,
-    /// Most rays in a step, sub-pixel rays counted each.
+    /// Maximum number of rays in a step, counting every sub-pixel ray.
     pub max_rays_per_step: usize,
     /// Learning rate at the start.
     pub learning_rate: f64,
-    /// Learning rate at the end, as a share of that.
+    /// Final learning rate as a fraction of the initial one.
     pub learning_rate_decay: f64,
-    /// How it gets there.
+    /// Learning rate between the start and the end.
     pub schedule: Schedule,
-    /// Standard deviation of what is added to raw densities.
+    /// Standard deviation of the noise on raw densities.
     pub density_noise_std: f64,
-    /// Seed of what is drawn.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
@@ -36,215 +36,243 @@ pub struct MlpTrainer {
     options: MlpTraining,
     adam: Adam,
     tally: Tally,
-    /// Steps in a row in which a network was stuck.
+    /// Number of consecutive steps in which a network was stuck.
     stuck_steps: u64,
 }
 
-/// Shards of a step on the CPU: by its rays alone, so that sums have one order at any thread count.
-/// Where a shard has few rays, libtorch's calls cost more than what they compute.
-fn shards(rays: usize) -> usize {
-    const MOST_SHARDS: usize = 8;
+/// Returns the number of shards of a step on the CPU. It depends only on the number of rays, so that
+/// sums have one order at any thread count. In shards of few rays, libtorch's calls cost more than
+/// what they compute: steps of 8 rays take a quarter less time in one shard (design note 022).
+fn shard_count(rays: usize) -> usize {
+    const MAX_SHARDS: usize = 8;
     const RAYS_PER_SHARD: usize = 16;
-    rays.div_ceil(RAYS_PER_SHARD).clamp(1, MOST_SHARDS)
+    rays.div_ceil(RAYS_PER_SHARD).clamp(1, MAX_SHARDS)
 }
 
-/// Samples that go through the fine network at once: few, so that what they leave on their way
-/// stays in the cache, and enough to be worth a call.
+/// Number of samples that pass through the fine network together: few enough that activations stay
+/// in the cache, enough to outweigh the overhead of a call (design note 022).
 const CHUNK_SAMPLES: usize = 4096;
-/// So many steps in a row in which a network is stuck are a collapse: no gradient leads out of it.
-const STUCK_STEPS: u64 = 200;
-/// Less of the light than this stopped by all samples: the background alone explains the images,
-/// and ReLU has no gradient there.
-const LEAST_STOPPED_SHARE: f64 = 1e-3;
-/// More of the light than this stopped by the first sample: what is left is of rays whose second
-/// happens to be drawn close to it, and what lies behind gets no gradient.
-const MOST_FIRST_STOPPED_SHARE: f64 = 0.9;
+/// Number of consecutive stuck steps that count as a collapse (design note 022).
+const MAX_STUCK_STEPS: u64 = 200;
+/// Minimum fraction of the light that all samples together stop. Below it, the background alone
+/// explains the images, and ReLU passes no gradient (design note 022).
+const MIN_STOPPED_FRACTION: f64 = 1e-3;
+/// Maximum fraction of the light that the first samples stop. Above it, the rest gets through only
+/// where the second sample is drawn close to the first, and nothing behind them gets a gradient
+/// (design note 022).
+const MAX_FIRST_STOPPED_FRACTION: f64 = 0.9;
 
-/// What a network makes of a step's rays, all together.
+/// Light that a network's samples stop, summed over rays.
 #[derive(Clone, Copy, Default)]
 struct StoppedLight {
-    /// Light that is stopped.
-    all: f64,
-    /// Light that the first sample stops.
+    /// Light stopped by all samples.
+    total: f64,
+    /// Light stopped by the first sample of each ray.
     first: f64,
 }
 
 impl StoppedLight {
-    fn by(weights: &Tensor) -> Result<Self, TchError> {
-        let sum = |of: &Tensor| of.f_sum(Kind::Double)?.f_double_value(&[]);
-        Ok(Self { all: sum(weights)?, first: sum(&weights.f_narrow(1, 0, 1)?)? })
+    fn new(weights: &Tensor) -> Result<Self, TchError> {
+        let first = weights.f_narrow(1, 0, 1)?;
+        Ok(Self {
+            total: weights.f_sum(Kind::Double)?.f_double_value(&[])?,
+            first: first.f_sum(Kind::Double)?.f_double_value(&[])?,
+        })
     }
 
     fn add(self, other: Self) -> Self {
-        Self { all: self.all + other.all, first: self.first + other.first }
+        Self { total: self.total + other.total, first: self.first + other.first }
     }
 
-    /// Why nothing more is learnt, if that is so for as many rays.
-    fn stuck(self, rays: f64) -> Option<&'static str> {
-        match self {
-            Self { all, .. } if all < LEAST_STOPPED_SHARE * rays => {
-                Some("it sees nothing but the background, and its ReLU passes no gradient")
-            }
-            Self { first, .. } if first > MOST_FIRST_STOPPED_SHARE * rays => {
-                Some("it sees a wall right before every camera, and nothing behind it")
-            }
-            _ => None,
+    /// Returns why the network is stuck, if it is; the sums are over `rays` rays.
+    fn stuck_reason(self, rays: f64) -> Option<&'static str> {
+        if self.total < MIN_STOPPED_FRACTION * rays {
+            Some("it renders only the background, where its ReLU passes no gradient")
+        } else if self.first > MAX_FIRST_STOPPED_FRACTION * rays {
+            Some("it renders a wall in front of every camera, behind which nothing gets a gradient")
+        } else {
+            None
         }
     }
 }
 
-/// What a piece of a step leaves.
+/// Gradients and statistics of a piece of a step.
 struct MlpPiece {
     gradients: Vec<Tensor>,
+    /// Colours of the rays, from the fine network.
     colours: Vec<[f32; 3]>,
+    /// Sum of the bundles' losses.
     loss: f64,
-    /// By the coarse and the fine network.
+    /// Light stopped in the coarse and in the fine network.
     stopped: [StoppedLight; 2],
 }
 
+impl MlpPiece {
+    /// Adds the next piece.
+    fn add(&mut self, other: Self) -> Result<(), TchError> {
+        for (sum, gradient) in self.gradients.iter_mut().zip(&other.gradients) {
+            let _ = sum.f_add_(gradient)?;
+        }
+        self.colours.extend(other.colours);
+        self.loss += other.loss;
+        for (sum, stopped) in self.stopped.iter_mut().zip(other.stopped) {
+            *sum = sum.add(stopped);
+        }
+        Ok(())
+    }
+}
+
 impl MlpTrainer {
-    /// Starts from a field.
+    /// Creates a trainer of `field`.
     pub fn new(field: Mlp, options: MlpTraining) -> Result<Self, TorchFieldError> {
         let adam = Adam::new(field.parameters())?;
         Ok(Self { field, options, adam, tally: Tally::default(), stuck_steps: 0 })
     }
 
-    /// The field as it is now.
+    /// Returns the field in its current state.
     pub fn field(&self) -> &Mlp {
         &self.field
     }
 
-    /// Steps taken.
+    /// Returns the number of steps taken.
     pub fn steps(&self) -> u64 {
         self.tally.steps
     }
 
-    /// Rays cast so far.
+    /// Returns the number of rays cast.
     pub fn rays_done(&self) -> u64 {
         self.tally.rays
     }
 
-    /// Takes a step; `None` once all rays are spent.
+    /// Takes one step; returns `None` after all rays are used.
     pub fn step(
         &mut self,
         supervision: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
         let done = self.tally.done(self.options.rays);
         supervision.set_progress(done);
-        let bundle = supervision.rays_per_bundle();
-        let Some(bundles) =
-            self.tally.bundles_of_step(self.options.rays, self.options.max_rays_per_step, bundle)
-        else {
+        let rays_per_bundle = supervision.rays_per_bundle();
+        let Some(bundles) = self.tally.bundles_of_step(
+            self.options.rays,
+            self.options.max_rays_per_step,
+            rays_per_bundle,
+        ) else {
             return Ok(None);
         };
-        let step = Step::new(&self.tally, bundles, bundle);
-        let pieces = self.pieces(&*supervision, step)?;
-        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / bundles as f64;
-        let rays = bundles * bundle;
-        let stopped = [0, 1].map(|i| {
-            pieces.iter().map(|p| p.stopped[i]).fold(StoppedLight::default(), StoppedLight::add)
-        });
-        self.tally.count(bundles, bundle);
-        let mut gradients = Vec::new();
-        let mut colours = Vec::with_capacity(pieces.len());
-        for piece in pieces {
-            colours.push(piece.colours);
-            if gradients.is_empty() {
-                gradients = piece.gradients;
-            } else {
-                no_grad(|| {
-                    gradients
-                        .iter_mut()
-                        .zip(&piece.gradients)
-                        .try_for_each(|(sum, g)| sum.f_add_(g).map(drop))
-                })?;
-            }
-        }
-        let skipped = !loss.is_finite() || !nets::all_finite(&gradients)?;
+        let step = Step::new(&self.tally, bundles, rays_per_bundle);
+        let rays = step.rays();
+        let pieces = self.run_step(&*supervision, step)?;
+        self.tally.count(bundles, rays_per_bundle);
+        let Some(sum) = no_grad(|| sum_in_order(pieces))? else { return Ok(None) };
+        let loss = sum.loss / bundles as f64;
+        let skipped = !loss.is_finite() || !nets::all_finite(&sum.gradients)?;
         if skipped {
             if !self.tally.forgives() {
                 return Err(TorchFieldError::NotFinite { step: self.tally.steps });
             }
         } else {
-            self.take(&gradients, done)?;
-            step.remember(supervision, colours.iter().map(Vec::as_slice));
+            self.apply_gradients(&sum.gradients, done)?;
+            step.remember(supervision, &[sum.colours]);
         }
         self.tally.steps += 1;
-        let stuck = ["coarse", "fine"]
-            .into_iter()
-            .zip(stopped)
-            .find_map(|(n, s)| Some((n, s.stuck(rays as f64)?)));
-        self.stuck_steps = if stuck.is_some() { self.stuck_steps + 1 } else { 0 };
-        if let Some((network, why)) = stuck.filter(|_| self.stuck_steps >= STUCK_STEPS) {
-            return Err(TorchFieldError::Collapsed { step: self.tally.steps, network, why });
-        }
-        let samples = rays
-            * (2 * self.field.architecture.coarse_samples + self.field.architecture.fine_samples)
-                as usize;
+        self.check_collapse(sum.stopped, rays)?;
+        let MlpArchitecture { coarse_samples, fine_samples, .. } = self.field.architecture;
+        let samples = rays * (2 * coarse_samples + fine_samples) as usize;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
     }
 
-    /// Forward and backward: on the CPU in shards, in parallel; on a GPU in as few pieces as its
-    /// memory allows.
-    fn pieces(
+    /// Counts consecutive stuck steps; fails if a network has collapsed.
+    fn check_collapse(
+        &mut self,
+        [coarse, fine]: [StoppedLight; 2],
+        rays: usize,
+    ) -> Result<(), TorchFieldError> {
+        let coarse = coarse.stuck_reason(rays as f64).map(|reason| ("coarse", reason));
+        let fine = fine.stuck_reason(rays as f64).map(|reason| ("fine", reason));
+        let Some((network, reason)) = coarse.or(fine) else {
+            self.stuck_steps = 0;
+            return Ok(());
+        };
+        self.stuck_steps += 1;
+        if self.stuck_steps >= MAX_STUCK_STEPS {
+            return Err(TorchFieldError::Collapsed { step: self.tally.steps, network, reason });
+        }
+        Ok(())
+    }
+
+    /// Runs the forward and backward pass of a step: on the CPU in parallel shards, on a GPU in as
+    /// few pieces as its memory allows.
+    fn run_step(
         &self,
         supervision: &impl Supervisor,
         step: Step,
     ) -> Result<Vec<MlpPiece>, TorchFieldError> {
-        let plan =
+        let context =
             StepContext { step, seed: self.options.seed, noise: self.options.density_noise_std };
         if self.field.device != Device::Cpu {
-            return step.in_pieces(|range| plan.run(&self.field, supervision, range));
+            return step.run_in_pieces(|range| context.run(&self.field, supervision, range));
         }
-        let (bundles, count) = (step.bundles, shards(step.bundles * step.bundle));
-        let shards: Vec<(Mlp, std::ops::Range<usize>)> = (0..count)
-            .map(|i| (self.field.share(), bundles * i / count..bundles * (i + 1) / count))
+        let (bundles, count) = (step.bundles, shard_count(step.rays()));
+        let shards: Vec<(Mlp, Range<usize>)> = (0..count)
+            .map(|i| (self.field.shallow_clone(), bundles * i / count..bundles * (i + 1) / count))
             .collect();
         let pieces: Result<Vec<Option<MlpPiece>>, TchError> = shards
             .into_par_iter()
-            .map(|(field, range)| plan.run_all(&field, supervision, range))
+            .map(|(field, range)| context.run_shard(&field, supervision, range))
             .collect();
         Ok(pieces?.into_iter().flatten().collect())
     }
 
-    /// Moves the parameters.
-    pub(crate) fn take(&mut self, gradients: &[Tensor], done: f64) -> Result<(), TchError> {
-        let rate = self.tally.rate_scale
-            * self.options.schedule.rate(
-                self.options.learning_rate,
-                self.options.learning_rate_decay,
-                done,
-            );
-        self.adam.step(self.field.parameters(), gradients, rate)
+    /// Updates the parameters when a fraction `done` of the training is over.
+    pub(crate) fn apply_gradients(
+        &mut self,
+        gradients: &[Tensor],
+        done: f64,
+    ) -> Result<(), TchError> {
+        let MlpTraining { schedule, learning_rate, learning_rate_decay, .. } = self.options;
+        let learning_rate = self.tally.rate_scale
+            * schedule.learning_rate(learning_rate, learning_rate_decay, done);
+        self.adam.step(self.field.parameters(), gradients, learning_rate)
     }
 
-    /// Writes all that a resumed training needs. The caller makes it atomic.
+    /// Writes a checkpoint, from which a training resumes. The caller makes the write atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
         let [steps, bundles, rays, scale, fault] = self.tally.counters();
         Ok(self.adam.write_checkpoint(
             path,
-            self.field.named(),
+            self.field.named_parameters(),
             &[steps, bundles, rays, scale, fault, self.stuck_steps],
         )?)
     }
 
-    /// The step a checkpoint was written at.
+    /// Reads the step at which a checkpoint was written.
     pub fn checkpoint_step(path: &Path) -> Result<u64, TorchFieldError> {
         let [steps, ..] = Adam::counts_of_checkpoint::<6>(path)?;
         Ok(steps)
     }
 
-    /// Goes on from a checkpoint of a trainer made with the same field and options.
+    /// Resumes from a checkpoint of a trainer with the same field and options.
     pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
         let (adam, [tally @ .., stuck_steps]): (Adam, [u64; 6]) =
-            Adam::resume(path, &self.field.named())?;
-        (self.adam, self.tally, self.stuck_steps) =
-            (adam, Tally::from_counters(tally), stuck_steps);
+            Adam::resume(path, &self.field.named_parameters())?;
+        self.adam = adam;
+        self.tally = Tally::from_counters(tally);
+        self.stuck_steps = stuck_steps;
         Ok(())
     }
 }
 
-/// What a piece of a step needs to know of the whole.
+/// Adds up pieces in their order; returns `None` if there are none.
+fn sum_in_order(pieces: impl IntoIterator<Item = MlpPiece>) -> Result<Option<MlpPiece>, TchError> {
+    let mut pieces = pieces.into_iter();
+    let Some(mut sum) = pieces.next() else { return Ok(None) };
+    for piece in pieces {
+        sum.add(piece)?;
+    }
+    Ok(Some(sum))
+}
+
+/// Values of a step that all its pieces need.
 #[derive(Clone, Copy)]
 struct StepContext {
     step: Step,
@@ -253,41 +281,33 @@ struct StepContext {
 }
 
 impl StepContext {
-    /// A shard in chunks, one after the other.
-    fn run_all(
+    /// Runs a shard in chunks, one after the other.
+    fn run_shard(
         self,
         field: &Mlp,
         supervision: &impl Supervisor,
-        range: std::ops::Range<usize>,
+        range: Range<usize>,
     ) -> Result<Option<MlpPiece>, TchError> {
         let samples =
             (field.architecture.coarse_samples + field.architecture.fine_samples) as usize;
-        let chunk = (CHUNK_SAMPLES / (samples * self.step.bundle)).max(1);
-        let mut whole: Option<MlpPiece> = None;
+        let chunk = (CHUNK_SAMPLES / (samples * self.step.rays_per_bundle)).max(1);
+        let mut sum = None::<MlpPiece>;
         for start in range.clone().step_by(chunk) {
             let piece = self.run(field, supervision, start..(start + chunk).min(range.end))?;
-            whole = Some(match whole {
-                None => piece,
-                Some(mut sum) => {
-                    for (sum, g) in sum.gradients.iter_mut().zip(&piece.gradients) {
-                        let _ = sum.f_add_(g)?;
-                    }
-                    sum.colours.extend(piece.colours);
-                    sum.loss += piece.loss;
-                    (0..2).for_each(|i| sum.stopped[i] = sum.stopped[i].add(piece.stopped[i]));
-                    sum
-                }
-            });
+            match &mut sum {
+                None => sum = Some(piece),
+                Some(sum) => sum.add(piece)?,
+            }
         }
-        Ok(whole)
+        Ok(sum)
     }
 
-    /// Some bundles forward and back, at once.
+    /// Runs the forward and backward pass of a range of bundles.
     fn run(
         self,
         field: &Mlp,
         supervision: &impl Supervisor,
-        range: std::ops::Range<usize>,
+        range: Range<usize>,
     ) -> Result<MlpPiece, TchError> {
         let rays = self.step.sample_rays(supervision, &range);
         let draws = SampleDraws::new(
@@ -297,25 +317,31 @@ impl StepContext {
             rays.len(),
             self.noise,
         )?;
-        let seen = field.see(&Batch::new(&rays, field)?, Some(&draws))?;
-        let coarse = self.step.loss_and_gradient(supervision, &range, &seen.coarse.colour)?;
-        let fine = self.step.loss_and_gradient(supervision, &range, &seen.fine.colour)?;
+        let forward = field.forward(&Batch::new(&rays, field)?, Some(&draws))?;
+        let coarse = self.step.loss(supervision, &range, &forward.coarse.colour)?;
+        let fine = self.step.loss(supervision, &range, &forward.fine.colour)?;
         let parameters: Vec<Tensor> = field.parameters().collect();
         let gradients = Tensor::f_run_backward(
-            &[coarse.towards.f_add(&fine.towards)?],
+            &[coarse.surrogate.f_add(&fine.surrogate)?],
             &parameters,
             false,
             false,
         )?;
-        let stopped =
-            [StoppedLight::by(&seen.coarse.weights)?, StoppedLight::by(&seen.fine.weights)?];
-        Ok(MlpPiece { gradients, colours: fine.colours, loss: coarse.loss + fine.loss, stopped })
+        Ok(MlpPiece {
+            gradients,
+            colours: fine.colours,
+            loss: coarse.sum + fine.sum,
+            stopped: [
+                StoppedLight::new(&forward.coarse.weights)?,
+                StoppedLight::new(&forward.fine.weights)?,
+            ],
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use radiance::{MlpArchitecture, Ray};
+    use radiance::Ray;
     use scene::Bounds;
 
     use super::*;
@@ -394,20 +420,20 @@ mod tests {
     #[test]
     fn collapses_are_told() {
         assert_eq!(collapse(|f| &f.fine, 0.5), None);
-        for (network, shift, said) in [
+        for (network, shift, expected) in [
             (
                 (|f| &f.coarse) as fn(&Mlp) -> &MlpNetwork,
                 -300.0,
-                "the coarse network has collapsed: it sees nothing but the background",
+                "the coarse network has collapsed: it renders only the background",
             ),
             (
                 |f| &f.fine,
                 300.0,
-                "the fine network has collapsed: it sees a wall right before every camera",
+                "the fine network has collapsed: it renders a wall in front of every camera",
             ),
         ] {
             let error = collapse(network, shift).expect("a collapse");
-            assert!(error.contains("step 200") && error.contains(said), "{error}");
+            assert!(error.contains("step 200") && error.contains(expected), "{error}");
         }
     }
 }

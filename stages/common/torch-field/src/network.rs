@@ -4,33 +4,52 @@ use counter_rng::CounterRng;
 use radiance::MlpArchitecture;
 use tch::{Device, Kind, TchError, Tensor};
 
-use crate::encoding::encoded;
 use crate::error::TorchFieldError;
 
-/// One of the two networks: position → density and a feature, that and direction → colour.
-/// Parameters are weight and bias of each layer, in the order of [`MlpNetwork::layers`].
+/// One of the two networks: position → density and feature; feature and direction → colour.
 #[derive(Debug)]
 pub(crate) struct MlpNetwork {
     architecture: MlpArchitecture,
+    /// Weight and bias of each layer, in the order of [`MlpNetwork::layers`].
     pub(crate) parameters: Vec<Tensor>,
 }
 
-/// A linear layer: its name in the reference's checkpoints, inputs, outputs.
+/// Linear layer: name in the reference's checkpoints, inputs, outputs.
 type Layer = (String, i64, i64);
 
-/// The encoded position joins in again at this layer, counted from 0.
-const SKIP: u32 = 4;
+/// Index of the layer that also takes the encoded position (Mildenhall et al. 2020).
+const SKIP_LAYER: u32 = 4;
+
+/// Stream of random numbers for the initial weights.
+const WEIGHTS: u64 = 200;
+
+/// Returns the number of outputs of [`encode`] for `dims` inputs.
+fn encoded_dims(dims: i64, octaves: u32) -> i64 {
+    dims * (1 + 2 * i64::from(octaves))
+}
+
+/// Encodes rows x as x, then sin(2ᵏx) and cos(2ᵏx) for k = 0, 1, …: in the reference's order, and
+/// without the paper's π.
+pub(crate) fn encode(x: &Tensor, octaves: u32) -> Result<Tensor, TchError> {
+    let mut parts = vec![x.shallow_clone()];
+    for k in 0..octaves {
+        let scaled = x.f_mul_scalar(f64::from(k).exp2())?;
+        parts.push(scaled.f_sin()?);
+        parts.push(scaled.f_cos()?);
+    }
+    Tensor::f_cat(&parts, -1)
+}
 
 impl MlpNetwork {
-    /// Layers from front to back.
+    /// Returns the layers from input to output.
     pub(crate) fn layers(architecture: &MlpArchitecture) -> Vec<Layer> {
         let width = i64::from(architecture.width);
-        let position = encoded(3, architecture.position_octaves);
-        let direction = encoded(3, architecture.direction_octaves);
+        let position = encoded_dims(3, architecture.position_octaves);
+        let direction = encoded_dims(3, architecture.direction_octaves);
         let trunk = (0..architecture.depth).map(|i| {
             let inputs = match i {
                 0 => position,
-                SKIP => position + width,
+                SKIP_LAYER => position + width,
                 _ => width,
             };
             (format!("xyz_encoding_{}.0", i + 1), inputs, width)
@@ -46,8 +65,8 @@ impl MlpNetwork {
             .collect()
     }
 
-    /// Names of the parameters.
-    pub(crate) fn names(
+    /// Returns the parameters' names and shapes.
+    pub(crate) fn parameter_shapes(
         architecture: &MlpArchitecture,
     ) -> impl Iterator<Item = (String, Vec<i64>)> {
         Self::layers(architecture).into_iter().flat_map(|(name, inputs, outputs)| {
@@ -58,8 +77,8 @@ impl MlpNetwork {
         })
     }
 
-    /// He et al. 2015, normal, for every layer, with biases of 0: the reference's. `index` tells
-    /// the networks of a seed apart.
+    /// Initialises every layer like the reference: weights by He et al. 2015 (normal), biases 0.
+    /// Networks of one seed differ in `index`.
     pub(crate) fn new(
         architecture: MlpArchitecture,
         seed: u64,
@@ -78,82 +97,83 @@ impl MlpNetwork {
         Self { architecture, parameters }.to(device, Kind::Float)
     }
 
-    /// From parameters by name, each with its shape.
+    /// Creates a network from parameters that `tensor` returns by name and shape.
     pub(crate) fn read(
         architecture: MlpArchitecture,
         mut tensor: impl FnMut(&str, &[i64]) -> Result<Tensor, TorchFieldError>,
     ) -> Result<Self, TorchFieldError> {
-        let parameters = Self::names(&architecture)
+        let parameters = Self::parameter_shapes(&architecture)
             .map(|(name, shape)| tensor(&name, &shape))
             .collect::<Result<_, _>>()?;
         Ok(Self { architecture, parameters })
     }
 
-    /// The same network elsewhere or in another precision; its parameters take gradients.
+    /// Copies the network to a device and precision; the copies require gradients.
     pub(crate) fn to(&self, device: Device, kind: Kind) -> Result<Self, TchError> {
-        let moved = self.parameters.iter().map(|t| learnable(t, device, kind));
+        let moved = self.parameters.iter().map(|t| trainable_copy(t, device, kind));
         Ok(Self { architecture: self.architecture, parameters: moved.collect::<Result<_, _>>()? })
     }
 
-    /// Another handle on the same parameters, for another thread.
-    pub(crate) fn share(&self) -> Self {
+    /// Returns another handle to the same parameters, for another thread.
+    pub(crate) fn shallow_clone(&self) -> Self {
         Self {
             architecture: self.architecture,
             parameters: self.parameters.iter().map(Tensor::shallow_clone).collect(),
         }
     }
 
-    /// Colour (n × 3, in 0..1) and raw density (n) of encoded positions and directions.
+    /// Returns colours (n × 3, in 0..1) and raw densities (n) at encoded positions and directions.
     pub(crate) fn forward(
         &self,
         position: &Tensor,
         direction: &Tensor,
     ) -> Result<(Tensor, Tensor), TchError> {
         let depth = self.architecture.depth as usize;
-        let linear =
-            |x: &Tensor, i: usize| linear(x, &self.parameters[2 * i], &self.parameters[2 * i + 1]);
         let mut x = position.shallow_clone();
         for i in 0..depth {
-            if i == SKIP as usize {
+            if i == SKIP_LAYER as usize {
                 x = Tensor::f_cat(&[position, &x], -1)?;
             }
-            x = linear(&x, i)?.f_relu()?;
+            x = self.layer(&x, i)?.f_relu()?;
         }
-        let density = linear(&x, depth)?.f_squeeze_dim(-1)?;
-        let feature = linear(&x, depth + 1)?;
-        let shaded = linear(&Tensor::f_cat(&[&feature, direction], -1)?, depth + 2)?.f_relu()?;
-        Ok((linear(&shaded, depth + 3)?.f_sigmoid()?, density))
+        let density = self.layer(&x, depth)?.f_squeeze_dim(-1)?;
+        let feature = self.layer(&x, depth + 1)?;
+        let input = Tensor::f_cat(&[&feature, direction], -1)?;
+        let hidden = self.layer(&input, depth + 2)?.f_relu()?;
+        Ok((self.layer(&hidden, depth + 3)?.f_sigmoid()?, density))
+    }
+
+    /// Applies the layer with this index.
+    fn layer(&self, x: &Tensor, i: usize) -> Result<Tensor, TchError> {
+        linear(x, &self.parameters[2 * i], &self.parameters[2 * i + 1])
     }
 }
 
-/// A copy elsewhere or in another precision, which takes gradients.
-fn learnable(tensor: &Tensor, device: Device, kind: Kind) -> Result<Tensor, TchError> {
+/// Copies a tensor to a device and precision; the copy requires gradients.
+fn trainable_copy(tensor: &Tensor, device: Device, kind: Kind) -> Result<Tensor, TchError> {
     Ok(tensor.f_to_device(device)?.f_to_kind(kind)?.f_detach_copy()?.set_requires_grad(true))
 }
 
-/// A linear layer. In f32 on a CPU by oneDNN, where libtorch has it: MKL's products use half of the
-/// vectors on processors that aren't Intel's (92 against 216 GFLOP/s on a core of the machine this
-/// was measured on), and oneDNN's are as exact.
+/// Applies a linear layer, in f32 on a CPU through oneDNN if libtorch has it: on processors of other
+/// makers than Intel, MKL uses only half of the vector width (92 against 216 GFLOP/s per core where
+/// this was measured), and oneDNN is as accurate (design note 022).
 fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
     static HAS_ONEDNN: LazyLock<bool> = LazyLock::new(|| {
         let one = Tensor::ones([1, 1], (Kind::Float, Device::Cpu));
-        by_onednn(&one, &one, &one.reshape([1])).is_ok()
+        onednn_linear(&one, &one, &one.reshape([1])).is_ok()
     });
     if x.kind() == Kind::Float && x.device() == Device::Cpu && *HAS_ONEDNN {
-        by_onednn(x, weight, bias)
+        onednn_linear(x, weight, bias)
     } else {
         x.f_linear(weight, Some(bias))
     }
 }
 
-fn by_onednn(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
+fn onednn_linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
     x.f_to_mkldnn(None)?.f_mkldnn_linear(weight, Some(bias))?.f_to_dense(None, false)
 }
 
-/// Purposes of draws.
-const WEIGHTS: u64 = 200;
-
-/// A standard normal draw (Box and Muller 1958).
+/// Draws from the standard normal distribution (Box and Muller 1958).
 pub(crate) fn normal(rng: &mut CounterRng) -> f64 {
     let radius = (-2.0 * (1.0 - f64::from(rng.uniform())).ln()).sqrt();
     radius * (std::f64::consts::TAU * f64::from(rng.uniform())).cos()

@@ -2,26 +2,26 @@ use radiance::{NormalizedRay, Ray, RayMap, clip};
 use scene::{Bounds, Space};
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
 
-use crate::transfer::columns;
-
-/// How rays run through the unit cube, as tensors: `radiance`'s [`NormalizedRay`]s, which it clips
-/// in f64 and on the host.
+/// Rays in the unit cube as tensors, from `radiance`'s [`NormalizedRay`]s, which are clipped on the
+/// host in f64.
 #[derive(Debug)]
 pub(crate) struct RayMaps {
     origin: Tensor,
     direction: Tensor,
-    /// What colours depend on: n × 3. The direction in the world, of unit length, or that in NDC,
-    /// of which z goes from -1 to 1.
+    /// View directions, on which colours depend (n × 3): in the world with unit length, or in NDC
+    /// scaled so that z runs from -1 to 1.
     pub(crate) view: Tensor,
-    /// Where they enter and leave, by their parameter t: n × 1. Equal where they meet nothing.
+    /// Parameters t at which rays enter and leave the cube (n × 1 each), equal if they miss it.
     pub(crate) enter: Tensor,
     pub(crate) leave: Tensor,
-    /// Distance where t is 0, its growth, and its perspective or its radii: n × 1 each.
+    /// Coefficients of the map from t to distance (n × 1 each): start, scale, and perspective or
+    /// radii.
     distance: [Tensor; 3],
-    contracted: bool,
+    is_contracted: bool,
 }
 
 impl RayMaps {
+    /// Clips rays to the unit cube of `bounds`.
     pub(crate) fn new(
         bounds: &Bounds,
         rays: &[Ray],
@@ -29,63 +29,72 @@ impl RayMaps {
         ndc_directions: bool,
     ) -> Result<Self, TchError> {
         let rays: Vec<NormalizedRay> = rays.iter().map(|r| clip(bounds, r)).collect();
-        let of_map = |k: usize| columns(&rays, device, |r| [distance_map(r)[k]]);
         let is_ndc = ndc_directions && matches!(bounds.space, Space::Ndc(_));
-        let in_ndc = |r: &NormalizedRay| r.direction.map(|d| 2.0 * d / r.direction[2]);
-        // What isn't finite meets nothing; its view must not spoil the others' sums.
-        let tame = |v: [f32; 3]| if v.iter().all(|x| x.is_finite()) { v } else { [0.0; 3] };
         Ok(Self {
             origin: columns(&rays, device, |r| r.origin)?,
             direction: columns(&rays, device, |r| r.direction)?,
-            view: columns(&rays, device, |r| tame(if is_ndc { in_ndc(r) } else { r.view }))?,
+            view: columns(&rays, device, |r| view_direction(r, is_ndc))?,
             enter: columns(&rays, device, |r| [r.enter])?,
             leave: columns(&rays, device, |r| [r.leave.max(r.enter)])?,
-            distance: [of_map(0)?, of_map(1)?, of_map(2)?],
-            contracted: bounds.space == Space::Contraction,
+            distance: [
+                columns(&rays, device, |r| [distance_map(r)[0]])?,
+                columns(&rays, device, |r| [distance_map(r)[1]])?,
+                columns(&rays, device, |r| [distance_map(r)[2]])?,
+            ],
+            is_contracted: bounds.space == Space::Contraction,
         })
     }
 
-    /// Places in the unit cube at t (n × m): n × m × 3.
+    /// Returns positions in the unit cube at t (n × m): n × m × 3.
     pub(crate) fn positions(&self, t: &Tensor) -> Result<Tensor, TchError> {
         let (origin, direction) = (self.origin.f_unsqueeze(1)?, self.direction.f_unsqueeze(1)?);
-        if !self.contracted {
-            return fused(&direction, &t.f_unsqueeze(-1)?, &origin);
+        if !self.is_contracted {
+            return multiply_add(&direction, &t.f_unsqueeze(-1)?, &origin);
         }
         let along = sinh4(t)?.f_mul(&self.distance[2])?;
-        let u = fused(&direction, &along.f_unsqueeze(-1)?, &origin)?;
+        let u = multiply_add(&direction, &along.f_unsqueeze(-1)?, &origin)?;
         let length = u
             .f_square()?
             .f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?
             .f_sqrt()?
             .f_clamp_min(1.0)?;
-        // (2 - 1 / length) / length, which is 1 where the length is.
+        // (2 - 1 / length) / length, which is 1 if the length is 1.
         let factor = length.f_reciprocal()?.f_neg()?.f_add_scalar(2.0)?.f_div(&length)?;
         u.f_mul(&factor)?.f_mul_scalar(0.25)?.f_add_scalar(0.5)
     }
 
-    /// Distances in scene units at t (n × m).
+    /// Returns distances in scene units at t (n × m).
     pub(crate) fn distances(&self, t: &Tensor) -> Result<Tensor, TchError> {
         let [start, scale, perspective] = &self.distance;
-        if self.contracted {
+        if self.is_contracted {
             return sinh4(t)?.f_mul(scale)?.f_add(start);
         }
         t.f_mul(scale)?.f_div(&t.f_mul(perspective)?.f_neg()?.f_add_scalar(1.0)?)?.f_add(start)
     }
 
-    /// Which rays meet the cube: n.
+    /// Returns whether each ray hits the cube: n.
     pub(crate) fn hits(&self) -> Result<Tensor, TchError> {
         self.enter.i((.., 0)).f_lt_tensor(&self.leave.i((.., 0)))
     }
 }
 
-/// a·b + c rounded once, as the hand-written field does it by fused multiply-adds, for which f64
-/// stands here.
-pub(crate) fn fused(a: &Tensor, b: &Tensor, c: &Tensor) -> Result<Tensor, TchError> {
-    let wide = |t: &Tensor| t.f_to_kind(Kind::Double);
-    wide(a)?.f_mul(&wide(b)?)?.f_add(&wide(c)?)?.f_to_kind(Kind::Float)
+/// Returns a ray's view direction; zero if it isn't finite, since NaN would spoil the sums of other
+/// rays.
+fn view_direction(ray: &NormalizedRay, is_ndc: bool) -> [f32; 3] {
+    let view = if is_ndc { ray.direction.map(|d| 2.0 * d / ray.direction[2]) } else { ray.view };
+    if view.iter().all(|x| x.is_finite()) { view } else { [0.0; 3] }
 }
 
-/// Distance where t is 0, its growth, and its perspective or its radii.
+/// Computes a·b + c rounded once, through f64, like the fused multiply-add of the hand-written
+/// field.
+pub(crate) fn multiply_add(a: &Tensor, b: &Tensor, c: &Tensor) -> Result<Tensor, TchError> {
+    a.f_to_kind(Kind::Double)?
+        .f_mul(&b.f_to_kind(Kind::Double)?)?
+        .f_add(&c.f_to_kind(Kind::Double)?)?
+        .f_to_kind(Kind::Float)
+}
+
+/// Returns the coefficients of a ray's map from t to distance: start, scale, perspective or radii.
 fn distance_map(ray: &NormalizedRay) -> [f32; 3] {
     match ray.map {
         RayMap::Straight { start, scale, perspective } => [start, scale, perspective],
@@ -93,9 +102,35 @@ fn distance_map(ray: &NormalizedRay) -> [f32; 3] {
     }
 }
 
-/// sinh(4t).
+/// Computes sinh(4t).
 fn sinh4(t: &Tensor) -> Result<Tensor, TchError> {
     t.f_mul_scalar(4.0)?.f_sinh()
+}
+
+/// Copies values to a device as a matrix.
+pub(crate) fn matrix(values: &[f32], shape: [i64; 2], device: Device) -> Result<Tensor, TchError> {
+    Tensor::f_from_slice(values)?.f_reshape(shape)?.f_to_device(device)
+}
+
+/// Returns a matrix (n × `N`) of `N` values for each of n rays.
+pub(crate) fn columns<T, const N: usize>(
+    rays: &[T],
+    device: Device,
+    values: impl Fn(&T) -> [f32; N],
+) -> Result<Tensor, TchError> {
+    let values: Vec<f32> = rays.iter().flat_map(values).collect();
+    matrix(&values, [rays.len() as i64, N as i64], device)
+}
+
+/// Copies a tensor's elements to the host, in f32.
+pub(crate) fn to_host(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
+    let flat = tensor
+        .f_detach()?
+        .f_to_device(Device::Cpu)?
+        .f_to_kind(Kind::Float)?
+        .f_contiguous()?
+        .f_view([-1])?;
+    Vec::<f32>::try_from(flat)
 }
 
 #[cfg(test)]

@@ -2,60 +2,66 @@ use radiance::Regularisers;
 use radiance::spec::LIKE_BACKGROUND;
 use tch::{Kind, TchError, Tensor};
 
-use crate::grid::GridSeen;
+use crate::grid::GridForward;
 
-/// Adds what is asked of the rays that are `seen`, beside their colours, to a number whose gradient
-/// is that of the step's loss. The step has so many `rays`; they are marched by `march_step`.
+/// Adds the regularisers' losses to `surrogate`, a scalar whose gradient is that of the step's mean
+/// loss. `forward` has some of the step's `rays` rays, marched by `march_step`.
 pub(crate) fn add_regularisers(
-    mut towards: Tensor,
+    mut surrogate: Tensor,
     regularisers: &Regularisers,
-    seen: &GridSeen,
+    forward: &GridForward,
     backgrounds: &Tensor,
     march_step: f64,
     rays: usize,
 ) -> Result<Tensor, TchError> {
     let Regularisers { distortion, floater_loss } = *regularisers;
-    let share = |weight: f32| f64::from(weight) / rays as f64;
     if distortion > 0.0 {
-        let sum = distortion_sum(seen, march_step)?;
-        towards = towards.f_add(&sum.f_mul_scalar(share(distortion))?)?;
+        let loss = distortion_sum(forward, march_step)?;
+        let weight = f64::from(distortion) / rays as f64;
+        surrogate = surrogate.f_add(&loss.f_mul_scalar(weight)?)?;
     }
     if floater_loss > 0.0 {
-        let sum = floater_sum(seen, backgrounds)?;
-        towards = towards.f_add(&sum.f_mul_scalar(share(floater_loss))?)?;
+        let loss = floater_sum(forward, backgrounds)?;
+        let weight = f64::from(floater_loss) / rays as f64;
+        surrogate = surrogate.f_add(&loss.f_mul_scalar(weight)?)?;
     }
-    Ok(towards)
+    Ok(surrogate)
 }
 
-/// The distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), summed over all rays: Σ_ij
-/// w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i².
-fn distortion_sum(seen: &GridSeen, step: f64) -> Result<Tensor, TchError> {
-    let weights = seen.weights.f_mul(&seen.counted)?;
-    let moments = weights.f_mul(&seen.t)?;
-    let before = |of: &Tensor| of.f_cumsum(1, None::<Kind>)?.f_sub(of);
-    let apart = seen.t.f_mul(&before(&weights)?)?.f_sub(&before(&moments)?)?;
-    let pairs = weights.f_mul(&apart)?.f_mul_scalar(2.0)?;
+/// Computes the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), summed over all rays:
+/// Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i².
+fn distortion_sum(forward: &GridForward, step: f64) -> Result<Tensor, TchError> {
+    let weights = forward.weights.f_mul(&forward.counted)?;
+    let moments = weights.f_mul(&forward.t)?;
+    let weights_before = weights.f_cumsum(1, None::<Kind>)?.f_sub(&weights)?;
+    let moments_before = moments.f_cumsum(1, None::<Kind>)?.f_sub(&moments)?;
+    let distances = forward.t.f_mul(&weights_before)?.f_sub(&moments_before)?;
+    let pairs = weights.f_mul(&distances)?.f_mul_scalar(2.0)?;
     pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
 }
 
-/// The floater loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient
-/// by the colours or the transmittance T.
-fn floater_sum(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
-    let behind = backgrounds.f_index_select(0, &seen.shaded_ray)?;
-    let squared = seen.shaded_colour.f_detach()?.f_sub(&behind)?.f_square()?.f_sum_dim_intlist(
-        [1i64].as_slice(),
-        true,
-        None::<Kind>,
-    )?;
+/// Computes the floater loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, without
+/// gradients through the colours c or the transmittance T.
+fn floater_sum(forward: &GridForward, backgrounds: &Tensor) -> Result<Tensor, TchError> {
+    let background = backgrounds.f_index_select(0, &forward.shaded_ray)?;
+    let squared = forward
+        .shaded_colour
+        .f_detach()?
+        .f_sub(&background)?
+        .f_square()?
+        .f_sum_dim_intlist([1i64].as_slice(), true, None::<Kind>)?;
     let likeness = squared
         .f_mul_scalar(-1.0 / f64::from(LIKE_BACKGROUND).powi(2))?
         .f_add_scalar(1.0)?
         .f_relu()?;
-    let through =
-        seen.transmittance.f_detach()?.f_index_select(0, &seen.shaded_ray)?.f_unsqueeze(-1)?;
-    seen.shaded_weight.f_mul(&likeness)?.f_mul(&through)?.f_sum(None::<Kind>)
+    let transmittance = forward
+        .transmittance
+        .f_detach()?
+        .f_index_select(0, &forward.shaded_ray)?
+        .f_unsqueeze(-1)?;
+    forward.shaded_weight.f_mul(&likeness)?.f_mul(&transmittance)?.f_sum(None::<Kind>)
 }
 
-/// What tests ask of rays: of every regulariser something.
+/// Weights with which tests check every regulariser.
 #[cfg(test)]
 pub(crate) const ALL: Regularisers = Regularisers { distortion: 0.02, floater_loss: 0.01 };

@@ -4,104 +4,159 @@ use radiance::{Ray, Supervisor, Tally};
 use tch::{TchError, Tensor};
 
 use crate::error::TorchFieldError;
-use crate::transfer::host;
+use crate::ray_maps::to_host;
 
-/// A step of a training: so many bundles of rays, counted on from what was cast before.
+/// Learning rate over a training.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Schedule {
+    /// Exponential decay with every step, as in the paper's text.
+    Exponential,
+    /// Decay by epochs, as in the reference's code: constant until the last ten epochs, each of
+    /// which multiplies the rate by the eleventh root of the decay, so that the final rate is never
+    /// quite reached. A training of fewer than twenty epochs goes through the same twenty faster.
+    Epochs {
+        /// Number of epochs of the training.
+        epochs: u64,
+    },
+}
+
+impl Schedule {
+    /// Number of epochs at the end during which the code's schedule decays.
+    const FALLING_EPOCHS: u64 = 10;
+
+    /// Returns the learning rate when a fraction `done` of the training is over.
+    pub fn learning_rate(self, highest: f64, decay: f64, done: f64) -> f64 {
+        let progress = match self {
+            Self::Exponential => done,
+            Self::Epochs { epochs } => {
+                let epochs = epochs.max(2 * Self::FALLING_EPOCHS);
+                let epoch = ((done * epochs as f64) as u64).min(epochs - 1);
+                (epoch + 1 + Self::FALLING_EPOCHS).saturating_sub(epochs) as f64
+                    / (Self::FALLING_EPOCHS + 1) as f64
+            }
+        };
+        highest * decay.powf(progress)
+    }
+}
+
+/// One training step: `bundles` bundles of rays, numbered after those of all earlier steps.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Step {
     first_bundle: u64,
     first_ray: u64,
     pub(crate) bundles: usize,
-    /// Rays in a bundle.
-    pub(crate) bundle: usize,
+    pub(crate) rays_per_bundle: usize,
 }
 
-/// What a colour image adds to a step.
-pub(crate) struct Judged {
-    /// Sum over its bundles.
-    pub(crate) loss: f64,
+/// Loss of some of a step's bundles.
+pub(crate) struct StepLoss {
+    /// Sum of the bundles' losses.
+    pub(crate) sum: f64,
+    /// Colours of the rays.
     pub(crate) colours: Vec<[f32; 3]>,
-    /// A number whose gradient is that of the step's mean loss.
-    pub(crate) towards: Tensor,
+    /// Scalar whose gradient is that of the step's mean loss.
+    pub(crate) surrogate: Tensor,
 }
 
 impl Step {
-    pub(crate) fn new(tally: &Tally, bundles: usize, bundle: usize) -> Self {
-        Self { first_bundle: tally.bundles, first_ray: tally.rays, bundles, bundle }
+    /// Creates the step that follows those counted in `tally`.
+    pub(crate) fn new(tally: &Tally, bundles: usize, rays_per_bundle: usize) -> Self {
+        Self { first_bundle: tally.bundles, first_ray: tally.rays, bundles, rays_per_bundle }
     }
 
-    /// Number of the first ray of some of its bundles, over the whole training.
+    /// Returns the number of rays of the step.
+    pub(crate) fn rays(self) -> usize {
+        self.bundles * self.rays_per_bundle
+    }
+
+    /// Returns the index of the first ray of a range of the step's bundles, over the whole training.
     pub(crate) fn first_ray(self, range: &Range<usize>) -> u64 {
-        self.first_ray + (range.start * self.bundle) as u64
+        self.first_ray + (range.start * self.rays_per_bundle) as u64
     }
 
-    /// The rays of some of its bundles.
+    /// Samples the rays of a range of the step's bundles.
     pub(crate) fn sample_rays(
         self,
         supervision: &impl Supervisor,
         range: &Range<usize>,
     ) -> Vec<Ray> {
-        let mut rays = vec![Ray::default(); range.len() * self.bundle];
-        for (g, rays) in range.clone().zip(rays.chunks_exact_mut(self.bundle)) {
-            supervision.sample_rays(self.first_bundle + g as u64, rays);
+        let mut rays = vec![Ray::default(); range.len() * self.rays_per_bundle];
+        for (i, rays) in rays.chunks_exact_mut(self.rays_per_bundle).enumerate() {
+            supervision.sample_rays(self.first_bundle + (range.start + i) as u64, rays);
         }
         rays
     }
 
-    /// Judges their colours (n × 3).
-    pub(crate) fn loss_and_gradient(
+    /// Computes the loss of the colours (n × 3) of a range of the step's bundles.
+    pub(crate) fn loss(
         self,
         supervision: &impl Supervisor,
         range: &Range<usize>,
         colour: &Tensor,
-    ) -> Result<Judged, TchError> {
-        let colours = host(colour)?.as_chunks::<3>().0.to_vec();
+    ) -> Result<StepLoss, TchError> {
+        let colours = to_host(colour)?.as_chunks::<3>().0.to_vec();
         let mut gradients = vec![[0.0f32; 3]; colours.len()];
-        let pairs = colours.chunks_exact(self.bundle).zip(gradients.chunks_exact_mut(self.bundle));
-        let losses = range.clone().zip(pairs).map(|(g, (colours, gradients))| {
-            supervision.loss_and_gradient(self.first_bundle + g as u64, colours, gradients)
-        });
-        let loss = losses.sum();
+        let chunks = gradients.chunks_exact_mut(self.rays_per_bundle).enumerate();
+        let sum = chunks
+            .map(|(i, gradients)| {
+                let colours = &colours[i * self.rays_per_bundle..][..self.rays_per_bundle];
+                let bundle = self.first_bundle + (range.start + i) as u64;
+                supervision.loss_and_gradient(bundle, colours, gradients)
+            })
+            .sum();
         let scaled: Vec<f32> =
             gradients.as_flattened().iter().map(|g| g / self.bundles as f32).collect();
         let gradients = Tensor::f_from_slice(&scaled)?
             .f_reshape([colours.len() as i64, 3])?
             .f_to_device(colour.device())?;
-        Ok(Judged { loss, colours, towards: colour.f_mul(&gradients)?.f_sum(None::<tch::Kind>)? })
+        let surrogate = colour.f_mul(&gradients)?.f_sum(None::<tch::Kind>)?;
+        Ok(StepLoss { sum, colours, surrogate })
     }
 
-    /// Lets supervision keep what was seen.
-    pub(crate) fn remember<'a>(
-        self,
-        supervision: &mut impl Supervisor,
-        colours: impl Iterator<Item = &'a [[f32; 3]]>,
-    ) {
-        let bundles = colours.flat_map(|c| c.chunks_exact(self.bundle));
-        (self.first_bundle..)
-            .zip(bundles)
-            .for_each(|(bundle, colours)| supervision.remember(bundle, colours));
-    }
-
-    /// Goes through its bundles in as few pieces as memory allows: where there isn't enough, the
-    /// next ones are smaller.
-    pub(crate) fn in_pieces<T>(
-        self,
-        mut run: impl FnMut(Range<usize>) -> Result<T, TchError>,
-    ) -> Result<Vec<T>, TorchFieldError> {
-        let (mut pieces, mut next, mut size) = (Vec::new(), 0, self.bundles);
-        while next < self.bundles {
-            let range = next..(next + size).min(self.bundles);
-            match run(range.clone()) {
-                Ok(piece) => {
-                    pieces.push(piece);
-                    next = range.end;
-                }
-                Err(error) if size > 1 && nets::is_out_of_memory(&error) => size = size.div_ceil(2),
-                Err(error) => return Err(error.into()),
+    /// Passes the rendered colours of all pieces, in order, to the supervision.
+    pub(crate) fn remember(self, supervision: &mut impl Supervisor, pieces: &[Vec<[f32; 3]>]) {
+        let mut bundle = self.first_bundle;
+        for colours in pieces {
+            for colours in colours.chunks_exact(self.rays_per_bundle) {
+                supervision.remember(bundle, colours);
+                bundle += 1;
             }
         }
-        Ok(pieces)
     }
+
+    /// Runs the step's bundles in as few pieces as memory allows.
+    pub(crate) fn run_in_pieces<T>(
+        self,
+        run: impl FnMut(Range<usize>) -> Result<T, TchError>,
+    ) -> Result<Vec<T>, TorchFieldError> {
+        run_in_pieces(self.bundles, self.bundles, 1, run)
+    }
+}
+
+/// Runs `0..count` in pieces of `size`; after running out of memory, in pieces of half that size,
+/// down to `min_size`.
+pub(crate) fn run_in_pieces<T>(
+    count: usize,
+    mut size: usize,
+    min_size: usize,
+    mut run: impl FnMut(Range<usize>) -> Result<T, TchError>,
+) -> Result<Vec<T>, TorchFieldError> {
+    let mut pieces = Vec::new();
+    let mut next = 0;
+    while next < count {
+        let range = next..(next + size).min(count);
+        match run(range.clone()) {
+            Ok(piece) => {
+                pieces.push(piece);
+                next = range.end;
+            }
+            Err(error) if size > min_size && nets::is_out_of_memory(&error) => {
+                size = size.div_ceil(2);
+            }
+            Err(error) => return Err(error.into()),
+        }
+    }
+    Ok(pieces)
 }
 
 #[cfg(test)]
@@ -120,10 +175,36 @@ mod tests {
     #[test]
     fn pieces_get_smaller_until_they_fit() {
         let step = Step::new(&Tally::default(), 17, 4);
-        let pieces = step.in_pieces(three_at_most).unwrap();
+        let pieces = step.run_in_pieces(three_at_most).unwrap();
         assert!(pieces.iter().all(|p| p.len() <= 3) && pieces.len() < 10);
         assert_eq!(pieces.into_iter().flatten().collect::<Vec<_>>(), (0..17).collect::<Vec<_>>());
         let never = |_| -> Result<(), _> { Err(TchError::Torch("CUDA out of memory".to_owned())) };
-        assert!(step.in_pieces(never).is_err());
+        assert!(step.run_in_pieces(never).is_err());
+    }
+
+    /// The rates that the reference's log shows for 20 epochs.
+    #[test]
+    fn epochs_are_the_references() {
+        let schedule = Schedule::Epochs { epochs: 20 };
+        let rate = |epoch: u64| schedule.learning_rate(5e-4, 1e-2, (epoch as f64 + 0.5) / 20.0);
+        assert!((0..10).all(|e| rate(e) == 5e-4));
+        let falling = [
+            3.29e-4, 2.16e-4, 1.42e-4, 9.37e-5, 6.16e-5, 4.06e-5, 2.67e-5, 1.76e-5, 1.16e-5,
+            7.60e-6,
+        ];
+        for (e, expected) in (10..).zip(falling) {
+            assert!((rate(e) / expected - 1.0).abs() < 5e-3, "{e}: {}", rate(e));
+        }
+        assert_eq!(schedule.learning_rate(5e-4, 1e-2, 1.0), rate(19));
+        let short = Schedule::Epochs { epochs: 3 };
+        assert!(
+            (0u32..20).all(|e| short.learning_rate(5e-4, 1e-2, (f64::from(e) + 0.5) / 20.0)
+                == rate(u64::from(e)))
+        );
+        let text = Schedule::Exponential;
+        assert!(
+            (text.learning_rate(5e-4, 1e-2, 0.5) - 5e-5).abs() < 1e-9
+                && (text.learning_rate(5e-4, 1e-2, 1.0) - 5e-6).abs() < 1e-12
+        );
     }
 }
