@@ -815,7 +815,7 @@ fn wrong_views_are_refused_in_a_line() {
     train(&project, r#"{"patch_size": 15}"#, &views, &truth)
         .fails(2, &["parameter patch_size: 15 is odd"]);
     train(&project, "{}", &views, &truth.with_file_name("downscaled"))
-        .fails(3, &["24×24 pixels where its image has 12×12"]);
+        .fails(3, &["24×24 pixels, but its image has 12×12"]);
     train(&project, "{}", &views, &truth.with_file_name("truth"))
         .fails(3, &["none of them has an image, by name and pose, in input truth"]);
 }

@@ -95,9 +95,9 @@ impl Stage for Refine {
                 .map(LrObservations::read)
                 .transpose()?,
             enlarged: context.optional_input("enlarged").map(Enlarged::read).transpose()?,
-            takes_consistent: file.agreeing,
+            takes_consistent: file.data_consistent,
         };
-        let references = usable_references(&job, &views, params, file.trusted.unwrap_or(1.0))?;
+        let references = usable_references(&job, &views, params, file.confidence.unwrap_or(1.0))?;
         let refined = refine_all(&job, &mut views, &references)?;
         context.write_json(VIEWS_FILE, &views)?;
         say_unseen(&job, &references, &refined.uses);

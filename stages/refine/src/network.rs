@@ -30,7 +30,7 @@ impl Application {
     /// As asked for, else as the network's training found best.
     pub(crate) fn new(params: &Params, file: &RefinerFile) -> Self {
         Self {
-            residual_weight: params.residual_weight.unwrap_or(file.strength) as f32,
+            residual_weight: params.residual_weight.unwrap_or(file.residual_weight) as f32,
             self_ensemble: params.self_ensemble,
             overlap: params.overlap as usize,
         }
@@ -73,7 +73,7 @@ impl AnyRefiner {
         match self {
             Self::Compact(network) => {
                 let Some(guidance) = self.guidance() else {
-                    return Ok(network.refine_by(
+                    return Ok(network.refine_weighted(
                         &rendered.view,
                         residual_weight,
                         self_ensemble,
@@ -81,7 +81,7 @@ impl AnyRefiner {
                 };
                 let conditioned = with_references(rendered, &references, guidance);
                 uses.iter_mut().zip(&conditioned.uses).for_each(|(sum, of_use)| sum.add(of_use));
-                Ok(network.refine_by(&conditioned.view, residual_weight, self_ensemble)?)
+                Ok(network.refine_weighted(&conditioned.view, residual_weight, self_ensemble)?)
             }
             Self::Paper(network, patches) => {
                 let mut drawn = network

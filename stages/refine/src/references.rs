@@ -67,7 +67,7 @@ fn same_exposure(reference: KnownView) -> (KnownView, Option<String>) {
     let note = format!(
         "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): taken back"
     );
-    (reference.without(&exposure), Some(note))
+    (reference.with_corrected_exposure(&exposure), Some(note))
 }
 
 /// A reference is doubted where the confidence in it is less than this share of that in those of

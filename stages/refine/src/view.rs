@@ -77,7 +77,7 @@ impl RefineJob<'_> {
     ) -> Result<(Rendered, ExrImage, Option<Photograph>), Failure> {
         let (rendered, image) = read_view(self.input, view, self.background)?;
         let own = match &self.photographs {
-            Some(photographs) => photographs.of(&view.camera)?,
+            Some(photographs) => photographs.photograph(&view.camera)?,
             None => None,
         };
         if !self.takes_consistent {

@@ -36,10 +36,10 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     };
     let options = RefinerTraining {
         steps: net.steps,
-        batch: net.batch as usize,
-        square: net.patch_size as usize,
+        batch_size: net.batch as usize,
+        patch_size: net.patch_size as usize,
         references: net.references_per_view as usize,
-        rate: net.rate,
+        learning_rate: net.rate,
         seed,
     };
     let mut trainer = RefinerTrainer::new(Refiner::new(architecture, seed)?, options)?;
@@ -50,11 +50,11 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?)?;
     let file = RefinerFile {
         network: Network::Compact(architecture),
-        strength: scores.strength,
+        residual_weight: scores.residual_weight,
         rendered_psnr: scores.rendered_psnr,
         refined_psnr: scores.refined_psnr,
-        trusted: scores.confidence,
-        agreeing: own.is_some(),
+        confidence: scores.confidence,
+        data_consistent: own.is_some(),
     };
     context.write_json(REFINER_FILE, &file)?;
     say(context, "views it hasn't seen", &file)

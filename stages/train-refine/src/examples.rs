@@ -91,7 +91,7 @@ pub(crate) fn lr_observations(context: &Context) -> Result<Option<LrObservations
         return Ok(None);
     };
     let own = LrObservations::read(photographs)?;
-    if !own.are_of_all(&Views::read(cameras)?) {
+    if !own.cover(&Views::read(cameras)?) {
         return Ok(None);
     }
     context.say(

@@ -52,11 +52,11 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     let network = Network::Paper { width, patches: params.patches };
     let file = RefinerFile {
         network,
-        strength: 1.0,
+        residual_weight: 1.0,
         rendered_psnr: rendered,
         refined_psnr: refined,
-        trusted: None,
-        agreeing: false,
+        confidence: None,
+        data_consistent: false,
     };
     context.write_json(REFINER_FILE, &file)?;
     say(context, "the references that it learnt from", &file)

@@ -1,16 +1,18 @@
 use pixels::Image;
 
-use crate::channels::INPUTS;
 use crate::sums::Sums;
-use crate::view::{KnownView, Rendered};
+use crate::view::{INPUTS, KnownView, Rendered};
 use crate::warped_pixel::WarpedPixel;
 
-/// Pixels that a reference is moved at most.
-const MOST_SHIFT_PIXELS: f64 = 2.0;
+/// Maximum distance in pixels that a reference's pixel is moved; chosen by hand.
+const MAX_SHIFT_PIXELS: f64 = 2.0;
 
-/// What a reference shows of rows from one on, each pixel from where what lies around it fits what
-/// is rendered: one step of Lucas and Kanade (1981) from where geometry puts it, held back by the
-/// detail that rendering lacks, whose squares stand for how little a difference says of a place.
+/// Moves each warped pixel of a band of rows, starting at `first_row`, to the position in the
+/// reference where its neighbourhood fits the rendered view best.
+///
+/// One step of Lucas and Kanade (1981) from the position given by geometry. The step is damped by the
+/// squared detail that rendering lacks, since that detail, too, makes the images differ (design note
+/// 018).
 pub(crate) fn align(
     warped: &[WarpedPixel],
     rendered: &Rendered,
@@ -18,12 +20,12 @@ pub(crate) fn align(
     first_row: usize,
 ) -> Vec<WarpedPixel> {
     let rows = WarpedRows { warped, view: &rendered.view, first_row };
-    let terms: Vec<[f64; 6]> = (0..warped.len()).map(|i| rows.terms(i)).collect();
+    let terms: Vec<[f64; 6]> = (0..warped.len()).map(|i| rows.normal_terms(i)).collect();
     let sums = Sums::new(rows.view.width, &terms);
-    (0..warped.len()).map(|i| rows.moved(i, &sums, reference)).collect()
+    (0..warped.len()).map(|i| rows.aligned(i, &sums, reference)).collect()
 }
 
-/// What a reference shows of rows of a view from one on.
+/// Rows of a view with a reference's warped pixels.
 struct WarpedRows<'a> {
     warped: &'a [WarpedPixel],
     view: &'a Image,
@@ -31,81 +33,89 @@ struct WarpedRows<'a> {
 }
 
 impl WarpedRows<'_> {
-    /// A pixel of the view.
+    /// Returns a pixel of the view.
     fn pixel(&self, x: usize, y: usize) -> &[f32] {
-        let at = y * self.view.width + x;
-        &self.view.data[at * INPUTS..(at + 1) * INPUTS]
+        let start = (y * self.view.width + x) * INPUTS;
+        &self.view.data[start..start + INPUTS]
     }
 
-    /// How a channel of the view rises across and down.
-    fn slope(&self, x: usize, y: usize, c: usize) -> (f64, f64) {
+    /// Returns the horizontal and vertical gradient of a channel of the view.
+    fn gradient(&self, x: usize, y: usize, c: usize) -> (f64, f64) {
         let (left, right) = (x.saturating_sub(1), (x + 1).min(self.view.width - 1));
         let (top, bottom) = (y.saturating_sub(1), (y + 1).min(self.view.height - 1));
-        let per = |far: f32, near: f32, pixels: usize| f64::from(far - near) / pixels.max(1) as f64;
-        (
-            per(self.pixel(right, y)[c], self.pixel(left, y)[c], right - left),
-            per(self.pixel(x, bottom)[c], self.pixel(x, top)[c], bottom - top),
-        )
+        let dx = self.pixel(right, y)[c] - self.pixel(left, y)[c];
+        let dy = self.pixel(x, bottom)[c] - self.pixel(x, top)[c];
+        let (width, height) = ((right - left).max(1) as f64, (bottom - top).max(1) as f64);
+        (f64::from(dx) / width, f64::from(dy) / height)
     }
 
-    /// What a pixel adds to the normal equations of those around it.
-    fn terms(&self, i: usize) -> [f64; 6] {
+    /// Returns a pixel's contribution to the normal equations of the pixels around it: xx, xy, yy, x
+    /// and y times the difference, and the squared missing detail.
+    fn normal_terms(&self, i: usize) -> [f64; 6] {
         let (own, width) = (&self.warped[i], self.view.width);
         let mut terms = [0.0; 6];
-        for c in (0..3).filter(|_| own.confidence > 0.0) {
-            let (x, y) = self.slope(i % width, self.first_row + i / width, c);
-            let (apart, lacks) = (f64::from(own.difference[c]), f64::from(own.lacking[c]));
-            let of_channel = [x * x, x * y, y * y, x * apart, y * apart, lacks * lacks];
-            terms.iter_mut().zip(of_channel).for_each(|(sum, term)| *sum += term);
+        if own.confidence <= 0.0 {
+            return terms;
+        }
+        for c in 0..3 {
+            let (x, y) = self.gradient(i % width, self.first_row + i / width, c);
+            let (difference, detail) = (f64::from(own.difference[c]), f64::from(own.detail[c]));
+            let channel = [x * x, x * y, y * y, x * difference, y * difference, detail * detail];
+            for (sum, term) in terms.iter_mut().zip(channel) {
+                *sum += term;
+            }
         }
         terms
     }
 
-    /// What the reference shows of a pixel where it fits best.
-    fn moved(&self, i: usize, sums: &Sums<6>, reference: &KnownView) -> WarpedPixel {
+    /// Returns a pixel moved to the position where it fits best.
+    fn aligned(&self, i: usize, sums: &Sums<6>, reference: &KnownView) -> WarpedPixel {
         let (warped, own, width) = (self.warped, &self.warped[i], self.view.width);
         if own.confidence <= 0.0 {
             return *own;
         }
         let (x, y) = (i % width, i / width);
-        let [xx, xy, yy, x_apart, y_apart, lacks] = sums.around(x, y);
-        let (xx, yy) = (xx + lacks, yy + lacks);
-        // Where all is flat and nothing is lacking it stays: what is divided by 0 isn't finite.
+        let [xx, xy, yy, x_difference, y_difference, damping] = sums.around(x, y);
+        let (xx, yy) = (xx + damping, yy + damping);
         let determinant = xx * yy - xy * xy;
-        let (dx, dy) = (
-            (xy * y_apart - yy * x_apart) / determinant,
-            (xy * x_apart - xx * y_apart) / determinant,
-        );
+        let dx = (xy * y_difference - yy * x_difference) / determinant;
+        let dy = (xy * x_difference - xx * y_difference) / determinant;
         let length = dx.hypot(dy);
+        // Not finite if the determinant is 0: the view is flat and lacks no detail.
         if !length.is_finite() || length == 0.0 {
             return *own;
         }
-        let share = (MOST_SHIFT_PIXELS / length).min(1.0);
-        let across =
-            step((x > 0).then(|| &warped[i - 1]), own, (x + 1 < width).then(|| &warped[i + 1]));
-        let down =
-            step(i.checked_sub(width).map(|above| &warped[above]), own, warped.get(i + width));
-        let place = std::array::from_fn(|k| {
-            own.place[k] + (share * (dx * across[k] + dy * down[k])) as f32
+        let scale = (MAX_SHIFT_PIXELS / length).min(1.0);
+        let left = if x > 0 { Some(&warped[i - 1]) } else { None };
+        let right = if x + 1 < width { Some(&warped[i + 1]) } else { None };
+        let above = i.checked_sub(width).map(|above| &warped[above]);
+        let across = shorter_step(left, own, right);
+        let down = shorter_step(above, own, warped.get(i + width));
+        let position = std::array::from_fn(|k| {
+            own.position[k] + (scale * (dx * across[k] + dy * down[k])) as f32
         });
-        WarpedPixel::new(reference, place, own.visibility, self.pixel(x, self.first_row + y))
+        WarpedPixel::new(reference, position, own.visibility, self.pixel(x, self.first_row + y))
     }
 }
 
-/// How far what a reference shows moves in it from one pixel to the next: the shorter of the steps
-/// from the one before and to the one after, for the other may lead over an edge; 0 where neither
-/// is shown.
-fn step(before: Option<&WarpedPixel>, own: &WarpedPixel, after: Option<&WarpedPixel>) -> [f64; 2] {
+/// Returns the step in the reference from one pixel of the view to the next: the shorter of the steps
+/// from the pixel before and to the pixel after, since the longer one may cross an edge; 0 if neither
+/// neighbour is visible.
+fn shorter_step(
+    before: Option<&WarpedPixel>,
+    own: &WarpedPixel,
+    after: Option<&WarpedPixel>,
+) -> [f64; 2] {
     let steps = [
-        after.and_then(|after| between(own, after)),
-        before.and_then(|before| between(before, own)),
+        after.and_then(|after| step_between(own, after)),
+        before.and_then(|before| step_between(before, own)),
     ];
-    let length = |[x, y]: &[f64; 2]| x.hypot(*y);
-    steps.into_iter().flatten().min_by(|a, b| length(a).total_cmp(&length(b))).unwrap_or([0.0; 2])
+    let steps = steps.into_iter().flatten();
+    steps.min_by(|a, b| a[0].hypot(a[1]).total_cmp(&b[0].hypot(b[1]))).unwrap_or([0.0; 2])
 }
 
-/// The step from one pixel to another, where both are shown.
-fn between(from: &WarpedPixel, to: &WarpedPixel) -> Option<[f64; 2]> {
-    let is_shown = from.confidence > 0.0 && to.confidence > 0.0;
-    is_shown.then(|| [0, 1].map(|k| f64::from(to.place[k] - from.place[k])))
+/// Returns the step in the reference between two pixels if both are visible there.
+fn step_between(from: &WarpedPixel, to: &WarpedPixel) -> Option<[f64; 2]> {
+    let is_visible = from.confidence > 0.0 && to.confidence > 0.0;
+    is_visible.then(|| [0, 1].map(|k| f64::from(to.position[k] - from.position[k])))
 }

@@ -4,51 +4,53 @@ use scene::{Camera, Photograph, Views};
 
 use crate::view::Rendered;
 
-/// LR observations by the views' own cameras, those that a field was trained on: refined views are
-/// made consistent with them.
+/// LR photographs of the cameras that a field was trained on; refined views of these cameras are made
+/// consistent with them.
 pub struct LrObservations<'a> {
     input: &'a GivenInput,
     views: Views,
     filter: Filter,
 }
 
-/// LR pixels that the nearest image looks at on each side.
-const INVERSE_REACH: usize = 12;
+/// Support of the kernel's pseudo-inverse on each side, in LR pixels; chosen by hand.
+const INVERSE_RADIUS_LR_PIXELS: usize = 12;
 
 impl<'a> LrObservations<'a> {
-    /// Those of a scene's training views, with the kernel that made them.
+    /// Opens a scene's training views and reads the kernel that degraded them.
     pub fn read(input: &'a GivenInput) -> Result<Self, Failure> {
         let degradation: Degradation = input.read_json(DEGRADATION_FILE)?;
         Ok(Self { input, views: Views::read(input)?, filter: degradation.kernel.filter() })
     }
 
-    /// Whether there is one of each of some cameras.
-    pub fn are_of_all(&self, cameras: &Views) -> bool {
+    /// Returns whether each of the cameras has a photograph.
+    pub fn cover(&self, cameras: &Views) -> bool {
         cameras.views.iter().all(|view| self.views.taken_by(&view.camera).is_some())
     }
 
-    /// The LR photograph that was taken by a view's own camera, over the background, where there is
-    /// one: of that name and pose, and smaller.
-    pub fn of(&self, camera: &Camera) -> Result<Option<Photograph>, Failure> {
+    /// Reads the LR photograph of a camera, composited on the background. The photograph has the
+    /// camera's name and pose, and at most its size; `None` if there is no such photograph.
+    pub fn photograph(&self, camera: &Camera) -> Result<Option<Photograph>, Failure> {
         let Some(view) = self.views.taken_by(camera) else { return Ok(None) };
         let photograph =
             view.read_photograph(self.input).bad_input(format!("photograph {}", camera.name))?;
         let k = &camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
-        let is_smaller = |p: &Photograph| p.image.width <= width && p.image.height <= height;
-        Ok(photograph.filter(is_smaller).map(|p| p.over(self.views.background.shown())))
+        Ok(photograph
+            .filter(|p| p.image.width <= width && p.image.height <= height)
+            .map(|p| p.over(self.views.background.shown())))
     }
 
-    /// A rendered view that is consistent with its own LR observation, where there is one.
+    /// Makes a rendered view consistent with its own LR photograph, if there is one.
     pub fn make_consistent(&self, rendered: Rendered) -> Result<Rendered, Failure> {
-        let Some(photograph) = self.of(&rendered.camera)? else { return Ok(rendered) };
+        let Some(photograph) = self.photograph(&rendered.camera)? else { return Ok(rendered) };
         let colours = self.project(&rendered.colours(), &photograph);
         Ok(rendered.with_colours(&colours))
     }
 
-    /// The image nearest to `refined` that the kernel makes `photograph` of: refined +
-    /// K⁺(photograph - K·refined), in [0, 1]. Where the photograph was clipped to black or white
-    /// and the prediction lies beyond, it says nothing, nor where its mask leaves it out.
+    /// Returns the image nearest to `refined` that the kernel K degrades to `photograph`: refined +
+    /// K⁺(photograph - K·refined), clamped to [0, 1]. The residual is 0 where the photograph is clipped
+    /// to black or white and K·refined lies beyond, and where the photograph is masked (design note
+    /// 016).
     pub fn project(
         &self,
         refined: &Image,
@@ -61,20 +63,20 @@ impl<'a> LrObservations<'a> {
         );
         let mut residual = kernel.apply(refined);
         for (r, &y) in residual.data.iter_mut().zip(&photograph.data) {
-            let clipped = (y >= 1.0 && *r > 1.0) || (y <= 0.0 && *r < 0.0);
-            *r = if clipped { 0.0 } else { y - *r };
+            let is_clipped = (y >= 1.0 && *r > 1.0) || (y <= 0.0 && *r < 0.0);
+            *r = if is_clipped { 0.0 } else { y - *r };
         }
         if let Some(mask) = mask {
-            let none = Image { data: vec![0.0; residual.data.len()], ..residual.clone() };
-            mask.fill(&mut residual, &none);
+            let zeros = Image { data: vec![0.0; residual.data.len()], ..residual.clone() };
+            mask.fill(&mut residual, &zeros);
         }
-        let share =
+        let scale =
             (refined.width * refined.height) as f32 / (photograph.width * photograph.height) as f32;
-        let mut moved = kernel.inverse(INVERSE_REACH).adjoint(&residual);
-        for (m, r) in moved.data.iter_mut().zip(&refined.data) {
-            *m = (share * *m + r).clamp(0.0, 1.0);
+        let mut projected = kernel.inverse(INVERSE_RADIUS_LR_PIXELS).adjoint(&residual);
+        for (m, r) in projected.data.iter_mut().zip(&refined.data) {
+            *m = (scale * *m + r).clamp(0.0, 1.0);
         }
-        moved
+        projected
     }
 }
 

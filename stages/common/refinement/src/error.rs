@@ -1,40 +1,40 @@
-/// A refiner that can't be read, written, used or trained.
+/// Error of a refiner that can't be read, written, applied or trained.
 #[derive(Debug, thiserror::Error)]
 pub enum RefinementError {
-    /// libtorch refused.
+    /// A libtorch operation failed.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),
-    /// A file of weights can't be used.
+    /// A weights file can't be used.
     #[error(transparent)]
     Weights(#[from] nets::WeightsError),
-    /// A network that can't be.
-    #[error("a network {channels} wide with {blocks} blocks: not one of ours")]
+    /// The network's size is out of range.
+    #[error("unsupported network: {channels} channels, {blocks} blocks")]
     Architecture {
-        /// Its width.
+        /// Number of channels.
         channels: u32,
-        /// Its blocks.
+        /// Number of residual blocks.
         blocks: u32,
     },
     /// A view can't be used.
     #[error("view {name}: {reason}")]
     View {
-        /// Which.
+        /// Name of the view.
         name: String,
-        /// What is wrong.
+        /// Reason, as a sentence fragment.
         reason: String,
     },
-    /// A view isn't one.
-    #[error("a view of {channels} channels where {expected} are expected")]
+    /// A view has the wrong number of channels.
+    #[error("expected a view of {expected} channels, found {channels}")]
     Channels {
-        /// How many it has.
+        /// Number of channels of the view.
         channels: usize,
-        /// How many the network takes.
+        /// Number of channels that the network takes.
         expected: usize,
     },
-    /// Numbers went wrong.
-    #[error("step {step}: the gradient is not finite; lower the rate")]
+    /// A step's loss or gradient isn't finite.
+    #[error("step {step}: the gradient is not finite; lower the learning rate")]
     NotFinite {
-        /// The step.
+        /// Index of the step.
         step: u64,
     },
 }

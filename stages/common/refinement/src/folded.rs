@@ -1,11 +1,11 @@
 use pixels::Image;
 use tch::{TchError, Tensor};
 
-/// Pixels along each side of a fold: the network sees 2×2 pixels as one of four times as many
-/// channels, which widens what it sees around a pixel at the same cost.
+/// Pixels along each side of a fold. The network takes 2×2 pixels as one with four times as many
+/// channels (space-to-depth), which widens its receptive field at equal cost (design note 015).
 pub(crate) const FOLD: usize = 2;
 
-/// Where a square of an image lies, in pixels; it may reach over the border, which goes on.
+/// Rectangle of an image in pixels; beyond the image's border, the border pixels are repeated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Square {
     pub(crate) x: isize,
@@ -15,33 +15,34 @@ pub(crate) struct Square {
 }
 
 impl Square {
-    /// The same and so many folds more on each side.
+    /// Returns the square grown by `folds` folds on each side.
     pub(crate) fn grown(self, folds: usize) -> Self {
-        let by = folds * FOLD;
-        let (x, y) = (self.x - by as isize, self.y - by as isize);
-        Self { x, y, size: (self.size.0 + 2 * by, self.size.1 + 2 * by) }
+        let margin = folds * FOLD;
+        let (x, y) = (self.x - margin as isize, self.y - margin as isize);
+        Self { x, y, size: (self.size.0 + 2 * margin, self.size.1 + 2 * margin) }
     }
 
-    /// Goes through the square's pixels, column and row in it, in the order in which the network
-    /// takes them: rows of folds, a fold's pixels together.
+    /// Calls `pixel` with the column and row of each pixel of the square, in the network's order: rows
+    /// of folds, the pixels of a fold together.
     pub(crate) fn fold(self, mut pixel: impl FnMut(usize, usize)) {
         for fold_y in 0..self.size.1 / FOLD {
             for fold_x in 0..self.size.0 / FOLD {
-                (0..FOLD * FOLD)
-                    .for_each(|k| pixel(fold_x * FOLD + k % FOLD, fold_y * FOLD + k / FOLD));
+                for k in 0..FOLD * FOLD {
+                    pixel(fold_x * FOLD + k % FOLD, fold_y * FOLD + k / FOLD);
+                }
             }
         }
     }
 
-    /// An image's samples at a place in the square; beyond the border, those at the border.
-    pub(crate) fn of(self, image: &Image, column: usize, row: usize) -> &[f32] {
-        let (column, row) =
-            (clamped(self.x, column, image.width), clamped(self.y, row, image.height));
-        let at = row * image.width + column;
-        &image.data[at * image.channels..(at + 1) * image.channels]
+    /// Returns the image's pixel at a column and row of the square, or the nearest border pixel.
+    pub(crate) fn pixel(self, image: &Image, column: usize, row: usize) -> &[f32] {
+        let column = clamped_index(self.x, column, image.width);
+        let row = clamped_index(self.y, row, image.height);
+        let start = (row * image.width + column) * image.channels;
+        &image.data[start..start + image.channels]
     }
 
-    /// Takes folded samples apart again: calls with column, row (in the square) and a pixel's
+    /// Calls `pixel` with the column and row in the square and the channels of each pixel of folded
     /// samples.
     pub(crate) fn unfold(
         self,
@@ -56,8 +57,8 @@ impl Square {
         }
     }
 
-    /// Folded samples of squares of this size as a tensor (squares × channels × rows × columns),
-    /// channels last in memory, as convolutions like it.
+    /// Converts folded samples of squares of this size to a tensor (squares × channels × rows ×
+    /// columns), channels last in memory, the fastest layout for convolutions.
     pub(crate) fn tensor(self, samples: &[f32], channels: usize) -> Result<Tensor, TchError> {
         let (width, height, depth) =
             (self.size.0 / FOLD, self.size.1 / FOLD, channels * FOLD * FOLD);
@@ -67,22 +68,22 @@ impl Square {
     }
 }
 
-/// So many pixels after `start` along an axis, but not beyond its ends.
-fn clamped(start: isize, by: usize, size: usize) -> usize {
-    (start + by as isize).clamp(0, size as isize - 1) as usize
+/// Returns the index `offset` after `start`, clamped to an axis of `size` pixels.
+fn clamped_index(start: isize, offset: usize, size: usize) -> usize {
+    (start + offset as isize).clamp(0, size as isize - 1) as usize
 }
 
-/// One of the eight ways to lay a square of pixels: turned by right angles, mirrored.
+/// One of a square's eight orientations: rotations by right angles and reflections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Turn {
-    /// Rows for columns.
+pub(crate) struct Orientation {
+    /// True if rows and columns are exchanged.
     swap: bool,
     flip_x: bool,
     flip_y: bool,
 }
 
-impl Turn {
-    /// All of them; the first leaves a square as it is.
+impl Orientation {
+    /// All orientations; the first is the identity.
     pub(crate) const ALL: [Self; 8] = {
         let mut all = [Self { swap: false, flip_x: false, flip_y: false }; 8];
         let mut i = 0;
@@ -93,13 +94,13 @@ impl Turn {
         all
     };
 
-    /// The size of a square once it is turned.
-    pub(crate) fn of(self, square: Square) -> Square {
+    /// Returns the square with the size that it has in this orientation.
+    pub(crate) fn oriented(self, square: Square) -> Square {
         let (width, height) = square.size;
         Square { size: if self.swap { (height, width) } else { (width, height) }, ..square }
     }
 
-    /// Where in a square a place of the turned one comes from.
+    /// Maps a column and row of the oriented square to those of the original square.
     pub(crate) fn source(self, square: Square, x: usize, y: usize) -> (usize, usize) {
         let (x, y) = if self.swap { (y, x) } else { (x, y) };
         let (width, height) = square.size;
@@ -107,8 +108,8 @@ impl Turn {
     }
 }
 
-/// A tensor's samples as [`Square::unfold`] takes them.
-pub(crate) fn samples(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
+/// Returns a tensor's folded samples, as [`Square::unfold`] takes them.
+pub(crate) fn folded_samples(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     let flat = tensor.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
     Vec::<f32>::try_from(&flat)
 }
@@ -122,8 +123,8 @@ mod tests {
         let image = Image::new(7, 5, 3, (0..105).map(|v| v as f32).collect());
         let square = Square { x: -2, y: 1, size: (6, 4) };
         let mut folded = Vec::new();
-        square.fold(|x, y| folded.extend_from_slice(square.of(&image, x, y)));
-        let again = samples(&square.tensor(&folded, 3).unwrap()).unwrap();
+        square.fold(|x, y| folded.extend_from_slice(square.pixel(&image, x, y)));
+        let again = folded_samples(&square.tensor(&folded, 3).unwrap()).unwrap();
         assert_eq!(again, folded);
         let mut count = 0;
         square.unfold(&again, 3, |x, y, pixel| {
@@ -138,15 +139,15 @@ mod tests {
     fn turns_are_eight_and_lose_nothing() {
         let square = Square { x: 3, y: 4, size: (6, 2) };
         let mut seen = std::collections::BTreeSet::new();
-        for turn in Turn::ALL {
+        for orientation in Orientation::ALL {
             let mut places = Vec::new();
-            turn.of(square).fold(|x, y| places.push(turn.source(square, x, y)));
+            orientation.oriented(square).fold(|x, y| places.push(orientation.source(square, x, y)));
             let all: std::collections::BTreeSet<_> = places.iter().copied().collect();
             assert_eq!(all.len(), 12);
             assert!(all.iter().all(|&(x, y)| x < 6 && y < 2));
             seen.insert(places);
         }
         assert_eq!(seen.len(), 8);
-        assert_eq!(Turn::ALL[0].source(square, 4, 1), (4, 1));
+        assert_eq!(Orientation::ALL[0].source(square, 4, 1), (4, 1));
     }
 }

@@ -7,76 +7,77 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::{TchError, Tensor, no_grad};
 
-use crate::channels::{INPUTS, OUTPUTS, REFERENCE_INPUTS};
 use crate::error::RefinementError;
-use crate::folded::{FOLD, Square, Turn, samples};
-use crate::guidance::Guidance;
+use crate::folded::{FOLD, Orientation, Square, folded_samples};
+use crate::view::{INPUTS, OUTPUTS, REFERENCE_INPUTS};
+use crate::warped_reference::Guidance;
 
-/// Size of a network.
+/// Size and inputs of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RefinerArchitecture {
-    /// Features of the hidden layers.
+    /// Number of features of the hidden layers.
     pub channels: u32,
-    /// Residual blocks of two layers each.
+    /// Number of residual blocks of two layers each.
     pub blocks: u32,
-    /// How it sees what references know; without it they aren't looked at.
+    /// Warping of references; `None` if the network takes no references.
     pub guidance: Option<Guidance>,
 }
 
 impl RefinerArchitecture {
-    /// Channels of what it takes.
-    pub(crate) fn inputs(self) -> usize {
+    /// Returns the number of input channels.
+    pub(crate) fn input_channels(self) -> usize {
         if self.guidance.is_some() { REFERENCE_INPUTS } else { INPUTS }
     }
 }
 
-/// Which network a refiner is.
+/// Kind of a refiner's network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum Network {
-    /// Ours: [`Refiner`].
+    /// This project's network: [`Refiner`].
     Compact(RefinerArchitecture),
-    /// The paper's (crate `paper-refiner`).
+    /// The paper's network (crate `paper-refiner`).
     Paper {
-        /// Features of its first layer; 128 are published.
+        /// Number of features of the first layer; 128 as published.
         width: u32,
-        /// Reference patches that each patch gets; 8 are published.
+        /// Number of reference patches per patch; 8 as published.
         patches: u32,
     },
 }
 
 /// Name of the file that describes a refiner.
 pub const REFINER_FILE: &str = "refiner.json";
-/// Name of the file with its weights: safetensors; ours has kernels as outputs × rows × columns ×
-/// inputs.
+/// Name of a refiner's weights file: safetensors. Kernels of [`Refiner`] are outputs × rows × columns
+/// × inputs.
 pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 
-/// `refiner.json`: what a folder with a refiner says of it.
+/// Content of `refiner.json`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RefinerFile {
-    /// The network.
+    /// Kind and size of the network.
     pub network: Network,
-    /// Share of what it predicts that is added: what was best for the views that training left out,
-    /// from 0 to 1.
-    pub strength: f64,
-    /// Mean PSNR of those views as they were rendered, in dB.
+    /// Fraction of the predicted residual that is added, from 0 to 1: the best one for the validation
+    /// views.
+    #[serde(rename = "strength")]
+    pub residual_weight: f64,
+    /// Mean PSNR of the rendered validation views, in dB.
     pub rendered_psnr: f64,
-    /// Mean PSNR of those views refined, in dB.
+    /// Mean PSNR of the refined validation views, in dB.
     pub refined_psnr: f64,
-    /// Confidence in references, as a share of what they saw of those views, where the network
-    /// knows references.
-    #[serde(default)]
-    pub trusted: Option<f64>,
-    /// Whether the network takes views that are consistent with LR photographs of their own.
-    #[serde(default)]
-    pub agreeing: bool,
+    /// Confidence in references as a fraction of their visibility in the validation views; absent if
+    /// the network takes no references.
+    #[serde(rename = "trusted", default)]
+    pub confidence: Option<f64>,
+    /// True if the network's input views are made consistent with their own LR photographs.
+    #[serde(rename = "agreeing", default)]
+    pub data_consistent: bool,
 }
 
-/// A network of 3×3 convolutions on folds of 2×2 pixels: one in, `blocks` residual blocks of two
-/// (Lim et al. 2017), one out. It pads nothing: borders are gone on with before it, and what it
-/// predicts depends on nothing but what it sees.
+/// Network of 3×3 convolutions on folds of 2×2 pixels: one input layer, `blocks` residual blocks of
+/// two layers (Lim et al. 2017), one output layer. The layers don't pad; image borders are extended
+/// before the first layer, so predictions don't depend on tile borders (design note 015).
 #[derive(Debug)]
 pub struct Refiner {
     architecture: RefinerArchitecture,
@@ -84,29 +85,29 @@ pub struct Refiner {
     parameters: Vec<Tensor>,
 }
 
-/// Pixels along a tile's side: with what a network sees around it small enough for the cache, large
-/// enough that little is seen twice.
+/// Side of a tile in pixels. A tile with its receptive field fits in the cache, and little of the
+/// work is repeated in overlaps (design note 015).
 const TILE_SIDE: usize = 128;
-/// Most channels of a network that is read.
-const MOST_CHANNELS: u32 = 4096;
-/// Most blocks of a network that is read.
-const MOST_BLOCKS: u32 = 4096;
-/// Purpose of draws.
+/// Maximum number of channels of a network that is read from a file.
+const MAX_CHANNELS: u32 = 4096;
+/// Maximum number of blocks of a network that is read from a file.
+const MAX_BLOCKS: u32 = 4096;
+/// Stream of random numbers for the initial weights.
 const WEIGHTS: u64 = 300;
 
 impl Refiner {
-    /// A network that hasn't learnt anything: it adds nothing.
+    /// Creates an untrained network, whose residual is 0.
     pub fn new(architecture: RefinerArchitecture, seed: u64) -> Result<Self, RefinementError> {
         let mut rng = CounterRng::new(seed, WEIGHTS, 0);
         let layers = layers(architecture);
         let mut parameters = Vec::with_capacity(2 * layers.len());
         for (i, (_, inputs, outputs)) in layers.iter().enumerate() {
-            // As PyTorch draws them: blocks that begin by adding little. The last layer, and with
-            // it the prediction, starts at 0.
-            let reach =
+            // PyTorch's initialisation, so that blocks start with small residuals. The last layer
+            // starts at 0.
+            let range =
                 if i + 1 == layers.len() { 0.0 } else { (1.0 / (9 * inputs) as f64).sqrt() };
             let kernel: Vec<f32> = (0..outputs * 9 * inputs)
-                .map(|_| (reach * (2.0 * f64::from(rng.uniform()) - 1.0)) as f32)
+                .map(|_| (range * (2.0 * f64::from(rng.uniform()) - 1.0)) as f32)
                 .collect();
             parameters.push(
                 Tensor::f_from_slice(&kernel)?
@@ -121,47 +122,52 @@ impl Refiner {
     /// Reads weights that [`Refiner::write`] wrote.
     pub fn read(path: &Path, architecture: RefinerArchitecture) -> Result<Self, RefinementError> {
         let RefinerArchitecture { channels, blocks, .. } = architecture;
-        // Before anything is made of such numbers.
-        if !(1..=MOST_CHANNELS).contains(&channels) || blocks > MOST_BLOCKS {
+        // Checked before anything of this size is allocated.
+        if !(1..=MAX_CHANNELS).contains(&channels) || blocks > MAX_BLOCKS {
             return Err(RefinementError::Architecture { channels, blocks });
         }
         let weights = nets::Weights::read(path)?;
-        let tensors =
-            shapes(architecture).into_iter().map(|(name, shape)| weights.tensor(&name, &shape));
+        let tensors = parameter_shapes(architecture)
+            .into_iter()
+            .map(|(name, shape)| weights.tensor(&name, &shape));
         Ok(Self { architecture, parameters: tensors.collect::<Result<_, _>>()? })
     }
 
     /// Writes the weights.
     pub fn write(&self, path: &Path) -> Result<(), RefinementError> {
-        Ok(nets::write(path, &self.named())?)
+        Ok(nets::write(path, &self.named_parameters())?)
     }
 
-    /// The network's size.
+    /// Returns the network's size and inputs.
     pub fn architecture(&self) -> RefinerArchitecture {
         self.architecture
     }
 
-    /// The parameters by name.
-    pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
-        shapes(self.architecture).into_iter().map(|(name, _)| name).zip(self.parameters()).collect()
+    /// Returns the parameters with their names.
+    pub(crate) fn named_parameters(&self) -> Vec<(String, Tensor)> {
+        parameter_shapes(self.architecture)
+            .into_iter()
+            .map(|(name, _)| name)
+            .zip(self.parameters())
+            .collect()
     }
 
-    /// The parameters.
+    /// Returns handles to the parameters.
     pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
         self.parameters.iter().map(Tensor::shallow_clone)
     }
 
-    /// Another handle on the same parameters, for another thread.
-    pub(crate) fn share(&self) -> Self {
+    /// Returns another handle to the same parameters, for another thread.
+    pub(crate) fn shallow_clone(&self) -> Self {
         Self { architecture: self.architecture, parameters: self.parameters().collect() }
     }
 
-    /// Folds that it sees on each side of one.
-    pub(crate) fn reach(&self) -> usize {
+    /// Returns the radius of the receptive field in folds.
+    pub(crate) fn receptive_radius(&self) -> usize {
         2 * self.architecture.blocks as usize + 2
     }
 
-    /// What to add to the colours of squares, from the squares grown by [`Refiner::reach`].
+    /// Predicts the residuals of squares, from the squares grown by [`Refiner::receptive_radius`].
     pub(crate) fn forward(&self, input: &Tensor) -> Result<Tensor, TchError> {
         let mut x = self.layer(input, 0)?;
         for block in 0..self.architecture.blocks as usize {
@@ -175,55 +181,53 @@ impl Refiner {
         self.layer(&x, 1 + 2 * self.architecture.blocks as usize)
     }
 
+    /// Applies the layer with this index.
     fn layer(&self, x: &Tensor, i: usize) -> Result<Tensor, TchError> {
         let kernel = self.parameters[2 * i].f_permute([0, 3, 1, 2])?;
         x.f_conv2d(&kernel, Some(&self.parameters[2 * i + 1]), 1, 0, 1, 1)
     }
 
-    /// The view with `strength` times what the network adds; a reference-based network takes it
-    /// from [`with_references`](crate::with_references). An image of three channels in 0..1. The
-    /// network is asked `turns` times, 1 to 8, each time with the view turned or mirrored another
-    /// way, and the mean of its answers is added (Timofte et al. 2016).
-    pub fn refine_by(
+    /// Adds `residual_weight` times the network's residual to a view, and clamps colours to 0..1. A
+    /// reference-based network takes a view from [`with_references`](crate::with_references). The
+    /// residual is the mean over the view's first `orientations` orientations, 1 to 8 (geometric
+    /// self-ensemble, Timofte et al. 2016).
+    pub fn refine_weighted(
         &self,
         view: &Image,
-        strength: f32,
-        turns: u32,
+        residual_weight: f32,
+        orientations: u32,
     ) -> Result<Image, RefinementError> {
-        let inputs = self.architecture.inputs();
+        let inputs = self.architecture.input_channels();
         if view.channels != inputs {
             return Err(RefinementError::Channels { channels: view.channels, expected: inputs });
         }
-        let turns = &Turn::ALL[..(turns as usize).clamp(1, Turn::ALL.len())];
+        let count = (orientations as usize).clamp(1, Orientation::ALL.len());
+        let orientations = &Orientation::ALL[..count];
         let (width, height) = (view.width, view.height);
         let tiles: Vec<(usize, usize, Self)> = (0..height)
             .step_by(TILE_SIDE)
             .flat_map(|y| (0..width).step_by(TILE_SIDE).map(move |x| (x, y)))
-            .map(|(x, y)| (x, y, self.share()))
+            .map(|(x, y)| (x, y, self.shallow_clone()))
             .collect();
-        let refined: Vec<(Square, Vec<f32>)> = tiles
+        let residuals: Vec<(Square, Vec<f32>)> = tiles
             .into_par_iter()
             .map(|(x, y, refiner)| -> Result<_, TchError> {
-                let side =
-                    |from: usize, size: usize| (size - from).min(TILE_SIDE).next_multiple_of(FOLD);
-                let square = Square {
-                    x: x as isize,
-                    y: y as isize,
-                    size: (side(x, width), side(y, height)),
-                };
-                Ok((square, refiner.added(view, square, turns)?))
+                let size = [width - x, height - y]
+                    .map(|remaining| remaining.min(TILE_SIDE).next_multiple_of(FOLD));
+                let square = Square { x: x as isize, y: y as isize, size: size.into() };
+                Ok((square, refiner.residual(view, square, orientations)?))
             })
             .collect::<Result<_, _>>()?;
         let mut data = vec![0.0; width * height * OUTPUTS];
-        for (square, added) in &refined {
-            for (i, added) in added.chunks_exact(OUTPUTS).enumerate() {
-                let (column, row) =
-                    (square.x as usize + i % square.size.0, square.y as usize + i / square.size.0);
+        for (square, residual) in &residuals {
+            for (i, residual) in residual.chunks_exact(OUTPUTS).enumerate() {
+                let column = square.x as usize + i % square.size.0;
+                let row = square.y as usize + i / square.size.0;
                 if column < width && row < height {
-                    let at = row * width + column;
+                    let index = row * width + column;
                     for c in 0..OUTPUTS {
-                        data[at * OUTPUTS + c] =
-                            (view.data[at * inputs + c] + strength * added[c]).clamp(0.0, 1.0);
+                        let colour = view.data[index * inputs + c] + residual_weight * residual[c];
+                        data[index * OUTPUTS + c] = colour.clamp(0.0, 1.0);
                     }
                 }
             }
@@ -231,54 +235,65 @@ impl Refiner {
         Ok(Image::new(width, height, OUTPUTS, data))
     }
 
-    /// What the network adds to a square of a view, the mean over turns: row by row, channels
+    /// Predicts the residual of a square of a view, the mean over orientations: row by row, channels
     /// interleaved.
-    fn added(&self, view: &Image, square: Square, turns: &[Turn]) -> Result<Vec<f32>, TchError> {
-        let around = square.grown(self.reach());
-        let inputs = self.architecture.inputs();
+    fn residual(
+        &self,
+        view: &Image,
+        square: Square,
+        orientations: &[Orientation],
+    ) -> Result<Vec<f32>, TchError> {
+        let around = square.grown(self.receptive_radius());
+        let inputs = self.architecture.input_channels();
         let mut sum = vec![0.0; square.size.0 * square.size.1 * OUTPUTS];
         let mut input = Vec::with_capacity(around.size.0 * around.size.1 * inputs);
-        for turn in turns {
+        for orientation in orientations {
             input.clear();
-            let turned = turn.of(around);
-            turned.fold(|x, y| {
-                let (x, y) = turn.source(around, x, y);
-                input.extend_from_slice(around.of(view, x, y));
+            let oriented = orientation.oriented(around);
+            oriented.fold(|x, y| {
+                let (x, y) = orientation.source(around, x, y);
+                input.extend_from_slice(around.pixel(view, x, y));
             });
-            let added = samples(&no_grad(|| self.forward(&turned.tensor(&input, inputs)?))?)?;
-            turn.of(square).unfold(&added, OUTPUTS, |x, y, added| {
-                let (x, y) = turn.source(square, x, y);
-                let at = (y * square.size.0 + x) * OUTPUTS;
-                sum[at..at + OUTPUTS].iter_mut().zip(added).for_each(|(sum, a)| *sum += a);
+            let output = no_grad(|| self.forward(&oriented.tensor(&input, inputs)?))?;
+            let residual = folded_samples(&output)?;
+            orientation.oriented(square).unfold(&residual, OUTPUTS, |x, y, residual| {
+                let (x, y) = orientation.source(square, x, y);
+                let start = (y * square.size.0 + x) * OUTPUTS;
+                for c in 0..OUTPUTS {
+                    sum[start + c] += residual[c];
+                }
             });
         }
-        sum.iter_mut().for_each(|sum| *sum /= turns.len() as f32);
+        for value in &mut sum {
+            *value /= orientations.len() as f32;
+        }
         Ok(sum)
     }
 
-    /// The view with all that the network adds to it as it is.
+    /// Adds the network's full residual to a view, without self-ensemble.
     pub fn refine(&self, view: &Image) -> Result<Image, RefinementError> {
-        self.refine_by(view, 1.0, 1)
+        self.refine_weighted(view, 1.0, 1)
     }
 }
 
-/// Name, inputs and outputs of each layer.
+/// Returns name, inputs and outputs of each layer.
 fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
     let width = architecture.channels as usize;
     let blocks = (0..architecture.blocks).flat_map(|i| {
         [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]
     });
-    let first = ("first".to_owned(), architecture.inputs() * FOLD * FOLD, width);
+    let first = ("first".to_owned(), architecture.input_channels() * FOLD * FOLD, width);
     let last = ("last".to_owned(), width, OUTPUTS * FOLD * FOLD);
     std::iter::once(first).chain(blocks).chain([last]).collect()
 }
 
+/// Returns the shape of a layer's kernel: outputs × rows × columns × inputs.
 fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
     [outputs as i64, 3, 3, inputs as i64]
 }
 
-/// Names and shapes of the parameters.
-fn shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
+/// Returns names and shapes of the parameters.
+fn parameter_shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
     let shapes = layers(architecture).into_iter().flat_map(|(name, inputs, outputs)| {
         [
             (format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()),
@@ -302,7 +317,7 @@ mod tests {
         )
     }
 
-    /// A network whose every weight says something.
+    /// A network with no zero weights.
     fn random(architecture: RefinerArchitecture) -> Refiner {
         let mut refiner = Refiner::new(architecture, 5).unwrap();
         let mut rng = CounterRng::new(5, 6, 7);
@@ -327,10 +342,10 @@ mod tests {
                 y: 0,
                 size: (width.next_multiple_of(FOLD), height.next_multiple_of(FOLD)),
             };
-            let around = square.grown(refiner.reach());
+            let around = square.grown(refiner.receptive_radius());
             let mut input = Vec::new();
-            around.fold(|x, y| input.extend_from_slice(around.of(&view, x, y)));
-            let added = samples(
+            around.fold(|x, y| input.extend_from_slice(around.pixel(&view, x, y)));
+            let added = folded_samples(
                 &no_grad(|| refiner.forward(&around.tensor(&input, INPUTS).unwrap())).unwrap(),
             )
             .unwrap();
@@ -352,7 +367,7 @@ mod tests {
     }
 
     fn added_to(refiner: &Refiner, view: &Image) -> Vec<f32> {
-        refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap()
+        refiner.residual(view, Square { x: 4, y: 4, size: (8, 8) }, &Orientation::ALL[..1]).unwrap()
     }
 
     /// Internal learning from little pushes features below 0 everywhere. What the network adds must
@@ -380,8 +395,8 @@ mod tests {
     }
 
     fn apart_by(refiner: &Refiner, view: &Image, turns: u32) -> f32 {
-        let straight = mirrored(&refiner.refine_by(view, 1.0, turns).unwrap());
-        let turned = refiner.refine_by(&mirrored(view), 1.0, turns).unwrap();
+        let straight = mirrored(&refiner.refine_weighted(view, 1.0, turns).unwrap());
+        let turned = refiner.refine_weighted(&mirrored(view), 1.0, turns).unwrap();
         straight.data.iter().zip(&turned.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
     }
 
@@ -405,7 +420,11 @@ mod tests {
         refiner.write(&path).unwrap();
         let again = Refiner::read(&path, architecture).unwrap();
         assert!(
-            refiner.named().iter().zip(again.named()).all(|((a, s), (b, t))| *a == b && *s == t)
+            refiner
+                .named_parameters()
+                .iter()
+                .zip(again.named_parameters())
+                .all(|((a, s), (b, t))| *a == b && *s == t)
         );
         for other in [
             RefinerArchitecture { channels: 7, ..architecture },
@@ -418,7 +437,10 @@ mod tests {
             RefinerArchitecture { blocks: u32::MAX, ..architecture },
         ] {
             assert!(
-                Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours")
+                Refiner::read(&path, other)
+                    .unwrap_err()
+                    .to_string()
+                    .contains("unsupported network")
             );
         }
         assert!(matches!(

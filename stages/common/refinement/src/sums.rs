@@ -1,8 +1,8 @@
-/// Pixels to each side over which what is shown is compared with what is rendered: in their mean
-/// the detail that rendering lacks evens out.
+/// Radius in pixels of the window in which a reference is compared with the rendered view. In its
+/// mean, missing detail averages out (design note 018).
 pub(crate) const COMPARED_RADIUS: usize = 5;
 
-/// Sums of numbers that pixels have, over all that lies above and to the left of each.
+/// Summed-area table of `N` values per pixel.
 pub(crate) struct Sums<const N: usize> {
     sums: Vec<[f64; N]>,
     width: usize,
@@ -10,7 +10,7 @@ pub(crate) struct Sums<const N: usize> {
 }
 
 impl<const N: usize> Sums<N> {
-    /// Of pixels row by row.
+    /// Builds the table of values given row by row.
     pub(crate) fn new(width: usize, pixels: &[[f64; N]]) -> Self {
         let height = pixels.len() / width.max(1);
         let across = width + 1;
@@ -18,7 +18,9 @@ impl<const N: usize> Sums<N> {
         for (y, row) in pixels.chunks_exact(width.max(1)).enumerate() {
             let mut left = [0.0; N];
             for (x, pixel) in row.iter().enumerate() {
-                left.iter_mut().zip(pixel).for_each(|(sum, value)| *sum += value);
+                for i in 0..N {
+                    left[i] += pixel[i];
+                }
                 sums[(y + 1) * across + x + 1] =
                     std::array::from_fn(|i| sums[y * across + x + 1][i] + left[i]);
             }
@@ -26,15 +28,15 @@ impl<const N: usize> Sums<N> {
         Self { sums, width, height }
     }
 
-    /// Over the pixels around one, as many as there are.
+    /// Returns the sums over the window around a pixel, clipped to the image.
     pub(crate) fn around(&self, x: usize, y: usize) -> [f64; N] {
-        let (left, right) =
-            (x.saturating_sub(COMPARED_RADIUS), (x + COMPARED_RADIUS + 1).min(self.width));
-        let (top, bottom) =
-            (y.saturating_sub(COMPARED_RADIUS), (y + COMPARED_RADIUS + 1).min(self.height));
-        let at = |x: usize, y: usize, i: usize| self.sums[y * (self.width + 1) + x][i];
+        let left = x.saturating_sub(COMPARED_RADIUS);
+        let right = (x + COMPARED_RADIUS + 1).min(self.width);
+        let top = y.saturating_sub(COMPARED_RADIUS) * (self.width + 1);
+        let bottom = (y + COMPARED_RADIUS + 1).min(self.height) * (self.width + 1);
         std::array::from_fn(|i| {
-            at(right, bottom, i) - at(left, bottom, i) - at(right, top, i) + at(left, top, i)
+            self.sums[bottom + right][i] - self.sums[bottom + left][i] - self.sums[top + right][i]
+                + self.sums[top + left][i]
         })
     }
 }

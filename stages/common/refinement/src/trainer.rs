@@ -7,186 +7,191 @@ use pixels::{Image, psnr_of};
 use rayon::prelude::*;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::channels::{OUTPUTS, REFERENCE_INPUTS};
 use crate::error::RefinementError;
-use crate::folded::{FOLD, Square, Turn};
-use crate::guidance::Guidance;
+use crate::folded::{FOLD, Orientation, Square};
 use crate::refiner::Refiner;
-use crate::view::KnownView;
-use crate::warped_reference::{Use, with_references};
+use crate::view::{KnownView, OUTPUTS, REFERENCE_INPUTS};
+use crate::warped_reference::{Guidance, Use, with_references};
 
-/// A training, step by step, that can be interrupted.
+/// Interruptible training, step by step.
 pub trait Training {
-    /// Steps taken.
+    /// Returns the number of steps taken.
     fn steps(&self) -> u64;
 
-    /// Takes a step on some of the examples, of which there is at least one; the error before it,
-    /// `None` once all steps are taken.
+    /// Takes one step on some of the examples, of which there is at least one. Returns the error
+    /// before the step, or `None` after the last step.
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError>;
 
-    /// Writes all that a resumed training needs. The caller makes it atomic.
+    /// Writes a checkpoint, from which the training resumes. The caller makes the write atomic.
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError>;
 
-    /// Goes on from a checkpoint of a training that began with the same network and options.
+    /// Resumes from a checkpoint of a training with the same network and options.
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError>;
 }
 
-/// How to train a [`Refiner`].
+/// Options for training a [`Refiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RefinerTraining {
-    /// Steps in all.
+    /// Total number of steps.
     pub steps: u64,
-    /// Squares in a step.
-    pub batch: usize,
-    /// Pixels along a square's side; an even number.
-    pub square: usize,
-    /// References that a reference-based network gets for a view.
+    /// Number of patches per step.
+    pub batch_size: usize,
+    /// Side of a patch in pixels; an even number.
+    pub patch_size: usize,
+    /// Number of references per view for a reference-based network.
     pub references: usize,
-    /// Highest learning rate; it rises over the first steps and falls to nothing, as a cosine.
-    pub rate: f64,
-    /// Seed of what is drawn.
+    /// Highest learning rate, reached after a warm-up and followed by cosine decay to 0.
+    pub learning_rate: f64,
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
-/// Trains a [`Refiner`] by Adam on the squared error of squares of examples, each turned, mirrored
-/// and with its colours changed: what is learnt are edges, not the scene's own colours, and so it
-/// holds at another size, too. Its error is the mean squared one.
+/// Trains a [`Refiner`] with Adam on the mean squared error of patches of examples. Each patch is
+/// rotated and mirrored, and its colours are changed, so that the network learns edges instead of the
+/// scene's colours and transfers to another size (design note 015).
 pub struct RefinerTrainer {
     refiner: Refiner,
     options: RefinerTraining,
     adam: Adam,
-    /// What a reference-based network is shown now.
+    /// Current training views of a reference-based network.
     pool: Option<Pool>,
 }
 
-/// Examples with what drawn references know of them: where references show a view is looked up once
-/// for all squares of it that are drawn, and no more views than these are kept.
+/// Random examples with random references. References are warped once for all patches of a view, and
+/// memory is bounded by the size of the pool (design note 017).
 struct Pool {
     round: u64,
-    /// Which example, and as the network takes it.
+    /// Index of the example, and the view with reference features.
     views: Vec<(usize, Image)>,
 }
 
 impl Pool {
+    /// Draws the views of a round.
     fn new(
         round: u64,
         options: &RefinerTraining,
         guidance: Guidance,
         examples: &[KnownView],
     ) -> Self {
-        let view = |i: u64| drawn_view(round * POOL_VIEWS + i, options, guidance, examples);
-        Self { round, views: (0..POOL_VIEWS).map(view).collect() }
+        let numbers = round * POOL_VIEWS..(round + 1) * POOL_VIEWS;
+        let views = numbers.map(|number| draw_view(number, options, guidance, examples)).collect();
+        Self { round, views }
     }
 }
 
-/// The drawn example of that number, with what drawn references know of it.
-fn drawn_view(
+/// Draws the `number`-th example of the training, with random references.
+fn draw_view(
     number: u64,
     options: &RefinerTraining,
     guidance: Guidance,
     examples: &[KnownView],
 ) -> (usize, Image) {
     let mut rng = CounterRng::new(options.seed, POOLS, number);
-    let mut draw = || rng.below(examples.len() as u64) as usize;
-    let (chosen, drawn): (usize, Vec<usize>) =
-        (draw(), (0..options.references).map(|_| draw()).collect());
-    let alone = rng.below(NO_REFERENCE_EVERY) == 0;
-    // A view is no reference for itself.
-    let others: Vec<&KnownView> = drawn
-        .iter()
-        .filter(|other| !alone && **other != chosen)
-        .map(|other| &examples[*other])
+    let count = examples.len() as u64;
+    let chosen = rng.below(count) as usize;
+    let drawn: Vec<usize> = (0..options.references).map(|_| rng.below(count) as usize).collect();
+    let is_alone = rng.below(NO_REFERENCE_EVERY) == 0;
+    // A view can't be its own reference.
+    let references: Vec<&KnownView> = drawn
+        .into_iter()
+        .filter(|other| !is_alone && *other != chosen)
+        .map(|other| &examples[other])
         .collect();
-    (chosen, with_references(&examples[chosen].rendered, &others, guidance).view)
+    (chosen, with_references(&examples[chosen].rendered, &references, guidance).view)
 }
 
-/// Shards of a step: fixed, so that sums have one order at any thread count.
+/// Number of shards of a step: fixed, so that sums have one order at any thread count.
 const SHARDS: usize = 8;
-/// Steps over which the rate rises.
+/// Number of steps over which the learning rate rises; chosen by hand.
 const WARM_UP_STEPS: u64 = 50;
-/// Squares with less contrast than this are drawn anew: flat ones teach nothing.
-const LEAST_CONTRAST: f32 = 0.08;
-/// A square is drawn anew at most so many times.
-const MOST_REDRAWS: usize = 8;
-/// A reference-based network gets no reference once in so many times, so that it can do without.
+/// Minimum contrast of a patch; flatter ones are drawn again, since they teach nothing. Chosen by
+/// hand.
+const MIN_CONTRAST: f32 = 0.08;
+/// Maximum number of times that a patch is drawn again; chosen by hand.
+const MAX_REDRAWS: usize = 8;
+/// One in this many views gets no reference, so that the network also works without; chosen by hand.
 const NO_REFERENCE_EVERY: u64 = 8;
-/// Views that squares are drawn from at a time where there are references.
+/// Number of views in the pool of a reference-based network (design note 017).
 const POOL_VIEWS: u64 = 32;
-/// Steps until those views are drawn anew.
+/// Number of steps before the pool is drawn again (design note 017).
 const POOL_STEPS: u64 = 200;
-/// Purposes of draws.
-const SQUARES: u64 = 301;
+/// Streams of random numbers.
+const PATCHES: u64 = 301;
 const SCORES: u64 = 302;
 const POOLS: u64 = 303;
 
-/// How well views are rendered and refined.
+/// Scores of the validation views.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RefinerScores {
-    /// Mean PSNR as rendered, in dB.
+    /// Mean PSNR of the rendered views, in dB.
     pub rendered_psnr: f64,
-    /// Mean PSNR refined, with the best strength, in dB.
+    /// Mean PSNR of the refined views with the best residual weight, in dB.
     pub refined_psnr: f64,
-    /// Share of the prediction that has the least squared error, from 0 to 1.
-    pub strength: f64,
-    /// Confidence in references, a share of their visibility, where there were any.
+    /// Fraction of the predicted residual with the smallest squared error, from 0 to 1.
+    pub residual_weight: f64,
+    /// Confidence in references as a fraction of their visibility; `None` without references.
     pub confidence: Option<f64>,
 }
 
 impl RefinerTrainer {
-    /// Starts from a refiner.
+    /// Creates a trainer of `refiner`.
     pub fn new(refiner: Refiner, options: RefinerTraining) -> Result<Self, RefinementError> {
         let adam = Adam::new(refiner.parameters())?;
         Ok(Self { refiner, options, adam, pool: None })
     }
 
-    /// The refiner as it is now.
+    /// Returns the refiner in its current state.
     pub fn refiner(&self) -> &Refiner {
         &self.refiner
     }
 
-    /// Scores examples that training left out, with references drawn from those that it had, and
-    /// finds the share of the prediction that serves them best.
+    /// Scores validation views, with references drawn from the training views, and finds the best
+    /// residual weight.
     pub fn score(
         &self,
         examples: &[KnownView],
         references: &[KnownView],
     ) -> Result<RefinerScores, RefinementError> {
         let mut uses = Use::default();
-        let views: Vec<Image> = (0u64..)
-            .zip(examples)
-            .map(|(number, example)| self.conditioned(number, example, references, &mut uses))
-            .collect();
+        let mut views = Vec::with_capacity(examples.len());
+        for (number, example) in examples.iter().enumerate() {
+            views.push(self.conditioned(number as u64, example, references, &mut uses));
+        }
         let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let refined = self.refiner.refine(view)?;
-            let colours = view.data.chunks_exact(view.channels).flat_map(|p| &p[..OUTPUTS]);
             let mut error = 0.0;
-            for ((r, v), t) in refined.data.iter().zip(colours).zip(&truth.data) {
-                let (added, lacks) = (f64::from(r - v), f64::from(t - v));
-                inner_product += added * lacks;
-                power += added * added;
-                error += lacks * lacks;
+            for (i, pixel) in view.data.chunks_exact(view.channels).enumerate() {
+                for c in 0..OUTPUTS {
+                    let sample = i * OUTPUTS + c;
+                    let residual = f64::from(refined.data[sample] - pixel[c]);
+                    let true_residual = f64::from(truth.data[sample] - pixel[c]);
+                    inner_product += residual * true_residual;
+                    power += residual * residual;
+                    error += true_residual * true_residual;
+                }
             }
             rendered += psnr_of(error / truth.data.len() as f64);
         }
-        let strength = if power > 0.0 { (inner_product / power).clamp(0.0, 1.0) } else { 0.0 };
+        let residual_weight =
+            if power > 0.0 { (inner_product / power).clamp(0.0, 1.0) } else { 0.0 };
         let mut refined = 0.0;
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
-            let by = self.refiner.refine_by(view, strength as f32, 1)?;
-            let error: f64 =
-                by.data.iter().zip(&truth.data).map(|(r, t)| f64::from(t - r).powi(2)).sum();
+            let image = self.refiner.refine_weighted(view, residual_weight as f32, 1)?;
+            let samples = image.data.iter().zip(&truth.data);
+            let error: f64 = samples.map(|(r, t)| f64::from(t - r).powi(2)).sum();
             refined += psnr_of(error / truth.data.len() as f64);
         }
         let count = examples.len().max(1) as f64;
         Ok(RefinerScores {
             rendered_psnr: rendered / count,
             refined_psnr: refined / count,
-            strength,
+            residual_weight,
             confidence: (uses.seen > 0).then(|| uses.confidence_share()),
         })
     }
 
-    /// A left-out example as the network takes it, with references drawn by its number.
+    /// Returns the network's input for a validation view, with references drawn by its number.
     fn conditioned(
         &self,
         number: u64,
@@ -202,12 +207,14 @@ impl RefinerTrainer {
             .map(|_| &references[rng.below(references.len() as u64) as usize])
             .collect();
         let conditioned = with_references(&example.rendered, &drawn, guidance);
-        conditioned.uses.iter().for_each(|of_use| uses.add(of_use));
+        for statistics in &conditioned.uses {
+            uses.add(statistics);
+        }
         conditioned.view
     }
 
-    /// Draws references for examples anew, where the network takes some and a round begins.
-    fn condition(&mut self, examples: &[KnownView]) {
+    /// Draws a new pool if the network takes references and a round begins.
+    fn update_pool(&mut self, examples: &[KnownView]) {
         let round = self.steps() / POOL_STEPS;
         if let Some(guidance) = self.refiner.architecture().guidance
             && self.pool.as_ref().is_none_or(|pool| pool.round != round)
@@ -216,16 +223,16 @@ impl RefinerTrainer {
         }
     }
 
-    /// What squares are drawn from: examples with their references, or as they are.
-    fn subjects<'a>(&'a self, examples: &'a [KnownView]) -> Vec<Subject<'a>> {
+    /// Returns the views that patches are drawn from: the pool, or all examples.
+    fn views<'a>(&'a self, examples: &'a [KnownView]) -> Vec<TrainingView<'a>> {
         let Some(pool) = &self.pool else {
             return examples
                 .iter()
-                .map(|example| Subject { view: &example.rendered.view, truth: &example.truth })
+                .map(|example| TrainingView { view: &example.rendered.view, truth: &example.truth })
                 .collect();
         };
-        let conditioned = pool.views.iter();
-        conditioned.map(|(i, view)| Subject { view, truth: &examples[*i].truth }).collect()
+        let views = pool.views.iter();
+        views.map(|(i, view)| TrainingView { view, truth: &examples[*i].truth }).collect()
     }
 }
 
@@ -235,168 +242,184 @@ impl Training for RefinerTrainer {
     }
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
-        let RefinerTraining { steps, batch, rate, .. } = self.options;
-        let (step, options) = (self.steps(), self.options);
+        let options = self.options;
+        let RefinerTraining { steps, batch_size, learning_rate, .. } = options;
+        let step = self.steps();
         if step >= steps {
             return Ok(None);
         }
         let shards: Vec<(Refiner, Range<usize>)> = (0..SHARDS)
-            .map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS))
+            .map(|i| {
+                let range = batch_size * i / SHARDS..batch_size * (i + 1) / SHARDS;
+                (self.refiner.shallow_clone(), range)
+            })
             .collect();
-        self.condition(examples);
-        let subjects = self.subjects(examples);
+        self.update_pool(examples);
+        let views = self.views(examples);
         let parts: Vec<(f64, Vec<Tensor>)> = shards
             .into_par_iter()
             .filter(|(_, range)| !range.is_empty())
-            .map(|(refiner, range)| shard(&refiner, &options, step, range, &subjects))
+            .map(|(refiner, range)| run_shard(&refiner, &options, step, range, &views))
             .collect::<Result<_, _>>()?;
         let (loss, gradients) = sum_in_order(parts)?;
         if !loss.is_finite() || !nets::all_finite(&gradients)? {
             return Err(RefinementError::NotFinite { step });
         }
-        let warm = ((step + 1) as f64 / WARM_UP_STEPS as f64).min(1.0);
+        let warm_up = ((step + 1) as f64 / WARM_UP_STEPS as f64).min(1.0);
         let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
-        self.adam.step(self.refiner.parameters(), &gradients, rate * warm * cosine)?;
+        self.adam.step(self.refiner.parameters(), &gradients, learning_rate * warm_up * cosine)?;
         Ok(Some(loss))
     }
 
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
-        Ok(self.adam.write_checkpoint(path, self.refiner.named(), &[])?)
+        Ok(self.adam.write_checkpoint(path, self.refiner.named_parameters(), &[])?)
     }
 
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
-        (self.adam, []) = Adam::resume(path, &self.refiner.named())?;
+        (self.adam, []) = Adam::resume(path, &self.refiner.named_parameters())?;
         Ok(())
     }
 }
 
-/// The sum of shards' losses and gradients, in their order.
+/// Sums shards' losses and gradients in their order.
 fn sum_in_order(parts: Vec<(f64, Vec<Tensor>)>) -> Result<(f64, Vec<Tensor>), TchError> {
     let loss = parts.iter().map(|(loss, _)| loss).sum();
     let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
     let mut gradients = parts.next().unwrap_or_default();
     for part in parts {
-        no_grad(|| {
-            gradients.iter_mut().zip(&part).try_for_each(|(sum, g)| sum.f_add_(g).map(drop))
+        no_grad(|| -> Result<(), TchError> {
+            for (sum, gradient) in gradients.iter_mut().zip(&part) {
+                let _ = sum.f_add_(gradient)?;
+            }
+            Ok(())
         })?;
     }
     Ok((loss, gradients))
 }
 
-/// Loss and gradients of some of a step's squares.
-fn shard(
+/// Computes loss and gradients of a range of a step's patches.
+fn run_shard(
     refiner: &Refiner,
     options: &RefinerTraining,
     step: u64,
     range: Range<usize>,
-    subjects: &[Subject<'_>],
+    views: &[TrainingView<'_>],
 ) -> Result<(f64, Vec<Tensor>), TchError> {
-    let (mut inputs, mut lacks) = (Vec::new(), Vec::new());
-    let size = (options.square, options.square);
-    let around = Square { x: 0, y: 0, size }.grown(refiner.reach());
-    let square = Square { x: 0, y: 0, size };
+    let (mut inputs, mut residuals) = (Vec::new(), Vec::new());
+    let square = Square { x: 0, y: 0, size: (options.patch_size, options.patch_size) };
+    let around = square.grown(refiner.receptive_radius());
     for i in range {
-        let drawn = TrainingSquare::new(options, step * options.batch as u64 + i as u64, subjects);
-        drawn.append(refiner, &mut inputs, &mut lacks);
+        let number = step * options.batch_size as u64 + i as u64;
+        let patch = TrainingPatch::draw(options, number, views);
+        patch.append(refiner, &mut inputs, &mut residuals);
     }
-    let added = refiner.forward(&around.tensor(&inputs, refiner.architecture().inputs())?)?;
-    let all = (options.batch * options.square * options.square * OUTPUTS) as f64;
-    let loss = added
-        .f_sub(&square.tensor(&lacks, OUTPUTS)?)?
+    let input = around.tensor(&inputs, refiner.architecture().input_channels())?;
+    let samples = (options.batch_size * options.patch_size * options.patch_size * OUTPUTS) as f64;
+    let loss = refiner
+        .forward(&input)?
+        .f_sub(&square.tensor(&residuals, OUTPUTS)?)?
         .f_square()?
         .f_sum(None::<Kind>)?
-        .f_div_scalar(all)?;
+        .f_div_scalar(samples)?;
     let parameters: Vec<Tensor> = refiner.parameters().collect();
     let gradients = Tensor::f_run_backward(&[&loss], &parameters, false, false)?;
     Ok((loss.f_double_value(&[])?, gradients))
 }
 
-/// A view as the network takes it, beside what it should look like.
+/// Input view of the network with its ground truth.
 #[derive(Clone, Copy)]
-struct Subject<'a> {
+struct TrainingView<'a> {
     view: &'a Image,
     truth: &'a Image,
 }
 
-/// A square of a view, as it is shown to the network.
-struct TrainingSquare<'a> {
-    subject: Subject<'a>,
+/// Augmented patch of a view.
+struct TrainingPatch<'a> {
+    view: TrainingView<'a>,
     square: Square,
-    turn: Turn,
-    /// Which channel comes first, second, third.
+    orientation: Orientation,
+    /// Permutation of the colour channels.
     order: [usize; OUTPUTS],
-    /// Contrast; negative for the negative.
+    /// Factor on colours; negative for a negative image.
     gain: f32,
     offset: f32,
 }
 
-impl<'a> TrainingSquare<'a> {
-    /// The square with that number.
-    fn new(options: &RefinerTraining, number: u64, subjects: &[Subject<'a>]) -> Self {
-        let mut rng = CounterRng::new(options.seed, SQUARES, number);
-        let mut placed = place(subjects, options.square, &mut rng);
-        for _ in 0..MOST_REDRAWS {
-            if contrast(placed.0.truth, placed.1) >= LEAST_CONTRAST {
+impl<'a> TrainingPatch<'a> {
+    /// Draws the `number`-th patch of the training.
+    fn draw(options: &RefinerTraining, number: u64, views: &[TrainingView<'a>]) -> Self {
+        let mut rng = CounterRng::new(options.seed, PATCHES, number);
+        let (mut view, mut square) = draw_square(views, options.patch_size, &mut rng);
+        for _ in 0..MAX_REDRAWS {
+            if contrast(view.truth, square) >= MIN_CONTRAST {
                 break;
             }
-            placed = place(subjects, options.square, &mut rng);
+            (view, square) = draw_square(views, options.patch_size, &mut rng);
         }
-        let (subject, square) = placed;
-        let turn = Turn::ALL[rng.below(Turn::ALL.len() as u64) as usize];
+        let orientation = Orientation::ALL[rng.below(Orientation::ALL.len() as u64) as usize];
         let mut order = [0, 1, 2];
-        (1..OUTPUTS).for_each(|i| order.swap(i, rng.below(i as u64 + 1) as usize));
-        let (contrast, shift) = (0.5 + 0.7 * rng.uniform(), 0.4 * (rng.uniform() - 0.5));
+        for i in 1..OUTPUTS {
+            order.swap(i, rng.below(i as u64 + 1) as usize);
+        }
+        let contrast = 0.5 + 0.7 * rng.uniform();
+        let shift = 0.4 * (rng.uniform() - 0.5);
         let sign = if rng.below(2) == 1 { -1.0 } else { 1.0 };
-        // Around the middle of all colours.
+        // Scaled around mid-grey.
         let (gain, offset) = (sign * contrast, 0.5 + sign * (shift - 0.5 * contrast));
-        Self { subject, square, turn, order, gain, offset }
+        Self { view, square, orientation, order, gain, offset }
     }
 
-    /// Appends what the network gets, which reaches farther than the square, and what it should
-    /// add.
-    fn append(&self, refiner: &Refiner, inputs: &mut Vec<f32>, lacks: &mut Vec<f32>) {
-        let Subject { view, truth } = self.subject;
-        let around = self.square.grown(refiner.reach());
+    /// Appends the network's input, which includes the receptive field around the patch, and the true
+    /// residual.
+    fn append(&self, refiner: &Refiner, inputs: &mut Vec<f32>, residuals: &mut Vec<f32>) {
+        let TrainingView { view, truth } = self.view;
+        let around = self.square.grown(refiner.receptive_radius());
         around.fold(|x, y| {
-            let (x, y) = self.turn.source(around, x, y);
-            let pixel = around.of(view, x, y);
+            let (x, y) = self.orientation.source(around, x, y);
+            let pixel = around.pixel(view, x, y);
             inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
             inputs.push(pixel[OUTPUTS]);
             if view.channels == REFERENCE_INPUTS {
                 let [.., r, g, b, confidence, x, y, z] = pixel else {
-                    unreachable!("a conditioned view has that many channels")
+                    unreachable!("a view with reference features has 11 channels")
                 };
-                let (differences, lacking) = ([r, g, b], [x, y, z]);
-                inputs.extend(self.order.map(|c| self.gain * differences[c]));
+                let (difference, detail) = ([r, g, b], [x, y, z]);
+                inputs.extend(self.order.map(|c| self.gain * difference[c]));
                 inputs.push(*confidence);
-                inputs.extend(self.order.map(|c| self.gain * lacking[c]));
+                inputs.extend(self.order.map(|c| self.gain * detail[c]));
             }
         });
         self.square.fold(|x, y| {
-            let (x, y) = self.turn.source(self.square, x, y);
-            let (seen, wanted) = (self.square.of(view, x, y), self.square.of(truth, x, y));
-            lacks.extend(self.order.map(|c| self.gain * (wanted[c] - seen[c])));
+            let (x, y) = self.orientation.source(self.square, x, y);
+            let rendered = self.square.pixel(view, x, y);
+            let truth = self.square.pixel(truth, x, y);
+            residuals.extend(self.order.map(|c| self.gain * (truth[c] - rendered[c])));
         });
     }
 }
 
-/// A drawn square, of so many pixels along its side, of a drawn view.
-fn place<'a>(subjects: &[Subject<'a>], side: usize, rng: &mut CounterRng) -> (Subject<'a>, Square) {
-    let subject = subjects[rng.below(subjects.len() as u64) as usize];
-    let (x, y) = (start(subject.view.width, side, rng), start(subject.view.height, side, rng));
-    (subject, Square { x, y, size: (side, side) })
+/// Draws a view and a square of `side` pixels in it.
+fn draw_square<'a>(
+    views: &[TrainingView<'a>],
+    side: usize,
+    rng: &mut CounterRng,
+) -> (TrainingView<'a>, Square) {
+    let view = views[rng.below(views.len() as u64) as usize];
+    let x = draw_start(view.view.width, side, rng);
+    let y = draw_start(view.view.height, side, rng);
+    (view, Square { x, y, size: (side, side) })
 }
 
-/// Where a drawn square begins along an axis: on even pixels, as the folds of whole views lie.
-fn start(size: usize, side: usize, rng: &mut CounterRng) -> isize {
+/// Draws the start of a square along an axis: an even pixel, aligned with the folds of whole views.
+fn draw_start(size: usize, side: usize, rng: &mut CounterRng) -> isize {
     (rng.below((size.saturating_sub(side) / FOLD + 1) as u64) as usize * FOLD) as isize
 }
 
-/// Range of the green in a square of the truth.
+/// Returns the range of the green channel in a square of the ground truth.
 fn contrast(truth: &Image, square: Square) -> f32 {
     let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
     square.fold(|x, y| {
-        let green = square.of(truth, x, y)[1];
+        let green = square.pixel(truth, x, y)[1];
         (low, high) = (low.min(green), high.max(green));
     });
     high - low
@@ -452,10 +475,10 @@ mod tests {
         nets::deterministic();
         let options = RefinerTraining {
             steps: 300,
-            batch: 8,
-            square: 16,
+            batch_size: 8,
+            patch_size: 16,
             references: 1,
-            rate: 5e-3,
+            learning_rate: 5e-3,
             seed: 3,
         };
         let refiner =
@@ -472,7 +495,7 @@ mod tests {
             let (trainer, examples) = trained(guidance);
             let scores = trainer.score(&[example(5)], &examples).unwrap();
             assert!(scores.refined_psnr > scores.rendered_psnr + 6.0, "{scores:?}");
-            assert!(scores.strength > 0.8, "{scores:?}");
+            assert!(scores.residual_weight > 0.8, "{scores:?}");
         }
     }
 

@@ -4,139 +4,142 @@ use scene::{Camera, Photograph, Surface, View};
 
 use crate::error::RefinementError;
 
-/// A view as a field rendered it.
+/// Number of channels of a rendered view: colour and opacity.
+pub(crate) const INPUTS: usize = 4;
+/// Number of channels of a view with reference features: difference, confidence and detail.
+pub(crate) const REFERENCE_INPUTS: usize = 11;
+/// Number of channels of an image.
+pub(crate) const OUTPUTS: usize = 3;
+
+/// View rendered from a field.
 #[derive(Clone, Debug)]
 pub struct Rendered {
-    /// Where from; its intrinsics have the view's size.
+    /// Camera; its intrinsics have the view's size.
     pub camera: Camera,
-    /// Colour, on the background that is shown, and opacity.
+    /// Colour, composited on the background, and opacity.
     pub view: Image,
-    /// Camera-space z-depth in scene units, a number a pixel.
+    /// Camera-space z-depth in scene units, one value per pixel.
     pub depth: Vec<f32>,
-    /// Opacity, a number a pixel.
+    /// Opacity, one value per pixel.
     pub opacity: Vec<f32>,
 }
 
 impl Rendered {
-    /// From a view's file, over a grey level.
+    /// Converts a view's image, composited on a grey background.
     pub fn new(camera: Camera, image: &ExrImage, background: f32) -> Result<Self, RefinementError> {
-        let refuse =
-            |reason: String| Err(RefinementError::View { name: camera.name.clone(), reason });
         let (Some(premultiplied), Some(map)) = (image.premultiplied(), DepthMap::of(image)) else {
-            return refuse("channels R, G, B, A and Z are expected".to_owned());
+            let reason = "channels R, G, B, A and Z are expected".to_owned();
+            return Err(RefinementError::View { name: camera.name, reason });
         };
         let k = &camera.intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
-            let (width, height) = (image.width, image.height);
-            return refuse(format!(
-                "{width}×{height} pixels where its camera has {}×{}",
-                k.width, k.height
-            ));
+            let reason = format!(
+                "{}×{} pixels, but its camera has {}×{}",
+                image.width, image.height, k.width, k.height
+            );
+            return Err(RefinementError::View { name: camera.name, reason });
         }
-        let over = premultiplied.over(background);
-        let pixels = over
-            .data
-            .chunks_exact(3)
-            .zip(premultiplied.data.chunks_exact(4))
-            .flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]);
-        let view = Image::new(image.width, image.height, 4, pixels.collect());
+        let mut view = premultiplied.clone();
+        let composited = premultiplied.over(background);
+        for (i, pixel) in view.data.chunks_exact_mut(INPUTS).enumerate() {
+            pixel[..OUTPUTS].copy_from_slice(&composited.data[i * OUTPUTS..][..OUTPUTS]);
+        }
         Ok(Self { opacity: map.opacity.to_vec(), depth: map.depth.to_vec(), view, camera })
     }
 
-    /// A view of an input over a grey level, and its file's channels. None where it has no image.
+    /// Reads a view of an input, composited on a grey background, together with its file's channels.
+    /// Returns `None` if the view has no image.
     ///
     /// # Errors
-    /// [`Failure::BadInput`], with input and view, where its image can't be read or isn't a
-    /// rendered view's.
+    /// [`Failure::BadInput`], with input and view, if the image can't be read or isn't that of a
+    /// rendered view.
     pub fn read(
         input: &GivenInput,
         view: &View,
         background: f32,
     ) -> Result<Option<(Self, ExrImage)>, Failure> {
         let Some(file) = &view.image else { return Ok(None) };
-        let place = format!("input {}", input.name());
+        let input_name = format!("input {}", input.name());
         let path = input.path(file);
         let image = read_exr(&path)
             .and_then(|image| image.with_finite(&["R", "G", "B", "A", "Z"], &path))
-            .bad_input(format!("{place}: view {}", view.camera.name))?;
-        let rendered = Self::new(view.camera.clone(), &image, background).bad_input(place)?;
+            .bad_input(format!("{input_name}: view {}", view.camera.name))?;
+        let rendered = Self::new(view.camera.clone(), &image, background).bad_input(input_name)?;
         Ok(Some((rendered, image)))
     }
 
-    /// Its colours alone.
+    /// Returns the colours, without opacity.
     pub fn colours(&self) -> Image {
         let colours = self.view.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]);
         Image::new(self.view.width, self.view.height, 3, colours.collect())
     }
 
-    /// The same view with other colours.
+    /// Replaces the colours.
     ///
     /// # Panics
-    /// Where they aren't of its size.
+    /// If `colours` has another size than the view.
     #[must_use]
     pub fn with_colours(mut self, colours: &Image) -> Self {
         assert_eq!(
             (colours.width, colours.height),
             (self.view.width, self.view.height),
-            "colours of its size"
+            "colours have the view's size"
         );
-        for (pixel, colour) in self.view.data.chunks_exact_mut(4).zip(colours.data.chunks_exact(3))
-        {
-            pixel[..3].copy_from_slice(colour);
+        for (i, pixel) in self.view.data.chunks_exact_mut(INPUTS).enumerate() {
+            pixel[..OUTPUTS].copy_from_slice(&colours.data[i * OUTPUTS..][..OUTPUTS]);
         }
         self
     }
 
-    /// Where the field sees surfaces.
+    /// Returns the surfaces that the view's depth describes.
     pub fn surface(&self) -> Surface<'_> {
         let map = DepthMap { depth: &self.depth, opacity: &self.opacity };
         Surface { camera: &self.camera, map }
     }
 }
 
-/// A rendered view whose true image is known: an example to learn from, or a reference for other
-/// views.
+/// Side in pixels of the blocks whose means are compared for exposure. In block means, missing detail
+/// averages out (design note 018).
+const BLOCK_SIDE: usize = 8;
+
+/// Rendered view with its ground truth: a training example, or a reference for other views.
 #[derive(Clone, Debug)]
 pub struct KnownView {
-    /// As rendered.
+    /// The view as rendered.
     pub rendered: Rendered,
-    /// Colour, on the background that is shown; of the view's size. What is rendered, where nothing
-    /// is known.
+    /// Ground truth of the view's size, composited on the background. Masked pixels have the rendered
+    /// colour.
     pub truth: Image,
 }
 
 impl KnownView {
-    /// A rendered view with its photograph, over the same background. Where that doesn't count it
-    /// is taken for what is rendered, and so says nothing.
+    /// Combines a rendered view with its photograph, composited on the same background. Masked pixels
+    /// of the photograph get the rendered colour, so that they differ nowhere.
     pub fn new(rendered: Rendered, photograph: Photograph) -> Result<Self, RefinementError> {
-        let (view, name, Photograph { image: mut truth, mask }) =
-            (&rendered.view, &rendered.camera.name, photograph);
+        let view = &rendered.view;
+        let Photograph { image: mut truth, mask } = photograph;
         if (view.width, view.height) != (truth.width, truth.height) {
             let reason = format!(
-                "{}×{} pixels where its image has {}×{}; render it for the image's camera",
+                "{}×{} pixels, but its image has {}×{}; render it for the image's camera",
                 view.width, view.height, truth.width, truth.height
             );
-            return Err(RefinementError::View { name: name.clone(), reason });
+            return Err(RefinementError::View { name: rendered.camera.name, reason });
         }
-        mask.iter().for_each(|mask| mask.fill(&mut truth, view));
+        if let Some(mask) = mask {
+            mask.fill(&mut truth, view);
+        }
         Ok(Self { rendered, truth })
     }
-}
 
-/// Pixels along the sides of blocks whose means are compared: in those, what a field lacks in
-/// detail evens out.
-const BLOCK_SIDE: usize = 8;
-
-impl KnownView {
-    /// The exposure of the true image against the rendered view, which has the exposure of the
-    /// images that the field learnt from. None where too little says what it is.
+    /// Estimates the exposure of the ground truth relative to the rendered view, which has the
+    /// exposure of the field's training images. Returns `None` if the images determine no exposure.
     pub fn exposure(&self) -> Option<Exposure> {
         Exposure::between(&self.rendered.view, &self.truth, BLOCK_SIDE)
     }
 
-    /// The same view with a true image as the rendered one's exposure would have made it.
+    /// Corrects the ground truth to the exposure of the rendered view.
     #[must_use]
-    pub fn without(mut self, exposure: &Exposure) -> Self {
+    pub fn with_corrected_exposure(mut self, exposure: &Exposure) -> Self {
         exposure.take_back(&mut self.truth);
         self
     }
@@ -195,7 +198,7 @@ mod tests {
             );
             let offsets = exposure.offset.map(|o| (o - offset).abs());
             assert!(offsets.iter().all(|o| *o < 0.02), "{exposure:?}");
-            let (same, again) = (view(1.0, 0.0), dark.without(&exposure));
+            let (same, again) = (view(1.0, 0.0), dark.with_corrected_exposure(&exposure));
             let pairs = || same.truth.data.iter().zip(&again.truth.data);
             let mean = pairs().map(|(a, b)| (a - b).abs()).sum::<f32>() / pairs().count() as f32;
             assert!(mean < 0.02, "{mean}");

@@ -1,36 +1,36 @@
 use crate::view::KnownView;
 
-/// What one reference shows of a pixel.
+/// Pixel of a view with the colours that one reference has at the same surface point.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct WarpedPixel {
-    /// Difference to what is rendered.
+    /// The reference's colour minus the view's rendered colour.
     pub(crate) difference: [f32; 3],
-    /// Difference to what is rendered for the reference.
-    pub(crate) lacking: [f32; 3],
-    /// Where in the reference, in pixels.
-    pub(crate) place: [f32; 2],
-    /// By angle and size; 0 where it shows nothing.
+    /// The reference's colour minus its own rendered colour: the detail that rendering lacks.
+    pub(crate) detail: [f32; 3],
+    /// Position in the reference in pixels.
+    pub(crate) position: [f32; 2],
+    /// Visibility in the reference by angle and size, 0 to 1; 0 if the point isn't visible.
     pub(crate) visibility: f32,
-    /// The same, less where it looks otherwise than what is rendered.
+    /// Visibility, reduced where the reference disagrees with the rendered view.
     pub(crate) confidence: f32,
 }
 
 impl WarpedPixel {
-    /// What a reference shows at a place of it, for a pixel as rendered.
+    /// Samples a reference at a position for a pixel of the rendered view.
     pub(crate) fn new(
         reference: &KnownView,
-        place: [f32; 2],
+        position: [f32; 2],
         visibility: f32,
         pixel: &[f32],
     ) -> Self {
-        let (colour, theirs) =
-            (reference.truth.colour_at(place), reference.rendered.view.colour_at(place));
+        let colour = reference.truth.colour_at(position);
+        let rendered = reference.rendered.view.colour_at(position);
         let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
-        let lacking = std::array::from_fn(|c| colour[c] - theirs[c]);
-        // An image with a hole in it shows nothing there.
-        let is_shown = difference.iter().chain(&lacking).all(|d: &f32| d.is_finite());
-        if is_shown {
-            Self { difference, lacking, place, visibility, confidence: visibility }
+        let detail = std::array::from_fn(|c| colour[c] - rendered[c]);
+        // An image with non-finite pixels shows nothing there.
+        let is_known = difference.iter().chain(&detail).all(|d: &f32| d.is_finite());
+        if is_known {
+            Self { difference, detail, position, visibility, confidence: visibility }
         } else {
             Self::default()
         }

@@ -1,52 +1,70 @@
-//! Reference-based refinement: HR references brought over to a view by its depth, and the
-//! confidence in what they show there.
+//! Reference-based refinement: HR references warped to a view by its depth, and the confidence in
+//! them.
 
 use std::ops::Range;
 
 use pixels::Image;
 use rayon::prelude::*;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::align::align;
-use crate::channels::{INPUTS, REFERENCE_INPUTS};
-use crate::guidance::Guidance;
 use crate::sums::{COMPARED_RADIUS, Sums};
-use crate::view::{KnownView, Rendered};
+use crate::view::{INPUTS, KnownView, REFERENCE_INPUTS, Rendered};
 use crate::warped_pixel::WarpedPixel;
 
-/// What references know of some rows of a view: how the colour they show there differs from the
-/// rendered one; the confidence in them, from 0 (none of them sees it) to 1 (one sees it from the
-/// same direction, as large, and as it is rendered); and what their own rendered views lack there,
-/// which is of use even where they show a surface a little aside, or in another light.
+/// Options for warping references to a view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Guidance {
+    /// True if a reference contributes only points that are visible in it by its own depth; false if
+    /// also hidden points.
+    pub occlusion: bool,
+    /// True if a reference's pixels are moved, by up to two pixels, to fit the rendered view.
+    pub alignment: bool,
+}
+
+impl Default for Guidance {
+    /// Returns the test for occlusion, without alignment.
+    fn default() -> Self {
+        Self { occlusion: true, alignment: false }
+    }
+}
+
+/// Features of references for some rows of a view.
 #[derive(Debug)]
 struct ReferenceFeatures {
-    known: Vec<[f32; KNOWN]>,
+    /// Features of each pixel: the references' difference to the rendered colour; the confidence,
+    /// from 0 (visible in none of them) to 1 (visible in one from the same direction and as large,
+    /// and equal to the rendered view); and the detail that the references' own rendered views lack,
+    /// which helps even if a reference shows a point slightly off or in another light.
+    features: Vec<[f32; FEATURES]>,
     uses: Vec<Use>,
 }
 
-/// Channels of what references know.
-const KNOWN: usize = REFERENCE_INPUTS - INPUTS;
+/// Number of channels of reference features.
+const FEATURES: usize = REFERENCE_INPUTS - INPUTS;
 
-/// What of a view a reference was of use for.
+/// Statistics of one reference in a view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Use {
-    /// Pixels that it sees.
+    /// Number of the view's pixels that are visible in the reference.
     pub seen: usize,
-    /// Sum over them of how well it sees them, by angle and size.
+    /// Sum over them of their visibility, by angle and size.
     #[serde(rename = "sight")]
     pub visibility: f64,
-    /// Sum over them of the confidence in it: less where it looks otherwise than what is rendered.
-    #[serde(rename = "confidence")]
+    /// Sum over them of the confidence: visibility, reduced where the reference disagrees with the
+    /// rendered view.
     pub confidence: f64,
 }
 
 impl Use {
-    /// Confidence in what it sees, a share of its visibility.
+    /// Returns the confidence as a fraction of the visibility.
     pub fn confidence_share(&self) -> f64 {
         if self.visibility > 0.0 { self.confidence / self.visibility } else { 1.0 }
     }
 
-    /// Adds what another part makes of the same reference.
+    /// Adds statistics of the same reference for other pixels.
     pub fn add(&mut self, other: &Self) {
         self.seen += other.seen;
         self.visibility += other.visibility;
@@ -54,66 +72,85 @@ impl Use {
     }
 }
 
-/// A view with what references know of it.
+/// View with reference features.
 #[derive(Clone, Debug)]
 pub struct ConditionedView {
-    /// As a reference-based refiner takes it: colour, opacity, difference to the references, their
-    /// confidence, and what their own views lack.
+    /// Input of a reference-based refiner: colour, opacity, and the references' difference,
+    /// confidence and detail.
     pub view: Image,
-    /// What each reference was of use for.
+    /// Statistics of each reference.
     pub uses: Vec<Use>,
 }
 
-/// The mean difference around a pixel that quarters the confidence.
+/// Mean difference around a pixel that quarters the confidence (design note 018).
 const QUARTERING_DIFFERENCE: f32 = 0.1;
-/// The jump between neighbours that halves the confidence, in pixels of the reference.
+/// Jump between neighbours that halves the confidence, in pixels of the reference; chosen by hand.
 const HALVING_JUMP: f32 = 1.0;
+/// Number of rows of a view that are warped together, so that memory doesn't grow with the view.
+const BAND_ROWS: usize = 32;
+
+/// Sums over references at one pixel, weighted by the fourth power of confidence (design note 017).
+#[derive(Clone, Copy, Default)]
+struct FeatureSums {
+    difference: [f32; 3],
+    detail: [f32; 3],
+    weight: f32,
+    max_confidence: f32,
+}
+
+impl FeatureSums {
+    /// Adds a reference's pixel. The less confidence, the more its features fade to 0, the value of
+    /// an invisible point.
+    fn add(&mut self, pixel: &WarpedPixel) {
+        let weight = pixel.confidence.powi(4);
+        let fade = pixel.confidence / pixel.visibility.max(f32::MIN_POSITIVE);
+        for c in 0..3 {
+            self.difference[c] += weight * fade * pixel.difference[c];
+            self.detail[c] += weight * fade * pixel.detail[c];
+        }
+        self.weight += weight;
+        self.max_confidence = self.max_confidence.max(pixel.confidence);
+    }
+
+    fn features(self) -> [f32; FEATURES] {
+        if self.weight > 0.0 {
+            let [r, g, b] = self.difference.map(|v| v / self.weight);
+            let [x, y, z] = self.detail.map(|v| v / self.weight);
+            [r, g, b, self.max_confidence, x, y, z]
+        } else {
+            [0.0; FEATURES]
+        }
+    }
+}
 
 impl ReferenceFeatures {
-    /// What references know of rows.
+    /// Warps references to rows of a view and combines them.
     fn new(
         rendered: &Rendered,
         references: &[&KnownView],
         rows: Range<usize>,
         guidance: Guidance,
     ) -> Self {
-        let mut sums =
-            vec![([0.0f32; 3], [0.0f32; 3], 0.0f32, 0.0f32); rendered.view.width * rows.len()];
-        let mut uses = Vec::new();
+        let mut sums = vec![FeatureSums::default(); rendered.view.width * rows.len()];
+        let mut uses = Vec::with_capacity(references.len());
         for reference in references {
+            let mut statistics = Use::default();
             let warped = warp(rendered, reference, &rows, guidance);
-            let mut of_use = Use::default();
-            for (
-                (sum, lacks, weights, best),
-                WarpedPixel { difference, lacking, visibility, confidence, .. },
-            ) in sums.iter_mut().zip(warped)
-            {
-                of_use.add(&Use {
-                    seen: usize::from(visibility > 0.0),
-                    visibility: f64::from(visibility),
-                    confidence: f64::from(confidence),
-                });
-                // The best counts most. What has no confidence fades, as if it weren't seen.
-                let weight = confidence.powi(4);
-                let share = confidence / visibility.max(f32::MIN_POSITIVE);
-                (0..3).for_each(|c| sum[c] += weight * share * difference[c]);
-                (0..3).for_each(|c| lacks[c] += weight * share * lacking[c]);
-                *weights += weight;
-                *best = best.max(confidence);
+            for (sums, pixel) in sums.iter_mut().zip(&warped) {
+                statistics.seen += usize::from(pixel.visibility > 0.0);
+                statistics.visibility += f64::from(pixel.visibility);
+                statistics.confidence += f64::from(pixel.confidence);
+                sums.add(pixel);
             }
-            uses.push(of_use);
+            uses.push(statistics);
         }
-        let known = sums.into_iter().map(|(sum, lacks, weights, confidence)| {
-            let ([r, g, b], [x, y, z]) = (sum.map(|v| v / weights), lacks.map(|v| v / weights));
-            if weights > 0.0 { [r, g, b, confidence, x, y, z] } else { [0.0; KNOWN] }
-        });
-        Self { known: known.collect(), uses }
+        Self { features: sums.into_iter().map(FeatureSums::features).collect(), uses }
     }
 }
 
-/// What a reference shows of rows, with less confidence where around a pixel it looks otherwise
-/// than rendered (wrong depth, something that moved, a highlight) or comes from here and there
-/// (noisy depth, an edge).
+/// Warps a reference to rows of a view. Confidence is lower where the reference differs from the
+/// rendered view in the mean around a pixel (wrong depth, a moved object, a highlight), and where
+/// neighbouring pixels map to positions out of line (noisy depth, an edge).
 fn warp(
     rendered: &Rendered,
     reference: &KnownView,
@@ -121,10 +158,10 @@ fn warp(
     guidance: Guidance,
 ) -> Vec<WarpedPixel> {
     let (width, height) = (rendered.view.width, rendered.view.height);
-    // What is looked at around a pixel was itself moved by what lies around it.
+    // Alignment makes every compared pixel depend on its own neighbourhood.
     let around = if guidance.alignment { 2 * COMPARED_RADIUS } else { COMPARED_RADIUS };
     let near = rows.start.saturating_sub(around)..(rows.end + around).min(height);
-    let mut warped = shown(rendered, reference, near.clone(), guidance.occlusion);
+    let mut warped = warp_by_depth(rendered, reference, near.clone(), guidance.occlusion);
     if guidance.alignment {
         warped = align(&warped, rendered, reference, near.start);
     }
@@ -133,25 +170,25 @@ fn warp(
         if pixel.confidence > 0.0 { [r, g, b, 1.0] } else { [0.0; 4] }
     });
     let sums = Sums::new(width, &terms.collect::<Vec<_>>());
-    let mut all = Vec::with_capacity(width * rows.len());
-    let neighbours = Neighbours { warped: &warped, width };
+    let mut pixels = Vec::with_capacity(width * rows.len());
+    let positions = WarpedPositions { warped: &warped, width };
     for y in rows.start - near.start..rows.end - near.start {
         for x in 0..width {
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
-                let apart = mean_difference(&sums, x, y) / QUARTERING_DIFFERENCE;
-                let jumped = neighbours.jumped(x, y);
-                own.confidence *=
-                    (1.0 + apart * apart).powi(-2) / (1.0 + jumped / (HALVING_JUMP * HALVING_JUMP));
+                let difference = mean_difference(&sums, x, y) / QUARTERING_DIFFERENCE;
+                let jump = positions.squared_jump(x, y);
+                own.confidence *= (1.0 + difference * difference).powi(-2)
+                    / (1.0 + jump / (HALVING_JUMP * HALVING_JUMP));
             }
-            all.push(own);
+            pixels.push(own);
         }
     }
-    all
+    pixels
 }
 
-/// What a reference shows of rows where geometry puts them.
-fn shown(
+/// Warps a reference to rows of a view by depth alone.
+fn warp_by_depth(
     rendered: &Rendered,
     reference: &KnownView,
     rows: Range<usize>,
@@ -159,7 +196,7 @@ fn shown(
 ) -> Vec<WarpedPixel> {
     let width = rendered.view.width;
     let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
-    let mut shown = Vec::with_capacity(width * rows.len());
+    let mut warped = Vec::with_capacity(width * rows.len());
     for (column, row) in rows.flat_map(|row| (0..width).map(move |column| (column, row))) {
         let visibility = if occlusion {
             surface.visibility(column, row, &theirs)
@@ -167,53 +204,53 @@ fn shown(
             surface.visibility_through(column, row, theirs.camera)
         };
         let Some(visibility) = visibility else {
-            shown.push(WarpedPixel::default());
+            warped.push(WarpedPixel::default());
             continue;
         };
-        let well = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
+        let weight = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
         let pixel = &rendered.view.data[(row * width + column) * INPUTS..];
-        shown.push(WarpedPixel::new(reference, visibility.place, well, pixel));
+        warped.push(WarpedPixel::new(reference, visibility.place, weight, pixel));
     }
-    shown
+    warped
 }
 
-/// How large the mean difference around a pixel is.
+/// Returns the length of the mean colour difference around a pixel.
 fn mean_difference(sums: &Sums<4>, x: usize, y: usize) -> f32 {
     let [r, g, b, count] = sums.around(x, y);
     [r, g, b].map(|sum| (sum / count.max(1.0)).powi(2)).iter().sum::<f64>().sqrt() as f32
 }
 
-/// Where neighbouring pixels were found in a reference.
-struct Neighbours<'a> {
+/// Positions of neighbouring pixels in a reference.
+struct WarpedPositions<'a> {
     warped: &'a [WarpedPixel],
     width: usize,
 }
 
-impl Neighbours<'_> {
-    fn place(&self, x: usize, y: usize, dx: isize, dy: isize) -> Option<[f32; 2]> {
+impl WarpedPositions<'_> {
+    /// Returns the position of a pixel's neighbour if the neighbour is visible.
+    fn of_neighbour(&self, x: usize, y: usize, dx: isize, dy: isize) -> Option<[f32; 2]> {
         let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
         let other = (x < self.width).then(|| self.warped.get(y * self.width + x))??;
-        (other.confidence > 0.0).then_some(other.place)
+        (other.confidence > 0.0).then_some(other.position)
     }
 
-    /// How far a pixel was found from the middle of its neighbours, squared: to both sides, and
-    /// above and below.
-    fn jumped(&self, x: usize, y: usize) -> f32 {
-        let own = self.warped[y * self.width + x].place;
-        apart(own, self.place(x, y, -1, 0), self.place(x, y, 1, 0))
-            + apart(own, self.place(x, y, 0, -1), self.place(x, y, 0, 1))
+    /// Returns the squared distances of a pixel's position from the line through its horizontal and
+    /// its vertical neighbours.
+    fn squared_jump(&self, x: usize, y: usize) -> f32 {
+        let own = self.warped[y * self.width + x].position;
+        squared_bend(own, self.of_neighbour(x, y, -1, 0), self.of_neighbour(x, y, 1, 0))
+            + squared_bend(own, self.of_neighbour(x, y, 0, -1), self.of_neighbour(x, y, 0, 1))
     }
 }
 
-/// How far the steps to a place from a neighbour and on to another are from equal, squared; 0 where
-/// one of those isn't there.
-fn apart(own: [f32; 2], a: Option<[f32; 2]>, b: Option<[f32; 2]>) -> f32 {
+/// Returns the squared second difference a + b - 2·own; 0 if a neighbour is missing.
+fn squared_bend(own: [f32; 2], a: Option<[f32; 2]>, b: Option<[f32; 2]>) -> f32 {
     let (Some(a), Some(b)) = (a, b) else { return 0.0 };
     (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
 }
 
-/// A view with what references know of it, as a reference-based refiner takes it: with its
-/// [`crate::RefinerArchitecture::guidance`].
+/// Adds reference features to a view, as a refiner with this
+/// [`crate::RefinerArchitecture::guidance`] takes them.
 pub fn with_references(
     rendered: &Rendered,
     references: &[&KnownView],
@@ -223,36 +260,36 @@ pub fn with_references(
     let mut data = vec![0.0; width * height * REFERENCE_INPUTS];
     let bands = data.par_chunks_mut(width * BAND_ROWS * REFERENCE_INPUTS).enumerate();
     let uses: Vec<Vec<Use>> = bands
-        .map(|(i, out)| condition(out, i * BAND_ROWS, rendered, references, guidance))
+        .map(|(i, band)| fill_band(band, i * BAND_ROWS, rendered, references, guidance))
         .collect();
     let mut sums = vec![Use::default(); references.len()];
-    uses.iter()
-        .for_each(|band| sums.iter_mut().zip(band).for_each(|(sum, of_use)| sum.add(of_use)));
+    for band in &uses {
+        for (sum, statistics) in sums.iter_mut().zip(band) {
+            sum.add(statistics);
+        }
+    }
     ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), uses: sums }
 }
 
-/// Fills a band of a conditioned view from its first row on; what references were of use for.
-fn condition(
-    out: &mut [f32],
-    first: usize,
+/// Fills a band of a conditioned view, starting at `first_row`; returns the references' statistics.
+fn fill_band(
+    band: &mut [f32],
+    first_row: usize,
     rendered: &Rendered,
     references: &[&KnownView],
     guidance: Guidance,
 ) -> Vec<Use> {
     let Image { width, height, .. } = rendered.view;
-    let rows = first..(first + BAND_ROWS).min(height);
-    let features = ReferenceFeatures::new(rendered, references, rows.clone(), guidance);
-    let pixels =
-        rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&features.known);
-    for (out, (pixel, known)) in out.chunks_exact_mut(REFERENCE_INPUTS).zip(pixels) {
-        out[..INPUTS].copy_from_slice(pixel);
-        out[INPUTS..].copy_from_slice(known);
+    let rows = first_row..(first_row + BAND_ROWS).min(height);
+    let ReferenceFeatures { features, uses } =
+        ReferenceFeatures::new(rendered, references, rows.clone(), guidance);
+    let view = &rendered.view.data[rows.start * width * INPUTS..];
+    for (i, pixel) in band.chunks_exact_mut(REFERENCE_INPUTS).enumerate() {
+        pixel[..INPUTS].copy_from_slice(&view[i * INPUTS..(i + 1) * INPUTS]);
+        pixel[INPUTS..].copy_from_slice(&features[i]);
     }
-    features.uses
+    uses
 }
-
-/// Rows of a view that are looked at together: memory is bounded, whatever its size.
-const BAND_ROWS: usize = 32;
 
 #[cfg(test)]
 mod tests {
@@ -396,10 +433,10 @@ mod tests {
         for guidance in [Guidance::default(), Guidance { alignment: true, ..Guidance::default() }] {
             let whole = with_references(&view.rendered, &[&reference], guidance).view;
             let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, guidance);
-            assert_eq!(band.known.len(), 34 * WIDTH);
+            assert_eq!(band.features.len(), 34 * WIDTH);
             let expected =
                 whole.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
-            for (found, expected) in band.known.iter().zip(expected) {
+            for (found, expected) in band.features.iter().zip(expected) {
                 assert!(
                     found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5),
                     "{found:?} {expected:?}"
