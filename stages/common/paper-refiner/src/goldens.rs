@@ -52,7 +52,7 @@ fn network_and_loss_are_those_of_pytorch() {
         let perceptual = (blocks > 0).then(|| {
             let path = Path::new(env!("CARGO_MANIFEST_DIR"))
                 .join(format!("tests/goldens/vgg-{kind}.safetensors"));
-            PerceptualLoss::of(&Weights::read(&path).unwrap(), [4, 4, 6, 6, 6]).unwrap()
+            PerceptualLoss::from_weights(&Weights::read(&path).unwrap(), [4, 4, 6, 6, 6]).unwrap()
         });
         assert_eq!(perceptual.as_ref().map_or(0, PerceptualLoss::blocks), blocks);
         let network = read();
@@ -64,8 +64,9 @@ fn network_and_loss_are_those_of_pytorch() {
         let parameters: Vec<Tensor> = network.parameters().collect();
         let gradients = Tensor::f_run_backward(&[&loss], &parameters, false, false).unwrap();
         let largest = gradients.iter().map(|g| g.abs().max().double_value(&[])).fold(0.0, f64::max);
-        let learnt = network.named().into_iter().filter(|(_, tensor)| tensor.requires_grad());
-        for ((name, _), gradient) in learnt.zip(&gradients) {
+        let trainable =
+            network.named_tensors().into_iter().filter(|(_, tensor)| tensor.requires_grad());
+        for ((name, _), gradient) in trainable.zip(&gradients) {
             let expected = file.tensor(&format!("{prefix}{name}"), &gradient.size()).unwrap();
             // Where normalisation takes a bias away again, its gradient is nothing but rounding.
             let scale = expected.abs().max().double_value(&[]).max(1e-3 * largest);

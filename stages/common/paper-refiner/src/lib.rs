@@ -1,25 +1,25 @@
-//! The paper's own refinement: a network of 30 million weights that redraws a patch of a rendered
-//! view, given patches of HR references that show the same.
+//! The paper's own refinement network: 30 million weights that redraw a patch of a rendered view, given
+//! patches of HR references of the same surface.
 //!
-//! It is here to be compared with. A training is for one scene, on the rendered view of a reference
-//! beside the reference itself, both warped by random perspectives; 46,875 steps of 32 patches are
-//! published, each of which takes a minute or two on two cores.
+//! The network is here for comparison. It is trained for one scene, on the rendered view of a
+//! reference and the reference itself, both warped by random perspectives: 46,875 steps of 32 patches
+//! as published, each of which takes a minute or two on two cores.
 //!
-//! * [`PaperRefiner`]: the network (Choi et al. 2019's maximum over references, batch
-//!   normalisation, tanh). [`PaperRefiner::refine`] goes through a view by patches that overlap and
-//!   are blended, with reference patches where geometry says that they show the same.
-//! * [`PaperTrainer`], [`PaperTraining`]: its training: L1 and, where VGG-19's weights are given,
+//! * [`PaperRefiner`]: the network (Choi et al. 2019's maximum over references, batch normalisation,
+//!   tanh). [`PaperRefiner::refine`] redraws a view in overlapping patches and blends them; depth
+//!   gives the positions of the reference patches.
+//! * [`PaperTrainer`], [`PaperTraining`]: training with L1 and, if VGG-19's weights are given,
 //!   [`PerceptualLoss`].
 //!
-//! Colours are display-encoded sRGB on the background that is shown, 0..1 outside and -1..1 inside.
-//! The reference's code takes its patches from one column of eight pixels, doesn't test whether
-//! anything stands between, drops a remainder of patches and lets them overlap without blending;
-//! none of that is repeated.
+//! Colours are display-encoded sRGB composited on the background, 0..1 outside and -1..1 inside. Four
+//! faults of the reference's code are not repeated: it takes its patches from one column of eight
+//! pixels, doesn't test for occlusion, drops a remainder of patches, and overlaps patches without
+//! blending (design note 024).
 //!
 //! ```
 //! use paper_refiner::PaperRefiner;
 //! let published = PaperRefiner::new(128, 0)?;
-//! assert_eq!(published.weights(), 30_253_187);
+//! assert_eq!(published.parameter_count(), 30_253_187);
 //! # Ok::<(), refinement::RefinementError>(())
 //! ```
 

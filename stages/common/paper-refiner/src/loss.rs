@@ -4,63 +4,63 @@ use nets::{Conv, Weights};
 use refinement::RefinementError;
 use tch::{Kind, TchError, Tensor};
 
-/// The paper's perceptual loss: mean absolute differences of VGG-19's features after the second
-/// ReLU of each block, weighted 1, 0.75, 0.5, 0.5 and 1, of as many blocks as there are weights
-/// for.
+/// The paper's perceptual loss: the weighted mean absolute differences of VGG-19's features after the
+/// second ReLU of each block, for the blocks whose weights are in the file.
 ///
-/// Two kinds of file are known by the names in them: torchvision's (`features.N.weight`), and those
-/// in Caffe's scaling (`convB_N.weight`), whose features are hundreds of times as large and are
-/// therefore divided by the truth's mean feature, layer by layer.
+/// Two kinds of files are supported: torchvision's (`features.N.weight`), and Caffe's
+/// (`convB_N.weight`). Features in Caffe's scaling are hundreds of times larger, so each layer's
+/// difference is divided by the ground truth's mean feature (design note 024).
 #[derive(Debug)]
 pub struct PerceptualLoss {
-    /// Convolutions by block; what comes after the last that is compared isn't kept.
+    /// Convolutions by block, up to the last one whose features are compared.
     blocks: Vec<Vec<Conv>>,
-    caffe: bool,
+    is_caffe: bool,
 }
 
-/// Outputs of each block, and how many convolutions it has.
+/// Outputs and number of convolutions of each block.
 const BLOCKS: [(i64, usize); 5] = [(64, 2), (128, 2), (256, 4), (512, 4), (512, 4)];
-/// Weights of the blocks' differences.
-const SHARES: [f64; 5] = [1.0, 0.75, 0.5, 0.5, 1.0];
-/// Means of Caffe's training images: blue, green, red.
+/// Weights of the blocks' differences, as published.
+const BLOCK_WEIGHTS: [f64; 5] = [1.0, 0.75, 0.5, 0.5, 1.0];
+/// Channel means of Caffe's training images: blue, green, red.
 const CAFFE_MEAN: [f32; 3] = [103.939, 116.779, 123.68];
-/// Means and deviations of ImageNet: red, green, blue.
+/// Channel means and standard deviations of ImageNet: red, green, blue.
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
-/// Keeps a mean feature of 0 from dividing.
+/// Added to a mean feature before dividing by it, which avoids a division by 0.
 const MEAN_EPSILON: f64 = 1e-6;
 
 impl PerceptualLoss {
-    /// Reads VGG-19's weights, as far as they go; the first block must be whole.
+    /// Reads VGG-19's weights for as many blocks as the file has; the first block must be complete.
     pub fn read(path: &Path) -> Result<Self, RefinementError> {
-        Self::of(&Weights::read(path)?, BLOCKS.map(|(outputs, _)| outputs))
+        Self::from_weights(&Weights::read(path)?, BLOCKS.map(|(outputs, _)| outputs))
     }
 
-    /// The same of blocks of other widths.
-    pub(crate) fn of(weights: &Weights, widths: [i64; 5]) -> Result<Self, RefinementError> {
-        let caffe = weights.has("conv1_1.weight");
+    /// Builds the loss from weights of blocks with the given widths.
+    pub(crate) fn from_weights(
+        weights: &Weights,
+        widths: [i64; 5],
+    ) -> Result<Self, RefinementError> {
+        let is_caffe = weights.has("conv1_1.weight");
         let (mut blocks, mut inputs, mut index) = (Vec::new(), 3, 0);
         for (block, (outputs, (_, count))) in widths.into_iter().zip(BLOCKS).enumerate() {
-            let names: Vec<String> = if caffe {
+            let names: Vec<String> = if is_caffe {
                 (1..=count).map(|i| format!("conv{}_{i}", block + 1)).collect()
             } else {
                 (0..count).map(|i| format!("features.{}", index + 2 * i)).collect()
             };
-            // The second one's features are compared.
-            if block > 0 && !names[..2].iter().all(|name| weights.has(&format!("{name}.weight"))) {
+            let available =
+                names.iter().take_while(|name| weights.has(&format!("{name}.weight"))).count();
+            // The second convolution's features are compared; the first block must have them.
+            if block > 0 && available < 2 {
                 break;
             }
             let mut convs = Vec::with_capacity(count);
-            for name in names {
-                if convs.len() >= 2 && !weights.has(&format!("{name}.weight")) {
-                    break;
-                }
-                convs.push(Conv::read(weights, &name, [outputs, inputs, 3, 3])?);
+            for name in &names[..available.max(2)] {
+                convs.push(Conv::read(weights, name, [outputs, inputs, 3, 3])?);
                 inputs = outputs;
             }
-            let whole = convs.len() == count;
             blocks.push(convs);
-            if !whole {
+            if available < count {
                 break;
             }
             index += 2 * count + 1;
@@ -68,41 +68,42 @@ impl PerceptualLoss {
         if let Some(last) = blocks.last_mut() {
             last.truncate(2);
         }
-        Ok(Self { blocks, caffe })
+        Ok(Self { blocks, is_caffe })
     }
 
-    /// Blocks that are compared, of five.
+    /// Returns the number of blocks that are compared, at most five.
     pub fn blocks(&self) -> usize {
         self.blocks.len()
     }
 
-    /// Distance of images in -1..1 (count × 3 × rows × columns) from what they should be.
+    /// Computes the loss of images in -1..1 (count × 3 × rows × columns).
     pub(crate) fn distance(&self, found: &Tensor, truth: &Tensor) -> Result<Tensor, TchError> {
         let mut sum = None::<Tensor>;
         let features = self.features(found)?;
         let expected = tch::no_grad(|| self.features(truth))?;
-        for ((a, b), share) in features.iter().zip(&expected).zip(SHARES) {
-            let scale = if self.caffe {
+        for (i, (a, b)) in features.iter().zip(&expected).enumerate() {
+            let scale = if self.is_caffe {
                 b.f_abs()?.f_mean(Kind::Float)?.f_double_value(&[])? + MEAN_EPSILON
             } else {
                 1.0
             };
-            let apart = a.f_sub(b)?.f_abs()?.f_mean(Kind::Float)?.f_mul_scalar(share / scale)?;
+            let weight = BLOCK_WEIGHTS[i] / scale;
+            let difference = a.f_sub(b)?.f_abs()?.f_mean(Kind::Float)?.f_mul_scalar(weight)?;
             sum = Some(match sum {
-                Some(sum) => sum.f_add(&apart)?,
-                None => apart,
+                Some(sum) => sum.f_add(&difference)?,
+                None => difference,
             });
         }
         sum.ok_or_else(|| TchError::Shape("no block to compare".to_owned()))
     }
 
+    /// Returns the features of images in -1..1 in every block that is compared.
     fn features(&self, images: &Tensor) -> Result<Vec<Tensor>, TchError> {
         let unit = images.f_add_scalar(1.0)?.f_mul_scalar(0.5)?;
-        let constant = |v: [f32; 3]| Tensor::f_from_slice(&v)?.f_reshape([1, 3, 1, 1]);
-        let mut x = if self.caffe {
-            unit.f_flip([1])?.f_mul_scalar(255.0)?.f_sub(&constant(CAFFE_MEAN)?)?
+        let mut x = if self.is_caffe {
+            unit.f_flip([1])?.f_mul_scalar(255.0)?.f_sub(&channel_values(CAFFE_MEAN)?)?
         } else {
-            unit.f_sub(&constant(MEAN)?)?.f_div(&constant(DEVIATION)?)?
+            unit.f_sub(&channel_values(MEAN)?)?.f_div(&channel_values(DEVIATION)?)?
         };
         let mut features = Vec::with_capacity(self.blocks.len());
         for (block, convs) in self.blocks.iter().enumerate() {
@@ -118,4 +119,9 @@ impl PerceptualLoss {
         }
         Ok(features)
     }
+}
+
+/// Returns one value per channel as a tensor (1 × 3 × 1 × 1).
+fn channel_values(values: [f32; 3]) -> Result<Tensor, TchError> {
+    Tensor::f_from_slice(&values)?.f_reshape([1, 3, 1, 1])
 }

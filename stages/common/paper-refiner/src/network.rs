@@ -5,7 +5,7 @@ use nets::Weights;
 use refinement::RefinementError;
 use tch::{TchError, Tensor};
 
-/// The published network, or one as it with other widths.
+/// The published network, of any width.
 #[derive(Debug)]
 pub struct PaperRefiner {
     encoder: Vec<ConvLayer>,
@@ -13,8 +13,8 @@ pub struct PaperRefiner {
     width: u32,
 }
 
-/// A convolution of 3×3 with zeros around, normalisation by batch where there is one, ReLU (the
-/// last layer has tanh).
+/// 3×3 convolution with zero padding, and optional batch normalisation. An activation follows: tanh
+/// after the last layer of the decoder, otherwise ReLU.
 #[derive(Debug)]
 struct ConvLayer {
     kernel: Tensor,
@@ -23,7 +23,7 @@ struct ConvLayer {
     stride: i64,
 }
 
-/// Batch normalisation: the mean and variance of a batch while training, their running means
+/// Batch normalisation, by the mean and variance of the batch in training, and by their running means
 /// afterwards.
 #[derive(Debug)]
 struct BatchNorm {
@@ -33,11 +33,11 @@ struct BatchNorm {
     variance: Tensor,
 }
 
-/// Inputs and outputs in multiples of the width (colours where there are none), stride, and whether
-/// it is normalised.
-type Spec = (Option<i64>, Option<i64>, i64, bool);
+/// Inputs and outputs of a layer in multiples of the width (`None`: colours), stride, and true if the
+/// layer is normalised.
+type LayerSpec = (Option<i64>, Option<i64>, i64, bool);
 
-const ENCODER: [Spec; 7] = [
+const ENCODER: [LayerSpec; 7] = [
     (None, Some(1), 1, false),
     (Some(1), Some(1), 1, true),
     (Some(1), Some(2), 2, true),
@@ -46,7 +46,7 @@ const ENCODER: [Spec; 7] = [
     (Some(4), Some(4), 1, true),
     (Some(4), Some(4), 2, true),
 ];
-const DECODER: [Spec; 12] = [
+const DECODER: [LayerSpec; 12] = [
     (Some(8), Some(4), 1, true),
     (Some(4), Some(4), 1, true),
     (Some(4), Some(4), 1, true),
@@ -60,31 +60,31 @@ const DECODER: [Spec; 12] = [
     (Some(1), Some(1), 1, true),
     (Some(1), None, 1, false),
 ];
-/// After which of the encoder's layers the decoder takes features.
+/// Indices of the encoder layers whose features the decoder takes.
 const TAPS: [usize; 4] = [1, 3, 5, 6];
-/// Channels of a colour.
+/// Number of colour channels.
 pub(crate) const COLOURS: i64 = 3;
-/// Pixels of a patch's side are a multiple of this.
+/// The side of a patch in pixels must be a multiple of this, since the encoder halves it three times.
 pub(crate) const PATCH_MULTIPLE: usize = 8;
-/// PyTorch's defaults.
+/// PyTorch's defaults for batch normalisation.
 const MOMENTUM: f64 = 0.1;
 const EPSILON: f64 = 1e-5;
-/// Widest network that is read.
-const MOST_WIDTH: u32 = 1024;
-/// Purpose of draws.
+/// Maximum width of a network that is read from a file.
+const MAX_WIDTH: u32 = 1024;
+/// Stream of random numbers for the initial weights.
 const WEIGHTS: u64 = 320;
 
 impl PaperRefiner {
-    /// A network that hasn't learnt anything, initialised as the reference does (He et al. 2015;
-    /// scales of normalisation about 1). The published width is 128.
+    /// Creates an untrained network, initialised like the reference (He et al. 2015; scales of batch
+    /// normalisation around 1). The published width is 128.
     pub fn new(width: u32, seed: u64) -> Result<Self, RefinementError> {
         let mut number = 0;
-        Self::build(width, |_, shape, part| {
+        Self::build(width, |_, shape, kind| {
             number += 1;
             let mut rng = CounterRng::new(seed, WEIGHTS, number);
             let count = shape.iter().product::<i64>();
             let inputs = shape[1..].iter().product::<i64>() as f64;
-            let values: Vec<f32> = match part {
+            let values: Vec<f32> = match kind {
                 LayerTensor::Kernel => {
                     (0..count).map(|_| ((2.0 / inputs).sqrt() * normal(&mut rng)) as f32).collect()
                 }
@@ -102,8 +102,8 @@ impl PaperRefiner {
 
     /// Reads weights that [`PaperRefiner::write`] wrote.
     pub fn read(path: &Path, width: u32) -> Result<Self, RefinementError> {
-        // Before anything is made of such a number.
-        if !(1..=MOST_WIDTH).contains(&width) {
+        // Checked before anything of this size is allocated.
+        if !(1..=MAX_WIDTH).contains(&width) {
             return Err(RefinementError::Architecture { channels: width, blocks: 0 });
         }
         let weights = Weights::read(path)?;
@@ -112,58 +112,62 @@ impl PaperRefiner {
 
     /// Writes the weights.
     pub fn write(&self, path: &Path) -> Result<(), RefinementError> {
-        Ok(nets::write(path, &self.named())?)
+        Ok(nets::write(path, &self.named_tensors())?)
     }
 
-    /// Features of the first layer.
+    /// Returns the number of features of the first layer.
     pub fn width(&self) -> u32 {
         self.width
     }
 
-    /// How many numbers are learnt.
-    pub fn weights(&self) -> usize {
+    /// Returns the number of trainable parameters.
+    pub fn parameter_count(&self) -> usize {
         self.parameters().map(|p| p.numel()).sum()
     }
 
+    /// Builds a network from tensors that `tensor` returns by name, shape and kind.
     fn build(
         width: u32,
         mut tensor: impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
     ) -> Result<Self, RefinementError> {
-        let encoder = layers("encoder", &ENCODER, width, &mut tensor)?;
-        let decoder = layers("decoder", &DECODER, width, &mut tensor)?;
+        let encoder = build_layers("encoder", &ENCODER, width, &mut tensor)?;
+        let decoder = build_layers("decoder", &DECODER, width, &mut tensor)?;
         Ok(Self { encoder, decoder, width })
     }
 
-    /// All tensors by name, running means among them.
-    pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
+    /// Returns all tensors with their names, including running means.
+    pub(crate) fn named_tensors(&self) -> Vec<(String, Tensor)> {
         let mut all = Vec::new();
         for (name, layers) in [("encoder", &self.encoder), ("decoder", &self.decoder)] {
             for (i, layer) in layers.iter().enumerate() {
-                for (part, tensor) in layer.tensors() {
-                    all.push((format!("{name}.{i}.{}", part.name()), tensor));
+                for (kind, tensor) in layer.tensors() {
+                    all.push((format!("{name}.{i}.{}", kind.name()), tensor));
                 }
             }
         }
         all
     }
 
-    /// What is learnt.
+    /// Returns handles to the trainable parameters.
     pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
         self.encoder
             .iter()
             .chain(&self.decoder)
             .flat_map(ConvLayer::tensors)
-            .filter(|(part, _)| part.is_learnt())
+            .filter(|(kind, _)| kind.is_trainable())
             .map(|(_, t)| t)
     }
 
-    /// Another handle on the same tensors, for another thread.
-    pub(crate) fn share(&self) -> Self {
-        let of = |layers: &[ConvLayer]| layers.iter().map(ConvLayer::share).collect();
-        Self { encoder: of(&self.encoder), decoder: of(&self.decoder), width: self.width }
+    /// Returns another handle to the same tensors, for another thread.
+    pub(crate) fn shallow_clone(&self) -> Self {
+        Self {
+            encoder: self.encoder.iter().map(ConvLayer::shallow_clone).collect(),
+            decoder: self.decoder.iter().map(ConvLayer::shallow_clone).collect(),
+            width: self.width,
+        }
     }
 
-    /// Features of patches (count × 3 × rows × columns, -1..1) at four sizes, the finest first.
+    /// Returns features of patches (count × 3 × rows × columns, -1..1) at four sizes, finest first.
     pub(crate) fn encode(&self, patches: &Tensor, training: bool) -> Result<Vec<Tensor>, TchError> {
         let (mut x, mut features) = (patches.shallow_clone(), Vec::with_capacity(TAPS.len()));
         for (i, layer) in self.encoder.iter().enumerate() {
@@ -175,8 +179,8 @@ impl PaperRefiner {
         Ok(features)
     }
 
-    /// What patches should look like, -1..1: rendered ones (count × 3 × rows × columns) beside as
-    /// many references for each (count · references × 3 × rows × columns).
+    /// Redraws rendered patches (count × 3 × rows × columns, -1..1), given equally many reference
+    /// patches for each (count · references × 3 × rows × columns).
     pub(crate) fn forward(
         &self,
         rendered: &Tensor,
@@ -187,13 +191,13 @@ impl PaperRefiner {
         let own = self.encode(rendered, training)?;
         let theirs = self.encode(references, training)?;
         let mut x = None::<Tensor>;
-        // From the coarsest on, three layers a size; the last ends in colours.
+        // Three layers per size, coarsest first; the last layer's outputs are colours.
         for (size, layers) in self.decoder.chunks_exact(3).enumerate() {
-            let at = TAPS.len() - 1 - size;
-            let known = [own[at].shallow_clone(), best(&theirs[at], count)?];
-            let mut y = Tensor::f_cat(&x.into_iter().chain(known).collect::<Vec<_>>(), 1)?;
+            let tap = TAPS.len() - 1 - size;
+            let features = [own[tap].shallow_clone(), max_over_references(&theirs[tap], count)?];
+            let mut y = Tensor::f_cat(&x.into_iter().chain(features).collect::<Vec<_>>(), 1)?;
             for (i, layer) in layers.iter().enumerate() {
-                let is_last = at == 0 && i == 2;
+                let is_last = tap == 0 && i == 2;
                 if i == 2 && !is_last {
                     y = y
                         .f_repeat_interleave_self_int(2, 2, None)?
@@ -208,33 +212,35 @@ impl PaperRefiner {
     }
 }
 
-/// A standard normal draw (Box and Muller 1958).
+/// Draws from the standard normal distribution (Box and Muller 1958).
 fn normal(rng: &mut CounterRng) -> f64 {
-    // A uniform of 0 would be infinitely far.
-    let (u, v) = (1.0 - f64::from(rng.uniform()), f64::from(rng.uniform()));
+    // Never 0, whose logarithm is infinite.
+    let u = 1.0 - f64::from(rng.uniform());
+    let v = f64::from(rng.uniform());
     (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
-/// Layers of tensors, which are had by name and shape; what is learnt takes gradients.
-fn layers(
+/// Builds the layers of the encoder or decoder; trainable tensors require gradients.
+fn build_layers(
     name: &str,
-    specs: &[Spec],
+    specs: &[LayerSpec],
     width: u32,
     tensor: &mut impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
 ) -> Result<Vec<ConvLayer>, RefinementError> {
-    let channels = |of: Option<i64>| of.map_or(COLOURS, |multiple| multiple * i64::from(width));
     let mut layers = Vec::with_capacity(specs.len());
     for (i, &(inputs, outputs, stride, normalised)) in specs.iter().enumerate() {
-        let (name, inputs, outputs) = (format!("{name}.{i}"), channels(inputs), channels(outputs));
-        let mut of = |part: LayerTensor, shape: &[i64]| layer_tensor(&name, part, shape, tensor);
-        let kernel = of(LayerTensor::Kernel, &[outputs, inputs, 3, 3])?;
-        let bias = of(LayerTensor::Bias, &[outputs])?;
+        let name = format!("{name}.{i}");
+        let [inputs, outputs] = [inputs, outputs]
+            .map(|multiple| multiple.map_or(COLOURS, |multiple| multiple * i64::from(width)));
+        let mut build = |kind: LayerTensor, shape: &[i64]| layer_tensor(&name, kind, shape, tensor);
+        let kernel = build(LayerTensor::Kernel, &[outputs, inputs, 3, 3])?;
+        let bias = build(LayerTensor::Bias, &[outputs])?;
         let norm = if normalised {
             Some(BatchNorm {
-                scale: of(LayerTensor::Scale, &[outputs])?,
-                shift: of(LayerTensor::Shift, &[outputs])?,
-                mean: of(LayerTensor::Mean, &[outputs])?,
-                variance: of(LayerTensor::Variance, &[outputs])?,
+                scale: build(LayerTensor::Scale, &[outputs])?,
+                shift: build(LayerTensor::Shift, &[outputs])?,
+                mean: build(LayerTensor::Mean, &[outputs])?,
+                variance: build(LayerTensor::Variance, &[outputs])?,
             })
         } else {
             None
@@ -244,25 +250,32 @@ fn layers(
     Ok(layers)
 }
 
+/// Returns one tensor of a layer.
 fn layer_tensor(
     layer: &str,
-    part: LayerTensor,
+    kind: LayerTensor,
     shape: &[i64],
     tensor: &mut impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
 ) -> Result<Tensor, RefinementError> {
-    let tensor = tensor(&format!("{layer}.{}", part.name()), shape, part)?;
-    Ok(if part.is_learnt() { tensor.set_requires_grad(true) } else { tensor })
+    let tensor = tensor(&format!("{layer}.{}", kind.name()), shape, kind)?;
+    Ok(if kind.is_trainable() { tensor.set_requires_grad(true) } else { tensor })
 }
 
-/// The largest features of the references of each of `count` patches.
-fn best(features: &Tensor, count: i64) -> Result<Tensor, TchError> {
+/// Converts square patches to a tensor (count × 3 × rows × columns), channels last in memory.
+pub(crate) fn patch_tensor(samples: &[f32], count: usize, side: usize) -> Result<Tensor, TchError> {
+    let (count, side) = (count as i64, side as i64);
+    Tensor::f_from_slice(samples)?.f_reshape([count, side, side, COLOURS])?.f_permute([0, 3, 1, 2])
+}
+
+/// Returns the maximum of the features over the references of each of `count` patches.
+fn max_over_references(features: &Tensor, count: i64) -> Result<Tensor, TchError> {
     let [all, channels, rows, columns] = features.size()[..] else {
-        return Err(TchError::Shape("features have four dimensions".to_owned()));
+        return Err(TchError::Shape("expected features of four dimensions".to_owned()));
     };
     features.f_reshape([count, all / count.max(1), channels, rows, columns])?.f_amax([1], false)
 }
 
-/// What a tensor of a layer is for.
+/// Kind of a layer's tensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum LayerTensor {
     Kernel,
@@ -274,6 +287,7 @@ enum LayerTensor {
 }
 
 impl LayerTensor {
+    /// Returns the name in a weights file.
     fn name(self) -> &'static str {
         match self {
             Self::Kernel => "weight",
@@ -285,12 +299,14 @@ impl LayerTensor {
         }
     }
 
-    fn is_learnt(self) -> bool {
+    /// Returns whether the tensor is trainable, not a running statistic.
+    fn is_trainable(self) -> bool {
         !matches!(self, Self::Mean | Self::Variance)
     }
 }
 
 impl ConvLayer {
+    /// Applies the layer without its activation.
     fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor, TchError> {
         let y = x.f_conv2d(&self.kernel, Some(&self.bias), [self.stride; 2], [1, 1], [1, 1], 1)?;
         let Some(BatchNorm { scale, shift, mean, variance }) = &self.norm else { return Ok(y) };
@@ -306,6 +322,7 @@ impl ConvLayer {
         )
     }
 
+    /// Returns handles to the layer's tensors.
     fn tensors(&self) -> Vec<(LayerTensor, Tensor)> {
         let norm = self.norm.iter().flat_map(|norm| {
             let BatchNorm { scale, shift, mean, variance } = norm;
@@ -319,10 +336,11 @@ impl ConvLayer {
         let all = [(LayerTensor::Kernel, &self.kernel), (LayerTensor::Bias, &self.bias)]
             .into_iter()
             .chain(norm);
-        all.map(|(part, tensor)| (part, tensor.shallow_clone())).collect()
+        all.map(|(kind, tensor)| (kind, tensor.shallow_clone())).collect()
     }
 
-    fn share(&self) -> Self {
+    /// Returns another handle to the same tensors.
+    fn shallow_clone(&self) -> Self {
         let norm = self.norm.as_ref().map(|norm| BatchNorm {
             scale: norm.scale.shallow_clone(),
             shift: norm.shift.shallow_clone(),

@@ -1,47 +1,51 @@
 use counter_rng::CounterRng;
 use pixels::Image;
 
-/// A random perspective, as torchvision draws them: every corner of an image moves inwards by at
-/// most a share of its half width and height.
+/// Random perspective warp, like torchvision's: every corner of an image moves inwards by at most a
+/// fraction of half the width and height.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Perspective {
-    /// From places of the warped image to those of the image: (ax + by + c) / w and (dx + ey + f) /
-    /// w, where w is gx + hy + 1.
+    /// Map from positions in the warped image to the original: (ax + by + c) / w and (dx + ey + f) / w,
+    /// where w is gx + hy + 1.
     map: [f64; 8],
-    /// The rectangle that the image fills once it is warped: x, y, and one past the end.
+    /// Bounding box of the warped image's content: left, top, and right, bottom (exclusive).
     pub(crate) filled: [usize; 4],
 }
 
-/// How far corners move, at most, as a share of the half width and height.
-const MOST_CORNER_SHIFT_SHARE: f64 = 0.3;
+/// Maximum shift of a corner as a fraction of half the width and height, as in the reference's code.
+const MAX_CORNER_SHIFT: f64 = 0.3;
 
-/// How far a corner moves along a side of that size.
-fn corner_shift(size: usize, rng: &mut CounterRng) -> f64 {
-    rng.below((MOST_CORNER_SHIFT_SHARE * (size / 2) as f64) as u64 + 1) as f64
+/// Draws the shift in pixels of a corner along a side of `size` pixels.
+fn draw_corner_shift(size: usize, rng: &mut CounterRng) -> f64 {
+    rng.below((MAX_CORNER_SHIFT * (size / 2) as f64) as u64 + 1) as f64
 }
 
 impl Perspective {
-    /// No change.
+    /// Returns the warp that changes nothing.
     pub(crate) fn identity(width: usize, height: usize) -> Self {
         Self { map: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], filled: [0, 0, width, height] }
     }
 
-    /// A random one.
+    /// Draws a random warp.
     pub(crate) fn draw(width: usize, height: usize, rng: &mut CounterRng) -> Self {
         let (right, bottom) = (width as f64 - 1.0, height as f64 - 1.0);
         let corners = [(0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)];
         let moved = corners.map(|(x, y)| {
-            let (dx, dy) = (corner_shift(width, rng), corner_shift(height, rng));
+            let dx = draw_corner_shift(width, rng);
+            let dy = draw_corner_shift(height, rng);
             (if x > 0.0 { x - dx } else { dx }, if y > 0.0 { y - dy } else { dy })
         });
         let Some(map) = homography(moved, corners) else { return Self::identity(width, height) };
-        let (xs, ys) = (moved.map(|p| p.0), moved.map(|p| p.1));
-        let low = |of: [f64; 4]| of.into_iter().fold(f64::INFINITY, f64::min) as usize;
-        let high = |of: [f64; 4]| of.into_iter().fold(0.0, f64::max) as usize + 1;
-        Self { map, filled: [low(xs), low(ys), high(xs), high(ys)] }
+        let (mut min, mut max) = ((f64::INFINITY, f64::INFINITY), (0.0f64, 0.0f64));
+        for (x, y) in moved {
+            min = (min.0.min(x), min.1.min(y));
+            max = (max.0.max(x), max.1.max(y));
+        }
+        let filled = [min.0 as usize, min.1 as usize, max.0 as usize + 1, max.1 as usize + 1];
+        Self { map, filled }
     }
 
-    /// The warped image's colour at a pixel, bilinear; black outside.
+    /// Returns the warped image's colour at a pixel, by bilinear interpolation; black outside.
     pub(crate) fn colour(&self, image: &Image, x: usize, y: usize) -> [f32; 3] {
         let (x, y, [a, b, c, d, e, f, g, h]) = (x as f64, y as f64, self.map);
         let w = g * x + h * y + 1.0;
@@ -50,51 +54,51 @@ impl Perspective {
         let mut colour = [0.0f32; 3];
         for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
             let (column, row) = (left + dx, top + dy);
-            // NaN is in no image.
+            // `contains` is false for NaN.
             if !(0.0..image.width as f64).contains(&column)
                 || !(0.0..image.height as f64).contains(&row)
             {
                 continue;
             }
-            let share = (1.0 - (u - column).abs()) * (1.0 - (v - row).abs());
-            let at = (row as usize * image.width + column as usize) * image.channels;
-            (0..3).for_each(|c| colour[c] += share as f32 * image.data[at + c]);
+            let weight = (1.0 - (u - column).abs()) * (1.0 - (v - row).abs());
+            let start = (row as usize * image.width + column as usize) * image.channels;
+            for c in 0..3 {
+                colour[c] += weight as f32 * image.data[start + c];
+            }
         }
         colour
     }
 }
 
-/// The perspective that takes four places to four others; none where three of them lie in a line.
+/// Solves for the perspective that maps four points to four others; `None` if three of them are
+/// collinear.
 fn homography(from: [(f64, f64); 4], to: [(f64, f64); 4]) -> Option<[f64; 8]> {
-    // Two rows a place, the right-hand side in the ninth column.
-    let mut rows: Vec<[f64; 9]> = from
-        .into_iter()
-        .zip(to)
-        .flat_map(|((x, y), (u, v))| {
-            [
-                [x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, u],
-                [0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, v],
-            ]
-        })
-        .collect();
+    // Two rows per point; the ninth column is the right-hand side.
+    let mut rows = Vec::with_capacity(8);
+    for ((x, y), (u, v)) in from.into_iter().zip(to) {
+        rows.push([x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, u]);
+        rows.push([0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, v]);
+    }
     for column in 0..8 {
         let pivot =
             (column..8).max_by(|&a, &b| rows[a][column].abs().total_cmp(&rows[b][column].abs()))?;
         rows.swap(column, pivot);
-        let by = rows[column][column];
-        if by.abs() < 1e-12 {
+        let divisor: f64 = rows[column][column];
+        if divisor.abs() < 1e-12 {
             return None;
         }
-        rows[column].iter_mut().for_each(|v| *v /= by);
-        let pivot = rows[column];
-        for (_, row) in rows.iter_mut().enumerate().filter(|(i, _)| *i != column) {
-            let share = row[column];
-            row.iter_mut().zip(pivot).for_each(|(v, p)| *v -= share * p);
+        let pivot = rows[column].map(|value| value / divisor);
+        rows[column] = pivot;
+        for (i, row) in rows.iter_mut().enumerate() {
+            if i != column {
+                let factor = row[column];
+                for k in 0..9 {
+                    row[k] -= factor * pivot[k];
+                }
+            }
         }
     }
-    let mut map = [0.0; 8];
-    (0..8).for_each(|i| map[i] = rows[i][8]);
-    Some(map)
+    Some(std::array::from_fn(|i| rows[i][8]))
 }
 
 #[cfg(test)]

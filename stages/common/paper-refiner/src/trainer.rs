@@ -2,34 +2,34 @@ use std::path::Path;
 
 use counter_rng::CounterRng;
 use nets::Adam;
+use pixels::Image;
 use refinement::{KnownView, RefinementError, Training};
 use tch::{Kind, TchError, Tensor};
 
 use crate::loss::PerceptualLoss;
-use crate::network::{COLOURS, PATCH_MULTIPLE, PaperRefiner};
+use crate::network::{PATCH_MULTIPLE, PaperRefiner, patch_tensor};
 use crate::perspective::Perspective;
 
-/// How to train a [`PaperRefiner`].
+/// Options for training a [`PaperRefiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PaperTraining {
-    /// Steps in all; 46,875 are published.
+    /// Total number of steps; 46,875 as published.
     pub steps: u64,
-    /// Patches in a step; 32 are published.
-    pub batch: usize,
-    /// Pixels along a patch's side, a multiple of 8; 64 are published.
-    pub patch: usize,
-    /// Reference patches that each gets; 8 are published.
+    /// Number of patches per step; 32 as published.
+    pub batch_size: usize,
+    /// Side of a patch in pixels, a multiple of 8; 64 as published.
+    pub patch_size: usize,
+    /// Number of reference patches per patch; 8 as published.
     pub references: usize,
-    /// Learning rate; 5e-4 is published.
-    pub rate: f64,
-    /// Seed of what is drawn.
+    /// Learning rate; 5e-4 as published.
+    pub learning_rate: f64,
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
-/// Trains a [`PaperRefiner`] on rendered views of references beside the references themselves: a
-/// patch of both, warped by one of 200 random perspectives, with reference patches that lie within
-/// a fixed window around it in the image that isn't warped. Its error is the mean absolute one, of
-/// -1..1.
+/// Trains a [`PaperRefiner`] on references and their rendered views: a patch of both, warped by one of
+/// 200 random perspectives, with reference patches from a fixed window around the patch in the
+/// unwarped reference. The reported error is the mean absolute error of colours in -1..1.
 pub struct PaperTrainer {
     network: PaperRefiner,
     options: PaperTraining,
@@ -37,16 +37,16 @@ pub struct PaperTrainer {
     adam: Adam,
 }
 
-/// Perspectives of an image, the one that changes nothing among them.
+/// Number of perspectives per image, including the identity; as in the reference's code.
 const PERSPECTIVES_PER_IMAGE: u64 = 200;
-/// Pixels that a reference patch lies away at most.
-const REFERENCE_REACH: usize = 64;
-/// Purposes of draws.
+/// Maximum offset in pixels of a reference patch along each axis; as in the reference's code.
+const MAX_REFERENCE_OFFSET_PIXELS: usize = 64;
+/// Streams of random numbers.
 const WARPS: u64 = 321;
 const PATCHES: u64 = 322;
 
 impl PaperTrainer {
-    /// Starts from a network.
+    /// Creates a trainer of `network`.
     pub fn new(
         network: PaperRefiner,
         options: PaperTraining,
@@ -56,7 +56,7 @@ impl PaperTrainer {
         Ok(Self { network, options, perceptual, adam })
     }
 
-    /// The network as it is now.
+    /// Returns the network in its current state.
     pub fn network(&self) -> &PaperRefiner {
         &self.network
     }
@@ -68,164 +68,167 @@ impl Training for PaperTrainer {
     }
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
-        let PaperTraining { steps, batch, patch, references, rate, seed } = self.options;
+        let PaperTraining { steps, batch_size, patch_size, references, learning_rate, seed } =
+            self.options;
         if self.steps() >= steps {
             return Ok(None);
         }
-        let (mut rendered, mut truth, mut others) = (Vec::new(), Vec::new(), Vec::new());
-        for i in 0..batch {
-            let mut rng = CounterRng::new(seed, PATCHES, self.steps() * batch as u64 + i as u64);
-            let number = rng.below(examples.len() as u64);
-            let drawn =
-                TrainingPatch::new(&examples[number as usize], number, &self.options, &mut rng);
-            drawn.append(&mut rendered, &mut truth, &mut others);
+        let mut samples = BatchSamples::default();
+        for i in 0..batch_size as u64 {
+            let number = self.steps() * batch_size as u64 + i;
+            let mut rng = CounterRng::new(seed, PATCHES, number);
+            let example = rng.below(examples.len() as u64);
+            TrainingPatch::draw(&examples[example as usize], example, &self.options, &mut rng)
+                .append(&mut samples);
         }
-        let tensor = |samples: &[f32], count: usize| tensor(samples, count, patch);
-        let (rendered, truth) = (tensor(&rendered, batch)?, tensor(&truth, batch)?);
-        let found = self.network.forward(&rendered, &tensor(&others, batch * references)?, true)?;
-        let (loss, error) = loss(&found, &truth, self.perceptual.as_ref())?;
+        let BatchSamples { rendered, truth, references: reference_samples } = samples;
+        let rendered = patch_tensor(&rendered, batch_size, patch_size)?.f_contiguous()?;
+        let truth = patch_tensor(&truth, batch_size, patch_size)?.f_contiguous()?;
+        let references = patch_tensor(&reference_samples, batch_size * references, patch_size)?
+            .f_contiguous()?;
+        let redrawn = self.network.forward(&rendered, &references, true)?;
+        let (loss, error) = loss(&redrawn, &truth, self.perceptual.as_ref())?;
         let parameters: Vec<Tensor> = self.network.parameters().collect();
         let gradients = Tensor::f_run_backward(&[&loss], &parameters, false, false)?;
         if !error.is_finite() || !nets::all_finite(&gradients)? {
             return Err(RefinementError::NotFinite { step: self.steps() });
         }
-        self.adam.step(self.network.parameters(), &gradients, rate)?;
+        self.adam.step(self.network.parameters(), &gradients, learning_rate)?;
         Ok(Some(error))
     }
 
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
-        Ok(self.adam.write_checkpoint(path, self.network.named(), &[])?)
+        Ok(self.adam.write_checkpoint(path, self.network.named_tensors(), &[])?)
     }
 
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
-        (self.adam, []) = Adam::resume(path, &self.network.named())?;
+        (self.adam, []) = Adam::resume(path, &self.network.named_tensors())?;
         Ok(())
     }
 }
 
-/// Square patches as a network takes them: count × 3 × rows × columns.
-fn tensor(samples: &[f32], count: usize, side: usize) -> Result<Tensor, TchError> {
-    let (count, side) = (count as i64, side as i64);
-    Tensor::f_from_slice(samples)?
-        .f_reshape([count, side, side, COLOURS])?
-        .f_permute([0, 3, 1, 2])?
-        .f_contiguous()
-}
-
-/// L1 of images in -1..1 and, where there is one, the perceptual loss; and the L1 alone.
+/// Computes the loss of patches in -1..1, L1 plus the perceptual loss if there is one, and the L1
+/// alone.
 pub(crate) fn loss(
-    found: &Tensor,
+    redrawn: &Tensor,
     truth: &Tensor,
     perceptual: Option<&PerceptualLoss>,
 ) -> Result<(Tensor, f64), TchError> {
-    let first = found.f_sub(truth)?.f_abs()?.f_mean(Kind::Float)?;
-    let error = first.f_double_value(&[])?;
-    Ok((
-        perceptual.map_or_else(
-            || Ok(first.shallow_clone()),
-            |p| p.distance(found, truth)?.f_add(&first),
-        )?,
-        error,
-    ))
+    let l1 = redrawn.f_sub(truth)?.f_abs()?.f_mean(Kind::Float)?;
+    let error = l1.f_double_value(&[])?;
+    let loss = match perceptual {
+        Some(perceptual) => perceptual.distance(redrawn, truth)?.f_add(&l1)?,
+        None => l1,
+    };
+    Ok((loss, error))
 }
 
-/// A patch to learn from.
+/// Colours of a batch's patches in -1..1: as rendered, ground truth, and reference patches.
+#[derive(Default)]
+struct BatchSamples {
+    rendered: Vec<f32>,
+    truth: Vec<f32>,
+    references: Vec<f32>,
+}
+
+/// Patch of a warped example, with its reference patches.
 struct TrainingPatch<'a> {
     example: &'a KnownView,
     warp: Perspective,
-    patch: usize,
+    size: usize,
     corner: (usize, usize),
-    /// Corners in the image that isn't warped.
+    /// Corners of the reference patches in the unwarped image.
     references: Vec<(usize, usize)>,
 }
 
 impl<'a> TrainingPatch<'a> {
-    fn new(
+    /// Draws a patch of an example; `index` is the example's.
+    fn draw(
         example: &'a KnownView,
-        number: u64,
+        index: u64,
         options: &PaperTraining,
         rng: &mut CounterRng,
     ) -> Self {
         let (width, height) = (example.truth.width, example.truth.height);
-        let which = rng.below(PERSPECTIVES_PER_IMAGE);
-        // The same 200 throughout.
-        let mut shape =
-            CounterRng::new(options.seed, WARPS, number * PERSPECTIVES_PER_IMAGE + which);
-        let warp = if which == 0 {
+        let perspective = rng.below(PERSPECTIVES_PER_IMAGE);
+        // The generator depends only on the perspective's number, so an image always has the same 200.
+        let number = index * PERSPECTIVES_PER_IMAGE + perspective;
+        let warp = if perspective == 0 {
             Perspective::identity(width, height)
         } else {
-            Perspective::draw(width, height, &mut shape)
+            Perspective::draw(width, height, &mut CounterRng::new(options.seed, WARPS, number))
         };
+        let size = options.patch_size;
         let [left, top, right, bottom] = warp.filled;
-        let last = |end: usize| end.saturating_sub(options.patch);
-        let corner = (
-            within(left.min(last(right)), last(right), rng),
-            within(top.min(last(bottom)), last(bottom), rng),
-        );
+        let (right, bottom) = (right.saturating_sub(size), bottom.saturating_sub(size));
+        let corner =
+            (draw_between(left.min(right), right, rng), draw_between(top.min(bottom), bottom, rng));
+        let (right, bottom) = (width.saturating_sub(size), height.saturating_sub(size));
         let references = (0..options.references)
-            .map(|_| (near(corner.0, last(width), rng), near(corner.1, last(height), rng)))
+            .map(|_| (draw_near(corner.0, right, rng), draw_near(corner.1, bottom, rng)))
             .collect();
-        Self { example, warp, patch: options.patch, corner, references }
+        Self { example, warp, size, corner, references }
     }
 
-    /// Appends the patch as rendered, as it should be, and its references, in -1..1.
-    fn append(&self, rendered: &mut Vec<f32>, truth: &mut Vec<f32>, others: &mut Vec<f32>) {
-        let signed = |colour: [f32; 3]| colour.map(|v| 2.0 * v - 1.0);
-        for (x, y) in self.pixels(self.corner) {
-            rendered.extend(signed(self.warp.colour(&self.example.rendered.view, x, y)));
-            truth.extend(signed(self.warp.colour(&self.example.truth, x, y)));
-        }
-        let whole = Perspective::identity(self.example.truth.width, self.example.truth.height);
+    /// Appends the patch and its reference patches to a batch.
+    fn append(&self, samples: &mut BatchSamples) {
+        let KnownView { rendered, truth } = self.example;
+        self.append_patch(&rendered.view, self.warp, self.corner, &mut samples.rendered);
+        self.append_patch(truth, self.warp, self.corner, &mut samples.truth);
+        let identity = Perspective::identity(truth.width, truth.height);
         for &corner in &self.references {
-            let reference = self.pixels(corner);
-            others.extend(
-                reference.flat_map(|(x, y)| signed(whole.colour(&self.example.truth, x, y))),
-            );
+            self.append_patch(truth, identity, corner, &mut samples.references);
         }
     }
 
-    /// Pixels of the patch at a corner, row by row.
-    fn pixels(&self, (x, y): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
-        let patch = self.patch;
-        (y..y + patch).flat_map(move |row| (x..x + patch).map(move |column| (column, row)))
+    /// Appends the patch at a corner of a warped image, row by row, in -1..1.
+    fn append_patch(
+        &self,
+        image: &Image,
+        warp: Perspective,
+        (x, y): (usize, usize),
+        samples: &mut Vec<f32>,
+    ) {
+        for row in y..y + self.size {
+            for column in x..x + self.size {
+                samples.extend(warp.colour(image, column, row).map(|v| 2.0 * v - 1.0));
+            }
+        }
     }
 }
 
-/// A draw from `low` to `high`, both included.
-fn within(low: usize, high: usize, rng: &mut CounterRng) -> usize {
+/// Draws an integer from `low` to `high`, both included.
+fn draw_between(low: usize, high: usize, rng: &mut CounterRng) -> usize {
     low + rng.below((high.max(low) - low + 1) as u64) as usize
 }
 
-/// A draw from the window around a place, which ends at `last`.
-fn near(at: usize, last: usize, rng: &mut CounterRng) -> usize {
-    within(at.saturating_sub(REFERENCE_REACH).min(last), (at + REFERENCE_REACH).min(last), rng)
+/// Draws the start of a reference patch near `start`, at most `last`.
+fn draw_near(start: usize, last: usize, rng: &mut CounterRng) -> usize {
+    let low = start.saturating_sub(MAX_REFERENCE_OFFSET_PIXELS).min(last);
+    draw_between(low, (start + MAX_REFERENCE_OFFSET_PIXELS).min(last), rng)
 }
 
 impl PaperTraining {
-    /// Checks that patches have a side that the network can halve, and fit into every example.
+    /// Checks that the network can halve patches three times, and that patches fit into every example.
     pub fn check(&self, examples: &[KnownView]) -> Result<(), RefinementError> {
-        let too_small = |e: &&KnownView| e.truth.width < self.patch || e.truth.height < self.patch;
-        let (name, reason) = match examples.iter().find(too_small) {
-            Some(small) => (
-                small.rendered.camera.name.clone(),
-                format!("smaller than a patch of {0}×{0} pixels", self.patch),
-            ),
-            None if self.patch == 0 || !self.patch.is_multiple_of(PATCH_MULTIPLE) => (
-                "any".to_owned(),
-                format!(
-                    "patches of {} pixels: a multiple of {PATCH_MULTIPLE} is expected",
-                    self.patch
-                ),
-            ),
-            None => return Ok(()),
-        };
-        Err(RefinementError::View { name, reason })
+        let size = self.patch_size;
+        for KnownView { rendered, truth } in examples {
+            if truth.width < size || truth.height < size {
+                let reason = format!("smaller than a patch of {size}×{size} pixels");
+                return Err(RefinementError::View { name: rendered.camera.name.clone(), reason });
+            }
+        }
+        if size == 0 || !size.is_multiple_of(PATCH_MULTIPLE) {
+            let reason =
+                format!("patches of {size} pixels: a multiple of {PATCH_MULTIPLE} is expected");
+            return Err(RefinementError::View { name: "any".to_owned(), reason });
+        }
+        Ok(())
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use pixels::Image;
     use refinement::Rendered;
     use scene::{Camera, Intrinsics};
 
@@ -257,8 +260,14 @@ mod tests {
         KnownView { rendered, truth: Image::new(48, 40, 3, truth) }
     }
 
-    const OPTIONS: PaperTraining =
-        PaperTraining { steps: 60, batch: 4, patch: 16, references: 2, rate: 3e-3, seed: 5 };
+    const OPTIONS: PaperTraining = PaperTraining {
+        steps: 60,
+        batch_size: 4,
+        patch_size: 16,
+        references: 2,
+        learning_rate: 3e-3,
+        seed: 5,
+    };
 
     #[test]
     fn training_learns_and_goes_on_where_it_was() {
@@ -282,17 +291,19 @@ mod tests {
         while again.step(&examples).unwrap().is_some() {}
         let same = trainer
             .network()
-            .named()
+            .named_tensors()
             .iter()
-            .zip(again.network().named())
+            .zip(again.network().named_tensors())
             .all(|((_, a), (_, b))| *a == b);
         assert!(same, "a resumed training ends elsewhere");
     }
 
     #[test]
     fn patches_must_fit() {
-        let said =
-            |patch| PaperTraining { patch, ..OPTIONS }.check(&[example()]).unwrap_err().to_string();
-        assert!(said(64).contains("64×64") && said(20).contains("multiple of 8"));
+        let error = |patch_size| {
+            let options = PaperTraining { patch_size, ..OPTIONS };
+            options.check(&[example()]).unwrap_err().to_string()
+        };
+        assert!(error(64).contains("64×64") && error(20).contains("multiple of 8"));
     }
 }
