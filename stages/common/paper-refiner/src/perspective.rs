@@ -12,7 +12,7 @@ pub(crate) struct Perspective {
     pub(crate) filled: [usize; 4],
 }
 
-/// Maximum shift of a corner as a fraction of half the width and height, as in the reference's code.
+/// Maximum shift of a corner as a fraction of half the width and height; source not recorded.
 const MAX_CORNER_SHIFT: f64 = 0.3;
 
 /// Draws the shift in pixels of a corner along a side of `size` pixels.

@@ -37,9 +37,9 @@ pub struct PaperTrainer {
     adam: Adam,
 }
 
-/// Number of perspectives per image, including the identity; as in the reference's code.
+/// Number of perspectives per image, including the identity; source not recorded.
 const PERSPECTIVES_PER_IMAGE: u64 = 200;
-/// Maximum offset in pixels of a reference patch along each axis; as in the reference's code.
+/// Maximum offset in pixels of a reference patch along each axis; source not recorded.
 const MAX_REFERENCE_OFFSET_PIXELS: usize = 64;
 /// Streams of random numbers.
 const WARPS: u64 = 321;
