@@ -137,7 +137,7 @@ fn views_are_enlarged_and_scored() {
         r#"{"method": "liif", "file": "../weights/liif.safetensors"}"#,
         Some(&weights),
         2,
-        &["no name of a file"],
+        &["not the name of a file"],
     );
     std::fs::copy(goldens().join("imdn.safetensors"), weights.join("imdn_x2.safetensors")).unwrap();
     fails_to_upsample(
@@ -146,7 +146,7 @@ fn views_are_enlarged_and_scored() {
         r#"{"method": "imdn"}"#,
         Some(&weights),
         3,
-        &["enlarges 3 times", "48×48 of 24×24", "liif"],
+        &["enlarges 3 times", "has 48×48 pixels and the view 24×24", "liif"],
     );
 }
 

@@ -7,7 +7,7 @@ use nets::Weights;
 use pixels::{Filter, Image, psnr_of, read_png, resize_pillow};
 use tch::{Kind, Tensor, no_grad};
 
-use crate::fit;
+use crate::check_scale;
 use crate::imdn::Imdn;
 use crate::liif::Liif;
 use crate::network::Network;
@@ -112,8 +112,11 @@ fn broken_weights_are_refused() {
 
 #[test]
 fn sizes_that_a_network_cannot_make_are_said() {
-    assert!(fit(Some(4), [5, 7], [20, 28]).is_ok() && fit(None, [5, 7], [13, 20]).is_ok());
-    assert!(fit(Some(4), [5, 7], [20, 27]).unwrap_err().to_string().contains("4 times"));
+    assert!(
+        check_scale(Some(4), [5, 7], [20, 28]).is_ok()
+            && check_scale(None, [5, 7], [13, 20]).is_ok()
+    );
+    assert!(check_scale(Some(4), [5, 7], [20, 27]).unwrap_err().to_string().contains("4 times"));
 }
 
 /// IMDN as released, on ten real views, against PyTorch's scores.

@@ -1,11 +1,10 @@
 use nets::{Conv, Weights, WeightsError};
 use tch::{TchError, Tensor};
 
-use crate::layers::{contrast, count, leaky, root};
-use crate::network::Network;
+use crate::network::{Network, contrast, count_parts, integer_root, leaky_relu};
 
 /// IMDN (Hui et al. 2019, "Lightweight Image Super-Resolution with Information Multi-distillation
-/// Network"), by the names of its released weights. Width and scale are what the file says.
+/// Network"), by the names of its released weights. Width and scale are read from the file.
 pub(crate) struct Imdn {
     first: Conv,
     blocks: Vec<Block>,
@@ -15,26 +14,28 @@ pub(crate) struct Imdn {
     scale: i64,
 }
 
-/// Keeps a quarter of the channels after each of three layers and works on with the rest; then
-/// weighs the channels by their contrast.
+/// Information multi-distillation block: each of three layers distils a quarter of the channels and
+/// passes the rest to the next layer; then channel attention weights all channels by their contrast.
 struct Block {
     layers: [Conv; 4],
     attention: [Conv; 2],
     fuse: Conv,
-    kept: i64,
+    /// Number of channels that each layer distils.
+    distilled: i64,
 }
 
-/// What leaks through its ReLUs.
+/// Negative slope of the leaky ReLUs.
 const SLOPE: f64 = 0.05;
 
 impl Imdn {
+    /// Reads the network.
     pub(crate) fn read(weights: &Weights) -> Result<Self, WeightsError> {
         let prefix = if weights.has("module.fea_conv.weight") { "module." } else { "" };
         let name = |part: &str| format!("{prefix}{part}");
         let [width, ..] = weights.shape::<4>(&name("fea_conv.weight"))?;
-        let blocks = count(weights, 1, |i| name(&format!("IMDB{i}.c1.weight")));
+        let blocks = count_parts(weights, 1, |i| name(&format!("IMDB{i}.c1.weight")));
         let [outputs, ..] = weights.shape::<4>(&name("upsampler.0.weight"))?;
-        let scale = root(outputs / 3);
+        let scale = integer_root(outputs / 3);
         Ok(Self {
             first: Conv::read(weights, &name("fea_conv"), [width, 3, 3, 3])?,
             blocks: (1..=blocks)
@@ -60,7 +61,7 @@ impl Network for Imdn {
             let x = block.forward(outputs.last().unwrap_or(&first))?;
             outputs.push(x);
         }
-        let fused = leaky(&self.fuse.forward(&Tensor::f_cat(&outputs, 1)?, 1, 0)?, SLOPE)?;
+        let fused = leaky_relu(&self.fuse.forward(&Tensor::f_cat(&outputs, 1)?, 1, 0)?, SLOPE)?;
         let deep = self.last.forward(&fused, 1, 1)?.f_add(&first)?;
         self.up.forward(&deep, 1, 1)?.f_pixel_shuffle(self.scale)
     }
@@ -68,8 +69,8 @@ impl Network for Imdn {
 
 impl Block {
     fn read(weights: &Weights, name: &str, width: i64) -> Result<Self, WeightsError> {
-        let kept = width / 4;
-        let rest = width - kept;
+        let distilled = width / 4;
+        let rest = width - distilled;
         let conv = |part: &str, shape| Conv::read(weights, &format!("{name}.{part}"), shape);
         let [narrow, ..] = weights.shape::<4>(&format!("{name}.cca.conv_du.0.weight"))?;
         Ok(Self {
@@ -77,28 +78,29 @@ impl Block {
                 conv("c1", [width, width, 3, 3])?,
                 conv("c2", [width, rest, 3, 3])?,
                 conv("c3", [width, rest, 3, 3])?,
-                conv("c4", [kept, rest, 3, 3])?,
+                conv("c4", [distilled, rest, 3, 3])?,
             ],
             attention: [
-                conv("cca.conv_du.0", [narrow, 4 * kept, 1, 1])?,
-                conv("cca.conv_du.2", [4 * kept, narrow, 1, 1])?,
+                conv("cca.conv_du.0", [narrow, 4 * distilled, 1, 1])?,
+                conv("cca.conv_du.2", [4 * distilled, narrow, 1, 1])?,
             ],
-            fuse: conv("c5", [width, 4 * kept, 1, 1])?,
-            kept,
+            fuse: conv("c5", [width, 4 * distilled, 1, 1])?,
+            distilled,
         })
     }
 
     fn forward(&self, input: &Tensor) -> Result<Tensor, TchError> {
-        let [one, two, three, four] = &self.layers;
-        let (mut kept, mut rest) = (Vec::with_capacity(4), input.shallow_clone());
-        for layer in [one, two, three] {
-            let x = leaky(&layer.forward(&rest, 1, 1)?, SLOPE)?;
+        let [layers @ .., last] = &self.layers;
+        let mut distilled = Vec::with_capacity(4);
+        let mut rest = input.shallow_clone();
+        for layer in layers {
+            let x = leaky_relu(&layer.forward(&rest, 1, 1)?, SLOPE)?;
             let channels = x.size()[1];
-            kept.push(x.f_narrow(1, 0, self.kept)?);
-            rest = x.f_narrow(1, self.kept, channels - self.kept)?;
+            distilled.push(x.f_narrow(1, 0, self.distilled)?);
+            rest = x.f_narrow(1, self.distilled, channels - self.distilled)?;
         }
-        kept.push(four.forward(&rest, 1, 1)?);
-        let all = Tensor::f_cat(&kept, 1)?;
+        distilled.push(last.forward(&rest, 1, 1)?);
+        let all = Tensor::f_cat(&distilled, 1)?;
         let narrow = self.attention[0].forward(&contrast(&all)?, 1, 0)?.f_relu()?;
         let weight = self.attention[1].forward(&narrow, 1, 0)?.f_sigmoid()?;
         self.fuse.forward(&all.f_mul(&weight)?, 1, 0)?.f_add(input)

@@ -1,24 +1,20 @@
-//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each image alone:
-//! the baselines of the paper's tables, and the training photographs at HR size, which `refine`
-//! takes the mean with.
+//! `upsample`: enlarges views to the size of HR cameras with a 2-D method: the baselines of the paper's
+//! tables, and the photographs at HR that `refine` averages with refined views.
 //!
-//! * `bicubic`: Pillow's, on 8 bits, to the last bit.
-//! * `imdn`, `swinir`: networks for one scale, which their weights say; the views must be that much
-//!   smaller.
+//! * `bicubic`: Pillow's filter on 8 bits, bit-exact.
+//! * `imdn`, `swinir`: networks with a fixed scale, which is read from their weights.
 //! * `liif`: a network for any scale.
 //!
-//! Weights are safetensors files with the tensors' published names (`scripts/convert-weights.py`
-//! makes them from released checkpoints); every tensor's shape is checked. Images are composited on
-//! their background, enlarged as display-encoded sRGB, and are opaque afterwards: there is no depth
-//! to them. What doesn't count of a photograph, by its mask, doesn't when it is enlarged.
+//! Weights are safetensors files with the tensors' published names, converted from released checkpoints
+//! by `scripts/convert-weights.py`; every tensor's shape is checked. Images are composited on their
+//! background and enlarged as display-encoded sRGB. The enlarged views are opaque and have no depth. A
+//! photograph's mask is enlarged with it.
 //!
-//! Convolutions and attention go through libtorch, a view in one thread, so bytes don't depend on
-//! how many there are.
+//! Each view runs through libtorch in one thread, so bytes don't depend on the number of threads.
 
 #[cfg(test)]
 mod goldens;
 mod imdn;
-mod layers;
 mod liif;
 mod network;
 mod swinir;
@@ -47,13 +43,13 @@ use network::Network;
 pub struct Params {
     /// Method that enlarges views.
     pub method: Method,
-    /// The network's file in input `weights`. Default: `imdn_xS.safetensors` or
+    /// Name of the network's file in input `weights`. Default: `imdn_xS.safetensors` or
     /// `swinir_xS.safetensors` for scale S, or `liif.safetensors`.
     #[schemars(extend("x-default" = "by method"))]
     pub file: Option<String>,
 }
 
-/// Ways to enlarge an image.
+/// Method that enlarges an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Method {
@@ -62,15 +58,15 @@ pub enum Method {
     Bicubic,
     /// IMDN, a light convolutional network (Hui et al. 2019).
     Imdn,
-    /// LIIF, a local implicit image function behind EDSR's baseline encoder, for any scale (Chen et
-    /// al. 2021).
+    /// LIIF, a local implicit image function with EDSR's baseline encoder, for any scale (Chen et al.
+    /// 2021).
     Liif,
     /// SwinIR, a transformer (Liang et al. 2021).
     Swinir,
 }
 
-/// Where a network's file comes from.
-const MAKE_WEIGHTS: &str = "scripts/convert-weights.py makes it from the published checkpoint";
+/// Remedy for missing weights, as a sentence fragment.
+const REMEDY: &str = "convert the published checkpoint with scripts/convert-weights.py";
 
 /// The stage.
 pub struct Upsample;
@@ -85,11 +81,14 @@ impl Stage for Upsample {
         vec![
             (
                 "views",
-                Input::required(&["views", "scene/train"], "rendered views, or photographs, at LR"),
+                Input::required(&["views", "scene/train"], "rendered views or photographs at LR"),
             ),
             (
                 "cameras",
-                Input::required(&cameras, "their cameras, at HR: how large the views become"),
+                Input::required(
+                    &cameras,
+                    "the views' cameras at HR, which set the size of the output",
+                ),
             ),
             (
                 "weights",
@@ -105,7 +104,7 @@ impl Stage for Upsample {
     fn rules() -> Vec<Rule> {
         let message = format!(
             "input weights is missing: methods imdn, liif and swinir need a folder with their \
-            network's safetensors file; {MAKE_WEIGHTS}"
+            network's safetensors file; {REMEDY}"
         );
         vec![
             Rule::new(&message)
@@ -117,45 +116,39 @@ impl Stage for Upsample {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         nets::deterministic();
         let input = context.input("views")?;
-        let (views, cameras) = (Views::read(input)?, Views::read(context.input("cameras")?)?);
+        let views = Views::read(input)?;
+        let cameras = Views::read(context.input("cameras")?)?;
         let pairs = views
             .views
             .iter()
-            .map(|view| pair(view, &cameras))
-            .collect::<anyhow::Result<Vec<_>>>()?;
-        let networks = networks(context, params, &pairs)?;
+            .map(|view| Ok((view, hr_camera(view, &cameras)?)))
+            .collect::<Result<Vec<_>, Failure>>()?;
+        let networks = read_networks(context, params, &pairs)?;
         let progress = context.progress("enlarging", pairs.len() as u64);
-        let lanes = networks.len();
+        let threads = networks.len();
         let work =
-            networks.into_par_iter().enumerate().map(|(lane, network)| -> anyhow::Result<()> {
-                for (view, camera) in pairs.iter().skip(lane).step_by(lanes) {
+            networks.into_par_iter().enumerate().map(|(thread, network)| -> anyhow::Result<()> {
+                for (view, camera) in pairs.iter().skip(thread).step_by(threads) {
                     context.check_interrupt()?;
-                    let place = || format!("view {}", camera.name);
+                    let name = format!("view {}", camera.name);
                     let photograph = view
                         .read_photograph(input)
-                        .bad_input(place())?
-                        .with_context(|| format!("{}: it has no image", place()));
+                        .bad_input(name.clone())?
+                        .with_context(|| format!("{name} has no image"));
                     let Photograph { image: lr, mask } =
                         photograph.bad_input("input views")?.over(views.background.shown());
-                    let hr = enlarge(network.as_deref(), &lr, camera).with_context(place)?;
-                    write(
-                        context,
-                        &camera.name,
-                        &hr,
-                        mask.map(|mask| mask.resized((hr.width, hr.height), 0)),
-                    )?;
+                    let hr = enlarge(network.as_deref(), &lr, camera).context(name)?;
+                    let mask = mask.map(|mask| mask.resized((hr.width, hr.height), 0));
+                    write_view(context, &camera.name, &hr, mask)?;
                     progress.add(1);
                 }
                 Ok(())
             });
         work.collect::<anyhow::Result<Vec<_>>>()?;
-        let hr = pairs.iter().map(|(view, camera)| {
-            let image = Some(image_file(&camera.name));
-            View {
-                image,
-                mask: view.mask.as_ref().map(|_| mask_file(&camera.name)),
-                ..View::camera_only((*camera).clone())
-            }
+        let hr = pairs.iter().map(|(view, camera)| View {
+            image: Some(image_file(&camera.name)),
+            mask: view.mask.as_ref().map(|_| mask_file(&camera.name)),
+            ..View::camera_only((*camera).clone())
         });
         let hr = Views::new(views.background, views.bounds, hr.collect());
         context.write_json(VIEWS_FILE, &hr)?;
@@ -164,30 +157,28 @@ impl Stage for Upsample {
     }
 }
 
-/// How a network is made of its weights.
-type Read = fn(&Weights) -> Result<Box<dyn Network>, nets::WeightsError>;
+/// Constructor of a network from its weights.
+type NetworkReader = fn(&Weights) -> Result<Box<dyn Network>, nets::WeightsError>;
 
-/// A view and its HR camera.
-fn pair<'a>(view: &'a View, cameras: &'a Views) -> anyhow::Result<(&'a View, &'a Camera)> {
-    let Some(hr) = cameras.taken_by(&view.camera) else {
+/// Finds a view's HR camera.
+fn hr_camera<'a>(view: &View, cameras: &'a Views) -> Result<&'a Camera, Failure> {
+    cameras.taken_by(&view.camera).map(|hr| &hr.camera).ok_or_else(|| {
         let name = &view.camera.name;
-        let missing = format!("input cameras: no camera {name} with that view's pose");
-        return Err(Failure::BadInput(missing).into());
-    };
-    Ok((view, &hr.camera))
+        Failure::BadInput(format!("input cameras: no camera {name} with the view's pose"))
+    })
 }
 
-/// A network for each thread, none for what needs none.
-fn networks(
+/// Reads the method's network once for each thread; `None` for `bicubic`.
+fn read_networks(
     context: &Context,
     params: &Params,
     pairs: &[(&View, &Camera)],
 ) -> anyhow::Result<Vec<Option<Box<dyn Network>>>> {
-    let widths =
-        pairs.first().map(|(view, camera)| (view.camera.intrinsics.width, camera.intrinsics.width));
-    let (lr, hr) = widths.unwrap_or((1, 1));
-    let scale = (f64::from(hr) / f64::from(lr)).round();
-    let (default, read): (String, Read) = match params.method {
+    let scale = pairs.first().map_or(1.0, |(view, camera)| {
+        f64::from(camera.intrinsics.width) / f64::from(view.camera.intrinsics.width)
+    });
+    let scale = scale.round();
+    let (default, read): (String, NetworkReader) = match params.method {
         Method::Bicubic => return Ok((0..context.threads).map(|_| None).collect()),
         Method::Imdn => (format!("imdn_x{scale}.safetensors"), |weights| {
             Ok(Box::new(imdn::Imdn::read(weights)?))
@@ -200,7 +191,7 @@ fn networks(
         }
     };
     let file = params.file.as_ref().unwrap_or(&default);
-    let weights = open(context.input("weights")?, file)?;
+    let weights = read_weights(context.input("weights")?, file)?;
     let networks =
         (0..context.threads).map(|_| read(&weights).map(Some)).collect::<Result<Vec<_>, _>>();
     let networks = networks.bad_input("input weights")?;
@@ -208,51 +199,48 @@ fn networks(
     for (view, camera) in pairs {
         let [lr, hr] = [&view.camera, *camera]
             .map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
-        fit(scale, lr, hr)
+        check_scale(scale, lr, hr)
             .map_err(|e| Failure::BadInput(format!("view {}: {file} {e}", camera.name)))?;
     }
     Ok(networks)
 }
 
-/// Sizes that a network can't make of each other.
+/// Error returned when a network's scale doesn't map the LR size to the HR size.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "enlarges {by} times, which doesn't make {}×{} of {}×{}; take views of another size, or \
-    bicubic or liif",
+    "enlarges {scale} times, but the camera has {}×{} pixels and the view {}×{}; use views of \
+    another size, or method bicubic or liif",
     hr[0], hr[1], lr[0], lr[1]
 )]
 struct WrongScale {
-    /// The network's scale.
-    by: i64,
+    scale: i64,
     lr: [i64; 2],
     hr: [i64; 2],
 }
 
-/// Whether a network of that scale makes the HR size of the LR one; what is wrong otherwise.
-fn fit(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), WrongScale> {
-    match scale.filter(|by| lr.map(|size| size * by) != hr) {
-        None => Ok(()),
-        Some(by) => Err(WrongScale { by, lr, hr }),
+/// Checks that a network's scale, if it has one, maps the LR size to the HR size.
+fn check_scale(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), WrongScale> {
+    match scale {
+        Some(scale) if lr.map(|size| size * scale) != hr => Err(WrongScale { scale, lr, hr }),
+        _ => Ok(()),
     }
 }
 
-/// The network's tensors, from a file of that name in the input.
-fn open(input: &GivenInput, file: &str) -> Result<Weights, Failure> {
+/// Reads the network's tensors from a file of this name in the input.
+fn read_weights(input: &GivenInput, file: &str) -> Result<Weights, Failure> {
     if std::path::Path::new(file).file_name().is_none_or(|name| name != file) {
         return Err(Failure::Usage(format!(
-            "file: {file:?} is no name of a file in input weights"
+            "parameter file: {file:?} is not the name of a file in input weights"
         )));
     }
     let path = input.path(file);
     if !path.is_file() {
-        return Err(Failure::BadInput(format!(
-            "input weights: no file {file} in it; {MAKE_WEIGHTS}"
-        )));
+        return Err(Failure::BadInput(format!("input weights: no file {file}; {REMEDY}")));
     }
     Weights::read(&path).bad_input("input weights")
 }
 
-/// An image at the size of a camera.
+/// Enlarges an image to the size of a camera, with a network or else Pillow's bicubic filter.
 fn enlarge(network: Option<&dyn Network>, lr: &Image, camera: &Camera) -> anyhow::Result<Image> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     let Some(network) = network else {
@@ -264,17 +252,17 @@ fn enlarge(network: Option<&dyn Network>, lr: &Image, camera: &Camera) -> anyhow
     Ok(nets::image_of(&hr)?)
 }
 
-/// A view's files: opaque colours, a preview, and what counts of them.
-fn write(context: &Context, name: &str, hr: &Image, mask: Option<Mask>) -> anyhow::Result<()> {
+/// Writes a view's files: opaque colours, preview and mask.
+fn write_view(context: &Context, name: &str, hr: &Image, mask: Option<Mask>) -> anyhow::Result<()> {
     if let Some(mask) = mask {
         write_png(&context.output_path(&mask_file(name))?, &mask.to_rgba8())?;
     }
     let channels = &VIEW_CHANNELS[..4];
     let path = context.output_path(&image_file(name))?;
     write_view_image(&path, (hr.width, hr.height), channels, |first, rows, samples| {
-        let pixels = hr.data[first * hr.width * 3..(first + rows) * hr.width * 3].chunks_exact(3);
-        for (sample, pixel) in samples.chunks_exact_mut(4).zip(pixels) {
-            sample[..3].copy_from_slice(pixel);
+        let pixels = &hr.data[first * hr.width * 3..(first + rows) * hr.width * 3];
+        for (i, sample) in samples.chunks_exact_mut(4).enumerate() {
+            sample[..3].copy_from_slice(&pixels[3 * i..3 * i + 3]);
             sample[3] = 1.0;
         }
         anyhow::Ok(())

@@ -1,39 +1,44 @@
 use nets::{Conv, Weights, WeightsError};
 use tch::{TchError, Tensor};
 
-use crate::layers::{Linear, count};
-use crate::network::Network;
+use crate::network::{Linear, Network, count_parts};
 
 /// LIIF (Chen et al. 2021, "Learning Continuous Image Representation with Local Implicit Image
-/// Function") behind EDSR's baseline encoder, by the names of its released weights: unfolded
-/// features, a local ensemble, decoding by cells. Any scale.
+/// Function") with EDSR's baseline encoder, by the names of its released weights: feature unfolding,
+/// local ensemble and cell decoding. Any scale.
 pub(crate) struct Liif {
     head: Conv,
     blocks: Vec<[Conv; 2]>,
     tail: Conv,
-    /// From features, where a place lies to them and how large its pixel is, to its colour.
+    /// MLP from features, relative position and cell size to a colour.
     layers: Vec<Linear>,
 }
 
-/// Rows and columns of features that a feature is joined by.
+/// Number of features that are unfolded into one: 3×3.
 const UNFOLDED: i64 = 9;
-/// Shift that decides between two features equally near.
-const SHIFT: f64 = 1e-6;
-/// Added to an area, so that there is always some.
-const LEAST_AREA: f64 = 1e-9;
-/// Pixels that are decoded at a time.
+/// Shift that breaks ties between two equally near features, as published.
+const TIE_SHIFT: f64 = 1e-6;
+/// Added to every area, as published, so that no weight is 0 / 0.
+const MIN_AREA: f64 = 1e-9;
+/// Number of pixels that are decoded together; chosen by hand.
 const CHUNK_PIXELS: usize = 16_384;
 
 impl Liif {
+    /// Reads the network.
     pub(crate) fn read(weights: &Weights) -> Result<Self, WeightsError> {
         let [width, ..] = weights.shape::<4>("encoder.head.0.weight")?;
-        let conv =
-            |name: &str| Conv::read(weights, &format!("encoder.{name}"), [width, width, 3, 3]);
-        let blocks = count(weights, 0, |i| format!("encoder.body.{i}.body.0.weight"));
-        let block =
-            |i: usize| Ok([conv(&format!("body.{i}.body.0"))?, conv(&format!("body.{i}.body.2"))?]);
+        let count = count_parts(weights, 0, |i| format!("encoder.body.{i}.body.0.weight"));
+        let shape = [width, width, 3, 3];
+        let mut blocks = Vec::with_capacity(count);
+        for i in 0..count {
+            blocks.push([
+                Conv::read(weights, &format!("encoder.body.{i}.body.0"), shape)?,
+                Conv::read(weights, &format!("encoder.body.{i}.body.2"), shape)?,
+            ]);
+        }
+        let tail = Conv::read(weights, &format!("encoder.body.{count}"), shape)?;
         let name = |i: usize| format!("imnet.layers.{}", 2 * i);
-        let count = count(weights, 0, |i| format!("{}.weight", name(i)));
+        let count = count_parts(weights, 0, |i| format!("{}.weight", name(i)));
         let mut inputs = UNFOLDED * width + 4;
         let mut layers = Vec::with_capacity(count);
         for i in 0..count {
@@ -47,13 +52,13 @@ impl Liif {
         }
         Ok(Self {
             head: Conv::read(weights, "encoder.head.0", [width, 3, 3, 3])?,
-            blocks: (0..blocks).map(block).collect::<Result<_, WeightsError>>()?,
-            tail: conv(&format!("body.{blocks}"))?,
+            blocks,
+            tail,
             layers,
         })
     }
 
-    /// Features of each pixel, with those around it: places × channels.
+    /// Returns the unfolded features of each pixel: pixels × channels.
     fn features(&self, image: &Tensor) -> Result<Tensor, TchError> {
         let first = self.head.forward(&image.f_sub_scalar(0.5)?.f_div_scalar(0.5)?, 1, 1)?;
         let mut x = first.shallow_clone();
@@ -69,45 +74,61 @@ impl Liif {
     }
 }
 
-/// Along an axis: which feature a pixel takes, and how far the pixel lies from it, in features'
-/// half steps.
+/// Nearest feature of a pixel along an axis.
 struct Nearest {
+    /// Index of the feature.
     index: usize,
+    /// Position of the pixel relative to the feature, in half the distance between features.
     offset: f64,
 }
 
-/// What each of `to` pixels along an axis takes of `from` features, shifted by half a feature to
-/// one side.
-fn nearest(from: i64, to: i64, side: f64) -> Vec<Nearest> {
-    let (from_f, to_f) = (from as f64, to as f64);
-    let pixels = (0..to).map(|i| {
-        let place = -1.0 + (2 * i + 1) as f64 / to_f;
-        let shifted = (place + side / from_f + SHIFT).clamp(-1.0 + SHIFT, 1.0 - SHIFT);
+/// Finds the feature nearest to each of `pixels` pixels along an axis of `features` features, after a
+/// shift by half a feature towards `side`, -1 or 1.
+fn nearest_features(features: i64, pixels: i64, side: f64) -> Vec<Nearest> {
+    let count = features as f64;
+    let mut nearest = Vec::with_capacity(pixels as usize);
+    for i in 0..pixels {
+        let position = -1.0 + (2 * i + 1) as f64 / pixels as f64;
+        let shifted =
+            (position + side / count + TIE_SHIFT).clamp(-1.0 + TIE_SHIFT, 1.0 - TIE_SHIFT);
         let index =
-            (((shifted + 1.0) * from_f - 1.0) / 2.0).round_ties_even().clamp(0.0, from_f - 1.0);
-        let centre = -1.0 + (2.0 * index + 1.0) / from_f;
-        Nearest { index: index as usize, offset: (place - centre) * from_f }
-    });
-    pixels.collect()
+            (((shifted + 1.0) * count - 1.0) / 2.0).round_ties_even().clamp(0.0, count - 1.0);
+        let centre = -1.0 + (2.0 * index + 1.0) / count;
+        nearest.push(Nearest { index: index as usize, offset: (position - centre) * count });
+    }
+    nearest
 }
 
-/// What pixels take of the features at the corners around them: above and below, left and right.
+/// Features at the four corners around each pixel (local ensemble).
 struct Corners {
-    down: [Vec<Nearest>; 2],
-    across: [Vec<Nearest>; 2],
+    /// Features above and below each row.
+    rows: [Vec<Nearest>; 2],
+    /// Features left and right of each column.
+    columns: [Vec<Nearest>; 2],
 }
 
 impl Corners {
-    /// What pixel `p` takes down and across, at one of its corners.
-    fn of(&self, p: usize, v: usize, h: usize) -> (&Nearest, &Nearest) {
-        let columns = self.across[h].len();
-        (&self.down[v][p / columns], &self.across[h][p % columns])
+    /// Returns the vertically and horizontally nearest features of a pixel at corner (v, h), 0 or 1
+    /// each.
+    fn nearest(&self, pixel: usize, v: usize, h: usize) -> (&Nearest, &Nearest) {
+        let columns = self.columns[h].len();
+        (&self.rows[v][pixel / columns], &self.columns[h][pixel % columns])
     }
 
-    /// Area between a pixel's centre and one of its corners.
-    fn area(&self, p: usize, v: usize, h: usize) -> f64 {
-        let (y, x) = self.of(p, v, h);
-        (y.offset * x.offset).abs() + LEAST_AREA
+    /// Returns the area between a pixel and the feature at corner (v, h).
+    fn area(&self, pixel: usize, v: usize, h: usize) -> f64 {
+        let (y, x) = self.nearest(pixel, v, h);
+        (y.offset * x.offset).abs() + MIN_AREA
+    }
+
+    /// Returns the weight of corner (v, h) for a pixel: the area to the opposite corner as a fraction
+    /// of all areas, so that nearer features weigh more.
+    fn weight(&self, pixel: usize, v: usize, h: usize) -> f32 {
+        let total = self.area(pixel, 0, 0)
+            + self.area(pixel, 0, 1)
+            + self.area(pixel, 1, 0)
+            + self.area(pixel, 1, 1);
+        (self.area(pixel, 1 - v, 1 - h) / total) as f32
     }
 }
 
@@ -118,51 +139,50 @@ impl Network for Liif {
 
     fn enlarge(&self, image: &Tensor, [rows, columns]: [i64; 2]) -> Result<Tensor, TchError> {
         let [_, _, lr_rows, lr_columns] = image.size()[..] else {
-            return Err(TchError::Shape("an image has four dimensions".to_owned()));
+            return Err(TchError::Shape("expected an image of four dimensions".to_owned()));
         };
-        let (first, others) =
-            self.layers.split_first().ok_or_else(|| TchError::Shape("no layers".to_owned()))?;
+        let (first, others) = self
+            .layers
+            .split_first()
+            .ok_or_else(|| TchError::Shape("expected at least one layer".to_owned()))?;
         let features = self.features(image)?;
         let width = features.size()[1];
-        // The first layer is linear: what features give it is the same for all pixels that take
-        // them, and so is the cell.
-        let known = first.part(&features, 0, width)?;
+        // The first layer is linear, so features and cell size pass through it once per LR pixel
+        // instead of four times per HR pixel (design note 028).
+        let by_features = first.forward_columns(&features, 0, width)?;
         let cell = [2.0 * lr_rows as f64 / rows as f64, 2.0 * lr_columns as f64 / columns as f64]
             .map(|c| c as f32);
-        let constant = first
-            .part(&Tensor::f_from_slice(&cell)?.f_reshape([1, 2])?, width + 2, width + 4)?
-            .f_add(first.bias())?;
+        let cell = Tensor::f_from_slice(&cell)?.f_reshape([1, 2])?;
+        let constant = first.forward_columns(&cell, width + 2, width + 4)?.f_add(first.bias())?;
         let sides = [-1.0, 1.0];
         let corners = Corners {
-            down: sides.map(|s| nearest(lr_rows, rows, s)),
-            across: sides.map(|s| nearest(lr_columns, columns, s)),
+            rows: sides.map(|side| nearest_features(lr_rows, rows, side)),
+            columns: sides.map(|side| nearest_features(lr_columns, columns, side)),
         };
         let mut chunks = Vec::new();
         for start in (0..(rows * columns) as usize).step_by(CHUNK_PIXELS) {
             let pixels = start..(start + CHUNK_PIXELS).min((rows * columns) as usize);
             let mut sum = None::<Tensor>;
             for (v, h) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-                let (mut index, mut offsets, mut share) = (Vec::new(), Vec::new(), Vec::new());
-                for p in pixels.clone() {
-                    let (y, x) = corners.of(p, v, h);
-                    index.push((y.index * lr_columns as usize + x.index) as i64);
+                let (mut indices, mut offsets, mut weights) = (Vec::new(), Vec::new(), Vec::new());
+                for pixel in pixels.clone() {
+                    let (y, x) = corners.nearest(pixel, v, h);
+                    indices.push((y.index * lr_columns as usize + x.index) as i64);
                     offsets.extend([y.offset as f32, x.offset as f32]);
-                    let area = |v: usize, h: usize| corners.area(p, v, h);
-                    let all = area(0, 0) + area(0, 1) + area(1, 0) + area(1, 1);
-                    // Nearer features weigh more: each gets the area on the other side.
-                    share.push((area(1 - v, 1 - h) / all) as f32);
+                    weights.push(corners.weight(pixel, v, h));
                 }
-                let count = index.len() as i64;
+                let count = indices.len() as i64;
                 let offset = Tensor::f_from_slice(&offsets)?.f_reshape([count, 2])?;
-                let mut x = known.f_index_select(0, &Tensor::f_from_slice(&index)?)?;
-                x = x.f_add(&first.part(&offset, width, width + 2)?)?.f_add(&constant)?;
+                let mut x = by_features.f_index_select(0, &Tensor::f_from_slice(&indices)?)?;
+                let by_offset = first.forward_columns(&offset, width, width + 2)?;
+                x = x.f_add(&by_offset)?.f_add(&constant)?;
                 for layer in others {
                     x = layer.forward(&x.f_relu()?)?;
                 }
-                let shared = x.f_mul(&Tensor::f_from_slice(&share)?.f_unsqueeze(1)?)?;
+                let weighted = x.f_mul(&Tensor::f_from_slice(&weights)?.f_unsqueeze(1)?)?;
                 sum = Some(match sum {
-                    Some(sum) => sum.f_add(&shared)?,
-                    None => shared,
+                    Some(sum) => sum.f_add(&weighted)?,
+                    None => weighted,
                 });
             }
             chunks.extend(sum);

@@ -1,12 +1,11 @@
 use nets::{Conv, Weights, WeightsError};
 use tch::{Kind, TchError, Tensor};
 
-use crate::layers::{LayerNorm, Linear, count, leaky, root};
-use crate::network::Network;
+use crate::network::{LayerNorm, Linear, Network, count_parts, integer_root, leaky_relu};
 
 /// SwinIR (Liang et al. 2021, "SwinIR: Image Restoration Using Swin Transformer") for
 /// super-resolution, by the names of its released weights: the classical, the lightweight and the
-/// real-world models. Width, depth, heads, window, scale and kind are what the file says.
+/// real-world models. Width, depth, heads, window, scale and kind are read from the file.
 pub(crate) struct SwinIr {
     first: Conv,
     embedded: Option<LayerNorm>,
@@ -14,58 +13,60 @@ pub(crate) struct SwinIr {
     norm: LayerNorm,
     after: Convs,
     head: Head,
+    /// Side of an attention window in pixels.
     window: i64,
     scale: i64,
 }
 
-/// Mean colour of the images that it was trained on.
+/// Mean colour of the training images, as published.
 const MEAN: [f32; 3] = [0.4488, 0.4371, 0.4040];
-/// What leaks through the ReLUs between three convolutions in a row, and of the real-world head.
+/// Negative slope of the leaky ReLUs between three convolutions in a row, and in the real-world head.
 const SLOPE: f64 = 0.2;
-/// What leaks through the ReLU before enlarging.
+/// Negative slope of the leaky ReLU before enlarging.
 const HEAD_SLOPE: f64 = 0.01;
-/// What keeps places in a window that aren't neighbours in the image from seeing each other.
-const UNRELATED_BIAS: f32 = -100.0;
+/// Attention bias between pixels of a shifted window that aren't neighbours in the image.
+const MASKED_BIAS: f32 = -100.0;
 
-/// Transformer blocks, and a convolution after them.
+/// Transformer blocks followed by a convolution.
 struct Group {
     blocks: Vec<TransformerBlock>,
     after: Convs,
 }
 
-/// One convolution, or three of which the middle ones are narrow.
+/// One convolution, or a bottleneck of three.
 struct Convs(Vec<Conv>);
 
-/// From features to a larger image.
+/// Layers from features to the enlarged image.
 enum Head {
-    /// Pixels shuffled one or several times, by so many; the classical models.
-    Shuffled { before: Conv, steps: Vec<(Conv, i64)>, last: Conv },
-    /// Shuffled at once; the lightweight models.
-    Direct { up: Conv, by: i64 },
-    /// Pixels repeated and filtered; the real-world models.
-    Repeated { before: Conv, steps: Vec<Conv>, hr: Conv, last: Conv },
+    /// Pixel shuffle in one or several steps, each with its scale; the classical models.
+    PixelShuffle { before: Conv, steps: Vec<(Conv, i64)>, last: Conv },
+    /// Pixel shuffle directly to colours; the lightweight models.
+    Direct { up: Conv, scale: i64 },
+    /// Nearest-neighbour enlargement and convolution; the real-world models.
+    NearestConv { before: Conv, steps: Vec<Conv>, hr: Conv, last: Conv },
 }
 
-/// Attention within windows, then a network of two layers, each added to what came in.
+/// Attention within windows, then an MLP of two layers, both with residual connections.
 struct TransformerBlock {
     norms: [LayerNorm; 2],
     qkv: Linear,
-    /// Heads × places × places.
+    /// Relative position bias: heads × pixels × pixels of a window.
     bias: Tensor,
     projection: Linear,
     layers: [Linear; 2],
     heads: i64,
-    /// How far windows are shifted.
+    /// Shift of the windows in pixels.
     shift: i64,
 }
 
 impl SwinIr {
+    /// Reads the network.
     pub(crate) fn read(weights: &Weights) -> Result<Self, WeightsError> {
         let [width, ..] = weights.shape::<4>("conv_first.weight")?;
         let table = "layers.0.residual_group.blocks.0.attn.relative_position_bias_table";
-        let window = ((root(weights.shape::<2>(table)?[0]) + 1) / 2).max(1);
+        let window = ((integer_root(weights.shape::<2>(table)?[0]) + 1) / 2).max(1);
         let groups =
-            count(weights, 0, |i| format!("layers.{i}.residual_group.blocks.0.norm1.weight"));
+            count_parts(weights, 0, |i| format!("layers.{i}.residual_group.blocks.0.norm1.weight"));
         let (head, scale) = Head::read(weights, width)?;
         let embedded = weights
             .has("patch_embed.norm.weight")
@@ -92,16 +93,16 @@ impl Network for SwinIr {
 
     fn enlarge(&self, image: &Tensor, _: [i64; 2]) -> Result<Tensor, TchError> {
         let [_, _, rows, columns] = image.size()[..] else {
-            return Err(TchError::Shape("an image has four dimensions".to_owned()));
+            return Err(TchError::Shape("expected an image of four dimensions".to_owned()));
         };
         let mean = Tensor::f_from_slice(&MEAN)?.f_reshape([1, 3, 1, 1])?;
-        let whole = self.whole_windows(&image.f_sub(&mean)?)?;
-        let first = self.first.forward(&whole, 1, 1)?;
+        let padded = self.pad_to_windows(&image.f_sub(&mean)?)?;
+        let first = self.first.forward(&padded, 1, 1)?;
         let mut x = first.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         if let Some(norm) = &self.embedded {
             x = norm.forward(&x)?;
         }
-        let mask = far(x.size()[1], x.size()[2], self.window)?;
+        let mask = shifted_window_mask(x.size()[1], x.size()[2], self.window)?;
         for group in &self.groups {
             x = group.forward(&x, self.window, &mask)?;
         }
@@ -113,19 +114,18 @@ impl Network for SwinIr {
 }
 
 impl SwinIr {
-    /// The image mirrored beyond its last row and column until windows are whole.
-    fn whole_windows(&self, image: &Tensor) -> Result<Tensor, TchError> {
+    /// Pads an image to a multiple of the window by reflection beyond its last row and column.
+    fn pad_to_windows(&self, image: &Tensor) -> Result<Tensor, TchError> {
         let mut x = image.shallow_clone();
         for axis in [2, 3] {
             let size = image.size()[axis];
-            let lacks = size.rem_euclid(self.window);
-            if lacks > 0 {
-                // Mirrored at the last one, as often as it takes: an image may be smaller than a
-                // window.
+            let remainder = size.rem_euclid(self.window);
+            if remainder > 0 {
+                // Reflects repeatedly, since an image may be smaller than a window.
                 let period = (2 * (size - 1)).max(1);
-                let source =
-                    |i: i64| if i % period < size { i % period } else { period - i % period };
-                let index: Vec<i64> = (0..size + self.window - lacks).map(source).collect();
+                let index: Vec<i64> = (0..size + self.window - remainder)
+                    .map(|i| (i % period).min(period - i % period))
+                    .collect();
                 x = x.f_index_select(axis as i64, &Tensor::f_from_slice(&index)?)?;
             }
         }
@@ -141,7 +141,7 @@ impl Group {
         window: i64,
     ) -> Result<Self, WeightsError> {
         let name = |i: usize| format!("layers.{index}.residual_group.blocks.{i}");
-        let blocks = count(weights, 0, |i| format!("{}.norm1.weight", name(i)));
+        let blocks = count_parts(weights, 0, |i| format!("{}.norm1.weight", name(i)));
         let blocks = (0..blocks).map(|i| {
             // Windows of every other block are shifted by half a window.
             let shift = if i % 2 == 1 { window / 2 } else { 0 };
@@ -178,8 +178,8 @@ impl Convs {
     fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         match &self.0[..] {
             [one, two, three] => {
-                let inner = leaky(&one.forward(x, 1, 1)?, SLOPE)?;
-                three.forward(&leaky(&two.forward(&inner, 1, 0)?, SLOPE)?, 1, 1)
+                let inner = leaky_relu(&one.forward(x, 1, 1)?, SLOPE)?;
+                three.forward(&leaky_relu(&two.forward(&inner, 1, 0)?, SLOPE)?, 1, 1)
             }
             convs => convs[0].forward(x, 1, 1),
         }
@@ -187,56 +187,55 @@ impl Convs {
 }
 
 impl Head {
-    /// The head that the weights are for, and how much it enlarges.
+    /// Reads the head of the kind that the file has; returns it with its scale.
     fn read(weights: &Weights, width: i64) -> Result<(Self, i64), WeightsError> {
         let conv = |name: &str, outputs, inputs| Conv::read(weights, name, [outputs, inputs, 3, 3]);
         if !weights.has("conv_before_upsample.0.weight") {
-            let scale = root(weights.shape::<4>("upsample.0.weight")?[0] / 3);
-            return Ok((
-                Self::Direct { up: conv("upsample.0", 3 * scale * scale, width)?, by: scale },
-                scale,
-            ));
+            let scale = integer_root(weights.shape::<4>("upsample.0.weight")?[0] / 3);
+            let up = conv("upsample.0", 3 * scale * scale, width)?;
+            return Ok((Self::Direct { up, scale }, scale));
         }
         let [middle, ..] = weights.shape::<4>("conv_before_upsample.0.weight")?;
-        let (before, last) =
-            (conv("conv_before_upsample.0", middle, width)?, conv("conv_last", 3, middle)?);
+        let before = conv("conv_before_upsample.0", middle, width)?;
+        let last = conv("conv_last", 3, middle)?;
         if weights.has("conv_up1.weight") {
-            let steps = count(weights, 1, |i| format!("conv_up{i}.weight"));
-            let read = (1..=steps)
+            let count = count_parts(weights, 1, |i| format!("conv_up{i}.weight"));
+            let steps = (1..=count)
                 .map(|i| conv(&format!("conv_up{i}"), middle, middle))
                 .collect::<Result<Vec<_>, _>>()?;
             let hr = conv("conv_hr", middle, middle)?;
-            return Ok((Self::Repeated { before, steps: read, hr, last }, 1 << steps.min(8)));
+            return Ok((Self::NearestConv { before, steps, hr, last }, 1 << count.min(8)));
         }
         let (mut scale, mut steps) = (1, Vec::new());
-        for i in 0..count(weights, 0, |i| format!("upsample.{}.weight", 2 * i)) {
+        for i in 0..count_parts(weights, 0, |i| format!("upsample.{}.weight", 2 * i)) {
             let name = format!("upsample.{}", 2 * i);
-            let by = root(weights.shape::<4>(&format!("{name}.weight"))?[0] / middle.max(1));
-            steps.push((conv(&name, by * by * middle, middle)?, by));
-            scale *= by;
+            let factor =
+                integer_root(weights.shape::<4>(&format!("{name}.weight"))?[0] / middle.max(1));
+            steps.push((conv(&name, factor * factor * middle, middle)?, factor));
+            scale *= factor;
         }
-        Ok((Self::Shuffled { before, steps, last }, scale))
+        Ok((Self::PixelShuffle { before, steps, last }, scale))
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         match self {
-            Self::Direct { up, by } => up.forward(x, 1, 1)?.f_pixel_shuffle(*by),
-            Self::Shuffled { before, steps, last } => {
-                let mut x = leaky(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
-                for (conv, by) in steps {
-                    x = conv.forward(&x, 1, 1)?.f_pixel_shuffle(*by)?;
+            Self::Direct { up, scale } => up.forward(x, 1, 1)?.f_pixel_shuffle(*scale),
+            Self::PixelShuffle { before, steps, last } => {
+                let mut x = leaky_relu(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
+                for (conv, factor) in steps {
+                    x = conv.forward(&x, 1, 1)?.f_pixel_shuffle(*factor)?;
                 }
                 last.forward(&x, 1, 1)
             }
-            Self::Repeated { before, steps, hr, last } => {
-                let mut x = leaky(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
+            Self::NearestConv { before, steps, hr, last } => {
+                let mut x = leaky_relu(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
                 for conv in steps {
                     let repeated = x
                         .f_repeat_interleave_self_int(2, 2, None)?
                         .f_repeat_interleave_self_int(2, 3, None)?;
-                    x = leaky(&conv.forward(&repeated, 1, 1)?, SLOPE)?;
+                    x = leaky_relu(&conv.forward(&repeated, 1, 1)?, SLOPE)?;
                 }
-                last.forward(&leaky(&hr.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
+                last.forward(&leaky_relu(&hr.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
             }
         }
     }
@@ -253,10 +252,10 @@ impl TransformerBlock {
         let part = |part: &str| format!("{name}.{part}");
         let table = part("attn.relative_position_bias_table");
         let heads = weights.shape::<2>(&table)?[1].max(1);
-        let reach = 2 * window - 1;
-        let table = weights.tensor(&table, &[reach * reach, heads])?;
+        let offsets = 2 * window - 1;
+        let table = weights.tensor(&table, &[offsets * offsets, heads])?;
         let [hidden, _] = weights.shape::<2>(&part("mlp.fc1.weight"))?;
-        let linear = |of: &str, shape| Linear::read(weights, &part(of), shape);
+        let linear = |name: &str, shape| Linear::read(weights, &part(name), shape);
         Ok(Self {
             norms: [
                 LayerNorm::read(weights, &part("norm1"), width)?,
@@ -264,7 +263,7 @@ impl TransformerBlock {
             ],
             qkv: linear("attn.qkv", [3 * width, width])?,
             bias: table
-                .index_select(0, &relative(window))
+                .index_select(0, &relative_position_index(window))
                 .reshape([window * window, window * window, heads])
                 .permute([2, 0, 1]),
             projection: linear("attn.proj", [width, width])?,
@@ -274,42 +273,40 @@ impl TransformerBlock {
         })
     }
 
-    /// `x`: 1 × rows × columns × channels, whole windows.
+    /// Applies the block to features (1 × rows × columns × channels), whose rows and columns are
+    /// multiples of the window.
     fn forward(&self, x: &Tensor, window: i64, mask: &Tensor) -> Result<Tensor, TchError> {
         let [_, rows, columns, width] = x.size()[..] else {
-            return Err(TchError::Shape("features have four dimensions".to_owned()));
+            return Err(TchError::Shape("expected features of four dimensions".to_owned()));
         };
         let shifted = self.norms[0].forward(x)?.f_roll([-self.shift, -self.shift], [1, 2])?;
-        let (down, across, places) = (rows / window, columns / window, window * window);
+        let (down, across, pixels) = (rows / window, columns / window, window * window);
         let windows =
             shifted.f_reshape([down, window, across, window, width])?.f_permute([0, 2, 1, 3, 4])?;
-        let windows = windows.f_reshape([down * across, places, width])?;
+        let windows = windows.f_reshape([down * across, pixels, width])?;
         let parts = self.qkv.forward(&windows)?.f_reshape([
             down * across,
-            places,
+            pixels,
             3,
             self.heads,
             width / self.heads,
         ])?;
         let parts = parts.f_permute([2, 0, 3, 1, 4])?;
-        let part = |i: i64| parts.f_select(0, i);
+        let (query, key) = (parts.f_select(0, 0)?, parts.f_select(0, 1)?);
+        let value = parts.f_select(0, 2)?;
         let scale = 1.0 / ((width / self.heads) as f64).sqrt();
-        let mut attention = part(0)?
-            .f_mul_scalar(scale)?
-            .f_matmul(&part(1)?.f_transpose(-2, -1)?)?
-            .f_add(&self.bias)?;
+        let mut attention =
+            query.f_mul_scalar(scale)?.f_matmul(&key.f_transpose(-2, -1)?)?.f_add(&self.bias)?;
         if self.shift > 0 {
             attention = attention.f_add(mask)?;
         }
-        let seen = attention.f_softmax(-1, Kind::Float)?.f_matmul(&part(2)?)?;
-        let seen = self.projection.forward(&seen.f_transpose(1, 2)?.f_reshape([
-            down * across,
-            places,
-            width,
-        ])?)?;
-        let seen =
-            seen.f_reshape([down, across, window, window, width])?.f_permute([0, 2, 1, 3, 4])?;
-        let x = seen
+        let attended = attention.f_softmax(-1, Kind::Float)?.f_matmul(&value)?;
+        let attended = attended.f_transpose(1, 2)?.f_reshape([down * across, pixels, width])?;
+        let attended = self.projection.forward(&attended)?;
+        let attended = attended
+            .f_reshape([down, across, window, window, width])?
+            .f_permute([0, 2, 1, 3, 4])?;
+        let x = attended
             .f_reshape([1, rows, columns, width])?
             .f_roll([self.shift, self.shift], [1, 2])?
             .f_add(x)?;
@@ -318,34 +315,36 @@ impl TransformerBlock {
     }
 }
 
-/// For each pair of places in a window, which entry of the table has their bias.
-fn relative(window: i64) -> Tensor {
-    let places = || (0..window).flat_map(|y| (0..window).map(move |x| (y, x)));
-    let index = |y: i64, x: i64| (y + window - 1) * (2 * window - 1) + x + window - 1;
-    let all: Vec<i64> =
-        places().flat_map(|a| places().map(move |b| index(a.0 - b.0, a.1 - b.1))).collect();
-    Tensor::from_slice(&all)
+/// Returns the index into the bias table for each pair of pixels in a window.
+fn relative_position_index(window: i64) -> Tensor {
+    let count = window * window;
+    let mut indices = Vec::with_capacity((count * count) as usize);
+    for a in 0..count {
+        for b in 0..count {
+            let (y, x) = (a / window - b / window, a % window - b % window);
+            indices.push((y + window - 1) * (2 * window - 1) + x + window - 1);
+        }
+    }
+    Tensor::from_slice(&indices)
 }
 
-/// What is added to the attention of shifted windows (windows × 1 × places × places): what is
-/// rolled around from the other end isn't near.
-fn far(rows: i64, columns: i64, window: i64) -> Result<Tensor, TchError> {
+/// Returns the attention mask of shifted windows (windows × 1 × pixels × pixels), which separates
+/// pixels that were rolled around from the image's other end.
+fn shifted_window_mask(rows: i64, columns: i64, window: i64) -> Result<Tensor, TchError> {
     let region =
         |i: i64, size: i64| i64::from(i >= size - window) + i64::from(i >= size - window / 2);
-    let (down, across, places) = (rows / window, columns / window, window * window);
-    let mut mask = Vec::with_capacity((down * across * places * places) as usize);
+    let (down, across, pixels) = (rows / window, columns / window, window * window);
+    let mut mask = Vec::with_capacity((down * across * pixels * pixels) as usize);
     for w in 0..down * across {
-        let regions: Vec<(i64, i64)> = (0..places)
+        let regions: Vec<(i64, i64)> = (0..pixels)
             .map(|p| {
                 let (y, x) = (w / across * window + p / window, w % across * window + p % window);
                 (region(y, rows), region(x, columns))
             })
             .collect();
-        mask.extend(
-            regions.iter().flat_map(|a| {
-                regions.iter().map(move |b| if a == b { 0.0 } else { UNRELATED_BIAS })
-            }),
-        );
+        for a in &regions {
+            mask.extend(regions.iter().map(|b| if a == b { 0.0 } else { MASKED_BIAS }));
+        }
     }
-    Tensor::f_from_slice(&mask)?.f_reshape([down * across, 1, places, places])
+    Tensor::f_from_slice(&mask)?.f_reshape([down * across, 1, pixels, pixels])
 }
