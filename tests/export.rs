@@ -289,7 +289,7 @@ fn files_may_be_left_out_but_not_all() {
     let count = read_ply(&project.path("some/points.ply"))["x"].len();
     assert!((100..=500).contains(&count), "{count} points");
     let none = r#"{"points": false, "splats": false, "mesh": false, "cameras": false}"#;
-    tiny(&project, none, "none", &[]).fails(2, &["nothing is to be written", "mesh"]);
+    tiny(&project, none, "none", &[]).fails(2, &["no files are enabled", "mesh"]);
 }
 
 /// Measures an artifact of `export`, `EXPORT`, that was made by the training cameras of a scene of

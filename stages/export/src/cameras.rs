@@ -4,17 +4,19 @@ use glam::{DMat3, DQuat, DVec3};
 use scene::{Camera, Distortion, Intrinsics};
 use serde_json::{Map, Value, json};
 
+use crate::ply::colour_bytes;
 use crate::surfel::Surfel;
 
-/// Points of a COLMAP model, at most: what a structure from motion finds, about.
-const MOST_POINTS: usize = 100_000;
+/// Maximum number of points of a COLMAP model: about as many as structure from motion finds.
+const MAX_POINTS: usize = 100_000;
 
-/// `transforms.json` as instant-ngp and nerfstudio read it. Images aren't exported: each is named
-/// `images/NAME.png`.
-pub(crate) fn transforms(cameras: &[Camera], points: Option<&str>) -> Value {
+/// Returns `transforms.json` in the format of instant-ngp and nerfstudio. Images aren't exported; their
+/// paths are `images/NAME.png`.
+pub(crate) fn transforms_json(cameras: &[Camera], points: Option<&str>) -> Value {
     let shared = shared_intrinsics(cameras);
-    let frames: Value = cameras.iter().map(|camera| frame(camera, shared.is_some())).collect();
-    let mut file = shared.map(lens).unwrap_or_default();
+    let frames: Value =
+        cameras.iter().map(|camera| frame_entry(camera, shared.is_some())).collect();
+    let mut file = shared.map(lens_entries).unwrap_or_default();
     file.insert("frames".to_owned(), frames);
     if let Some(points) = points {
         file.insert("ply_file_path".to_owned(), json!(points));
@@ -22,32 +24,29 @@ pub(crate) fn transforms(cameras: &[Camera], points: Option<&str>) -> Value {
     Value::Object(file)
 }
 
-fn frame(camera: &Camera, has_shared_lens: bool) -> Value {
-    let mut entry = if has_shared_lens { Map::new() } else { lens(&camera.intrinsics) };
+/// Returns the entry of a camera.
+fn frame_entry(camera: &Camera, has_shared_lens: bool) -> Value {
+    let mut entry = if has_shared_lens { Map::new() } else { lens_entries(&camera.intrinsics) };
     let mut matrix = camera.camera_to_world.to_vec();
     matrix.push([0.0, 0.0, 0.0, 1.0]);
-    entry.insert("file_path".to_owned(), json!(image(camera, "images/")));
+    entry.insert("file_path".to_owned(), json!(format!("images/{}.png", camera.name)));
     entry.insert("transform_matrix".to_owned(), json!(matrix));
     Value::Object(entry)
 }
 
-/// The intrinsics of all cameras, where they have the same.
+/// Returns the intrinsics of all cameras if they are equal.
 fn shared_intrinsics(cameras: &[Camera]) -> Option<&Intrinsics> {
     let first = &cameras.first()?.intrinsics;
     cameras.iter().all(|camera| camera.intrinsics == *first).then_some(first)
 }
 
-fn image(camera: &Camera, folder: &str) -> String {
-    format!("{folder}{}.png", camera.name)
-}
-
-fn lens(k: &Intrinsics) -> Map<String, Value> {
+/// Returns the entries for intrinsics.
+fn lens_entries(k: &Intrinsics) -> Map<String, Value> {
     let ([k1, k2, k3, k4], [p1, p2]) = (k.distortion.radial, k.distortion.tangential);
-    let half_angle = |size: u32, focal: f64| (0.5 * f64::from(size) / focal).atan();
     let mut entry = json!({
         "camera_model": if k.distortion.is_none() { "PINHOLE" } else { "OPENCV" },
-        "camera_angle_x": 2.0 * half_angle(k.width, k.fx),
-        "camera_angle_y": 2.0 * half_angle(k.height, k.fy),
+        "camera_angle_x": 2.0 * (0.5 * f64::from(k.width) / k.fx).atan(),
+        "camera_angle_y": 2.0 * (0.5 * f64::from(k.height) / k.fy).atan(),
         "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": k.width, "h": k.height,
         "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2,
     });
@@ -58,13 +57,13 @@ fn lens(k: &Intrinsics) -> Map<String, Value> {
     if k.distortion.is_fisheye() {
         entry.insert("camera_model".to_owned(), json!("OPENCV_FISHEYE"));
         entry.insert("is_fisheye".to_owned(), json!(true));
-        // Those of a pinhole.
+        // These angles are those of a pinhole camera.
         entry.retain(|key, _| !key.starts_with("camera_angle"));
     }
     entry
 }
 
-/// A format of cameras, and what its readers know of lenses.
+/// Format of exported cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum CameraFormat {
     /// `transforms.json`.
@@ -74,27 +73,26 @@ pub(crate) enum CameraFormat {
 }
 
 impl CameraFormat {
-    /// Returns why the format can't hold some of the cameras, or `None` if it can hold all.
-    pub(crate) fn problem(self, cameras: &[Camera]) -> Option<&'static str> {
+    /// Returns why the format can't describe the cameras' lenses, or `None` if it can.
+    pub(crate) fn lens_problem(self, cameras: &[Camera]) -> Option<&'static str> {
         let is_any =
             |has: fn(&Distortion) -> bool| cameras.iter().any(|c| has(&c.intrinsics.distortion));
         match self {
             Self::Transforms if is_any(|lens| lens.denominator != [0.0; 3]) => Some(
-                "transforms.json is not written: its readers know no lens with the rational terms \
-                k4 to k6",
+                "transforms.json is not written: its readers don't support the rational terms k4 to k6 \
+                of a lens",
             ),
             Self::Colmap if is_any(|lens| lens.radial[3] != 0.0 && !lens.is_fisheye()) => Some(
-                "colmap/ is not written: COLMAP has no perspective lens with a fourth radial term",
+                "colmap/ is not written: COLMAP doesn't support a fourth radial term of a perspective lens",
             ),
             _ => None,
         }
     }
 }
 
-/// A COLMAP model as text: `cameras.txt`, `images.txt` and `points3D.txt`. Poses are world to
-/// camera with axes right, down, forward. Points have no track; `offset` is their origin's place in
-/// the world.
-pub(crate) fn colmap(
+/// Returns a COLMAP model as text files: names and contents. Poses are world to camera with axes right,
+/// down, forward. Points have no track; `offset` is the world point of their origin.
+pub(crate) fn colmap_files(
     cameras: &[Camera],
     surfels: &[Surfel],
     offset: DVec3,
@@ -103,33 +101,33 @@ pub(crate) fn colmap(
     let mut images =
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; a line of points\n".to_owned();
     for (id, camera) in (1..).zip(cameras) {
-        let known = lenses.iter().position(|k| **k == camera.intrinsics);
-        let lens = known.unwrap_or_else(|| {
+        let lens = lenses.iter().position(|k| **k == camera.intrinsics).unwrap_or_else(|| {
             lenses.push(&camera.intrinsics);
             lenses.len() - 1
         });
         let (q, t) = world_to_camera(camera);
         let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
-        let _ = writeln!(images, "{id} {pose} {} {}\n", lens + 1, image(camera, ""));
+        let _ = writeln!(images, "{id} {pose} {} {}.png\n", lens + 1, camera.name);
     }
     let mut cameras = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
     for (id, k) in (1..).zip(lenses) {
-        let (model, numbers) = colmap_model(k);
-        let numbers = numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
-        let _ = writeln!(cameras, "{id} {model} {} {} {numbers}", k.width, k.height);
+        let (model, parameters) = colmap_model(k);
+        let parameters = parameters.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+        let _ = writeln!(cameras, "{id} {model} {} {} {parameters}", k.width, k.height);
     }
     let mut points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n".to_owned();
-    let step = surfels.len().div_ceil(MOST_POINTS).max(1);
+    let step = surfels.len().div_ceil(MAX_POINTS).max(1);
     for (id, surfel) in (1..).zip(surfels.iter().step_by(step)) {
-        let [x, y, z] = coordinates(surfel.position, offset);
-        let [r, g, b] = crate::points::level(surfel.colour);
+        let [x, y, z] = world_coordinates(surfel.position, offset);
+        let [r, g, b] = colour_bytes(surfel.colour);
         let _ = writeln!(points, "{id} {x} {y} {z} {r} {g} {b} 0");
     }
     [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)]
 }
 
-/// A point's world coordinates as text: in double precision where single precision can't hold them.
-fn coordinates(position: DVec3, offset: DVec3) -> [String; 3] {
+/// Returns a point's world coordinates as text: in double precision if there is an offset, because
+/// single precision is too coarse then.
+fn world_coordinates(position: DVec3, offset: DVec3) -> [String; 3] {
     if offset == DVec3::ZERO {
         position.as_vec3().to_array().map(|x| x.to_string())
     } else {
@@ -156,10 +154,10 @@ fn colmap_model(k: &Intrinsics) -> (&'static str, Vec<f64>) {
     }
 }
 
-/// Rotation and translation from the world to a camera with axes right, down, forward.
+/// Returns rotation and translation from the world to a camera with axes right, down, forward.
 fn world_to_camera(camera: &Camera) -> (DQuat, DVec3) {
     let axes = camera.rotation();
-    let turned = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis).transpose();
-    let rotation = DQuat::from_mat3(&turned).normalize();
+    let matrix = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis).transpose();
+    let rotation = DQuat::from_mat3(&matrix).normalize();
     (rotation, -(rotation * camera.centre()))
 }

@@ -1,54 +1,59 @@
 use rayon::prelude::*;
 use stage::Progress;
 
-use crate::seen::{SeenView, Sight};
+use crate::surface_view::{PointState, SurfaceView};
 
-/// Views see one surface where they agree to so many pixel widths.
-const AGREEMENT_PIXELS: f64 = 2.0;
-/// They see one side of it where the cosine between their normals is larger: normals agree to 45°.
-/// Thin things have another side.
-const MERGED_SIDE_COSINE: f64 = 0.7;
+/// Maximum distance in pixel widths at which views observe the same surface (design note 043).
+const MAX_DISTANCE_PIXELS: f64 = 2.0;
+/// Minimum cosine between normals at which views observe the same side of a surface: 45° (design note
+/// 043). Thin objects have another side close by.
+const MIN_SAME_SIDE_COSINE: f64 = 0.7;
 
-/// Moves what each view sees to the mean of what all views see of the same surface, and drops what
-/// more than a third of them look through: floaters, and fringes of edges.
-pub(crate) fn agree(views: &mut [SeenView], progress: &Progress) {
-    let agreed: Vec<Vec<(usize, Option<f32>)>> = views
+/// Moves every pixel's point to the mean of the surfaces that all views observe there, and removes
+/// points that too many views see through: floaters and fringes of edges.
+pub(crate) fn apply_consensus(views: &mut [SurfaceView], progress: &Progress) {
+    let shifts: Vec<Vec<(usize, Option<f32>)>> = views
         .par_iter()
         .map(|view| {
-            let shifts = view.surface().map(|(at, _)| (at, shift(views, view, at))).collect();
+            let shifts = view
+                .surface_pixels()
+                .map(|(index, _)| (index, consensus_shift(views, view, index)))
+                .collect();
             progress.add(1);
             shifts
         })
         .collect();
-    for (view, agreed) in views.iter_mut().zip(agreed) {
-        for (at, shift) in agreed {
+    for (view, shifts) in views.iter_mut().zip(shifts) {
+        for (index, shift) in shifts {
             match shift {
-                Some(shift) => view.move_along_normal(at, shift),
-                None => view.forget(at),
+                Some(shift) => view.move_along_normal(index, shift),
+                None => view.remove_surface(index),
             }
         }
     }
 }
 
-/// How far a pixel's point is moved along its normal; `None` where it is dropped.
-fn shift(views: &[SeenView], view: &SeenView, at: usize) -> Option<f32> {
-    let (point, normal) = (view.world_point(at), view.world_normal(at));
-    let reach = (AGREEMENT_PIXELS * view.footprint(at)) as f32;
-    let (mut sum, mut weights, mut seen, mut looked_through) = (0.0, 0.0, 0, 0);
+/// Returns the distance by which a pixel's point moves along its normal; `None` if the point is
+/// removed, because more than half as many views see through it as observe it.
+fn consensus_shift(views: &[SurfaceView], view: &SurfaceView, index: usize) -> Option<f32> {
+    let (point, normal) = (view.world_point(index), view.world_normal(index));
+    let max_distance = (MAX_DISTANCE_PIXELS * view.pixel_width(index)) as f32;
+    let (mut sum, mut weights) = (0.0, 0.0);
+    // At least one view observes the point: its own.
+    let (mut observing, mut seeing_through) = (0, 0);
     for other in views {
-        match other.look(point, reach) {
-            Sight::Surface { distance, cosine, index }
-                if other.world_normal(index).dot(normal) > MERGED_SIDE_COSINE =>
+        match other.point_state(point, max_distance) {
+            PointState::Surface { distance, cosine, index }
+                if other.world_normal(index).dot(normal) > MIN_SAME_SIDE_COSINE =>
             {
                 let weight = cosine.max(0.05);
                 sum += weight * distance;
                 weights += weight;
-                seen += 1;
+                observing += 1;
             }
-            Sight::Empty => looked_through += 1,
+            PointState::Empty => seeing_through += 1,
             _ => {}
         }
     }
-    // It sees the point itself.
-    (2 * looked_through <= seen).then(|| -sum / weights)
+    (2 * seeing_through <= observing).then(|| -sum / weights)
 }

@@ -11,11 +11,11 @@ pub const OFFSET_FILE: &str = "offset.json";
 /// Files whose coordinates have single precision.
 const SINGLE_FILES: [&str; 3] = ["points.ply", "splats.ply", "mesh.glb"];
 
-/// Distance of a scene's middle from the origin, in scene sizes, up to which single precision holds
-/// its coordinates: rounding moves a point by less than a millionth of the size.
+/// Maximum distance of a scene's middle from the origin, in scene sizes, for files without an offset:
+/// single precision moves a point by less than a millionth of the size (design note 043).
 const MAX_DISTANCE_SIZES: f64 = 8.0;
 
-/// `offset.json`: the offset of files with single precision, for scenes far from the origin.
+/// Content of `offset.json`: the offset of files with single precision, for scenes far from the origin.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExportOffset {
@@ -27,16 +27,16 @@ pub struct ExportOffset {
     pub files: Vec<String>,
 }
 
-/// Frame of the coordinates in files: the input's, moved so that single precision holds them.
+/// Frame of the coordinates in files: the input's frame, moved if single precision is too coarse.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Coordinates {
-    /// World point that is the origin of files with single precision.
+    /// World point of the origin of files with single precision.
     pub(crate) offset: DVec3,
 }
 
 impl Coordinates {
-    /// Chooses the frame for a field's bounds: the input's where single precision holds it.
-    pub(crate) fn of(bounds: &Bounds) -> Self {
+    /// Chooses the frame for a field's bounds: the input's frame if single precision is fine enough.
+    pub(crate) fn new(bounds: &Bounds) -> Self {
         let (middle, size) = match bounds.space {
             Space::Ndc(frustum) => (frustum.centre(), frustum.near),
             _ => (bounds.middle(), bounds.longest_side()),
@@ -44,7 +44,7 @@ impl Coordinates {
         if middle.abs().max_element() <= MAX_DISTANCE_SIZES * size {
             return Self::default();
         }
-        Self { offset: middle.to_array().map(|x| short(x, size)).into() }
+        Self { offset: middle.to_array().map(|x| round_coordinate(x, size)).into() }
     }
 
     /// True if files with single precision lack an offset.
@@ -53,13 +53,18 @@ impl Coordinates {
     }
 
     /// Returns the content of [`OFFSET_FILE`] for the files that are written.
-    pub(crate) fn file(&self, is_written: [bool; 3]) -> ExportOffset {
-        let files = SINGLE_FILES.iter().zip(is_written).filter(|(_, is_written)| *is_written);
+    pub(crate) fn offset_file(&self, is_written: [bool; 3]) -> ExportOffset {
+        let mut files = Vec::new();
+        for (i, file) in SINGLE_FILES.iter().enumerate() {
+            if is_written[i] {
+                files.push((*file).to_owned());
+            }
+        }
         ExportOffset {
             note: "add the offset to the coordinates of these files for the input's coordinates"
                 .to_owned(),
             offset: self.offset.to_array(),
-            files: files.map(|(file, _)| (*file).to_owned()).collect(),
+            files,
         }
     }
 }
@@ -76,12 +81,12 @@ impl fmt::Display for Coordinates {
     }
 }
 
-/// Rounds a coordinate to as few decimals as a scene's size needs.
-fn short(value: f64, size: f64) -> f64 {
+/// Rounds a coordinate to the number of decimals that the scene's size needs.
+fn round_coordinate(value: f64, size: f64) -> f64 {
     let scientific = format!("{size:e}");
     let exponent = scientific.split_once('e').and_then(|(_, e)| e.parse::<i32>().ok());
     let decimals = exponent.map_or(0, |exponent| (-exponent).clamp(0, 300));
     let rounded: f64 = format!("{value:.*}", decimals as usize).parse().unwrap_or(value);
-    // No -0.
+    // Turns -0 into 0.
     rounded + 0.0
 }

@@ -7,24 +7,26 @@ use serde_json::{Value, json};
 use crate::coordinates::Coordinates;
 use crate::mesh::Mesh;
 
-/// glTF's numbers for kinds of components and of buffers.
+/// Codes of glTF for component types and buffer targets.
 const FLOAT: u32 = 5126;
 const UNSIGNED: u32 = 5125;
 const VERTICES: u32 = 34962;
 const INDICES: u32 = 34963;
 
-/// Writes a mesh as binary glTF 2.0, unlit: the colours hold the scene's light. glTF has linear
-/// colours, so `colours`, display-encoded sRGB of each vertex, are converted.
+/// Writes a mesh as binary glTF 2.0, unlit, since the colours include the scene's light. The vertices'
+/// `colours`, display-encoded sRGB, are converted to glTF's linear colours.
 pub(crate) fn write(
     file: &mut impl Write,
     mesh: &Mesh,
     colours: &[[f32; 3]],
     coordinates: &Coordinates,
 ) -> io::Result<()> {
-    let linear = |v: f32| linear_from_srgb(f64::from(v)) as f32;
-    let colours: Vec<Vec3> = colours.iter().map(|c| Vec3::from(c.map(linear))).collect();
-    let mut text = serde_json::to_string(&description(mesh, coordinates))?;
-    // Chunks have whole words.
+    let colours: Vec<Vec3> = colours
+        .iter()
+        .map(|c| Vec3::from(c.map(|v| linear_from_srgb(f64::from(v)) as f32)))
+        .collect();
+    let mut text = serde_json::to_string(&gltf_json(mesh, coordinates))?;
+    // A chunk's length is a multiple of four bytes.
     while !text.len().is_multiple_of(4) {
         text.push(' ');
     }
@@ -38,23 +40,34 @@ pub(crate) fn write(
     for vector in mesh.positions.iter().chain(&mesh.normals).chain(&colours) {
         crate::ply::write_floats(file, &vector.to_array())?;
     }
-    mesh.triangles.iter().try_for_each(|triangle| write_words(file, triangle))
+    for triangle in &mesh.triangles {
+        write_words(file, triangle)?;
+    }
+    Ok(())
 }
 
+/// Writes little-endian 32-bit integers.
 fn write_words(file: &mut impl Write, words: &[u32]) -> io::Result<()> {
-    words.iter().try_for_each(|word| file.write_all(&word.to_le_bytes()))
+    for word in words {
+        file.write_all(&word.to_le_bytes())?;
+    }
+    Ok(())
 }
 
-/// Bytes of all vertices and triangles.
+/// Returns the number of bytes of all vertices and triangles.
 pub(crate) fn buffer_length(mesh: &Mesh) -> usize {
     3 * 12 * mesh.positions.len() + 12 * mesh.triangles.len()
 }
 
-fn description(mesh: &Mesh, coordinates: &Coordinates) -> Value {
+/// Returns the JSON chunk.
+fn gltf_json(mesh: &Mesh, coordinates: &Coordinates) -> Value {
     let (vertices, triangles) = (mesh.positions.len(), mesh.triangles.len());
-    let mut positions = vectors(0, vertices);
-    positions["min"] = json!(bound(mesh, Vec3::min));
-    positions["max"] = json!(bound(mesh, Vec3::max));
+    let bound = |fold: fn(Vec3, Vec3) -> Vec3| {
+        mesh.positions.iter().copied().reduce(fold).unwrap_or_default().to_array()
+    };
+    let mut positions = vector_accessor(0, vertices);
+    positions["min"] = json!(bound(Vec3::min));
+    positions["max"] = json!(bound(Vec3::max));
     let indices = json!({"bufferView": 3, "componentType": UNSIGNED, "count": 3 * triangles,
         "type": "SCALAR"});
     let length = 12 * vertices;
@@ -75,7 +88,12 @@ fn description(mesh: &Mesh, coordinates: &Coordinates) -> Value {
             "extensions": {"KHR_materials_unlit": {}},
             "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
         }],
-        "accessors": [positions, vectors(1, vertices), vectors(2, vertices), indices],
+        "accessors": [
+            positions,
+            vector_accessor(1, vertices),
+            vector_accessor(2, vertices),
+            indices,
+        ],
         "bufferViews": [
             buffer_view(0, length, VERTICES),
             buffer_view(length, length, VERTICES),
@@ -86,16 +104,12 @@ fn description(mesh: &Mesh, coordinates: &Coordinates) -> Value {
     })
 }
 
-/// A list of vectors, one of each vertex.
-fn vectors(buffer_view: u32, count: usize) -> Value {
+/// Returns the accessor of one vector per vertex.
+fn vector_accessor(buffer_view: u32, count: usize) -> Value {
     json!({"bufferView": buffer_view, "componentType": FLOAT, "count": count, "type": "VEC3"})
 }
 
-/// A part of the buffer.
+/// Returns the view of a part of the buffer.
 fn buffer_view(first: usize, length: usize, target: u32) -> Value {
     json!({"buffer": 0, "byteOffset": first, "byteLength": length, "target": target})
-}
-
-fn bound(mesh: &Mesh, of: fn(Vec3, Vec3) -> Vec3) -> [f32; 3] {
-    mesh.positions.iter().copied().reduce(of).unwrap_or_default().to_array()
 }

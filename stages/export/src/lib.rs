@@ -1,18 +1,19 @@
 //! `export`: a trained field in files that other programs open.
 //!
-//! The field is rendered from the training cameras; all files are made of what these views see.
+//! The field is rendered from the training cameras; all files are derived from the surfaces in these
+//! views (design note 043).
 //!
 //! * `points.ply`: coloured points with normals.
 //! * `splats.ply`: 3D Gaussians in the layout of 3DGS viewers.
 //! * `mesh.glb`: triangles with vertex colours, by fusing the views' depth.
 //! * `transforms.json`, `colmap/sparse/0/`: the cameras for instant-ngp, nerfstudio and COLMAP.
-//! * [`EXPORT_FILE`]: counts, and the coordinates in words.
-//! * [`OFFSET_FILE`]: for scenes far from the origin, what points, splats and mesh lack.
+//! * [`EXPORT_FILE`]: counts, and a description of the coordinates.
+//! * [`OFFSET_FILE`]: for scenes far from the origin, the offset of points, splats and mesh.
 //!
-//! Coordinates, scale and orientation are those of the cameras given, which `prep` leaves as the
-//! data set has them. Points, splats and mesh have single precision. Where that can't hold the
-//! coordinates, these files are counted from an offset ([`coordinates`]). Camera axes are OpenGL's (x right, y up, looking along -z) in
-//! `transforms.json`, and COLMAP's (x right, y down, looking along z) in its model.
+//! Coordinates, scale and orientation are those of the input cameras, which `prep` copies from the data
+//! set. Points, splats and mesh have single precision; if that is too coarse, their coordinates are
+//! relative to an offset ([`coordinates`]). Camera axes are OpenGL's (x right, y up, looking along -z)
+//! in `transforms.json`, and COLMAP's (x right, y down, looking along z) in its model.
 
 mod cameras;
 mod colour;
@@ -23,14 +24,11 @@ mod glb;
 mod lattice;
 mod mesh;
 mod ply;
-mod points;
-mod seen;
-mod splats;
 mod surface_nets;
+mod surface_view;
 mod surfel;
 #[cfg(test)]
 mod tests;
-mod unseen;
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write as _};
@@ -50,19 +48,20 @@ use coordinates::Coordinates;
 pub use coordinates::{ExportOffset, OFFSET_FILE};
 use lattice::Lattice;
 use mesh::Mesh;
-use seen::SeenView;
+use surface_view::SurfaceView;
 use surfel::Surfel;
 
 /// Name of the summary in the artifact.
 pub const EXPORT_FILE: &str = "export.json";
 
-/// Pixels of all rendered views together, unless `size` is given.
-const MOST_PIXELS: f64 = 16e6;
-/// Size of the rendered views over the cameras': a supersampled field has more than these show.
-const MOST_SCALE: f64 = 2.0;
+/// Maximum number of pixels of all rendered views together, unless `size` is given; chosen by hand.
+const MAX_PIXELS: f64 = 16e6;
+/// Maximum size of the rendered views relative to the cameras: a supersampled field has more detail
+/// than the cameras' pixels (design note 043).
+const MAX_SCALE: f64 = 2.0;
 
-/// Bytes per place of the lattice: a distance.
-const BYTES_PER_PLACE: u64 = size_of::<f32>() as u64;
+/// Number of bytes per node of the lattice: a signed distance.
+const BYTES_PER_NODE: u64 = size_of::<f32>() as u64;
 /// Remedy for short memory, as a sentence fragment.
 const REMEDY: &str = "choose a smaller resolution or size, or end other programs";
 
@@ -78,15 +77,14 @@ pub struct Params {
     pub mesh: bool,
     /// Writes the cameras as `transforms.json` and as COLMAP's text files.
     pub cameras: bool,
-    /// Width at which the field is rendered from each camera. Default: twice the cameras' own, or
-    /// less where all views together would have more than 16 million pixels.
+    /// Width in pixels at which the field is rendered from each camera. Default: twice the cameras'
+    /// width, or less if all views together would have more than 16 million pixels.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by cameras"))]
     pub size: Option<u32>,
     /// Maximum number of points and of splats.
     #[schemars(range(min = 1, max = 20_000_000))]
     pub max_points: u32,
-    /// Cells of the mesh's grid along the longest side of the field's box, or in NDC of its
-    /// frustum.
+    /// Number of cells of the mesh's grid along the longest side of the field's box or NDC frustum.
     #[schemars(range(min = 8, max = 1024))]
     pub resolution: u32,
 }
@@ -105,11 +103,11 @@ impl Default for Params {
     }
 }
 
-/// `export.json`: what was written.
+/// Content of `export.json`: summary of the written files.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExportSummary {
-    /// What coordinates in all files are.
+    /// Description of the coordinates in all files.
     pub coordinates: String,
     /// Number of cameras.
     pub cameras: usize,
@@ -147,23 +145,23 @@ impl Stage for Export {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         if !(params.points || params.splats || params.mesh || params.cameras) {
-            let message = "nothing is to be written; set points, splats, mesh or cameras to true";
+            let message = "no files are enabled; set points, splats, mesh or cameras to true";
             return Err(Failure::Usage(message.to_owned()).into());
         }
         let field = Members::read(context.input("field")?, &context.device)?;
-        let given = Views::read(context.input("cameras")?)?;
-        let cameras: Vec<Camera> = given.views.into_iter().map(|view| view.camera).collect();
+        let views = Views::read(context.input("cameras")?)?;
+        let cameras: Vec<Camera> = views.views.into_iter().map(|view| view.camera).collect();
         for note in lens_notes(&cameras, params) {
             context.say(note);
         }
-        let coordinates = Coordinates::of(&field.file.bounds);
+        let coordinates = Coordinates::new(&field.file.bounds);
         let bounds = field.file.bounds.moved(-coordinates.offset);
-        let resized = resized(&cameras, params.size);
+        let resized = resize_cameras(&cameras, params.size);
         let lattice = params.mesh.then(|| Lattice::new(&bounds, params.resolution));
         context.check_memory("the export", memory_need(&resized, lattice.as_ref()), REMEDY)?;
-        let mut views = render(context, &field, &resized, coordinates.offset)?;
+        let mut views = render_views(context, &field, &resized, coordinates.offset)?;
         let progress = context.progress("comparing", views.len() as u64);
-        consensus::agree(&mut views, &progress);
+        consensus::apply_consensus(&mut views, &progress);
         let job = ExportJob { context, params, field, cameras, views, coordinates, bounds };
         let mut summary = ExportSummary {
             coordinates: coordinates.to_string(),
@@ -180,125 +178,135 @@ impl Stage for Export {
         }
         job.write_offset()?;
         context.write_json(EXPORT_FILE, &summary)?;
-        context.write_summary(&in_words(&summary))
+        context.write_summary(&summary_text(&summary))
     }
 }
 
-/// Describes what files won't hold of the cameras' lenses, a line each.
+/// Returns notes on lenses that files can't describe, a line each.
 fn lens_notes(cameras: &[Camera], params: &Params) -> Vec<&'static str> {
     let mut notes = Vec::new();
     let is_fisheye = |camera: &Camera| camera.intrinsics.distortion.is_fisheye();
     if (params.points || params.splats || params.mesh) && cameras.iter().any(is_fisheye) {
         notes.push(
-            "fisheye lenses: points, splats and mesh hold what pinhole cameras in their place see, \
-            at most 100° across",
+            "fisheye lenses: points, splats and mesh cover only the field of view of pinhole \
+            cameras, at most 100°",
         );
     }
     if params.cameras {
         let formats = [CameraFormat::Transforms, CameraFormat::Colmap];
-        notes.extend(formats.into_iter().filter_map(|format| format.problem(cameras)));
+        notes.extend(formats.into_iter().filter_map(|format| format.lens_problem(cameras)));
     }
     notes
 }
 
-fn in_words(summary: &ExportSummary) -> String {
-    let counts =
-        [(summary.points, "points"), (summary.splats, "splats"), (summary.triangles, "triangles")];
-    let counts = counts.into_iter().filter(|(count, _)| *count > 0);
-    let mut words: Vec<String> =
-        counts.map(|(count, what)| format!("{} {what}", amount(count as u64))).collect();
-    words.push(counted(summary.cameras, "camera"));
-    words.join(", ")
+/// Formats the summary as one line.
+fn summary_text(summary: &ExportSummary) -> String {
+    let ExportSummary { points, splats, triangles, .. } = *summary;
+    let mut parts = Vec::new();
+    for (count, noun) in [(points, "points"), (splats, "splats"), (triangles, "triangles")] {
+        if count > 0 {
+            parts.push(format!("{} {noun}", amount(count as u64)));
+        }
+    }
+    parts.push(counted(summary.cameras, "camera"));
+    parts.join(", ")
 }
 
-/// Cameras at the size at which the field is rendered.
-fn resized(cameras: &[Camera], width: Option<u32>) -> Vec<Camera> {
-    let pixels = |c: &Camera| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height);
-    let most = (MOST_PIXELS / cameras.iter().map(pixels).sum::<f64>()).sqrt().min(MOST_SCALE);
+/// Resizes cameras to `width`, or to the default size at which the field is rendered.
+fn resize_cameras(cameras: &[Camera], width: Option<u32>) -> Vec<Camera> {
+    let pixels: f64 = cameras
+        .iter()
+        .map(|c| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height))
+        .sum();
+    let default_scale = (MAX_PIXELS / pixels).sqrt().min(MAX_SCALE);
     let mut resized = Vec::with_capacity(cameras.len());
     for camera in cameras {
         let k = &camera.intrinsics;
-        let scale = width.map_or(most, |width| f64::from(width) / f64::from(k.width));
-        let side = |pixels: u32| (scale * f64::from(pixels)).round().max(1.0) as u32;
-        resized.push(camera.resized(side(k.width), side(k.height)));
+        let scale = width.map_or(default_scale, |width| f64::from(width) / f64::from(k.width));
+        let [width, height] =
+            [k.width, k.height].map(|side| (scale * f64::from(side)).round().max(1.0) as u32);
+        resized.push(camera.resized(width, height));
     }
     resized
 }
 
+/// Returns the number of a camera's pixels.
 fn pixel_count(camera: &Camera) -> u64 {
     u64::from(camera.intrinsics.width) * u64::from(camera.intrinsics.height)
 }
 
 /// Renders the field from every camera, in the frame whose origin in the world is `offset`.
-fn render(
+fn render_views(
     context: &Context,
     field: &Members,
     cameras: &[Camera],
     offset: DVec3,
-) -> anyhow::Result<Vec<SeenView>> {
+) -> anyhow::Result<Vec<SurfaceView>> {
     let progress = context.progress("rendering", cameras.iter().map(pixel_count).sum());
     let mut views = Vec::with_capacity(cameras.len());
     for camera in cameras {
         context.check_interrupt()?;
         let background = field.file.background;
-        views.push(SeenView::render(field, camera, background, offset, &progress)?);
+        views.push(SurfaceView::render(field, camera, background, offset, &progress)?);
     }
     Ok(views)
 }
 
-/// Maximum bytes that an export needs: all pixels, together with either the samples that are merged
-/// or the mesh's lattice.
+/// Returns the maximum number of bytes that an export needs: all pixels, and either the samples that
+/// are merged or the mesh's lattice.
 fn memory_need(cameras: &[Camera], lattice: Option<&Lattice>) -> u64 {
     let pixels: u64 = cameras.iter().map(pixel_count).sum();
-    let values = lattice.map_or(0, |lattice| BYTES_PER_PLACE * lattice.len() as u64);
-    SeenView::BYTES_PER_PIXEL * pixels + values.max(surfel::BYTES_PER_PIXEL * pixels)
+    let values = lattice.map_or(0, |lattice| BYTES_PER_NODE * lattice.len() as u64);
+    SurfaceView::BYTES_PER_PIXEL * pixels + values.max(surfel::BYTES_PER_PIXEL * pixels)
 }
 
+/// Inputs and rendered views of an export.
 struct ExportJob<'a> {
     context: &'a Context,
     params: &'a Params,
     field: Members,
     cameras: Vec<Camera>,
-    views: Vec<SeenView>,
+    views: Vec<SurfaceView>,
     coordinates: Coordinates,
     /// Bounds of the field, in the frame of the exported files.
     bounds: Bounds,
 }
 
 impl ExportJob<'_> {
-    /// Points, splats and cameras.
+    /// Writes points, splats and cameras.
     fn write_surfels(&self, summary: &mut ExportSummary) -> anyhow::Result<()> {
-        let most = self.params.max_points as usize;
-        let surfels = surfel::merge(&self.views, &self.bounds, most);
+        let max_surfels = self.params.max_points as usize;
+        let surfels = surfel::merge(&self.views, &self.bounds, max_surfels);
         if surfels.is_empty() {
             return Err(no_surface());
         }
-        let chosen = points::chosen(&surfels);
+        let points = ply::select_points(&surfels);
         if self.params.points {
-            self.write("points.ply", |file| points::write(file, &chosen, &self.coordinates))?;
-            summary.points = chosen.len();
+            self.write("points.ply", |file| ply::write_points(file, &points, &self.coordinates))?;
+            summary.points = points.len();
         }
         if self.params.splats {
-            self.write("splats.ply", |file| splats::write(file, &surfels, &self.coordinates))?;
+            self.write("splats.ply", |file| ply::write_splats(file, &surfels, &self.coordinates))?;
             summary.splats = surfels.len();
         }
         if self.params.cameras {
-            self.write_cameras(&chosen)?;
+            self.write_cameras(&points)?;
         }
         Ok(())
     }
 
-    /// Writes the cameras in each format that can hold them.
+    /// Writes the cameras in each format that supports their lenses.
     fn write_cameras(&self, points: &[Surfel]) -> anyhow::Result<()> {
-        if CameraFormat::Transforms.problem(&self.cameras).is_none() {
-            // Programs take the cameras and this file to have one frame.
+        if CameraFormat::Transforms.lens_problem(&self.cameras).is_none() {
+            // Programs assume that the cameras and this file have the same frame.
             let is_same_frame = self.params.points && !self.coordinates.is_moved();
-            let points = is_same_frame.then_some("points.ply");
-            let file = cameras::transforms(&self.cameras, points);
+            let points_file = is_same_frame.then_some("points.ply");
+            let file = cameras::transforms_json(&self.cameras, points_file);
             self.context.write_json("transforms.json", &file)?;
         }
-        if CameraFormat::Colmap.problem(&self.cameras).is_none() {
-            for (name, text) in cameras::colmap(&self.cameras, points, self.coordinates.offset) {
+        if CameraFormat::Colmap.lens_problem(&self.cameras).is_none() {
+            let files = cameras::colmap_files(&self.cameras, points, self.coordinates.offset);
+            for (name, text) in files {
                 self.write(&format!("colmap/sparse/0/{name}"), |file| {
                     file.write_all(text.as_bytes())
                 })?;
@@ -307,24 +315,26 @@ impl ExportJob<'_> {
         Ok(())
     }
 
+    /// Writes the mesh.
     fn write_mesh(&self, lattice: &Lattice, summary: &mut ExportSummary) -> anyhow::Result<()> {
-        let mut mesh = self.surface(lattice);
-        mesh.find_normals();
-        unseen::drop_unseen(&self.views, lattice, &mut mesh);
-        mesh.drop_small_pieces();
-        mesh.find_normals();
+        let mut mesh = self.fused_mesh(lattice);
+        mesh.compute_normals();
+        fusion::remove_unseen(&self.views, lattice, &mut mesh);
+        mesh.remove_small_components();
+        mesh.compute_normals();
         if mesh.triangles.is_empty() {
             return Err(no_surface());
         }
         let offset = self.coordinates.offset;
-        let colours = colour::colours(&self.field, &self.views, &mesh, lattice, offset)?;
+        let colours = colour::vertex_colours(&self.field, &self.views, &mesh, lattice, offset)?;
         self.write("mesh.glb", |file| glb::write(file, &mesh, &colours, &self.coordinates))?;
-        (summary.vertices, summary.triangles) = (mesh.positions.len(), mesh.triangles.len());
+        summary.vertices = mesh.positions.len();
+        summary.triangles = mesh.triangles.len();
         Ok(())
     }
 
-    /// Extracts the surface that the views see, through a lattice of distances from it.
-    fn surface(&self, lattice: &Lattice) -> Mesh {
+    /// Fuses the views' depth and extracts the surface.
+    fn fused_mesh(&self, lattice: &Lattice) -> Mesh {
         let [_, ny, nz] = lattice.counts;
         let progress = self.context.progress("fusing", (ny * nz) as u64);
         let values = fusion::fuse(&self.views, lattice, &progress);
@@ -332,10 +342,10 @@ impl ExportJob<'_> {
         surface_nets::extract(lattice, &values, &progress)
     }
 
-    /// Writes the offset that files with single precision lack, if they lack one, and says so.
+    /// Writes and logs the offset of files with single precision, if there is one.
     fn write_offset(&self) -> anyhow::Result<()> {
         let Params { points, splats, mesh, .. } = *self.params;
-        let offset = self.coordinates.file([points, splats, mesh]);
+        let offset = self.coordinates.offset_file([points, splats, mesh]);
         if !self.coordinates.is_moved() || offset.files.is_empty() {
             return Ok(());
         }
@@ -364,7 +374,9 @@ impl ExportJob<'_> {
     }
 }
 
+/// Returns the failure of a field without a visible surface.
 fn no_surface() -> anyhow::Error {
-    let message = "input field: no camera sees a surface inside its bounds; train it longer";
+    let message =
+        "input field: no surface inside the bounds is visible from any camera; train longer";
     Failure::BadInput(message.to_owned()).into()
 }

@@ -1,33 +1,36 @@
 use glam::{DVec3, Vec3};
 
-/// Triangles.
+/// Triangle mesh.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Mesh {
-    /// Vertices in scene units, in the frame of the exported files.
+    /// Positions of the vertices in scene units, in the frame of the exported files.
     pub(crate) positions: Vec<Vec3>,
     /// Unit normals of the vertices, outwards.
     pub(crate) normals: Vec<Vec3>,
-    /// Vertices of each triangle, counter-clockwise seen from outside.
+    /// Vertices of each triangle, counter-clockwise from outside.
     pub(crate) triangles: Vec<[u32; 3]>,
 }
 
-/// Pieces with fewer triangles than this share of all are dropped: floaters.
-const LEAST_PIECE_SHARE: f64 = 1e-3;
+/// Minimum size of a connected component as a fraction of all triangles; smaller ones are floaters.
+/// Chosen by hand.
+const MIN_COMPONENT_FRACTION: f64 = 1e-3;
 
 impl Mesh {
-    /// Makes each vertex's normal the mean of its triangles', weighted by area.
-    pub(crate) fn find_normals(&mut self) {
+    /// Computes each vertex's normal as the mean of its triangles' normals, weighted by area.
+    pub(crate) fn compute_normals(&mut self) {
         let mut sums = vec![DVec3::ZERO; self.positions.len()];
         for triangle in &self.triangles {
             let [a, b, c] = triangle.map(|v| self.positions[v as usize].as_dvec3());
             let area = (b - a).cross(c - a);
-            triangle.iter().for_each(|&v| sums[v as usize] += area);
+            for &vertex in triangle {
+                sums[vertex as usize] += area;
+            }
         }
         self.normals = sums.iter().map(|sum| sum.normalize_or(DVec3::Z).as_vec3()).collect();
     }
 
-    /// Edges with one triangle alone, by their vertices in ascending order, sorted.
-    pub(crate) fn open_edges(&self) -> Vec<[u32; 2]> {
+    /// Returns the edges of a single triangle, sorted, each with its vertices in ascending order.
+    pub(crate) fn boundary_edges(&self) -> Vec<[u32; 2]> {
         let mut edges: Vec<[u32; 2]> = self
             .triangles
             .iter()
@@ -35,43 +38,52 @@ impl Mesh {
             .map(|[a, b]| [a.min(b), a.max(b)])
             .collect();
         edges.sort_unstable();
-        let alone = edges.chunk_by(|a, b| a == b).filter(|edges| edges.len() == 1);
-        alone.map(|edges| edges[0]).collect()
+        let single = edges.chunk_by(|a, b| a == b).filter(|edges| edges.len() == 1);
+        single.map(|edges| edges[0]).collect()
     }
 
-    /// Drops small pieces, and vertices of no triangle.
-    pub(crate) fn drop_small_pieces(&mut self) {
-        let pieces = self.pieces();
+    /// Removes small connected components, and vertices without triangles.
+    pub(crate) fn remove_small_components(&mut self) {
+        let components = self.components();
         let mut sizes = vec![0usize; self.positions.len()];
-        self.triangles.iter().for_each(|t| sizes[pieces[t[0] as usize] as usize] += 1);
-        let least = LEAST_PIECE_SHARE * self.triangles.len() as f64;
-        self.triangles.retain(|t| sizes[pieces[t[0] as usize] as usize] as f64 >= least);
-        let mut is_used = vec![false; self.positions.len()];
-        self.triangles.iter().flatten().for_each(|&v| is_used[v as usize] = true);
-        let mut renumbered = vec![0u32; self.positions.len()];
-        let mut kept = Vec::new();
-        for (i, &position) in self.positions.iter().enumerate().filter(|(i, _)| is_used[*i]) {
-            renumbered[i] = kept.len() as u32;
-            kept.push(position);
+        for triangle in &self.triangles {
+            sizes[components[triangle[0] as usize] as usize] += 1;
         }
-        self.positions = kept;
-        self.triangles.iter_mut().for_each(|t| *t = t.map(|v| renumbered[v as usize]));
+        let min_size = MIN_COMPONENT_FRACTION * self.triangles.len() as f64;
+        self.triangles.retain(|t| sizes[components[t[0] as usize] as usize] as f64 >= min_size);
+        let mut is_used = vec![false; self.positions.len()];
+        for &vertex in self.triangles.iter().flatten() {
+            is_used[vertex as usize] = true;
+        }
+        let mut new_indices = vec![0u32; self.positions.len()];
+        let mut positions = Vec::new();
+        for (i, &position) in self.positions.iter().enumerate() {
+            if is_used[i] {
+                new_indices[i] = positions.len() as u32;
+                positions.push(position);
+            }
+        }
+        self.positions = positions;
+        for vertex in self.triangles.iter_mut().flatten() {
+            *vertex = new_indices[*vertex as usize];
+        }
     }
 
-    /// For each vertex the first one of its piece (union-find).
-    fn pieces(&self) -> Vec<u32> {
+    /// Returns the first vertex of each vertex's connected component (union-find).
+    fn components(&self) -> Vec<u32> {
         let mut parents: Vec<u32> = (0..self.positions.len() as u32).collect();
         for &[a, b, c] in &self.triangles {
             for (v, w) in [(a, b), (b, c)] {
-                let (v, w) = (root(&mut parents, v), root(&mut parents, w));
+                let (v, w) = (find_root(&mut parents, v), find_root(&mut parents, w));
                 parents[v.max(w) as usize] = v.min(w);
             }
         }
-        (0..parents.len() as u32).map(|v| root(&mut parents, v)).collect()
+        (0..parents.len() as u32).map(|v| find_root(&mut parents, v)).collect()
     }
 }
 
-fn root(parents: &mut [u32], mut v: u32) -> u32 {
+/// Finds the root of a vertex's component, and shortens the path to it.
+fn find_root(parents: &mut [u32], mut v: u32) -> u32 {
     while parents[v as usize] != v {
         parents[v as usize] = parents[parents[v as usize] as usize];
         v = parents[v as usize];

@@ -4,23 +4,23 @@ use stage::Progress;
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 
-/// Extracts the surface between places with values below 0, inside, and above (naive surface nets,
-/// Gibson 1998). Each cell that the surface passes gets a vertex, at the mean of its crossings with
-/// the cell's edges. Each crossed edge of the lattice gets a quad around it. NaN is unknown: no
-/// surface ends there.
+/// Extracts the surface between nodes with negative values, inside, and the others (naive surface nets,
+/// Gibson 1998). Each cell that the surface crosses gets a vertex, at the mean of the crossings with
+/// the cell's edges; each crossed edge gets a quad around it. NaN is unknown: the surface has a hole
+/// there.
 pub(crate) fn extract(lattice: &Lattice, values: &[f32], progress: &Progress) -> Mesh {
     let cells = Cells { lattice, values, strides: lattice.strides() };
     let mut mesh = Mesh::default();
     let [nx, ny, nz] = lattice.counts;
-    // A quad lies among cells of two neighbouring layers, so the vertices of two are kept in turn.
+    // A quad connects cells of two neighbouring layers, so only the vertices of two are stored.
     let mut vertices = vec![u32::MAX; 2 * nx * ny];
-    let kept = vertices.len();
+    let stored = vertices.len();
     for k in 0..nz - 1 {
         for j in 0..ny - 1 {
             for i in 0..nx - 1 {
-                if let Some(place) = cells.vertex([i, j, k]) {
-                    vertices[cells.index([i, j, k]) % kept] = mesh.positions.len() as u32;
-                    mesh.positions.push(place);
+                if let Some(position) = cells.vertex([i, j, k]) {
+                    vertices[cells.index([i, j, k]) % stored] = mesh.positions.len() as u32;
+                    mesh.positions.push(position);
                 }
             }
         }
@@ -36,6 +36,7 @@ pub(crate) fn extract(lattice: &Lattice, values: &[f32], progress: &Progress) ->
     mesh
 }
 
+/// Cells of a lattice with values at its nodes.
 struct Cells<'a> {
     lattice: &'a Lattice,
     values: &'a [f32],
@@ -43,18 +44,19 @@ struct Cells<'a> {
 }
 
 impl Cells<'_> {
+    /// Returns the linear index of a node, or of the cell above it.
     fn index(&self, cell: [usize; 3]) -> usize {
         (0..3).map(|axis| cell[axis] * self.strides[axis]).sum()
     }
 
-    /// Where between two places the surface is, as a share of the way.
+    /// Returns the surface's position between two nodes, 0 to 1, if the surface crosses their edge.
     fn crossing(&self, from: usize, to: usize) -> Option<f64> {
         let (a, b) = (self.values[from], self.values[to]);
         let is_crossed = (a < 0.0 && b >= 0.0) || (a >= 0.0 && b < 0.0);
         is_crossed.then(|| f64::from(a) / (f64::from(a) - f64::from(b)))
     }
 
-    /// The vertex of a cell, by its lowest corner.
+    /// Returns the vertex of a cell, which is given by its lowest node.
     fn vertex(&self, cell: [usize; 3]) -> Option<Vec3> {
         let base = self.index(cell);
         let (mut sum, mut count) = (DVec3::ZERO, 0);
@@ -63,20 +65,23 @@ impl Cells<'_> {
             for corner in 0..4 {
                 let (along_u, along_v) = (corner & 1, corner >> 1);
                 let from = base + along_u * self.strides[u] + along_v * self.strides[v];
-                if let Some(share) = self.crossing(from, from + self.strides[axis]) {
-                    sum[axis] += share;
+                if let Some(position) = self.crossing(from, from + self.strides[axis]) {
+                    sum[axis] += position;
                     sum[u] += along_u as f64;
                     sum[v] += along_v as f64;
                     count += 1;
                 }
             }
         }
-        let place = || sum / f64::from(count) + DVec3::from(cell.map(|i| i as f64));
-        (count > 0).then(|| self.lattice.point(place().to_array()).as_vec3())
+        if count == 0 {
+            return None;
+        }
+        let node = sum / f64::from(count) + DVec3::from(cell.map(|i| i as f64));
+        Some(self.lattice.to_world(node.to_array()).as_vec3())
     }
 
-    /// Two triangles among the four cells around the edge from a place along an axis, where the
-    /// surface crosses it.
+    /// Adds two triangles between the four cells around the edge from a node along an axis, if the
+    /// surface crosses the edge.
     fn add_quad(
         &self,
         from: [usize; 3],
@@ -90,19 +95,19 @@ impl Cells<'_> {
         if from[axis] + 1 >= counts[axis] || !is_inner(u) || !is_inner(v) {
             return;
         }
-        let at = self.index(from);
-        if self.crossing(at, at + self.strides[axis]).is_none() {
+        let node = self.index(from);
+        if self.crossing(node, node + self.strides[axis]).is_none() {
             return;
         }
-        // Counter-clockwise, seen from the axis' positive end.
+        // Counter-clockwise as viewed from the positive end of the axis.
         let around = [
-            at - self.strides[u] - self.strides[v],
-            at - self.strides[v],
-            at,
-            at - self.strides[u],
+            node - self.strides[u] - self.strides[v],
+            node - self.strides[v],
+            node,
+            node - self.strides[u],
         ];
         let [a, b, c, d] = around.map(|cell| vertices[cell % vertices.len()]);
-        let is_outwards = (self.values[at] < 0.0) != self.lattice.is_mirrored();
+        let is_outwards = (self.values[node] < 0.0) != self.lattice.is_mirrored();
         triangles.extend(if is_outwards { [[a, b, c], [a, c, d]] } else { [[a, c, b], [a, d, c]] });
     }
 }

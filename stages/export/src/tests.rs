@@ -10,9 +10,9 @@ use crate::cameras::CameraFormat;
 use crate::coordinates::Coordinates;
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
-use crate::seen::SeenView;
+use crate::surface_view::SurfaceView;
 use crate::surfel::Surfel;
-use crate::{cameras, fusion, glb, points, splats, surface_nets, surfel, unseen};
+use crate::{cameras, fusion, glb, ply, surface_nets, surfel};
 
 /// A ball around the origin: red on the side of +x, blue on the other.
 struct Ball;
@@ -61,18 +61,19 @@ fn around(count: u32, lowest: f64) -> Vec<Camera> {
     (0..count).map(|i| camera_around(i, count, lowest)).collect()
 }
 
-fn views(cameras: &[Camera]) -> Vec<SeenView> {
+fn views(cameras: &[Camera]) -> Vec<SurfaceView> {
     let (background, silent) = (Background::White, Progress::silent());
-    let view = |c: &Camera| SeenView::render(&Ball, c, background, DVec3::ZERO, &silent).unwrap();
+    let view =
+        |c: &Camera| SurfaceView::render(&Ball, c, background, DVec3::ZERO, &silent).unwrap();
     cameras.iter().map(view).collect()
 }
 
-fn fused(views: &[SeenView], cells: u32) -> Mesh {
+fn fused(views: &[SurfaceView], cells: u32) -> Mesh {
     let lattice = Lattice::new(&BOX, cells);
     let values = fusion::fuse(views, &lattice, &Progress::silent());
     let mut mesh = surface_nets::extract(&lattice, &values, &Progress::silent());
-    mesh.drop_small_pieces();
-    mesh.find_normals();
+    mesh.remove_small_components();
+    mesh.compute_normals();
     mesh
 }
 
@@ -92,7 +93,7 @@ const BALL_VOLUME: f64 = 4.0 / 3.0 * std::f64::consts::PI * RADIUS * RADIUS * RA
 fn beyond_the_ball(lattice: &Lattice, i: usize) -> f32 {
     let [nx, ny, _] = lattice.counts;
     let place = [i % nx, i / nx % ny, i / (nx * ny)].map(|n| n as f64);
-    (lattice.point(place).length() - RADIUS) as f32
+    (lattice.to_world(place).length() - RADIUS) as f32
 }
 
 #[test]
@@ -104,8 +105,8 @@ fn surface_nets_close_a_ball_in_a_box_and_in_a_frustum() {
         let lattice = Lattice::new(&Bounds { space, ..BOX }, 48);
         let values: Vec<f32> = (0..lattice.len()).map(|i| beyond_the_ball(&lattice, i)).collect();
         let mut mesh = surface_nets::extract(&lattice, &values, &Progress::silent());
-        mesh.find_normals();
-        assert_eq!(mesh.open_edges().len(), 0, "{space:?}");
+        mesh.compute_normals();
+        assert_eq!(mesh.boundary_edges().len(), 0, "{space:?}");
         assert!((volume(&mesh) / BALL_VOLUME - 1.0).abs() < 0.02, "{space:?}: {}", volume(&mesh));
         for (p, n) in mesh.positions.iter().zip(&mesh.normals) {
             assert!((f64::from(p.length()) - RADIUS).abs() < 4e-3, "{space:?}: {p}");
@@ -122,7 +123,7 @@ fn places_of_a_lattice_come_back() {
     for space in [Space::Box, Space::Ndc(frustum), Space::Contraction] {
         let lattice = Lattice::new(&Bounds { space, ..BOX }, 20);
         let place = [3.0, 1.5, 2.25];
-        let back = lattice.place(lattice.point(place));
+        let back = lattice.to_lattice(lattice.to_world(place));
         assert!((DVec3::from(back) - DVec3::from(place)).length() < 1e-9, "{space:?}: {back:?}");
     }
 }
@@ -130,7 +131,7 @@ fn places_of_a_lattice_come_back() {
 #[test]
 fn fused_depth_is_the_ball() {
     let mesh = fused(&views(&around(24, -0.95)), 64);
-    assert_eq!(mesh.open_edges().len(), 0);
+    assert_eq!(mesh.boundary_edges().len(), 0);
     assert!((volume(&mesh) / BALL_VOLUME - 1.0).abs() < 0.02, "{}", volume(&mesh));
     let off = mesh.positions.iter().map(|p| (f64::from(p.length()) - RADIUS).abs());
     let mean = off.sum::<f64>() / mesh.positions.len() as f64;
@@ -142,7 +143,7 @@ fn fused_depth_is_the_ball() {
 #[test]
 fn the_unseen_side_stays_open() {
     let mesh = fused(&views(&around(24, 0.05)), 64);
-    assert!(mesh.open_edges().len() > 50, "{}", mesh.open_edges().len());
+    assert!(mesh.boundary_edges().len() > 50, "{}", mesh.boundary_edges().len());
     for p in &mesh.positions {
         assert!((f64::from(p.length()) - RADIUS).abs() < 0.08, "{p}");
     }
@@ -163,8 +164,8 @@ fn what_no_view_shows_is_dropped() {
     let views = views(&cameras);
     let whole = fused(&views, 64);
     let mut mesh = whole.clone();
-    unseen::drop_unseen(&views, &lattice, &mut mesh);
-    mesh.drop_small_pieces();
+    fusion::remove_unseen(&views, &lattice, &mut mesh);
+    mesh.remove_small_components();
     assert!(
         !whole.positions.iter().all(|p| is_seen(&cameras, p))
             && mesh.positions.iter().all(|p| is_seen(&cameras, p))
@@ -209,7 +210,7 @@ fn pieces_of_a_few_triangles_go() {
     let first = mesh.positions.len() as u32;
     mesh.positions.extend([glam::Vec3::X, glam::Vec3::Y, glam::Vec3::Z]);
     mesh.triangles.insert(0, [first, first + 1, first + 2]);
-    mesh.drop_small_pieces();
+    mesh.remove_small_components();
     assert!(mesh.positions == whole.positions && mesh.triangles == whole.triangles);
 }
 
@@ -225,7 +226,7 @@ fn one_surfel() -> Surfel {
 }
 
 /// Header and numbers of a PLY file.
-fn ply(bytes: &[u8]) -> (String, Vec<u8>) {
+fn split_ply(bytes: &[u8]) -> (String, Vec<u8>) {
     let end = b"end_header\n";
     let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
     (String::from_utf8(bytes[..at].to_vec()).unwrap(), bytes[at..].to_vec())
@@ -234,8 +235,8 @@ fn ply(bytes: &[u8]) -> (String, Vec<u8>) {
 #[test]
 fn points_have_normals_and_colours() {
     let mut bytes = Vec::new();
-    points::write(&mut bytes, &[one_surfel()], &Coordinates::default()).unwrap();
-    let (header, data) = ply(&bytes);
+    ply::write_points(&mut bytes, &[one_surfel()], &Coordinates::default()).unwrap();
+    let (header, data) = split_ply(&bytes);
     assert!(header.contains("\nelement vertex 1\nproperty float x\n"), "{header}");
     assert!(
         header.ends_with(
@@ -251,15 +252,15 @@ fn points_have_normals_and_colours() {
 fn points_keep_away_from_silhouettes_where_there_are_others() {
     let with = |margin| Surfel { margin, ..one_surfel() };
     let all = [with(1), with(2), with(3), with(4)];
-    assert_eq!(points::chosen(&all), all[2..]);
-    assert_eq!(points::chosen(&all[..2]), all[..2]);
+    assert_eq!(ply::select_points(&all), all[2..]);
+    assert_eq!(ply::select_points(&all[..2]), all[..2]);
 }
 
 #[test]
 fn splats_are_discs_across_their_normal() {
     let mut bytes = Vec::new();
-    splats::write(&mut bytes, &[one_surfel()], &Coordinates::default()).unwrap();
-    let (header, data) = ply(&bytes);
+    ply::write_splats(&mut bytes, &[one_surfel()], &Coordinates::default()).unwrap();
+    let (header, data) = split_ply(&bytes);
     let names: Vec<&str> =
         header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
     let numbers: Vec<f64> =
@@ -331,7 +332,7 @@ fn surfaces_far_away_have_an_offset() {
         // A tiny scene so far away has no digits left.
         let at = if scale < 1e-6 { DVec3::ZERO } else { at };
         let field = MovedBall { at, scale };
-        let coordinates = Coordinates::of(&bounds.moved(at));
+        let coordinates = Coordinates::new(&bounds.moved(at));
         let offset = coordinates.offset;
         assert_eq!(coordinates.is_moved(), at != DVec3::ZERO);
         assert!((offset - at).length() < 8.0 * scale, "{offset}");
@@ -340,8 +341,8 @@ fn surfaces_far_away_have_an_offset() {
             camera.moved(at + scale * centre - centre)
         });
         let (background, silent) = (Background::White, Progress::silent());
-        let views: Vec<SeenView> = cameras
-            .map(|c| SeenView::render(&field, &c, background, offset, &silent).unwrap())
+        let views: Vec<SurfaceView> = cameras
+            .map(|c| SurfaceView::render(&field, &c, background, offset, &silent).unwrap())
             .collect();
         let there = surfel::merge(&views, &bounds.moved(at - offset), 100_000);
         // Cells at which roundings differ apart.
@@ -359,13 +360,13 @@ fn surfaces_far_away_have_an_offset() {
 fn offsets_are_short_and_only_where_they_are_needed() {
     let boxed = |middle: [f64; 3], half: f64| {
         let bounds = Bounds { min: [-half; 3], max: [half; 3], ..BOX };
-        Coordinates::of(&bounds.moved(middle.into())).offset.to_array()
+        Coordinates::new(&bounds.moved(middle.into())).offset.to_array()
     };
     assert_eq!(boxed([15.9, -3.0, 0.0], 1.0), [0.0; 3]);
     assert_eq!(boxed([16.3, -3.2, -0.1], 1.0), [16.0, -3.0, 0.0]);
     assert_eq!(boxed([499_999.97, 4_649_776.21, 120.4], 0.02), [499_999.97, 4_649_776.21, 120.4]);
     assert_eq!(boxed([1e9, 0.0, 0.0], 3e7), [1e9, 0.0, 0.0]);
-    let file = Coordinates { offset: DVec3::X }.file([true, false, true]);
+    let file = Coordinates { offset: DVec3::X }.offset_file([true, false, true]);
     assert_eq!(
         (file.offset, file.files),
         ([1.0, 0.0, 0.0], vec!["points.ply".into(), "mesh.glb".into()])
@@ -441,11 +442,11 @@ fn lenses_are_in_the_formats_that_have_them() {
 
 /// False where the format says that it can't hold the cameras.
 fn comes_back_from_transforms(cameras: &[Camera]) -> bool {
-    if CameraFormat::Transforms.problem(cameras).is_some() {
+    if CameraFormat::Transforms.lens_problem(cameras).is_some() {
         return false;
     }
     let folder = folder(cameras);
-    let text = cameras::transforms(cameras, Some("points.ply")).to_string();
+    let text = cameras::transforms_json(cameras, Some("points.ply")).to_string();
     std::fs::write(folder.path().join("transforms.json"), text).unwrap();
     assert_same(&Dataset::read(folder.path()).unwrap(), cameras);
     true
@@ -453,13 +454,13 @@ fn comes_back_from_transforms(cameras: &[Camera]) -> bool {
 
 /// False where the format says that it can't hold the cameras.
 fn comes_back_from_colmap(cameras: &[Camera]) -> bool {
-    if CameraFormat::Colmap.problem(cameras).is_some() {
+    if CameraFormat::Colmap.lens_problem(cameras).is_some() {
         return false;
     }
     let folder = folder(cameras);
     let sparse = folder.path().join("sparse/0");
     std::fs::create_dir_all(&sparse).unwrap();
-    for (name, text) in cameras::colmap(cameras, &[one_surfel()], DVec3::ZERO) {
+    for (name, text) in cameras::colmap_files(cameras, &[one_surfel()], DVec3::ZERO) {
         std::fs::write(sparse.join(name), text).unwrap();
     }
     let set = Dataset::read(folder.path()).unwrap();
