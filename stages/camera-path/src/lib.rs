@@ -1,8 +1,7 @@
-//! `camera-path`: cameras along a path through a scene, for `render-depth` to render and `video` to
-//! show.
+//! `camera-path`: creates cameras along a path through a scene, for `render-depth` and `video`.
 //!
-//! * [`Params`]: which [`Kind`] of path, how many frames.
-//! * [`poses`]: the poses of a path, from the cameras that saw the scene and its bounds.
+//! * [`Params`]: [`Kind`] of the path, number of frames, and more.
+//! * [`poses`]: computes the poses of a path from the scene's cameras and bounds.
 
 use std::f64::consts::TAU;
 
@@ -21,24 +20,24 @@ use stage::{Context, Stage};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Kind of path. Default: `list` with `poses`, `spiral` for cameras that look one way, else
-    /// `orbit`.
+    /// Kind of path. Default: `list` if `poses` are given, `spiral` for cameras that look in one
+    /// direction, otherwise `orbit`.
     #[schemars(extend("x-default" = "by cameras"))]
     pub kind: Option<Kind>,
-    /// Number of frames. A list has a frame for each pose.
+    /// Number of frames. A `list` has one frame per pose.
     #[schemars(range(min = 1, max = 10000))]
     pub frames: u32,
-    /// Turns of a spiral or orbit.
+    /// Number of turns of a spiral or orbit.
     #[schemars(range(min = 0.01, max = 100.0))]
     pub turns: f64,
-    /// Radius of a spiral or orbit, over that of the given cameras.
+    /// Radius of a spiral or orbit relative to that of the input cameras.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub radius: f64,
-    /// Poses of `kind: list`: for each frame a `camera_to_world` of three rows of four numbers, as
-    /// in `views.json`.
+    /// Poses of `kind: list`: for each frame a `camera_to_world` matrix of three rows of four numbers,
+    /// as in `views.json`.
     pub poses: Vec<Pose>,
-    /// Width of the frames; the height follows the first camera's aspect. Default: the width of the
-    /// scene's HR images.
+    /// Width of the frames in pixels; the height follows from the first camera's aspect. Default: the
+    /// width of the scene's HR images.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by scene"))]
     pub size: Option<u32>,
 }
@@ -49,18 +48,18 @@ impl Default for Params {
     }
 }
 
-/// Kinds of paths.
+/// Kind of a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Kind {
-    /// Around the mean camera, to the sides as far as most cameras go, looking at one point:
-    /// forward-facing photographs.
+    /// Spiral around the mean camera, as wide as the positions of most cameras, looking at one point;
+    /// for forward-facing photographs.
     Spiral,
-    /// Around the middle of the scene's box, at the cameras' mean distance and height.
+    /// Circle around the middle of the scene's box, at the cameras' mean distance and height.
     Orbit,
-    /// From camera to camera, in their order, and back to the first.
+    /// Closed curve through all cameras, in their order.
     Between,
-    /// The parameter `poses`.
+    /// Poses of the parameter `poses`.
     List,
 }
 
@@ -70,15 +69,12 @@ pub struct CameraPath;
 impl Stage for CameraPath {
     type Params = Params;
     const NAME: &'static str = "camera-path";
-    const SUMMARY: &'static str = "Makes cameras along a path through a scene.";
+    const SUMMARY: &'static str = "Creates cameras along a path through a scene.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
         let kinds =
             ["scene/train", "scene/cameras", "scene/truth", "scene/references", "cameras", "views"];
-        vec![(
-            "cameras",
-            Input::required(&kinds, "folder with views.json: the cameras that saw the scene"),
-        )]
+        vec![("cameras", Input::required(&kinds, "folder with views.json: the scene's cameras"))]
     }
 
     fn output() -> Output {
@@ -87,30 +83,34 @@ impl Stage for CameraPath {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let input = context.input("cameras")?;
-        let given = Views::read(input)?;
-        let mut first = given.views[0].camera.clone();
-        // Films are taken without lens distortion.
+        let scene = Views::read(input)?;
+        let mut first = scene.views[0].camera.clone();
+        // Frames have no lens distortion.
         first.intrinsics = first.intrinsics.pinhole().unwrap_or(first.intrinsics);
-        let is_scene = input.path(DEGRADATION_FILE).exists();
-        let made: Option<Degradation> =
-            if is_scene { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
-        let width = params.size.or(made.map(|d| d.hr[0])).unwrap_or(first.intrinsics.width);
+        let degradation: Option<Degradation> = if input.path(DEGRADATION_FILE).exists() {
+            Some(input.read_json(DEGRADATION_FILE)?)
+        } else {
+            None
+        };
+        let hr_width = degradation.map(|degradation| degradation.hr[0]);
+        let width = params.size.or(hr_width).unwrap_or(first.intrinsics.width);
         let aspect = f64::from(first.intrinsics.height) / f64::from(first.intrinsics.width);
         let height = (f64::from(width) * aspect).round().max(1.0) as u32;
-        let cameras: Vec<Camera> = given.views.iter().map(|v| v.camera.clone()).collect();
+        let cameras: Vec<Camera> = scene.views.iter().map(|v| v.camera.clone()).collect();
         let kind = params.kind.unwrap_or_else(|| default_kind(&cameras, params));
-        let poses = poses(kind, params, &cameras, &given.bounds);
+        let poses = poses(kind, params, &cameras, &scene.bounds);
         if poses.is_empty() {
-            return Err(
-                Failure::Usage("parameter poses: kind list needs at least one".to_owned()).into()
-            );
+            return Err(Failure::Usage(
+                "parameter poses: kind list needs at least one pose".to_owned(),
+            )
+            .into());
         }
         let views = poses.into_iter().enumerate().map(|(i, pose)| {
             let camera =
                 Camera { name: format!("frame_{i:05}"), camera_to_world: pose, ..first.clone() };
             View::camera_only(camera.resized(width, height))
         });
-        let views = Views::new(given.background, given.bounds, views.collect());
+        let views = Views::new(scene.background, scene.bounds, views.collect());
         views.check().map_err(|e| Failure::Usage(format!("parameter poses: {e}")))?;
         context.write_json(VIEWS_FILE, &views)?;
         context.write_summary(&format!(
@@ -121,6 +121,7 @@ impl Stage for CameraPath {
     }
 }
 
+/// Chooses the kind of path if the parameter isn't given.
 fn default_kind(cameras: &[Camera], params: &Params) -> Kind {
     if !params.poses.is_empty() {
         Kind::List
@@ -131,96 +132,101 @@ fn default_kind(cameras: &[Camera], params: &Params) -> Kind {
     }
 }
 
-/// The poses of a path: `camera_to_world` of each frame.
+/// Computes the poses of a path: `camera_to_world` of each frame.
 pub fn poses(kind: Kind, params: &Params, cameras: &[Camera], bounds: &Bounds) -> Vec<Pose> {
-    let shares = (0..params.frames).map(|i| f64::from(i) / f64::from(params.frames));
+    let fractions = (0..params.frames).map(|i| f64::from(i) / f64::from(params.frames));
     match kind {
-        Kind::Spiral => spiral(cameras, bounds, params, shares),
-        Kind::Orbit => orbit(cameras, bounds, params, shares),
-        Kind::Between => shares.map(|share| between(cameras, share)).collect(),
+        Kind::Spiral => spiral_poses(cameras, bounds, params, fractions),
+        Kind::Orbit => orbit_poses(cameras, bounds, params, fractions),
+        Kind::Between => fractions.map(|fraction| interpolated_pose(cameras, fraction)).collect(),
         Kind::List => params.poses.clone(),
     }
 }
 
-fn mean(cameras: &[Camera], of: impl Fn(&Camera) -> DVec3) -> DVec3 {
-    cameras.iter().map(of).sum::<DVec3>() / cameras.len().max(1) as f64
+/// Returns the mean of a vector over the cameras.
+fn mean(cameras: &[Camera], vector: impl Fn(&Camera) -> DVec3) -> DVec3 {
+    cameras.iter().map(vector).sum::<DVec3>() / cameras.len().max(1) as f64
 }
 
-fn spiral(
+/// Computes the poses of a spiral at fractions of its length.
+fn spiral_poses(
     cameras: &[Camera],
     bounds: &Bounds,
     params: &Params,
-    shares: impl Iterator<Item = f64>,
+    fractions: impl Iterator<Item = f64>,
 ) -> Vec<Pose> {
-    let (centre, forward) =
-        (mean(cameras, Camera::centre), mean(cameras, Camera::forward).normalize_or(DVec3::NEG_Z));
+    let centre = mean(cameras, Camera::centre);
+    let forward = mean(cameras, Camera::forward).normalize_or(DVec3::NEG_Z);
     let right = forward.cross(mean(cameras, |c| c.rotation().y_axis)).normalize_or(DVec3::X);
     let up = right.cross(forward);
-    let [aside, above, ahead] =
-        [right, up, forward].map(|axis| params.radius * reach(cameras, centre, axis));
+    let [width, height, depth] =
+        [right, up, forward].map(|axis| params.radius * spread(cameras, centre, axis));
     let (near, far) = match bounds.space {
         Space::Ndc(frustum) => (frustum.near, frustum.far),
         _ => (bounds.near, bounds.far),
     };
-    // Three quarters of the way in disparity, where most is seen.
+    // Three quarters of the way from far to near in disparity, where most of a scene is; chosen by
+    // hand.
     let focus = centre + forward / (0.25 / far + 0.75 / near.max(1e-3 * far));
-    shares
-        .map(|share| {
-            let angle = TAU * params.turns * share;
-            let offset = aside * angle.cos() * right
-                + above * angle.sin() * up
-                + ahead * (0.5 * angle).sin() * forward;
+    fractions
+        .map(|fraction| {
+            let angle = TAU * params.turns * fraction;
+            let offset = width * angle.cos() * right
+                + height * angle.sin() * up
+                + depth * (0.5 * angle).sin() * forward;
             looking_at(centre + offset, focus, up)
         })
         .collect()
 }
 
-/// How far most cameras stand from a point along an axis: nine in ten lie within (as in LLFF's own
+/// Returns the 90th percentile of the cameras' distances from a point along an axis (as in LLFF's
 /// spirals).
-fn reach(cameras: &[Camera], centre: DVec3, axis: DVec3) -> f64 {
+fn spread(cameras: &[Camera], centre: DVec3, axis: DVec3) -> f64 {
     let mut offsets: Vec<f64> =
         cameras.iter().map(|c| (c.centre() - centre).dot(axis).abs()).collect();
     offsets.sort_by(f64::total_cmp);
     offsets[(offsets.len() - 1) * 9 / 10]
 }
 
-fn orbit(
+/// Computes the poses of an orbit at fractions of its length.
+fn orbit_poses(
     cameras: &[Camera],
     bounds: &Bounds,
     params: &Params,
-    shares: impl Iterator<Item = f64>,
+    fractions: impl Iterator<Item = f64>,
 ) -> Vec<Pose> {
     let up = mean(cameras, |c| c.rotation().y_axis).normalize_or(DVec3::Z);
     let middle = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
     let height = mean(cameras, |c| c.centre() - middle).dot(up);
-    // As far away as the cameras are, all in all.
     let distance = cameras.iter().map(|c| (c.centre() - middle).length()).sum::<f64>()
         / cameras.len().max(1) as f64;
-    let around = (distance * distance - height * height).max(0.0).sqrt();
-    let from = cameras[0].centre() - middle;
-    let first = (from - from.dot(up) * up).normalize_or(up.any_orthonormal_vector());
-    shares
-        .map(|share| {
-            let turn = DQuat::from_axis_angle(up, TAU * params.turns * share);
-            looking_at(middle + params.radius * (turn * first * around + height * up), middle, up)
+    let radius = (distance * distance - height * height).max(0.0).sqrt();
+    let offset = cameras[0].centre() - middle;
+    let first = (offset - offset.dot(up) * up).normalize_or(up.any_orthonormal_vector());
+    fractions
+        .map(|fraction| {
+            let rotation = DQuat::from_axis_angle(up, TAU * params.turns * fraction);
+            let offset = params.radius * (rotation * first * radius + height * up);
+            looking_at(middle + offset, middle, up)
         })
         .collect()
 }
 
-/// Between two cameras of the round: centres by Catmull and Rom's spline, turns by the shorter arc.
-fn between(cameras: &[Camera], share: f64) -> Pose {
+/// Interpolates the pose at a fraction of the closed curve through all cameras: centres by a Catmull-Rom
+/// spline, rotations along the shorter arc.
+fn interpolated_pose(cameras: &[Camera], fraction: f64) -> Pose {
     let count = cameras.len();
-    let at = share * count as f64;
-    let (i, t) = (at as usize % count, at.fract());
-    let camera = |k: usize| &cameras[(i + k) % count];
-    let [a, b, c, d] = [count - 1, 0, 1, 2].map(|k| camera(k).centre());
+    let position = fraction * count as f64;
+    let (i, t) = (position as usize % count, position.fract());
+    let [before, from, to, after] = [count - 1, 0, 1, 2].map(|k| &cameras[(i + k) % count]);
+    let [a, b, c, d] = [before, from, to, after].map(Camera::centre);
     let centre = 0.5
         * (2.0 * b
             + (c - a) * t
             + (2.0 * a - 5.0 * b + 4.0 * c - d) * t * t
             + (3.0 * (b - c) + d - a) * t * t * t);
-    let (from, to) =
-        (DQuat::from_mat3(&camera(0).rotation()), DQuat::from_mat3(&camera(1).rotation()));
+    let from = DQuat::from_mat3(&from.rotation());
+    let to = DQuat::from_mat3(&to.rotation());
     pose_of(DMat3::from_quat(from.slerp(to, t).normalize()), centre)
 }
 

@@ -4,9 +4,9 @@ use serde_json::{Value, json};
 
 use crate::params::{CAMERA_ANGLE, Params};
 
-/// OpenCV's fisheye coefficients of the lens: angles are compressed towards the border, by 4 % at
-/// 89°.
-const FISHEYE: [f64; 4] = [-0.02, 0.006, -0.003, 0.0005];
+/// OpenCV's fisheye coefficients of the lens, which compress angles towards the border, by 4 % at 89°;
+/// chosen by hand.
+const FISHEYE_COEFFICIENTS: [f64; 4] = [-0.02, 0.006, -0.003, 0.0005];
 
 /// Camera of a split's views; its principal point is the middle of the image.
 #[derive(Clone, Copy, Debug)]
@@ -18,29 +18,28 @@ pub(crate) struct ViewCamera {
     lens: ViewLens,
 }
 
+/// Lens of a [`ViewCamera`].
 #[derive(Clone, Copy, Debug)]
 enum ViewLens {
-    /// Horizontal angle of view.
-    Pinhole {
-        angle_x: f64,
-    },
+    /// Pinhole camera with a horizontal angle of view in radians.
+    Pinhole { angle_x: f64 },
+    /// Fisheye lens.
     Fisheye(Intrinsics),
 }
 
 impl ViewCamera {
-    /// Creates the camera of test views, and of training views unless parameters say otherwise.
+    /// Creates the camera of test views, which is also the default for training views.
     pub(crate) fn of_test(params: &Params) -> Self {
-        let (sides, angle_x) = (params.sides(), params.angle_x());
-        Self::pinhole(sides, angle_x)
+        Self::pinhole(params.sides(), params.angle_x())
     }
 
-    /// Creates the camera of training views: with as many pixels per degree in the middle as the
-    /// test views have.
+    /// Creates the camera of training views, with as many pixels per degree in the middle as in test
+    /// views.
     pub(crate) fn of_training(params: &Params) -> Self {
         let test = Self::of_test(params);
         let Some(degrees) = params.training_angle() else { return test };
         let half_angle = 0.5 * degrees.to_radians();
-        let distortion = Distortion::fisheye(FISHEYE);
+        let distortion = Distortion::fisheye(FISHEYE_COEFFICIENTS);
         let half_width = match params.projection {
             Projection::Perspective => libm::tan(half_angle),
             Projection::Fisheye => distortion.distort([libm::tan(half_angle), 0.0])[0],
@@ -59,13 +58,14 @@ impl ViewCamera {
         }
     }
 
+    /// Creates a pinhole camera.
     fn pinhole(sides: [u32; 2], angle_x: f64) -> Self {
         let focal = 0.5 * f64::from(sides[0]) / libm::tan(0.5 * angle_x);
         Self { sides, focal, lens: ViewLens::Pinhole { angle_x } }
     }
 
     /// Returns the direction of the ray at an image position, for a camera with axes right, up and
-    /// back; `None` where the lens has none.
+    /// back; `None` outside the lens's field of view.
     pub(crate) fn direction(
         &self,
         [x, y]: [f64; 2],
@@ -77,20 +77,21 @@ impl ViewCamera {
             ViewLens::Fisheye(intrinsics) if intrinsics.is_cut([x, y]) => return None,
             ViewLens::Fisheye(intrinsics) => intrinsics.undistort([x, y]),
         };
-        let (across, down) = ((x - half_x) / self.focal, (y - half_y) / self.focal);
+        let across = (x - half_x) / self.focal;
+        let down = (y - half_y) / self.focal;
         Some((across * right - down * up - back).normalize())
     }
 
-    /// Returns the entries of Blender's form.
-    pub(crate) fn blender(&self) -> Value {
+    /// Returns the camera's entries in Blender's format.
+    pub(crate) fn blender_entries(&self) -> Value {
         match self.lens {
             ViewLens::Pinhole { angle_x } => json!({"camera_angle_x": angle_x}),
-            ViewLens::Fisheye(_) => self.transforms(),
+            ViewLens::Fisheye(_) => self.transforms_entries(),
         }
     }
 
-    /// Returns the entries of `transforms.json`.
-    pub(crate) fn transforms(&self) -> Value {
+    /// Returns the camera's entries in `transforms.json`.
+    pub(crate) fn transforms_entries(&self) -> Value {
         let [width, height] = self.sides;
         let [cx, cy] = self.sides.map(|side| 0.5 * f64::from(side));
         let focal = self.focal;
@@ -98,8 +99,8 @@ impl ViewCamera {
             json!({"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy});
         if let ViewLens::Fisheye(intrinsics) = self.lens {
             entries["camera_model"] = json!("OPENCV_FISHEYE");
-            for (name, k) in ["k1", "k2", "k3", "k4"].iter().zip(intrinsics.distortion.radial) {
-                entries[*name] = json!(k);
+            for (i, k) in intrinsics.distortion.radial.into_iter().enumerate() {
+                entries[format!("k{}", i + 1)] = json!(k);
             }
         }
         entries

@@ -1,22 +1,22 @@
-//! `demo-scene`: a small procedural scene, rendered in linear light and written as a data set: in
-//! Blender's form with exact depth, or as photographs are, in JPEG with a `transforms.json`.
+//! `demo-scene`: renders a small procedural scene in linear light and writes a data set: in Blender's
+//! format with exact depth, or like photographs, as JPEG with a `transforms.json`.
 //!
-//! It is made to tell methods apart: fine texture (base, crate, sign), thin parts (cage, spring),
-//! gloss (ball, copper), occlusion (a striped ball inside the cage). Everything is arithmetic and
-//! `libm`, so equal parameters give equal bytes.
+//! The scene separates good methods from bad ones: it has fine texture (base, crate, sign), thin parts
+//! (cage, spring), gloss (ball, copper) and occlusion (a striped ball inside the cage). It uses only
+//! arithmetic and `libm`, so equal parameters give equal bytes.
 //!
-//! * `world`: shapes, where they stand, how they intersect a ray.
-//! * `material`: albedo and gloss of a point.
-//! * `camera`: what views are taken with: a pinhole camera, training views also a fisheye lens.
+//! * `world`: the objects, their shapes, and intersection with rays.
+//! * `material`: albedo and gloss at a surface point.
+//! * `camera`: pinhole camera, or a fisheye lens for training views.
 //! * `render`: light, shadow, reflection, anti-aliasing.
-//! * `written`: files of both forms.
+//! * `dataset_writer`: files of both formats.
 
 mod camera;
+mod dataset_writer;
 mod material;
 mod params;
 mod render;
 mod world;
-mod written;
 
 use contract::Output;
 use glam::{DMat3, DVec3};
@@ -24,16 +24,16 @@ use rayon::prelude::*;
 use stage::{Context, Stage};
 
 use camera::ViewCamera;
+use dataset_writer::DatasetWriter;
 pub use params::{Form, Layout, Params};
 pub use render::RenderedImage;
 pub use world::World;
-use written::Written;
 
-/// Distance of every camera from the scene's centre.
-const DISTANCE: f64 = 4.0;
+/// Distance of every camera from the scene's centre, in scene units.
+const CAMERA_DISTANCE: f64 = 4.0;
 
-/// Bytes of a pixel while its image is rendered and written: colour and depth, and a copy of the
-/// colour that PNG's or JPEG's encoder takes.
+/// Number of bytes per pixel while an image is rendered and written: colour, depth, and a copy of the
+/// colour for the PNG or JPEG encoder.
 const BYTES_PER_PIXEL: u64 = 16;
 /// Remedy for short memory, as a sentence fragment.
 const REMEDY: &str = "choose a smaller size, or end other programs";
@@ -45,7 +45,7 @@ impl Stage for DemoScene {
     type Params = Params;
     const NAME: &'static str = "demo-scene";
     const SUMMARY: &'static str =
-        "Renders a small procedural scene as a data set, with exact depth in Blender's form.";
+        "Renders a small procedural scene as a data set, with exact depth in Blender's format.";
 
     fn output() -> Output {
         Output::kind("dataset")
@@ -61,10 +61,10 @@ impl Stage for DemoScene {
         check_memory(context, &splits)?;
         let rows = splits.iter().map(|(_, count, camera)| u64::from(count * camera.sides[1]));
         let progress = context.progress("rendering", rows.sum());
-        let mut written = Written::new(params);
+        let mut writer = DatasetWriter::new(params);
         for (split, count, camera) in splits {
             let poses: Vec<[[f64; 4]; 4]> =
-                (0..count).map(|i| pose(params.layout, split, i, count)).collect();
+                (0..count).map(|i| camera_pose(params.layout, split, i, count)).collect();
             context.output_path(&format!("{}/.", params.form.folder(split)))?;
             (0..count)
                 .into_par_iter()
@@ -72,13 +72,13 @@ impl Stage for DemoScene {
                     context.check_interrupt()?;
                     let pose = &poses[i as usize];
                     let samples = params.samples_per_axis;
-                    let frame = render::render(&world, pose, &camera, samples, &progress);
-                    params.form.write_view(context, split, i, &frame)
+                    let image = render::render(&world, pose, &camera, samples, &progress);
+                    params.form.write_view(context, split, i, &image)
                 })
                 .collect::<anyhow::Result<Vec<()>>>()?;
-            written.add(context, split, &camera, &poses)?;
+            writer.add_split(context, split, &camera, &poses)?;
         }
-        written.end(context)?;
+        writer.finish(context)?;
         let [width, height] = splits[0].2.sides;
         context.write_summary(&format!(
             "{}, {}, {width}×{height}",
@@ -88,7 +88,7 @@ impl Stage for DemoScene {
     }
 }
 
-/// Fails unless there is memory for the views that are rendered at once.
+/// Fails unless there is memory for the views that are rendered in parallel.
 fn check_memory(context: &Context, splits: &[(&str, u32, ViewCamera)]) -> anyhow::Result<()> {
     let needs = splits.iter().map(|(_, count, camera)| {
         let pixels = u64::from(camera.sides[0]) * u64::from(camera.sides[1]);
@@ -97,39 +97,42 @@ fn check_memory(context: &Context, splits: &[(&str, u32, ViewCamera)]) -> anyhow
     Ok(context.check_memory("rendering", needs.max().unwrap_or(0), REMEDY)?)
 }
 
-/// Camera `i` of `count`. Around: training views spread evenly over the upper hemisphere, test
-/// views on a wavy circle between them. Forward: training views fill a square by the golden ratio,
-/// test views lie on a circle in it.
-fn pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
+/// Returns the pose of camera `i` of `count`.
+///
+/// Around: training views are evenly spread over the upper hemisphere, test views are on a wavy circle
+/// between them. Forward: training views fill a square by the golden ratio, test views are on a circle
+/// in this square.
+fn camera_pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     use std::f64::consts::{PI, TAU};
-    let share = (f64::from(i) + 0.5) / f64::from(count);
+    let fraction = (f64::from(i) + 0.5) / f64::from(count);
     if layout == Layout::Forward {
         let (u, v) = if split == "train" {
-            (share - 0.5, (f64::from(i) * 0.618_033_988_75 + 0.5) % 1.0 - 0.5)
+            (fraction - 0.5, (f64::from(i) * 0.618_033_988_75 + 0.5) % 1.0 - 0.5)
         } else {
-            (0.3 * libm::cos(TAU * share), 0.3 * libm::sin(TAU * share))
+            (0.3 * libm::cos(TAU * fraction), 0.3 * libm::sin(TAU * fraction))
         };
-        // Looking along +y.
+        // Cameras look along +y.
         let axes = DMat3::from_cols(DVec3::X, DVec3::Z, -DVec3::Y);
-        return matrix(axes, DVec3::new(u, -DISTANCE, 0.3 + v));
+        return camera_to_world(axes, DVec3::new(u, -CAMERA_DISTANCE, 0.3 + v));
     }
     let (azimuth, height) = if split == "train" {
-        // The golden angle; heights between just below the horizon and almost straight above.
-        (f64::from(i) * PI * (3.0 - 5.0f64.sqrt()), -0.08 + 1.03 * share)
+        // Azimuths by the golden angle; heights from just below the horizon to almost straight above.
+        (f64::from(i) * PI * (3.0 - 5.0f64.sqrt()), -0.08 + 1.03 * fraction)
     } else {
-        (TAU * share, 0.42 + 0.28 * libm::sin(3.0 * TAU * share))
+        (TAU * fraction, 0.42 + 0.28 * libm::sin(3.0 * TAU * fraction))
     };
     let level = (1.0 - height * height).sqrt();
-    let centre =
-        DISTANCE * DVec3::new(level * libm::cos(azimuth), level * libm::sin(azimuth), height);
+    let direction = DVec3::new(level * libm::cos(azimuth), level * libm::sin(azimuth), height);
+    let centre = CAMERA_DISTANCE * direction;
     let back = centre.normalize();
     let right = DVec3::Z.cross(back).normalize();
-    let r = DMat3::from_cols(right, back.cross(right), back);
-    matrix(r, centre)
+    camera_to_world(DMat3::from_cols(right, back.cross(right), back), centre)
 }
 
-fn matrix(r: DMat3, centre: DVec3) -> [[f64; 4]; 4] {
-    let [x, y, z] = [0, 1, 2].map(|k| [r.x_axis[k], r.y_axis[k], r.z_axis[k], centre[k]]);
+/// Returns the 4 × 4 matrix of a camera with the given axes and centre.
+fn camera_to_world(axes: DMat3, centre: DVec3) -> [[f64; 4]; 4] {
+    let DMat3 { x_axis, y_axis, z_axis } = axes;
+    let [x, y, z] = [0, 1, 2].map(|k| [x_axis[k], y_axis[k], z_axis[k], centre[k]]);
     [x, y, z, [0.0, 0.0, 0.0, 1.0]]
 }
 
@@ -147,7 +150,7 @@ mod tests {
     #[test]
     fn depth_is_that_of_the_surface() {
         let world = World::new(0);
-        let pose = pose(Layout::Around, "test", 3, 10);
+        let pose = camera_pose(Layout::Around, "test", 3, 10);
         let frame = render::render(&world, &pose, &test_camera(64, 1.0), 2, &Progress::silent());
         let seen: Vec<f32> = frame.depth.iter().flatten().copied().collect();
         assert!(seen.len() > 64 * 64 / 8, "{} pixels see something", seen.len());
@@ -169,7 +172,7 @@ mod tests {
         let world = World::new(2);
         let mut met = 0;
         for i in 0..200 {
-            let pose = pose(Layout::Around, "train", i, 200);
+            let pose = camera_pose(Layout::Around, "train", i, 200);
             let origin = DVec3::new(pose[0][3], pose[1][3], pose[2][3]);
             let at = 0.2 * DVec3::new(f64::from(i % 7) - 3.0, f64::from(i % 11) - 5.0, -1.0);
             let direction = (at - origin).normalize();
@@ -198,7 +201,7 @@ mod tests {
             let camera = test_camera(48, aspect);
             let [width, height] = camera.sides;
             for i in 0..10 {
-                let pose = pose(Layout::Around, "test", i, 10);
+                let pose = camera_pose(Layout::Around, "test", i, 10);
                 let frame = render::render(&world, &pose, &camera, 1, &Progress::silent());
                 let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
                 for (x, y) in rows.chain((0..height).flat_map(|y| [(0, y), (width - 1, y)])) {
@@ -210,7 +213,7 @@ mod tests {
     }
 
     fn view(seed: u32) -> pixels::Rgba8 {
-        let pose = pose(Layout::Around, "test", 0, 10);
+        let pose = camera_pose(Layout::Around, "test", 0, 10);
         let camera = test_camera(32, 1.0);
         render::render(&World::new(seed), &pose, &camera, 1, &Progress::silent()).colour
     }
@@ -241,7 +244,7 @@ mod tests {
         let half = 0.5 * f64::from(camera.sides[0]);
         assert!((angle(&camera, half).to_degrees() - 75.0).abs() < 0.5, "{camera:?}");
         assert_eq!(camera.direction([0.0, 0.0], axes), None);
-        let pose = pose(Layout::Around, "train", 3, 10);
+        let pose = camera_pose(Layout::Around, "train", 3, 10);
         let frame = render::render(&World::new(0), &pose, &camera, 1, &Progress::silent());
         assert_eq!(frame.colour.data[..4], [0, 0, 0, 255]);
     }

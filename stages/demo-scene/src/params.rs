@@ -2,74 +2,75 @@ use scene::Projection;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Angle of view across the shorter side, as in NeRF's Blender scenes: the things stay in every
-/// view.
+/// Angle of view across the shorter side in radians, as in NeRF's Blender scenes: all objects are
+/// inside every view.
 pub(crate) const CAMERA_ANGLE: f64 = 0.691_111_2;
+
 /// Parameters of `demo-scene`.
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the images, in pixels; where `projection` or `angle` is given, of the test views.
+    /// Width of the images in pixels; only of the test views if `projection` or `angle` is given.
     #[schemars(range(min = 1, max = 2048))]
     pub size: u32,
-    /// Width over height.
+    /// Width of the images divided by their height.
     #[schemars(range(min = 0.25, max = 4.0))]
     pub aspect: f64,
     /// Number of training views.
     #[schemars(range(min = 1, max = 1000))]
     pub train: u32,
-    /// Number of test views, which have depth in Blender's form.
+    /// Number of test views; they have depth in Blender's format.
     #[schemars(range(min = 1, max = 1000))]
     pub test: u32,
-    /// Rays along each side of a pixel, against aliasing.
+    /// Number of rays along each side of a pixel, against aliasing.
     #[schemars(range(min = 1, max = 16))]
     pub samples_per_axis: u32,
-    /// Projection of the training views' lens. Test views are always a pinhole camera's. A
-    /// `fisheye` lens has OpenCV's model, and black beyond 89° from its axis.
+    /// Projection of the training views' lens; test views always have a pinhole camera. A `fisheye` lens
+    /// follows OpenCV's model and is black beyond 89° from its axis.
     pub projection: Projection,
-    /// Angle of view of the training views across the shorter side, in degrees. They have as many
-    /// pixels per degree in the middle as the test views. Default: that of the test views, 39.6, or
-    /// 120 through a fisheye lens.
+    /// Angle of view of the training views across the shorter side, in degrees. Training views have as
+    /// many pixels per degree in the middle as test views. Default: 39.6, as for test views, or 120 for
+    /// a fisheye lens.
     #[schemars(range(min = 10.0, max = 170.0), extend("x-default" = "by `projection`"))]
     pub angle: Option<f64>,
-    /// Where cameras stand.
+    /// Arrangement of the cameras.
     pub layout: Layout,
-    /// Adds an unbounded background: ground, towers far away, a sky.
+    /// Adds an unbounded background: ground, distant towers, and sky.
     pub backdrop: bool,
-    /// Files that are written.
+    /// Format of the data set.
     pub form: Form,
-    /// Seed of the objects' places and textures.
+    /// Seed of the objects' positions and textures.
     pub seed: u32,
 }
 
-/// Files of a data set.
+/// Format of a data set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Form {
-    /// NeRF's synthetic scenes: PNG with alpha, `transforms_train.json` and `transforms_test.json`,
-    /// depth of test views.
+    /// Format of NeRF's synthetic scenes: PNG with alpha, `transforms_train.json` and
+    /// `transforms_test.json`, depth of test views.
     Blender,
-    /// Photographs with poses: JPEG on white, one `transforms.json` with the focal length, no
-    /// depth.
+    /// Photographs with poses: JPEG on white, one `transforms.json` with the focal length, no depth.
     Transforms,
 }
 
-/// Angle of view of a fisheye lens across the shorter side unless given, in degrees.
-const FISHEYE_ANGLE: f64 = 120.0;
+/// Default angle of view of a fisheye lens across the shorter side, in degrees.
+const DEFAULT_FISHEYE_ANGLE_DEGREES: f64 = 120.0;
 
 impl Params {
-    /// Angle of view of the training views across the shorter side, in degrees; none where it is
-    /// the test views'.
+    /// Returns the angle of view of the training views across the shorter side, in degrees; `None` if
+    /// they have the test views' camera.
     pub(crate) fn training_angle(&self) -> Option<f64> {
-        self.angle.or((self.projection == Projection::Fisheye).then_some(FISHEYE_ANGLE))
+        self.angle
+            .or((self.projection == Projection::Fisheye).then_some(DEFAULT_FISHEYE_ANGLE_DEGREES))
     }
 
-    /// Width and height of the images.
+    /// Returns width and height of the test images in pixels.
     pub(crate) fn sides(&self) -> [u32; 2] {
         [self.size, ((f64::from(self.size) / self.aspect).round() as u32).max(1)]
     }
 
-    /// Horizontal angle of view.
+    /// Returns the horizontal angle of view of the test images in radians.
     pub(crate) fn angle_x(&self) -> f64 {
         let [width, height] = self.sides();
         if width <= height {
@@ -81,7 +82,6 @@ impl Params {
 
 impl Default for Params {
     fn default() -> Self {
-        let (layout, form) = (Layout::Around, Form::Blender);
         Self {
             size: 200,
             aspect: 1.0,
@@ -90,20 +90,20 @@ impl Default for Params {
             samples_per_axis: 4,
             projection: Projection::Perspective,
             angle: None,
-            layout,
+            layout: Layout::Around,
             backdrop: false,
-            form,
+            form: Form::Blender,
             seed: 0,
         }
     }
 }
 
-/// Where cameras stand.
+/// Arrangement of the cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Layout {
-    /// All around the things, looking at their middle.
+    /// All around the objects, looking at their middle.
     Around,
-    /// In front of them, a step to the sides, up and down, all looking one way.
+    /// In front of the objects, a step to the sides, up and down, all looking in one direction.
     Forward,
 }

@@ -1,4 +1,4 @@
-//! Files of a data set, in both forms.
+//! Files of a data set in both formats.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -15,11 +15,11 @@ use crate::camera::ViewCamera;
 use crate::params::{Form, Params};
 use crate::render::RenderedImage;
 
-/// JPEG's quality: that of a careful camera.
-const QUALITY: u8 = 95;
+/// Quality of JPEG files, like that of a good camera; chosen by hand.
+const JPEG_QUALITY: u8 = 95;
 
 impl Form {
-    /// Where a split's images lie.
+    /// Returns the folder of a split's images.
     pub(crate) fn folder(self, split: &str) -> &str {
         match self {
             Self::Blender => split,
@@ -33,46 +33,53 @@ impl Form {
         context: &Context,
         split: &str,
         number: u32,
-        frame: &RenderedImage,
+        image: &RenderedImage,
     ) -> anyhow::Result<()> {
         if self == Self::Transforms {
-            let path = context.output_path(&photograph(split, number))?;
-            return write_jpeg(&path, &frame.colour)
+            let path = context.output_path(&photograph_name(split, number))?;
+            return write_jpeg(&path, &image.colour)
                 .with_context(|| format!("cannot write {}", path.display()));
         }
-        write_png(&context.output_path(&format!("{split}/r_{number}.png"))?, &frame.colour)?;
+        write_png(&context.output_path(&format!("{split}/r_{number}.png"))?, &image.colour)?;
         if split == "test" {
-            write_depth(&context.output_path(&format!("test/r_{number}_depth.exr"))?, frame)?;
+            write_depth(&context.output_path(&format!("test/r_{number}_depth.exr"))?, image)?;
         }
         Ok(())
     }
 }
 
-/// Name of a photograph.
-fn photograph(split: &str, number: u32) -> String {
+/// Returns the path of a photograph in the data set.
+fn photograph_name(split: &str, number: u32) -> String {
     format!("images/{split}_{number}.jpg")
 }
 
-/// The files with cameras.
-pub(crate) struct Written {
+/// Writer of a data set's camera files.
+pub(crate) struct DatasetWriter {
     form: Form,
-    /// Camera of the frames that say nothing of theirs.
+    /// Camera of the test views, and of all frames without a camera of their own.
     shared: ViewCamera,
-    /// Whether training frames have another.
+    /// True if training views have another camera.
     is_mixed: bool,
-    /// Frames of `transforms.json`, and which of them are for what.
+    /// Frames of `transforms.json`.
     frames: Vec<Value>,
+    /// Key and image names of each split in `transforms.json`.
     splits: Vec<(String, Vec<String>)>,
 }
 
-impl Written {
+impl DatasetWriter {
+    /// Creates a writer without frames.
     pub(crate) fn new(params: &Params) -> Self {
-        let (shared, is_mixed) = (ViewCamera::of_test(params), params.training_angle().is_some());
-        Self { form: params.form, shared, is_mixed, frames: Vec::new(), splits: Vec::new() }
+        Self {
+            form: params.form,
+            shared: ViewCamera::of_test(params),
+            is_mixed: params.training_angle().is_some(),
+            frames: Vec::new(),
+            splits: Vec::new(),
+        }
     }
 
-    /// Takes in a split's cameras.
-    pub(crate) fn add(
+    /// Adds a split's cameras; in Blender's format, writes their file.
+    pub(crate) fn add_split(
         &mut self,
         context: &Context,
         split: &str,
@@ -80,40 +87,42 @@ impl Written {
         poses: &[[[f64; 4]; 4]],
     ) -> anyhow::Result<()> {
         if self.form == Form::Transforms {
-            let names: Vec<String> =
-                (0..poses.len() as u32).map(|number| photograph(split, number)).collect();
-            let own =
-                if self.is_mixed && split == "train" { camera.transforms() } else { json!({}) };
-            for (name, pose) in names.iter().zip(poses) {
+            let has_own_camera = self.is_mixed && split == "train";
+            let own = if has_own_camera { camera.transforms_entries() } else { json!({}) };
+            let mut names = Vec::with_capacity(poses.len());
+            for (number, pose) in (0..).zip(poses) {
+                let name = photograph_name(split, number);
                 let mut frame = own.clone();
-                (frame["file_path"], frame["transform_matrix"]) = (json!(name), json!(pose));
+                frame["file_path"] = json!(name);
+                frame["transform_matrix"] = json!(pose);
                 self.frames.push(frame);
+                names.push(name);
             }
             self.splits.push((format!("{split}_filenames"), names));
             return Ok(());
         }
-        let frames = poses.iter().enumerate().map(|(number, pose)| {
+        let mut frames = Vec::with_capacity(poses.len());
+        for (number, pose) in poses.iter().enumerate() {
             let mut frame =
                 json!({"file_path": format!("./{split}/r_{number}"), "transform_matrix": pose});
             if split == "test" {
                 frame["depth_file_path"] = json!(format!("./test/r_{number}_depth.exr"));
             }
-            frame
-        });
-        let frames: Vec<Value> = frames.collect();
-        let mut file = camera.blender();
+            frames.push(frame);
+        }
+        let mut file = camera.blender_entries();
         file["frames"] = json!(frames);
         context
             .write_json(&format!("transforms_{split}.json"), &file)
             .context("cannot write the cameras")
     }
 
-    /// Writes what is about all of them.
-    pub(crate) fn end(self, context: &Context) -> anyhow::Result<()> {
+    /// Writes `transforms.json` unless the format is Blender's.
+    pub(crate) fn finish(self, context: &Context) -> anyhow::Result<()> {
         if self.form == Form::Blender {
             return Ok(());
         }
-        let mut file = self.shared.transforms();
+        let mut file = self.shared.transforms_entries();
         file["frames"] = json!(self.frames);
         for (key, names) in self.splits {
             file[key] = json!(names);
@@ -122,10 +131,10 @@ impl Written {
     }
 }
 
-/// Writes an image over white.
+/// Writes an image, composited on white, as JPEG.
 fn write_jpeg(path: &Path, image: &Rgba8) -> anyhow::Result<()> {
     let rgb: Vec<u8> = image.data.chunks_exact(4).flat_map(over_white).collect();
-    let encoder = JpegEncoder::new_with_quality(BufWriter::new(File::create(path)?), QUALITY);
+    let encoder = JpegEncoder::new_with_quality(BufWriter::new(File::create(path)?), JPEG_QUALITY);
     Ok(encoder.write_image(
         &rgb,
         image.width as u32,
@@ -134,28 +143,29 @@ fn write_jpeg(path: &Path, image: &Rgba8) -> anyhow::Result<()> {
     )?)
 }
 
+/// Composites an RGBA pixel on white.
 fn over_white(p: &[u8]) -> [u8; 3] {
     let alpha = u32::from(p[3]);
     std::array::from_fn(|c| ((u32::from(p[c]) * alpha + 255 * (255 - alpha) + 127) / 255) as u8)
 }
 
-/// Depth of the first surface at each pixel's centre; where there is none, `Z` is 0 and `A` is 0.
-fn write_depth(path: &Path, frame: &RenderedImage) -> Result<(), PixelError> {
+/// Writes the depth of the first surface at each pixel's centre; without a surface, `Z` and `A` are 0.
+fn write_depth(path: &Path, image: &RenderedImage) -> Result<(), PixelError> {
     let channels = [
         Channel { name: "A", sample_type: SampleType::Half },
         Channel { name: "Z", sample_type: SampleType::Float },
     ];
-    let (width, height) = (frame.colour.width, frame.colour.height);
+    let (width, height) = (image.colour.width, image.colour.height);
     write_exr(
         path,
         (width, height),
         &channels,
         "Z: camera-space z-depth in scene units; A: 0 where nothing is seen",
         |first, rows, samples| {
-            let band = &frame.depth[first * width..(first + rows) * width];
-            for (sample, depth) in samples.chunks_exact_mut(2).zip(band) {
-                sample
-                    .copy_from_slice(&[f32::from(u8::from(depth.is_some())), depth.unwrap_or(0.0)]);
+            let band = &image.depth[first * width..(first + rows) * width];
+            for (i, depth) in band.iter().enumerate() {
+                samples[2 * i] = if depth.is_some() { 1.0 } else { 0.0 };
+                samples[2 * i + 1] = depth.unwrap_or(0.0);
             }
             Ok(())
         },
