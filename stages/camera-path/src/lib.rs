@@ -33,11 +33,11 @@ pub struct Params {
     /// Radius of a spiral or orbit relative to that of the input cameras.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub radius: f64,
-    /// Poses of `kind: list`: for each frame a `camera_to_world` matrix of three rows of four numbers,
-    /// as in `views.json`.
+    /// Poses of `kind: list`: for each frame a `camera_to_world` matrix of three rows of four
+    /// numbers, as in `views.json`.
     pub poses: Vec<Pose>,
-    /// Width of the frames in pixels; the height follows from the first camera's aspect. Default: the
-    /// width of the scene's HR images.
+    /// Width of the frames in pixels; the height follows from the first camera's aspect. Default:
+    /// the width of the scene's HR images.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by scene"))]
     pub size: Option<u32>,
 }
@@ -52,8 +52,8 @@ impl Default for Params {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Kind {
-    /// Spiral around the mean camera, as wide as the positions of most cameras, looking at one point;
-    /// for forward-facing photographs.
+    /// Spiral around the mean camera, as wide as the positions of most cameras, looking at one
+    /// point; for forward-facing photographs.
     Spiral,
     /// Circle around the middle of the scene's box, at the cameras' mean distance and height.
     Orbit,
@@ -212,8 +212,8 @@ fn orbit_poses(
         .collect()
 }
 
-/// Interpolates the pose at a fraction of the closed curve through all cameras: centres by a Catmull-Rom
-/// spline, rotations along the shorter arc.
+/// Interpolates the pose at a fraction of the closed curve through all cameras: centres by a
+/// Catmull-Rom spline, rotations along the shorter arc.
 fn interpolated_pose(cameras: &[Camera], fraction: f64) -> Pose {
     let count = cameras.len();
     let position = fraction * count as f64;

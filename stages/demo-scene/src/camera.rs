@@ -4,8 +4,8 @@ use serde_json::{Value, json};
 
 use crate::params::{CAMERA_ANGLE, Params};
 
-/// OpenCV's fisheye coefficients of the lens, which compress angles towards the border, by 4 % at 89°;
-/// chosen by hand.
+/// OpenCV's fisheye coefficients of the lens, which compress angles towards the border, by 4 % at
+/// 89°; chosen by hand.
 const FISHEYE_COEFFICIENTS: [f64; 4] = [-0.02, 0.006, -0.003, 0.0005];
 
 /// Camera of a split's views; its principal point is the middle of the image.
@@ -33,8 +33,8 @@ impl ViewCamera {
         Self::pinhole(params.sides(), params.angle_x())
     }
 
-    /// Creates the camera of training views, with as many pixels per degree in the middle as in test
-    /// views.
+    /// Creates the camera of training views, with as many pixels per degree in the middle as in
+    /// test views.
     pub(crate) fn of_training(params: &Params) -> Self {
         let test = Self::of_test(params);
         let Some(degrees) = params.training_angle() else { return test };

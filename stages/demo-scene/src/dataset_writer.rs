@@ -90,8 +90,8 @@ impl DatasetWriter {
             let has_own_camera = self.is_mixed && split == "train";
             let own = if has_own_camera { camera.transforms_entries() } else { json!({}) };
             let mut names = Vec::with_capacity(poses.len());
-            for (number, pose) in (0..).zip(poses) {
-                let name = photograph_name(split, number);
+            for (number, pose) in poses.iter().enumerate() {
+                let name = photograph_name(split, number as u32);
                 let mut frame = own.clone();
                 frame["file_path"] = json!(name);
                 frame["transform_matrix"] = json!(pose);
@@ -149,7 +149,8 @@ fn over_white(p: &[u8]) -> [u8; 3] {
     std::array::from_fn(|c| ((u32::from(p[c]) * alpha + 255 * (255 - alpha) + 127) / 255) as u8)
 }
 
-/// Writes the depth of the first surface at each pixel's centre; without a surface, `Z` and `A` are 0.
+/// Writes the depth of the first surface at each pixel's centre; without a surface, `Z` and `A` are
+/// 0.
 fn write_depth(path: &Path, image: &RenderedImage) -> Result<(), PixelError> {
     let channels = [
         Channel { name: "A", sample_type: SampleType::Half },

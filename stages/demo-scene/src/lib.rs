@@ -1,9 +1,9 @@
-//! `demo-scene`: renders a small procedural scene in linear light and writes a data set: in Blender's
-//! format with exact depth, or like photographs, as JPEG with a `transforms.json`.
+//! `demo-scene`: renders a small procedural scene in linear light and writes a data set: in
+//! Blender's format with exact depth, or like photographs, as JPEG with a `transforms.json`.
 //!
-//! The scene separates good methods from bad ones: it has fine texture (base, crate, sign), thin parts
-//! (cage, spring), gloss (ball, copper) and occlusion (a striped ball inside the cage). It uses only
-//! arithmetic and `libm`, so equal parameters give equal bytes.
+//! The scene separates good methods from bad ones: it has fine texture (base, crate, sign), thin
+//! parts (cage, spring), gloss (ball, copper) and occlusion (a striped ball inside the cage). It
+//! uses only arithmetic and `libm`, so equal parameters give equal bytes.
 //!
 //! * `world`: the objects, their shapes, and intersection with rays.
 //! * `material`: albedo and gloss at a surface point.
@@ -32,8 +32,8 @@ pub use world::World;
 /// Distance of every camera from the scene's centre, in scene units.
 const CAMERA_DISTANCE: f64 = 4.0;
 
-/// Number of bytes per pixel while an image is rendered and written: colour, depth, and a copy of the
-/// colour for the PNG or JPEG encoder.
+/// Number of bytes per pixel while an image is rendered and written: colour, depth, and a copy of
+/// the colour for the PNG or JPEG encoder.
 const BYTES_PER_PIXEL: u64 = 16;
 /// Remedy for short memory, as a sentence fragment.
 const REMEDY: &str = "choose a smaller size, or end other programs";
@@ -99,9 +99,9 @@ fn check_memory(context: &Context, splits: &[(&str, u32, ViewCamera)]) -> anyhow
 
 /// Returns the pose of camera `i` of `count`.
 ///
-/// Around: training views are evenly spread over the upper hemisphere, test views are on a wavy circle
-/// between them. Forward: training views fill a square by the golden ratio, test views are on a circle
-/// in this square.
+/// Around: training views are evenly spread over the upper hemisphere, test views are on a wavy
+/// circle between them. Forward: training views fill a square by the golden ratio, test views are
+/// on a circle in this square.
 fn camera_pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     use std::f64::consts::{PI, TAU};
     let fraction = (f64::from(i) + 0.5) / f64::from(count);
@@ -116,7 +116,8 @@ fn camera_pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4]
         return camera_to_world(axes, DVec3::new(u, -CAMERA_DISTANCE, 0.3 + v));
     }
     let (azimuth, height) = if split == "train" {
-        // Azimuths by the golden angle; heights from just below the horizon to almost straight above.
+        // Azimuths by the golden angle; heights from just below the horizon to almost straight
+        // above.
         (f64::from(i) * PI * (3.0 - 5.0f64.sqrt()), -0.08 + 1.03 * fraction)
     } else {
         (TAU * fraction, 0.42 + 0.28 * libm::sin(3.0 * TAU * fraction))

@@ -50,8 +50,8 @@ fn cell(x: f64) -> i64 {
     x.floor() as i64
 }
 
-/// Returns a material's reflectance at a point with a normal, both in the shape's own space (centred,
-/// about 1 in size).
+/// Returns a material's reflectance at a point with a normal, both in the shape's own space
+/// (centred, about 1 in size).
 pub(crate) fn reflectance(material: Material, p: DVec3, normal: DVec3, seed: u32) -> Reflectance {
     match material {
         Material::Tiles => matt(tiles(p, normal, seed)),

@@ -25,12 +25,12 @@ pub struct Params {
     /// Number of rays along each side of a pixel, against aliasing.
     #[schemars(range(min = 1, max = 16))]
     pub samples_per_axis: u32,
-    /// Projection of the training views' lens; test views always have a pinhole camera. A `fisheye` lens
-    /// follows OpenCV's model and is black beyond 89° from its axis.
+    /// Projection of the training views' lens; test views always have a pinhole camera. A `fisheye`
+    /// lens follows OpenCV's model and is black beyond 89° from its axis.
     pub projection: Projection,
-    /// Angle of view of the training views across the shorter side, in degrees. Training views have as
-    /// many pixels per degree in the middle as test views. Default: 39.6, as for test views, or 120 for
-    /// a fisheye lens.
+    /// Angle of view of the training views across the shorter side, in degrees. Training views have
+    /// as many pixels per degree in the middle as test views. Default: 39.6, as for test views, or
+    /// 120 for a fisheye lens.
     #[schemars(range(min = 10.0, max = 170.0), extend("x-default" = "by `projection`"))]
     pub angle: Option<f64>,
     /// Arrangement of the cameras.
@@ -50,7 +50,8 @@ pub enum Form {
     /// Format of NeRF's synthetic scenes: PNG with alpha, `transforms_train.json` and
     /// `transforms_test.json`, depth of test views.
     Blender,
-    /// Photographs with poses: JPEG on white, one `transforms.json` with the focal length, no depth.
+    /// Photographs with poses: JPEG on white, one `transforms.json` with the focal length, no
+    /// depth.
     Transforms,
 }
 
@@ -58,8 +59,8 @@ pub enum Form {
 const DEFAULT_FISHEYE_ANGLE_DEGREES: f64 = 120.0;
 
 impl Params {
-    /// Returns the angle of view of the training views across the shorter side, in degrees; `None` if
-    /// they have the test views' camera.
+    /// Returns the angle of view of the training views across the shorter side, in degrees; `None`
+    /// if they have the test views' camera.
     pub(crate) fn training_angle(&self) -> Option<f64> {
         self.angle
             .or((self.projection == Projection::Fisheye).then_some(DEFAULT_FISHEYE_ANGLE_DEGREES))

@@ -33,8 +33,8 @@ impl Object {
         Self { shape, centre, to_local: DMat3::IDENTITY, material }
     }
 
-    /// Returns distance and normal of the first surface that a ray hits; the normal is in the object's
-    /// own space.
+    /// Returns distance and normal of the first surface that a ray hits; the normal is in the
+    /// object's own space.
     fn intersect(&self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3)> {
         let local_origin = self.to_local * (origin - self.centre);
         self.shape.intersect(local_origin, self.to_local * direction)
@@ -89,8 +89,8 @@ pub struct World {
 const FLOOR: f64 = -0.5;
 
 impl World {
-    /// Creates the scene of a seed: the seed rotates the arrangement, permutes the objects' positions and
-    /// changes textures.
+    /// Creates the scene of a seed: the seed rotates the arrangement, permutes the objects'
+    /// positions and changes textures.
     pub fn new(seed: u32) -> Self {
         let turn = f64::from(seed % 360) * 2.4;
         let foot = |slot: u32, distance: f64| {
@@ -130,8 +130,8 @@ impl World {
         self
     }
 
-    /// Returns the distance from a point to the nearest surface, below 0 inside objects: ground truth for
-    /// geometry that is reconstructed from the scene's images.
+    /// Returns the distance from a point to the nearest surface, below 0 inside objects: ground
+    /// truth for geometry that is reconstructed from the scene's images.
     pub fn distance(&self, point: DVec3) -> f64 {
         let mut distance = f64::INFINITY;
         for object in self.clusters.iter().flat_map(|cluster| &cluster.objects) {
@@ -141,8 +141,8 @@ impl World {
         distance
     }
 
-    /// Returns point and outward unit normal of the first surface that a ray hits. The direction has unit
-    /// length.
+    /// Returns point and outward unit normal of the first surface that a ray hits. The direction
+    /// has unit length.
     pub fn surface(&self, origin: DVec3, direction: DVec3) -> Option<(DVec3, DVec3)> {
         self.first_hit(origin, direction).map(|hit| (origin + hit.t * direction, hit.normal))
     }
@@ -268,8 +268,8 @@ impl Cluster {
         let mut radius = 0.0f64;
         for ball in &mut balls {
             radius = radius.max((ball.centre - centre).length() + ball.radius);
-            // An object's ball is enlarged, so that rounding loses no hit. The cluster's ball isn't: a
-            // larger one would change images.
+            // An object's ball is enlarged, so that rounding loses no hit. The cluster's ball
+            // isn't: a larger one would change images.
             ball.radius += MAX_ROUNDING_ERROR;
         }
         Self { ball: BoundingBall { centre, radius }, objects, balls }
@@ -349,7 +349,8 @@ impl Shape {
     }
 }
 
-/// Returns the signed distance from a box, given the signed distances from its faces along each axis.
+/// Returns the signed distance from a box, given the signed distances from its faces along each
+/// axis.
 fn box_distance(face_distances: DVec3) -> f64 {
     face_distances.max(DVec3::ZERO).length() + face_distances.max_element().min(0.0)
 }

@@ -10,8 +10,8 @@ use crate::surfel::Surfel;
 /// Maximum number of points of a COLMAP model: about as many as structure from motion finds.
 const MAX_POINTS: usize = 100_000;
 
-/// Returns `transforms.json` in the format of instant-ngp and nerfstudio. Images aren't exported; their
-/// paths are `images/NAME.png`.
+/// Returns `transforms.json` in the format of instant-ngp and nerfstudio. Images aren't exported;
+/// their paths are `images/NAME.png`.
 pub(crate) fn transforms_json(cameras: &[Camera], points: Option<&str>) -> Value {
     let shared = shared_intrinsics(cameras);
     let frames: Value =
@@ -79,19 +79,20 @@ impl CameraFormat {
             |has: fn(&Distortion) -> bool| cameras.iter().any(|c| has(&c.intrinsics.distortion));
         match self {
             Self::Transforms if is_any(|lens| lens.denominator != [0.0; 3]) => Some(
-                "transforms.json is not written: its readers don't support the rational terms k4 to k6 \
-                of a lens",
+                "transforms.json is not written: its readers don't support the rational terms of \
+                a lens, k4 to k6",
             ),
             Self::Colmap if is_any(|lens| lens.radial[3] != 0.0 && !lens.is_fisheye()) => Some(
-                "colmap/ is not written: COLMAP doesn't support a fourth radial term of a perspective lens",
+                "colmap/ is not written: COLMAP doesn't support the fourth radial term of a \
+                perspective lens",
             ),
             _ => None,
         }
     }
 }
 
-/// Returns a COLMAP model as text files: names and contents. Poses are world to camera with axes right,
-/// down, forward. Points have no track; `offset` is the world point of their origin.
+/// Returns a COLMAP model as text files: names and contents. Poses are world to camera with axes
+/// right, down, forward. Points have no track; `offset` is the world point of their origin.
 pub(crate) fn colmap_files(
     cameras: &[Camera],
     surfels: &[Surfel],
@@ -100,27 +101,27 @@ pub(crate) fn colmap_files(
     let mut lenses: Vec<&Intrinsics> = Vec::new();
     let mut images =
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; a line of points\n".to_owned();
-    for (id, camera) in (1..).zip(cameras) {
+    for (i, camera) in cameras.iter().enumerate() {
         let lens = lenses.iter().position(|k| **k == camera.intrinsics).unwrap_or_else(|| {
             lenses.push(&camera.intrinsics);
             lenses.len() - 1
         });
         let (q, t) = world_to_camera(camera);
         let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
-        let _ = writeln!(images, "{id} {pose} {} {}.png\n", lens + 1, camera.name);
+        let _ = writeln!(images, "{} {pose} {} {}.png\n", i + 1, lens + 1, camera.name);
     }
     let mut cameras = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
-    for (id, k) in (1..).zip(lenses) {
+    for (i, k) in lenses.iter().enumerate() {
         let (model, parameters) = colmap_model(k);
         let parameters = parameters.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
-        let _ = writeln!(cameras, "{id} {model} {} {} {parameters}", k.width, k.height);
+        let _ = writeln!(cameras, "{} {model} {} {} {parameters}", i + 1, k.width, k.height);
     }
     let mut points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n".to_owned();
     let step = surfels.len().div_ceil(MAX_POINTS).max(1);
-    for (id, surfel) in (1..).zip(surfels.iter().step_by(step)) {
+    for (i, surfel) in surfels.iter().step_by(step).enumerate() {
         let [x, y, z] = world_coordinates(surfel.position, offset);
         let [r, g, b] = colour_bytes(surfel.colour);
-        let _ = writeln!(points, "{id} {x} {y} {z} {r} {g} {b} 0");
+        let _ = writeln!(points, "{} {x} {y} {z} {r} {g} {b} 0", i + 1);
     }
     [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)]
 }

@@ -8,9 +8,9 @@ use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 use crate::surface_view::{PointState, SurfaceView};
 
-/// Returns the colours of a mesh's vertices, display-encoded sRGB: the mean over the views that observe
-/// the vertex, weighted by the angle of view, or else the field's own colour along the normal. `offset`
-/// is the world point of the mesh's origin.
+/// Returns the colours of a mesh's vertices, display-encoded sRGB: the mean over the views that
+/// observe the vertex, weighted by the angle of view, or else the field's own colour along the
+/// normal. `offset` is the world point of the mesh's origin.
 pub(crate) fn vertex_colours(
     field: &Members,
     views: &[SurfaceView],

@@ -5,8 +5,8 @@ use crate::surface_view::{PointState, SurfaceView};
 
 /// Maximum distance in pixel widths at which views observe the same surface (design note 043).
 const MAX_DISTANCE_PIXELS: f64 = 2.0;
-/// Minimum cosine between normals at which views observe the same side of a surface: 45° (design note
-/// 043). Thin objects have another side close by.
+/// Minimum cosine between normals at which views observe the same side of a surface: 45° (design
+/// note 043). Thin objects have another side close by.
 const MIN_SAME_SIDE_COSINE: f64 = 0.7;
 
 /// Moves every pixel's point to the mean of the surfaces that all views observe there, and removes
@@ -23,7 +23,8 @@ pub(crate) fn apply_consensus(views: &mut [SurfaceView], progress: &Progress) {
             shifts
         })
         .collect();
-    for (view, shifts) in views.iter_mut().zip(shifts) {
+    for (i, shifts) in shifts.into_iter().enumerate() {
+        let view = &mut views[i];
         for (index, shift) in shifts {
             match shift {
                 Some(shift) => view.move_along_normal(index, shift),

@@ -11,11 +11,12 @@ pub const OFFSET_FILE: &str = "offset.json";
 /// Files whose coordinates have single precision.
 const SINGLE_FILES: [&str; 3] = ["points.ply", "splats.ply", "mesh.glb"];
 
-/// Maximum distance of a scene's middle from the origin, in scene sizes, for files without an offset:
-/// single precision moves a point by less than a millionth of the size (design note 043).
+/// Maximum distance of a scene's middle from the origin, in scene sizes, for files without an
+/// offset: single precision moves a point by less than a millionth of the size (design note 043).
 const MAX_DISTANCE_SIZES: f64 = 8.0;
 
-/// Content of `offset.json`: the offset of files with single precision, for scenes far from the origin.
+/// Content of `offset.json`: the offset of files with single precision, for scenes far from the
+/// origin.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExportOffset {
@@ -35,7 +36,8 @@ pub(crate) struct Coordinates {
 }
 
 impl Coordinates {
-    /// Chooses the frame for a field's bounds: the input's frame if single precision is fine enough.
+    /// Chooses the frame for a field's bounds: the input's frame if single precision is fine
+    /// enough.
     pub(crate) fn new(bounds: &Bounds) -> Self {
         let (middle, size) = match bounds.space {
             Space::Ndc(frustum) => (frustum.centre(), frustum.near),

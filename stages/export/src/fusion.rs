@@ -9,18 +9,18 @@ use crate::surface_view::{PointState, SurfaceView};
 /// Truncation distance of signed distances in lattice spacings: more than noise, less than thin
 /// objects (design note 043).
 const TRUNCATION_SPACINGS: f64 = 2.5;
-/// Maximum distance along the surface between a vertex and a pixel's point, in pixel widths: about half
-/// of a pixel's diagonal. Below a cell's width, that width applies, the accuracy of a mesh.
+/// Maximum distance along the surface between a vertex and a pixel's point, in pixel widths: about
+/// half of a pixel's diagonal. Below a cell's width, that width applies, the accuracy of a mesh.
 const MAX_PIXEL_DISTANCE: f64 = 0.75;
-/// Minimum cosine between a vertex's normal and a view's normal at which the view observes the vertex's
-/// side of the surface; chosen by hand.
+/// Minimum cosine between a vertex's normal and a view's normal at which the view observes the
+/// vertex's side of the surface; chosen by hand.
 const MIN_SAME_SIDE_COSINE: f64 = 0.3;
 /// Number of rows of triangles that are removed next to unseen parts (design note 043).
 const UNCERTAIN_ROWS: usize = 3;
 
-/// Fuses the views' signed distances from the surface at a lattice's nodes (Curless and Levoy 1996), as
-/// fractions of the truncation distance: below 0 inside, 1 in empty space, NaN if no view observes the
-/// node.
+/// Fuses the views' signed distances from the surface at a lattice's nodes (Curless and Levoy
+/// 1996), as fractions of the truncation distance: below 0 inside, 1 in empty space, NaN if no view
+/// observes the node.
 pub(crate) fn fuse(views: &[SurfaceView], lattice: &Lattice, progress: &Progress) -> Vec<f32> {
     let [nx, ny, _] = lattice.counts;
     let bounds = surface_bounds(views);
@@ -81,8 +81,9 @@ fn fused_distance(
     if weights > 0.0 { sum / weights } else { f32::NAN }
 }
 
-/// Removes triangles with a vertex that no view observes, and a few rows of triangles next to them. A
-/// fused surface extends a little beyond its edges, where only pixels at grazing angles support it.
+/// Removes triangles with a vertex that no view observes, and a few rows of triangles next to them.
+/// A fused surface extends a little beyond its edges, where only pixels at grazing angles support
+/// it.
 pub(crate) fn remove_unseen(views: &[SurfaceView], lattice: &Lattice, mesh: &mut Mesh) {
     let is_seen: Vec<bool> = (0..mesh.positions.len())
         .into_par_iter()

@@ -13,8 +13,8 @@ const UNSIGNED: u32 = 5125;
 const VERTICES: u32 = 34962;
 const INDICES: u32 = 34963;
 
-/// Writes a mesh as binary glTF 2.0, unlit, since the colours include the scene's light. The vertices'
-/// `colours`, display-encoded sRGB, are converted to glTF's linear colours.
+/// Writes a mesh as binary glTF 2.0, unlit, since the colours include the scene's light. The
+/// vertices' `colours`, display-encoded sRGB, are converted to glTF's linear colours.
 pub(crate) fn write(
     file: &mut impl Write,
     mesh: &Mesh,

@@ -1,8 +1,8 @@
 use glam::DVec3;
 use scene::{Bounds, Frustum, Space};
 
-/// Evenly spaced nodes: in the world, or in the cube of an NDC frustum, where their spacing in the world
-/// grows with depth.
+/// Evenly spaced nodes: in the world, or in the cube of an NDC frustum, where their spacing in the
+/// world grows with depth.
 pub(crate) struct Lattice {
     frustum: Option<Frustum>,
     origin: DVec3,
@@ -12,8 +12,8 @@ pub(crate) struct Lattice {
 }
 
 impl Lattice {
-    /// Creates a lattice that fills a field's box or NDC frustum, with `cells` cells along the longest
-    /// side.
+    /// Creates a lattice that fills a field's box or NDC frustum, with `cells` cells along the
+    /// longest side.
     pub(crate) fn new(bounds: &Bounds, cells: u32) -> Self {
         let (frustum, origin, sides) = match bounds.space {
             Space::Ndc(frustum) => {
@@ -69,8 +69,8 @@ impl Lattice {
         spacing
     }
 
-    /// Returns whether the lattice's axes are left-handed in the world: a frustum's third axis points
-    /// away from the camera.
+    /// Returns whether the lattice's axes are left-handed in the world: a frustum's third axis
+    /// points away from the camera.
     pub(crate) fn is_mirrored(&self) -> bool {
         self.frustum.is_some()
     }

@@ -1,7 +1,7 @@
 //! `export`: a trained field in files that other programs open.
 //!
-//! The field is rendered from the training cameras; all files are derived from the surfaces in these
-//! views (design note 043).
+//! The field is rendered from the training cameras; all files are derived from the surfaces in
+//! these views (design note 043).
 //!
 //! * `points.ply`: coloured points with normals.
 //! * `splats.ply`: 3D Gaussians in the layout of 3DGS viewers.
@@ -10,10 +10,11 @@
 //! * [`EXPORT_FILE`]: counts, and a description of the coordinates.
 //! * [`OFFSET_FILE`]: for scenes far from the origin, the offset of points, splats and mesh.
 //!
-//! Coordinates, scale and orientation are those of the input cameras, which `prep` copies from the data
-//! set. Points, splats and mesh have single precision; if that is too coarse, their coordinates are
-//! relative to an offset ([`coordinates`]). Camera axes are OpenGL's (x right, y up, looking along -z)
-//! in `transforms.json`, and COLMAP's (x right, y down, looking along z) in its model.
+//! Coordinates, scale and orientation are those of the input cameras, which `prep` copies from the
+//! data set. Points, splats and mesh have single precision; if that is too coarse, their
+//! coordinates are relative to an offset ([`coordinates`]). Camera axes are OpenGL's (x right, y
+//! up, looking along -z) in `transforms.json`, and COLMAP's (x right, y down, looking along z) in
+//! its model.
 
 mod cameras;
 mod colour;
@@ -252,8 +253,8 @@ fn render_views(
     Ok(views)
 }
 
-/// Returns the maximum number of bytes that an export needs: all pixels, and either the samples that
-/// are merged or the mesh's lattice.
+/// Returns the maximum number of bytes that an export needs: all pixels, and either the samples
+/// that are merged or the mesh's lattice.
 fn memory_need(cameras: &[Camera], lattice: Option<&Lattice>) -> u64 {
     let pixels: u64 = cameras.iter().map(pixel_count).sum();
     let values = lattice.map_or(0, |lattice| BYTES_PER_NODE * lattice.len() as u64);

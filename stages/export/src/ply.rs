@@ -7,25 +7,20 @@ use glam::{DQuat, DVec3};
 use crate::coordinates::Coordinates;
 use crate::surfel::Surfel;
 
-/// Type of a PLY property.
-#[derive(Clone, Copy)]
-enum PropertyType {
-    /// 32-bit floating point.
-    Float,
-    /// 8-bit unsigned integer.
-    Byte,
-}
+/// PLY's type names of 32-bit floats and 8-bit unsigned integers.
+const FLOAT: &str = "float";
+const BYTE: &str = "uchar";
 
 /// Maximum distance in pixels from a silhouette at which normals are uncertain (design note 043).
 const MAX_UNCERTAIN_MARGIN_PIXELS: u8 = 2;
 
 /// Spherical harmonic of degree 0.
 const HARMONIC: f32 = 0.282_094_79;
-/// Standard deviation of a splat along its surface, as a fraction of the distance to its neighbours:
-/// splats close the surface at any viewing distance (design note 043).
+/// Standard deviation of a splat along its surface, as a fraction of the distance to its
+/// neighbours: splats close the surface at any viewing distance (design note 043).
 const SPLAT_DEVIATION: f64 = 0.5;
-/// Standard deviation of a splat along its normal, as a fraction of that along the surface; chosen by
-/// hand.
+/// Standard deviation of a splat along its normal, as a fraction of that along the surface; chosen
+/// by hand.
 const SPLAT_FLATNESS: f64 = 0.1;
 /// Opacity of a splat on an opaque surface, which several splats cover. Larger values widen edges,
 /// since viewers blur splats (design note 043).
@@ -46,8 +41,8 @@ pub(crate) fn write_points(
     surfels: &[Surfel],
     coordinates: &Coordinates,
 ) -> io::Result<()> {
-    let floats = ["x", "y", "z", "nx", "ny", "nz"].map(|name| (name, PropertyType::Float));
-    let bytes = ["red", "green", "blue"].map(|name| (name, PropertyType::Byte));
+    let floats = ["x", "y", "z", "nx", "ny", "nz"].map(|name| (name, FLOAT));
+    let bytes = ["red", "green", "blue"].map(|name| (name, BYTE));
     write_header(file, coordinates, surfels.len(), &[&floats[..], &bytes].concat())?;
     for surfel in surfels {
         write_floats(file, &surfel.position.as_vec3().to_array())?;
@@ -67,8 +62,7 @@ pub(crate) fn write_splats(
 ) -> io::Result<()> {
     let names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 \
         rot_2 rot_3";
-    let properties: Vec<_> =
-        names.split_whitespace().map(|name| (name, PropertyType::Float)).collect();
+    let properties: Vec<_> = names.split_whitespace().map(|name| (name, FLOAT)).collect();
     write_header(file, coordinates, surfels.len(), &properties)?;
     for surfel in surfels {
         write_floats(file, &splat_properties(surfel))?;
@@ -96,16 +90,12 @@ fn write_header(
     file: &mut impl Write,
     coordinates: &Coordinates,
     count: usize,
-    properties: &[(&str, PropertyType)],
+    properties: &[(&str, &str)],
 ) -> io::Result<()> {
     writeln!(file, "ply\nformat binary_little_endian 1.0")?;
     writeln!(file, "comment {coordinates}")?;
     writeln!(file, "element vertex {count}")?;
     for (name, property_type) in properties {
-        let property_type = match property_type {
-            PropertyType::Float => "float",
-            PropertyType::Byte => "uchar",
-        };
         writeln!(file, "property {property_type} {name}")?;
     }
     writeln!(file, "end_header")

@@ -4,10 +4,10 @@ use stage::Progress;
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 
-/// Extracts the surface between nodes with negative values, inside, and the others (naive surface nets,
-/// Gibson 1998). Each cell that the surface crosses gets a vertex, at the mean of the crossings with
-/// the cell's edges; each crossed edge gets a quad around it. NaN is unknown: the surface has a hole
-/// there.
+/// Extracts the surface between nodes with negative values, inside, and the others (naive surface
+/// nets, Gibson 1998). Each cell that the surface crosses gets a vertex, at the mean of the
+/// crossings with the cell's edges; each crossed edge gets a quad around it. NaN is unknown: the
+/// surface has a hole there.
 pub(crate) fn extract(lattice: &Lattice, values: &[f32], progress: &Progress) -> Mesh {
     let cells = Cells { lattice, values, strides: lattice.strides() };
     let mut mesh = Mesh::default();

@@ -9,11 +9,11 @@ use stage::Progress;
 const RAYS_PER_BATCH: usize = 1 << 16;
 /// Minimum opacity of a pixel with a surface: half of its light is stopped, so median depth exists.
 const MIN_OPACITY: f32 = 0.5;
-/// Maximum depth difference, in pixel widths, of neighbouring pixels of one surface: slants of up to
-/// 80°.
+/// Maximum depth difference, in pixel widths, of neighbouring pixels of one surface: slants of up
+/// to 80°.
 const MAX_DEPTH_STEP_PIXELS: f32 = 6.0;
-/// Maximum number of pixels to each side from which a normal is computed: more than noise, less than
-/// thin objects (design note 043).
+/// Maximum number of pixels to each side from which a normal is computed: more than noise, less
+/// than thin objects (design note 043).
 const MAX_BASELINE_PIXELS: usize = 4;
 
 /// Surface points and normals of a view, rendered by a pinhole camera.
@@ -41,7 +41,8 @@ pub(crate) struct SurfacePixel {
     pub(crate) colour: [u8; 3],
     /// Opacity, from 0 to 255.
     pub(crate) opacity: u8,
-    /// True if a neighbouring pixel has a nearer surface, whose silhouette is known only to a pixel.
+    /// True if a neighbouring pixel has a nearer surface, whose silhouette is known only to a
+    /// pixel.
     pub(crate) is_edge: bool,
     /// Number of pixels to the nearest end of the surface in the pixel's row and column, at most
     /// [`MAX_BASELINE_PIXELS`].
@@ -70,8 +71,8 @@ impl SurfaceView {
     /// Number of bytes per pixel.
     pub(crate) const BYTES_PER_PIXEL: u64 = size_of::<SurfacePixel>() as u64;
 
-    /// Renders one ray per pixel of a camera without its lens distortion. The view is in the frame of
-    /// the exported files, whose origin in the world is `offset`.
+    /// Renders one ray per pixel of a camera without its lens distortion. The view is in the frame
+    /// of the exported files, whose origin in the world is `offset`.
     pub(crate) fn render(
         field: &dyn RayField,
         camera: &Camera,
@@ -152,9 +153,9 @@ impl SurfaceView {
         }
     }
 
-    /// Returns the vector along the surface between the pixels before and after a pixel in its row or
-    /// column, and the pixel's margin in that line; `None` if the surface is one pixel wide. The pixel
-    /// is at `position` in a line of `length` pixels with indices `stride` apart.
+    /// Returns the vector along the surface between the pixels before and after a pixel in its row
+    /// or column, and the pixel's margin in that line; `None` if the surface is one pixel wide. The
+    /// pixel is at `position` in a line of `length` pixels with indices `stride` apart.
     fn tangent(
         &self,
         index: usize,
@@ -169,8 +170,8 @@ impl SurfaceView {
         (before != after).then_some((tangent, margin as u8))
     }
 
-    /// Returns the farthest pixel of the same surface in one direction, at most `available` pixels, to
-    /// the image's border, and [`MAX_BASELINE_PIXELS`] away.
+    /// Returns the farthest pixel of the same surface in one direction, at most `available` pixels,
+    /// to the image's border, and [`MAX_BASELINE_PIXELS`] away.
     fn last_of_surface(&self, index: usize, available: usize, stride: isize) -> usize {
         let mut last = index;
         for _ in 0..available.min(MAX_BASELINE_PIXELS) {
@@ -189,7 +190,8 @@ impl SurfaceView {
         depth > 0.0 && other > 0.0 && (other - depth).abs() <= self.max_depth_step(depth)
     }
 
-    /// Returns whether a pixel has a surface and its neighbour has none, or one that is farther away.
+    /// Returns whether a pixel has a surface and its neighbour has none, or one that is farther
+    /// away.
     fn is_nearer(&self, index: usize, neighbour: usize) -> bool {
         let (depth, other) = (self.pixels[index].depth, self.pixels[neighbour].depth);
         depth > 0.0 && (other == 0.0 || depth < other - self.max_depth_step(other))

@@ -26,9 +26,9 @@ type Sample = ([u32; 3], u32, u32);
 /// Maximum bytes per pixel that [`merge`] needs: a sample, twice while samples are collected.
 pub(crate) const BYTES_PER_PIXEL: u64 = 2 * size_of::<Sample>() as u64;
 
-/// Merges the surface pixels of all views to one surfel per cell of a grid over the field's unit cube.
-/// Cells are half as wide as the median pixel, or wider if there would be more than `max_surfels`
-/// (design note 043). Surfels are in the order of their cells.
+/// Merges the surface pixels of all views to one surfel per cell of a grid over the field's unit
+/// cube. Cells are half as wide as the median pixel, or wider if there would be more than
+/// `max_surfels` (design note 043). Surfels are in the order of their cells.
 pub(crate) fn merge(views: &[SurfaceView], bounds: &Bounds, max_surfels: usize) -> Vec<Surfel> {
     let mut edge = finest_edge(views, bounds);
     loop {

@@ -15,7 +15,8 @@ pub(crate) struct Imdn {
 }
 
 /// Information multi-distillation block: each of three layers distils a quarter of the channels and
-/// passes the rest to the next layer; then channel attention weights all channels by their contrast.
+/// passes the rest to the next layer; then channel attention weights all channels by their
+/// contrast.
 struct Block {
     layers: [Conv; 4],
     attention: [Conv; 2],

@@ -1,14 +1,14 @@
-//! `upsample`: enlarges views to the size of HR cameras with a 2-D method: the baselines of the paper's
-//! tables, and the photographs at HR that `refine` averages with refined views.
+//! `upsample`: enlarges views to the size of HR cameras with a 2-D method: the baselines of the
+//! paper's tables, and the photographs at HR that `refine` averages with refined views.
 //!
 //! * `bicubic`: Pillow's filter on 8 bits, bit-exact.
 //! * `imdn`, `swinir`: networks with a fixed scale, which is read from their weights.
 //! * `liif`: a network for any scale.
 //!
-//! Weights are safetensors files with the tensors' published names, converted from released checkpoints
-//! by `scripts/convert-weights.py`; every tensor's shape is checked. Images are composited on their
-//! background and enlarged as display-encoded sRGB. The enlarged views are opaque and have no depth. A
-//! photograph's mask is enlarged with it.
+//! Weights are safetensors files with the tensors' published names, converted from released
+//! checkpoints by `scripts/convert-weights.py`; every tensor's shape is checked. Images are
+//! composited on their background and enlarged as display-encoded sRGB. The enlarged views are
+//! opaque and have no depth. A photograph's mask is enlarged with it.
 //!
 //! Each view runs through libtorch in one thread, so bytes don't depend on the number of threads.
 
@@ -58,8 +58,8 @@ pub enum Method {
     Bicubic,
     /// IMDN, a light convolutional network (Hui et al. 2019).
     Imdn,
-    /// LIIF, a local implicit image function with EDSR's baseline encoder, for any scale (Chen et al.
-    /// 2021).
+    /// LIIF, a local implicit image function with EDSR's baseline encoder, for any scale (Chen et
+    /// al. 2021).
     Liif,
     /// SwinIR, a transformer (Liang et al. 2021).
     Swinir,

@@ -4,8 +4,8 @@ use tch::{TchError, Tensor};
 use crate::network::{Linear, Network, count_parts};
 
 /// LIIF (Chen et al. 2021, "Learning Continuous Image Representation with Local Implicit Image
-/// Function") with EDSR's baseline encoder, by the names of its released weights: feature unfolding,
-/// local ensemble and cell decoding. Any scale.
+/// Function") with EDSR's baseline encoder, by the names of its released weights: feature
+/// unfolding, local ensemble and cell decoding. Any scale.
 pub(crate) struct Liif {
     head: Conv,
     blocks: Vec<[Conv; 2]>,
@@ -82,8 +82,8 @@ struct Nearest {
     offset: f64,
 }
 
-/// Finds the feature nearest to each of `pixels` pixels along an axis of `features` features, after a
-/// shift by half a feature towards `side`, -1 or 1.
+/// Finds the feature nearest to each of `pixels` pixels along an axis of `features` features, after
+/// a shift by half a feature towards `side`, -1 or 1.
 fn nearest_features(features: i64, pixels: i64, side: f64) -> Vec<Nearest> {
     let count = features as f64;
     let mut nearest = Vec::with_capacity(pixels as usize);
@@ -121,8 +121,8 @@ impl Corners {
         (y.offset * x.offset).abs() + MIN_AREA
     }
 
-    /// Returns the weight of corner (v, h) for a pixel: the area to the opposite corner as a fraction
-    /// of all areas, so that nearer features weigh more.
+    /// Returns the weight of corner (v, h) for a pixel: the area to the opposite corner as a
+    /// fraction of all areas, so that nearer features weigh more.
     fn weight(&self, pixel: usize, v: usize, h: usize) -> f32 {
         let total = self.area(pixel, 0, 0)
             + self.area(pixel, 0, 1)

@@ -6,8 +6,8 @@ pub(crate) trait Network: Send {
     /// Returns the network's scale factor, or `None` if it enlarges by any factor.
     fn scale(&self) -> Option<i64>;
 
-    /// Enlarges an image (1 × 3 × rows × columns, 0..1) to `size`, rows and columns. A network with a
-    /// scale ignores `size`.
+    /// Enlarges an image (1 × 3 × rows × columns, 0..1) to `size`, rows and columns. A network with
+    /// a scale ignores `size`.
     fn enlarge(&self, image: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>;
 }
 

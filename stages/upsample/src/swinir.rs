@@ -20,7 +20,8 @@ pub(crate) struct SwinIr {
 
 /// Mean colour of the training images, as published.
 const MEAN: [f32; 3] = [0.4488, 0.4371, 0.4040];
-/// Negative slope of the leaky ReLUs between three convolutions in a row, and in the real-world head.
+/// Negative slope of the leaky ReLUs between three convolutions in a row, and in the real-world
+/// head.
 const SLOPE: f64 = 0.2;
 /// Negative slope of the leaky ReLU before enlarging.
 const HEAD_SLOPE: f64 = 0.01;

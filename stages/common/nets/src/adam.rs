@@ -133,6 +133,16 @@ fn trainable(network: &[(String, Tensor)]) -> Vec<(String, Tensor)> {
     trainable.map(|(name, tensor)| (name.clone(), tensor.shallow_clone())).collect()
 }
 
+/// Adds a shard's gradients to their sum.
+pub fn add_gradients(sum: &mut [Tensor], gradients: &[Tensor]) -> Result<(), TchError> {
+    no_grad(|| {
+        for (sum, gradient) in sum.iter_mut().zip(gradients) {
+            let _ = sum.f_add_(gradient)?;
+        }
+        Ok(())
+    })
+}
+
 /// Returns whether all elements of all tensors are finite.
 pub fn all_finite(tensors: &[Tensor]) -> Result<bool, TchError> {
     for tensor in tensors {

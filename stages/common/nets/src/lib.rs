@@ -22,7 +22,7 @@ mod weights;
 use pixels::Image;
 use tch::{Cuda, Device, TchError, Tensor};
 
-pub use adam::{Adam, all_finite};
+pub use adam::{Adam, add_gradients, all_finite};
 pub use weights::{Conv, Weights, WeightsError, write};
 
 /// Makes libtorch's results reproducible: libtorch splits sums by thread, so it gets one thread.

@@ -4,8 +4,8 @@ use nets::{Conv, Weights};
 use refinement::RefinementError;
 use tch::{Kind, TchError, Tensor};
 
-/// The paper's perceptual loss: the weighted mean absolute differences of VGG-19's features after the
-/// second ReLU of each block, for the blocks whose weights are in the file.
+/// The paper's perceptual loss: the weighted mean absolute differences of VGG-19's features after
+/// the second ReLU of each block, for the blocks whose weights are in the file.
 ///
 /// Two kinds of files are supported: torchvision's (`features.N.weight`), and Caffe's
 /// (`convB_N.weight`). Features in Caffe's scaling are hundreds of times larger, so each layer's
@@ -42,7 +42,8 @@ impl PerceptualLoss {
     ) -> Result<Self, RefinementError> {
         let is_caffe = weights.has("conv1_1.weight");
         let (mut blocks, mut inputs, mut index) = (Vec::new(), 3, 0);
-        for (block, (outputs, (_, count))) in widths.into_iter().zip(BLOCKS).enumerate() {
+        for (block, (_, count)) in BLOCKS.into_iter().enumerate() {
+            let outputs = widths[block];
             let names: Vec<String> = if is_caffe {
                 (1..=count).map(|i| format!("conv{}_{i}", block + 1)).collect()
             } else {

@@ -17,24 +17,14 @@ pub struct PaperRefiner {
 /// after the last layer of the decoder, otherwise ReLU.
 #[derive(Debug)]
 struct ConvLayer {
-    kernel: Tensor,
-    bias: Tensor,
-    norm: Option<BatchNorm>,
+    /// Tensors in the order of [`LayerTensor::ALL`]; without batch normalisation only the first
+    /// two.
+    tensors: Vec<Tensor>,
     stride: i64,
 }
 
-/// Batch normalisation, by the mean and variance of the batch in training, and by their running means
-/// afterwards.
-#[derive(Debug)]
-struct BatchNorm {
-    scale: Tensor,
-    shift: Tensor,
-    mean: Tensor,
-    variance: Tensor,
-}
-
-/// Inputs and outputs of a layer in multiples of the width (`None`: colours), stride, and true if the
-/// layer is normalised.
+/// Inputs and outputs of a layer in multiples of the width (`None`: colours), stride, and true if
+/// the layer is normalised.
 type LayerSpec = (Option<i64>, Option<i64>, i64, bool);
 
 const ENCODER: [LayerSpec; 7] = [
@@ -64,7 +54,8 @@ const DECODER: [LayerSpec; 12] = [
 const TAPS: [usize; 4] = [1, 3, 5, 6];
 /// Number of colour channels.
 pub(crate) const COLOURS: i64 = 3;
-/// The side of a patch in pixels must be a multiple of this, since the encoder halves it three times.
+/// The side of a patch in pixels must be a multiple of this, since the encoder halves it three
+/// times.
 pub(crate) const PATCH_MULTIPLE: usize = 8;
 /// PyTorch's defaults for batch normalisation.
 const MOMENTUM: f64 = 0.1;
@@ -75,8 +66,8 @@ const MAX_WIDTH: u32 = 1024;
 const WEIGHTS: u64 = 320;
 
 impl PaperRefiner {
-    /// Creates an untrained network, initialised like the reference (He et al. 2015; scales of batch
-    /// normalisation around 1). The published width is 128.
+    /// Creates an untrained network, initialised like the reference (He et al. 2015; scales of
+    /// batch normalisation around 1). The published width is 128.
     pub fn new(width: u32, seed: u64) -> Result<Self, RefinementError> {
         let mut number = 0;
         Self::build(width, |_, shape, kind| {
@@ -229,36 +220,19 @@ fn build_layers(
 ) -> Result<Vec<ConvLayer>, RefinementError> {
     let mut layers = Vec::with_capacity(specs.len());
     for (i, &(inputs, outputs, stride, normalised)) in specs.iter().enumerate() {
-        let name = format!("{name}.{i}");
         let [inputs, outputs] = [inputs, outputs]
             .map(|multiple| multiple.map_or(COLOURS, |multiple| multiple * i64::from(width)));
-        let mut build = |kind: LayerTensor, shape: &[i64]| layer_tensor(&name, kind, shape, tensor);
-        let kernel = build(LayerTensor::Kernel, &[outputs, inputs, 3, 3])?;
-        let bias = build(LayerTensor::Bias, &[outputs])?;
-        let norm = if normalised {
-            Some(BatchNorm {
-                scale: build(LayerTensor::Scale, &[outputs])?,
-                shift: build(LayerTensor::Shift, &[outputs])?,
-                mean: build(LayerTensor::Mean, &[outputs])?,
-                variance: build(LayerTensor::Variance, &[outputs])?,
-            })
-        } else {
-            None
-        };
-        layers.push(ConvLayer { kernel, bias, norm, stride });
+        let kinds = if normalised { &LayerTensor::ALL[..] } else { &LayerTensor::ALL[..2] };
+        let mut tensors = Vec::with_capacity(kinds.len());
+        for &kind in kinds {
+            let kernel_shape = [outputs, inputs, 3, 3];
+            let shape = if kind == LayerTensor::Kernel { &kernel_shape[..] } else { &[outputs] };
+            let tensor = tensor(&format!("{name}.{i}.{}", kind.name()), shape, kind)?;
+            tensors.push(tensor.set_requires_grad(kind.is_trainable()));
+        }
+        layers.push(ConvLayer { tensors, stride });
     }
     Ok(layers)
-}
-
-/// Returns one tensor of a layer.
-fn layer_tensor(
-    layer: &str,
-    kind: LayerTensor,
-    shape: &[i64],
-    tensor: &mut impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
-) -> Result<Tensor, RefinementError> {
-    let tensor = tensor(&format!("{layer}.{}", kind.name()), shape, kind)?;
-    Ok(if kind.is_trainable() { tensor.set_requires_grad(true) } else { tensor })
 }
 
 /// Converts square patches to a tensor (count × 3 × rows × columns), channels last in memory.
@@ -287,6 +261,9 @@ enum LayerTensor {
 }
 
 impl LayerTensor {
+    const ALL: [Self; 6] =
+        [Self::Kernel, Self::Bias, Self::Scale, Self::Shift, Self::Mean, Self::Variance];
+
     /// Returns the name in a weights file.
     fn name(self) -> &'static str {
         match self {
@@ -308,8 +285,15 @@ impl LayerTensor {
 impl ConvLayer {
     /// Applies the layer without its activation.
     fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor, TchError> {
-        let y = x.f_conv2d(&self.kernel, Some(&self.bias), [self.stride; 2], [1, 1], [1, 1], 1)?;
-        let Some(BatchNorm { scale, shift, mean, variance }) = &self.norm else { return Ok(y) };
+        let y = x.f_conv2d(
+            &self.tensors[0],
+            Some(&self.tensors[1]),
+            [self.stride; 2],
+            [1, 1],
+            [1, 1],
+            1,
+        )?;
+        let [_, _, scale, shift, mean, variance] = &self.tensors[..] else { return Ok(y) };
         y.f_batch_norm(
             Some(scale),
             Some(shift),
@@ -322,36 +306,14 @@ impl ConvLayer {
         )
     }
 
-    /// Returns handles to the layer's tensors.
-    fn tensors(&self) -> Vec<(LayerTensor, Tensor)> {
-        let norm = self.norm.iter().flat_map(|norm| {
-            let BatchNorm { scale, shift, mean, variance } = norm;
-            [
-                (LayerTensor::Scale, scale),
-                (LayerTensor::Shift, shift),
-                (LayerTensor::Mean, mean),
-                (LayerTensor::Variance, variance),
-            ]
-        });
-        let all = [(LayerTensor::Kernel, &self.kernel), (LayerTensor::Bias, &self.bias)]
-            .into_iter()
-            .chain(norm);
-        all.map(|(kind, tensor)| (kind, tensor.shallow_clone())).collect()
+    /// Returns handles to the layer's tensors with their kinds.
+    fn tensors(&self) -> impl Iterator<Item = (LayerTensor, Tensor)> {
+        LayerTensor::ALL.into_iter().zip(self.tensors.iter().map(Tensor::shallow_clone))
     }
 
     /// Returns another handle to the same tensors.
     fn shallow_clone(&self) -> Self {
-        let norm = self.norm.as_ref().map(|norm| BatchNorm {
-            scale: norm.scale.shallow_clone(),
-            shift: norm.shift.shallow_clone(),
-            mean: norm.mean.shallow_clone(),
-            variance: norm.variance.shallow_clone(),
-        });
-        Self {
-            kernel: self.kernel.shallow_clone(),
-            bias: self.bias.shallow_clone(),
-            norm,
-            stride: self.stride,
-        }
+        let tensors = self.tensors.iter().map(Tensor::shallow_clone);
+        Self { tensors: tensors.collect(), stride: self.stride }
     }
 }

@@ -12,7 +12,8 @@ use crate::network::{PaperRefiner, patch_tensor};
 pub(crate) const PATCH: usize = 64;
 /// Default overlap of patches in pixels: a quarter of a patch (design note 024).
 pub const OVERLAP: usize = 16;
-/// Number of pixels along each side of a patch whose depth locates reference patches; chosen by hand.
+/// Number of pixels along each side of a patch whose depth locates reference patches; chosen by
+/// hand.
 const PROBES_PER_SIDE: usize = 4;
 
 /// Column and row of a patch's top left corner.
@@ -20,8 +21,8 @@ type Corner = (usize, usize);
 
 impl PaperRefiner {
     /// Redraws a view in patches of 64×64 pixels that overlap by `overlap` pixels, at most by half,
-    /// and are blended. Each patch gets at most `count` reference patches, at the positions at which
-    /// its own pixels are visible in references; a patch without any gets itself, as in the
+    /// and are blended. Each patch gets at most `count` reference patches, at the positions at
+    /// which its own pixels are visible in references; a patch without any gets itself, as in the
     /// reference's code. Returns an image of three channels in 0..1.
     pub fn refine(
         &self,
@@ -101,8 +102,8 @@ pub(crate) fn patch(image: &Image, (x, y): Corner) -> Vec<f32> {
 }
 
 /// Finds reference patches of the surface in a view's patch, the most visible first: index of the
-/// reference, and corner. Each probe pixel that is visible in a reference gives one candidate; equal
-/// corners count once.
+/// reference, and corner. Each probe pixel that is visible in a reference gives one candidate;
+/// equal corners count once.
 fn matching_patches(
     rendered: &Rendered,
     references: &[&KnownView],

@@ -5,8 +5,8 @@ use pixels::Image;
 /// fraction of half the width and height.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Perspective {
-    /// Map from positions in the warped image to the original: (ax + by + c) / w and (dx + ey + f) / w,
-    /// where w is gx + hy + 1.
+    /// Map from positions in the warped image to the original: (ax + by + c) / w and (dx + ey + f)
+    /// / w, where w is gx + hy + 1.
     map: [f64; 8],
     /// Bounding box of the warped image's content: left, top, and right, bottom (exclusive).
     pub(crate) filled: [usize; 4],

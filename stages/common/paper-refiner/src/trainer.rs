@@ -27,8 +27,8 @@ pub struct PaperTraining {
     pub seed: u64,
 }
 
-/// Trains a [`PaperRefiner`] on references and their rendered views: a patch of both, warped by one of
-/// 200 random perspectives, with reference patches from a fixed window around the patch in the
+/// Trains a [`PaperRefiner`] on references and their rendered views: a patch of both, warped by one
+/// of 200 random perspectives, with reference patches from a fixed window around the patch in the
 /// unwarped reference. The reported error is the mean absolute error of colours in -1..1.
 pub struct PaperTrainer {
     network: PaperRefiner,
@@ -151,7 +151,8 @@ impl<'a> TrainingPatch<'a> {
     ) -> Self {
         let (width, height) = (example.truth.width, example.truth.height);
         let perspective = rng.below(PERSPECTIVES_PER_IMAGE);
-        // The generator depends only on the perspective's number, so an image always has the same 200.
+        // The generator depends only on the perspective's number, so an image always has the same
+        // 200.
         let number = index * PERSPECTIVES_PER_IMAGE + perspective;
         let warp = if perspective == 0 {
             Perspective::identity(width, height)
@@ -209,7 +210,8 @@ fn draw_near(start: usize, last: usize, rng: &mut CounterRng) -> usize {
 }
 
 impl PaperTraining {
-    /// Checks that the network can halve patches three times, and that patches fit into every example.
+    /// Checks that the network can halve patches three times, and that patches fit into every
+    /// example.
     pub fn check(&self, examples: &[KnownView]) -> Result<(), RefinementError> {
         let size = self.patch_size;
         for KnownView { rendered, truth } in examples {

@@ -10,9 +10,9 @@ const MAX_SHIFT_PIXELS: f64 = 2.0;
 /// Moves each warped pixel of a band of rows, starting at `first_row`, to the position in the
 /// reference where its neighbourhood fits the rendered view best.
 ///
-/// One step of Lucas and Kanade (1981) from the position given by geometry. The step is damped by the
-/// squared detail that rendering lacks, since that detail, too, makes the images differ (design note
-/// 018).
+/// One step of Lucas and Kanade (1981) from the position given by geometry. The step is damped by
+/// the squared detail that rendering lacks, since that detail, too, makes the images differ (design
+/// note 018).
 pub(crate) fn align(
     warped: &[WarpedPixel],
     rendered: &Rendered,
@@ -49,8 +49,8 @@ impl WarpedRows<'_> {
         (f64::from(dx) / width, f64::from(dy) / height)
     }
 
-    /// Returns a pixel's contribution to the normal equations of the pixels around it: xx, xy, yy, x
-    /// and y times the difference, and the squared missing detail.
+    /// Returns a pixel's contribution to the normal equations of the pixels around it: xx, xy, yy,
+    /// x and y times the difference, and the squared missing detail.
     fn normal_terms(&self, i: usize) -> [f64; 6] {
         let (own, width) = (&self.warped[i], self.view.width);
         let mut terms = [0.0; 6];
@@ -98,9 +98,9 @@ impl WarpedRows<'_> {
     }
 }
 
-/// Returns the step in the reference from one pixel of the view to the next: the shorter of the steps
-/// from the pixel before and to the pixel after, since the longer one may cross an edge; 0 if neither
-/// neighbour is visible.
+/// Returns the step in the reference from one pixel of the view to the next: the shorter of the
+/// steps from the pixel before and to the pixel after, since the longer one may cross an edge; 0 if
+/// neither neighbour is visible.
 fn shorter_step(
     before: Option<&WarpedPixel>,
     own: &WarpedPixel,

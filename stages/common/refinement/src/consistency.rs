@@ -4,8 +4,8 @@ use scene::{Camera, Photograph, Views};
 
 use crate::view::Rendered;
 
-/// LR photographs of the cameras that a field was trained on; refined views of these cameras are made
-/// consistent with them.
+/// LR photographs of the cameras that a field was trained on; refined views of these cameras are
+/// made consistent with them.
 pub struct LrObservations<'a> {
     input: &'a GivenInput,
     views: Views,
@@ -48,9 +48,9 @@ impl<'a> LrObservations<'a> {
     }
 
     /// Returns the image nearest to `refined` that the kernel K degrades to `photograph`: refined +
-    /// K⁺(photograph - K·refined), clamped to [0, 1]. The residual is 0 where the photograph is clipped
-    /// to black or white and K·refined lies beyond, and where the photograph is masked (design note
-    /// 016).
+    /// K⁺(photograph - K·refined), clamped to [0, 1]. The residual is 0 where the photograph is
+    /// clipped to black or white and K·refined lies beyond, and where the photograph is masked
+    /// (design note 016).
     pub fn project(
         &self,
         refined: &Image,

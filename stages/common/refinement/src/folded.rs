@@ -22,8 +22,8 @@ impl Square {
         Self { x, y, size: (self.size.0 + 2 * margin, self.size.1 + 2 * margin) }
     }
 
-    /// Calls `pixel` with the column and row of each pixel of the square, in the network's order: rows
-    /// of folds, the pixels of a fold together.
+    /// Calls `pixel` with the column and row of each pixel of the square, in the network's order:
+    /// rows of folds, the pixels of a fold together.
     pub(crate) fn fold(self, mut pixel: impl FnMut(usize, usize)) {
         for fold_y in 0..self.size.1 / FOLD {
             for fold_x in 0..self.size.0 / FOLD {

@@ -1,16 +1,17 @@
-//! Refinement of rendered views: a small network that adds the detail that they systematically lack.
+//! Refinement of rendered views: a small network that adds the detail that they systematically
+//! lack.
 //!
 //! A field trained on LR images renders edges too soft, and in the same way everywhere in a scene.
 //! The network takes a rendered view and predicts the residual. It learns this one size down, where
-//! ground truth is known: a field trained on LR images that were downscaled once more renders views of
-//! LR size, whose ground truth is the LR images.
+//! ground truth is known: a field trained on LR images that were downscaled once more renders views
+//! of LR size, whose ground truth is the LR images.
 //!
 //! If HR images of some views are known (references), a reference-based network also takes the
-//! references' colours at each pixel's surface point. The field's depth gives the point's position in
-//! a reference, and whether it is visible there.
+//! references' colours at each pixel's surface point. The field's depth gives the point's position
+//! in a reference, and whether it is visible there.
 //!
-//! * [`Rendered`]: a view rendered from a field; [`KnownView`]: a rendered view with its ground truth,
-//!   an example or a reference.
+//! * [`Rendered`]: a view rendered from a field; [`KnownView`]: a rendered view with its ground
+//!   truth, an example or a reference.
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
 //! * [`with_references`]: adds reference features to a view; [`Guidance`] has the options.
 //! * [`LrObservations`]: LR photographs that views are made consistent with (data consistency).
@@ -19,8 +20,8 @@
 //!
 //! Colours are display-encoded sRGB, composited on the background.
 //!
-//! Each tile and each shard of a step runs through libtorch in one thread, and gradients are added in
-//! order, so bytes don't depend on the number of threads.
+//! Each tile and each shard of a step runs through libtorch in one thread, and gradients are added
+//! in order, so bytes don't depend on the number of threads.
 //!
 //! ```
 //! use pixels::Image;

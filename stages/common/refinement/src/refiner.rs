@@ -48,8 +48,8 @@ pub enum Network {
 
 /// Name of the file that describes a refiner.
 pub const REFINER_FILE: &str = "refiner.json";
-/// Name of a refiner's weights file: safetensors. Kernels of [`Refiner`] are outputs × rows × columns
-/// × inputs.
+/// Name of a refiner's weights file: safetensors. Kernels of [`Refiner`] are outputs × rows ×
+/// columns × inputs.
 pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 
 /// Content of `refiner.json`.
@@ -58,16 +58,16 @@ pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 pub struct RefinerFile {
     /// Kind and size of the network.
     pub network: Network,
-    /// Fraction of the predicted residual that is added, from 0 to 1: the best one for the validation
-    /// views.
+    /// Fraction of the predicted residual that is added, from 0 to 1: the best one for the
+    /// validation views.
     #[serde(rename = "strength")]
     pub residual_weight: f64,
     /// Mean PSNR of the rendered validation views, in dB.
     pub rendered_psnr: f64,
     /// Mean PSNR of the refined validation views, in dB.
     pub refined_psnr: f64,
-    /// Confidence in references as a fraction of their visibility in the validation views; absent if
-    /// the network takes no references.
+    /// Confidence in references as a fraction of their visibility in the validation views; absent
+    /// if the network takes no references.
     #[serde(rename = "trusted", default)]
     pub confidence: Option<f64>,
     /// True if the network's input views are made consistent with their own LR photographs.
@@ -235,8 +235,8 @@ impl Refiner {
         Ok(Image::new(width, height, OUTPUTS, data))
     }
 
-    /// Predicts the residual of a square of a view, the mean over orientations: row by row, channels
-    /// interleaved.
+    /// Predicts the residual of a square of a view, the mean over orientations: row by row,
+    /// channels interleaved.
     fn residual(
         &self,
         view: &Image,

@@ -5,7 +5,7 @@ use counter_rng::CounterRng;
 use nets::Adam;
 use pixels::{Image, psnr_of};
 use rayon::prelude::*;
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Kind, TchError, Tensor};
 
 use crate::error::RefinementError;
 use crate::folded::{FOLD, Orientation, Square};
@@ -47,8 +47,8 @@ pub struct RefinerTraining {
 }
 
 /// Trains a [`Refiner`] with Adam on the mean squared error of patches of examples. Each patch is
-/// rotated and mirrored, and its colours are changed, so that the network learns edges instead of the
-/// scene's colours and transfers to another size (design note 015).
+/// rotated and mirrored, and its colours are changed, so that the network learns edges instead of
+/// the scene's colours and transfers to another size (design note 015).
 pub struct RefinerTrainer {
     refiner: Refiner,
     options: RefinerTraining,
@@ -57,8 +57,8 @@ pub struct RefinerTrainer {
     pool: Option<Pool>,
 }
 
-/// Random examples with random references. References are warped once for all patches of a view, and
-/// memory is bounded by the size of the pool (design note 017).
+/// Random examples with random references. References are warped once for all patches of a view,
+/// and memory is bounded by the size of the pool (design note 017).
 struct Pool {
     round: u64,
     /// Index of the example, and the view with reference features.
@@ -109,7 +109,8 @@ const WARM_UP_STEPS: u64 = 50;
 const MIN_CONTRAST: f32 = 0.08;
 /// Maximum number of times that a patch is drawn again; chosen by hand.
 const MAX_REDRAWS: usize = 8;
-/// One in this many views gets no reference, so that the network also works without; chosen by hand.
+/// One in this many views gets no reference, so that the network also works without; chosen by
+/// hand.
 const NO_REFERENCE_EVERY: u64 = 8;
 /// Number of views in the pool of a reference-based network (design note 017).
 const POOL_VIEWS: u64 = 32;
@@ -158,12 +159,13 @@ impl RefinerTrainer {
             views.push(self.conditioned(number as u64, example, references, &mut uses));
         }
         let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
-        for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
+        for (i, view) in views.iter().enumerate() {
+            let truth = &examples[i].truth;
             let refined = self.refiner.refine(view)?;
             let mut error = 0.0;
-            for (i, pixel) in view.data.chunks_exact(view.channels).enumerate() {
+            for (p, pixel) in view.data.chunks_exact(view.channels).enumerate() {
                 for c in 0..OUTPUTS {
-                    let sample = i * OUTPUTS + c;
+                    let sample = p * OUTPUTS + c;
                     let residual = f64::from(refined.data[sample] - pixel[c]);
                     let true_residual = f64::from(truth.data[sample] - pixel[c]);
                     inner_product += residual * true_residual;
@@ -176,7 +178,8 @@ impl RefinerTrainer {
         let residual_weight =
             if power > 0.0 { (inner_product / power).clamp(0.0, 1.0) } else { 0.0 };
         let mut refined = 0.0;
-        for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
+        for (i, view) in views.iter().enumerate() {
+            let truth = &examples[i].truth;
             let image = self.refiner.refine_weighted(view, residual_weight as f32, 1)?;
             let samples = image.data.iter().zip(&truth.data);
             let error: f64 = samples.map(|(r, t)| f64::from(t - r).powi(2)).sum();
@@ -261,7 +264,12 @@ impl Training for RefinerTrainer {
             .filter(|(_, range)| !range.is_empty())
             .map(|(refiner, range)| run_shard(&refiner, &options, step, range, &views))
             .collect::<Result<_, _>>()?;
-        let (loss, gradients) = sum_in_order(parts)?;
+        let loss: f64 = parts.iter().map(|(loss, _)| loss).sum();
+        let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
+        let mut gradients = parts.next().unwrap_or_default();
+        for part in parts {
+            nets::add_gradients(&mut gradients, &part)?;
+        }
         if !loss.is_finite() || !nets::all_finite(&gradients)? {
             return Err(RefinementError::NotFinite { step });
         }
@@ -279,22 +287,6 @@ impl Training for RefinerTrainer {
         (self.adam, []) = Adam::resume(path, &self.refiner.named_parameters())?;
         Ok(())
     }
-}
-
-/// Sums shards' losses and gradients in their order.
-fn sum_in_order(parts: Vec<(f64, Vec<Tensor>)>) -> Result<(f64, Vec<Tensor>), TchError> {
-    let loss = parts.iter().map(|(loss, _)| loss).sum();
-    let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
-    let mut gradients = parts.next().unwrap_or_default();
-    for part in parts {
-        no_grad(|| -> Result<(), TchError> {
-            for (sum, gradient) in gradients.iter_mut().zip(&part) {
-                let _ = sum.f_add_(gradient)?;
-            }
-            Ok(())
-        })?;
-    }
-    Ok((loss, gradients))
 }
 
 /// Computes loss and gradients of a range of a step's patches.
@@ -369,8 +361,8 @@ impl<'a> TrainingPatch<'a> {
         Self { view, square, orientation, order, gain, offset }
     }
 
-    /// Appends the network's input, which includes the receptive field around the patch, and the true
-    /// residual.
+    /// Appends the network's input, which includes the receptive field around the patch, and the
+    /// true residual.
     fn append(&self, refiner: &Refiner, inputs: &mut Vec<f32>, residuals: &mut Vec<f32>) {
         let TrainingView { view, truth } = self.view;
         let around = self.square.grown(refiner.receptive_radius());

@@ -47,8 +47,8 @@ impl Rendered {
         Ok(Self { opacity: map.opacity.to_vec(), depth: map.depth.to_vec(), view, camera })
     }
 
-    /// Reads a view of an input, composited on a grey background, together with its file's channels.
-    /// Returns `None` if the view has no image.
+    /// Reads a view of an input, composited on a grey background, together with its file's
+    /// channels. Returns `None` if the view has no image.
     ///
     /// # Errors
     /// [`Failure::BadInput`], with input and view, if the image can't be read or isn't that of a
@@ -98,8 +98,8 @@ impl Rendered {
     }
 }
 
-/// Side in pixels of the blocks whose means are compared for exposure. In block means, missing detail
-/// averages out (design note 018).
+/// Side in pixels of the blocks whose means are compared for exposure. In block means, missing
+/// detail averages out (design note 018).
 const BLOCK_SIDE: usize = 8;
 
 /// Rendered view with its ground truth: a training example, or a reference for other views.
@@ -107,14 +107,14 @@ const BLOCK_SIDE: usize = 8;
 pub struct KnownView {
     /// The view as rendered.
     pub rendered: Rendered,
-    /// Ground truth of the view's size, composited on the background. Masked pixels have the rendered
-    /// colour.
+    /// Ground truth of the view's size, composited on the background. Masked pixels have the
+    /// rendered colour.
     pub truth: Image,
 }
 
 impl KnownView {
-    /// Combines a rendered view with its photograph, composited on the same background. Masked pixels
-    /// of the photograph get the rendered colour, so that they differ nowhere.
+    /// Combines a rendered view with its photograph, composited on the same background. Masked
+    /// pixels of the photograph get the rendered colour, so that they differ nowhere.
     pub fn new(rendered: Rendered, photograph: Photograph) -> Result<Self, RefinementError> {
         let view = &rendered.view;
         let Photograph { image: mut truth, mask } = photograph;

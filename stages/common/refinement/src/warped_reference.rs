@@ -17,8 +17,8 @@ use crate::warped_pixel::WarpedPixel;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Guidance {
-    /// True if a reference contributes only points that are visible in it by its own depth; false if
-    /// also hidden points.
+    /// True if a reference contributes only points that are visible in it by its own depth; false
+    /// if also hidden points.
     pub occlusion: bool,
     /// True if a reference's pixels are moved, by up to two pixels, to fit the rendered view.
     pub alignment: bool,
@@ -36,8 +36,8 @@ impl Default for Guidance {
 struct ReferenceFeatures {
     /// Features of each pixel: the references' difference to the rendered colour; the confidence,
     /// from 0 (visible in none of them) to 1 (visible in one from the same direction and as large,
-    /// and equal to the rendered view); and the detail that the references' own rendered views lack,
-    /// which helps even if a reference shows a point slightly off or in another light.
+    /// and equal to the rendered view); and the detail that the references' own rendered views
+    /// lack, which helps even if a reference shows a point slightly off or in another light.
     features: Vec<[f32; FEATURES]>,
     uses: Vec<Use>,
 }

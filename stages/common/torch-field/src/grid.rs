@@ -45,18 +45,21 @@ impl TorchLevel {
         table.f_narrow(0, self.first, self.entries)
     }
 
-    /// Returns the cell indices along an axis of positions in the unit cube (n × 3), and the
-    /// fractions within those cells: n each.
-    fn cells(&self, positions: &Tensor, axis: usize) -> Result<Axis, TchError> {
+    /// Finds the cells along an axis of positions in the unit cube (n × 3).
+    fn cells(&self, positions: &Tensor, axis: usize) -> Result<AxisCells, TchError> {
         let cells = self.resolution[axis] as f64;
         let scaled = positions.i((.., axis as i64)).f_mul_scalar(cells)?;
         let cell = scaled.f_floor()?.f_clamp_max(cells - 1.0)?;
-        Ok(Axis { fraction: scaled.f_sub(&cell)?, cell: cell.f_to_kind(Kind::Int64)? })
+        let fraction = scaled.f_sub(&cell)?;
+        let cell = cell.f_to_kind(Kind::Int64)?;
+        Ok(AxisCells {
+            vertices: [cell.shallow_clone(), cell.f_add_scalar(1)?],
+            weights: [fraction.f_neg()?.f_add_scalar(1.0)?, fraction],
+        })
     }
 
     /// Returns the table indices (n) of vertices, given their indices along each axis (n each).
-    fn entry_index(&self, vertex: &[Tensor; 3]) -> Result<Tensor, TchError> {
-        let [x, y, z] = vertex;
+    fn entry_index(&self, [x, y, z]: [&Tensor; 3]) -> Result<Tensor, TchError> {
         let (brick_x, brick_y) = (x.f_floor_divide_scalar(2)?, y.f_floor_divide_scalar(2)?);
         let brick_z = z.f_floor_divide_scalar(2)?;
         let brick = if self.is_hashed {
@@ -76,10 +79,12 @@ impl TorchLevel {
     }
 }
 
-/// Cell indices along an axis and fractions within the cells: n each.
-struct Axis {
-    cell: Tensor,
-    fraction: Tensor,
+/// Cells of n positions along an axis.
+struct AxisCells {
+    /// Indices of the cells' lower and upper vertices: n each.
+    vertices: [Tensor; 2],
+    /// Interpolation weights of these vertices: n each.
+    weights: [Tensor; 2],
 }
 
 /// Samples of n rays of at most `count` steps each.
@@ -166,23 +171,6 @@ fn layer_shapes(architecture: &Architecture) -> [(i64, i64); 5] {
     ]
 }
 
-/// Returns the trilinear weights (n) of a cell's corner at `offset` (0 or 1 along each axis).
-fn corner_weight(axes: &[Axis; 3], offset: [i64; 3]) -> Result<Tensor, TchError> {
-    let [x, y, z] = axes;
-    let weight = axis_weight(x, offset[0])?;
-    let weight = axis_weight(y, offset[1])?.f_mul(&weight)?;
-    axis_weight(z, offset[2])?.f_mul(&weight)
-}
-
-/// Returns the linear weights (n) of the cells' lower (0) or upper (1) ends along an axis.
-fn axis_weight(axis: &Axis, offset: i64) -> Result<Tensor, TchError> {
-    if offset == 1 {
-        Ok(axis.fraction.shallow_clone())
-    } else {
-        axis.fraction.f_neg()?.f_add_scalar(1.0)
-    }
-}
-
 /// Returns the real spherical harmonics up to degree 2 of unit directions (n × 3): n × 9.
 fn harmonics(direction: &Tensor) -> Result<Tensor, TchError> {
     let [x, y, z] = [0, 1, 2].map(|i| direction.i((.., i)));
@@ -212,8 +200,8 @@ fn trainable_matrix(values: &[f32], shape: [i64; 2], device: Device) -> Result<T
     Ok(matrix(values, shape, device)?.set_requires_grad(true))
 }
 
-/// Returns optical depths up to the ends of steps, and the steps' transmittances and weights (rays ×
-/// count each), given the optical depths `sample_tau` of the samples `kept`.
+/// Returns optical depths up to the ends of steps, and the steps' transmittances and weights (rays
+/// × count each), given the optical depths `sample_tau` of the samples `kept`.
 fn optical_depths(
     sample_tau: &Tensor,
     kept: &Tensor,
@@ -308,21 +296,15 @@ impl TorchGrid {
         let mut features = Vec::with_capacity(self.levels.len());
         let positions = positions.f_clamp(0.0, 1.0)?;
         for level in &self.levels {
-            let axes = [
-                level.cells(&positions, 0)?,
-                level.cells(&positions, 1)?,
-                level.cells(&positions, 2)?,
-            ];
+            let x = level.cells(&positions, 0)?;
+            let y = level.cells(&positions, 1)?;
+            let z = level.cells(&positions, 2)?;
             let mut sum: Option<Tensor> = None;
-            for corner in 0..8i64 {
-                let offset = [corner & 1, corner >> 1 & 1, corner >> 2];
-                let weight = corner_weight(&axes, offset)?;
-                let vertex = [
-                    axes[0].cell.f_add_scalar(offset[0])?,
-                    axes[1].cell.f_add_scalar(offset[1])?,
-                    axes[2].cell.f_add_scalar(offset[2])?,
-                ];
-                let entry = self.table.f_index_select(0, &level.entry_index(&vertex)?)?;
+            for corner in 0..8 {
+                let [i, j, k] = [corner & 1, corner >> 1 & 1, corner >> 2];
+                let weight = z.weights[k].f_mul(&y.weights[j].f_mul(&x.weights[i])?)?;
+                let vertex = [&x.vertices[i], &y.vertices[j], &z.vertices[k]];
+                let entry = self.table.f_index_select(0, &level.entry_index(vertex)?)?;
                 let weighted = entry.f_mul(&weight.f_unsqueeze(-1)?)?;
                 sum = Some(match sum {
                     None => weighted,
@@ -422,8 +404,8 @@ impl TorchGrid {
         Ok(Marched { t, kept, positions, length, count })
     }
 
-    /// Returns the colours of composited samples: the sigmoid of the sample's own raw colour plus its
-    /// ray's (deferred shading).
+    /// Returns the colours of composited samples: the sigmoid of the sample's own raw colour plus
+    /// its ray's (deferred shading).
     fn shade(
         &self,
         maps: &RayMaps,

@@ -13,8 +13,8 @@ use crate::step::Step;
 
 /// Trains a [`radiance::Field`] like [`radiance::Trainer`], in libtorch: with equal random numbers,
 /// steps, learning rates and occupancy updates, but without [`TrainingOptions::roulette`], so that
-/// all samples get gradients. On the CPU it runs in one thread and checks that trainer; on CUDA it is
-/// fast (design note 023).
+/// all samples get gradients. On the CPU it runs in one thread and checks that trainer; on CUDA it
+/// is fast (design note 023).
 pub struct GridTrainer {
     grid: TorchGrid,
     options: TrainingOptions,
@@ -112,7 +112,7 @@ impl GridTrainer {
             if sum.is_empty() {
                 sum = piece.gradients;
             } else {
-                no_grad(|| add_gradients(&mut sum, &piece.gradients))?;
+                nets::add_gradients(&mut sum, &piece.gradients)?;
             }
         }
         loss /= bundles as f64;
@@ -285,14 +285,6 @@ impl GridTrainer {
         self.samples_per_ray = f64::from_bits(samples_per_ray);
         Ok(())
     }
-}
-
-/// Adds gradients to their sum.
-fn add_gradients(sum: &mut [Tensor], gradients: &[Tensor]) -> Result<(), TchError> {
-    for (sum, gradient) in sum.iter_mut().zip(gradients) {
-        let _ = sum.f_add_(gradient)?;
-    }
-    Ok(())
 }
 
 /// Names of tensors in a checkpoint.

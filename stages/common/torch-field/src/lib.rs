@@ -5,8 +5,8 @@
 //!   sampling. [`Mlp::render`] returns colour, opacity and depth of rays.
 //! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: training of the paper's field, driven by the
 //!   same [`radiance::Supervisor`] as the hash-grid field's.
-//! * [`TorchGrid`], [`GridTrainer`]: the hash-grid field of `radiance` and its training, on the same
-//!   parameters: a check of the hand-written engine, and its way to CUDA.
+//! * [`TorchGrid`], [`GridTrainer`]: the hash-grid field of `radiance` and its training, on the
+//!   same parameters: a check of the hand-written engine, and its way to CUDA.
 //!
 //! On the CPU a batch is cut into shards by index. Each shard runs in one thread, and gradients are
 //! added in order, so bytes don't depend on the number of threads. On CUDA results agree to a

@@ -16,10 +16,10 @@ use crate::ray_maps::{RayMaps, columns, matrix, to_host};
 use crate::sampling::{importance, midpoints, stratified};
 use crate::step::run_in_pieces;
 
-/// The paper's field: a coarse network, whose weights place the samples of a fine network. In a box,
-/// positions are in [`MlpFrame`], and rays run from `near` to `far` of the bounds. In NDC and in a
-/// contraction, positions are in the unit cube stretched to -1..1, and samples are evenly spaced
-/// through it, as in the paper for forward-facing scenes. Directions are in world space.
+/// The paper's field: a coarse network, whose weights place the samples of a fine network. In a
+/// box, positions are in [`MlpFrame`], and rays run from `near` to `far` of the bounds. In NDC and
+/// in a contraction, positions are in the unit cube stretched to -1..1, and samples are evenly
+/// spaced through it, as in the paper for forward-facing scenes. Directions are in world space.
 #[derive(Debug)]
 pub struct Mlp {
     pub(crate) architecture: MlpArchitecture,
@@ -159,8 +159,8 @@ impl Mlp {
         Ok(Self { architecture, bounds, coarse, fine, device })
     }
 
-    /// Reads a file that [`Mlp::write`] wrote, or that `scripts/convert-checkpoint.py` converted from
-    /// the reference's checkpoints.
+    /// Reads a file that [`Mlp::write`] wrote, or that `scripts/convert-checkpoint.py` converted
+    /// from the reference's checkpoints.
     pub fn read(
         path: &Path,
         architecture: MlpArchitecture,
@@ -383,14 +383,14 @@ fn read_network(
     device: Device,
 ) -> Result<MlpNetwork, TorchFieldError> {
     let network = MlpNetwork::read(architecture, |name, shape| {
-        Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?)
-    })?;
-    for (i, (name, _)) in MlpNetwork::parameter_shapes(&architecture).enumerate() {
-        if network.parameters[i].f_isfinite()?.f_all()?.f_int64_value(&[])? == 0 {
-            let reason = format!("tensor {prefix}.{name} is not finite");
+        let name = format!("{prefix}.{name}");
+        let tensor = weights.tensor(&name, shape)?;
+        if tensor.f_isfinite()?.f_all()?.f_int64_value(&[])? == 0 {
+            let reason = format!("tensor {name} is not finite");
             return Err(TorchFieldError::Format { path: path.to_path_buf(), reason });
         }
-    }
+        Ok(tensor)
+    })?;
     Ok(network.to(device, Kind::Float)?)
 }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 use nets::Adam;
 use radiance::{MlpArchitecture, StepReport, Supervisor, Tally};
 use rayon::prelude::*;
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Device, Kind, TchError, Tensor};
 
 use crate::error::TorchFieldError;
 use crate::mlp::{Batch, Mlp, SampleDraws};
@@ -40,9 +40,9 @@ pub struct MlpTrainer {
     stuck_steps: u64,
 }
 
-/// Returns the number of shards of a step on the CPU. It depends only on the number of rays, so that
-/// sums have one order at any thread count. In shards of few rays, libtorch's calls cost more than
-/// what they compute: steps of 8 rays take a quarter less time in one shard (design note 022).
+/// Returns the number of shards of a step on the CPU. It depends only on the number of rays, so
+/// that sums have one order at any thread count. In shards of few rays, libtorch's calls cost more
+/// than what they compute: steps of 8 rays take a quarter less time in one shard (design note 022).
 fn shard_count(rays: usize) -> usize {
     const MAX_SHARDS: usize = 8;
     const RAYS_PER_SHARD: usize = 16;
@@ -110,13 +110,11 @@ struct MlpPiece {
 impl MlpPiece {
     /// Adds the next piece.
     fn add(&mut self, other: Self) -> Result<(), TchError> {
-        for (sum, gradient) in self.gradients.iter_mut().zip(&other.gradients) {
-            let _ = sum.f_add_(gradient)?;
-        }
+        nets::add_gradients(&mut self.gradients, &other.gradients)?;
         self.colours.extend(other.colours);
         self.loss += other.loss;
-        for (sum, stopped) in self.stopped.iter_mut().zip(other.stopped) {
-            *sum = sum.add(stopped);
+        for i in 0..2 {
+            self.stopped[i] = self.stopped[i].add(other.stopped[i]);
         }
         Ok(())
     }
@@ -163,7 +161,7 @@ impl MlpTrainer {
         let rays = step.rays();
         let pieces = self.run_step(&*supervision, step)?;
         self.tally.count(bundles, rays_per_bundle);
-        let Some(sum) = no_grad(|| sum_in_order(pieces))? else { return Ok(None) };
+        let Some(sum) = sum_in_order(pieces)? else { return Ok(None) };
         let loss = sum.loss / bundles as f64;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum.gradients)?;
         if skipped {
@@ -343,6 +341,7 @@ impl StepContext {
 mod tests {
     use radiance::Ray;
     use scene::Bounds;
+    use tch::no_grad;
 
     use super::*;
     use crate::network::MlpNetwork;

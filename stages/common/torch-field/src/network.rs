@@ -154,9 +154,9 @@ fn trainable_copy(tensor: &Tensor, device: Device, kind: Kind) -> Result<Tensor,
     Ok(tensor.f_to_device(device)?.f_to_kind(kind)?.f_detach_copy()?.set_requires_grad(true))
 }
 
-/// Applies a linear layer, in f32 on a CPU through oneDNN if libtorch has it: on processors of other
-/// makers than Intel, MKL uses only half of the vector width (92 against 216 GFLOP/s per core where
-/// this was measured), and oneDNN is as accurate (design note 022).
+/// Applies a linear layer, in f32 on a CPU through oneDNN if libtorch has it: on processors of
+/// other makers than Intel, MKL uses only half of the vector width (92 against 216 GFLOP/s per core
+/// where this was measured), and oneDNN is as accurate (design note 022).
 fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
     static HAS_ONEDNN: LazyLock<bool> = LazyLock::new(|| {
         let one = Tensor::ones([1, 1], (Kind::Float, Device::Cpu));

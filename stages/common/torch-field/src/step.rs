@@ -69,7 +69,8 @@ impl Step {
         self.bundles * self.rays_per_bundle
     }
 
-    /// Returns the index of the first ray of a range of the step's bundles, over the whole training.
+    /// Returns the index of the first ray of a range of the step's bundles, over the whole
+    /// training.
     pub(crate) fn first_ray(self, range: &Range<usize>) -> u64 {
         self.first_ray + (range.start * self.rays_per_bundle) as u64
     }
