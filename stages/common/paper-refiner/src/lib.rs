@@ -12,8 +12,8 @@
 //!   [`PerceptualLoss`].
 //!
 //! Colours are display-encoded sRGB composited on the background, 0..1 outside and -1..1 inside.
-//! Four faults of the reference's code are not repeated: it takes its patches from one column of
-//! eight pixels, doesn't test for occlusion, drops a remainder of patches, and overlaps patches
+//! Faults of the reference's code are not repeated: it takes its reference patches from one column
+//! of eight pixels, doesn't test for occlusion, drops a remainder of patches, and overlaps patches
 //! without blending (design note 024).
 //!
 //! ```
