@@ -105,7 +105,7 @@ impl Default for Params {
 }
 
 /// Content of `export.json`: summary of the written files.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExportSummary {
     /// Description of the coordinates in all files.
@@ -167,10 +167,7 @@ impl Stage for Export {
         let mut summary = ExportSummary {
             coordinates: coordinates.to_string(),
             cameras: job.cameras.len(),
-            points: 0,
-            splats: 0,
-            vertices: 0,
-            triangles: 0,
+            ..ExportSummary::default()
         };
         job.write_surfels(&mut summary)?;
         if let Some(lattice) = &lattice {

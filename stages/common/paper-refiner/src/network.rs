@@ -10,7 +10,6 @@ use tch::{TchError, Tensor};
 pub struct PaperRefiner {
     encoder: Vec<ConvLayer>,
     decoder: Vec<ConvLayer>,
-    width: u32,
 }
 
 /// 3×3 convolution with zero padding, and optional batch normalisation. An activation follows: tanh
@@ -106,11 +105,6 @@ impl PaperRefiner {
         Ok(nets::write(path, &self.named_tensors())?)
     }
 
-    /// Returns the number of features of the first layer.
-    pub fn width(&self) -> u32 {
-        self.width
-    }
-
     /// Returns the number of trainable parameters.
     pub fn parameter_count(&self) -> usize {
         self.parameters().map(|p| p.numel()).sum()
@@ -123,7 +117,7 @@ impl PaperRefiner {
     ) -> Result<Self, RefinementError> {
         let encoder = build_layers("encoder", &ENCODER, width, &mut tensor)?;
         let decoder = build_layers("decoder", &DECODER, width, &mut tensor)?;
-        Ok(Self { encoder, decoder, width })
+        Ok(Self { encoder, decoder })
     }
 
     /// Returns all tensors with their names, including running means.
@@ -154,7 +148,6 @@ impl PaperRefiner {
         Self {
             encoder: self.encoder.iter().map(ConvLayer::shallow_clone).collect(),
             decoder: self.decoder.iter().map(ConvLayer::shallow_clone).collect(),
-            width: self.width,
         }
     }
 

@@ -161,7 +161,7 @@ impl MlpTrainer {
         let rays = step.rays();
         let pieces = self.run_step(&*supervision, step)?;
         self.tally.count(bundles, rays_per_bundle);
-        let Some(sum) = sum_in_order(pieces)? else { return Ok(None) };
+        let Some(sum) = sum_in_order(pieces.into_iter().map(Ok))? else { return Ok(None) };
         let loss = sum.loss / bundles as f64;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum.gradients)?;
         if skipped {
@@ -261,13 +261,17 @@ impl MlpTrainer {
 }
 
 /// Adds up pieces in their order; returns `None` if there are none.
-fn sum_in_order(pieces: impl IntoIterator<Item = MlpPiece>) -> Result<Option<MlpPiece>, TchError> {
-    let mut pieces = pieces.into_iter();
-    let Some(mut sum) = pieces.next() else { return Ok(None) };
+fn sum_in_order(
+    pieces: impl Iterator<Item = Result<MlpPiece, TchError>>,
+) -> Result<Option<MlpPiece>, TchError> {
+    let mut sum = None::<MlpPiece>;
     for piece in pieces {
-        sum.add(piece)?;
+        match &mut sum {
+            None => sum = Some(piece?),
+            Some(sum) => sum.add(piece?)?,
+        }
     }
-    Ok(Some(sum))
+    Ok(sum)
 }
 
 /// Values of a step that all its pieces need.
@@ -289,15 +293,12 @@ impl StepContext {
         let samples =
             (field.architecture.coarse_samples + field.architecture.fine_samples) as usize;
         let chunk = (CHUNK_SAMPLES / (samples * self.step.rays_per_bundle)).max(1);
-        let mut sum = None::<MlpPiece>;
-        for start in range.clone().step_by(chunk) {
-            let piece = self.run(field, supervision, start..(start + chunk).min(range.end))?;
-            match &mut sum {
-                None => sum = Some(piece),
-                Some(sum) => sum.add(piece)?,
-            }
-        }
-        Ok(sum)
+        sum_in_order(
+            range
+                .clone()
+                .step_by(chunk)
+                .map(|start| self.run(field, supervision, start..(start + chunk).min(range.end))),
+        )
     }
 
     /// Runs the forward and backward pass of a range of bundles.
