@@ -180,7 +180,7 @@ fn exact_shifts_and_units_give_equal_bytes() {
         let there = made(&project, &format!("moved-{i}"), &moved(shift), FEW_RAYS);
         assert!(weights(&there) == expected, "moved by {shift}");
         assert_eq!(cube_rays(&there), cube_rays(&here), "moved by {shift}");
-        for view in Views::of_folder(&here.views).unwrap().views {
+        for view in Views::read_folder(&here.views).unwrap().views {
             let file = view.image.unwrap();
             let [a, b] = [&here, &there].map(|made| std::fs::read(made.views.join(&file)).unwrap());
             assert!(a == b, "{file}, moved by {shift}");
@@ -260,7 +260,7 @@ fn exported_points_return_to_the_inputs_coordinates() {
         }
     }
     // Cameras are the input's themselves.
-    let cameras = Views::of_folder(&made.scene.join("train-cameras")).unwrap().views;
+    let cameras = Views::read_folder(&made.scene.join("train-cameras")).unwrap().views;
     let frames = &read(&there.join("transforms.json"))["frames"];
     for (i, view) in cameras.iter().enumerate() {
         for (row, expected) in view.camera.camera_to_world.iter().enumerate() {

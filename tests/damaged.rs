@@ -124,9 +124,7 @@ const DAMAGES: &[Damage] = &[
     ),
     (
         |data| edit_training(data, |list| list["fl_x"] = json!(1e300)),
-        &[
-            "transforms_train.json: frame 0 (./train/r_0): fx is 1e300 pixels where the image's side",
-        ],
+        &["transforms_train.json: frame 0 (./train/r_0): fx is 1e300 pixels, but the image's side"],
     ),
     (
         |data| edit_training(data, |list| list["frames"][3]["cx"] = json!(-1e12)),

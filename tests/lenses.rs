@@ -154,7 +154,7 @@ fn a_fisheye_capture_is_as_good_as_a_pinholes() {
     let of_fisheye = ["-p", "projection=fisheye"];
     let scene = project.artifact("prep", &of_fisheye);
     let is_fisheye = |subtree: &str| {
-        let views = Views::of_folder(&scene.join(subtree)).unwrap();
+        let views = Views::read_folder(&scene.join(subtree)).unwrap();
         views.views.iter().all(|view| view.camera.intrinsics.distortion.is_fisheye())
     };
     assert_eq!(
@@ -167,7 +167,7 @@ fn a_fisheye_capture_is_as_good_as_a_pinholes() {
         stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &train)], &film, &[]).code,
         0
     );
-    let intrinsics = Views::of_folder(&film).unwrap().views[0].camera.intrinsics;
+    let intrinsics = Views::read_folder(&film).unwrap().views[0].camera.intrinsics;
     assert!(intrinsics.distortion.is_none());
     let [across, _] = intrinsics.pinhole_angles();
     assert!((99.0..=100.01).contains(&across), "{across}");
@@ -198,7 +198,7 @@ fn what_a_fisheye_cannot_see_is_masked() {
     let scene = project.path("scene");
     let made = stage("prep", "{}", &[("dataset", &data)], &scene, &[]);
     assert_eq!(made.code, 0, "{}", made.stderr);
-    let views = Views::of_folder(&scene.join("train")).unwrap();
+    let views = Views::read_folder(&scene.join("train")).unwrap();
     let mut masked = 0;
     for view in &views.views {
         let k = view.camera.intrinsics;
@@ -229,7 +229,7 @@ fn what_a_fisheye_cannot_see_is_masked() {
     assert_eq!(made.code, 0, "{}", made.stderr);
     let said = "8 fisheye photographs are resampled for pinhole cameras that see 100.0°×100.0°";
     assert!(notes(&undone).iter().any(|note| note.starts_with(said)), "{:?}", notes(&undone));
-    let views = Views::of_folder(&undone.join("train")).unwrap();
+    let views = Views::read_folder(&undone.join("train")).unwrap();
     assert!(
         views.views.iter().all(|v| v.mask.is_none() && v.camera.intrinsics.distortion.is_none())
     );

@@ -55,5 +55,5 @@ fn a_list_of_poses_is_a_path_and_a_wrong_one_is_refused() {
     let summary = project.artifact("camera-path", &["camera-path"]).join("summary.txt");
     assert!(std::fs::read_to_string(summary).unwrap().contains("2 frames of 48×48, list"));
     project.replace("[1, 0, 0, 1]", "[3, 0, 0, 1]");
-    project.run(&["run", "camera-path"]).fails(2, &["poses", "frame_00001", "no rigid motion"]);
+    project.run(&["run", "camera-path"]).fails(2, &["poses", "frame_00001", "not a rigid motion"]);
 }

@@ -47,7 +47,7 @@ impl Small {
 
     /// Cameras of the training views, of these widths.
     pub fn cameras(&self, output: &str, widths: &[u32]) {
-        let given = Views::of_folder(&self.path("scene/train-cameras")).unwrap();
+        let given = Views::read_folder(&self.path("scene/train-cameras")).unwrap();
         let mut views = Vec::new();
         for (view, &width) in given.views.iter().zip(widths) {
             views.push(View::camera_only(view.camera.resized(width, width)));

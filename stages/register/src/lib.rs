@@ -10,7 +10,7 @@
 use artifact::{FailureExt as _, GivenInput, WARNING, counted, with_warnings};
 use contract::{Input, Output};
 use pixels::{Image, PixelError};
-use poses::{CameraMove, Moved, Options, Pyramid, refine};
+use poses::{CameraMotion, MeanMotion, Options, Pyramid, refine};
 use radiance::{RayField, RenderError};
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -72,7 +72,7 @@ impl Stage for Register {
             let photograph = read(view, input).bad_input(place())?;
             let registered = match photograph {
                 Some(photograph) => {
-                    let image = photograph.over(shown).known();
+                    let image = photograph.over(shown).masked_image();
                     Registered::by(&members, &view.camera, &image, params, shown)
                         .map_err(|e| anyhow::anyhow!("{}: {e}", place()))?
                 }
@@ -117,10 +117,10 @@ impl Registered {
         background: f32,
     ) -> Result<Self, RenderError> {
         let pyramid = Pyramid::new(image, params.smaller);
-        let options = Options { renderings: params.renderings, background, ..Options::default() };
-        let given = refine(field, camera, &pyramid, 0, &Options { renderings: 1, ..options })?;
+        let options = Options { max_renders: params.renderings, background, ..Options::default() };
+        let given = refine(field, camera, &pyramid, 0, &Options { max_renders: 1, ..options })?;
         let mut to = camera.clone();
-        for level in (1..=pyramid.smaller()).rev() {
+        for level in (1..=pyramid.smaller_levels()).rev() {
             to = refine(field, &to, &pyramid, level, &options)?.camera;
         }
         let last = refine(field, &to, &pyramid, 0, &options)?;
@@ -137,7 +137,7 @@ impl Registered {
 
 /// The LR photograph of a view, or the only one there is.
 fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
-    Ok(match view.read_lr(input)? {
+    Ok(match view.read_lr_photograph(input)? {
         Some(photograph) => Some(photograph),
         None => view.read_photograph(input)?,
     })
@@ -145,11 +145,13 @@ fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelErro
 
 /// How far cameras went, and what it was good for; a warning, where they went far.
 fn summary(found: &[Registered]) -> (String, Option<String>) {
-    let moved = Moved::between(found.iter().map(|Registered { from, to, depth, .. }| CameraMove {
-        from,
-        to,
-        depth: *depth,
-    }));
+    let moved = MeanMotion::of_cameras(
+        found.iter().map(|Registered { from, to, depth, .. }| CameraMotion {
+            from,
+            to,
+            depth: *depth,
+        }),
+    );
     let errors: Vec<[f64; 2]> = found.iter().filter_map(|registered| registered.errors).collect();
     let mean =
         |i: usize| (errors.iter().map(|e| e[i]).sum::<f64>() / errors.len().max(1) as f64).sqrt();

@@ -76,7 +76,7 @@ fn a_camera_that_is_off_is_found_and_one_far_off_is_warned_of() {
     ]);
     assert!(text.starts_with("2 of 3 cameras registered: "), "{text}");
     assert!(
-        warning.as_ref().is_some_and(|w| w.contains("(4.4 LR pixels) in the mean, which is far")),
+        warning.as_ref().is_some_and(|w| w.contains("(4.4 LR pixels) on average, which is far")),
         "{warning:?}"
     );
 }

@@ -14,7 +14,7 @@ use std::ops::Range;
 use anyhow::Context as _;
 use artifact::{amount, counted};
 use contract::{Input, Output};
-use fields::{Members, mean, middle};
+use fields::{Members, lower_median, mean};
 use pixels::{PngRows, to_u8};
 use radiance::{Ray, RayField};
 use scene::{
@@ -242,7 +242,7 @@ impl RenderJob<'_> {
         let mut distances: Vec<(f32, f32)> =
             subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect();
         // A mean would invent a surface between two.
-        let (distance, to_z) = middle(&mut distances, |d| d.0).copied().unwrap_or_default();
+        let (distance, to_z) = lower_median(&mut distances, |d| d.0).copied().unwrap_or_default();
         ViewPixel {
             channels: [r, g, b, mean(subs, |(p, _)| p.opacity), distance * to_z, distance],
             colour: std::array::from_fn(|c| mean(subs, |(p, _)| p.colour[c])),

@@ -53,7 +53,7 @@ pub(crate) struct Folder {
 
 impl Folder {
     fn read(path: PathBuf) -> anyhow::Result<Arc<Self>> {
-        let views = Views::of_folder(&path)?;
+        let views = Views::read_folder(&path)?;
         Ok(Arc::new(Self { path, views }))
     }
 

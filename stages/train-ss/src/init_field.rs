@@ -21,7 +21,7 @@ impl<'a> InitField<'a> {
         wanted: &mut FieldFile,
         anchor: DVec3,
     ) -> anyhow::Result<Self> {
-        let file = fields::read_file(input)?;
+        let file = fields::read_field_file(input)?;
         if file.bounds.rounded(anchor) == wanted.bounds {
             wanted.bounds = file.bounds;
         }

@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use artifact::{Failure, GivenInput};
-use poses::Moved;
+use poses::MeanMotion;
 use radiance::{FieldFile, FieldModel};
 use scene::{Bounds, Views};
 use stage::{Context, Progress};
@@ -50,7 +50,7 @@ pub(crate) struct Member<'a> {
 const DONE_WEIGHTS: &str = "field.safetensors";
 const DONE_LOG: &str = "training.json";
 
-fn far_warning(moved: &Moved) -> String {
+fn far_warning(moved: &MeanMotion) -> String {
     format!(
         "pose refinement: cameras have {moved}, which is far: unless the given poses are that far \
         off, train without it"
@@ -250,7 +250,7 @@ impl<'a> Member<'a> {
         log.exposures = supervision.exposures().to_vec();
         log.poses =
             supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
-        log.warnings = moved.filter(Moved::is_far).iter().map(far_warning).collect();
+        log.warnings = moved.filter(MeanMotion::is_far).iter().map(far_warning).collect();
         self.write_weights(trainer, bounds)?;
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS))

@@ -1,5 +1,5 @@
 use pixels::Image;
-use poses::{CameraMove, Moved, Options, Pyramid, refine, take_back_common_motion};
+use poses::{CameraMotion, MeanMotion, Options, Pyramid, refine, remove_common_motion};
 use radiance::{RayField, RenderError};
 use scene::Camera;
 
@@ -59,13 +59,13 @@ impl MovingCameras {
         exposure: impl Fn(usize) -> [f32; 3],
     ) -> Result<(), RenderError> {
         for (i, (camera, photograph)) in self.now.iter_mut().zip(&self.photographs).enumerate() {
-            let smaller = f64::from(photograph.smaller()) * (1.0 - done / OWN_SIZE_SHARE);
+            let smaller = f64::from(photograph.smaller_levels()) * (1.0 - done / OWN_SIZE_SHARE);
             let options =
-                Options { renderings: RENDERINGS_PER_ROUND, background, exposure: exposure(i) };
+                Options { max_renders: RENDERINGS_PER_ROUND, background, exposure: exposure(i) };
             *camera =
                 refine(field, camera, photograph, smaller.max(0.0).ceil() as u32, &options)?.camera;
         }
-        take_back_common_motion(&mut self.now, &self.were);
+        remove_common_motion(&mut self.now, &self.were);
         self.rounds += 1;
         Ok(())
     }
@@ -76,8 +76,8 @@ impl MovingCameras {
         field: &dyn RayField,
         count: usize,
         background: f32,
-    ) -> Result<Moved, RenderError> {
-        let options = Options { renderings: 1, background, ..Options::default() };
+    ) -> Result<MeanMotion, RenderError> {
+        let options = Options { max_renders: 1, background, ..Options::default() };
         let seen = self.now.iter().zip(&self.photographs).take(count);
         let depths = seen
             .map(|(camera, photograph)| Ok(refine(field, camera, photograph, 0, &options)?.depth));
@@ -87,8 +87,8 @@ impl MovingCameras {
             .iter()
             .zip(&self.now)
             .zip(depths)
-            .map(|((from, to), depth)| CameraMove { from, to, depth });
-        Ok(Moved::between(steps))
+            .map(|((from, to), depth)| CameraMotion { from, to, depth });
+        Ok(MeanMotion::of_cameras(steps))
     }
 
     /// All that a resumed training needs.

@@ -2,7 +2,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use pixels::{Image, psnr_of};
-use poses::{Shot, photometric_error};
+use poses::{PosedPhotograph, photometric_error};
 use scene::Camera;
 
 use crate::field_trainer::read;
@@ -89,8 +89,12 @@ impl<'a> Judge<'a> {
         let exposure =
             |i: usize| log.exposures.get(i).map_or([1.0; 3], |exposure| exposure.map(f32::recip));
         let shots = cameras.iter().zip(&self.photographs).enumerate();
-        let shots: Vec<Shot<'_>> = shots
-            .map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) })
+        let shots: Vec<PosedPhotograph<'_>> = shots
+            .map(|(i, (camera, photograph))| PosedPhotograph {
+                camera,
+                photograph,
+                exposure: exposure(i),
+            })
             .collect();
         photometric_error(&*field, &shots, self.background).map_err(fields::rendering_failure)
     }

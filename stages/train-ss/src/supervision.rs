@@ -1,7 +1,7 @@
 use std::io;
 
 use counter_rng::CounterRng;
-use poses::Moved;
+use poses::MeanMotion;
 use radiance::{Ray, RayField};
 use scene::{Background, Camera, CameraRays};
 use schemars::JsonSchema;
@@ -147,7 +147,7 @@ impl Supersampling {
     pub(crate) fn moved<'a>(
         &self,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
-    ) -> anyhow::Result<Option<Moved>> {
+    ) -> anyhow::Result<Option<MeanMotion>> {
         let Some(moving) = &self.learnt.moving else { return Ok(None) };
         let moved = moving
             .moved(&*field()?, self.lr_views(), self.background.shown())

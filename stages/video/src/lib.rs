@@ -78,7 +78,7 @@ fn make_film(
     folder: &Path,
     prefix: &str,
 ) -> anyhow::Result<()> {
-    let views = Views::of_folder(folder)?;
+    let views = Views::read_folder(folder)?;
     if views.views.iter().any(|view| size_of_view(view) != size_of_view(&views.views[0])) {
         return Err(Failure::BadInput(
             "views have different sizes; set render-depth.size".to_owned(),

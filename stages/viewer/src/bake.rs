@@ -23,7 +23,7 @@ const MIN_OPACITY: f32 = 0.5 / 255.0;
 /// Field that is baked, a trait for tests. Positions are those of the unit cube.
 pub(crate) trait Source: Sync {
     /// True if density is possible between two corners.
-    fn may_hold(&self, low: [f32; 3], high: [f32; 3]) -> bool;
+    fn has_occupied_cell(&self, low: [f32; 3], high: [f32; 3]) -> bool;
     /// Evaluates density, raw colour and view features at some positions.
     fn sample(&self, positions: &[[f32; 3]]) -> Vec<PointSample>;
     /// Evaluates the view network's raw colours for view features and some directions.
@@ -35,8 +35,8 @@ pub(crate) trait Source: Sync {
 }
 
 impl Source for Field {
-    fn may_hold(&self, low: [f32; 3], high: [f32; 3]) -> bool {
-        Self::may_hold(self, low, high)
+    fn has_occupied_cell(&self, low: [f32; 3], high: [f32; 3]) -> bool {
+        Self::has_occupied_cell(self, low, high)
     }
 
     fn sample(&self, positions: &[[f32; 3]]) -> Vec<PointSample> {
@@ -115,7 +115,7 @@ impl<S: Source> Baker<'_, S> {
             let low = brick.map(|c| (c * SIDE) as f32 / self.resolution as f32);
             // The upper corner itself belongs to the next brick.
             let high = brick.map(|c| ((c + 1) * SIDE) as f32 / self.resolution as f32 - 1e-6);
-            self.sources.iter().any(|source| source.may_hold(low, high))
+            self.sources.iter().any(|source| source.has_occupied_cell(low, high))
         })
     }
 
@@ -360,7 +360,7 @@ pub(crate) mod tests {
     }
 
     impl Source for Ball {
-        fn may_hold(&self, _low: [f32; 3], _high: [f32; 3]) -> bool {
+        fn has_occupied_cell(&self, _low: [f32; 3], _high: [f32; 3]) -> bool {
             true
         }
 

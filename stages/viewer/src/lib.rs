@@ -31,7 +31,7 @@ use base64::Engine as _;
 use contract::{Input, Output};
 use pixels::{Filter, Rgba8, encode_png, resize_pillow};
 use radiance::{Field, FieldFile, FieldModel};
-use scene::{Bounds, Camera, Intrinsics, Space, Views, undistorted};
+use scene::{Bounds, Camera, Intrinsics, Space, Views, undistort_image};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
@@ -114,7 +114,7 @@ fn write_page(
     check_space(&file.bounds)?;
     let folder = node.inputs.get("scene").map(|input| run.folder_of(input));
     let folder = folder.context("the field's training has no input `scene`")?;
-    let views = Views::of_folder(&folder)?;
+    let views = Views::read_folder(&folder)?;
     let cameras: Vec<&Camera> = views.views.iter().map(|view| &view.camera).collect();
     let resolution = params.resolution as usize;
     let observers = visibility::observers(&cameras, resolution);
@@ -168,7 +168,7 @@ fn check_space(bounds: &Bounds) -> Result<(), Failure> {
 /// Reads all fields of an artifact.
 fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
     let input = GivenInput::open("field", folder)?;
-    let file = fields::read_file(&input)?;
+    let file = fields::read_field_file(&input)?;
     let FieldModel::Grid(architecture) = file.field else {
         let message = "the paper's field can't be baked; train with `field: grid` to view it";
         return Err(Failure::BadInput(message.to_owned()).into());
@@ -194,7 +194,7 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
             Some(file) if has_photograph => {
                 let image = views.read_over(&folder.join(file))?.to_rgba8();
                 let image = match pinhole {
-                    Some(pinhole) => undistorted(&image, &intrinsics, &pinhole),
+                    Some(pinhole) => undistort_image(&image, &intrinsics, &pinhole),
                     None => image,
                 };
                 Some(shrunk(image, params.photograph_width as usize))

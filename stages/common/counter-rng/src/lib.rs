@@ -1,5 +1,5 @@
-//! Random numbers as a function of a seed, a purpose and a counter (Salmon et al. 2011), so that
-//! any thread may draw any of them at any time.
+//! Random numbers as a function of seed, stream (one per use) and counter (Salmon et al. 2011), so
+//! that threads draw them in any order.
 //!
 //! ```
 //! use counter_rng::{CounterRng, uniform};
@@ -17,21 +17,21 @@ fn scramble(mut x: u64) -> u64 {
     x ^ (x >> 31)
 }
 
-/// A number in [0, 1) that depends on a seed, a purpose and a counter alone.
+/// Returns a number in [0, 1) that depends only on seed, stream and counter.
 #[inline]
-pub fn uniform(seed: u64, purpose: u64, counter: u64) -> f32 {
-    CounterRng::new(seed, purpose, counter).uniform()
+pub fn uniform(seed: u64, stream: u64, counter: u64) -> f32 {
+    CounterRng::new(seed, stream, counter).uniform()
 }
 
-/// A sequence of random numbers that depends on a seed, a purpose and a counter alone.
+/// Sequence of random numbers that depends only on seed, stream and counter.
 #[derive(Clone, Debug)]
 pub struct CounterRng(u64);
 
 impl CounterRng {
-    /// Starts the sequence.
+    /// Starts a sequence.
     #[inline]
-    pub fn new(seed: u64, purpose: u64, counter: u64) -> Self {
-        Self(scramble(scramble(seed ^ purpose.wrapping_mul(0xD1B5_4A32_D192_ED03)) ^ counter))
+    pub fn new(seed: u64, stream: u64, counter: u64) -> Self {
+        Self(scramble(scramble(seed ^ stream.wrapping_mul(0xD1B5_4A32_D192_ED03)) ^ counter))
     }
 
     #[inline]
@@ -40,13 +40,13 @@ impl CounterRng {
         scramble(self.0)
     }
 
-    /// In [0, 1).
+    /// Draws a number in [0, 1).
     #[inline]
     pub fn uniform(&mut self) -> f32 {
         (self.next() >> 40) as f32 / (1u64 << 24) as f32
     }
 
-    /// In 0..bound.
+    /// Draws an integer in 0..bound.
     #[inline]
     pub fn below(&mut self, bound: u64) -> u64 {
         ((u128::from(self.next()) * u128::from(bound)) >> 64) as u64
@@ -57,9 +57,9 @@ impl CounterRng {
 mod tests {
     use super::CounterRng;
 
-    /// Results that are made anew must be those made before.
+    /// Other draws would change every result.
     #[test]
-    fn draws_stay_as_they_are() {
+    fn draws_are_pinned() {
         let mut rng = CounterRng::new(7, 1, 3);
         assert_eq!(rng.uniform(), 16_024_985.0 / 16_777_216.0);
         assert_eq!(rng.below(1000), 106);

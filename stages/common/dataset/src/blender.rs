@@ -173,7 +173,7 @@ mod tests {
             ),
             (with_pose("1").replace("0.7", "NaN"), "camera_angle_x is NaN"),
             (format!("\u{feff}\u{feff}{}", with_pose("1")), "line 1"),
-            (with_pose("2"), "no rigid motion"),
+            (with_pose("2"), "not a rigid motion"),
             (with_pose("1").replace("0.7", "0"), "focal length inf"),
             (with_pose("1").replace("0.7", "3.2"), "between 0 and π"),
             (with_pose("1").replace("./train/r_0", "../r_0"), "not a path inside"),
@@ -216,10 +216,10 @@ mod tests {
         let sheared = [[1.0, 0.2, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         for (axes, words) in [
             (half([1.0, 1.0, -1.0]), "camera_to_world is a reflection (its determinant is -1.000)"),
-            (half([1.0, 1.0, 1.2]), "camera_to_world is no rigid motion"),
-            (half([0.0; 3]), "camera_to_world is no rigid motion"),
-            (sheared, "camera_to_world is no rigid motion"),
-            (sheared.map(|row| row.map(|x| 0.1 * x)), "camera_to_world is no rigid motion"),
+            (half([1.0, 1.0, 1.2]), "camera_to_world is not a rigid motion"),
+            (half([0.0; 3]), "camera_to_world is not a rigid motion"),
+            (sheared, "camera_to_world is not a rigid motion"),
+            (sheared.map(|row| row.map(|x| 0.1 * x)), "camera_to_world is not a rigid motion"),
         ] {
             let message = Dataset::read(folder(&with_axes(axes)).path()).unwrap_err().to_string();
             let place = "transforms_train.json: frame 0 (./train/r_0): transform_matrix: ";

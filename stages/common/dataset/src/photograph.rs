@@ -8,7 +8,7 @@ use pixels::{
     COLOUR_CHANNELS, MAX_PIXELS, Mask, PixelError, Rgba8, exr_reading_bytes, exr_size, read_exr,
     srgb_from_linear, to_u8,
 };
-use scene::{Intrinsics, undistorted};
+use scene::{Intrinsics, undistort_image};
 
 use crate::clipping::Clipping;
 use crate::error::DatasetError;
@@ -261,7 +261,7 @@ impl Frame {
     /// Returns an image of the photograph's pixels as the camera sees it.
     fn seen(&self, image: Rgba8) -> Rgba8 {
         match &self.pinhole {
-            Some(pinhole) => undistorted(&image, &self.taken_with, pinhole),
+            Some(pinhole) => undistort_image(&image, &self.taken_with, pinhole),
             None => image,
         }
     }
@@ -457,8 +457,11 @@ pub(crate) mod tests {
         assert!(pinhole.fx != intrinsics.fx);
         let expected =
             image_of(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
-        let found =
-            undistorted(&image_of(&|x, y| ray_through(&intrinsics, x, y)), &intrinsics, &pinhole);
+        let found = undistort_image(
+            &image_of(&|x, y| ray_through(&intrinsics, x, y)),
+            &intrinsics,
+            &pinhole,
+        );
         let worst =
             found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst <= 3, "{worst}");

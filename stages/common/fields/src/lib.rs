@@ -1,9 +1,8 @@
-//! Whatever radiance field an artifact holds, ready to cast rays through: what stages that render
-//! have in common.
+//! Loader of field artifacts for stages that render: hash-grid fields and the paper's field.
 //!
-//! * [`Members`]: all fields of an artifact. What they render is averaged: each errs in its own way
-//!   where images leave it open.
-//! * [`mean`], [`middle`]: what a pixel shows of several fields or rays.
+//! * [`Members`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
+//!   cancels errors where images don't determine the scene (docs/design/011).
+//! * [`mean`], [`lower_median`]: a pixel's value from several fields or rays.
 //!
 //! ```no_run
 //! use artifact::GivenInput;
@@ -12,90 +11,89 @@
 //! println!("{} fields over {:?}", members.fields.len(), members.file.background);
 //! # Ok::<(), artifact::Failure>(())
 //! ```
-use std::path::PathBuf;
 
 use artifact::{Failure, FailureExt as _, GivenInput};
 use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Pixel, Ray, RayField, RenderError};
 
-/// Variables of the environment that change what fields render, whether this was built with
-/// libtorch or not. libtorch's own lets CUDA's products use TensorFloat-32, with ten bits behind
-/// the point. It is off unless it is 1.
+/// Environment variables that change renders, in builds with and without libtorch. If 1, libtorch's
+/// variable lets CUDA multiply in TensorFloat-32, with a mantissa of ten bits.
 pub const ENVIRONMENT: &[&str] = &["TORCH_ALLOW_TF32_CUBLAS_OVERRIDE"];
 
-/// The fields of an artifact.
+/// Fields of an artifact.
 pub struct Members {
-    /// What the artifact says of them.
+    /// Description of the fields.
     pub file: FieldFile,
-    /// Each of them, on the device asked for.
+    /// Fields on the requested device.
     pub fields: Vec<Box<dyn RayField>>,
 }
 
 impl Members {
-    /// Reads all of an input, whichever field it is, onto `cpu` or `cuda:N`.
+    /// Reads all fields of an input onto device `cpu` or `cuda:N`.
     ///
     /// # Errors
-    /// [`Failure::BadInput`] where the input can't be read, [`Failure::Usage`] where the device
-    /// can't be used.
+    /// [`Failure::BadInput`] if the input can't be read, [`Failure::Usage`] if the device can't be
+    /// used.
     pub fn read(input: &GivenInput, device: &str) -> Result<Self, Failure> {
-        let file = read_file(input)?;
+        let file = read_field_file(input)?;
         let fields = read_all(&file, input, device)?;
         Ok(Self { file, fields })
     }
 }
 
-/// Reads and checks what an input says of its fields.
+/// Reads and checks the description of an input's fields.
 ///
 /// # Errors
-/// [`Failure::BadInput`] with file and number.
-pub fn read_file(input: &GivenInput) -> Result<FieldFile, Failure> {
+/// [`Failure::BadInput`] with the file and the number that is out of range.
+pub fn read_field_file(input: &GivenInput) -> Result<FieldFile, Failure> {
     let file: FieldFile = input.read_json(FIELD_FILE)?;
     file.check().bad_input(input.path(FIELD_FILE).display())?;
     Ok(file)
 }
 
-/// The mean of what all members see. The distance that half of the light stops at is the middle one
-/// of theirs: a mean would invent a surface between two.
+/// Renders the mean of all members. The median depth is the median of theirs: a mean would invent a
+/// surface between two.
 impl RayField for Members {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
-        let rendered: Vec<Vec<Pixel>> =
+        let renders: Vec<Vec<Pixel>> =
             self.fields.iter().map(|field| field.render(rays)).collect::<Result<_, _>>()?;
-        let mut seen = Vec::with_capacity(rendered.len());
+        let mut members = Vec::with_capacity(renders.len());
         let pixels: Vec<Pixel> = (0..rays.len())
             .map(|ray| {
-                seen.clear();
-                seen.extend(rendered.iter().map(|pixels| pixels[ray]));
-                together(&mut seen)
+                members.clear();
+                members.extend(renders.iter().map(|pixels| pixels[ray]));
+                average_pixels(&mut members)
             })
             .collect();
         if pixels.iter().all(Pixel::is_finite) { Ok(pixels) } else { Err(RenderError::NotFinite) }
     }
 }
 
-/// What fields see along a ray, as one.
-fn together(seen: &mut [Pixel]) -> Pixel {
+/// Combines several fields' renders of one ray.
+fn average_pixels(pixels: &mut [Pixel]) -> Pixel {
     Pixel {
-        colour: [0, 1, 2].map(|c| mean(seen, |p| p.colour[c])),
-        premultiplied: [0, 1, 2].map(|c| mean(seen, |p| p.premultiplied[c])),
-        opacity: mean(seen, |p| p.opacity),
-        depth: mean(seen, |p| p.depth),
-        median_depth: middle(seen, |p| p.median_depth).map_or(0.0, |p| p.median_depth),
+        colour: [0, 1, 2].map(|c| mean(pixels, |p| p.colour[c])),
+        premultiplied: [0, 1, 2].map(|c| mean(pixels, |p| p.premultiplied[c])),
+        opacity: mean(pixels, |p| p.opacity),
+        depth: mean(pixels, |p| p.depth),
+        median_depth: lower_median(pixels, |p| p.median_depth).map_or(0.0, |p| p.median_depth),
     }
 }
 
-/// The mean of one number over all items. Pixels take it over rays or fields.
+/// Returns the mean of one number over all items; 0 if there are none.
 pub fn mean<T>(items: &[T], number: impl Fn(&T) -> f32) -> f32 {
     let share = 1.0 / items.len().max(1) as f32;
     share * items.iter().map(number).sum::<f32>()
 }
 
-/// The one in the middle by a distance; of two the nearer. NaN lies beyond all numbers, on the side
-/// of its sign.
-pub fn middle<T>(items: &mut [T], distance: impl Fn(&T) -> f32) -> Option<&T> {
+/// Returns the item with the median distance, of two the nearer. NaN is beyond all numbers, on the
+/// side of its sign.
+pub fn lower_median<T>(items: &mut [T], distance: impl Fn(&T) -> f32) -> Option<&T> {
     items.sort_unstable_by(|a, b| distance(a).total_cmp(&distance(b)));
     items.get(items.len().saturating_sub(1) / 2)
 }
 
-/// A failure to render, with its exit code: 4 where numbers went wrong.
+/// Converts a render error to a failure with its exit code: 4 if numbers aren't finite, otherwise
+/// 1.
 pub fn rendering_failure(error: RenderError) -> anyhow::Error {
     match error {
         RenderError::NotFinite => Failure::Numerical(error.to_string()).into(),
@@ -110,11 +108,12 @@ fn read_all(
 ) -> Result<Vec<Box<dyn RayField>>, Failure> {
     let paths = (0..file.members).map(|i| input.path(&FieldFile::member(i)));
     match file.field {
-        FieldModel::Grid(architecture) => {
-            let read =
-                |path: PathBuf| Field::read(&path, architecture, file.bounds).bad_input("field");
-            paths.map(|path| grid_on(device, read(path)?)).collect()
-        }
+        FieldModel::Grid(architecture) => paths
+            .map(|path| {
+                let field = Field::read(&path, architecture, file.bounds).bad_input("field")?;
+                move_grid(field, device)
+            })
+            .collect(),
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
             let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
@@ -128,34 +127,29 @@ fn read_all(
         }
         #[cfg(not(feature = "torch"))]
         FieldModel::Mlp(_) => {
-            let message =
-                "field: mlp needs libtorch, and this was built without it; run `make build`";
+            let message = "field: mlp needs libtorch, and this program was built without libtorch; \
+                run `make build`";
             Err(Failure::Usage(message.to_owned()))
         }
     }
 }
 
-/// A grid: on the CPU as it is, elsewhere through libtorch.
-#[cfg(feature = "torch")]
-fn grid_on(device: &str, field: Field) -> Result<Box<dyn RayField>, Failure> {
+/// Moves a grid field to a device other than the CPU by libtorch.
+fn move_grid(field: Field, device: &str) -> Result<Box<dyn RayField>, Failure> {
     if device == "cpu" {
         return Ok(Box::new(field));
     }
-    let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
-    nets::deterministic();
-    let on_device = torch_field::TorchGrid::new(&field, device).usage("--device")?;
-    Ok(Box::new(on_device))
-}
-
-#[cfg(not(feature = "torch"))]
-fn grid_on(device: &str, field: Field) -> Result<Box<dyn RayField>, Failure> {
-    if device == "cpu" {
-        return Ok(Box::new(field));
+    #[cfg(feature = "torch")]
+    {
+        let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+        nets::deterministic();
+        Ok(Box::new(torch_field::TorchGrid::new(&field, device).usage("--device")?))
     }
-    let message = format!(
-        "--device {device}: it needs libtorch, and this was built without it; run `make build`"
-    );
-    Err(Failure::Usage(message))
+    #[cfg(not(feature = "torch"))]
+    Err(Failure::Usage(format!(
+        "--device {device} needs libtorch, and this program was built without libtorch; run `make \
+        build`"
+    )))
 }
 
 #[cfg(test)]
@@ -186,7 +180,7 @@ mod tests {
         members.render(&[Ray::default()])
     }
 
-    /// What isn't finite has exit code 4, and what a library refuses 1.
+    /// Pixels that aren't finite have exit code 4, a library's error 1.
     #[test]
     fn rendering_failures_have_exit_codes() {
         assert_eq!(seen(0.5).unwrap()[0].opacity, 0.5);
@@ -194,7 +188,7 @@ mod tests {
         assert_eq!(artifact::exit_code(&failure), 4);
         let refused = rendering_failure(RenderError::Backend("out of memory".to_owned()));
         assert_eq!(artifact::exit_code(&refused), 1);
-        assert_eq!(refused.to_string(), "the field can't be rendered: out of memory");
+        assert_eq!(refused.to_string(), "cannot render the field: out of memory");
     }
 
     /// Order and ties change nothing.
@@ -217,17 +211,17 @@ mod tests {
                 let mut items = distances.to_vec();
                 items.rotate_left(turn);
                 let mut mirrored: Vec<f32> = items.iter().rev().copied().collect();
-                assert_eq!(middle(&mut items, |d| *d).copied(), expected, "{distances:?}");
-                assert_eq!(middle(&mut mirrored, |d| *d).copied(), expected, "{distances:?}");
+                assert_eq!(lower_median(&mut items, |d| *d).copied(), expected, "{distances:?}");
+                assert_eq!(lower_median(&mut mirrored, |d| *d).copied(), expected, "{distances:?}");
             }
         }
     }
 
-    /// The middle one comes whole: what belongs to its distance belongs to it.
+    /// The median item is returned whole, not its distance alone.
     #[test]
     fn the_middle_one_keeps_what_belongs_to_it() {
         let mut items = [(3.0, "far"), (1.0, "near"), (2.0, "middle")];
-        assert_eq!(middle(&mut items, |item| item.0), Some(&(2.0, "middle")));
+        assert_eq!(lower_median(&mut items, |item| item.0), Some(&(2.0, "middle")));
         assert_eq!(mean(&items, |item| item.0 + 1.0), 3.0);
     }
 
@@ -246,8 +240,8 @@ mod tests {
         Ray { origin: [x, 0.1, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] }
     }
 
-    /// All members are read, and what they see is averaged; one that is missing, and numbers that
-    /// can't be, are refused.
+    /// All members are read and their renders averaged; a missing member or a number out of range
+    /// is an error.
     #[test]
     fn members_are_averaged() {
         let bounds =
@@ -276,7 +270,7 @@ mod tests {
                     && (pixel.opacity - mean(|p| p.opacity)).abs() < 1e-6
             );
             assert!((pixel.depth - mean(|p| p.depth)).abs() < 1e-5 && apart[0][i] != apart[1][i]);
-            // Of two the nearer: between them there may be nothing.
+            // Of two the nearer: space between them may be empty.
             let nearer = apart[0][i].median_depth.min(apart[1][i].median_depth);
             assert_eq!(pixel.median_depth, nearer);
         }

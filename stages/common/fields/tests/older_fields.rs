@@ -1,6 +1,6 @@
-//! Fields that an older build trained render as they did then, or are refused. The files in
-//! `goldens/` are of the demo scene at 16 px: commit 5af0c3e made `mlp`, the first commit with
-//! format 2 `grid`.
+//! Fields trained by an older build render unchanged, or are rejected. The files in `goldens/` are
+//! of the demo scene at 16 px: `mlp` is from commit 5af0c3e, `grid` from the first commit with
+//! format 2.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -15,7 +15,7 @@ fn goldens() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/goldens"))
 }
 
-/// A folder like the artifact that the older build made; weights are kept compressed.
+/// Creates a field artifact like the older build's from compressed weights.
 fn artifact(name: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     std::fs::copy(goldens().join(format!("{name}.json")), folder.path().join(FIELD_FILE)).unwrap();
@@ -36,8 +36,7 @@ fn rays(camera: &Camera) -> Vec<Ray> {
     (0..width * height).map(|i| ray(camera, i)).collect()
 }
 
-/// Compares a render with the EXR file that the older build wrote, whose colours have half
-/// precision.
+/// Compares a render with the older build's EXR file, whose colours have half precision.
 fn renders_as_before(name: &str) {
     let folder = artifact(name);
     let members = Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").unwrap();
@@ -72,7 +71,7 @@ fn a_grid_of_the_first_format_is_refused() {
     let file = folder.path().join(FIELD_FILE);
     let mut description: serde_json::Value =
         serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
-    // Such files don't say their format.
+    // Files of the first format have no `format`.
     description.as_object_mut().unwrap().remove("format").unwrap();
     std::fs::write(&file, description.to_string()).unwrap();
     let error =
@@ -80,8 +79,7 @@ fn a_grid_of_the_first_format_is_refused() {
     let line = format!("{error:#}");
     assert!(
         line.ends_with(
-            "another build trained this field, in format 1; this build reads \
-        format 2: train it again"
+            "field has format 1 of another build; this build reads format 2: train the field again"
         ),
         "{line}"
     );

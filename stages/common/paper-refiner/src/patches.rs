@@ -120,7 +120,7 @@ fn matching_patches(
         for (r, other) in surfaces.iter().enumerate() {
             let Some(visibility) = surface.visibility(x + dx, y + dy, other) else { continue };
             let truth = &references[r].truth;
-            let [column, row] = visibility.place;
+            let [column, row] = visibility.position;
             let corner =
                 (matching_start(column, dx, truth.width), matching_start(row, dy, truth.height));
             candidates.push((visibility.cosine.max(0.0) * visibility.detail.min(1.0), r, corner));

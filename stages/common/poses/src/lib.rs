@@ -1,21 +1,20 @@
-//! Pose refinement: moves cameras until what a field renders meets their photographs.
+//! Pose refinement: moves cameras until renders of a field match their photographs
+//! (docs/design/025).
 //!
-//! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the pixels of each that say
-//!   where it was taken from.
-//! * [`refine`]: one camera, at one size, by Gauss and Newton with Levenberg's and Marquardt's
+//! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the informative pixels of
+//!   each.
+//! * [`refine`]: refines one camera at one size by Gauss-Newton steps with Levenberg-Marquardt
 //!   damping.
-//! * [`Moved`]: how far cameras have gone, in words for a log; [`photometric_error`]: whether that
-//!   was for the better.
-//! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that
-//!   photographs could tell.
+//! * [`MeanMotion`]: mean motion of cameras, for a log; [`photometric_error`]: quality of poses.
+//! * [`remove_common_motion`]: removes the motion that all cameras share, which photographs can't
+//!   tell from a motion of the scene.
 //!
-//! A photograph's own gradient says how each of its pixels would change if what it shows moved in
-//! the image, and the rendered depth how that moves with the camera (Lucas and Kanade 1981; the
-//! template's gradient, as in Baker and Matthews 2004). So a step takes one rendering of some
-//! thousand pixels, and any field will do that renders colour and depth: nothing is differentiated
-//! but photographs.
+//! A photograph's gradient gives the change of each pixel with a motion in the image; the rendered
+//! depth gives the motion in the image with that of the camera (Lucas and Kanade 1981; the
+//! template's gradient, as in Baker and Matthews 2004). A step renders a few thousand pixels and
+//! needs no derivative of the field, so any field that renders colour and depth will do.
 //!
-//! Lengths are in scene units, angles in radians, camera axes as `scene` has them (x right, y up,
+//! Lengths are in scene units, angles in radians; camera axes are those of `scene` (x right, y up,
 //! looking along -z).
 //!
 //! ```
@@ -33,12 +32,10 @@
 //! let pyramid = Pyramid::new(&photograph, 2);
 //! let refined = refine(&field, &camera, &pyramid, 0, &Default::default()).unwrap();
 //! let Refinement { camera: found, before, after, .. } = refined;
-//! // A grey wall says nothing of where it was seen from.
+//! // A grey wall has no gradient.
 //! assert!(found == camera && before == after);
 //! ```
 
-mod cast;
-mod huber;
 mod normal_matrix;
 mod photometric;
 mod pyramid;
@@ -46,49 +43,47 @@ mod pyramid;
 use std::fmt;
 
 use glam::{DMat3, DQuat, DVec3};
-use radiance::{Ray, RayField, RenderError};
-use scene::{Camera, length, pose_of};
+use radiance::{Pixel, Ray, RayField, RenderError};
+use scene::{Camera, CameraRay, length, pose_of};
 
-use crate::cast::cast;
-use crate::huber::{HUBER_ERROR, huber};
-use crate::normal_matrix::NormalMatrix;
-use crate::pyramid::{PyramidLevel, Telling};
+use crate::normal_matrix::{HUBER_THRESHOLD, NormalMatrix, huber};
+use crate::pyramid::{InformativePixel, PyramidLevel};
 
-pub use photometric::{Shot, photometric_error};
+pub use photometric::{PosedPhotograph, photometric_error};
 pub use pyramid::Pyramid;
 
-/// How to refine.
+/// Options of [`refine`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
-    /// Renderings at most: one to begin with, and one for each step tried.
-    pub renderings: u32,
-    /// What is behind the scene.
+    /// Maximum number of renders: one at the start, then one per step tried.
+    pub max_renders: u32,
+    /// Grey level of the background.
     pub background: f32,
-    /// What the photograph's channels are multiplied by to have the field's exposure.
+    /// Factor per channel from the photograph's exposure to the field's.
     pub exposure: [f32; 3],
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { renderings: 6, background: 1.0, exposure: [1.0; 3] }
+        Self { max_renders: 6, background: 1.0, exposure: [1.0; 3] }
     }
 }
 
-/// A camera that was moved.
+/// Result of [`refine`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Refinement {
-    /// Where it is now.
+    /// Refined camera.
     pub camera: Camera,
-    /// Mean robust error of the pixels looked at, where it was: Huber's, of colours.
+    /// Mean Huber error of colours before refinement.
     pub before: f64,
-    /// The same where it is.
+    /// Mean Huber error of colours after refinement.
     pub after: f64,
-    /// Middle depth of what is seen from where it is, in scene units; none where nothing is.
+    /// Median depth in the refined view, in scene units; `None` if no pixel has a depth.
     pub depth: Option<f64>,
 }
 
-/// Moves a camera, whose intrinsics have any size, to where a pyramid's level is met best. It stays
-/// where that says too little, and never ends where it is met worse.
+/// Moves a camera to the pose with the least error at a pyramid's level. Its intrinsics may have
+/// any size. The camera is unchanged if too few pixels are informative, and the error never grows.
 pub fn refine(
     field: &dyn RayField,
     camera: &Camera,
@@ -97,15 +92,15 @@ pub fn refine(
     options: &Options,
 ) -> Result<Refinement, RenderError> {
     let level = &pyramid.levels[(level as usize).min(pyramid.levels.len() - 1)];
-    let start = Equations::of(field, camera, level, options)?;
+    let start = Equations::linearised(field, camera, level, options)?;
     let before = start.error;
     let (mut best, mut equations, mut damping) = (camera.clone(), start, FIRST_DAMPING);
-    for _ in 1..options.renderings {
+    for _ in 1..options.max_renders {
         let Some(motion) = equations.solve(damping) else { break };
         let moved = motion.applied_to(&best);
-        let there = Equations::of(field, &moved, level, options)?;
-        if there.error < equations.error {
-            (best, equations, damping) = (moved, there, damping / 4.0);
+        let next = Equations::linearised(field, &moved, level, options)?;
+        if next.error < equations.error {
+            (best, equations, damping) = (moved, next, damping / 4.0);
         } else {
             damping *= 16.0;
         }
@@ -113,122 +108,136 @@ pub fn refine(
     Ok(Refinement { camera: best, before, after: equations.error, depth: equations.depth })
 }
 
-/// Fewer pixels say nothing.
-const LEAST_PIXELS: usize = 24;
-/// Damping of the first step, as a share of the equations' own diagonal.
+/// Minimum number of pixels with a depth; chosen by hand.
+const MIN_PIXELS: usize = 24;
+/// Damping of the first step, relative to the equations' diagonal; chosen by hand.
 const FIRST_DAMPING: f64 = 1e-3;
-/// Of a pixel that stops less, no place is known. It is low since edges that are still soft have to
-/// pull from both sides: their inner halves alone would make everything too large, and cameras back
-/// away.
-const LEAST_PLACE_OPACITY: f32 = 0.02;
+/// Minimum opacity of a pixel whose depth is used. Edges that are still soft have to pull from both
+/// sides: with their opaque halves alone cameras backed away by 6 % (docs/design/025).
+const MIN_DEPTH_OPACITY: f32 = 0.02;
 
-/// Least squares for a small motion of the camera, linear about where it is.
+/// Least-squares equations of a small camera motion, linearised at the current pose.
 struct Equations {
     matrix: NormalMatrix,
-    /// Right-hand sides of turning and shifting.
+    /// Right-hand sides of rotation and translation.
     right: [DVec3; 2],
-    /// Middle depth of what is seen, where anything is.
+    /// Median depth of the pixels, if any has one.
     depth: Option<f64>,
-    /// Unit of translation: that depth, so that turning and moving weigh alike.
+    /// Unit of translation: the median depth, so that rotation and translation have equal weight.
     unit: f64,
+    /// Mean Huber error of colours.
     error: f64,
+    /// Number of pixels with a depth.
     pixels: usize,
 }
 
 impl Equations {
-    fn of(
+    fn linearised(
         field: &dyn RayField,
         camera: &Camera,
         level: &PyramidLevel,
         options: &Options,
     ) -> Result<Self, RenderError> {
         let camera = camera.resized(level.width as u32, level.height as u32);
-        let cast = |pixel: &Telling| cast(&camera, pixel.centre(), options.background);
-        let rays: Vec<Ray> = level.telling.iter().map(|pixel| cast(pixel).1).collect();
-        let rendered = field.render(&rays)?;
-        let depths: Vec<Option<f64>> = (level.telling.iter().zip(&rendered))
-            .map(|(pixel, seen)| {
-                let distance = if seen.opacity > 0.5 { seen.median_depth } else { seen.depth };
-                let depth = f64::from(distance) * camera.depth_per_distance(&cast(pixel).0);
-                (seen.opacity > LEAST_PLACE_OPACITY && depth.is_finite() && depth > 0.0)
-                    .then_some(depth)
-            })
+        let lines: Vec<CameraRay> =
+            level.pixels.iter().map(|p| camera.ray(p.x as f64 + 0.5, p.y as f64 + 0.5)).collect();
+        let rays: Vec<Ray> =
+            lines.iter().map(|line| Ray::new(line, [options.background; 3])).collect();
+        let renders = field.render(&rays)?;
+        let depths: Vec<Option<f64>> = (0..renders.len())
+            .map(|i| trusted_depth(&renders[i], camera.depth_per_distance(&lines[i])))
             .collect();
         let mut sorted: Vec<f64> = depths.iter().flatten().copied().collect();
         sorted.sort_unstable_by(f64::total_cmp);
         let depth = sorted.get(sorted.len() / 2).copied();
-        let unit = depth.unwrap_or(1.0);
-        let mut sums = Self {
+        let mut equations = Self {
             matrix: NormalMatrix::ZERO,
             right: [DVec3::ZERO; 2],
             depth,
-            unit,
+            unit: depth.unwrap_or(1.0),
             error: 0.0,
             pixels: 0,
         };
-        for ((pixel, seen), depth) in level.telling.iter().zip(&rendered).zip(&depths) {
-            let errors = [0, 1, 2]
-                .map(|c| f64::from(pixel.colour[c] * options.exposure[c] - seen.colour[c]));
-            sums.error += errors.iter().map(|e| huber(*e)).sum::<f64>();
-            let Some(depth) = *depth else { continue };
-            sums.pixels += 1;
-            let motion = image_motion(&camera, pixel.centre(), depth, unit);
-            for (c, error) in errors.into_iter().enumerate() {
-                let [right, down] = pixel.gradient[c].map(|g| f64::from(g * options.exposure[c]));
-                // What is seen would have to move by the opposite of the error over the gradient.
-                let row = [0, 1].map(|part| -(motion[0][part] * right + motion[1][part] * down));
-                let weight =
-                    if error.abs() > HUBER_ERROR { HUBER_ERROR / error.abs() } else { 1.0 };
-                sums.matrix.add(weight, row);
-                for (sum, part) in sums.right.iter_mut().zip(row) {
-                    *sum += weight * error * part;
-                }
-            }
+        for (i, pixel) in level.pixels.iter().enumerate() {
+            equations.add_pixel(&camera, pixel, renders[i].colour, depths[i], options.exposure);
         }
-        sums.error /= (3 * level.telling.len()).max(1) as f64;
-        Ok(sums)
+        equations.error /= (3 * level.pixels.len()).max(1) as f64;
+        Ok(equations)
     }
 
-    /// The motion that they ask for; none where they say too little.
+    /// Adds a pixel's error and, if it has a depth, its rows.
+    fn add_pixel(
+        &mut self,
+        camera: &Camera,
+        pixel: &InformativePixel,
+        rendered: [f32; 3],
+        depth: Option<f64>,
+        exposure: [f32; 3],
+    ) {
+        let errors = [0, 1, 2].map(|c| f64::from(pixel.colour[c] * exposure[c] - rendered[c]));
+        self.error += errors.iter().map(|e| huber(*e)).sum::<f64>();
+        let Some(depth) = depth else { return };
+        self.pixels += 1;
+        let motion = image_motion(camera, pixel.centre(), depth, self.unit);
+        for (c, error) in errors.into_iter().enumerate() {
+            let [right, down] = pixel.gradient[c].map(|g| f64::from(g * exposure[c]));
+            // The surface would have to move by the negative error over the gradient.
+            let row = [0, 1].map(|part| -(motion[0][part] * right + motion[1][part] * down));
+            let weight =
+                if error.abs() > HUBER_THRESHOLD { HUBER_THRESHOLD / error.abs() } else { 1.0 };
+            self.matrix.add(weight, row);
+            for (part, row) in row.into_iter().enumerate() {
+                self.right[part] += weight * error * row;
+            }
+        }
+    }
+
+    /// Returns the motion that minimises the error; `None` if too few pixels have a depth.
     fn solve(&self, damping: f64) -> Option<Motion> {
-        if self.pixels < LEAST_PIXELS || !self.error.is_finite() {
+        if self.pixels < MIN_PIXELS || !self.error.is_finite() {
             return None;
         }
-        let [turn, shift] = self.matrix.damped(damping).solve(self.right)?;
-        Some(Motion { turn, shift: self.unit * shift })
+        let [rotation, translation] = self.matrix.damped(damping).solve(self.right)?;
+        Some(Motion { rotation, translation: self.unit * translation })
     }
 }
 
-/// How far what is seen at an image position moves to the right and down when the camera turns
-/// about its axes and shifts along them, by a radian and by so many scene units. Of both: turning,
-/// then shifting.
+/// Returns a pixel's z-depth: median depth of an opaque pixel, expected depth of another.
+fn trusted_depth(render: &Pixel, depth_per_distance: f64) -> Option<f64> {
+    let distance = if render.opacity > 0.5 { render.median_depth } else { render.depth };
+    let depth = f64::from(distance) * depth_per_distance;
+    (render.opacity > MIN_DEPTH_OPACITY && depth.is_finite() && depth > 0.0).then_some(depth)
+}
+
+/// Returns the derivatives of an image position of given depth, to the right and down, by the
+/// camera's rotation about its axes (in radians) and translation along them (in `unit`s).
 fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [[DVec3; 2]; 2] {
     let k = &camera.intrinsics;
     let [u, v] = k.undistort([u, v]);
     let (x, y) = ((u - k.cx) / k.fx, -(v - k.cy) / k.fy);
     let [by_x, by_y] = k.distortion.derivative([x, -y]);
-    let place = depth * DVec3::new(x, y, -1.0);
-    // Of a point in camera space, on the plane of depth 1.
+    let point = depth * DVec3::new(x, y, -1.0);
+    // Derivatives of the position on the plane of depth 1 by the point in camera space.
     let along_x = DVec3::new(1.0, 0.0, x) / depth;
     let along_y = DVec3::new(0.0, -1.0, -y) / depth;
     let right = k.fx * (by_x[0] * along_x + by_x[1] * along_y);
     let down = k.fy * (by_y[0] * along_x + by_y[1] * along_y);
-    // In camera space a point goes the other way: by place × turn, and by -shift.
-    [right, down].map(|along| [along.cross(place), -unit * along])
+    // In camera space the point moves the other way: by point × rotation, and by -translation.
+    [right, down].map(|along| [along.cross(point), -unit * along])
 }
 
-/// A motion of a camera in its own axes.
+/// Motion of a camera in its own axes.
 #[derive(Clone, Copy, Debug)]
 struct Motion {
-    /// Axis times angle.
-    turn: DVec3,
-    shift: DVec3,
+    /// Axis times angle, in radians.
+    rotation: DVec3,
+    translation: DVec3,
 }
 
 impl Motion {
     fn applied_to(&self, camera: &Camera) -> Camera {
-        let turned = rotation(camera) * DQuat::from_scaled_axis(self.turn);
-        placed(camera, turned, camera.centre() + camera.rotation() * self.shift)
+        let rotated = rotation(camera) * DQuat::from_scaled_axis(self.rotation);
+        with_pose(camera, rotated, camera.centre() + camera.rotation() * self.translation)
     }
 }
 
@@ -236,43 +245,45 @@ fn rotation(camera: &Camera) -> DQuat {
     DQuat::from_mat3(&camera.rotation()).normalize()
 }
 
-/// The camera with another pose.
-fn placed(camera: &Camera, rotation: DQuat, centre: DVec3) -> Camera {
+/// Returns the camera with another pose.
+fn with_pose(camera: &Camera, rotation: DQuat, centre: DVec3) -> Camera {
     let axes = DMat3::from_quat(rotation.normalize());
     Camera { camera_to_world: pose_of(axes, centre), ..camera.clone() }
 }
 
-/// A camera before and after.
+/// Motion of one camera.
 #[derive(Clone, Copy, Debug)]
-pub struct CameraMove<'a> {
-    /// Where it was; its pixels are the photograph's.
+pub struct CameraMotion<'a> {
+    /// Camera before the motion, of the photograph's size.
     pub from: &'a Camera,
-    /// Where it is.
+    /// Camera after the motion.
     pub to: &'a Camera,
-    /// Middle depth of what it sees, in scene units, where anything is known of it.
+    /// Median depth of the camera's view, in scene units, if known.
     pub depth: Option<f64>,
 }
 
-/// How far cameras have moved, in the mean.
+/// Mean motion of cameras.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Moved {
-    /// Angle by which they have turned, in radians.
+pub struct MeanMotion {
+    /// Mean angle of rotation, in radians.
     pub angle: f64,
-    /// Distance of their centres from where they were, in scene units.
+    /// Mean distance between old and new centre, in scene units.
     pub distance: f64,
-    /// How far that moves what they see across their photographs, in pixels.
+    /// Mean motion in the photographs caused by the distance, in pixels.
     pub pixels: f64,
 }
 
-/// Poses that are known at all are commonly right to within these.
-const FAR_TURN_DEGREES: f64 = 1.0;
-const FAR_PIXELS: f64 = 3.0;
+/// Mean rotation in degrees above which given poses are doubtful; chosen by hand.
+const MAX_TRUSTED_ANGLE_DEGREES: f64 = 1.0;
+/// Mean motion in pixels above which given poses are doubtful; chosen by hand.
+const MAX_TRUSTED_PIXELS: f64 = 3.0;
 
-impl Moved {
-    /// Over all cameras.
-    pub fn between<'a>(steps: impl Iterator<Item = CameraMove<'a>>) -> Self {
-        let (mut count, mut sum) = (0.0f64, Self { angle: 0.0, distance: 0.0, pixels: 0.0 });
-        for CameraMove { from, to, depth } in steps {
+impl MeanMotion {
+    /// Computes the mean over all cameras; 0 if there are none.
+    pub fn of_cameras<'a>(motions: impl Iterator<Item = CameraMotion<'a>>) -> Self {
+        let mut count = 0.0f64;
+        let mut sum = Self { angle: 0.0, distance: 0.0, pixels: 0.0 };
+        for CameraMotion { from, to, depth } in motions {
             count += 1.0;
             let distance = from.centre().distance(to.centre());
             sum.angle += rotation(from).angle_between(rotation(to));
@@ -287,52 +298,51 @@ impl Moved {
         }
     }
 
-    /// Whether that is farther than given poses are commonly off: by more than 1°, or by more than
-    /// 3 pixels of the photographs.
+    /// Returns whether the motion exceeds the usual error of given poses: 1°, or 3 pixels of the
+    /// photographs.
     pub fn is_far(&self) -> bool {
-        self.angle.to_degrees() > FAR_TURN_DEGREES || self.pixels > FAR_PIXELS
+        self.angle.to_degrees() > MAX_TRUSTED_ANGLE_DEGREES || self.pixels > MAX_TRUSTED_PIXELS
     }
 }
 
-impl fmt::Display for Moved {
+impl fmt::Display for MeanMotion {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { angle, distance, pixels } = self;
         write!(
             f,
-            "turned by {:.3}° and moved by {} ({pixels:.1} LR pixels) in the mean",
+            "turned by {:.3}° and moved by {} ({pixels:.1} LR pixels) on average",
             angle.to_degrees(),
             length(*distance, 4)
         )
     }
 }
 
-/// Moves all cameras back together so that in the mean they have neither turned nor shifted nor
-/// spread from where they were: a motion that all share could as well be the scene's, which would
-/// leave its bounds, and test views would miss it.
-pub fn take_back_common_motion(cameras: &mut [Camera], were: &[Camera]) {
+/// Removes the mean rotation, translation and scaling of all cameras relative to `before`. A motion
+/// that all cameras share is a motion of the scene: the scene would leave its bounds, and test
+/// views would be off.
+pub fn remove_common_motion(cameras: &mut [Camera], before: &[Camera]) {
     let share = 1.0 / cameras.len().max(1) as f64;
-    let turns = cameras.iter().zip(were).map(|(camera, was)| {
-        let turn = rotation(camera) * rotation(was).inverse();
-        // The shorter way round.
-        (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis()
+    let rotations = cameras.iter().zip(before).map(|(camera, before)| {
+        let relative = rotation(camera) * rotation(before).inverse();
+        // Of q and -q, the same rotation, the one with the smaller angle.
+        (if relative.w < 0.0 { -relative } else { relative }).to_scaled_axis()
     });
-    let back = DQuat::from_scaled_axis(-share * turns.sum::<DVec3>());
-    let middle = |cameras: &[Camera]| share * cameras.iter().map(Camera::centre).sum::<DVec3>();
-    let (now, before) = (middle(cameras), middle(were));
-    let (wide, was_wide) = (spread(cameras, now), spread(were, before));
-    let narrower = if wide > 0.0 && was_wide > 0.0 { (was_wide / wide).sqrt() } else { 1.0 };
+    let inverse = DQuat::from_scaled_axis(-share * rotations.sum::<DVec3>());
+    let [centre, centre_before] = [&*cameras, before]
+        .map(|cameras| share * cameras.iter().map(Camera::centre).sum::<DVec3>());
+    let spread = squared_distances(cameras, centre);
+    let spread_before = squared_distances(before, centre_before);
+    let scale =
+        if spread > 0.0 && spread_before > 0.0 { (spread_before / spread).sqrt() } else { 1.0 };
     for camera in cameras {
-        *camera = placed(
-            camera,
-            back * rotation(camera),
-            before + narrower * (back * (camera.centre() - now)),
-        );
+        let offset = scale * (inverse * (camera.centre() - centre));
+        *camera = with_pose(camera, inverse * rotation(camera), centre_before + offset);
     }
 }
 
-/// How far cameras are from a place: the sum of squares.
-fn spread(cameras: &[Camera], place: DVec3) -> f64 {
-    cameras.iter().map(|c| c.centre().distance_squared(place)).sum::<f64>()
+/// Returns the sum of the cameras' squared distances from a point.
+fn squared_distances(cameras: &[Camera], point: DVec3) -> f64 {
+    cameras.iter().map(|c| c.centre().distance_squared(point)).sum::<f64>()
 }
 
 #[cfg(test)]

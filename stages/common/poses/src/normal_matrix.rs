@@ -1,47 +1,61 @@
-//! Normal equations of a camera's motion.
+//! Robust least squares for a camera's motion.
 
 use glam::{DMat3, DVec3};
 
-/// A symmetric 6×6 matrix by its blocks: the first three rows are of turning, the others of
-/// shifting.
+/// Colour error above which Huber's loss is linear: an outlier, such as a moved object or a part of
+/// the scene that no image covers. Chosen by hand.
+pub(crate) const HUBER_THRESHOLD: f64 = 0.1;
+
+/// Returns Huber's robust error.
+pub(crate) fn huber(error: f64) -> f64 {
+    let size = error.abs();
+    if size > HUBER_THRESHOLD {
+        HUBER_THRESHOLD * (2.0 * size - HUBER_THRESHOLD)
+    } else {
+        size * size
+    }
+}
+
+/// Symmetric 6×6 matrix by its blocks: three rows of rotation, then three of translation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct NormalMatrix {
-    turning: DMat3,
-    /// Rows of turning, columns of shifting.
-    both: DMat3,
-    shifting: DMat3,
+    rotation: DMat3,
+    /// Rows of rotation, columns of translation.
+    cross: DMat3,
+    translation: DMat3,
 }
 
 impl NormalMatrix {
     pub(crate) const ZERO: Self =
-        Self { turning: DMat3::ZERO, both: DMat3::ZERO, shifting: DMat3::ZERO };
+        Self { rotation: DMat3::ZERO, cross: DMat3::ZERO, translation: DMat3::ZERO };
 
-    /// Adds a row's product with itself.
-    pub(crate) fn add(&mut self, weight: f64, [turn, shift]: [DVec3; 2]) {
-        self.turning += outer(weight * turn, turn);
-        self.both += outer(weight * turn, shift);
-        self.shifting += outer(weight * shift, shift);
+    /// Adds the weighted outer product of a row with itself.
+    pub(crate) fn add(&mut self, weight: f64, [rotation, translation]: [DVec3; 2]) {
+        self.rotation += outer(weight * rotation, rotation);
+        self.cross += outer(weight * rotation, translation);
+        self.translation += outer(weight * translation, translation);
     }
 
-    /// Levenberg and Marquardt's: the diagonal grows by a share of itself, and by a little of the
-    /// trace where a direction says nothing.
+    /// Returns the matrix with Levenberg's and Marquardt's damping: the diagonal grows by the
+    /// factor 1 + `damping`, and by 1e-9 of the trace in case a direction has no gradient.
     pub(crate) fn damped(&self, damping: f64) -> Self {
-        let [turning, shifting] = [self.turning, self.shifting].map(diagonal);
-        let floor = DVec3::splat(1e-9 * (turning.element_sum() + shifting.element_sum()));
+        let [rotation, translation] = [self.rotation, self.translation].map(diagonal);
+        let floor = DVec3::splat(1e-9 * (rotation.element_sum() + translation.element_sum()));
         Self {
-            turning: self.turning + DMat3::from_diagonal(damping * turning + floor),
-            both: self.both,
-            shifting: self.shifting + DMat3::from_diagonal(damping * shifting + floor),
+            rotation: self.rotation + DMat3::from_diagonal(damping * rotation + floor),
+            cross: self.cross,
+            translation: self.translation + DMat3::from_diagonal(damping * translation + floor),
         }
     }
 
-    /// Solves by the Schur complement of turning; none unless the matrix is positive.
-    pub(crate) fn solve(&self, [turn, shift]: [DVec3; 2]) -> Option<[DVec3; 2]> {
-        let inverse = positive_inverse(self.turning)?;
-        let across = self.both.transpose() * inverse;
-        let moved = positive_inverse(self.shifting - across * self.both)? * (shift - across * turn);
-        let turned = inverse * (turn - self.both * moved);
-        (turned.is_finite() && moved.is_finite()).then_some([turned, moved])
+    /// Solves by the Schur complement of rotation; `None` unless the matrix is positive definite.
+    pub(crate) fn solve(&self, [rotation, translation]: [DVec3; 2]) -> Option<[DVec3; 2]> {
+        let inverse = positive_inverse(self.rotation)?;
+        let across = self.cross.transpose() * inverse;
+        let complement = positive_inverse(self.translation - across * self.cross)?;
+        let translated = complement * (translation - across * rotation);
+        let rotated = inverse * (rotation - self.cross * translated);
+        (rotated.is_finite() && translated.is_finite()).then_some([rotated, translated])
     }
 }
 
@@ -53,8 +67,8 @@ fn diagonal(matrix: DMat3) -> DVec3 {
     DVec3::new(matrix.x_axis.x, matrix.y_axis.y, matrix.z_axis.z)
 }
 
-/// The inverse of a symmetric matrix; none unless it is positive, by its leading minors
-/// (Sylvester).
+/// Returns the inverse of a symmetric matrix; `None` unless the matrix is positive definite, by its
+/// leading minors (Sylvester).
 fn positive_inverse(matrix: DMat3) -> Option<DMat3> {
     let [x, y] = [matrix.x_axis, matrix.y_axis];
     let minors = [x.x, x.x * y.y - x.y * y.x, matrix.determinant()];
@@ -102,10 +116,12 @@ mod tests {
     #[test]
     fn matrices_that_are_not_positive_have_no_solution() {
         for diagonal in [DVec3::new(-1.0, -1.0, 1.0), DVec3::new(1.0, -1.0, -1.0), -DVec3::X] {
-            let turning = DMat3::from_diagonal(diagonal);
-            let matrix = NormalMatrix { turning, shifting: DMat3::IDENTITY, ..NormalMatrix::ZERO };
+            let rotation = DMat3::from_diagonal(diagonal);
+            let matrix =
+                NormalMatrix { rotation, translation: DMat3::IDENTITY, ..NormalMatrix::ZERO };
             assert!(matrix.solve([DVec3::ONE; 2]).is_none(), "{diagonal}");
-            let matrix = NormalMatrix { turning: DMat3::IDENTITY, shifting: turning, ..matrix };
+            let matrix =
+                NormalMatrix { rotation: DMat3::IDENTITY, translation: rotation, ..matrix };
             assert!(matrix.solve([DVec3::ONE; 2]).is_none(), "{diagonal}");
         }
     }

@@ -1,118 +1,140 @@
 use glam::DVec3;
 use pixels::Image;
-use radiance::{RayField, RenderError};
+use radiance::{Pixel, Ray, RayField, RenderError};
 use scene::Camera;
 
-use crate::cast::cast;
-use crate::huber::huber;
+use crate::normal_matrix::huber;
 use crate::pyramid::PyramidLevel;
 
-/// A photograph, and the camera that took it.
+/// Photograph with the camera that took it.
 #[derive(Clone, Copy, Debug)]
-pub struct Shot<'a> {
-    /// Its pixels are the photograph's.
+pub struct PosedPhotograph<'a> {
+    /// Camera with the photograph's size.
     pub camera: &'a Camera,
-    /// RGB over its background; NaN where nothing is known.
+    /// RGB over the background; NaN in pixels that don't count.
     pub photograph: &'a Image,
-    /// What the photograph's channels are multiplied by to have the field's exposure.
+    /// Factor per channel from the photograph's exposure to the field's.
     pub exposure: [f32; 3],
 }
 
-/// Photographs that are looked at, at most, spread over all.
-const MOST_VIEWS: usize = 64;
-/// Pixels of each that are looked at, at most, spread over all that tell something.
-const MOST_PIXELS_PER_VIEW: usize = 1024;
-/// Others that each is compared with: those that were taken from nearest by.
+/// Maximum number of photographs compared, spread evenly over all; chosen by hand.
+const MAX_VIEWS: usize = 64;
+/// Maximum number of pixels compared per photograph, spread evenly over the informative ones;
+/// chosen by hand.
+const MAX_PIXELS_PER_VIEW: usize = 1024;
+/// Number of nearest photographs that each one is compared with; chosen by hand.
 const NEIGHBOURS: usize = 2;
-/// Of less than this opacity no surface is known.
-const LEAST_SURFACE_OPACITY: f32 = 0.5;
-/// Two distances of one surface differ by at most this share of them.
-const SAME_DISTANCE_SHARE: f64 = 0.02;
+/// Minimum opacity at which a pixel's depth is trusted.
+const MIN_SURFACE_OPACITY: f32 = 0.5;
+/// Maximum relative difference between two distances of one surface; chosen by hand.
+const MAX_DISTANCE_DIFFERENCE: f64 = 0.02;
 
-/// Photometric error between photographs of the same surfaces: mean robust error (Huber's, of
-/// colours) between what one shows and what its neighbours show there, where the field says that
-/// they see it, too. None where it says so nowhere.
+/// Returns the photometric error between photographs of the same surfaces: the mean Huber error of
+/// colours between each photograph and its neighbours at surface points visible in both. `None` if
+/// there are no such points.
 ///
-/// The field only says where surfaces are. So this tells good poses from bad ones even by fields
-/// that learnt both photograph by photograph: such a field renders every photograph well, but its
-/// surfaces lie where no two of them see the same.
+/// The field gives only the surfaces. So the error tells good poses from bad ones even with a field
+/// that over-fits each photograph: its renders are good, but its surfaces are where no two
+/// photographs agree.
 pub fn photometric_error(
     field: &dyn RayField,
-    shots: &[Shot<'_>],
+    shots: &[PosedPhotograph<'_>],
     background: f32,
 ) -> Result<Option<f64>, RenderError> {
-    let (mut sum, mut count) = (0.0, 0usize);
-    for i in (0..shots.len()).step_by(shots.len().div_ceil(MOST_VIEWS).max(1)) {
-        let places = surfaces(field, &shots[i], background)?;
-        for other in neighbours(shots, i) {
-            for error in errors(field, &places, other, background)? {
-                (sum, count) = (sum + error, count + 1);
+    let mut sum = 0.0;
+    let mut count = 0usize;
+    for i in (0..shots.len()).step_by(shots.len().div_ceil(MAX_VIEWS).max(1)) {
+        let points = surface_points(field, &shots[i], background)?;
+        for neighbour in neighbours(shots, i) {
+            for error in colour_errors(field, &points, neighbour, background)? {
+                sum += error;
+                count += 1;
             }
         }
     }
     Ok((count > 0).then(|| sum / count as f64))
 }
 
-/// A place on a surface, and its colour in the photograph that it was seen in.
-struct Place {
-    at: DVec3,
+/// Point of a surface, with its colour in the photograph that it was found in.
+struct SurfacePoint {
+    position: DVec3,
     colour: [f32; 3],
 }
 
-/// Where a photograph's telling pixels show surfaces.
-fn surfaces(
+/// Finds the surface points in a photograph's informative pixels.
+fn surface_points(
     field: &dyn RayField,
-    shot: &Shot<'_>,
+    shot: &PosedPhotograph<'_>,
     background: f32,
-) -> Result<Vec<Place>, RenderError> {
-    let telling = PyramidLevel::new(shot.photograph).telling;
-    let every = telling.len().div_ceil(MOST_PIXELS_PER_VIEW).max(1);
-    let pixels: Vec<_> = telling.into_iter().step_by(every).collect();
-    let places = pixels.iter().map(|pixel| [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5]);
-    let (lines, rays): (Vec<_>, Vec<_>) =
-        places.map(|place| cast(shot.camera, place, background)).unzip();
-    let seen = pixels.iter().zip(lines).zip(field.render(&rays)?);
-    Ok(seen
-        .filter(|(_, seen)| seen.opacity > LEAST_SURFACE_OPACITY && seen.median_depth.is_finite())
-        .map(|((pixel, line), seen)| {
-            let colour = [0, 1, 2].map(|c| pixel.colour[c] * shot.exposure[c]);
-            Place { at: line.at(f64::from(seen.median_depth)), colour }
-        })
-        .collect())
-}
-
-/// The photographs that were taken from nearest by.
-fn neighbours<'s, 'a>(shots: &'s [Shot<'a>], of: usize) -> impl Iterator<Item = &'s Shot<'a>> {
-    let away = |i: usize| shots[i].camera.centre().distance_squared(shots[of].camera.centre());
-    let mut others: Vec<usize> = (0..shots.len()).filter(|&i| i != of).collect();
-    others.sort_by(|&a, &b| away(a).total_cmp(&away(b)));
-    others.into_iter().take(NEIGHBOURS).map(|i| &shots[i])
-}
-
-/// Errors of each channel at the places that another photograph shows.
-fn errors(
-    field: &dyn RayField,
-    places: &[Place],
-    shot: &Shot<'_>,
-    background: f32,
-) -> Result<Vec<f64>, RenderError> {
-    let (camera, k) = (shot.camera, &shot.camera.intrinsics);
-    let (width, height) = (f64::from(k.width), f64::from(k.height));
-    let is_inside = |[x, y]: &[f64; 2]| (0.0..width).contains(x) && (0.0..height).contains(y);
-    let place_in = |at: DVec3| camera.project(at).map(|(x, y, _)| [x, y]).filter(is_inside);
-    let (inside, at): (Vec<&Place>, Vec<[f64; 2]>) =
-        places.iter().filter_map(|place| Some((place, place_in(place.at)?))).unzip();
-    let rays: Vec<_> = at.iter().map(|&at| cast(camera, at, background).1).collect();
-    let mut found = Vec::with_capacity(3 * rays.len());
-    for ((place, [x, y]), seen) in inside.into_iter().zip(at).zip(field.render(&rays)?) {
-        let distance = camera.centre().distance(place.at);
-        let is_same =
-            (f64::from(seen.median_depth) - distance).abs() <= SAME_DISTANCE_SHARE * distance;
-        let colour = shot.photograph.colour_at([x as f32, y as f32]);
-        if seen.opacity > LEAST_SURFACE_OPACITY && is_same && colour.iter().all(|v| v.is_finite()) {
-            let error = |c: usize| huber(f64::from(colour[c] * shot.exposure[c] - place.colour[c]));
-            found.extend([0, 1, 2].map(error));
+) -> Result<Vec<SurfacePoint>, RenderError> {
+    let pixels = PyramidLevel::new(shot.photograph).pixels;
+    let stride = pixels.len().div_ceil(MAX_PIXELS_PER_VIEW).max(1);
+    let pixels: Vec<_> = pixels.into_iter().step_by(stride).collect();
+    let lines: Vec<_> = pixels
+        .iter()
+        .map(|pixel| shot.camera.ray(pixel.x as f64 + 0.5, pixel.y as f64 + 0.5))
+        .collect();
+    let rays: Vec<_> = lines.iter().map(|line| Ray::new(line, [background; 3])).collect();
+    let mut points = Vec::new();
+    for (i, render) in field.render(&rays)?.into_iter().enumerate() {
+        if has_surface(&render) && render.median_depth.is_finite() {
+            let position = lines[i].at(f64::from(render.median_depth));
+            let colour = [0, 1, 2].map(|c| pixels[i].colour[c] * shot.exposure[c]);
+            points.push(SurfacePoint { position, colour });
         }
     }
-    Ok(found)
+    Ok(points)
+}
+
+/// Returns the photographs whose cameras are nearest to that of photograph `i`.
+fn neighbours<'s, 'a>(
+    shots: &'s [PosedPhotograph<'a>],
+    i: usize,
+) -> impl Iterator<Item = &'s PosedPhotograph<'a>> {
+    let mut others: Vec<(f64, usize)> = (0..shots.len())
+        .filter(|&k| k != i)
+        .map(|k| (shots[k].camera.centre().distance_squared(shots[i].camera.centre()), k))
+        .collect();
+    others.sort_by(|a, b| a.0.total_cmp(&b.0));
+    others.into_iter().take(NEIGHBOURS).map(|(_, k)| &shots[k])
+}
+
+/// Returns the errors of each channel at the surface points visible in another photograph.
+fn colour_errors(
+    field: &dyn RayField,
+    points: &[SurfacePoint],
+    shot: &PosedPhotograph<'_>,
+    background: f32,
+) -> Result<Vec<f64>, RenderError> {
+    let camera = shot.camera;
+    let [width, height] = [camera.intrinsics.width, camera.intrinsics.height].map(f64::from);
+    let mut visible = Vec::new();
+    let mut rays = Vec::new();
+    for point in points {
+        if let Some((x, y, _)) = camera.project(point.position)
+            && (0.0..width).contains(&x)
+            && (0.0..height).contains(&y)
+        {
+            visible.push((point, [x as f32, y as f32]));
+            rays.push(Ray::new(&camera.ray(x, y), [background; 3]));
+        }
+    }
+    let mut errors = Vec::with_capacity(3 * rays.len());
+    for (i, render) in field.render(&rays)?.into_iter().enumerate() {
+        let (point, pixel) = visible[i];
+        let distance = camera.centre().distance(point.position);
+        let is_same =
+            (f64::from(render.median_depth) - distance).abs() <= MAX_DISTANCE_DIFFERENCE * distance;
+        let colour = shot.photograph.colour_at(pixel);
+        if has_surface(&render) && is_same && colour.iter().all(|v| v.is_finite()) {
+            errors.extend(
+                [0, 1, 2].map(|c| huber(f64::from(colour[c] * shot.exposure[c] - point.colour[c]))),
+            );
+        }
+    }
+    Ok(errors)
+}
+
+fn has_surface(render: &Pixel) -> bool {
+    render.opacity > MIN_SURFACE_OPACITY
 }

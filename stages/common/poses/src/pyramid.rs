@@ -1,6 +1,6 @@
 use pixels::{Filter, Image, Resampling};
 
-/// A photograph at several sizes.
+/// Photograph at several sizes.
 #[derive(Clone, Debug)]
 pub struct Pyramid {
     pub(crate) levels: Vec<PyramidLevel>,
@@ -10,59 +10,57 @@ pub struct Pyramid {
 pub(crate) struct PyramidLevel {
     pub(crate) width: usize,
     pub(crate) height: usize,
-    pub(crate) telling: Vec<Telling>,
+    pub(crate) pixels: Vec<InformativePixel>,
 }
 
-/// A pixel that says where it was taken from.
+/// Pixel with an image gradient, which constrains the camera's pose.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Telling {
+pub(crate) struct InformativePixel {
     pub(crate) x: usize,
     pub(crate) y: usize,
     pub(crate) colour: [f32; 3],
-    /// Change of each channel a pixel to the right, and a pixel down.
+    /// Change of each channel per pixel to the right, and per pixel down.
     pub(crate) gradient: [[f32; 2]; 3],
 }
 
-impl Telling {
-    /// Its centre in the image.
+impl InformativePixel {
+    /// Returns the position of the pixel's centre in the image.
     pub(crate) fn centre(&self) -> [f64; 2] {
         [self.x as f64 + 0.5, self.y as f64 + 0.5]
     }
 }
 
-/// Smaller levels have too little to go by.
-const LEAST_LEVEL_SIDE: usize = 12;
-/// At most so many pixels of a level are rendered, spread over all that tell something.
-const MOST_PIXELS: usize = 4096;
-/// A pixel tells something where a channel changes by more, from a pixel to the next.
-const LEAST_SLOPE: f32 = 3.0 / 255.0;
+/// Minimum width and height of a smaller level, in pixels; chosen by hand.
+const MIN_LEVEL_SIDE: usize = 12;
+/// Maximum number of pixels rendered per level, spread evenly over the informative ones; chosen by
+/// hand.
+const MAX_PIXELS: usize = 4096;
+/// Minimum gradient of an informative pixel in some channel, per pixel; chosen by hand.
+const MIN_GRADIENT: f32 = 3.0 / 255.0;
 
 impl Pyramid {
-    /// Of an RGB image over its background; NaN where nothing is known. Each level has half the
-    /// width of the one before it; there are at most `smaller` below the image itself.
+    /// Creates the pyramid of an RGB image over its background, NaN in pixels that don't count. The
+    /// image is followed by at most `smaller` levels, each half as wide as the one before.
     ///
     /// # Panics
-    /// When the image has other than three channels.
+    /// If the image doesn't have three channels.
     pub fn new(photograph: &Image, smaller: u32) -> Self {
-        assert_eq!(photograph.channels, 3, "a photograph over its background");
-        let size =
-            |level: u32| [photograph.width, photograph.height].map(|n| n.div_ceil(1 << level));
-        let is_large =
-            |level: &u32| *level == 0 || size(*level).into_iter().all(|n| n >= LEAST_LEVEL_SIDE);
-        let levels = (0..=smaller).take_while(is_large).map(|level| {
-            let [width, height] = size(level);
-            let shrink = Resampling::new(
-                Filter::Box,
-                (photograph.width, photograph.height),
-                (width, height),
-            );
-            PyramidLevel::new(&shrink.apply(photograph))
-        });
-        Self { levels: levels.collect() }
+        assert_eq!(photograph.channels, 3, "number of channels of a photograph");
+        let size = (photograph.width, photograph.height);
+        let mut levels = Vec::new();
+        for level in 0..=smaller {
+            let [width, height] = [size.0, size.1].map(|n| n.div_ceil(1 << level));
+            if level > 0 && width.min(height) < MIN_LEVEL_SIDE {
+                break;
+            }
+            let shrink = Resampling::new(Filter::Box, size, (width, height));
+            levels.push(PyramidLevel::new(&shrink.apply(photograph)));
+        }
+        Self { levels }
     }
 
-    /// How many levels lie below the image itself.
-    pub fn smaller(&self) -> u32 {
+    /// Returns the number of levels smaller than the image itself.
+    pub fn smaller_levels(&self) -> u32 {
         self.levels.len() as u32 - 1
     }
 }
@@ -70,24 +68,28 @@ impl Pyramid {
 impl PyramidLevel {
     pub(crate) fn new(image: &Image) -> Self {
         let (width, height) = (image.width, image.height);
-        let inner = |n: usize| 1..n.saturating_sub(1);
-        let all: Vec<Telling> = inner(height)
-            .flat_map(|y| inner(width).map(move |x| (x, y)))
-            .filter_map(|(x, y)| telling(image, x, y))
-            .collect();
-        let every = all.len().div_ceil(MOST_PIXELS).max(1);
-        Self { width, height, telling: all.into_iter().step_by(every).collect() }
+        let mut pixels = Vec::new();
+        for y in 1..height.saturating_sub(1) {
+            for x in 1..width.saturating_sub(1) {
+                pixels.extend(informative_pixel(image, x, y));
+            }
+        }
+        let stride = pixels.len().div_ceil(MAX_PIXELS).max(1);
+        Self { width, height, pixels: pixels.into_iter().step_by(stride).collect() }
     }
 }
 
-/// A pixel within the border, where it tells something.
-fn telling(image: &Image, x: usize, y: usize) -> Option<Telling> {
-    let colour = |x: usize, y: usize| [0, 1, 2].map(|c| image.data[(y * image.width + x) * 3 + c]);
-    let [left, right, up, down] =
-        [colour(x - 1, y), colour(x + 1, y), colour(x, y - 1), colour(x, y + 1)];
+/// Returns a pixel within the border if its neighbourhood is known and has a gradient.
+fn informative_pixel(image: &Image, x: usize, y: usize) -> Option<InformativePixel> {
+    let [centre, left, right, up, down] = [(x, y), (x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)]
+        .map(|(x, y)| [0, 1, 2].map(|c| image.data[(y * image.width + x) * 3 + c]));
     let gradient = [0, 1, 2].map(|c| [0.5 * (right[c] - left[c]), 0.5 * (down[c] - up[c])]);
-    let pixel = Telling { x, y, colour: colour(x, y), gradient };
     let numbers = gradient.as_flattened();
-    let is_known = numbers.iter().chain(&pixel.colour).all(|v| v.is_finite());
-    (is_known && numbers.iter().any(|g| g.abs() > LEAST_SLOPE)).then_some(pixel)
+    let is_known = numbers.iter().chain(&centre).all(|v| v.is_finite());
+    (is_known && numbers.iter().any(|g| g.abs() > MIN_GRADIENT)).then_some(InformativePixel {
+        x,
+        y,
+        colour: centre,
+        gradient,
+    })
 }

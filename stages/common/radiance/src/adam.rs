@@ -4,18 +4,18 @@ use crate::spec::{ADAM_BETA, ADAM_EPSILON};
 /// Constants of one optimiser step.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct AdamStep {
-    /// Rate with the bias correction of this step.
+    /// Learning rate times this step's bias corrections.
     pub(crate) rate: f32,
     pub(crate) beta1: f32,
     pub(crate) beta2: f32,
     pub(crate) epsilon: f32,
-    /// Added to the gradient: decay·weight.
+    /// Weight decay: decay·weight is added to the gradient.
     pub(crate) decay: f32,
 }
 
 impl AdamStep {
-    /// Adam (Kingma and Ba 2015) at step 1, 2, …, with the two bias corrections folded into the
-    /// rate.
+    /// Creates the constants of Adam's (Kingma and Ba 2015) step 1, 2, …, with both bias
+    /// corrections folded into the rate.
     pub(crate) fn new(step: u64, rate: f64, decay: f32) -> Self {
         let [beta1, beta2] = ADAM_BETA;
         let t = step.min(100_000) as i32;
@@ -30,19 +30,18 @@ impl AdamStep {
     }
 }
 
-/// Which blocks of 16 numbers a step has touched: a byte each, since a bit would have to be read
-/// before it is set.
+/// Marks of the blocks of 16 floats that a step has touched. A mark is a byte, since a bit would
+/// have to be read before it is set.
 pub(crate) type Touched = [u8];
 
-/// Blocks whose marks are looked at together.
-const BLOCKS_PER_LOOK: usize = 256;
-/// Blocks by which memory is asked for before it is needed.
+/// Number of blocks whose marks are scanned together; chosen by hand.
+const BLOCKS_PER_SCAN: usize = 256;
+/// Number of touched blocks that are prefetched before their use; chosen by hand.
 const BLOCKS_AHEAD: usize = 8;
 
 kernel! {
-    /// One lazy Adam step: entries whose gradient is 0 keep value and moments (a vertex no ray came
-    /// near learns nothing from it). Looks only at the blocks that were touched, and clears their
-    /// gradients and marks. Lengths are equal multiples of 16.
+    /// Takes one lazy Adam step: entries whose gradient is 0 keep value and moments. Visits only
+    /// the touched blocks, and clears their gradients and marks. Lengths are equal multiples of 16.
     pub(crate) fn adam<L>(
         step: &AdamStep, touched: &mut Touched, weights: &mut [f32], gradients: &mut [f32],
         first: &mut [f32], second: &mut [f32],
@@ -51,9 +50,9 @@ kernel! {
             gradients.as_chunks_mut::<LANES>().0);
         let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
         let most = touched.len().min(weights.len());
-        let mut list = [0; BLOCKS_PER_LOOK];
-        for start in (0..most).step_by(BLOCKS_PER_LOOK) {
-            let marks = &mut touched[start..(start + BLOCKS_PER_LOOK).min(most)];
+        let mut list = [0; BLOCKS_PER_SCAN];
+        for start in (0..most).step_by(BLOCKS_PER_SCAN) {
+            let marks = &mut touched[start..(start + BLOCKS_PER_SCAN).min(most)];
             if marks.iter().fold(0, |any, m| any | m) == 0 {
                 continue;
             }
@@ -63,7 +62,7 @@ kernel! {
                 count += usize::from(std::mem::take(mark) != 0);
             }
             for at in 0..count {
-                // Blocks lie far apart in memory, and there is little to do for each.
+                // Blocks are far apart in memory, and each needs little arithmetic.
                 let ahead = list[(at + BLOCKS_AHEAD).min(count - 1)];
                 L::prefetch(&weights[ahead]);
                 L::prefetch(&gradients[ahead]);
@@ -90,8 +89,8 @@ kernel! {
 }
 
 kernel! {
-    /// Takes weights into their running average, which gets `share` of what is new.
-    pub(crate) fn take_into_average<L>(average: &mut [f32], now: &[f32], share: f32) {
+    /// Moves the weights' running average towards `now` by the fraction `share`.
+    pub(crate) fn update_average<L>(average: &mut [f32], now: &[f32], share: f32) {
         for (average, now) in average.iter_mut().zip(now) {
             *average = share.mul_add(now - *average, *average);
         }

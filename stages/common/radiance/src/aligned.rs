@@ -3,16 +3,17 @@ use std::ops::{Deref, DerefMut};
 
 use crate::spec::{BRICK, FEATURES};
 
-/// Bytes of a brick: two cache lines.
+/// Alignment in bytes: the size of a brick, two cache lines.
 const ALIGNMENT: usize = BRICK * FEATURES * size_of::<f32>();
-/// Numbers by which the first one is moved at most.
-const MOST_MOVED: usize = ALIGNMENT / size_of::<f32>() - 1;
+/// Maximum number of floats before the first aligned one.
+const MAX_PADDING: usize = ALIGNMENT / size_of::<f32>() - 1;
 
-/// Numbers that begin at a whole brick, so that a vector lies in one cache line and a brick in two.
-/// The allocator's own arrays begin 16 bytes later, where vectors lie in two and bricks in three.
+/// Growable array of floats that is aligned to bricks, so that a vector is in one cache line and a
+/// brick in two. The allocator's arrays begin 16 bytes later: vectors would be in two cache lines
+/// and bricks in three.
 ///
-/// The system is asked for large pages: samples read and write tables of many MiB at random, and
-/// the processor remembers few addresses of pages.
+/// Large pages are requested from the system: samples access tables of many MiB at random, and the
+/// processor's TLB has few entries.
 #[derive(Default)]
 pub(crate) struct Aligned {
     memory: Vec<f32>,
@@ -21,15 +22,16 @@ pub(crate) struct Aligned {
 }
 
 impl Aligned {
+    /// Creates an array of `len` zeros.
     pub(crate) fn zeros(len: usize) -> Self {
-        let mut memory = vec![0.0; len + MOST_MOVED];
-        ask_for_large_pages(&mut memory);
-        // The offset is one that can't be only where addresses can't be looked at.
-        let start = memory.as_ptr().align_offset(ALIGNMENT).min(MOST_MOVED);
+        let mut memory = vec![0.0; len + MAX_PADDING];
+        request_large_pages(&mut memory);
+        // `align_offset` may return usize::MAX, as in const evaluation.
+        let start = memory.as_ptr().align_offset(ALIGNMENT).min(MAX_PADDING);
         Self { memory, start, len }
     }
 
-    /// The first `len` numbers, with what was in them before; grows where there are fewer.
+    /// Returns the first `len` floats with their old content; grows the array if it is shorter.
     pub(crate) fn fit(&mut self, len: usize) -> &mut [f32] {
         if self.len < len {
             let mut grown = Self::zeros(len.max(2 * self.len));
@@ -68,27 +70,25 @@ impl fmt::Debug for Aligned {
     }
 }
 
-/// Bytes of a large page.
+/// Requests large pages for an array; does nothing for an array smaller than one such page.
 #[cfg(target_os = "linux")]
-const LARGE_PAGE: usize = 2 << 20;
-
-#[cfg(target_os = "linux")]
-fn ask_for_large_pages(numbers: &mut [f32]) {
-    if size_of_val(numbers) < LARGE_PAGE {
+fn request_large_pages(numbers: &mut [f32]) {
+    const LARGE_PAGE_BYTES: usize = 2 << 20;
+    if size_of_val(numbers) < LARGE_PAGE_BYTES {
         return;
     }
     let page = rustix::param::page_size();
     let skipped = numbers.as_ptr().align_offset(page);
     if let Some(start) = numbers.get_mut(skipped..) {
-        let whole = size_of_val(start) / page * page;
+        let len = size_of_val(start) / page * page;
         let advice = rustix::mm::Advice::LinuxHugepage;
-        // SAFETY: the pages lie within `numbers`, and this advice leaves what they hold.
-        unsafe { rustix::mm::madvise(start.as_mut_ptr().cast(), whole, advice) }.ok();
+        // SAFETY: the pages are within `numbers`, and this advice doesn't change their content.
+        unsafe { rustix::mm::madvise(start.as_mut_ptr().cast(), len, advice) }.ok();
     }
 }
 
 #[cfg(not(target_os = "linux"))]
-fn ask_for_large_pages(_: &mut [f32]) {}
+fn request_large_pages(_: &mut [f32]) {}
 
 #[cfg(test)]
 mod tests {

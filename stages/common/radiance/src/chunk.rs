@@ -1,44 +1,46 @@
-//! A few rays at a time through the whole field and back, in buffers that are reused: nothing is
-//! allocated once they have grown.
+//! Forward and backward pass of a few rays through the whole field, in reused buffers: nothing is
+//! allocated after the buffers have grown.
 
 use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::march::March;
-use crate::occupancy::Met;
+use crate::occupancy::CellHit;
 use crate::ray::NormalizedRay;
 use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
 use crate::shading::{LayerInput, NetworkGradients, RayGradients, Shading, dot};
 use crate::simd::{LANES, kernel};
+use crate::spec::Strides;
 use crate::spec::{DENSITY_OUTPUTS, FEATURES};
-use crate::strides::Strides;
 
-/// Rays in one chunk: enough samples to fill the vectors, few enough to stay in the cache.
+/// Number of rays in a chunk, whose samples fill the vectors and fit the cache (docs/design/006).
 pub(crate) const CHUNK_RAYS: usize = 64;
 
-/// Gradients by grid features, in sample order: what is scattered once all shards are done.
+/// Gradients by grid features, in sample order. Scattered to the grid after all shards have run.
 #[derive(Debug, Default)]
 pub(crate) struct FeatureGradients {
     pub(crate) positions: Vec<[f32; 3]>,
-    /// One list a level, as long as `positions`.
+    /// One list per level, as long as `positions`.
     pub(crate) levels: Vec<Vec<[f32; FEATURES]>>,
 }
 
 impl FeatureGradients {
     pub(crate) fn clear(&mut self) {
         self.positions.clear();
-        self.levels.iter_mut().for_each(Vec::clear);
+        for level in &mut self.levels {
+            level.clear();
+        }
     }
 }
 
-/// Which samples a backward pass takes through the density network and to the grid: Russian
-/// roulette.
+/// Russian roulette on samples' gradients: small ones are dropped at random before they reach the
+/// density network and the grid (docs/design/037).
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Roulette {
-    /// Samples whose gradient by the density network's outputs is shorter than so many times the
-    /// chunk's mean are kept as often as their share of that length says, with a gradient as long;
-    /// 0 keeps all. The expected gradient stays.
+    /// Threshold m as a multiple of the chunk's mean gradient norm; 0 keeps all samples. A sample
+    /// whose norm g is below m is kept with probability g/m, its gradient multiplied by m/g, so the
+    /// expected gradient is unchanged.
     pub(crate) limit: f32,
-    /// Where the draw begins, from 0 to 1: samples are drawn evenly along the sum of their shares.
+    /// Start of the systematic draw, in 0..1.
     pub(crate) draw: f32,
 }
 
@@ -49,16 +51,16 @@ pub(crate) struct Chunk {
     samples: Samples,
     counted: Counted,
     shading: Shading,
-    back: Back,
+    backward: BackwardBuffers,
 }
 
-/// Buffers of the way back through the density network.
+/// Buffers of the backward pass through the density network.
 #[derive(Debug, Default)]
-struct Back {
-    /// By the density network's outputs: of the samples that count, then of those chosen.
+struct BackwardBuffers {
+    /// Gradients by the density network's outputs: of the samples that count, then of the chosen.
     gradients: Vec<[f32; DENSITY_OUTPUTS]>,
     lengths: Aligned,
-    /// Samples chosen, round by round.
+    /// Indices of the chosen samples, by round.
     chosen: Vec<u32>,
     rounds: Vec<Round>,
     features: Aligned,
@@ -74,8 +76,8 @@ kernel! {
     }
 }
 
-impl Back {
-    /// Chooses among the samples that count; `gradients` are then those of the chosen ones.
+impl BackwardBuffers {
+    /// Chooses among the samples that count; afterwards `gradients` has those of the chosen ones.
     fn choose(&mut self, samples: &Samples, counted: &Counted, roulette: Roulette) {
         let count = counted.sample.len();
         lengths_of(&self.gradients, self.lengths.fit(count));
@@ -103,7 +105,8 @@ impl Back {
         }
     }
 
-    /// Goes on from the chosen samples' gradients to the density network and the grid's features.
+    /// Propagates the chosen samples' gradients to the density network's weights and the grid's
+    /// features.
     fn run(
         &mut self,
         field: &Field,
@@ -128,8 +131,8 @@ impl Back {
         gather(&self.rounds, &self.chosen, &samples.rows.features, first.inputs, features, m);
         let hidden = self.hidden.fit(first.outputs * m);
         gather(&self.rounds, &self.chosen, &samples.rows.hidden, first.outputs, hidden, m);
-        network.back(second, LayerInput::Hidden(hidden), m, a, b);
-        network.back(first, LayerInput::First(features), m, b, a);
+        network.backward(second, LayerInput::Hidden(hidden), m, a, b);
+        network.backward(first, LayerInput::First(features), m, b, a);
 
         into.positions.extend(self.chosen.iter().map(|&i| samples.marched.positions[i as usize]));
         into.levels.resize_with(field.levels.len(), Vec::new);
@@ -142,7 +145,7 @@ impl Back {
 }
 
 impl Chunk {
-    /// Renders rays into [`Chunk::sums`]. `offsets` shift each ray's samples by a share of a step.
+    /// Renders rays into [`Chunk::sums`]. `offsets` are shifts of each ray's samples, in steps.
     pub(crate) fn forward(
         &mut self,
         field: &Field,
@@ -159,12 +162,12 @@ impl Chunk {
         self.shading.forward(field, rays, &self.samples, &self.counted, &mut self.sums);
     }
 
-    /// Goes back from the rays of the last forward pass: adds to the networks' gradients and
-    /// appends to the grid's.
+    /// Propagates gradients from the rays of the last forward pass: adds to the networks' gradients
+    /// and appends to the grid's.
     pub(crate) fn backward(
         &mut self,
         field: &Field,
-        towards: RayGradients<'_>,
+        upstream: RayGradients<'_>,
         roulette: Roulette,
         network: &mut NetworkGradients<'_>,
         into: &mut FeatureGradients,
@@ -172,23 +175,24 @@ impl Chunk {
         if self.counted.sample.is_empty() {
             return;
         }
-        let Self { sums, samples, counted, shading, back } = self;
-        shading.backward(field, (samples, counted, sums), towards, network, &mut back.gradients);
-        back.choose(samples, counted, roulette);
-        back.run(field, samples, network, into);
+        let Self { sums, samples, counted, shading, backward } = self;
+        let gradients = &mut backward.gradients;
+        shading.backward(field, (samples, counted, sums), upstream, network, gradients);
+        backward.choose(samples, counted, roulette);
+        backward.run(field, samples, network, into);
     }
 
-    /// Lists the cells where samples of the last forward pass stop light.
-    pub(crate) fn list_met(&self, step: f32, met: &mut Vec<Met>) {
-        self.samples.list_met(&self.counted, step, met);
+    /// Lists the densities and cells of samples of the last forward pass that stop light.
+    pub(crate) fn list_hits(&self, step: f32, hits: &mut Vec<CellHit>) {
+        self.samples.list_hits(&self.counted, step, hits);
     }
 
-    /// Samples marched in the last forward pass.
+    /// Returns the number of samples marched in the last forward pass.
     pub(crate) fn samples(&self) -> usize {
         self.samples.count
     }
 
-    /// Samples that got a colour in the last forward pass.
+    /// Returns the number of samples with a colour in the last forward pass.
     pub(crate) fn coloured(&self) -> usize {
         self.counted.sample.len()
     }

@@ -6,7 +6,7 @@ use crate::simd::kernel;
 use crate::spec::MAX_RAW_DENSITY;
 
 kernel! {
-    /// Optical depth τ of each sample: density e^raw times the step.
+    /// Computes each sample's optical depth τ: density e^raw times the step.
     pub(crate) fn optical_depths<L>(raw: &[f32], step: f32, tau: &mut [f32]) {
         for (tau, &raw) in tau.iter_mut().zip(raw) {
             *tau = exp(raw.min(MAX_RAW_DENSITY)) * step;
@@ -15,8 +15,8 @@ kernel! {
 }
 
 kernel! {
-    /// Transmittance before each sample and its weight, from the optical depth before it and its
-    /// own.
+    /// Computes each sample's transmittance and weight from the optical depth `before` it and its
+    /// own, `tau`.
     pub(crate) fn weights<L>(before: &[f32], tau: &[f32], transmittance: &mut [f32],
         weight: &mut [f32]) {
         for i in 0..before.len().min(tau.len()).min(transmittance.len()).min(weight.len()) {
@@ -28,7 +28,7 @@ kernel! {
 }
 
 kernel! {
-    /// Gradient of a loss by each sample's optical depth, along one ray from back to front.
+    /// Computes the gradient of a loss by each sample's optical depth, along one ray.
     ///
     /// With C = Σ w c + T_end·b and g = dL/dC: dL/dτ_i = T_{i+1}·(g·c_i) - Σ_{j>i} w_j·(g·c_j) -
     /// T_end·(g·b).

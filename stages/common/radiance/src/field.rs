@@ -11,14 +11,16 @@ use crate::mlp::Layers;
 use crate::occupancy::{CELLS, Cell, Occupancy};
 use crate::simd::LANES;
 use crate::spec::FEATURES;
-use crate::tensors::{FieldError, FieldProblem, Tensor, read_f32, read_u8, write_tensors};
+use crate::tensors::{
+    FieldError, FieldProblem, Tensor, read_f32, read_tensors, read_u8, write_tensors,
+};
 
-/// A radiance field: density and view-dependent colour of every point of a box.
+/// Radiance field: density and view-dependent colour at every point of the unit cube.
 #[derive(Clone, Debug)]
 pub struct Field {
-    /// What it is made of.
+    /// Sizes of grid and networks.
     pub architecture: Architecture,
-    /// Where it lies.
+    /// Bounds of the scene, in scene units.
     pub bounds: Bounds,
     pub(crate) levels: Vec<Level>,
     pub(crate) layers: Layers,
@@ -28,7 +30,7 @@ pub struct Field {
 }
 
 impl Field {
-    /// A field before training: faint density, drawn from a seed.
+    /// Creates an untrained field with random parameters.
     pub fn new(architecture: Architecture, bounds: Bounds, seed: u64) -> Self {
         let mut field = Self::empty(architecture, bounds);
         for (i, value) in field.grid.iter_mut().enumerate() {
@@ -49,127 +51,115 @@ impl Field {
         let levels = levels(&architecture);
         let layers = Layers::new(levels.len() * FEATURES, architecture.hidden as usize);
         let grid = Aligned::zeros(architecture.grid_len());
-        // Whole vectors, for the optimiser.
+        // The optimiser takes whole vectors.
         let network = Aligned::zeros(layers.len().next_multiple_of(LANES));
         Self { architecture, bounds, levels, layers, grid, network, occupancy: Occupancy::full() }
     }
 
-    /// Distance between samples, in cube sides.
+    /// Returns the distance between samples, in cube sides.
     pub fn step(&self) -> f32 {
         self.architecture.step()
     }
 
-    /// Share of the cells that may hold something.
-    pub fn occupied(&self) -> f64 {
-        self.occupancy.cells().count() as f64 / CELLS as f64
-    }
-
-    /// Numbers in the grid.
+    /// Returns the number of floats in the grid.
     pub fn grid_len(&self) -> usize {
         self.grid.len()
     }
 
-    /// The grid's entries, level by level; the networks' weights, layer by layer, each input by
-    /// input, filled up with 0 to whole vectors; and where there may be something: for whoever
-    /// renders or trains them elsewhere.
+    /// Returns grid entries, network weights and occupancy, for the libtorch twin. Grid entries are
+    /// ordered by level; weights by layer and input, padded with 0 to whole vectors.
     pub fn parts(&self) -> (&[f32], &[f32], &Occupancy) {
         (&self.grid, &self.network, &self.occupancy)
     }
 
-    /// The same, to be changed.
+    /// Returns the mutable parts of [`Field::parts`].
     pub fn parts_mut(&mut self) -> (&mut [f32], &mut [f32], &mut Occupancy) {
         (&mut self.grid, &mut self.network, &mut self.occupancy)
     }
 
-    /// Multiplications of the density network for one sample, forward; backward takes twice as
-    /// many.
+    /// Returns the number of multiplications of the density network per sample of a forward pass; a
+    /// backward pass has twice as many.
     pub fn network_multiplications(&self) -> usize {
         self.layers.density.iter().map(|l| l.inputs * l.outputs).sum()
     }
 
-    /// Makes every parameter the mean of its own and of another field's of the same architecture.
-    /// Where one was trained on from the other, that is nearly what the mean of both's colours is
-    /// (Wortsman et al. 2022, "Robust fine-tuning"). Where there may be something stays as it is.
+    /// Replaces every parameter by its mean with another field's of the same architecture; the
+    /// occupancy is unchanged. If one field was fine-tuned from the other, the result renders
+    /// nearly the mean of both renders (Wortsman et al. 2022, "Robust fine-tuning").
     pub fn average_with(&mut self, other: &Self) {
-        let own = self.grid.iter_mut().chain(&mut *self.network);
-        own.zip(other.grid.iter().chain(&*other.network))
-            .for_each(|(own, other)| *own = 0.5 * (*own + other));
+        for (own, other) in [(&mut self.grid, &other.grid), (&mut self.network, &other.network)] {
+            for i in 0..own.len().min(other.len()) {
+                own[i] = 0.5 * (own[i] + other[i]);
+            }
+        }
     }
 
-    /// Keeps a training that goes on from this field to the cells that may hold something, and
-    /// those around them. Elsewhere no image says anything, or that there is nothing: opened again,
-    /// it would fill with what is as bright as the background, which images taken before it don't
-    /// show.
+    /// Limits fine-tuning of this field to its occupied cells and their neighbours. No image has
+    /// evidence of other cells, or the images show them empty: reopened, they would fill with
+    /// density of the background's colour.
     pub fn limit_to_occupied(&mut self) {
         self.occupancy.limit_to_occupied();
     }
 
-    /// Keeps a training that starts from this field to some cells of the occupancy, 128³ over the
-    /// unit cube, x fastest.
+    /// Limits training of this field to a mask of occupancy cells, 128³ over the unit cube, x
+    /// fastest.
     ///
     /// # Panics
-    /// When there aren't so many.
+    /// If the mask has another length.
     pub fn limit_to(&mut self, cells: Vec<bool>) {
-        assert_eq!(cells.len(), CELLS, "a cell of the occupancy each");
+        assert_eq!(cells.len(), CELLS, "length of the mask of occupancy cells");
         self.occupancy.limit_to(cells);
     }
 
-    /// Whether every parameter is finite.
+    /// Returns whether every parameter is finite.
     pub fn is_finite(&self) -> bool {
         self.grid.iter().chain(&*self.network).all(|x| x.is_finite())
     }
 
     /// Writes a safetensors file: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest: 0
-    /// empty, 1 thin, 2 dense). No metadata, so bytes repeat.
+    /// empty, 1 thin, 2 dense). It has no metadata, so equal fields have equal bytes.
     pub fn write(&self, path: &Path) -> Result<(), FieldError> {
         let occupancy = self.occupancy.to_bytes();
         write_tensors(
             path,
             &[
-                ("grid", Tensor::F32(&self.grid)),
-                ("network", Tensor::F32(&self.network)),
-                ("occupancy", Tensor::U8(&occupancy)),
+                ("grid", Tensor::of_floats(&self.grid)),
+                ("network", Tensor::of_floats(&self.network)),
+                ("occupancy", Tensor::of_bytes(&occupancy)),
             ],
         )
     }
 
-    /// Reads what [`Field::write`] wrote; sizes must fit the architecture and numbers be finite.
+    /// Reads a file of [`Field::write`]; sizes must match the architecture, numbers must be finite.
     pub fn read(
         path: &Path,
         architecture: Architecture,
         bounds: Bounds,
     ) -> Result<Self, FieldError> {
-        let format = |reason| FieldError::Format { path: path.to_path_buf(), reason };
-        check(&architecture, &bounds).map_err(format)?;
-        let bytes = std::fs::read(path)
-            .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
-        Self::from_tensors(&bytes, architecture, bounds).map_err(format)
+        read_tensors(path, |tensors| {
+            architecture.check()?;
+            if !bounds.is_valid() {
+                return Err(FieldProblem::NoInside(Box::new(bounds)));
+            }
+            Self::from_tensors(tensors, architecture, bounds)
+        })
     }
 
     fn from_tensors(
-        bytes: &[u8],
+        tensors: &SafeTensors<'_>,
         architecture: Architecture,
         bounds: Bounds,
     ) -> Result<Self, FieldProblem> {
-        let tensors = SafeTensors::deserialize(bytes)?;
         let mut field = Self::empty(architecture, bounds);
-        read_f32(&tensors, "grid", &mut field.grid)?;
-        read_f32(&tensors, "network", &mut field.network)?;
-        let occupancy = read_u8(&tensors, "occupancy", CELLS)?;
+        read_f32(tensors, "grid", &mut field.grid)?;
+        read_f32(tensors, "network", &mut field.network)?;
+        let occupancy = read_u8(tensors, "occupancy", CELLS)?;
         field.occupancy.set(|cell| Cell::from_byte(occupancy[cell]));
         if !field.is_finite() {
             return Err(FieldProblem::NotFinite);
         }
         Ok(field)
     }
-}
-
-fn check(architecture: &Architecture, bounds: &Bounds) -> Result<(), FieldProblem> {
-    architecture.check()?;
-    if !bounds.is_valid() {
-        return Err(FieldProblem::NoInside(Box::new(*bounds)));
-    }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -180,8 +170,7 @@ mod tests {
         field.grid.iter().chain(&*field.network).copied().collect()
     }
 
-    /// Every parameter is the mean of both fields', and rays are stopped where the field's own
-    /// were.
+    /// Every parameter is the mean of both fields', and the occupancy stays the field's own.
     #[test]
     fn fields_are_averaged() {
         let architecture = Architecture {

@@ -4,63 +4,63 @@ use serde::{Deserialize, Serialize};
 use scene::Bounds;
 
 use crate::architecture::Architecture;
-use crate::ranges::{OutOfRange, in_ranges};
+use crate::architecture::{OutOfRange, check_ranges};
 
-/// Name of the description in a field's artifact; the weights lie beside it, each member's in
+/// Name of the description in a field artifact. Each member's weights are next to it, in
 /// [`FieldFile::member`].
 pub const FIELD_FILE: &str = "field.json";
 
-/// Format of the weights that this build writes: grid fields of another one it can't read, since
-/// their networks and the order of their entries differ. The paper's field has had one format.
+/// Format of the weights that this build reads and writes. Formats of grid fields differ in their
+/// networks and the order of their entries; the paper's field has a single format.
 pub const FIELD_FORMAT: u32 = 2;
 
-/// `field.json`: what a reader of the weights must know.
+/// Description of a field artifact, `field.json`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FieldFile {
-    /// [`FIELD_FORMAT`] of the build that trained it; files from before there was such a number
-    /// have none, and format 1.
+    /// [`FIELD_FORMAT`] of the build that trained the field; 1 if missing.
     #[serde(default = "first_format")]
     pub format: u32,
-    /// Which field, and what it is made of.
+    /// Kind and sizes of the field.
     pub field: FieldModel,
-    /// How many there are, trained apart or one on from another: what they render is averaged.
+    /// Number of fields, trained independently or fine-tuned from another member; their renders are
+    /// averaged.
     #[schemars(range(min = 1, max = 16))]
     pub members: u32,
-    /// Where it lies, in scene units.
+    /// Bounds of the field, in scene units.
     pub bounds: Bounds,
-    /// What lies behind the scene.
+    /// Background behind the scene.
     pub background: scene::Background,
 }
 
-/// Format of files that don't say it.
+/// Returns the format of a file without `format`.
 fn first_format() -> u32 {
     1
 }
 
-/// A description of a field that no field can have.
+/// Error returned when a field's description is invalid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FieldFileError {
-    /// A number out of its bounds.
+    /// A number is out of range.
     #[error(transparent)]
     OutOfRange(#[from] OutOfRange),
     /// The file has another format.
     #[error(
-        "another build trained this field, in format {0}; this build reads format {FIELD_FORMAT}: \
-        train it again"
+        "field has format {0} of another build; this build reads format {FIELD_FORMAT}: train the \
+        field again"
     )]
     Format(u32),
 }
 
 impl FieldFile {
-    /// Name of a member's weights, beside [`FIELD_FILE`].
+    /// Returns the name of a member's weights file, next to [`FIELD_FILE`].
     pub fn member(index: u32) -> String {
         format!("field-{index}.safetensors")
     }
 
-    /// Says which number can't be.
+    /// Fails with the first number that is out of range, or with a format that can't be read.
     pub fn check(&self) -> Result<(), FieldFileError> {
-        in_ranges(&[("members", self.members, 1, 16)])?;
+        check_ranges(&[("members", self.members, 1, 16)])?;
         match self.field {
             FieldModel::Grid(_) if self.format != FIELD_FORMAT => {
                 Err(FieldFileError::Format(self.format))
@@ -71,37 +71,37 @@ impl FieldFile {
     }
 }
 
-/// A kind of field, and what it is made of.
+/// Kind of a field, and its sizes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FieldModel {
-    /// Multi-resolution grid with small MLPs: this crate's.
+    /// Multi-resolution grid with small MLPs, of this crate.
     Grid(Architecture),
-    /// The paper's own two MLPs.
+    /// The paper's coarse and fine MLP, of `torch-field`.
     Mlp(MlpArchitecture),
 }
 
-/// What the paper's field is made of; the defaults are the published ones.
+/// Sizes of the paper's field; defaults are the published ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MlpArchitecture {
-    /// Octaves of the positions' encoding.
+    /// Octaves of the positional encoding of positions.
     pub position_octaves: u32,
-    /// Octaves of the directions' encoding.
+    /// Octaves of the positional encoding of directions.
     pub direction_octaves: u32,
-    /// Layers before density and colour part; positions join in again at the fifth.
+    /// Number of layers before density and colour branch; the fifth has a skip connection.
     pub depth: u32,
-    /// Width of those layers.
+    /// Width of the layers before the branch.
     pub width: u32,
-    /// Samples of the coarse network along a ray.
+    /// Number of samples per ray of the coarse network.
     pub coarse_samples: u32,
-    /// Samples that the fine network has besides those.
+    /// Number of additional samples per ray of the fine network.
     pub fine_samples: u32,
-    /// In NDC: colours depend on the ray's direction there, from the near to the far plane and not
-    /// of unit length, as the reference's code has it; without it on its direction in the world.
+    /// In NDC, colours depend on the NDC direction from the near to the far plane, not normalised,
+    /// as in the reference code; if false, on the world direction.
     pub ndc_directions: bool,
-    /// In a box: positions are counted from the box's middle, in [`Bounds::unit`]s. Without it they
-    /// are scene units from the origin, as in the reference's code, which expects scenes of a few
+    /// In a box, positions are relative to the box's middle, in [`Bounds::unit`]s. If false, they
+    /// are in scene units from the origin, as in the reference code, which expects scenes of a few
     /// units around the origin.
     pub scaled_positions: bool,
 }
@@ -122,16 +122,15 @@ impl Default for MlpArchitecture {
 }
 
 impl MlpArchitecture {
-    /// Says which number can't be.
+    /// Fails with the first number that is out of range.
     pub fn check(&self) -> Result<(), OutOfRange> {
-        let ranges = [
+        check_ranges(&[
             ("position_octaves", self.position_octaves, 0, 16),
             ("direction_octaves", self.direction_octaves, 0, 16),
             ("depth", self.depth, 1, 32),
             ("width", self.width, 2, 4096),
             ("coarse_samples", self.coarse_samples, 4, 4096),
             ("fine_samples", self.fine_samples, 1, 4096),
-        ];
-        in_ranges(&ranges)
+        ])
     }
 }

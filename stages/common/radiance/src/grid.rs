@@ -1,9 +1,9 @@
-//! The multi-resolution grid: levels of growing resolution, four features a vertex, trilinear
+//! Multi-resolution grid: levels of growing resolution, four features per vertex, trilinear
 //! interpolation.
 //!
-//! Vertices lie in bricks of 2³, so that the eight corners of a cell touch few cache lines. A level
-//! whose bricks fit its table is stored densely; of a finer one the bricks are hashed (Müller et
-//! al. 2022, "Instant neural graphics primitives", eq. 4), and collisions are left to the networks.
+//! Vertices are stored in bricks of 2³, so that a cell's eight corners are in few cache lines. A
+//! level whose bricks fit its table is stored densely; bricks of a finer level are hashed (Müller
+//! et al. 2022, "Instant neural graphics primitives", eq. 4) without resolving collisions.
 
 use crate::adam::Touched;
 use crate::architecture::Architecture;
@@ -11,35 +11,35 @@ use crate::math::floor;
 use crate::simd::{LANES, Quad as _, kernel};
 use crate::spec::{BRICK, FEATURES, HASH_FACTORS};
 
-/// Entries in a block that the optimiser takes at once.
-const PER_BLOCK: usize = LANES / FEATURES;
+/// Number of entries in a block of the optimiser.
+const ENTRIES_PER_BLOCK: usize = LANES / FEATURES;
 
 impl Architecture {
-    /// Numbers in the grid of a field with this architecture.
+    /// Returns the number of floats in the grid.
     pub fn grid_len(&self) -> usize {
         levels(self).last().map_or(0, |level| level.range().end)
     }
 }
 
-/// One level.
+/// Shape of one grid level.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Level {
     /// Cells along each axis.
     pub(crate) resolution: [u32; 3],
-    /// Entries in its table.
+    /// Number of entries in the table.
     pub(crate) entries: usize,
     /// Bricks along x and y.
     bricks: [u32; 2],
-    /// Whether bricks are hashed; then `entries` is a power of two.
+    /// True if bricks are hashed; `entries` is then a power of two.
     pub(crate) hashed: bool,
-    /// First float of its table.
+    /// Index of the table's first float.
     pub(crate) offset: usize,
 }
 
 impl Level {
-    /// Blocks that the optimiser takes at once.
+    /// Returns the number of the optimiser's blocks.
     pub(crate) fn blocks(&self) -> usize {
-        self.entries.div_ceil(PER_BLOCK)
+        self.entries.div_ceil(ENTRIES_PER_BLOCK)
     }
 
     pub(crate) fn range(&self) -> std::ops::Range<usize> {
@@ -47,8 +47,8 @@ impl Level {
     }
 }
 
-/// Levels from `coarsest` to `finest` cells in equal ratios, no more than `finest_z` along z, at
-/// most 2^`log2_entries` entries each.
+/// Returns the shapes of levels from `coarsest` to `finest` cells in equal ratios, with at most
+/// `finest_z` cells along z and 2^`log2_entries` entries each.
 pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
     let Architecture { levels: count, coarsest, finest, finest_z, log2_entries, .. } =
         *architecture;
@@ -71,7 +71,7 @@ pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
         .collect()
 }
 
-/// Indices and weights of the eight corners around sixteen positions in the unit cube.
+/// Entry indices and weights of the eight corners around sixteen positions in the unit cube.
 struct Corners {
     index: [[u32; LANES]; 8],
     weight: [[f32; LANES]; 8],
@@ -86,7 +86,7 @@ fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
         let last = resolution - 1.0;
         for l in 0..LANES {
             let at = p[axis][l].max(0.0).min(1.0) * resolution;
-            // A position on the far face belongs to the last cell: 0.5 keeps the product inside it.
+            // A position on the far face belongs to the last cell; 0.5 keeps the product inside.
             let (whole, c) = floor(at.min(last + 0.5));
             cell[axis][l] = c;
             fraction[axis][l] = at - whole;
@@ -120,7 +120,7 @@ impl Corners {
 }
 
 kernel! {
-    /// Interpolated features of `n` positions (three rows, unit cube): four rows of `n`.
+    /// Interpolates the features of `n` positions (three rows, unit cube) into four rows of `n`.
     pub(crate) fn encode<L>(level: &Level, table: &[f32], positions: &[f32], features: &mut [f32],
         n: usize) {
         let (table, _) = table.as_chunks::<FEATURES>();
@@ -148,8 +148,8 @@ kernel! {
 }
 
 kernel! {
-    /// Adds each sample's feature gradient to the eight entries it came from, in sample order, and
-    /// marks what it touched.
+    /// Adds each sample's feature gradient to its eight corners' entries, in sample order, and
+    /// marks the touched blocks.
     pub(crate) fn scatter<L>(
         level: &Level, gradient: &mut [f32], touched: &mut Touched, positions: &[[f32; 3]],
         feature_gradients: &[[f32; FEATURES]],
@@ -168,7 +168,7 @@ kernel! {
                 let d = L::Quad::load(d);
                 for c in 0..8 {
                     let index = around.index[c][l] as usize;
-                    touched[index / PER_BLOCK] = 1;
+                    touched[index / ENTRIES_PER_BLOCK] = 1;
                     let entry = &mut gradient[index];
                     d.mul_add(L::Quad::splat(around.weight[c][l]),
                         L::Quad::load(entry)).store(entry);

@@ -1,31 +1,30 @@
 //! The fast radiance field: a multi-resolution grid with small MLPs, written for the CPU. No
 //! autograd, no torch.
 //!
-//! * [`RayField`]: whatever rays can be cast through; [`FieldFile`] says what an artifact holds.
-//! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of
-//!   rays.
+//! * [`RayField`]: trait of fields that render rays; [`FieldFile`] describes a field artifact.
+//! * [`Field`]: parameters and occupancy grid; [`Field::render`] returns colour, opacity and depth
+//!   of rays.
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that
-//!   casts rays and judges colours.
-//! * [`Tally`], [`Occupancy`], [`NormalizedRay`]: what a training of the same field elsewhere
-//!   (`torch-field`) shares: how far it has come, where there may be something, how rays run
-//!   through the unit cube.
-//! * [`regularisers`]: what a training asks of rays beside their colours.
-//! * [`spec`]: the constants that the libtorch twin shares.
-//! * [`Passes`]: one forward and backward pass alone, for benchmarks.
-//! * [`PointSample`]: what a field holds at a place, for whoever bakes it into something else.
-//! * [`Architecture`]: what a field is made of; [`scene::Bounds`]: where it lies.
+//!   casts rays and computes the loss of their colours.
+//! * [`TrainingState`], [`Occupancy`], [`NormalizedRay`]: training progress, occupied cells and
+//!   rays in the unit cube, shared with the libtorch twin in `torch-field`.
+//! * [`regularisers`]: losses on a ray other than its colour error.
+//! * [`spec`]: constants shared with the libtorch twin.
+//! * [`Passes`]: one forward and backward pass without an optimiser, for benchmarks.
+//! * [`PointSample`]: the field at a point of the unit cube, for baking.
+//! * [`Architecture`]: sizes of a field; [`scene::Bounds`]: its position in the world.
 //!
 //! Shading is deferred (SNeRG, Hedman et al. 2021): a sample has a density, a raw colour and view
-//! features. A ray composites its samples' view features, and the view network makes of them and
-//! the direction a raw colour that is added to those of all its samples.
+//! features. A ray composites its samples' view features. From these and the direction the view
+//! network computes a raw colour, which is added to the raw colour of each of the ray's samples.
 //!
-//! Layout of the work: rays are cut into shards by index; a shard's samples go through encoding,
-//! density, compositing, shading and back in chunks that stay in the cache; gradients of the grid
-//! are kept and added level by level, in sample order. So sums have one order, and results are
-//! equal bits at any thread count. Kernels work on 16 logical lanes whatever the machine has, and
-//! multiply-adds are fused everywhere, so AVX-512, AVX2 and portable code give equal bits, too.
+//! A step's rays are cut into shards by index. A shard's samples go through encoding, density,
+//! compositing, shading and back in chunks that fit the cache. Gradients of the grid are stored and
+//! then added level by level, in sample order. All sums have a fixed order, so results have equal
+//! bits at any thread count. Kernels work on 16 logical lanes on any machine and fuse all
+//! multiply-adds, so AVX-512, AVX2 and portable code give equal bits, too.
 //!
-//! Units: rays and depths are in scene units; inside, the scene's box is scaled to the unit cube.
+//! Units: rays and depths are in scene units; positions inside the field are in the unit cube.
 //! Colours are display-encoded sRGB.
 //!
 //! ```
@@ -57,7 +56,6 @@ mod mlp;
 mod occupancy;
 mod passes;
 mod points;
-mod ranges;
 mod ray;
 #[cfg(test)]
 mod reference;
@@ -68,29 +66,24 @@ mod shading;
 mod simd;
 pub mod spec;
 mod specks;
-mod spherical;
-mod strides;
-mod supervisor;
-mod tally;
 mod tensors;
 mod trainer;
+mod training_state;
 
-pub use architecture::Architecture;
+pub use architecture::{Architecture, OutOfRange};
 pub use field::Field;
 pub use field_file::{
     FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel, MlpArchitecture,
 };
-pub use occupancy::{Met, Occupancy};
+pub use math::spherical_harmonics;
+pub use occupancy::{CellHit, Occupancy};
 pub use passes::Passes;
 pub use points::PointSample;
-pub use ranges::OutOfRange;
 pub use ray::{NormalizedRay, Ray, RayMap, clip};
 pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};
 pub use simd::{Family, set_family};
-pub use spherical::spherical_harmonics;
-pub use strides::Strides;
-pub use supervisor::Supervisor;
-pub use tally::Tally;
+pub use spec::Strides;
 pub use tensors::{FieldError, FieldProblem};
-pub use trainer::{StepReport, Trainer, TrainingError, TrainingOptions};
+pub use trainer::{StepReport, Supervisor, Trainer, TrainingError, TrainingOptions};
+pub use training_state::TrainingState;

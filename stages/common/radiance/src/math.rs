@@ -1,12 +1,14 @@
-//! Exponentials whose bits don't depend on the machine, written so that loops over them vectorise.
+//! Exponentials with equal bits on every machine, written so that loops over them vectorise, and
+//! spherical harmonics.
 
-/// e^x for finite x; saturates at about e^±87. Relative error below 2e-7.
+use crate::spec::BASIS;
+
+/// Returns e^x for finite x; saturates at about e^±87. The relative error is below 2e-7.
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
-    // max before min, so that NaN becomes a number here; NaNs are looked for in sums, not in every
-    // exponent.
+    // max before min turns NaN into a number. NaNs are detected in sums, not in every exponent.
     let x = x.max(-87.0).min(87.0);
-    // Adding and taking away 1.5·2^23 rounds to the nearest whole number.
+    // Adding and subtracting 1.5·2^23 rounds to the nearest integer.
     const ROUND: f32 = 12_582_912.0;
     let rounded = x.mul_add(std::f32::consts::LOG2_E, ROUND);
     let k = rounded - ROUND;
@@ -19,12 +21,12 @@ pub(crate) fn exp(x: f32) -> f32 {
     p = p.mul_add(r, 1.666_666_5e-1);
     p = p.mul_add(r, 5.000_000_3e-1);
     let e = (p * r).mul_add(r, r) + 1.0;
-    // The low bits of `rounded` are k; a cast would saturate, and so not vectorise.
+    // The low bits of `rounded` are k. `as u32` saturates, which blocks vectorisation.
     e * f32::from_bits(rounded.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
 }
 
-/// The whole number not above x, for x in 0..=2^22, as a number and as an integer. A cast would
-/// saturate, and so not vectorise.
+/// Returns the integer part of x, for x in 0..=2^22, as a float and as an integer. `as u32`
+/// saturates, which blocks vectorisation.
 #[inline(always)]
 pub(crate) fn floor(x: f32) -> (f32, u32) {
     const ROUND: f32 = 8_388_608.0;
@@ -33,7 +35,7 @@ pub(crate) fn floor(x: f32) -> (f32, u32) {
     (floor, (floor + ROUND).to_bits() - ROUND.to_bits())
 }
 
-/// 1 - e^(-x) for x ≥ 0, without losing small x to cancellation.
+/// Returns 1 - e^(-x) for x ≥ 0 without cancellation at small x.
 #[inline(always)]
 pub(crate) fn one_minus_exp_neg(x: f32) -> f32 {
     // Taylor to x^7 below 0.25, where 1 - e^-x would cancel.
@@ -49,16 +51,59 @@ pub(crate) fn one_minus_exp_neg(x: f32) -> f32 {
     if x < 0.25 { series } else { direct }
 }
 
-/// 1 / (1 + e^-x).
+/// Returns 1 / (1 + e^-x).
 #[inline(always)]
 pub(crate) fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
+}
+
+/// Returns the real spherical harmonics of a unit direction up to degree 2.
+#[inline]
+pub fn spherical_harmonics([x, y, z]: [f32; 3]) -> [f32; BASIS] {
+    [
+        0.282_094_8,
+        -0.488_602_5 * y,
+        0.488_602_5 * z,
+        -0.488_602_5 * x,
+        1.092_548_4 * x * y,
+        -1.092_548_4 * y * z,
+        0.315_391_57 * (3.0 * z * z - 1.0),
+        -1.092_548_4 * x * z,
+        0.546_274_2 * (x * x - y * y),
+    ]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    /// ∫ Yi·Yj over the sphere is 1 for i = j, else 0.
+    #[test]
+    fn orthonormal() {
+        let n = 200;
+        let mut gram = [[0.0f64; BASIS]; BASIS];
+        for a in 0..n {
+            for b in 0..n {
+                let z = (2.0 * (f64::from(a) + 0.5) / f64::from(n)) - 1.0;
+                let phi = std::f64::consts::TAU * (f64::from(b) + 0.5) / f64::from(n);
+                let r = (1.0 - z * z).sqrt();
+                let y =
+                    spherical_harmonics([(r * phi.cos()) as f32, (r * phi.sin()) as f32, z as f32])
+                        .map(f64::from);
+                for i in 0..BASIS {
+                    for j in 0..BASIS {
+                        gram[i][j] += y[i] * y[j] * 4.0 * std::f64::consts::PI / f64::from(n * n);
+                    }
+                }
+            }
+        }
+        for (i, row) in gram.iter().enumerate() {
+            for (j, value) in row.iter().enumerate() {
+                assert!((value - f64::from(u8::from(i == j))).abs() < 1e-3, "{i} {j} {value}");
+            }
+        }
+    }
 
     #[test]
     fn floor_is_the_whole_part() {

@@ -1,6 +1,6 @@
 //! Matrix kernels of the small networks. Activations are rows of `n` samples (a multiple of 16);
-//! weights are stored input by input (`w[i·outputs + j]`). There are no biases: the first spherical
-//! harmonic is a constant input already.
+//! weights are stored by input (`w[i·outputs + j]`). There are no biases: the first spherical
+//! harmonic is a constant input.
 
 use crate::simd::{LANES, Lanes, Quad as _, kernel};
 use crate::spec::{DENSITY_OUTPUTS, VIEW_INPUTS};
@@ -15,38 +15,38 @@ fn put<L: Lanes>(value: L, to: &mut [f32], at: usize) {
     value.store((&mut to[at..at + LANES]).try_into().expect("a row has whole vectors"));
 }
 
-/// Weights of one layer, or the same transposed.
+/// Weights of one layer, plain or transposed.
 #[derive(Clone, Copy)]
 pub(crate) struct Matrix<'a> {
-    /// Input by input.
+    /// Weights by input.
     weights: &'a [f32],
     inputs: usize,
     outputs: usize,
 }
 
-/// What happens to a sum before it is stored.
+/// Activation applied to a sum before it is stored.
 #[derive(Clone, Copy)]
 pub(crate) enum After<'a> {
-    /// Nothing.
+    /// Identity.
     Linear,
     /// max(0, ·).
     Relu,
-    /// 0 where the gate (same shape as the output) isn't above 0: ReLU's derivative.
+    /// Derivative of ReLU: 0 where the gate, of the output's shape, isn't above 0.
     Gate(&'a [f32]),
 }
 
-/// A product of weights and activations.
+/// Product of weights and activations.
 #[derive(Clone, Copy)]
 struct Product<'a> {
     matrix: Matrix<'a>,
-    /// A row of `n` samples for each input.
+    /// One row of `n` samples per input.
     x: &'a [f32],
     n: usize,
     after: After<'a>,
 }
 
-/// TO outputs from `j` on of TV vectors of samples from `s` on, all in registers. The sum over
-/// inputs has one order, whatever the tile.
+/// Computes TO outputs from `j` on of TV vectors of samples from `s` on, all in registers. The
+/// order of the sum over inputs doesn't depend on the tile.
 #[inline(always)]
 fn tile<L: Lanes, const TO: usize, const TV: usize>(
     product: &Product<'_>,
@@ -99,8 +99,8 @@ fn all_outputs<L: Lanes, const TO: usize, const TV: usize>(
 }
 
 kernel! {
-    /// y = after(wᵀ·x): a row of `n` samples for each input to one for each output. With the
-    /// transposed weights it is the backward pass.
+    /// Computes y = after(wᵀ·x), from one row of `n` samples per input to one per output; with
+    /// transposed weights, the backward pass.
     pub(crate) fn multiply<L>(matrix: Matrix<'_>, x: &[f32], y: &mut [f32], n: usize,
         after: After<'_>) {
         let product = Product { matrix, x, n, after };
@@ -199,7 +199,7 @@ kernel! {
     }
 }
 
-/// Shape of one layer and where its weights lie.
+/// Shape of one layer, and offset of its weights.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Layer {
     pub(crate) inputs: usize,
@@ -212,19 +212,19 @@ impl Layer {
         self.offset..self.offset + self.inputs * self.outputs
     }
 
-    /// Its weights, out of those of all layers.
+    /// Returns the layer's weights from those of all layers.
     #[inline]
     pub(crate) fn matrix(self, weights: &[f32]) -> Matrix<'_> {
         Matrix { weights: &weights[self.range()], inputs: self.inputs, outputs: self.outputs }
     }
 
-    /// Its weights transposed, out of those of all layers that [`Layer::transpose`] wrote.
+    /// Returns the layer's transposed weights from those of all layers by [`Layer::transpose`].
     #[inline]
     pub(crate) fn transposed_matrix(self, transposed: &[f32]) -> Matrix<'_> {
         Matrix { weights: &transposed[self.range()], inputs: self.outputs, outputs: self.inputs }
     }
 
-    /// The layer's weights, output by output.
+    /// Writes the layer's weights to `to`, by output.
     pub(crate) fn transpose(self, weights: &[f32], to: &mut [f32]) {
         let (w, t) = (&weights[self.range()], &mut to[self.range()]);
         for i in 0..self.inputs {
@@ -235,9 +235,8 @@ impl Layer {
     }
 }
 
-/// The five layers of the two networks: a sample's features → raw density, raw colour and view
-/// features; a ray's composited view features and direction → what is added to the raw colours of
-/// its samples.
+/// Layers of both networks. Density: a sample's features → raw density, raw colour and view
+/// features. View: a ray's composited view features and direction → view colour.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layers {
     pub(crate) density: [Layer; 2],

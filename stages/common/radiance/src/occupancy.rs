@@ -1,138 +1,135 @@
-//! Which cells of the unit cube may hold something: what rays skip by, and where they take fewer
-//! samples.
+//! Occupancy grid of the unit cube: rays skip empty cells, and training rays sample thin cells at
+//! double stride.
 
 use counter_rng::CounterRng;
 use rayon::prelude::*;
 
 use crate::math::floor;
 use crate::ray::NormalizedRay;
-use crate::spec::{EMPTY, OCCUPANCY_CELLS as GRID, THIN};
-use crate::strides::Strides;
+use crate::spec::Strides;
+use crate::spec::{MAX_EMPTY_OPTICAL_DEPTH, MAX_THIN_OPTICAL_DEPTH, OCCUPANCY_CELLS as GRID};
 
-/// Cells in all.
+/// Number of cells.
 pub(crate) const CELLS: usize = GRID * GRID * GRID;
-/// A word holds 4³ of what is below it: cells in a brick, bricks in a block.
+/// Side of the 4³ elements whose bits share a word: cells of a brick, bricks of a block.
 pub(crate) const SIDE: usize = 4;
-/// Bricks and blocks along each axis.
+/// Number of bricks along each axis.
 const BRICKS: usize = GRID / SIDE;
+/// Number of blocks along each axis.
 const BLOCKS: usize = BRICKS / SIDE;
 
-/// Which word of a level and which bit in it belong to a place.
+/// Returns the word index and bit of an element, given its coordinates and the number of words
+/// along each axis.
 #[inline(always)]
-fn place(at: [usize; 3], words: usize) -> (usize, u32) {
-    let (word, bit) = place_of_lane(at.map(|c| c as u32), words);
+fn word_and_bit(coordinates: [usize; 3], words: usize) -> (usize, u32) {
+    let (word, bit) = word_and_bit_u32(coordinates.map(|c| c as u32), words);
     (word as usize, bit)
 }
 
-/// The same in 32 bits, so that it vectorises.
+/// Computes [`word_and_bit`] in 32 bits, which vectorises.
 #[inline(always)]
-fn place_of_lane([x, y, z]: [u32; 3], words: usize) -> (u32, u32) {
+fn word_and_bit_u32([x, y, z]: [u32; 3], words: usize) -> (u32, u32) {
     let (words, side) = (words as u32, SIDE as u32);
     let word = x / side + words * (y / side + words * (z / side));
     (word, x % side + side * (y % side + side * (z % side)))
 }
 
-/// Steps of a training between updates of the occupancy.
+/// Number of training steps between updates (docs/design/037).
 const STEPS_PER_UPDATE: u64 = 32;
-/// An update looks at one occupied cell in so many, and at one empty cell in so many.
-const OCCUPIED_TURNS: usize = 4;
-const EMPTY_TURNS: usize = 16;
-/// Until this step empty cells are looked at as often as occupied ones.
+/// Number of updates in which every occupied cell is evaluated once (docs/design/037).
+const OCCUPIED_PERIOD: usize = 4;
+/// Number of updates in which every empty cell is evaluated once (docs/design/037).
+const EMPTY_PERIOD: usize = 16;
+/// Last step at which empty cells are evaluated as often as occupied ones (docs/design/037).
 const WARM_UP_STEPS: u64 = 512;
-/// By this step each cell has been looked at.
-const KNOWN_FROM: u64 = STEPS_PER_UPDATE * OCCUPIED_TURNS as u64;
-/// Share of a density that is left when its cell is looked at again.
-const KEPT_SHARE: f32 = 0.7;
+/// Step by which every cell has been evaluated once.
+const FIRST_KNOWN_STEP: u64 = STEPS_PER_UPDATE * OCCUPIED_PERIOD as u64;
+/// Decay of a cell's density each time the cell is evaluated; chosen by hand.
+const DENSITY_DECAY: f32 = 0.7;
 
-/// Which cell along each axis of `side` a number means.
+/// Converts a linear index in a cube of `side` cells to (x, y, z), x fastest.
 #[inline(always)]
-pub(crate) fn corner(cell: usize, side: usize) -> [usize; 3] {
+pub(crate) fn cell_coordinates(cell: usize, side: usize) -> [usize; 3] {
     [cell % side, cell / side % side, cell / (side * side)]
 }
 
-/// A cell and the cells that share a side, an edge or a corner with it, in order.
-pub(crate) fn around(cell: usize) -> impl Iterator<Item = usize> {
-    let [xs, ys, zs] = corner(cell, GRID).map(|c| c.saturating_sub(1)..=(c + 1).min(GRID - 1));
+/// Lists a cell and the cells that share a face, an edge or a corner with it, in ascending order.
+pub(crate) fn cell_and_neighbours(cell: usize) -> impl Iterator<Item = usize> {
+    let [xs, ys, zs] =
+        cell_coordinates(cell, GRID).map(|c| c.saturating_sub(1)..=(c + 1).min(GRID - 1));
     zs.flat_map(move |z| {
         let xs = xs.clone();
         ys.clone().flat_map(move |y| xs.clone().map(move |x| x + GRID * (y + GRID * z)))
     })
 }
 
-/// A word a brick: a bit for each cell that isn't empty, and one for each dense cell.
-fn words(held: impl Fn(usize) -> Cell + Sync) -> (Vec<u64>, Vec<u64>) {
+/// Computes two words per brick: bits of the cells that aren't empty, and bits of the dense cells.
+fn brick_words(kind: impl Fn(usize) -> Cell + Sync) -> (Vec<u64>, Vec<u64>) {
     let bricks = (0..BRICKS * BRICKS * BRICKS).into_par_iter().with_min_len(256);
-    bricks.map(|brick| words_of(brick, &held)).unzip()
+    bricks.map(|brick| words_of_brick(brick, &kind)).unzip()
 }
 
-/// A brick's words.
-fn words_of(brick: usize, held: impl Fn(usize) -> Cell) -> (u64, u64) {
-    let first = corner(brick, BRICKS).map(|c| c * SIDE);
+/// Computes the words of occupied and of dense cells of one brick.
+fn words_of_brick(brick: usize, kind: impl Fn(usize) -> Cell) -> (u64, u64) {
+    let first = cell_coordinates(brick, BRICKS).map(|c| c * SIDE);
     let (mut occupied, mut dense) = (0, 0);
     for bit in 0..SIDE * SIDE * SIDE {
-        let [x, y, z] = corner(bit, SIDE);
-        let held = held(first[0] + x + GRID * (first[1] + y + GRID * (first[2] + z)));
-        occupied |= u64::from(held != Cell::Empty) << bit;
-        dense |= u64::from(held == Cell::Dense) << bit;
+        let [x, y, z] = cell_coordinates(bit, SIDE);
+        let kind = kind(first[0] + x + GRID * (first[1] + y + GRID * (first[2] + z)));
+        occupied |= u64::from(kind != Cell::Empty) << bit;
+        dense |= u64::from(kind == Cell::Dense) << bit;
     }
     (occupied, dense)
 }
 
-/// The cell along each axis that a place of the unit cube lies in.
+/// Returns the coordinates of the cell that contains a position in the unit cube.
 #[inline(always)]
-pub(crate) fn cell_of(place: [f32; 3]) -> [usize; 3] {
-    place.map(|coordinate| cell_along(coordinate) as usize)
+pub(crate) fn cell_at(position: [f32; 3]) -> [usize; 3] {
+    position.map(|coordinate| cell_along(coordinate) as usize)
 }
 
-/// The cell along one axis. A cast would saturate, and so not vectorise.
+/// Returns the cell of a coordinate along one axis. `as u32` saturates, which blocks vectorisation;
+/// `floor` doesn't.
 #[inline(always)]
 pub(crate) fn cell_along(coordinate: f32) -> u32 {
     floor((coordinate * GRID as f32).max(0.0).min(GRID as f32 - 1.0)).1
 }
 
-/// A density that a ray has met in a cell, where it stops light.
+/// Density of a training sample that stops light, and its cell.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Met {
-    /// Number of the cell.
+pub struct CellHit {
+    /// Linear index of the cell.
     pub cell: u32,
-    /// Density for a cube side.
+    /// Density per cube side.
     pub density: f32,
 }
 
-impl Met {
-    /// At a place of the unit cube.
+impl CellHit {
+    /// Creates a hit at a position in the unit cube.
     #[inline(always)]
-    pub fn at(place: [f32; 3], density: f32) -> Self {
-        let [x, y, z] = cell_of(place);
+    pub fn at(position: [f32; 3], density: f32) -> Self {
+        let [x, y, z] = cell_at(position);
         Self { cell: (x + GRID * (y + GRID * z)) as u32, density }
     }
 }
 
-/// Density of a cell that hasn't been looked at.
-const UNKNOWN: f32 = -1.0;
+/// Density of a cell that has never been evaluated.
+const UNKNOWN_DENSITY: f32 = -1.0;
 
-/// What a cell holds.
+/// Kind of a cell; the discriminant is its byte in files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Cell {
-    /// Nothing: rays leap over it.
-    Empty,
-    /// Little ([`THIN`]): in training, rays take every other sample, of double length.
-    Thin,
-    /// Much, or what isn't known yet.
-    Dense,
+    /// No density: rays leap over the cell.
+    Empty = 0,
+    /// Little density ([`MAX_THIN_OPTICAL_DEPTH`]): training rays take every other sample, of
+    /// double length.
+    Thin = 1,
+    /// Higher or unknown density.
+    Dense = 2,
 }
 
 impl Cell {
-    /// As a byte of a file.
-    fn byte(self) -> u8 {
-        match self {
-            Self::Empty => 0,
-            Self::Thin => 1,
-            Self::Dense => 2,
-        }
-    }
-
-    /// From a byte of a file.
+    /// Converts a byte of a file.
     pub(crate) fn from_byte(byte: u8) -> Self {
         match byte {
             0 => Self::Empty,
@@ -142,27 +139,29 @@ impl Cell {
     }
 }
 
-/// A slowly decaying maximum of the density seen in each cell, and what it makes of the cell: 128³
-/// over the unit cube, x fastest.
+/// Slowly decaying maximum of each cell's density, and the cell's kind: 128³ cells over the unit
+/// cube, x fastest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Occupancy {
+    /// Density per cube side of each cell.
     density: Vec<f32>,
-    /// Cells that may be occupied at all.
+    /// Mask of the cells that may become occupied; `None` for all.
     allowed: Option<Vec<bool>>,
-    /// A bit a cell that isn't empty, and a bit a brick that isn't.
+    /// One word per brick: bits of the cells that aren't empty.
     bricks: Vec<u64>,
+    /// One word per block: bits of the bricks that aren't empty.
     blocks: Vec<u64>,
-    /// A bit a dense cell.
+    /// One word per brick: bits of the dense cells.
     dense: Vec<u64>,
-    /// Lowest and highest corner of the bricks that hold something, in the unit cube.
+    /// Lowest and highest corner of the occupied bricks, in the unit cube.
     extent: [[f32; 3]; 2],
 }
 
 impl Occupancy {
-    /// Everything may be occupied.
+    /// Creates a grid of dense cells.
     pub fn full() -> Self {
         let mut full = Self {
-            density: vec![UNKNOWN; CELLS],
+            density: vec![UNKNOWN_DENSITY; CELLS],
             allowed: None,
             bricks: Vec::new(),
             blocks: Vec::new(),
@@ -173,82 +172,88 @@ impl Occupancy {
         full
     }
 
-    /// Limits it to the cells that are occupied and those around them: for a training that goes on
-    /// where the rest is known to be empty.
+    /// Limits occupancy to the occupied cells and their neighbours, for fine-tuning of a field
+    /// whose other cells are known to be empty.
     pub(crate) fn limit_to_occupied(&mut self) {
-        let is_near = |cell: usize| around(cell).any(|near| self.is_occupied(near));
-        let mask = (0..CELLS).into_par_iter().map(is_near).collect();
+        let mask = (0..CELLS)
+            .into_par_iter()
+            .map(|cell| cell_and_neighbours(cell).any(|near| self.is_occupied(near)))
+            .collect();
         self.limit_to(mask);
     }
 
-    /// Limits it to cells, besides what limits it already; all that is left may be occupied.
+    /// Limits occupancy to a mask of cells, within earlier limits; all cells left become dense.
     pub(crate) fn limit_to(&mut self, mut mask: Vec<bool>) {
-        if let Some(allowed) = &self.allowed {
-            mask.iter_mut().zip(allowed).for_each(|(kept, allowed)| *kept &= allowed);
+        for (cell, is_left) in mask.iter_mut().enumerate() {
+            *is_left &= self.is_allowed(cell);
         }
         self.set(|cell| if mask[cell] { Cell::Dense } else { Cell::Empty });
         self.allowed = Some(mask);
     }
 
-    /// Cells to look at, at a step of a training: none at most of them.
+    fn is_allowed(&self, cell: usize) -> bool {
+        self.allowed.as_ref().is_none_or(|allowed| allowed[cell])
+    }
+
+    /// Lists the cells to evaluate at a training step; at most steps there are none.
     pub fn cells_to_update(&self, step: u64) -> Vec<u32> {
         if step == 0 || !step.is_multiple_of(STEPS_PER_UPDATE) {
             return Vec::new();
         }
-        // Whoever has an empty cell's turn has an occupied one's, too: only those are gone through.
-        const { assert!(EMPTY_TURNS.is_multiple_of(OCCUPIED_TURNS)) };
-        const { assert!(GRID.is_multiple_of(OCCUPIED_TURNS)) };
-        let turn = (step / STEPS_PER_UPDATE) as usize;
+        // Cells due as empty are a subset of those due as occupied, so only the latter are visited.
+        const { assert!(EMPTY_PERIOD.is_multiple_of(OCCUPIED_PERIOD)) };
+        const { assert!(GRID.is_multiple_of(OCCUPIED_PERIOD)) };
+        let update = (step / STEPS_PER_UPDATE) as usize;
         let planes = (0..GRID).into_par_iter().flat_map_iter(|z| {
-            let first = (turn + GRID - z) % OCCUPIED_TURNS;
-            (z * GRID * GRID + first..(z + 1) * GRID * GRID).step_by(OCCUPIED_TURNS)
+            let first = (update + GRID - z) % OCCUPIED_PERIOD;
+            (z * GRID * GRID + first..(z + 1) * GRID * GRID).step_by(OCCUPIED_PERIOD)
         });
-        planes.filter(|&cell| self.is_looked_at(cell, step)).map(|cell| cell as u32).collect()
+        planes.filter(|&cell| self.is_due(cell, step)).map(|cell| cell as u32).collect()
     }
 
-    /// Whether to look at a cell at a step that looks at some.
-    fn is_looked_at(&self, cell: usize, step: u64) -> bool {
-        let turn = (step / STEPS_PER_UPDATE) as usize;
-        let allowed = self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
-        let [.., z] = corner(cell, GRID);
-        let turns = if step <= WARM_UP_STEPS || self.is_occupied(cell) {
-            OCCUPIED_TURNS
+    /// Returns whether a cell is evaluated at an update step.
+    fn is_due(&self, cell: usize, step: u64) -> bool {
+        let update = (step / STEPS_PER_UPDATE) as usize;
+        let [.., z] = cell_coordinates(cell, GRID);
+        let period = if step <= WARM_UP_STEPS || self.is_occupied(cell) {
+            OCCUPIED_PERIOD
         } else {
-            EMPTY_TURNS
+            EMPTY_PERIOD
         };
-        let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
-        allowed && wanted
+        self.is_allowed(cell) && (cell % (GRID * GRID) + z) % period == update % period
     }
 
-    /// How rays take samples at a step of a training: until every cell is known, by double strides.
-    /// A training that goes on from another's field knows where it is.
+    /// Returns the strides of a training step: double until every cell has been evaluated, unless
+    /// the training is limited to cells known from another field.
     pub fn strides(&self, step: u64) -> Strides {
-        if step < KNOWN_FROM && self.allowed.is_none() { Strides::Double } else { Strides::ByCell }
+        if step < FIRST_KNOWN_STEP && self.allowed.is_none() {
+            Strides::Double
+        } else {
+            Strides::ByCell
+        }
     }
 
-    /// Where in a cell to look at that step, in the unit cube.
-    pub fn place_in(cell: u32, seed: u64, step: u64) -> [f32; 3] {
+    /// Draws the position in a cell, in the unit cube, at which its density is evaluated.
+    pub fn random_position(cell: u32, seed: u64, step: u64) -> [f32; 3] {
         let mut rng = CounterRng::new(seed, 3, step * CELLS as u64 + u64::from(cell));
-        corner(cell as usize, GRID).map(|c| (c as f32 + rng.uniform()) / GRID as f32)
+        cell_coordinates(cell as usize, GRID).map(|c| (c as f32 + rng.uniform()) / GRID as f32)
     }
 
-    /// Takes the densities that were found in cells, and decides anew what every cell holds, for
-    /// rays with samples so far apart in the cube.
+    /// Stores the densities evaluated in `cells` and classifies every cell, for rays with samples
+    /// `step` apart in cube sides.
     pub fn update(&mut self, cells: &[u32], densities: &[f32], step: f32) {
         if cells.is_empty() {
             return;
         }
-        for (&cell, &found) in cells.iter().zip(densities) {
+        for (&cell, &new_density) in cells.iter().zip(densities) {
             let density = &mut self.density[cell as usize];
-            *density = (*density * KEPT_SHARE).max(found);
+            *density = (*density * DENSITY_DECAY).max(new_density);
         }
-        let mean = self.mean_density();
-        // A hundredth of a step's light is worth a sample; while all is semi-transparent, only what
-        // is denser than the mean.
-        let (empty, thin) = (mean.min(EMPTY / step), THIN / step);
-        let allowed = |cell: usize| self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
-        let (bricks, dense) = words(|cell| match self.density[cell] {
-            _ if !allowed(cell) => Cell::Empty,
+        // While all space is semi-transparent, the mean keeps cells below it empty.
+        let empty = self.mean_density().min(MAX_EMPTY_OPTICAL_DEPTH / step);
+        let thin = MAX_THIN_OPTICAL_DEPTH / step;
+        let (bricks, dense) = brick_words(|cell| match self.density[cell] {
+            _ if !self.is_allowed(cell) => Cell::Empty,
             d if d < 0.0 => self.cell(cell),
             d if d < empty => Cell::Empty,
             d if d < thin => Cell::Thin,
@@ -257,18 +262,18 @@ impl Occupancy {
         self.set_words(bricks, dense);
     }
 
-    /// Raises cells to densities that rays have met, for the next update. Cells that haven't been
-    /// looked at count as dense anyway.
-    pub fn keep(&mut self, met: &[Met]) {
-        for &Met { cell, density } in met {
+    /// Raises cells' densities to those of training samples, for the next update. Cells that were
+    /// never evaluated are dense anyway.
+    pub fn raise_densities(&mut self, hits: &[CellHit]) {
+        for &CellHit { cell, density } in hits {
             let known = &mut self.density[cell as usize];
-            if *known != UNKNOWN {
+            if *known != UNKNOWN_DENSITY {
                 *known = known.max(density);
             }
         }
     }
 
-    /// Mean density of the cells that have been looked at; parts are summed in order.
+    /// Returns the mean density of the cells that have been evaluated; sums have a fixed order.
     fn mean_density(&self) -> f32 {
         let parts: Vec<(f64, u32)> = (self.density.par_chunks(GRID * GRID))
             .map(|part| {
@@ -276,20 +281,20 @@ impl Occupancy {
                 known.fold((0.0, 0), |(sum, count), &d| (sum + f64::from(d), count + 1))
             })
             .collect();
-        let (sum, count) =
-            parts.iter().fold((0.0, 0), |(sum, count), part| (sum + part.0, count + part.1));
+        let sum = parts.iter().fold(0.0, |sum, part| sum + part.0);
+        let count = parts.iter().map(|part| part.1).sum::<u32>();
         (sum / f64::from(count.max(1))) as f32
     }
 
-    /// Whether a cell may hold something.
+    /// Returns whether a cell isn't empty.
     pub(crate) fn is_occupied(&self, cell: usize) -> bool {
-        let (word, bit) = place(corner(cell, GRID), BRICKS);
+        let (word, bit) = word_and_bit(cell_coordinates(cell, GRID), BRICKS);
         self.bricks[word] >> bit & 1 == 1
     }
 
-    /// What a cell holds.
+    /// Returns a cell's kind.
     pub(crate) fn cell(&self, cell: usize) -> Cell {
-        let (word, bit) = place(corner(cell, GRID), BRICKS);
+        let (word, bit) = word_and_bit(cell_coordinates(cell, GRID), BRICKS);
         match (self.bricks[word] >> bit & 1, self.dense[word] >> bit & 1) {
             (0, _) => Cell::Empty,
             (_, 0) => Cell::Thin,
@@ -297,9 +302,9 @@ impl Occupancy {
         }
     }
 
-    /// Sets every cell anew.
-    pub(crate) fn set(&mut self, held: impl Fn(usize) -> Cell + Sync) {
-        let (bricks, dense) = words(held);
+    /// Sets every cell's kind.
+    pub(crate) fn set(&mut self, kind: impl Fn(usize) -> Cell + Sync) {
+        let (bricks, dense) = brick_words(kind);
         self.set_words(bricks, dense);
     }
 
@@ -307,58 +312,58 @@ impl Occupancy {
         self.blocks = vec![0; BLOCKS * BLOCKS * BLOCKS];
         let (mut low, mut high) = ([BRICKS; 3], [0; 3]);
         for brick in (0..bricks.len()).filter(|&brick| bricks[brick] != 0) {
-            let at = corner(brick, BRICKS);
-            let (word, bit) = place(at, BLOCKS);
+            let coordinates = cell_coordinates(brick, BRICKS);
+            let (word, bit) = word_and_bit(coordinates, BLOCKS);
             self.blocks[word] |= 1 << bit;
             for axis in 0..3 {
-                low[axis] = low[axis].min(at[axis]);
-                high[axis] = high[axis].max(at[axis] + 1);
+                low[axis] = low[axis].min(coordinates[axis]);
+                high[axis] = high[axis].max(coordinates[axis] + 1);
             }
         }
         if low == [BRICKS; 3] {
-            // Nothing: an extent without an inside.
+            // All cells are empty: an empty extent.
             low = high;
         }
-        self.extent = [low, high].map(|at| at.map(|brick| brick as f32 / BRICKS as f32));
+        self.extent = [low, high].map(|corner| corner.map(|c| c as f32 / BRICKS as f32));
         (self.bricks, self.dense) = (bricks, dense);
     }
 
-    /// Cells that are occupied, in order.
+    /// Lists the occupied cells in ascending order.
     pub(crate) fn cells(&self) -> impl Iterator<Item = usize> + '_ {
         (0..CELLS).filter(|&cell| self.is_occupied(cell))
     }
 
-    /// The density of each cell.
+    /// Returns each cell's density per cube side; below 0 if unknown.
     pub fn density(&self) -> &[f32] {
         &self.density
     }
 
-    /// Goes on with the densities and the cells of a checkpoint.
+    /// Restores the densities and cells of a checkpoint.
     pub fn restore(&mut self, density: Vec<f32>, cells: &[u8]) {
         self.density = density;
         self.set(|cell| Cell::from_byte(cells[cell]));
     }
 
-    /// Cells as bytes for a file: 0 is empty, 1 thin, 2 dense.
+    /// Returns the cells as bytes of a file: 0 is empty, 1 thin, 2 dense.
     pub fn to_bytes(&self) -> Vec<u8> {
-        (0..CELLS).map(|cell| self.cell(cell).byte()).collect()
+        (0..CELLS).map(|cell| self.cell(cell) as u8).collect()
     }
 }
 
-/// Stands for a cell that isn't empty, where [`Occupancy::empty_around`] gives a size.
+/// Value of [`Occupancy::empty_cube_sizes`] for a cell that isn't empty.
 pub(crate) const OCCUPIED: u32 = 8;
 
-/// The first 2³ bits of a word's 4³. The other mask keeps, of a bit's number, what says in which
-/// eighth the bit is.
+/// Bits of the first 2³ elements of a word's 4³.
 const EIGHTH: u64 = 0x33_0033;
+/// Bits of an element's bit index that select its eighth of the word.
 const FIRST_OF_EIGHTH: u32 = 0b10_1010;
-/// How far outside the extent a ray may pass and still march, for an origin within the unit cube:
-/// more than positions are rounded by.
+/// Width by which the extent is enlarged for an origin within the unit cube: more than the rounding
+/// errors of positions.
 const MARGIN: f32 = 1e-5;
 
 impl Occupancy {
-    /// The range of t in which a straight ray passes the bricks that hold something, a little
-    /// widened; `None` where it passes beside. `inverse` is 1 over its direction.
+    /// Returns the range of t in which a straight ray crosses the slightly enlarged extent of
+    /// occupied bricks; `None` if the ray misses it. `inverse` is 1 over the ray's direction.
     #[inline(always)]
     pub(crate) fn crossing(&self, ray: &NormalizedRay, inverse: &[f32; 3]) -> Option<[f32; 2]> {
         let [low, high] = self.extent;
@@ -379,26 +384,27 @@ impl Occupancy {
         (from < to).then_some([from, to])
     }
 
-    /// For each cell the size of the largest empty cube around it: 2^size cells a side, 0 to 4.
-    /// [`OCCUPIED`] where the cell isn't empty. Cells are given by an array an axis.
+    /// Returns for each cell the size, 0 to 4, of the largest empty cube around it, which has
+    /// 2^size cells per side; [`OCCUPIED`] for a cell that isn't empty. `cells` has one array per
+    /// axis.
     ///
-    /// Written so that all but the loads vectorises.
+    /// All operations but the loads vectorise.
     #[inline(always)]
-    pub(crate) fn empty_around<const N: usize>(&self, cells: &[[u32; N]; 3]) -> [u32; N] {
+    pub(crate) fn empty_cube_sizes<const N: usize>(&self, cells: &[[u32; N]; 3]) -> [u32; N] {
         let [xs, ys, zs] = cells;
         let (mut bricks, mut cell_bits) = ([0; N], [0; N]);
         let (mut blocks, mut brick_bits) = ([0; N], [0; N]);
         let (mut words, mut sizes) = ([[0; N]; 2], [0; N]);
         for i in 0..N {
             let cell = [xs[i], ys[i], zs[i]];
-            (bricks[i], cell_bits[i]) = place_of_lane(cell, BRICKS);
-            (blocks[i], brick_bits[i]) = place_of_lane(cell.map(|c| c / SIDE as u32), BLOCKS);
+            (bricks[i], cell_bits[i]) = word_and_bit_u32(cell, BRICKS);
+            (blocks[i], brick_bits[i]) = word_and_bit_u32(cell.map(|c| c / SIDE as u32), BLOCKS);
         }
         for i in 0..N {
             words[0][i] = self.bricks[bricks[i] as usize];
             words[1][i] = self.blocks[blocks[i] as usize];
         }
-        // No branches: which size comes next can't be predicted.
+        // Without branches, since sizes are unpredictable.
         for i in 0..N {
             let [cells, bricks] = [words[0][i], words[1][i]];
             let size = u32::from(cells & EIGHTH << (cell_bits[i] & FIRST_OF_EIGHTH) == 0)
@@ -410,10 +416,10 @@ impl Occupancy {
         sizes
     }
 
-    /// Whether an occupied cell is thin.
+    /// Returns whether an occupied cell is thin.
     #[inline(always)]
     pub(crate) fn is_thin(&self, cell: [usize; 3]) -> bool {
-        let (word, bit) = place(cell, BRICKS);
+        let (word, bit) = word_and_bit(cell, BRICKS);
         self.dense[word] >> bit & 1 == 0
     }
 }
@@ -422,13 +428,13 @@ impl Occupancy {
 mod tests {
     use super::*;
 
-    /// What goes on stays in the cells that were occupied and their neighbours, whatever density is
-    /// found elsewhere, and within a mask.
+    /// Fine-tuning keeps to the cells that were occupied and their neighbours, whatever density is
+    /// found elsewhere, and to a mask.
     #[test]
-    fn going_on_stays_where_something_was() {
+    fn limits_hold_for_all_densities() {
         let mut occupancy = Occupancy::full();
-        assert_eq!(occupancy.strides(KNOWN_FROM - 1), Strides::Double);
-        assert_eq!(occupancy.strides(KNOWN_FROM), Strides::ByCell);
+        assert_eq!(occupancy.strides(FIRST_KNOWN_STEP - 1), Strides::Double);
+        assert_eq!(occupancy.strides(FIRST_KNOWN_STEP), Strides::ByCell);
         let cell = |x: usize, y: usize, z: usize| x + GRID * (y + GRID * z);
         let (inside, corner) = (cell(5, 60, 70), cell(0, GRID - 1, 0));
         occupancy.set(|c| if c == inside || c == corner { Cell::Thin } else { Cell::Empty });
@@ -440,7 +446,7 @@ mod tests {
         occupancy.limit_to(mask);
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
-        let updates = (1..=OCCUPIED_TURNS as u64)
+        let updates = (1..=OCCUPIED_PERIOD as u64)
             .map(|turn| occupancy.cells_to_update(turn * STEPS_PER_UPDATE).len());
         assert_eq!(updates.sum::<usize>(), 26 + 8, "each once a round of turns");
         occupancy.update(&all, &vec![1e3; CELLS], 0.003);
@@ -458,7 +464,7 @@ mod tests {
             WARM_UP_STEPS + STEPS_PER_UPDATE,
             WARM_UP_STEPS + 7 * STEPS_PER_UPDATE,
         ] {
-            let expected = (0..CELLS).filter(|&cell| occupancy.is_looked_at(cell, step));
+            let expected = (0..CELLS).filter(|&cell| occupancy.is_due(cell, step));
             let found = occupancy.cells_to_update(step);
             assert!(found.into_iter().map(|cell| cell as usize).eq(expected), "step {step}");
         }
@@ -468,26 +474,26 @@ mod tests {
     #[test]
     fn a_cell_that_rays_meet_stays() {
         let (missed, found, place) = (200_100, 1e3, [0.6, 0.2, 0.9]);
-        let met = Met::at(place, found);
-        assert_eq!(corner(met.cell as usize, GRID), cell_of(place));
+        let hit = CellHit::at(place, found);
+        assert_eq!(cell_coordinates(hit.cell as usize, GRID), cell_at(place));
         let mut occupancy = Occupancy::full();
         let all: Vec<u32> = (0..CELLS as u32).collect();
         let mut densities = vec![0.0; CELLS];
-        occupancy.keep(&[met]);
-        assert_eq!(occupancy.density()[met.cell as usize], UNKNOWN);
-        (densities[missed], densities[met.cell as usize]) = (found, found);
+        occupancy.raise_densities(&[hit]);
+        assert_eq!(occupancy.density()[hit.cell as usize], UNKNOWN_DENSITY);
+        (densities[missed], densities[hit.cell as usize]) = (found, found);
         occupancy.update(&all, &densities, 0.003);
         assert_eq!(occupancy.cells().count(), 2);
         densities.fill(0.0);
         densities[0] = found;
         for _ in 0..50 {
-            occupancy.keep(&[met, Met { density: 0.1, ..met }]);
+            occupancy.raise_densities(&[hit, CellHit { density: 0.1, ..hit }]);
             occupancy.update(&all, &densities, 0.003);
         }
-        assert!(occupancy.cells().eq([0, met.cell as usize]));
+        assert!(occupancy.cells().eq([0, hit.cell as usize]));
     }
 
-    /// As casts have it.
+    /// Cells equal those of a cast by `as u32`.
     #[test]
     fn places_lie_in_their_cells() {
         for x in (0..40_000).map(|i| i as f32 * 3e-5 - 0.1).chain([f32::NAN, f32::INFINITY]) {
@@ -500,14 +506,14 @@ mod tests {
     #[test]
     fn cubes_are_as_large_as_what_is_empty() {
         let mut occupancy = Occupancy::full();
-        occupancy.set(|cell| match corner(cell, GRID) {
+        occupancy.set(|cell| match cell_coordinates(cell, GRID) {
             [x, y, z] if x > 64 && (cell / 3) % 67 == 0 && y + z < 150 => Cell::Thin,
             [x, _, 40] if x % 16 == 3 => Cell::Dense,
             _ => Cell::Empty,
         });
         let is_empty = |low: [usize; 3], side: usize| {
             (0..side * side * side).all(|i| {
-                let [x, y, z] = corner(i, side);
+                let [x, y, z] = cell_coordinates(i, side);
                 let cell = low[0] + x + GRID * (low[1] + y + GRID * (low[2] + z));
                 !occupancy.is_occupied(cell)
             })
@@ -517,7 +523,7 @@ mod tests {
             let cell = [(); 3].map(|()| rng.below(GRID as u64) as usize);
             let largest =
                 (0..=4).rev().find(|size| is_empty(cell.map(|c| c >> size << size), 1 << size));
-            let [size] = occupancy.empty_around(&cell.map(|c| [c as u32]));
+            let [size] = occupancy.empty_cube_sizes(&cell.map(|c| [c as u32]));
             assert_eq!(size, largest.unwrap_or(OCCUPIED), "{cell:?}");
             seen[size.min(5) as usize] += 1;
         }

@@ -4,40 +4,41 @@ use crate::field::Field;
 use crate::ray::{Ray, clip};
 use crate::regularisers::Regularisers;
 use crate::shading::{NetworkGradients, RayGradients};
-use crate::strides::Strides;
+use crate::spec::Strides;
 
-/// One worker's forward and backward pass without an optimiser: what benchmarks measure, and what
-/// another reading of the field is compared with.
+/// Forward and backward pass of one worker without an optimiser, for benchmarks and for comparison
+/// with the libtorch twin.
 #[derive(Debug)]
 pub struct Passes {
     chunk: Chunk,
     transposed: Aligned,
     network: Vec<f32>,
-    into: FeatureGradients,
+    features: FeatureGradients,
     touched: Vec<u8>,
 }
 
 impl Passes {
-    /// Buffers for a field.
+    /// Creates buffers for a field.
     pub fn new(field: &Field) -> Self {
         let mut transposed = Aligned::zeros(field.network.len());
-        field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
+        for layer in field.layers.all() {
+            layer.transpose(&field.network, &mut transposed);
+        }
         let blocks = field.levels.iter().map(crate::grid::Level::blocks).max().unwrap_or(0);
         Self {
             chunk: Chunk::default(),
             transposed,
             network: vec![0.0; field.network.len()],
-            into: FeatureGradients::default(),
+            features: FeatureGradients::default(),
             touched: vec![0; blocks],
         }
     }
 
-    /// Renders rays in this thread and, where asked for, goes back from a gradient of 1 by every
-    /// colour, as far as the list that a trainer scatters. Returns the samples marched and those
-    /// that got a colour.
+    /// Renders rays in this thread; if `backward`, also propagates a gradient of 1 by every colour
+    /// to the grid's features. Returns the numbers of samples marched and of samples with a colour.
     pub fn run(&mut self, field: &Field, rays: &[Ray], backward: bool) -> [usize; 2] {
         let mut samples = [0; 2];
-        self.into.clear();
+        self.features.clear();
         for rays in rays.chunks(CHUNK_RAYS) {
             let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
             self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
@@ -45,7 +46,7 @@ impl Passes {
             samples[1] += self.chunk.coloured();
             if backward {
                 let ones = [[1.0; 3]; CHUNK_RAYS];
-                let towards = RayGradients {
+                let upstream = RayGradients {
                     colours: &ones,
                     backgrounds: &ones,
                     regularisers: Regularisers::default(),
@@ -54,10 +55,10 @@ impl Passes {
                     NetworkGradients { transposed: &self.transposed, sums: &mut self.network };
                 self.chunk.backward(
                     field,
-                    towards,
+                    upstream,
                     Roulette::default(),
                     &mut network,
-                    &mut self.into,
+                    &mut self.features,
                 );
             }
         }
@@ -67,21 +68,21 @@ impl Passes {
     /// Adds the last backward pass's gradients to a table of the grid's size.
     ///
     /// # Panics
-    /// When the table has another size.
+    /// If the table has another size.
     pub fn scatter(&mut self, field: &Field, table: &mut [f32]) {
-        for (level, gradients) in field.levels.iter().zip(&self.into.levels) {
+        for (level, gradients) in field.levels.iter().zip(&self.features.levels) {
             let touched = &mut self.touched[..level.blocks()];
             crate::grid::scatter(
                 level,
                 &mut table[level.range()],
                 touched,
-                &self.into.positions,
+                &self.features.positions,
                 gradients,
             );
         }
     }
 
-    /// Gradient by the networks, layer after layer, each input by input, summed over all backward
+    /// Returns the gradient by the networks' weights, by layer and input, summed over all backward
     /// passes so far.
     pub fn network_gradient(&self) -> &[f32] {
         &self.network

@@ -1,9 +1,10 @@
-//! What a field holds at places of its unit cube, without any ray: for whoever bakes it.
+//! Density and colour of a field at points of its unit cube, without rays: for baking.
 
 use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::math::exp;
-use crate::occupancy::cell_of;
+use crate::math::spherical_harmonics;
+use crate::occupancy::cell_at;
 use crate::samples::DensityRows;
 use crate::shading::view_network;
 use crate::simd::LANES;
@@ -11,61 +12,61 @@ use crate::spec::{
     DENSITY_OUTPUTS, MAX_RAW_DENSITY, OCCUPANCY_CELLS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES,
     VIEW_INPUTS,
 };
-use crate::spherical::spherical_harmonics;
 
-/// What a field holds at a place.
+/// Density and colour of a field at a point.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PointSample {
-    /// Optical depth for each unit of a ray's t ([`crate::NormalizedRay`]); 0 where the occupancy
-    /// says that there is nothing.
+    /// Optical depth per unit of a ray's t ([`crate::NormalizedRay`]); 0 in an empty cell.
     pub density: f32,
-    /// Red, green and blue before the sigmoid, without the view network's part.
+    /// Red, green and blue before the sigmoid, without the view-dependent part.
     pub raw_colour: [f32; 3],
-    /// What [`Field::view_colours`] takes.
+    /// Input of [`Field::view_colours`].
     pub view_features: [f32; VIEW_FEATURES],
 }
 
-/// Places in one pass: their activations stay in the cache.
-const PLACES_PER_PASS: usize = 256;
+/// Number of points per pass, whose activations fit the cache; chosen by hand.
+const POINTS_PER_PASS: usize = 256;
 
 impl Field {
-    /// Whether some cell of the occupancy between two corners of the unit cube may hold something.
-    pub fn may_hold(&self, low: [f32; 3], high: [f32; 3]) -> bool {
-        let (from, to) = (cell_of(low), cell_of(high));
-        let cell = |x: usize, y: usize, z: usize| x + OCCUPANCY_CELLS * (y + OCCUPANCY_CELLS * z);
-        (from[2]..=to[2]).any(|z| {
-            (from[1]..=to[1])
-                .any(|y| (from[0]..=to[0]).any(|x| self.occupancy.is_occupied(cell(x, y, z))))
+    /// Returns whether the box between two corners in the unit cube intersects an occupied cell.
+    pub fn has_occupied_cell(&self, low: [f32; 3], high: [f32; 3]) -> bool {
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| cell_at(low)[axis]..=cell_at(high)[axis]);
+        zs.into_iter().any(|z| {
+            ys.clone().any(|y| {
+                let row = OCCUPANCY_CELLS * (y + OCCUPANCY_CELLS * z);
+                xs.clone().any(|x| self.occupancy.is_occupied(row + x))
+            })
         })
     }
 
-    /// What the field holds at some places of the unit cube, as rays would find it. In this thread.
-    pub fn sample_points(&self, places: &[[f32; 3]]) -> Vec<PointSample> {
-        let mut samples = vec![PointSample::default(); places.len()];
+    /// Evaluates the field at points of the unit cube, in this thread.
+    pub fn sample_points(&self, points: &[[f32; 3]]) -> Vec<PointSample> {
+        let mut samples = vec![PointSample::default(); points.len()];
         let occupied: Vec<usize> =
-            (0..places.len()).filter(|&i| self.may_hold(places[i], places[i])).collect();
+            (0..points.len()).filter(|&i| self.has_occupied_cell(points[i], points[i])).collect();
         let mut rows = DensityRows::default();
-        for chosen in occupied.chunks(PLACES_PER_PASS) {
-            let n = chosen.len().next_multiple_of(LANES);
+        for indices in occupied.chunks(POINTS_PER_PASS) {
+            let n = indices.len().next_multiple_of(LANES);
             let mut positions = vec![0.0; 3 * n];
-            for (k, &i) in chosen.iter().enumerate() {
-                (0..3).for_each(|axis| positions[axis * n + k] = places[i][axis]);
+            for (k, &i) in indices.iter().enumerate() {
+                for axis in 0..3 {
+                    positions[axis * n + k] = points[i][axis];
+                }
             }
             let outputs = rows.outputs_at(self, &positions, n);
-            for (k, &i) in chosen.iter().enumerate() {
-                let output = |o: usize| outputs[o * n + k];
+            for (k, &i) in indices.iter().enumerate() {
                 samples[i] = PointSample {
-                    density: exp(output(0).min(MAX_RAW_DENSITY)),
-                    raw_colour: std::array::from_fn(|c| output(RAW_COLOUR + c)),
-                    view_features: std::array::from_fn(|f| output(VIEW_FEATURE + f)),
+                    density: exp(outputs[k].min(MAX_RAW_DENSITY)),
+                    raw_colour: std::array::from_fn(|c| outputs[(RAW_COLOUR + c) * n + k]),
+                    view_features: std::array::from_fn(|f| outputs[(VIEW_FEATURE + f) * n + k]),
                 };
             }
         }
         samples
     }
 
-    /// What is added to the raw colours of a ray's samples, for composited view features and each
-    /// of some directions of unit length. In this thread.
+    /// Computes, in this thread, the view-dependent part of raw colours for composited view
+    /// features and each of `directions`, which have unit length.
     pub fn view_colours(
         &self,
         features: &[f32; VIEW_FEATURES],
@@ -76,11 +77,13 @@ impl Field {
         let mut input = vec![0.0; VIEW_INPUTS * n];
         for (k, &direction) in directions.iter().enumerate() {
             let values = features.iter().copied().chain(spherical_harmonics(direction));
-            values.enumerate().for_each(|(row, value)| input[row * n + k] = value);
+            for (row, value) in values.enumerate() {
+                input[row * n + k] = value;
+            }
         }
-        let mut added = Aligned::default();
-        let added = view_network(self, &input, &mut Default::default(), &mut added, n);
-        (0..directions.len()).map(|k| [0, 1, 2].map(|c| added[c * n + k])).collect()
+        let mut view_colour = Aligned::default();
+        let view_colour = view_network(self, &input, &mut Default::default(), &mut view_colour, n);
+        (0..directions.len()).map(|k| [0, 1, 2].map(|c| view_colour[c * n + k])).collect()
     }
 }
 
@@ -92,7 +95,7 @@ mod tests {
     use crate::ray::{Ray, clip};
     use scene::Bounds;
 
-    /// Composited by hand, the samples of a ray's places give the colour that the engine renders.
+    /// Point samples along a ray, composited by hand, give the colour that the engine renders.
     #[test]
     fn places_hold_what_rays_see() {
         let architecture = Architecture {
@@ -133,14 +136,19 @@ mod tests {
         for (sample, weight) in samples.iter().zip(&weights) {
             features.iter_mut().zip(&sample.view_features).for_each(|(sum, f)| *sum += weight * f);
         }
-        let added = field.view_colours(&features, &[clipped.view, [0.0, 1.0, 0.0]]);
+        let view_colour = field.view_colours(&features, &[clipped.view, [0.0, 1.0, 0.0]]);
         let colour: [f32; 3] = std::array::from_fn(|c| {
             let lights = samples.iter().zip(&weights);
-            lights.map(|(s, weight)| weight * sigmoid(s.raw_colour[c] + added[0][c])).sum::<f32>()
+            lights
+                .map(|(s, weight)| weight * sigmoid(s.raw_colour[c] + view_colour[0][c]))
+                .sum::<f32>()
                 + through
         });
         let pixel = field.render(&[ray])[0];
-        assert!(through > 0.01 && through < 0.9 && added[0] != added[1], "{through} {added:?}");
+        assert!(
+            through > 0.01 && through < 0.9 && view_colour[0] != view_colour[1],
+            "{through} {view_colour:?}"
+        );
         assert!(samples.iter().any(|s| s.density == 0.0));
         for c in 0..3 {
             assert!((colour[c] - pixel.colour[c]).abs() < 1e-3, "{colour:?} {pixel:?}");
@@ -158,8 +166,8 @@ mod tests {
             false => crate::occupancy::Cell::Empty,
         });
         let at = |x: f32, y: f32, z: f32| [x, y, z].map(|c| (c + 0.5) / OCCUPANCY_CELLS as f32);
-        assert!(field.may_hold(at(98.0, 20.0, 28.0), at(101.0, 23.0, 30.0)));
-        assert!(!field.may_hold(at(98.0, 20.0, 28.0), at(101.0, 23.0, 29.0)));
-        assert!(!field.may_hold(at(101.0, 20.0, 28.0), [1.0; 3]));
+        assert!(field.has_occupied_cell(at(98.0, 20.0, 28.0), at(101.0, 23.0, 30.0)));
+        assert!(!field.has_occupied_cell(at(98.0, 20.0, 28.0), at(101.0, 23.0, 29.0)));
+        assert!(!field.has_occupied_cell(at(101.0, 20.0, 28.0), [1.0; 3]));
     }
 }

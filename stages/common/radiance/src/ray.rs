@@ -3,20 +3,20 @@ use scene::{Bounds, CameraRay, Frustum, Space};
 
 use crate::math::exp;
 
-/// A ray in scene units. Double precision, since scenes may lie far from the origin; [`clip`] maps
-/// the ray to the unit cube first, and only then rounds it.
+/// Ray in scene units, in double precision since scenes may be far from the origin. [`clip`] maps
+/// the ray to the unit cube before it rounds to single precision.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Ray {
     /// Start of the ray.
     pub origin: [f64; 3],
-    /// Unit length; a direction that isn't finite or is zero sees the background alone.
+    /// Unit direction; a direction that is 0 or not finite renders the background.
     pub direction: [f64; 3],
-    /// What it sees where nothing stands in its way.
+    /// Background colour, display-encoded sRGB.
     pub background: [f32; 3],
 }
 
 impl Ray {
-    /// Returns a camera's ray before a background.
+    /// Creates a ray from a camera's ray and a background.
     pub fn new(ray: &CameraRay, background: [f32; 3]) -> Self {
         let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
         Self { origin, direction, background }
@@ -28,53 +28,52 @@ impl Ray {
         self.direction != [0.0; 3] && numbers.into_iter().all(|x| x.is_finite())
     }
 
-    /// Returns the direction as fields take it: single precision.
+    /// Returns the direction in single precision.
     fn view(&self) -> [f32; 3] {
         self.direction.map(|x| x as f32)
     }
 }
 
-/// A ray in the unit cube, by a parameter t that moves through it evenly: for a box the distance in
-/// cube sides.
+/// Ray in the unit cube with a parameter t of even speed; in a box t is the distance in cube sides.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NormalizedRay {
-    /// Where t is 0.
+    /// Position at t = 0.
     pub origin: [f32; 3],
-    /// Along which t moves.
+    /// Direction of increasing t.
     pub direction: [f32; 3],
-    /// Where it enters and leaves; nothing when `enter >= leave`.
+    /// Parameter at which the ray enters the cube; the ray misses if `enter >= leave`.
     pub enter: f32,
-    /// Where it leaves.
+    /// Parameter at which the ray leaves the cube.
     pub leave: f32,
-    /// How t maps to places and distances in between.
+    /// Map from t to position and distance.
     pub map: RayMap,
-    /// The direction in the world, unit length: what colours depend on, whatever the field's space.
+    /// Unit direction in the world, on which colours depend in every space.
     pub view: [f32; 3],
 }
 
-/// Maps the parameter t of a ray to its place in the unit cube and its distance in scene units.
+/// Map from a ray's parameter t to its position in the unit cube and its distance in scene units.
 #[derive(Clone, Copy, Debug)]
 pub enum RayMap {
-    /// Position origin + t·direction, distance start + t·scale / (1 - t·perspective): a perspective
-    /// map keeps lines straight and moves along them as a Möbius map does; in a box `perspective`
-    /// is 0.
+    /// Box or NDC: position origin + t·direction, distance start + t·scale / (1 - t·perspective). A
+    /// perspective map keeps lines straight; along a line it is a Möbius map. In a box
+    /// `perspective` is 0.
     Straight {
-        /// Distance where t is 0.
+        /// Distance at t = 0, in scene units.
         start: f32,
-        /// How fast it grows there.
+        /// Derivative of the distance at t = 0.
         scale: f32,
-        /// How fast that itself grows.
+        /// Relative change of the derivative with t; 0 in a box.
         perspective: f32,
     },
-    /// Through the contraction: `origin` is the point nearest to the centre, in units of the ball's
-    /// radius; from there it is `radii`·sinh(4t) to the point, whose steps thereby grow as fast as
-    /// the contraction shrinks them. The distance is start + scale·sinh(4t).
+    /// Contraction: `origin` is the ray's point nearest to the centre, in ball radii. The point at
+    /// t is `radii`·sinh(4t) from `origin`, so steps grow as fast as the contraction shrinks them.
+    /// The distance is start + scale·sinh(4t).
     Contracted {
-        /// Distance of the point nearest to the centre.
+        /// Distance of the point nearest to the centre, in scene units.
         start: f32,
-        /// Scene units for each sinh(4t).
+        /// Scene units per sinh(4t).
         scale: f32,
-        /// Ball radii for each sinh(4t).
+        /// Ball radii per sinh(4t).
         radii: f32,
     },
 }
@@ -85,33 +84,33 @@ impl Default for RayMap {
     }
 }
 
-/// Most that a contracted ray moves through the cube for each unit of t: neared by rays that pass
-/// far from the centre.
-pub(crate) const FASTEST: f32 = 2.0;
+/// Maximum speed of a contracted ray in cube sides per unit of t, approached by rays that pass far
+/// from the centre.
+pub(crate) const MAX_SPEED: f32 = 2.0;
 
-/// Most by which a contracted ray's velocity changes for each unit of t: reached just outside the
-/// ball by a ray through the centre.
-pub(crate) const MOST_BENT: f32 = 12.0;
+/// Maximum change of a contracted ray's velocity per unit of t, reached just outside the ball by a
+/// ray through the centre.
+pub(crate) const MAX_ACCELERATION: f32 = 12.0;
 
-/// sinh(4t). Near 0 it has the absolute error of a difference of two numbers near 1, which is that
-/// of a position.
+/// Returns sinh(4t). Near 0 the absolute error is that of a difference of two numbers near 1, as
+/// large as a position's.
 #[inline(always)]
 fn sinh4(t: f32) -> f32 {
     let e = exp(4.0 * t);
     0.5 * (e - 1.0 / e)
 }
 
-/// A contracted ray's point `along` from the one nearest to the centre, and its distance from the
-/// centre, all in ball radii.
+/// Returns a contracted ray's point at distance `along` from the one nearest to the centre, and the
+/// point's distance from the centre, all in ball radii.
 #[inline(always)]
 fn before_contraction(origin: [f32; 3], direction: [f32; 3], along: f32) -> ([f32; 3], f32) {
     let u: [f32; 3] = std::array::from_fn(|i| direction[i].mul_add(along, origin[i]));
     (u, u.iter().map(|x| x * x).sum::<f32>().sqrt())
 }
 
-/// The place of a contracted ray in the unit cube at t.
+/// Returns the position of a contracted ray in the unit cube at t.
 #[inline(always)]
-pub(crate) fn contracted_place(
+pub(crate) fn contracted_position(
     origin: [f32; 3],
     direction: [f32; 3],
     radii: f32,
@@ -122,8 +121,8 @@ pub(crate) fn contracted_place(
     u.map(|x| (0.25 * factor).mul_add(x, 0.5))
 }
 
-/// How fast the place of a contracted ray moves in the unit cube at t, for each unit of t. Both
-/// sides of the ball's surface are computed, so that a loop vectorises.
+/// Returns the derivative of [`contracted_position`] by t. Both the inside and the outside of the
+/// ball are computed, so that a loop vectorises.
 #[inline(always)]
 pub(crate) fn contracted_velocity(
     origin: [f32; 3],
@@ -133,7 +132,7 @@ pub(crate) fn contracted_velocity(
 ) -> [f32; 3] {
     let e = exp(4.0 * t);
     let half = 0.5 * radii;
-    // A quarter of how fast `along` grows: the cube is four radii wide.
+    // A quarter of the derivative of `along`: the cube is four radii wide.
     let (along, speed) = (half * (e - 1.0 / e), half * (e + 1.0 / e));
     let (u, length) = before_contraction(origin, direction, along);
     // The contraction is h(r)·u with h = (2 - 1/r) / r, and dr/d(along) = along / r.
@@ -147,7 +146,7 @@ pub(crate) fn contracted_velocity(
 }
 
 impl NormalizedRay {
-    /// The place in the unit cube at t.
+    /// Returns the position in the unit cube at t.
     #[inline(always)]
     pub fn position(&self, t: f32) -> [f32; 3] {
         match self.map {
@@ -155,12 +154,12 @@ impl NormalizedRay {
                 std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i]))
             }
             RayMap::Contracted { radii, .. } => {
-                contracted_place(self.origin, self.direction, radii, t)
+                contracted_position(self.origin, self.direction, radii, t)
             }
         }
     }
 
-    /// Ball radii of a contracted ray's map; 0 of a straight ray.
+    /// Returns `radii` of a contracted ray; 0 for a straight ray.
     #[inline(always)]
     pub(crate) fn radii(&self) -> f32 {
         match self.map {
@@ -169,7 +168,7 @@ impl NormalizedRay {
         }
     }
 
-    /// The distance in scene units at t.
+    /// Returns the distance at t, in scene units.
     #[inline(always)]
     pub fn distance(&self, t: f32) -> f32 {
         match self.map {
@@ -180,114 +179,114 @@ impl NormalizedRay {
         }
     }
 
-    /// A ray that meets nothing.
+    /// Creates a ray that misses the cube.
     fn miss(ray: &Ray) -> Self {
         Self { enter: 0.0, leave: 0.0, view: ray.view(), ..Self::default() }
     }
 }
 
-/// Clips a ray to what a field sees of the world, and to the range of distances. Computed in f64,
-/// so that scenes of 1e-6 and 1e6 units, and georeferenced ones, lose nothing.
+/// Clips a ray to the field's space and range of distances. Computed in f64, so that scenes of 1e-6
+/// or 1e6 units, and georeferenced ones, lose no precision.
 pub fn clip(bounds: &Bounds, ray: &Ray) -> NormalizedRay {
-    // A NaN or a zero direction anywhere ends here.
     if !ray.is_usable() {
         return NormalizedRay::miss(ray);
     }
     let (origin, direction) = (DVec3::from(ray.origin), DVec3::from(ray.direction));
     let clipped = match &bounds.space {
-        Space::Box => through_box(bounds, origin, direction),
-        Space::Ndc(frustum) => through_frustum(frustum, bounds.near, origin, direction),
-        Space::Contraction => through_contraction(bounds, origin, direction),
+        Space::Box => clip_to_box(bounds, origin, direction),
+        Space::Ndc(frustum) => clip_to_frustum(frustum, bounds.near, origin, direction),
+        Space::Contraction => Some(clip_to_contraction(bounds, origin, direction)),
     };
     clipped
         .map_or(NormalizedRay::miss(ray), |clipped| NormalizedRay { view: ray.view(), ..clipped })
 }
 
-fn through_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
+fn clip_to_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
     let side = bounds.longest_side();
     let origin = (origin - DVec3::from(bounds.min)) / side;
     let extent = (DVec3::from(bounds.max) - DVec3::from(bounds.min)) / side;
-    // On the inner side of a face: offset + slope·t >= 0.
+    // A point is inside of a face if offset + slope·t >= 0.
     let faces =
         (0..3).flat_map(|i| [(origin[i], direction[i]), (extent[i] - origin[i], -direction[i])]);
-    let (enter, leave) = clip_to(faces, [bounds.near / side, bounds.far / side])?;
-    let map = RayMap::Straight { start: 0.0, scale: side as f32, perspective: 0.0 };
-    let (origin, direction) = (origin.as_vec3().to_array(), direction.as_vec3().to_array());
+    let (enter, leave) = clip_to_halfspaces(faces, [bounds.near / side, bounds.far / side])?;
     Some(NormalizedRay {
-        origin,
-        direction,
+        origin: origin.as_vec3().to_array(),
+        direction: direction.as_vec3().to_array(),
         enter: enter as f32,
         leave: leave as f32,
-        map,
+        map: RayMap::Straight { start: 0.0, scale: side as f32, perspective: 0.0 },
         view: [0.0; 3],
     })
 }
 
-/// Between the frustum's planes, from a distance on; its far plane lies behind all that is known,
-/// so the range's far end says no more.
-fn through_frustum(
+/// Clips a ray to the frustum, beyond `near`. The range's far end isn't needed: the frustum's far
+/// plane is behind the whole scene.
+fn clip_to_frustum(
     frustum: &Frustum,
     near: f64,
     origin: DVec3,
     direction: DVec3,
 ) -> Option<NormalizedRay> {
-    let (o, d) = (frustum.to_camera(origin), frustum.turn(direction));
+    let (o, d) = (frustum.to_camera(origin), frustum.rotate_to_camera(direction));
     let depths = [(o.z - frustum.near, d.z), (frustum.far - o.z, -d.z)];
     let sides = (0..2).flat_map(|i| {
         let (low, high) = (frustum.min[i], frustum.max[i]);
         [(o[i] - low * o.z, d[i] - low * d.z), (high * o.z - o[i], high * d.z - d[i])]
     });
-    let (enter, leave) = clip_to(depths.into_iter().chain(sides), [near, f64::INFINITY])?;
+    let planes = depths.into_iter().chain(sides);
+    let (enter, leave) = clip_to_halfspaces(planes, [near, f64::INFINITY])?;
     let (from, to) = (o + enter * d, o + leave * d);
     let (start, end) = (frustum.to_cube(from), frustum.to_cube(to));
     let length = (end - start).length();
-    // A ray that no plane ends has no length in numbers.
+    // A ray that no plane ends has no finite length.
     if !length.is_finite() || length <= 0.0 {
         return None;
     }
-    // x = distance - enter and t are a projective map of each other: t = c·x / (Z + x·dZ), c from
-    // the far end.
+    // x = distance - enter is a projective function of t: t = c·x / (Z + x·dZ), with c from the far
+    // end.
     let c = length * to.z / (leave - enter);
-    let map = RayMap::Straight {
-        start: enter as f32,
-        scale: (from.z / c) as f32,
-        perspective: (d.z / c) as f32,
-    };
-    let direction = (end - start) / length;
-    let (origin, direction) = (start.as_vec3().to_array(), direction.as_vec3().to_array());
-    Some(NormalizedRay { origin, direction, enter: 0.0, leave: length as f32, map, view: [0.0; 3] })
+    Some(NormalizedRay {
+        origin: start.as_vec3().to_array(),
+        direction: ((end - start) / length).as_vec3().to_array(),
+        enter: 0.0,
+        leave: length as f32,
+        map: RayMap::Straight {
+            start: enter as f32,
+            scale: (from.z / c) as f32,
+            perspective: (d.z / c) as f32,
+        },
+        view: [0.0; 3],
+    })
 }
 
-fn through_contraction(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
+fn clip_to_contraction(bounds: &Bounds, origin: DVec3, direction: DVec3) -> NormalizedRay {
     let radius = 0.5 * bounds.longest_side();
     let from = (origin - bounds.middle()) / radius;
     let to_nearest = -from.dot(direction);
     let nearest = from + to_nearest * direction;
     let radii = nearest.length().max(1.0);
-    let t = |distance: f64| 0.25 * ((distance / radius - to_nearest) / radii).asinh();
-    let map = RayMap::Contracted {
-        start: (to_nearest * radius) as f32,
-        scale: (radii * radius) as f32,
-        radii: radii as f32,
-    };
-    let (origin, direction) = (nearest.as_vec3().to_array(), direction.as_vec3().to_array());
-    Some(NormalizedRay {
-        origin,
-        direction,
-        enter: t(bounds.near) as f32,
-        leave: t(bounds.far) as f32,
-        map,
+    let [enter, leave] = [bounds.near, bounds.far]
+        .map(|distance| 0.25 * ((distance / radius - to_nearest) / radii).asinh());
+    NormalizedRay {
+        origin: nearest.as_vec3().to_array(),
+        direction: direction.as_vec3().to_array(),
+        enter: enter as f32,
+        leave: leave as f32,
+        map: RayMap::Contracted {
+            start: (to_nearest * radius) as f32,
+            scale: (radii * radius) as f32,
+            radii: radii as f32,
+        },
         view: [0.0; 3],
-    })
+    }
 }
 
-/// The part of a range of x in which all of some functions offset + slope·x aren't negative; `None`
-/// where there is none.
-fn clip_to(
+/// Clips a range of x to where all functions offset + slope·x are at least 0; returns `None` if
+/// nothing is left.
+fn clip_to_halfspaces(
     functions: impl Iterator<Item = (f64, f64)>,
-    [low, high]: [f64; 2],
+    [mut low, mut high]: [f64; 2],
 ) -> Option<(f64, f64)> {
-    let (mut low, mut high) = (low, high);
     for (offset, slope) in functions {
         if slope > 0.0 {
             low = low.max(-offset / slope);
@@ -442,8 +441,8 @@ mod tests {
         }
     }
 
-    /// A contracted ray's speed is at most [`FASTEST`], its velocity is that of its places, and
-    /// changes by at most [`MOST_BENT`], however it passes: what leaping relies on.
+    /// A contracted ray's speed is at most [`MAX_SPEED`], its velocity is that of its places, and
+    /// changes by at most [`MAX_ACCELERATION`], however it passes: what leaping relies on.
     #[test]
     fn contracted_rays_keep_their_bounds() {
         let bounds = Bounds {
@@ -470,14 +469,14 @@ mod tests {
             let mut t = seen.enter;
             while t + step < seen.leave {
                 let [a, b] = [t, t + step].map(|t| seen.position(t));
-                assert!(length(a, b) < FASTEST * step + 1e-6, "at {t} of {seen:?}");
+                assert!(length(a, b) < MAX_SPEED * step + 1e-6, "at {t} of {seen:?}");
                 let [before, after] = [t, t + step]
                     .map(|t| contracted_velocity(seen.origin, seen.direction, radii, t));
                 let measured: [f32; 3] = std::array::from_fn(|i| (b[i] - a[i]) / step);
                 let middle = std::array::from_fn(|i| 0.5 * (before[i] + after[i]));
                 assert!(length(measured, middle) < 0.01, "{measured:?} {middle:?} at {t}");
                 let bent = length(before, after) / step;
-                assert!(bent < MOST_BENT + 0.01, "{bent} at {t} of {seen:?}");
+                assert!(bent < MAX_ACCELERATION + 0.01, "{bent} at {t} of {seen:?}");
                 most_bent = most_bent.max(bent);
                 t += step;
             }

@@ -1,4 +1,4 @@
-//! The same field written plainly in f64: the judge of the fused f32 passes. Tests only.
+//! Plain f64 implementation of the field, for tests of the fused f32 passes.
 
 use counter_rng::CounterRng;
 use scene::Bounds;
@@ -7,17 +7,17 @@ use crate::architecture::Architecture;
 use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::field::Field;
 use crate::grid::{Level, scatter};
-use crate::march::{March, Marched, march};
+use crate::march::{March, MarchedSamples, march};
+use crate::math::spherical_harmonics;
 use crate::mlp::Layer;
 use crate::occupancy::Cell;
 use crate::ray::{NormalizedRay, Ray, clip};
-use crate::regularisers::{Regularisers, likeness};
+use crate::regularisers::{Regularisers, background_likeness};
 use crate::shading::{NetworkGradients, RayGradients};
+use crate::spec::Strides;
 use crate::spec::{
     BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS,
 };
-use crate::spherical::spherical_harmonics;
-use crate::strides::Strides;
 
 /// Parameters in f64.
 struct Judge<'a> {
@@ -26,8 +26,8 @@ struct Judge<'a> {
     network: Vec<f64>,
 }
 
-fn colour_of(outputs: &[f64], added: &[f64]) -> [f64; 3] {
-    [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[RAW_COLOUR + c] - added[c]).exp()))
+fn colour_of(outputs: &[f64], view_colour: &[f64]) -> [f64; 3] {
+    [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[RAW_COLOUR + c] - view_colour[c]).exp()))
 }
 
 impl Judge<'_> {
@@ -79,8 +79,8 @@ impl Judge<'_> {
         self.layer(second, &self.layer(first, &features, true), false)
     }
 
-    /// What is added to the raw colours of a ray's samples, by their composited outputs.
-    fn added(&self, composited: &[f64], direction: [f32; 3]) -> Vec<f64> {
+    /// Returns a ray's view colour from its composited outputs.
+    fn view_colour(&self, composited: &[f64], direction: [f32; 3]) -> Vec<f64> {
         let features = composited[VIEW_FEATURE..].iter().copied();
         let input: Vec<f64> =
             features.chain(spherical_harmonics(direction).map(f64::from)).collect();
@@ -105,9 +105,12 @@ impl Judge<'_> {
             }
             depth += tau;
         }
-        let added = self.added(&composited, ray.direction.map(|x| x as f32));
+        let view_colour = self.view_colour(&composited, ray.direction.map(|x| x as f32));
         (
-            counted.iter().map(|(weight, outputs)| (*weight, colour_of(outputs, &added))).collect(),
+            counted
+                .iter()
+                .map(|(weight, outputs)| (*weight, colour_of(outputs, &view_colour)))
+                .collect(),
             (-depth).exp(),
         )
     }
@@ -126,7 +129,7 @@ struct Sample {
     position: [f32; 3],
     /// Steps that it stands for.
     length: f32,
-    /// Whether it has a colour and a gradient.
+    /// True if the sample has a colour and a gradient.
     counts: bool,
 }
 
@@ -138,7 +141,7 @@ fn samples(
     strides: Strides,
 ) -> Vec<Vec<Sample>> {
     let rays_alone = rays.iter().zip(offsets).map(|(&ray, &offset)| {
-        let mut marched = Marched::default();
+        let mut marched = MarchedSamples::default();
         let one = March {
             occupancy: &field.occupancy,
             rays: &[ray],
@@ -157,7 +160,7 @@ fn samples(
 fn fused_gradients(
     field: &Field,
     chunk: &mut Chunk,
-    towards: RayGradients<'_>,
+    upstream: RayGradients<'_>,
     roulette: Roulette,
 ) -> (Vec<f32>, Vec<f32>, usize) {
     let mut transposed = vec![0.0; field.network.len()];
@@ -166,7 +169,7 @@ fn fused_gradients(
     let mut features = FeatureGradients::default();
     chunk.backward(
         field,
-        towards,
+        upstream,
         roulette,
         &mut NetworkGradients { transposed: &transposed, sums: &mut network },
         &mut features,
@@ -218,7 +221,7 @@ fn example() -> (Field, Vec<Ray>) {
 }
 
 fn wide_likeness(colour: &[f64; 3], background: [f32; 3]) -> f64 {
-    f64::from(likeness(colour.map(|c| c as f32), background))
+    f64::from(background_likeness(colour.map(|c| c as f32), background))
 }
 
 #[test]
@@ -250,7 +253,8 @@ fn fused_passes_equal_the_plain_ones() {
     }
 
     // The loss is Σ g·C with random g, so that its gradient by the colours is g; and the floater
-    // loss, where neither likeness to the background nor what comes through to it is learnt from.
+    // loss, where neither background_likeness to the background nor what comes through to it is
+    // learnt from.
     let regularisers = Regularisers { floater_loss: 0.3, ..Regularisers::default() };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {
@@ -272,7 +276,7 @@ fn fused_passes_equal_the_plain_ones() {
             let floaters: f64 = shaded
                 .iter()
                 .zip(&likenesses[i])
-                .map(|((weight, _), likeness)| weight * likeness)
+                .map(|((weight, _), background_likeness)| weight * background_likeness)
                 .sum();
             let colour = judge.ray(&rays[i], &samples[i]);
             colour.iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum::<f64>()
@@ -289,8 +293,8 @@ fn fused_passes_equal_the_plain_ones() {
     }
 
     let backgrounds: Vec<[f32; 3]> = rays.iter().map(|r| r.background).collect();
-    let towards = RayGradients { colours: &g, backgrounds: &backgrounds, regularisers };
-    let (grid, network, _) = fused_gradients(&field, &mut chunk, towards, Roulette::default());
+    let upstream = RayGradients { colours: &g, backgrounds: &backgrounds, regularisers };
+    let (grid, network, _) = fused_gradients(&field, &mut chunk, upstream, Roulette::default());
 
     let mut difference = |which: usize, index: usize| {
         const H: f64 = 1e-6;
@@ -325,12 +329,12 @@ fn fused_passes_equal_the_plain_ones() {
 fn drawn_gradients(
     field: &Field,
     clipped: &[NormalizedRay],
-    towards: RayGradients<'_>,
+    upstream: RayGradients<'_>,
     roulette: Roulette,
 ) -> (Vec<f32>, Vec<f32>, usize) {
     let mut chunk = Chunk::default();
     chunk.forward(field, clipped, &[0.5; 20], Strides::ByCell);
-    fused_gradients(field, &mut chunk, towards, roulette)
+    fused_gradients(field, &mut chunk, upstream, roulette)
 }
 
 /// Samples with short gradients are drawn, and the mean over evenly spaced draws is the gradient of
@@ -343,13 +347,13 @@ fn roulette_keeps_the_expected_gradient() {
     let colours: Vec<[f32; 3]> =
         rays.iter().map(|_| [0, 1, 2].map(|_| rng.uniform() - 0.5)).collect();
     let backgrounds = [[0.5; 3]; 20];
-    let towards = RayGradients {
+    let upstream = RayGradients {
         colours: &colours,
         backgrounds: &backgrounds,
         regularisers: Regularisers::default(),
     };
     let (all_grid, all_network, all) =
-        drawn_gradients(&field, &clipped, towards, Roulette::default());
+        drawn_gradients(&field, &clipped, upstream, Roulette::default());
     let all_gradients: Vec<f64> =
         all_grid.iter().chain(&all_network).map(|&g| f64::from(g)).collect();
     const DRAWS: usize = 400;
@@ -357,7 +361,7 @@ fn roulette_keeps_the_expected_gradient() {
     for draw in 0..DRAWS {
         let draw = (draw as f32 + 0.5) / DRAWS as f32;
         let (grid, network, chosen) =
-            drawn_gradients(&field, &clipped, towards, Roulette { limit: 1.0, draw });
+            drawn_gradients(&field, &clipped, upstream, Roulette { limit: 1.0, draw });
         kept += chosen;
         mean.iter_mut()
             .zip(grid.iter().chain(&network))
@@ -403,13 +407,13 @@ fn outcome(field: &Field, rays: &[Ray]) -> Vec<u32> {
     chunk.forward(field, &clipped, &[0.25; 20], Strides::ByCell);
     let mut bits: Vec<u32> = chunk.sums.iter().flat_map(|s| s.colour.map(f32::to_bits)).collect();
     let regularisers = Regularisers { distortion: 0.2, floater_loss: 0.3 };
-    let towards = RayGradients {
+    let upstream = RayGradients {
         colours: &[[0.3, -0.2, 0.1]; 20],
         backgrounds: &[[0.5; 3]; 20],
         regularisers,
     };
     let roulette = Roulette { limit: 1.0, draw: 0.7 };
-    let (grid, network, _) = fused_gradients(field, &mut chunk, towards, roulette);
+    let (grid, network, _) = fused_gradients(field, &mut chunk, upstream, roulette);
     bits.extend(grid.iter().chain(&network).map(|x| x.to_bits()));
     bits
 }

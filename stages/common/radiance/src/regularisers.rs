@@ -1,32 +1,33 @@
-//! Regularisers: losses on a ray besides the squared error of its colour. Each has a weight and a
+//! Regularisers: losses on a ray other than the error of its colour. Each has a weight and a
 //! function that adds the loss's gradient to the ray's gradients. `torch-field` computes the losses
 //! for autograd. The distortion loss is checked in f64 here, the floater loss in `reference.rs`.
 
-use crate::spec::LIKE_BACKGROUND;
+use crate::spec::MAX_FLOATER_COLOUR_DISTANCE;
 
-/// Weights of what is asked of rays beside their colours; 0 asks for nothing.
+/// Weights of the regularisers; 0 disables one.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Regularisers {
-    /// Weight of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), the mean over
-    /// all rays, beside the loss that supervision gives.
+    /// Weight of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), a mean over rays
+    /// (docs/design/012).
     pub distortion: f32,
-    /// Weight of the floater loss (ours), the mean over all rays: opacity that has the background's
-    /// colour.
+    /// Weight of the floater loss on opacity of the background's colour, a mean over rays
+    /// (docs/design/013).
     pub floater_loss: f32,
 }
 
-/// One ray's samples from front to back, and what is seen through them.
+/// One ray's samples from front to back, its transmittance and its background.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ShadedRay<'a> {
-    /// Where along the ray the samples lie: it rises.
+    /// Parameter t of each sample, ascending.
     pub(crate) t: &'a [f32],
     pub(crate) weight: &'a [f32],
     /// Length of a step in t.
     pub(crate) step: f32,
-    /// Red, green and blue of many rays' samples, and the places of this ray's among them.
+    /// Red, green and blue of many rays' samples.
     pub(crate) channels: [&'a [f32]; 3],
-    pub(crate) places: &'a [u32],
-    /// Light that comes through the whole ray, T.
+    /// Indices of this ray's samples in `channels`.
+    pub(crate) indices: &'a [u32],
+    /// Transmittance T of the whole ray.
     pub(crate) transmittance: f32,
     pub(crate) background: [f32; 3],
 }
@@ -34,20 +35,22 @@ pub(crate) struct ShadedRay<'a> {
 /// Gradients of a ray's loss.
 #[derive(Debug)]
 pub(crate) struct LossGradients<'a> {
-    /// By each sample's weight.
+    /// Gradient by each sample's weight.
     pub(crate) by_weight: &'a mut [f32],
-    /// By the ray's transmittance T, times T.
+    /// Gradient by the ray's transmittance T, times T.
     pub(crate) behind: f32,
 }
 
 impl Regularisers {
-    /// Weights for one ray of a step, where bundles of so many rays count `scale` each.
-    pub(crate) fn of_ray(&self, scale: f32, bundle: usize) -> Self {
-        let of_ray = |weight: f32| weight * scale / bundle as f32;
-        Self { distortion: of_ray(self.distortion), floater_loss: of_ray(self.floater_loss) }
+    /// Returns the weights for one ray, if each bundle of `bundle` rays has weight `scale`.
+    pub(crate) fn per_ray(&self, scale: f32, bundle: usize) -> Self {
+        Self {
+            distortion: self.distortion * scale / bundle as f32,
+            floater_loss: self.floater_loss * scale / bundle as f32,
+        }
     }
 
-    /// Adds to the gradients of a ray's loss, where these are the weights for one ray.
+    /// Adds the losses' gradients to those of a ray. `self` has the weights for one ray.
     #[inline]
     pub(crate) fn add_gradients(&self, ray: &ShadedRay<'_>, gradients: &mut LossGradients<'_>) {
         let Self { distortion, floater_loss } = *self;
@@ -62,48 +65,47 @@ impl Regularisers {
 }
 
 impl ShadedRay<'_> {
-    /// The samples' colours.
+    /// Returns the samples' colours.
     #[inline]
     fn colours(&self) -> impl Iterator<Item = [f32; 3]> {
-        self.places.iter().map(move |&k| self.channels.map(|channel| channel[k as usize]))
+        self.indices.iter().map(move |&k| self.channels.map(|channel| channel[k as usize]))
     }
 }
 
-/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from
-/// [`LIKE_BACKGROUND`] on. Whether it is there no image tells that sees it before the background
-/// alone.
+/// Returns the likeness of a sample's colour to the background's: 1 if equal, 0 from
+/// [`MAX_FLOATER_COLOUR_DISTANCE`] on. A sample of the background's colour is indistinguishable
+/// from the background.
 #[inline]
-pub(crate) fn likeness(colour: [f32; 3], background: [f32; 3]) -> f32 {
+pub(crate) fn background_likeness(colour: [f32; 3], background: [f32; 3]) -> f32 {
     let squared: f32 = colour.iter().zip(background).map(|(c, b)| (c - b) * (c - b)).sum();
-    (1.0 - squared / (LIKE_BACKGROUND * LIKE_BACKGROUND)).max(0.0)
+    (1.0 - squared / (MAX_FLOATER_COLOUR_DISTANCE * MAX_FLOATER_COLOUR_DISTANCE)).max(0.0)
 }
 
-/// Adds the gradient by each weight w_i of the floater loss T·Σ_i w_i·[`likeness`]_i; `factor` is
-/// the loss's weight times T. There is no gradient by the colours, which would make floaters darker
-/// instead of thinner, or by the ray's transmittance T. What stops a ray is paint of the
-/// background's colour, no floater: it would become thin and darker, and look the same.
+/// Adds the gradient by each weight w_i of the floater loss T·Σ_i w_i·[`background_likeness`]_i;
+/// `factor` is the loss's weight times T. There is no gradient by the colours, which would make
+/// floaters darker instead of thinner, or by the ray's transmittance T. The factor T spares opaque
+/// surfaces of the background's colour.
 #[inline]
 fn add_floater_gradients(ray: &ShadedRay<'_>, factor: f32, by_weight: &mut [f32]) {
     for (by_weight, colour) in by_weight.iter_mut().zip(ray.colours()) {
-        *by_weight = factor.mul_add(likeness(colour, ray.background), *by_weight);
+        *by_weight = factor.mul_add(background_likeness(colour, ray.background), *by_weight);
     }
 }
 
-/// Adds the gradient by each weight of the distortion loss times `factor`: of Σ_ij w_i·w_j·|t_i -
-/// t_j| + ⅓·step·Σ_i w_i². It draws a ray's weights together.
+/// Adds the gradient by each weight of the distortion loss, times `factor`. The loss Σ_ij
+/// w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i² concentrates a ray's weights.
 #[inline]
 fn add_distortion_gradients(ray: &ShadedRay<'_>, factor: f32, by_weight: &mut [f32]) {
     let ShadedRay { t, weight, step, .. } = *ray;
-    let whole: f32 = weight.iter().sum();
-    // Measured from the mean, so that nothing cancels.
-    let mean = weight.iter().zip(t).map(|(w, t)| w * t).sum::<f32>() / whole.max(f32::MIN_POSITIVE);
+    let total: f32 = weight.iter().sum();
+    // Distances from the mean don't cancel.
+    let mean = weight.iter().zip(t).map(|(w, t)| w * t).sum::<f32>() / total.max(f32::MIN_POSITIVE);
     let (mut before, mut moment) = (0.0, 0.0);
     for ((by_weight, &w), &t) in by_weight.iter_mut().zip(weight).zip(t) {
         let t = t - mean;
-        // Σ_j w_j·|t - t_j|: what lies before with +, what lies behind with -; all moments add up
-        // to 0.
-        let apart = t * (2.0 * before + w - whole) - (2.0 * moment + w * t);
-        *by_weight += 2.0 * factor * (apart + step * w / 3.0);
+        // Σ_j w_j·|t - t_j|: samples before with +, samples behind with -. All moments sum to 0.
+        let spread = t * (2.0 * before + w - total) - (2.0 * moment + w * t);
+        *by_weight += 2.0 * factor * (spread + step * w / 3.0);
         before += w;
         moment += w * t;
     }
@@ -135,7 +137,7 @@ mod tests {
                 weight: &weight,
                 step: 0.003,
                 channels: [&[]; 3],
-                places: &[],
+                indices: &[],
                 transmittance: 1.0,
                 background: [0.0; 3],
             };

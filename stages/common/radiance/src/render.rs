@@ -6,46 +6,46 @@ use crate::chunk::{CHUNK_RAYS, Chunk};
 use crate::field::Field;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::samples::RaySum;
-use crate::spec::UNSEEN;
-use crate::strides::Strides;
+use crate::spec::MIN_TOTAL_WEIGHT;
+use crate::spec::Strides;
 
-/// What a ray sees.
+/// Render of one ray.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Pixel {
     /// Colour over the ray's background.
     pub colour: [f32; 3],
-    /// Colour of the scene alone, weighted by opacity (premultiplied).
+    /// Premultiplied colour of the scene without background.
     pub premultiplied: [f32; 3],
-    /// Share of the ray that is stopped.
+    /// Fraction of the light that is stopped.
     pub opacity: f32,
-    /// Expected distance where it is stopped, in scene units; the far end where nothing stops it.
+    /// Expected distance at which light is stopped, in scene units; the far end if none is.
     pub depth: f32,
-    /// Distance at which half of the ray is stopped; the far end where it never is.
+    /// Distance at which half of the light is stopped, in scene units; the far end if less is.
     pub median_depth: f32,
 }
 
 impl Pixel {
-    /// Whether all of it is finite.
+    /// Returns whether all numbers are finite.
     pub fn is_finite(&self) -> bool {
         let depths = [self.opacity, self.depth, self.median_depth];
         self.colour.iter().chain(&self.premultiplied).chain(&depths).all(|v| v.is_finite())
     }
 }
 
-/// Rays that couldn't be cast.
+/// Error returned when rays can't be rendered.
 #[derive(Debug, thiserror::Error)]
 pub enum RenderError {
-    /// What the field is computed by refused: a library, or its device.
-    #[error("the field can't be rendered: {0}")]
+    /// A library or its device failed.
+    #[error("cannot render the field: {0}")]
     Backend(String),
     /// A pixel isn't finite.
-    #[error("the field renders numbers that aren't finite; train it again, with a lower rate")]
+    #[error("rendered pixels are not finite; train the field again with a lower learning rate")]
     NotFinite,
 }
 
-/// Whatever rays can be cast through: what renders views needn't know which field it has.
+/// Field that renders rays, of any kind and on any device.
 pub trait RayField {
-    /// Colour, opacity and depth of each ray.
+    /// Renders colour, opacity and depth of each ray.
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError>;
 }
 
@@ -62,33 +62,33 @@ impl RayField for Field {
 }
 
 thread_local! {
-    /// Kept from one call to the next: views are rendered in bands, and buffers grow slowly. Some
-    /// ten MB a thread.
+    /// Buffers reused across calls, some ten MB per thread: views are rendered in bands, and
+    /// growing buffers for each band is slow.
     static CHUNK: RefCell<Chunk> = RefCell::default();
 }
 
 impl Field {
-    /// Colour, opacity and depth of each ray, in parallel; the result doesn't depend on the number
-    /// of threads.
+    /// Renders colour, opacity and depth of each ray, in parallel; the result doesn't depend on the
+    /// number of threads.
     pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
         let chunks = rays.par_chunks(CHUNK_RAYS);
         chunks.flat_map_iter(|rays| self.render_chunk(rays)).collect()
     }
 
-    /// Colour, opacity and depth of at most [`CHUNK_RAYS`] rays.
+    /// Renders at most [`CHUNK_RAYS`] rays.
     fn render_chunk(&self, rays: &[Ray]) -> Vec<Pixel> {
         let mut chunk = CHUNK.take();
         let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
         chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
         let far = self.bounds.far as f32;
-        let seen = rays.iter().zip(&clipped).zip(&chunk.sums);
-        let pixels = seen.map(|((ray, clipped), sum)| pixel(ray, clipped, sum, far)).collect();
+        let pixels =
+            (0..rays.len()).map(|i| pixel(&rays[i], &clipped[i], &chunk.sums[i], far)).collect();
         CHUNK.set(chunk);
         pixels
     }
 }
 
-/// What a ray sees; the far end where it misses the cube.
+/// Converts a ray's sums to a pixel; depth is `far` if the ray misses the cube.
 fn pixel(ray: &Ray, clipped: &NormalizedRay, sum: &RaySum, far: f32) -> Pixel {
     let far = if clipped.leave > clipped.enter { clipped.distance(clipped.leave) } else { far };
     let opacity = 1.0 - sum.transmittance;
@@ -98,7 +98,7 @@ fn pixel(ray: &Ray, clipped: &NormalizedRay, sum: &RaySum, far: f32) -> Pixel {
         }),
         premultiplied: sum.colour,
         opacity,
-        depth: if sum.weight > UNSEEN { sum.distance / sum.weight } else { far },
+        depth: if sum.weight > MIN_TOTAL_WEIGHT { sum.distance / sum.weight } else { far },
         median_depth: sum.median.map_or(far, |t| clipped.distance(t)),
     }
 }

@@ -1,51 +1,56 @@
-//! Samples of a few rays, marched in rounds: where they lie, their density, and their weights.
+//! Samples of a chunk's rays, marched in rounds: positions, densities and weights.
 
 use crate::aligned::Aligned;
 use crate::composite::{optical_depths, weights};
 use crate::field::Field;
 use crate::grid::encode;
-use crate::march::{DONE, March, Marched, march};
+use crate::march::{DONE, March, MarchedSamples, march};
 use crate::math::exp;
 use crate::mlp::{After, multiply};
-use crate::occupancy::Met;
+use crate::occupancy::CellHit;
 use crate::simd::LANES;
-use crate::spec::{DARK, DENSITY_OUTPUTS, FAINT, FEATURES, MAX_RAW_DENSITY, MET, TRAINING_ROUNDS};
-use crate::strides::Strides;
+use crate::spec::Strides;
+use crate::spec::{
+    DENSITY_OUTPUTS, FEATURES, MAX_OPTICAL_DEPTH, MAX_RAW_DENSITY, MIN_HIT_WEIGHT,
+    MIN_TRANSMITTANCE, MIN_WEIGHT, TRAINING_ROUNDS,
+};
 
-/// What one ray adds up to.
+/// Sums over one ray's samples.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RaySum {
     pub(crate) colour: [f32; 3],
     pub(crate) transmittance: f32,
     /// Σ w over the samples that count.
     pub(crate) weight: f32,
-    /// Σ w·distance over them, in scene units.
+    /// Σ w·distance over the samples that count, in scene units.
     pub(crate) distance: f32,
-    /// Where along the ray the transmittance falls below one half: its t.
+    /// Parameter t at which the transmittance falls below one half.
     pub(crate) median: Option<f32>,
 }
 
-/// Samples of each ray in a round of rendering: a trained field's surfaces stop rays within few.
+/// Number of samples per ray in a round of rendering: a trained field's surfaces stop rays early.
+/// Chosen by hand.
 const RENDERING_ROUND: usize = 8;
 
-/// Samples that were marched together. Their rows have a length of `n`, whole vectors.
+/// Samples that were marched together, padded to whole vectors.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Round {
-    /// First sample of the round; what has k rows begins at k·start.
+    /// Index of the first sample; a buffer with k rows per round has this round at k·start.
     pub(crate) start: usize,
+    /// Number of samples with padding: the length of a row.
     pub(crate) n: usize,
-    /// First of its samples in a list of samples.
+    /// Index of the round's first sample in a list of selected samples.
     pub(crate) first: usize,
 }
 
 impl Round {
-    /// Where the `rows` rows of the round lie.
+    /// Returns the range of the round's `rows` rows in a buffer.
     fn range(self, rows: usize) -> std::ops::Range<usize> {
         rows * self.start..rows * (self.start + self.n)
     }
 }
 
-/// Activations of the density network: rows of all samples of a round, round after round.
+/// Activations of the density network, stored by round, then by row.
 #[derive(Debug, Default)]
 pub(crate) struct DensityRows {
     positions: Aligned,
@@ -79,14 +84,14 @@ impl DensityRows {
         multiply(second.matrix(&field.network), hidden, outputs, n, After::Linear);
     }
 
-    /// Outputs of the network at `n` positions (three rows): a row each.
+    /// Runs the network at `n` positions (three rows) and returns its outputs, one row each.
     pub(crate) fn outputs_at(&mut self, field: &Field, positions: &[f32], n: usize) -> &[f32] {
         self.positions.fit(3 * n).copy_from_slice(positions);
         self.run(field, Round { start: 0, n, first: 0 });
         &self.outputs[..DENSITY_OUTPUTS * n]
     }
 
-    /// Density of `n` positions (three rows): for the occupancy.
+    /// Evaluates the density at `n` positions (three rows), for the occupancy.
     pub(crate) fn densities(
         &mut self,
         field: &Field,
@@ -98,14 +103,15 @@ impl DensityRows {
     }
 }
 
-/// All samples of a few rays, in rounds: of every ray that is still lit, the next few.
+/// Samples of a chunk's rays. Each round has the next few samples of every active ray.
 #[derive(Debug, Default)]
 pub(crate) struct Samples {
     pub(crate) rounds: Vec<Round>,
-    pub(crate) marched: Marched,
+    pub(crate) marched: MarchedSamples,
     pub(crate) rows: DensityRows,
-    /// Samples without those that fill rounds up.
+    /// Number of samples without padding.
     pub(crate) count: usize,
+    /// Optical depth of each sample.
     tau: Aligned,
     /// Optical depth before each sample.
     before: Aligned,
@@ -113,8 +119,9 @@ pub(crate) struct Samples {
     pub(crate) weight: Aligned,
     /// Optical depth of each ray so far.
     depth: Vec<f32>,
-    /// Rays still lit, and the step that each ray's march has come to.
+    /// Rays that haven't ended.
     active: Vec<u32>,
+    /// Number of each ray's next step.
     next: Vec<u32>,
 }
 
@@ -141,7 +148,7 @@ impl Samples {
         counted.sample.clear();
         counted.ray.clear();
         while !self.active.is_empty() {
-            self.round(field, rays, counted, sums);
+            self.march_round(field, rays, counted, sums);
         }
         for (sum, &depth) in sums.iter_mut().zip(&self.depth) {
             if depth > 0.0 {
@@ -150,8 +157,8 @@ impl Samples {
         }
     }
 
-    /// Takes every active ray some samples further, and drops those that end.
-    fn round(
+    /// Marches one round, and removes the rays that end from the active ones.
+    fn march_round(
         &mut self,
         field: &Field,
         rays: &March<'_>,
@@ -160,17 +167,17 @@ impl Samples {
     ) {
         let round = self.take_samples(rays, counted.sample.len());
         self.rows.run(field, round);
-        self.weigh(round, rays.step, sums);
+        self.compute_weights(round, rays.step, sums);
         self.list_counted(counted);
         self.rounds.push(round);
         let (next, depth) = (&self.next, &self.depth);
-        self.active.retain(|&r| next[r as usize] != DONE && depth[r as usize] < DARK);
+        self.active.retain(|&r| next[r as usize] != DONE && depth[r as usize] < MAX_OPTICAL_DEPTH);
     }
 
-    /// Takes the next samples of every active ray, and puts their positions into the network's
-    /// rows. So far `counted` samples count.
+    /// Finds the next samples of every active ray, and copies their positions to the network's
+    /// rows. Before this round `counted` samples count.
     fn take_samples(&mut self, rays: &March<'_>, counted: usize) -> Round {
-        let most = match rays.strides {
+        let max_samples = match rays.strides {
             Strides::Even => RENDERING_ROUND,
             Strides::ByCell | Strides::Double => {
                 TRAINING_ROUNDS[self.rounds.len().min(TRAINING_ROUNDS.len() - 1)]
@@ -178,7 +185,7 @@ impl Samples {
         };
         let start = self.marched.t.len();
         self.marched.starts.clear();
-        march(rays, most, &self.active, &mut self.next, &mut self.marched);
+        march(rays, max_samples, &self.active, &mut self.next, &mut self.marched);
         let count = self.marched.t.len() - start;
         let n = count.next_multiple_of(LANES);
         self.count += count;
@@ -194,22 +201,22 @@ impl Samples {
         Round { start, n, first: counted }
     }
 
-    /// Finds each sample's optical depth, transmittance and weight from the network's outputs, and
-    /// where a ray's light is halved. A sample stands for `step` times its length, in cube sides.
-    fn weigh(&mut self, round: Round, step: f32, sums: &mut [RaySum]) {
+    /// Computes each sample's optical depth, transmittance and weight from the network's outputs,
+    /// and the rays' median t. A sample spans `step` times its length, in cube sides.
+    fn compute_weights(&mut self, round: Round, step: f32, sums: &mut [RaySum]) {
         let Round { start, n, .. } = round;
         for buffer in [&mut self.tau, &mut self.before, &mut self.transmittance, &mut self.weight] {
             buffer.fit(start + n);
         }
-        let whole = start..start + n;
-        let tau = &mut self.tau[whole.clone()];
+        let range = start..start + n;
+        let tau = &mut self.tau[range.clone()];
         if n > 0 {
             optical_depths(&self.rows.outputs[DENSITY_OUTPUTS * start..][..n], step, tau);
-            tau.iter_mut()
-                .zip(&self.marched.lengths[start..])
-                .for_each(|(tau, length)| *tau *= length);
+            for (tau, length) in tau.iter_mut().zip(&self.marched.lengths[start..]) {
+                *tau *= length;
+            }
         }
-        let before = &mut self.before[whole.clone()];
+        let before = &mut self.before[range.clone()];
         for (&r, range) in self.active.iter().zip(self.marched.starts.windows(2)) {
             let mut depth = self.depth[r as usize];
             for i in range[0] - start..range[1] - start {
@@ -221,16 +228,16 @@ impl Samples {
             }
             self.depth[r as usize] = depth;
         }
-        // What fills the round up.
+        // Padding.
         before[self.marched.starts[self.active.len()] - start..].fill(0.0);
-        weights(before, tau, &mut self.transmittance[whole.clone()], &mut self.weight[whole]);
+        weights(before, tau, &mut self.transmittance[range.clone()], &mut self.weight[range]);
     }
 
-    /// Lists those of the last round's samples that count.
+    /// Lists the last round's samples that count.
     fn list_counted(&self, counted: &mut Counted) {
         for (&r, range) in self.active.iter().zip(self.marched.starts.windows(2)) {
             for i in range[0]..range[1] {
-                if self.transmittance[i] > FAINT && self.weight[i] > FAINT {
+                if self.transmittance[i] > MIN_TRANSMITTANCE && self.weight[i] > MIN_WEIGHT {
                     counted.sample.push(i as u32);
                     counted.ray.push(r);
                 }
@@ -238,52 +245,54 @@ impl Samples {
         }
     }
 
-    /// Lists the cells where samples stop light. A sample stands for `step` times its length, in
-    /// cube sides.
-    pub(crate) fn list_met(&self, counted: &Counted, step: f32, met: &mut Vec<Met>) {
-        let Marched { positions, lengths, .. } = &self.marched;
+    /// Lists the densities and cells of samples that stop light. A sample spans `step` times its
+    /// length, in cube sides.
+    pub(crate) fn list_hits(&self, counted: &Counted, step: f32, hits: &mut Vec<CellHit>) {
+        let MarchedSamples { positions, lengths, .. } = &self.marched;
         let samples = counted.sample.iter().map(|&i| i as usize);
-        met.extend(
+        hits.extend(
             samples
-                .filter(|&i| self.weight[i] > MET)
-                .map(|i| Met::at(positions[i], self.tau[i] / (lengths[i] * step))),
+                .filter(|&i| self.weight[i] > MIN_HIT_WEIGHT)
+                .map(|i| CellHit::at(positions[i], self.tau[i] / (lengths[i] * step))),
         );
     }
 
-    /// Derivative of a sample's optical depth by its raw density.
+    /// Returns the derivative of a sample's optical depth by its raw density.
     fn slope(&self, sample: usize, raw: f32) -> f32 {
         if raw < MAX_RAW_DENSITY { self.tau[sample] } else { 0.0 }
     }
 }
 
-/// The samples that count: what they hold, and whose they are.
+/// Samples that count: those with transmittance and weight above [`MIN_TRANSMITTANCE`] and
+/// [`MIN_WEIGHT`], which alone have colour and gradient.
 #[derive(Debug, Default)]
 pub(crate) struct Counted {
-    /// Samples, round by round, and their rays.
+    /// Sample indices, by round.
     pub(crate) sample: Vec<u32>,
+    /// Ray of each sample.
     ray: Vec<u32>,
-    /// Places in `sample`, ray by ray from front to back; and the first of each ray.
+    /// Indices in `sample`, by ray from front to back.
     along: Vec<u32>,
+    /// First entry of each ray in `along`, and the end.
     ray_starts: Vec<usize>,
-    /// Rays that have any.
+    /// Rays with at least one sample that counts.
     pub(crate) rays: Vec<u32>,
-    /// Outputs of the density network, sample by sample; instead of the raw density its slope:
-    /// dτ/d(raw).
+    /// Outputs of the density network per sample; in place of the raw density its slope dτ/d(raw).
     pub(crate) outputs: Vec<[f32; DENSITY_OUTPUTS]>,
 }
 
 impl Counted {
-    /// A ray's places, from front to back.
+    /// Returns the indices in `sample` of a ray's samples, from front to back.
     pub(crate) fn of_ray(&self, ray: u32) -> &[u32] {
         &self.along[self.ray_starts[ray as usize]..self.ray_starts[ray as usize + 1]]
     }
 
-    /// Most samples of a ray.
-    pub(crate) fn longest(&self) -> usize {
+    /// Returns the maximum number of samples of a ray.
+    pub(crate) fn max_samples_per_ray(&self) -> usize {
         self.ray_starts.windows(2).map(|r| r[1] - r[0]).max().unwrap_or(0)
     }
 
-    /// Finds each ray's samples, and takes out of the rounds what they hold.
+    /// Sorts the samples by ray, and copies their network outputs out of the rounds.
     pub(crate) fn collect(&mut self, samples: &Samples, rays: usize) {
         self.ray_starts.clear();
         self.ray_starts.resize(rays + 1, 0);
@@ -300,11 +309,11 @@ impl Counted {
         );
         self.along.clear();
         self.along.resize(self.sample.len(), 0);
-        // Filled from each ray's start, which thereby becomes its end: the next ray's start.
+        // Filling advances each ray's start to its end, which is the next ray's start.
         for (k, &r) in self.ray.iter().enumerate() {
-            let place = &mut self.ray_starts[r as usize];
-            self.along[*place] = k as u32;
-            *place += 1;
+            let next = &mut self.ray_starts[r as usize];
+            self.along[*next] = k as u32;
+            *next += 1;
         }
         self.ray_starts.rotate_right(1);
         self.ray_starts[0] = 0;
@@ -324,7 +333,7 @@ impl Counted {
     }
 }
 
-/// Each round and the places of its samples in a list of so many.
+/// Returns each round with the range of its samples in a list of `count` selected samples.
 pub(crate) fn rounds_of(
     rounds: &[Round],
     count: usize,
@@ -333,8 +342,8 @@ pub(crate) fn rounds_of(
     rounds.iter().zip(ends).map(|(round, end)| (round, round.first..end))
 }
 
-/// Copies the columns of a list of samples out of the rounds, whose `rows` rows lie in `from`, to
-/// rows of stride `m`; what pads the result is 0.
+/// Copies the columns of selected samples from the rounds, whose `rows` rows are in `from`, to rows
+/// of length `m`, padded with 0.
 pub(crate) fn gather(
     rounds: &[Round],
     list: &[u32],

@@ -1,11 +1,12 @@
 //! Deferred shading (Hedman et al. 2021, "Baking neural radiance fields", SNeRG): view features are
-//! composited along a ray, one small network makes of them and the direction what is added to the
-//! raw colours of all the ray's samples. So colours cost a network a ray.
+//! composited along a ray. From these and the direction one small network per ray computes the view
+//! colour, which is added to the raw colour of each of the ray's samples.
 
 use crate::aligned::Aligned;
 use crate::composite::optical_depth_gradients;
 use crate::field::Field;
 use crate::math::sigmoid;
+use crate::math::spherical_harmonics;
 use crate::mlp::Layers;
 use crate::mlp::{After, Layer, add_outer, multiply};
 use crate::ray::NormalizedRay;
@@ -13,16 +14,15 @@ use crate::regularisers::{LossGradients, Regularisers, ShadedRay};
 use crate::samples::{Counted, RaySum, Samples};
 use crate::simd::{LANES, kernel};
 use crate::spec::{DENSITY_OUTPUTS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES, VIEW_INPUTS};
-use crate::spherical::spherical_harmonics;
 
-/// Buffers of the view network, a column a ray that has samples, and of the samples' colours.
+/// Buffers of the view network, one column per ray with samples, and of the samples' colours.
 #[derive(Debug, Default)]
 pub(crate) struct Shading {
     input: Aligned,
     hidden: [Aligned; 2],
-    /// What is added to the raw colours: three rows.
-    added: Aligned,
-    /// Colours: three rows, a column a sample that counts.
+    /// View-dependent part of raw colours: three rows.
+    view_colour: Aligned,
+    /// Colours: three rows, one column per sample that counts.
     colour: Aligned,
     gradient: [Aligned; 2],
     along: AlongRay,
@@ -38,35 +38,35 @@ struct AlongRay {
     by_depth: Aligned,
 }
 
-/// What a backward pass starts from, an entry a ray.
+/// Inputs of a backward pass, one entry per ray.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RayGradients<'a> {
-    /// By the colour over the background.
+    /// Gradient by the colour over the background.
     pub(crate) colours: &'a [[f32; 3]],
     pub(crate) backgrounds: &'a [[f32; 3]],
-    /// Their weights for one ray.
+    /// Weights of the regularisers for one ray.
     pub(crate) regularisers: Regularisers,
 }
 
-/// The networks' weights output by output, and where their gradients are added.
+/// The networks' transposed weights, and the sums of gradients by the weights.
 pub(crate) struct NetworkGradients<'a> {
     pub(crate) transposed: &'a [f32],
     pub(crate) sums: &'a mut [f32],
 }
 
-/// What a layer got on the way forward: rows of n.
+/// Input of a layer in the forward pass: rows of n.
 #[derive(Clone, Copy)]
 pub(crate) enum LayerInput<'a> {
-    /// What the network got.
+    /// Input of the network.
     First(&'a [f32]),
-    /// What the layer before gave, through its ReLU.
+    /// Output of the previous layer's ReLU.
     Hidden(&'a [f32]),
 }
 
 impl NetworkGradients<'_> {
-    /// Goes back through a layer from `dy`, the gradient by its outputs, to `dx`, the gradient by
-    /// its input before any ReLU: rows of n. Adds the gradient by its weights.
-    pub(crate) fn back(
+    /// Propagates `dy`, the gradient by a layer's outputs, to `dx`, the gradient by its input
+    /// before any ReLU: rows of n. Adds the gradient by the layer's weights.
+    pub(crate) fn backward(
         &mut self,
         layer: Layer,
         input: LayerInput<'_>,
@@ -94,8 +94,8 @@ kernel! {
 }
 
 kernel! {
-    /// Composites view features into the view network's `input`, a column a ray, and adds weights
-    /// and distances to the rays' sums.
+    /// Composites view features into the view network's `input`, one column per ray, and adds
+    /// weights and distances to the rays' sums.
     fn composite<L>(samples: &Samples, counted: &Counted, rays: &[NormalizedRay],
         sums: &mut [RaySum], input: &mut [f32], n: usize) {
         for (column, &r) in counted.rays.iter().enumerate() {
@@ -119,16 +119,16 @@ kernel! {
 }
 
 kernel! {
-    /// Adds each ray's part to its samples' raw colours: `colour` has three rows, a column a sample
-    /// that counts; `added` has three rows of n.
-    fn raw_colours<L>(counted: &Counted, added: &[f32], n: usize, colour: &mut [f32]) {
+    /// Adds each ray's view colour to its samples' raw colours: `colour` has three rows with one
+    /// column per sample that counts, `view_colour` three rows of n.
+    fn raw_colours<L>(counted: &Counted, view_colour: &[f32], n: usize, colour: &mut [f32]) {
         let m = counted.sample.len();
         for (column, &r) in counted.rays.iter().enumerate() {
-            let added = [0, 1, 2].map(|c| added[c * n + column]);
+            let view_colour = [0, 1, 2].map(|c| view_colour[c * n + column]);
             for &k in counted.of_ray(r) {
                 let k = k as usize;
                 for c in 0..3 {
-                    colour[c * m + k] = counted.outputs[k][RAW_COLOUR + c] + added[c];
+                    colour[c * m + k] = counted.outputs[k][RAW_COLOUR + c] + view_colour[c];
                 }
             }
         }
@@ -136,7 +136,7 @@ kernel! {
 }
 
 kernel! {
-    /// Adds the samples' colours to their rays'.
+    /// Adds the samples' weighted colours to their rays' sums.
     fn sum_colours<L>(samples: &Samples, counted: &Counted, colour: &[f32], sums: &mut [RaySum]) {
         let m = counted.sample.len();
         for &r in &counted.rays {
@@ -152,9 +152,9 @@ kernel! {
 }
 
 kernel! {
-    /// Gradient by what was added to each ray's raw colours: `gradient` has three rows of n.
-    /// `colour` has the samples' colours, `colours` the gradient by each ray's.
-    fn gradients_by_added<L>(
+    /// Computes the gradient by each ray's view colour, three rows of n, from the samples' colours
+    /// `colour` and the gradients `colours` by each ray's colour.
+    fn view_colour_gradients<L>(
         samples: &Samples, counted: &Counted, colour: &[f32], colours: &[[f32; 3]],
         gradient: &mut [f32], n: usize,
     ) {
@@ -176,7 +176,7 @@ kernel! {
     }
 }
 
-/// Sum of products, in one order on every machine.
+/// Returns the sum of products, in one order on every machine.
 #[inline(always)]
 pub(crate) fn dot(a: &[f32; DENSITY_OUTPUTS], b: &[f32; DENSITY_OUTPUTS]) -> f32 {
     let mut products: [f32; DENSITY_OUTPUTS] = std::array::from_fn(|o| a[o] * b[o]);
@@ -190,27 +190,27 @@ pub(crate) fn dot(a: &[f32; DENSITY_OUTPUTS], b: &[f32; DENSITY_OUTPUTS]) -> f32
     products[0]
 }
 
-/// A ray's gradients, from which those of its samples follow.
+/// Gradients of one ray, from which its samples' gradients follow.
 #[derive(Clone, Copy)]
-struct AtRay<'a> {
-    /// Places of its samples among those that count, from front to back.
-    places: &'a [u32],
-    /// Gradient by its colour.
+struct UpstreamGradient<'a> {
+    /// Indices of the ray's samples among those that count, from front to back.
+    indices: &'a [u32],
+    /// Gradient by the ray's colour.
     colour: [f32; 3],
-    /// Gradient by its composited outputs of the density network.
+    /// Gradient by the composited outputs of the density network.
     composited: [f32; DENSITY_OUTPUTS],
 }
 
 kernel! {
-    /// Gradients of one ray's samples by the density network's outputs, but for that by the raw
-    /// density; `along` gets transmittances, weights, places and the gradient by each weight.
+    /// Computes the gradients of one ray's samples by the density network's outputs, except by the
+    /// raw density. Fills `along` with transmittances, weights, t and the gradient by each weight.
     fn gradients_along<L>(
-        samples: &Samples, counted: &Counted, colour: &[f32], ray: &AtRay<'_>, along: &mut AlongRay,
-        gradients: &mut [[f32; DENSITY_OUTPUTS]],
+        samples: &Samples, counted: &Counted, colour: &[f32], ray: &UpstreamGradient<'_>,
+        along: &mut AlongRay, gradients: &mut [[f32; DENSITY_OUTPUTS]],
     ) {
-        let (places, g, composited) = (ray.places, ray.colour, &ray.composited);
+        let (indices, g, composited) = (ray.indices, ray.colour, &ray.composited);
         let m = counted.sample.len();
-        for (j, &k) in places.iter().enumerate() {
+        for (j, &k) in indices.iter().enumerate() {
             let (k, i) = (k as usize, counted.sample[k as usize] as usize);
             let w = samples.weight[i];
             (along.transmittance[j], along.weight[j], along.t[j]) = (samples.transmittance[i], w,
@@ -228,13 +228,12 @@ kernel! {
     }
 }
 
-/// Runs the view network on `n` columns of its `input`; what is added to raw colours: three rows of
-/// n.
+/// Runs the view network on `n` columns of `input`, and returns the view colours: three rows of n.
 pub(crate) fn view_network<'a>(
     field: &Field,
     input: &[f32],
     hidden: &mut [Aligned; 2],
-    added: &'a mut Aligned,
+    view_colour: &'a mut Aligned,
     n: usize,
 ) -> &'a mut [f32] {
     let Layers { view, .. } = field.layers;
@@ -243,9 +242,9 @@ pub(crate) fn view_network<'a>(
     multiply(view[0].matrix(&field.network), input, hidden1, n, After::Relu);
     let hidden2 = hidden2.fit(view[1].outputs * n);
     multiply(view[1].matrix(&field.network), hidden1, hidden2, n, After::Relu);
-    let added = added.fit(view[2].outputs * n);
-    multiply(view[2].matrix(&field.network), hidden2, added, n, After::Linear);
-    added
+    let view_colour = view_colour.fit(view[2].outputs * n);
+    multiply(view[2].matrix(&field.network), hidden2, view_colour, n, After::Linear);
+    view_colour
 }
 
 impl AlongRay {
@@ -263,7 +262,7 @@ impl AlongRay {
 }
 
 impl Shading {
-    /// Colours of the samples that count, and each ray's sums.
+    /// Computes the colours of the samples that count, and each ray's sums.
     pub(crate) fn forward(
         &mut self,
         field: &Field,
@@ -278,20 +277,20 @@ impl Shading {
             row[counted.rays.len()..].fill(0.0);
         }
         composite(samples, counted, rays, sums, input, n);
-        let added = view_network(field, input, &mut self.hidden, &mut self.added, n);
+        let view_colour = view_network(field, input, &mut self.hidden, &mut self.view_colour, n);
         let colour = self.colour.fit(3 * m);
-        raw_colours(counted, added, n, colour);
+        raw_colours(counted, view_colour, n, colour);
         sigmoids(colour);
         sum_colours(samples, counted, colour, sums);
     }
 
-    /// Goes back from rays to the density network's outputs of every sample that counts, and adds
-    /// the view network's gradients.
+    /// Propagates gradients from rays to the density network's outputs of every sample that counts,
+    /// and adds the view network's gradients.
     pub(crate) fn backward(
         &mut self,
         field: &Field,
         (samples, counted, sums): (&Samples, &Counted, &[RaySum]),
-        towards: RayGradients<'_>,
+        upstream: RayGradients<'_>,
         network: &mut NetworkGradients<'_>,
         gradients: &mut Vec<[f32; DENSITY_OUTPUTS]>,
     ) {
@@ -304,34 +303,36 @@ impl Shading {
         for row in a[..3 * n].chunks_exact_mut(n) {
             row[counted.rays.len()..].fill(0.0);
         }
-        gradients_by_added(samples, counted, colour, towards.colours, a, n);
+        view_colour_gradients(samples, counted, colour, upstream.colours, a, n);
         let [hidden1, hidden2] = &self.hidden;
         let (hidden1, hidden2) = (&hidden1[..first.outputs * n], &hidden2[..second.outputs * n]);
-        network.back(third, LayerInput::Hidden(hidden2), n, a, b);
-        network.back(second, LayerInput::Hidden(hidden1), n, b, a);
-        network.back(first, LayerInput::First(&self.input[..VIEW_INPUTS * n]), n, a, b);
+        network.backward(third, LayerInput::Hidden(hidden2), n, a, b);
+        network.backward(second, LayerInput::Hidden(hidden1), n, b, a);
+        network.backward(first, LayerInput::First(&self.input[..VIEW_INPUTS * n]), n, a, b);
 
         gradients.clear();
         gradients.resize(m, [0.0; DENSITY_OUTPUTS]);
         let along = &mut self.along;
-        along.fit(counted.longest());
+        along.fit(counted.max_samples_per_ray());
         let step = field.step();
         let channels: [&[f32]; 3] = std::array::from_fn(|c| &colour[c * m..(c + 1) * m]);
         for (column, &r) in counted.rays.iter().enumerate() {
-            let (g, background) = (towards.colours[r as usize], towards.backgrounds[r as usize]);
-            let (places, transmittance) = (counted.of_ray(r), sums[r as usize].transmittance);
-            let len = places.len();
+            let (g, background) = (upstream.colours[r as usize], upstream.backgrounds[r as usize]);
+            let (indices, transmittance) = (counted.of_ray(r), sums[r as usize].transmittance);
+            let len = indices.len();
             let mut composited = [0.0; DENSITY_OUTPUTS];
-            (0..VIEW_FEATURES).for_each(|f| composited[VIEW_FEATURE + f] = b[f * n + column]);
-            let at = AtRay { places, colour: g, composited };
-            gradients_along(samples, counted, colour, &at, along, gradients);
+            for f in 0..VIEW_FEATURES {
+                composited[VIEW_FEATURE + f] = b[f * n + column];
+            }
+            let ray_gradient = UpstreamGradient { indices, colour: g, composited };
+            gradients_along(samples, counted, colour, &ray_gradient, along, gradients);
             let (t, weight) = (&along.t[..len], &along.weight[..len]);
-            let ray = ShadedRay { t, weight, step, channels, places, transmittance, background };
+            let ray = ShadedRay { t, weight, step, channels, indices, transmittance, background };
             let mut loss = LossGradients {
                 by_weight: &mut along.by_weight[..len],
                 behind: transmittance * (0..3).map(|c| g[c] * background[c]).sum::<f32>(),
             };
-            towards.regularisers.add_gradients(&ray, &mut loss);
+            upstream.regularisers.add_gradients(&ray, &mut loss);
             optical_depth_gradients(
                 loss.by_weight,
                 &along.transmittance[..len],
@@ -339,7 +340,7 @@ impl Shading {
                 loss.behind,
                 &mut along.by_depth[..len],
             );
-            for (&k, &by_depth) in places.iter().zip(&*along.by_depth) {
+            for (&k, &by_depth) in indices.iter().zip(&*along.by_depth) {
                 gradients[k as usize][0] = by_depth * counted.outputs[k as usize][0];
             }
         }

@@ -1,29 +1,29 @@
 //! Sixteen logical lanes on any machine, and the choice of machine code at run time.
 //!
-//! Every family does the same operations on the same lanes in the same order, so all give equal
-//! bits; a test compares them.
+//! All families execute the same operations on the same lanes in the same order, so their results
+//! have equal bits; a test compares them.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
-/// Logical lanes of every kernel.
+/// Number of logical lanes of every kernel.
 pub(crate) const LANES: usize = 16;
 
-/// A family of machine code.
+/// SIMD family of machine code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Family {
     /// 512-bit vectors (x86-64-v4).
     Avx512,
     /// 256-bit vectors with fused multiply-add (x86-64-v3).
     Avx2,
-    /// Whatever the target has.
+    /// Instructions of the compilation target.
     Portable,
 }
 
-/// 0: not chosen yet; else 1 + the family.
+/// Chosen family: 1 AVX-512, 2 AVX2, 3 portable; 0 before the first choice.
 static CHOSEN: AtomicU8 = AtomicU8::new(0);
 
 impl Family {
-    /// The best family of this machine, or the one set with [`set_family`].
+    /// Returns the family set with [`set_family`], by default the best that the machine supports.
     pub(crate) fn current() -> Self {
         match CHOSEN.load(Ordering::Relaxed) {
             1 => Self::Avx512,
@@ -40,7 +40,7 @@ impl Family {
         }
     }
 
-    /// Whether this machine can run it.
+    /// Returns whether the machine supports the family.
     pub fn is_supported(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         match self {
@@ -61,8 +61,8 @@ impl Family {
     }
 }
 
-/// Uses a family from now on, in the whole process: for tests and benchmarks. One that the machine
-/// lacks is ignored.
+/// Sets the family of the whole process, for tests and benchmarks. A family that the machine
+/// doesn't support is ignored.
 pub fn set_family(family: Family) {
     if family.is_supported() {
         let code = match family {
@@ -74,10 +74,10 @@ pub fn set_family(family: Family) {
     }
 }
 
-/// Runs a test by every family that this machine has, and says which it lacks.
+/// Runs a test with every family that the machine supports, and prints the others.
 #[cfg(test)]
 pub(crate) fn by_every_family(mut test: impl FnMut(Family)) {
-    // Tests run beside each other, and the family is that of the process.
+    // Tests run in parallel, and the family is global.
     static ALONE_HERE: std::sync::Mutex<()> = std::sync::Mutex::new(());
     let _alone = ALONE_HERE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     for family in [Family::Avx512, Family::Avx2, Family::Portable] {
@@ -88,7 +88,9 @@ pub(crate) fn by_every_family(mut test: impl FnMut(Family)) {
             eprintln!("skipped: this machine has no {family:?}");
         }
     }
-    [Family::Portable, Family::Avx2, Family::Avx512].into_iter().for_each(set_family);
+    for family in [Family::Portable, Family::Avx2, Family::Avx512] {
+        set_family(family);
+    }
 }
 
 /// Four `f32`: the features of a vertex.
@@ -96,7 +98,7 @@ pub(crate) trait Quad: Copy {
     fn splat(value: f32) -> Self;
     fn load(from: &[f32; 4]) -> Self;
     fn store(self, to: &mut [f32; 4]);
-    /// self · factor + addend, rounded once.
+    /// Returns self · factor + addend, rounded once.
     fn mul_add(self, factor: Self, addend: Self) -> Self;
 }
 
@@ -121,22 +123,22 @@ impl Quad for [f32; 4] {
 
 /// Sixteen `f32`.
 pub(crate) trait Lanes: Copy {
-    /// Four of the same family.
+    /// Four `f32` of the same family.
     type Quad: Quad;
-    /// Whether 24 of them fit into registers at once.
+    /// True if 24 values fit into registers at once.
     const WIDE: bool;
     fn splat(value: f32) -> Self;
     fn load(from: &[f32; LANES]) -> Self;
     fn store(self, to: &mut [f32; LANES]);
-    /// self · factor + addend, rounded once.
+    /// Returns self · factor + addend, rounded once.
     fn mul_add(self, factor: Self, addend: Self) -> Self;
-    /// self where it is above 0, else 0.
+    /// Returns self in lanes where it is above 0, otherwise 0.
     fn positive(self) -> Self;
-    /// self where `gate` is above 0, else 0.
+    /// Returns self in lanes where `gate` is above 0, otherwise 0.
     fn where_positive(self, gate: Self) -> Self;
-    /// The sums of four over their lanes, each by halves: lanes 0 and 8, 1 and 9, … first.
+    /// Sums each of four values over its lanes by halves: first lanes 0 and 8, 1 and 9, ….
     fn sums(four: [Self; 4]) -> Self::Quad;
-    /// Asks the memory for numbers that are needed soon.
+    /// Prefetches floats that are needed soon.
     fn prefetch(_soon: &[f32]) {}
 }
 
@@ -187,10 +189,10 @@ impl Lanes for Portable {
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86 {
-    //! `unsafe` here pays with a known vector width: left to the optimiser, the accumulators of a
-    //! matrix tile spill. All of it is sound because these types are only used inside functions
-    //! compiled for their features (see `kernel!`). No closure here: it wouldn't inherit them, and
-    //! its intrinsics would be calls.
+    //! Intrinsics fix the vector width: with auto-vectorisation the accumulators of a matrix tile
+    //! spill. The `unsafe` is sound because these types are only used in functions compiled for
+    //! their features (see `kernel!`). There are no closures: a closure wouldn't inherit the
+    //! features, and its intrinsics would be calls.
 
     use std::arch::x86_64::*;
 
@@ -223,7 +225,7 @@ pub(crate) mod x86 {
     }
 
     impl Four {
-        /// The sums of four, each of eight floats.
+        /// Sums each of four vectors of eight floats.
         ///
         /// # Safety
         /// The caller runs with AVX2.
@@ -380,8 +382,8 @@ pub(crate) mod x86 {
     }
 }
 
-/// Defines a kernel: one body, generic over `L: Lanes`, compiled for every family and chosen at run
-/// time.
+/// Defines a kernel: one body, generic over `L: Lanes`, compiled for every family. The family is
+/// chosen at run time.
 macro_rules! kernel {
     (
         $(#[$meta:meta])*

@@ -1,56 +1,82 @@
-//! The field's constants: shared by the fused passes, their f64 judge and the libtorch twin.
+//! Constants of the field, shared by the fused passes, the f64 reference and the libtorch twin.
 
-/// Features of a grid vertex.
+/// Number of features of a grid vertex.
 pub const FEATURES: usize = 4;
-/// Vertices of a brick, which lie together in memory: 2³.
+/// Number of vertices of a brick, 2³, which are contiguous in memory.
 pub const BRICK: usize = 8;
 /// Factors of a brick's y and z coordinates in its hash (Müller et al. 2022, eq. 4); x has 1.
 pub const HASH_FACTORS: [u32; 2] = [2_654_435_761, 805_459_861];
 
-/// Outputs of the density network: raw density, the colour's raw red, green and blue, and the view
-/// features.
+/// Number of outputs of the density network: raw density, raw red, green and blue, view features.
 pub const DENSITY_OUTPUTS: usize = 16;
-/// First raw colour and first view feature among those outputs.
+/// Index of the first raw colour among the density network's outputs.
 pub const RAW_COLOUR: usize = 1;
-/// See [`RAW_COLOUR`].
+/// Index of the first view feature among the density network's outputs.
 pub const VIEW_FEATURE: usize = 4;
-/// View features: composited along a ray, they are what the view network gets besides the
-/// direction.
+/// Number of view features. Composited along a ray, view features are inputs of the view network.
 pub const VIEW_FEATURES: usize = DENSITY_OUTPUTS - VIEW_FEATURE;
-/// Spherical harmonics of a direction, up to degree 2.
+/// Number of spherical harmonics of a direction, up to degree 2.
 pub const BASIS: usize = 9;
-/// Inputs of the view network.
+/// Number of inputs of the view network: view features and spherical harmonics.
 pub const VIEW_INPUTS: usize = VIEW_FEATURES + BASIS;
-/// Raw density stops growing here: a step is opaque long before e^15.
+/// Maximum raw density, to which larger values are clamped: a step is opaque long before e^15.
 pub const MAX_RAW_DENSITY: f32 = 15.0;
 
-/// Samples behind this transmittance, and samples of less weight, have no colour and no gradient.
-pub const FAINT: f32 = 1e-4;
-/// A ray whose samples weigh no more in all has its depth at the far end.
-pub const UNSEEN: f32 = 1e-4;
-/// Optical depth at which a ray ends: -ln([`FAINT`]).
-pub const DARK: f32 = 9.210_34;
-/// Samples of each ray in the first rounds of a training and in all later ones: few while a surface
-/// may stop the ray, then more. A ray that is dark ([`DARK`]) takes no further round.
+/// Minimum transmittance at which rays are sampled and samples have colour and gradient. A larger
+/// threshold costs PSNR (docs/design/006).
+pub const MIN_TRANSMITTANCE: f32 = 1e-4;
+/// Minimum weight of a sample that has colour and gradient. A larger threshold costs PSNR
+/// (docs/design/006).
+pub const MIN_WEIGHT: f32 = 1e-4;
+/// Minimum total weight of a ray's samples for its depth to be their mean; chosen by hand.
+pub const MIN_TOTAL_WEIGHT: f32 = 1e-4;
+/// Optical depth at which a ray ends: -ln([`MIN_TRANSMITTANCE`]).
+pub const MAX_OPTICAL_DEPTH: f32 = 9.210_34;
+/// Samples per ray in the first rounds of a training; later rounds have the last number
+/// (docs/design/006). Samples behind a surface that an early round finds are never evaluated.
 pub const TRAINING_ROUNDS: [usize; 4] = [8, 8, 16, 32];
 
-/// How far apart colours at most are for matter to pass for the background.
-pub const LIKE_BACKGROUND: f32 = 0.1;
+/// Maximum distance of a floater's colour from the background's (docs/design/013).
+pub const MAX_FLOATER_COLOUR_DISTANCE: f32 = 0.1;
 
-/// Cells of the occupancy along each axis of the unit cube.
+/// Cells of the occupancy grid along each axis of the unit cube.
 pub const OCCUPANCY_CELLS: usize = 128;
-/// Optical depth of a step below which a cell is thin: in training, rays take a sample of double
-/// length at every other step.
-pub const THIN: f32 = 0.05;
-/// Optical depth of a step below which a cell is empty, once the mean is above it.
-pub const EMPTY: f32 = 0.01;
+/// Maximum optical depth of a step in a thin cell (docs/design/037), where training rays take a
+/// sample of double length at every other step.
+pub const MAX_THIN_OPTICAL_DEPTH: f32 = 0.05;
+/// Maximum optical depth of a step in an empty cell. A tenth of it fills the background with faint
+/// density (docs/design/045).
+pub const MAX_EMPTY_OPTICAL_DEPTH: f32 = 0.01;
 
-/// Weight of a sample above which its cell keeps the density found there: a random place may miss a
-/// thin surface, and the cell would become empty.
-pub const MET: f32 = 0.03;
+/// Minimum weight of a training sample that raises its cell's density to the sample's own
+/// (docs/design/037): random probes miss thin surfaces, and their cells would become empty.
+pub const MIN_HIT_WEIGHT: f32 = 0.03;
 
-/// Adam's decay of the two moments of gradients. The second moment forgets sooner than usual, since
-/// a grid entry is seen now and then.
+/// Decay rates of Adam's two moments (Müller et al. 2022). The second is below the usual 0.999,
+/// since a grid entry has a gradient in few steps.
 pub const ADAM_BETA: [f64; 2] = [0.9, 0.99];
-/// What keeps Adam's division from 0.
+/// Term that keeps Adam's denominator above 0 (Müller et al. 2022).
 pub const ADAM_EPSILON: f64 = 1e-15;
+
+/// Choice between a sample at every step and one of double length at every other step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Strides {
+    /// A sample at every step: for rendering.
+    Even,
+    /// Double strides in thin cells: for training, where other rays have samples in between.
+    ByCell,
+    /// Double strides everywhere: for a training's first steps, while density is smooth.
+    Double,
+}
+
+impl Strides {
+    /// Returns whether a sample in a thin or dense cell has double length.
+    #[inline]
+    pub(crate) fn are_double_in(self, thin: bool) -> bool {
+        match self {
+            Self::Even => false,
+            Self::ByCell => thin,
+            Self::Double => true,
+        }
+    }
+}

@@ -4,133 +4,147 @@ use std::path::{Path, PathBuf};
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView, View};
 use scene::Bounds;
 
-use crate::ranges::OutOfRange;
+use crate::architecture::OutOfRange;
 
-/// A field that can't be read or written.
+/// Error returned when a field or checkpoint can't be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum FieldError {
-    /// The file can't be opened.
+    /// The file can't be read or written.
     #[error("{path}: {source}")]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file isn't a field.
+    /// The file's content is neither a field nor a checkpoint.
     #[error("{path}: {reason}")]
     Format {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Reason.
         reason: FieldProblem,
     },
 }
 
-/// Why a file is neither a field nor a checkpoint.
+/// Reason why a file is neither a field nor a checkpoint.
 #[derive(Debug, thiserror::Error)]
 pub enum FieldProblem {
-    /// The file isn't one of tensors.
+    /// The file isn't in safetensors format.
     #[error(transparent)]
     NotTensors(#[from] SafeTensorError),
-    /// A tensor can't be had.
+    /// A tensor is missing.
     #[error("tensor {name}: {problem}")]
     Missing {
-        /// The tensor.
+        /// Name of the tensor.
         name: String,
-        /// Why.
+        /// Error of the safetensors library.
         problem: SafeTensorError,
     },
-    /// A tensor has another type or length.
-    #[error("tensor {name}: {found:?} {shape:?} where {count} {expected} are expected")]
+    /// A tensor has an unexpected type or length.
+    #[error("tensor {name}: expected {count} {expected}, found {found:?} {shape:?}")]
     Unexpected {
-        /// The tensor.
+        /// Name of the tensor.
         name: String,
-        /// Its type.
+        /// Type found.
         found: Dtype,
-        /// Its shape.
+        /// Shape found.
         shape: Vec<usize>,
-        /// How many numbers a reader expects.
+        /// Number of elements expected.
         count: usize,
-        /// Their type.
+        /// Type expected.
         expected: &'static str,
     },
-    /// No field has such an architecture.
+    /// A number of the architecture is out of range.
     #[error(transparent)]
     Architecture(#[from] OutOfRange),
-    /// Nothing lies inside the bounds.
-    #[error("the box {0:?} has no inside")]
+    /// The bounds are empty or not finite.
+    #[error("bounds {0:?} are empty or not finite")]
     NoInside(Box<Bounds>),
     /// A parameter isn't finite.
     #[error("a parameter is not finite")]
     NotFinite,
 }
 
-/// A tensor to write.
-pub(crate) enum Tensor<'a> {
+/// Vector to write. Its bytes are created while it is written, so that one vector at a time is
+/// copied.
+pub(crate) struct Tensor<'a> {
+    data: TensorData<'a>,
+    shape: [usize; 1],
+}
+
+enum TensorData<'a> {
     F32(&'a [f32]),
     U8(&'a [u8]),
 }
 
-/// A tensor with its shape, whose bytes are made when they are written: a copy of the largest
-/// tensor at a time.
-struct Written<'a>(&'a Tensor<'a>, [usize; 1]);
+impl<'a> Tensor<'a> {
+    pub(crate) fn of_floats(data: &'a [f32]) -> Self {
+        Self { data: TensorData::F32(data), shape: [data.len()] }
+    }
 
-impl View for Written<'_> {
+    pub(crate) fn of_bytes(data: &'a [u8]) -> Self {
+        Self { data: TensorData::U8(data), shape: [data.len()] }
+    }
+}
+
+impl View for &Tensor<'_> {
     fn dtype(&self) -> Dtype {
-        match self.0 {
-            Tensor::F32(_) => Dtype::F32,
-            Tensor::U8(_) => Dtype::U8,
+        match self.data {
+            TensorData::F32(_) => Dtype::F32,
+            TensorData::U8(_) => Dtype::U8,
         }
     }
 
     fn shape(&self) -> &[usize] {
-        &self.1
+        &self.shape
     }
 
     fn data(&self) -> Cow<'_, [u8]> {
-        match self.0 {
-            Tensor::F32(numbers) => {
-                Cow::Owned(numbers.iter().flat_map(|x| x.to_le_bytes()).collect())
+        match self.data {
+            TensorData::F32(floats) => {
+                Cow::Owned(floats.iter().flat_map(|x| x.to_le_bytes()).collect())
             }
-            Tensor::U8(bytes) => Cow::Borrowed(bytes),
+            TensorData::U8(bytes) => Cow::Borrowed(bytes),
         }
     }
 
     fn data_len(&self) -> usize {
-        match self.0 {
-            Tensor::F32(numbers) => size_of_val(*numbers),
-            Tensor::U8(bytes) => bytes.len(),
-        }
+        self.shape[0] * self.dtype().bitsize() / 8
     }
 }
 
-impl Tensor<'_> {
-    fn len(&self) -> usize {
-        match self {
-            Self::F32(numbers) => numbers.len(),
-            Self::U8(bytes) => bytes.len(),
-        }
-    }
-}
-
+/// Writes a safetensors file.
 pub(crate) fn write_tensors(path: &Path, tensors: &[(&str, Tensor<'_>)]) -> Result<(), FieldError> {
-    let views = tensors.iter().map(|(name, tensor)| (*name, Written(tensor, [tensor.len()])));
-    let io = |source| FieldError::Io { path: path.to_path_buf(), source };
-    let whole = safetensors::serialize(views, None)
-        .map_err(|e| io(std::io::Error::other(e.to_string())))?;
-    std::fs::write(path, whole).map_err(io)
+    safetensors::serialize(tensors.iter().map(|(name, tensor)| (*name, tensor)), None)
+        .map_err(|e| std::io::Error::other(e.to_string()))
+        .and_then(|bytes| std::fs::write(path, bytes))
+        .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })
 }
 
+/// Opens a safetensors file and reads it by `read`; errors name the file.
+pub(crate) fn read_tensors<T>(
+    path: &Path,
+    read: impl FnOnce(&SafeTensors<'_>) -> Result<T, FieldProblem>,
+) -> Result<T, FieldError> {
+    let bytes = std::fs::read(path)
+        .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
+    SafeTensors::deserialize(&bytes)
+        .map_err(FieldProblem::from)
+        .and_then(|tensors| read(&tensors))
+        .map_err(|reason| FieldError::Format { path: path.to_path_buf(), reason })
+}
+
+/// Reads a tensor of as many floats as `into` has.
 pub(crate) fn read_f32(
     tensors: &SafeTensors<'_>,
     name: &str,
     into: &mut [f32],
 ) -> Result<(), FieldProblem> {
-    let tensor = named(tensors, name)?;
+    let tensor = find_tensor(tensors, name)?;
     let (data, rest) = tensor.data().as_chunks::<4>();
     if tensor.dtype() != Dtype::F32 || data.len() != into.len() || !rest.is_empty() {
-        return Err(unexpected(&tensor, name, into.len(), "f32"));
+        return Err(unexpected_tensor(&tensor, name, into.len(), "f32"));
     }
     for (value, bytes) in into.iter_mut().zip(data) {
         *value = f32::from_le_bytes(*bytes);
@@ -138,29 +152,34 @@ pub(crate) fn read_f32(
     Ok(())
 }
 
+/// Reads a tensor of `len` bytes.
 pub(crate) fn read_u8(
     tensors: &SafeTensors<'_>,
     name: &str,
     len: usize,
 ) -> Result<Vec<u8>, FieldProblem> {
-    let tensor = named(tensors, name)?;
+    let tensor = find_tensor(tensors, name)?;
     if tensor.dtype() != Dtype::U8 || tensor.data().len() != len {
-        return Err(unexpected(&tensor, name, len, "u8"));
+        return Err(unexpected_tensor(&tensor, name, len, "u8"));
     }
     Ok(tensor.data().to_vec())
 }
 
-fn named<'a>(tensors: &SafeTensors<'a>, name: &str) -> Result<TensorView<'a>, FieldProblem> {
-    let missing = |problem| FieldProblem::Missing { name: name.to_owned(), problem };
-    tensors.tensor(name).map_err(missing)
+fn find_tensor<'a>(tensors: &SafeTensors<'a>, name: &str) -> Result<TensorView<'a>, FieldProblem> {
+    tensors.tensor(name).map_err(|problem| FieldProblem::Missing { name: name.to_owned(), problem })
 }
 
-fn unexpected(
+fn unexpected_tensor(
     tensor: &TensorView<'_>,
     name: &str,
     count: usize,
     expected: &'static str,
 ) -> FieldProblem {
-    let (found, shape) = (tensor.dtype(), tensor.shape().to_vec());
-    FieldProblem::Unexpected { name: name.to_owned(), found, shape, count, expected }
+    FieldProblem::Unexpected {
+        name: name.to_owned(),
+        found: tensor.dtype(),
+        shape: tensor.shape().to_vec(),
+        count,
+        expected,
+    }
 }

@@ -6,53 +6,54 @@ use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use crate::adam::{AdamStep, adam, take_into_average};
+use crate::adam::{AdamStep, adam, update_average};
 use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::grid::scatter;
 use crate::occupancy::Occupancy;
 use crate::samples::DensityRows;
 use crate::simd::LANES;
-use crate::supervisor::Supervisor;
-use crate::tally::Tally;
+use crate::training_state::TrainingState;
 
-pub use options::TrainingOptions;
+pub use options::{Supervisor, TrainingOptions};
 
 use shard::{Shard, StepWork, Worker};
 
-/// What a step did.
+/// Result of a training step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepReport {
     /// Mean loss of the bundles.
     pub loss: f64,
-    /// Rays cast.
+    /// Number of rays cast.
     pub rays: usize,
-    /// Samples marched.
+    /// Number of samples marched.
     pub samples: usize,
-    /// Whether the step was thrown away, because something in it wasn't finite.
+    /// True if the step was discarded because a number wasn't finite.
     pub skipped: bool,
 }
 
-/// A training that can't go on.
+/// Error returned when a training can't continue.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
-    /// Numbers went wrong twice within a hundred steps.
+    /// Two steps within 100 weren't finite.
     #[error(
-        "step {step}: {tensor} is not finite, for the second time within 100 steps; lower the rate"
+        "step {step}: {tensor} is not finite, for the second time within 100 steps; lower the \
+        learning rate"
     )]
     NotFinite {
-        /// The step.
+        /// Number of the step.
         step: u64,
-        /// What wasn't finite.
+        /// Description of the tensor.
         tensor: &'static str,
     },
 }
 
-/// Shards of a step: fixed, so that sums have one order at any thread count.
+/// Number of shards of a step (docs/design/006), fixed so that sums have one order at any thread
+/// count.
 const SHARDS: usize = 32;
-/// Blocks of a level that the optimiser takes in one piece.
+/// Number of a level's blocks per task of the optimiser; chosen by hand.
 const ADAM_BLOCKS: usize = 1 << 12;
-/// Weights that are taken into their average in one piece.
+/// Number of weights per task that updates their average; chosen by hand.
 const AVERAGE_PIECE: usize = 1 << 16;
 
 /// Trains a [`Field`] by Adam.
@@ -62,19 +63,19 @@ pub struct Trainer {
     first: Moments,
     second: Moments,
     gradients: Moments,
-    /// Running average of the weights, once there is one.
+    /// Running average of the weights, created by the first update.
     average: Option<Moments>,
-    /// Blocks of each level's gradient that aren't 0.
+    /// Marks of each level's blocks that have a gradient.
     touched: Vec<Vec<u8>>,
     touched_network: Vec<u8>,
     transposed: Aligned,
-    tally: Tally,
+    state: TrainingState,
     samples_per_ray: f64,
     shards: Vec<Shard>,
     workers: Mutex<Vec<Worker>>,
 }
 
-/// One number a parameter.
+/// One float per parameter.
 struct Moments {
     grid: Aligned,
     network: Aligned,
@@ -90,7 +91,7 @@ impl Moments {
 }
 
 impl Trainer {
-    /// Starts from a field.
+    /// Creates a trainer that is initialised from a field.
     pub fn new(field: Field, options: TrainingOptions) -> Self {
         Self {
             first: Moments::zeros(&field),
@@ -100,8 +101,8 @@ impl Trainer {
             touched: field.levels.iter().map(|l| vec![0; l.blocks()]).collect(),
             touched_network: vec![0; field.network.len().div_ceil(LANES)],
             transposed: Aligned::zeros(field.network.len()),
-            tally: Tally::default(),
-            samples_per_ray: field.architecture.full_ray(),
+            state: TrainingState::default(),
+            samples_per_ray: field.architecture.samples_per_full_ray(),
             shards: (0..SHARDS).map(|_| Shard::default()).collect(),
             workers: Mutex::new(Vec::new()),
             field,
@@ -109,7 +110,7 @@ impl Trainer {
         }
     }
 
-    /// The trained field: with the average of its weights, where one was kept.
+    /// Returns the trained field, with averaged weights if averaging has begun.
     pub fn finish(self) -> Field {
         let mut field = self.field;
         if let Some(average) = self.average {
@@ -118,30 +119,30 @@ impl Trainer {
         field
     }
 
-    /// The field as it is now.
+    /// Returns the field in its current state.
     pub fn field(&self) -> &Field {
         &self.field
     }
 
-    /// Steps taken.
+    /// Returns the number of steps taken.
     pub fn steps(&self) -> u64 {
-        self.tally.steps
+        self.state.steps
     }
 
-    /// Rays cast so far.
+    /// Returns the number of rays cast.
     pub fn rays_done(&self) -> u64 {
-        self.tally.rays
+        self.state.rays
     }
 
-    /// Takes a step; `None` once all rays are spent.
+    /// Takes a step; returns `None` after all rays have been cast.
     pub fn step(
         &mut self,
         supervision: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TrainingError> {
-        supervision.set_progress(self.tally.done(self.options.rays));
+        supervision.set_progress(self.state.progress(self.options.rays));
         let bundle = supervision.rays_per_bundle();
-        let wanted = self.options.rays_of_step(&self.tally, self.samples_per_ray);
-        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else {
+        let wanted = self.options.rays_of_step(&self.state, self.samples_per_ray);
+        let Some(bundles) = self.state.bundles_of_step(self.options.rays, wanted, bundle) else {
             return Ok(None);
         };
         self.update_occupancy();
@@ -149,44 +150,45 @@ impl Trainer {
             layer.transpose(&self.field.network, &mut self.transposed);
         }
 
-        let first_bundle = self.tally.bundles;
+        let first_bundle = self.state.bundles;
         self.run_shards(&*supervision, bundles);
         self.sum_network_gradients();
         let samples: usize = self.shards.iter().map(|s| s.samples).sum();
         let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / bundles as f64;
-        self.tally.count(bundles, bundle);
+        self.state.count(bundles, bundle);
         self.samples_per_ray = samples as f64 / (bundles * bundle) as f64;
-        let fault = self.fault(loss);
-        if let Some(tensor) = fault {
+        let nonfinite = self.find_nonfinite(loss);
+        if let Some(tensor) = nonfinite {
             self.gradients.network.fill(0.0);
-            if !self.tally.forgives() {
-                return Err(TrainingError::NotFinite { step: self.tally.steps, tensor });
+            if !self.state.record_nonfinite_step() {
+                return Err(TrainingError::NotFinite { step: self.state.steps, tensor });
             }
         } else {
-            self.apply();
-            self.average();
+            self.apply_gradients();
+            self.update_average();
             for shard in &self.shards {
-                self.field.occupancy.keep(&shard.met);
+                self.field.occupancy.raise_densities(&shard.hits);
             }
             let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(bundle));
-            (first_bundle..)
-                .zip(colours)
-                .for_each(|(bundle, colours)| supervision.remember(bundle, colours));
+            for (i, colours) in colours.enumerate() {
+                supervision.remember(first_bundle + i as u64, colours);
+            }
         }
-        self.tally.steps += 1;
-        Ok(Some(StepReport { loss, rays: bundles * bundle, samples, skipped: fault.is_some() }))
+        self.state.steps += 1;
+        let skipped = nonfinite.is_some();
+        Ok(Some(StepReport { loss, rays: bundles * bundle, samples, skipped }))
     }
 
-    /// Takes a step's bundles forward and back, each shard a range of them.
+    /// Runs the forward and backward pass of a step's bundles, a range of them per shard.
     fn run_shards(&mut self, supervision: &impl Supervisor, bundles: usize) {
         let work = StepWork {
             field: &self.field,
             transposed: &self.transposed,
             supervision,
             options: &self.options,
-            strides: self.field.occupancy.strides(self.tally.steps),
-            first_bundle: self.tally.bundles,
-            first_ray: self.tally.rays,
+            strides: self.field.occupancy.strides(self.state.steps),
+            first_bundle: self.state.bundles,
+            first_ray: self.state.rays,
             bundles,
         };
         let workers = &self.workers;
@@ -197,24 +199,26 @@ impl Trainer {
         });
     }
 
-    /// Adds up the networks' gradients of all shards, in the shards' order.
+    /// Sums the networks' gradients over all shards, in the shards' order.
     fn sum_network_gradients(&mut self) {
         let shards = &self.shards;
         let parts = self.gradients.network.par_chunks_mut(1024).enumerate();
         parts.for_each(|(i, sums)| {
             for shard in shards {
                 let part = &shard.network[1024 * i..][..sums.len()];
-                sums.iter_mut().zip(part).for_each(|(sum, g)| *sum += g);
+                for (sum, gradient) in sums.iter_mut().zip(part) {
+                    *sum += gradient;
+                }
             }
         });
     }
 
-    /// What isn't finite, before anything has been changed by it.
-    fn fault(&self, loss: f64) -> Option<&'static str> {
-        let finite = |sum: f32| sum.is_finite();
+    /// Returns the description of the first value that isn't finite; called before parameters
+    /// change.
+    fn find_nonfinite(&self, loss: f64) -> Option<&'static str> {
         if !loss.is_finite() {
             Some("the loss")
-        } else if !finite(self.gradients.network.iter().sum()) {
+        } else if !self.gradients.network.iter().sum::<f32>().is_finite() {
             Some("the networks' gradient")
         } else if !self
             .shards
@@ -227,12 +231,13 @@ impl Trainer {
         }
     }
 
-    fn apply(&mut self) {
+    /// Takes an Adam step of networks and grid; first adds the shards' gradients of each level.
+    fn apply_gradients(&mut self) {
         let options = &self.options;
-        let (schedule, step) = (options.schedule(&self.tally), self.tally.steps + 1);
+        let (schedule, step) = (options.schedule(&self.state), self.state.steps + 1);
         let network_step =
             AdamStep::new(step, options.mlp_learning_rate * schedule, options.network_decay);
-        // All of a network is touched, always.
+        // Every weight of the networks has a gradient.
         self.touched_network.fill(1);
         adam(
             &network_step,
@@ -260,7 +265,7 @@ impl Trainer {
             grids = (rest_w, rest_g, rest_m, rest_v);
             work.push((i, level, touched, w, g, m, v));
         }
-        // The finest levels cost most: begin with them.
+        // The finest levels take longest, so they go first.
         work.into_par_iter().rev().with_max_len(1).for_each(|(i, level, touched, w, g, m, v)| {
             for shard in shards {
                 if let Some(gradients) = shard.features.levels.get(i) {
@@ -269,7 +274,7 @@ impl Trainer {
             }
             let adam_step = AdamStep::new(step, options.rate_of_level(i, schedule), 0.0);
             let len = ADAM_BLOCKS * LANES;
-            // In parts, so that the last level leaves no thread without work.
+            // In pieces, so that the last level occupies all threads.
             let [w, g, m, v] = [w, g, m, v].map(|numbers| numbers.par_chunks_mut(len));
             (touched.par_chunks_mut(ADAM_BLOCKS), w, g, m, v)
                 .into_par_iter()
@@ -277,10 +282,10 @@ impl Trainer {
         });
     }
 
-    /// Late in the training, takes the weights into their average (Polyak): what is left of the
-    /// steps' noise evens out.
-    fn average(&mut self) {
-        if !self.options.averages(&self.tally) {
+    /// Updates the average of the weights (Polyak) late in the training, which cancels the steps'
+    /// noise (docs/design/007).
+    fn update_average(&mut self) {
+        if !self.options.is_averaging_step(&self.state) {
             return;
         }
         let field = &self.field;
@@ -293,31 +298,35 @@ impl Trainer {
         for (average, now) in pairs {
             (average.par_chunks_mut(AVERAGE_PIECE), now.par_chunks(AVERAGE_PIECE))
                 .into_par_iter()
-                .for_each(|(average, now)| take_into_average(average, now, share));
+                .for_each(|(average, now)| update_average(average, now, share));
         }
     }
 
-    /// Looks at the density of cells where it is time to.
+    /// Evaluates the density of the cells that are due, and updates the occupancy.
     fn update_occupancy(&mut self) {
-        let (field, seed, at) = (&self.field, self.options.seed, self.tally.steps);
-        let cells = field.occupancy.cells_to_update(at);
-        let found = cells.par_chunks(1024).map_init(
+        let field = &self.field;
+        let seed = self.options.seed;
+        let step = self.state.steps;
+        let cells = field.occupancy.cells_to_update(step);
+        let densities = cells.par_chunks(1024).map_init(
             || (DensityRows::default(), vec![0.0; 3 * 1024]),
             |(rows, positions), cells| {
                 let n = cells.len().next_multiple_of(LANES);
                 for (k, &cell) in cells.iter().enumerate() {
-                    let place = Occupancy::place_in(cell, seed, at);
-                    (0..3).for_each(|axis| positions[axis * n + k] = place[axis]);
+                    let position = Occupancy::random_position(cell, seed, step);
+                    for axis in 0..3 {
+                        positions[axis * n + k] = position[axis];
+                    }
                 }
-                let mut found = vec![0.0; n];
-                rows.densities(field, &positions[..3 * n], n, &mut found);
-                found.truncate(cells.len());
-                found
+                let mut densities = vec![0.0; n];
+                rows.densities(field, &positions[..3 * n], n, &mut densities);
+                densities.truncate(cells.len());
+                densities
             },
         );
-        let found: Vec<f32> = found.flatten_iter().collect();
-        let step = field.step();
-        self.field.occupancy.update(&cells, &found, step);
+        let densities: Vec<f32> = densities.flatten_iter().collect();
+        let distance = field.step();
+        self.field.occupancy.update(&cells, &densities, distance);
     }
 }
 
@@ -489,8 +498,7 @@ mod tests {
         }
     }
 
-    /// A white floater before white is as good as nothing to the images, and stays; by the floater
-    /// loss it goes.
+    /// A white floater before white has no colour error and stays; the floater loss removes it.
     #[test]
     fn what_passes_for_the_background_goes() {
         let (floater, opacity) = trained(Field::new(SMALL, cube(Space::Box), 5), 0.0, 0.0, 40);

@@ -201,7 +201,7 @@ fn warp_by_depth(
         let visibility = if occlusion {
             surface.visibility(column, row, &theirs)
         } else {
-            surface.visibility_through(column, row, theirs.camera)
+            surface.unoccluded_visibility(column, row, theirs.camera)
         };
         let Some(visibility) = visibility else {
             warped.push(WarpedPixel::default());
@@ -209,7 +209,7 @@ fn warp_by_depth(
         };
         let weight = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
         let pixel = &rendered.view.data[(row * width + column) * INPUTS..];
-        warped.push(WarpedPixel::new(reference, visibility.place, weight, pixel));
+        warped.push(WarpedPixel::new(reference, visibility.position, weight, pixel));
     }
     warped
 }

@@ -2,39 +2,37 @@ use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::rounding::{power_of_two_below, rounded, rounded_offset, rounding_step};
-use crate::space::Space;
+use crate::space::{Space, power_of_two_below, rounded, rounded_offset, rounding_step};
 
-/// An axis-aligned box around the scene, the range of distances along rays at which it lies, and
-/// how a field sees it.
+/// Axis-aligned box around the scene, range of its distances along rays, and the field's space.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Bounds {
-    /// Smallest corner.
+    /// Corner with the smallest coordinates.
     pub min: [f64; 3],
-    /// Largest corner.
+    /// Corner with the largest coordinates.
     pub max: [f64; 3],
-    /// Distance before which there is nothing.
+    /// Minimum distance of the scene along rays.
     pub near: f64,
-    /// Distance behind which there is nothing.
+    /// Maximum distance of the scene along rays.
     pub far: f64,
-    /// What a field keeps in its unit cube.
+    /// Map from the world to a field's unit cube.
     #[serde(default)]
     pub space: Space,
 }
 
 impl Bounds {
-    /// Whether box, range and space have an inside, all numbers finite.
+    /// Returns whether box, range and space aren't empty and all numbers are finite.
     pub fn is_valid(&self) -> bool {
-        let finite =
-            self.min.iter().chain(&self.max).chain([&self.near, &self.far]).all(|x| x.is_finite());
-        let inside =
-            (0..3).all(|i| self.min[i] < self.max[i]) && 0.0 <= self.near && self.near < self.far;
-        let space = if let Space::Ndc(frustum) = &self.space { frustum.is_valid() } else { true };
-        finite && inside && space
+        let mut numbers = self.min.iter().chain(&self.max).chain([&self.near, &self.far]);
+        numbers.all(|x| x.is_finite())
+            && (0..3).all(|i| self.min[i] < self.max[i])
+            && 0.0 <= self.near
+            && self.near < self.far
+            && !matches!(&self.space, Space::Ndc(frustum) if !frustum.is_valid())
     }
 
-    /// Length of the longest side.
+    /// Returns the length of the longest side.
     pub fn longest_side(&self) -> f64 {
         (0..3).map(|i| self.max[i] - self.min[i]).fold(f64::MIN_POSITIVE, f64::max)
     }
@@ -44,8 +42,8 @@ impl Bounds {
         0.5 * (DVec3::from(self.min) + DVec3::from(self.max))
     }
 
-    /// Returns the length that suits the scene as a unit: half of the longest side, rounded down to
-    /// a power of two so that it divides without rounding.
+    /// Returns a unit of length for the scene: half of the longest side, rounded down to a power of
+    /// two so that division by the unit is exact.
     pub fn unit(&self) -> f64 {
         power_of_two_below(0.5 * self.longest_side()).max(f64::MIN_POSITIVE)
     }
@@ -62,11 +60,11 @@ impl Bounds {
     }
 
     /// Returns the bounds with all lengths rounded to 26 binary digits: near, far, and the corners'
-    /// offsets from `anchor`, a camera's centre. Bounds that would lose their inside stay unchanged.
+    /// offsets from `anchor`, a camera's centre. Bounds that would become empty stay unchanged.
     ///
-    /// Bounds are computed from all cameras, with rounding errors that depend on where the scene
-    /// lies. Rounding removes these errors: rays of a scene that is moved, or scaled by a power of
-    /// two, have the same bits in the unit cube as long as the cameras' centres are exact.
+    /// Bounds are computed from all cameras, with rounding errors that depend on the scene's
+    /// position. Rounding removes these errors: rays of a scene that is moved, or scaled by a power
+    /// of two, have the same bits in the unit cube if the cameras' centres are exact.
     #[must_use]
     pub fn rounded(&self, anchor: DVec3) -> Self {
         let step = rounding_step(self.longest_side());
@@ -84,7 +82,7 @@ impl Bounds {
         if bounds.is_valid() { bounds } else { *self }
     }
 
-    /// A world point's place in the unit cube that a field keeps.
+    /// Converts a world point to the unit cube.
     pub fn to_cube(&self, point: DVec3) -> DVec3 {
         match &self.space {
             Space::Box => (point - DVec3::from(self.min)) / self.longest_side(),
@@ -97,6 +95,14 @@ impl Bounds {
             }
         }
     }
+}
+
+/// Formats a length in scene units with a number of decimals, or with three significant digits if
+/// all decimals would be 0, and for a million units and more.
+pub fn length(value: f64, decimals: u8) -> String {
+    let fixed = format!("{value:.*}", usize::from(decimals));
+    let shows_digits = fixed.contains(|digit| ('1'..='9').contains(&digit));
+    if value == 0.0 || (shows_digits && value.abs() < 1e6) { fixed } else { format!("{value:.2e}") }
 }
 
 #[cfg(test)]
@@ -166,5 +172,28 @@ mod tests {
         assert_eq!(thin.rounded(DVec3::ZERO), thin);
         let tiny = spaces(DVec3::ZERO, 1e-300)[0];
         assert!(tiny.rounded(DVec3::ZERO).is_valid());
+    }
+
+    #[test]
+    fn lengths_have_significant_digits() {
+        for (value, decimals, expected) in [
+            (0.0, 3, "0.000"),
+            (3.0483, 3, "3.048"),
+            (0.052, 3, "0.052"),
+            (0.075_6, 2, "0.08"),
+            (0.004_125_9, 2, "4.13e-3"),
+            (3.024e-5, 3, "3.02e-5"),
+            (418.3594, 3, "418.359"),
+            (999_000.0, 0, "999000"),
+            (4_649_776.0, 3, "4.65e6"),
+            (151.2, 0, "151"),
+            (0.2, 0, "2.00e-1"),
+            (-1.23e-7, 4, "-1.23e-7"),
+            (1e300, 2, "1.00e300"),
+            (f64::INFINITY, 2, "inf"),
+            (f64::NAN, 2, "NaN"),
+        ] {
+            assert_eq!(length(value, decimals), expected);
+        }
     }
 }

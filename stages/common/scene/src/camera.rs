@@ -9,49 +9,50 @@ use crate::intrinsics::Intrinsics;
 use crate::lens::Distortion;
 use crate::pose::{MAX_ROTATION_ERROR, Pose, moved, rotation_error, rotation_of};
 
-/// A camera: intrinsics and pose.
+/// Camera: intrinsics and pose.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Camera {
-    /// Unique within a list; names the view's files.
+    /// Name of the view and its files, unique within a list.
     pub name: String,
-    /// The inside.
+    /// Image size, focal lengths, principal point and distortion.
     pub intrinsics: Intrinsics,
     /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world
     /// space.
     pub camera_to_world: Pose,
 }
 
-/// A half-line with a direction of unit length.
+/// Ray from a camera, in scene units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CameraRay {
-    /// Where it starts: the camera's centre.
+    /// Centre of the camera.
     pub origin: DVec3,
-    /// Unit length.
+    /// Unit direction.
     pub direction: DVec3,
 }
 
 impl CameraRay {
-    /// The point at distance `t`.
+    /// Returns the point at distance `t`.
     pub fn at(&self, t: f64) -> DVec3 {
         self.origin + t * self.direction
     }
 }
 
-/// The rays of a camera.
+/// Rays of a camera, with precomputed directions.
 #[derive(Clone, Copy, Debug)]
 pub struct CameraRays {
     intrinsics: Intrinsics,
     origin: DVec3,
-    /// Of the pinhole: direction of image position (0, 0), and what one pixel to the right or down
-    /// adds; not of unit length.
+    /// Direction of the pinhole's image position (0, 0), not of unit length.
     corner: DVec3,
+    /// Change of the direction per pixel to the right.
     right: DVec3,
+    /// Change of the direction per pixel down.
     down: DVec3,
 }
 
 impl CameraRays {
-    /// The ray through image position (x, y), in pixels from the top left corner.
+    /// Returns the ray through image position (x, y), in pixels from the top left corner.
     pub fn ray(&self, x: f64, y: f64) -> CameraRay {
         let [u, v] = self.intrinsics.undistort([x, y]);
         let direction = self.corner + u * self.right + v * self.down;
@@ -59,10 +60,10 @@ impl CameraRays {
     }
 }
 
-/// A camera that can't be used.
+/// Error returned when a camera is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CameraError {
-    /// A number that isn't finite.
+    /// A number of the pose isn't finite.
     #[error("camera_to_world[{row}][{column}] is {}; poses must be \
         finite", if value.is_nan() { "NaN" } else { "infinite" })]
     NotFinite {
@@ -70,50 +71,50 @@ pub enum CameraError {
         row: usize,
         /// Column of the pose.
         column: usize,
-        /// The number.
+        /// Number found.
         value: f64,
     },
-    /// Focal length or principal point that no camera has.
+    /// A focal length isn't positive, or an intrinsic parameter isn't finite.
     #[error(
         "{name} is {}; focal lengths must be above 0 and principal points finite", number(*value)
     )]
     Intrinsics {
         /// `fx`, `fy`, `cx` or `cy`.
         name: &'static str,
-        /// The number.
+        /// Number found.
         value: f64,
     },
-    /// Focal length or principal point out of all proportion to the image.
+    /// A focal length or principal point doesn't fit the image size.
     #[error(
-        "{name} is {} pixels where the image's side has {side}; is the {quantity} in pixels, and \
-        of this image?",
+        "{name} is {} pixels, but the image's side has {side}; check that the {quantity} is in \
+        pixels and belongs to this image",
         number(*value)
     )]
     Proportion {
         /// `fx`, `fy`, `cx` or `cy`.
         name: &'static str,
-        /// Its quantity, as text.
+        /// Description of the quantity.
         quantity: &'static str,
-        /// The number.
+        /// Number found, in pixels.
         value: f64,
         /// Length of the image along the same axis, in pixels.
         side: u32,
     },
-    /// Distortion by which a place in the image would belong to no ray, or to several.
-    #[error("lens distortion {0} can't be undone within the image; are its coefficients right?")]
+    /// The distortion isn't invertible within the image.
+    #[error("lens distortion {0} is not invertible within the image; check its coefficients")]
     Distortion(Distortion),
-    /// An image without pixels.
+    /// The image has no pixels.
     #[error("image size {width}×{height}; both must be at least 1")]
     Empty {
-        /// Columns.
+        /// Number of columns.
         width: u32,
-        /// Rows.
+        /// Number of rows.
         height: u32,
     },
-    /// A centre so far away that depths leave the range of single precision.
+    /// The centre is so far away that depths leave the range of single precision.
     #[error(
         "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than \
-        {FARTHEST_CENTRE:e}; is the pose right, and its unit?",
+        {MAX_CENTRE_DISTANCE:e}; check the pose and its unit",
         .0[0], .0[1], .0[2]
     )]
     FarAway([f64; 3]),
@@ -128,48 +129,53 @@ pub enum CameraError {
     },
     /// The left 3×3 part isn't a rotation.
     #[error(
-        "camera_to_world is no rigid motion: R·Rᵀ is off the identity by {error:.3}; remove scale \
-        or shear from the pose"
+        "camera_to_world is not a rigid motion: R·Rᵀ differs from the identity by {error:.3}; \
+        remove scale or shear from the pose"
     )]
     NotRigid {
-        /// Largest deviation of R·Rᵀ from the identity.
+        /// Maximum deviation of R·Rᵀ from the identity.
         error: f64,
     },
 }
 
-/// Largest distance of a camera from the origin, in scene units. Depths have single precision, and
+/// Maximum distance of a camera from the origin, in scene units. Depths have single precision, and
 /// the product of two depths must be finite.
-const FARTHEST_CENTRE: f64 = 1e18;
+const MAX_CENTRE_DISTANCE: f64 = 1e18;
 
-/// Cameras that turn at most so far from their mean direction look one way: cos 45°.
-const ONE_WAY_COSINE: f64 = 0.707;
+/// Minimum cosine of the angle between a camera's and the mean direction of forward-facing cameras:
+/// cos 45° (docs/design/004).
+const MIN_COMMON_DIRECTION_COSINE: f64 = 0.707;
 
-/// The direction in which all cameras look, where they do: forward-facing photographs.
+/// Returns the mean viewing direction of forward-facing cameras; `None` for other cameras.
 pub fn common_direction<'a>(cameras: impl Iterator<Item = &'a Camera> + Clone) -> Option<DVec3> {
     let mean = cameras.clone().map(Camera::forward).sum::<DVec3>().try_normalize()?;
-    cameras.map(Camera::forward).all(|forward| forward.dot(mean) >= ONE_WAY_COSINE).then_some(mean)
+    cameras
+        .map(Camera::forward)
+        .all(|forward| forward.dot(mean) >= MIN_COMMON_DIRECTION_COSINE)
+        .then_some(mean)
 }
 
 impl Camera {
-    /// The rotation R.
+    /// Returns the rotation R.
     pub fn rotation(&self) -> DMat3 {
         rotation_of(&self.camera_to_world)
     }
 
-    /// The camera's centre in world space.
+    /// Returns the camera's centre in world space.
     pub fn centre(&self) -> DVec3 {
         let m = &self.camera_to_world;
         DVec3::new(m[0][3], m[1][3], m[2][3])
     }
 
-    /// Where it looks: -z of the camera, unit length.
+    /// Returns the viewing direction: -z of the camera, unit length.
     pub fn forward(&self) -> DVec3 {
         -self.rotation().z_axis.normalize()
     }
 
-    /// Its rays, for many places of its image.
+    /// Returns the camera's rays, for many image positions.
     pub fn rays(&self) -> CameraRays {
-        let (k, r) = (self.intrinsics, self.rotation());
+        let k = self.intrinsics;
+        let r = self.rotation();
         CameraRays {
             intrinsics: k,
             origin: self.centre(),
@@ -179,14 +185,14 @@ impl Camera {
         }
     }
 
-    /// The ray through image position (x, y), in pixels from the top left corner; (i + 0.5, j +
-    /// 0.5) is a pixel's centre.
+    /// Returns the ray through image position (x, y), in pixels from the top left corner; (i + 0.5,
+    /// j + 0.5) is a pixel's centre.
     pub fn ray(&self, x: f64, y: f64) -> CameraRay {
         self.rays().ray(x, y)
     }
 
-    /// Where a world point is seen: (x, y, depth). `None` on or behind the camera's plane, and
-    /// where the lens's distortion says nothing of what lies so far aside.
+    /// Projects a world point to (x, y, depth). `None` on or behind the camera's plane, and where
+    /// the lens's distortion isn't invertible.
     pub fn project(&self, point: DVec3) -> Option<(f64, f64, f64)> {
         let k = &self.intrinsics;
         let p = self.rotation().transpose() * (point - self.centre());
@@ -194,20 +200,20 @@ impl Camera {
         if depth <= 0.0 {
             return None;
         }
-        let straight = [k.cx + k.fx * p.x / depth, k.cy - k.fy * p.y / depth];
-        let [x, y] = k.distort(straight);
+        let undistorted = [k.cx + k.fx * p.x / depth, k.cy - k.fy * p.y / depth];
+        let [x, y] = k.distort(undistorted);
         if !k.distortion.is_none() {
-            // A distortion may fold back into the image what lies outside.
+            // A distortion may fold points outside back into the image.
             let [u, v] = k.undistort([x, y]);
-            let off = (u - straight[0]).hypot(v - straight[1]);
-            if off.is_nan() || off > 1e-3 {
+            let error = (u - undistorted[0]).hypot(v - undistorted[1]);
+            if error.is_nan() || error > 1e-3 {
                 return None;
             }
         }
         Some((x, y, depth))
     }
 
-    /// Depth per distance along a ray of this camera: multiply a distance by it to get z-depth.
+    /// Returns the z-depth per unit of distance along a ray of this camera.
     pub fn depth_per_distance(&self, ray: &CameraRay) -> f64 {
         ray.direction.dot(self.forward())
     }
@@ -218,14 +224,14 @@ impl Camera {
         Self { camera_to_world: moved(&self.camera_to_world, by), ..self.clone() }
     }
 
-    /// The same camera with another number of pixels.
+    /// Returns the camera with another image size.
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
         Self { intrinsics: self.intrinsics.resized(width, height), ..self.clone() }
     }
 
-    /// Refuses what no camera can be: NaN, focal length 0, an empty image, a pose with scale, shear
-    /// or a reflection, or far from all scenes.
+    /// Fails for an invalid camera: NaN, focal length 0, an empty image, a pose with scale, shear
+    /// or reflection, or a centre beyond [`MAX_CENTRE_DISTANCE`].
     pub fn check(&self) -> Result<(), CameraError> {
         let k = &self.intrinsics;
         if k.width == 0 || k.height == 0 {
@@ -233,11 +239,11 @@ impl Camera {
         }
         for (name, value, side) in [("fx", k.fx, k.width), ("fy", k.fy, k.height)] {
             check_length(name, value, value > 0.0)?;
-            check_proportion(name, "focal length", value, side, FOCAL_LENGTHS)?;
+            check_proportion(name, "focal length", value, side, ALLOWED_FOCAL_LENGTHS)?;
         }
         for (name, value, side) in [("cx", k.cx, k.width), ("cy", k.cy, k.height)] {
             check_length(name, value, true)?;
-            check_proportion(name, "principal point", value, side, PRINCIPAL_POINTS)?;
+            check_proportion(name, "principal point", value, side, ALLOWED_PRINCIPAL_POINTS)?;
         }
         for (row, values) in self.camera_to_world.iter().enumerate() {
             for (column, &value) in values.iter().enumerate() {
@@ -259,7 +265,7 @@ impl Camera {
             return Err(CameraError::Mirrored { determinant });
         }
         let centre = self.centre();
-        if centre.length() > FARTHEST_CENTRE {
+        if centre.length() > MAX_CENTRE_DISTANCE {
             Err(CameraError::FarAway(centre.to_array()))
         } else {
             Ok(())
@@ -267,12 +273,12 @@ impl Camera {
     }
 }
 
-/// Focal lengths that cameras may have, in image sides: angles of view from 0.006° to 179.98°. The
-/// longest photographic lenses have about 1°.
-const FOCAL_LENGTHS: RangeInclusive<f64> = 1e-4..=1e4;
-/// Principal points that cameras may have, in image sides from the corner. A part cut out of a
-/// photograph may be far from the principal point.
-const PRINCIPAL_POINTS: RangeInclusive<f64> = -1e4..=1e4;
+/// Allowed focal lengths in image sides: angles of view from 0.006° to 179.98°. The longest
+/// photographic lenses have about 1°.
+const ALLOWED_FOCAL_LENGTHS: RangeInclusive<f64> = 1e-4..=1e4;
+/// Allowed principal points, in image sides from the corner. A crop of a photograph may be far from
+/// the principal point.
+const ALLOWED_PRINCIPAL_POINTS: RangeInclusive<f64> = -1e4..=1e4;
 
 fn check_length(name: &'static str, value: f64, is_allowed: bool) -> Result<(), CameraError> {
     if value.is_finite() && is_allowed {
@@ -412,9 +418,17 @@ mod tests {
         bad.intrinsics.fx = 0.0;
         assert!(matches!(bad.check(), Err(CameraError::Intrinsics { name: "fx", .. })));
         for (fx, cy, words) in [
-            (1e300, 12.5, "fx is 1e300 pixels where the image's side has 37; is the focal length"),
+            (
+                1e300,
+                12.5,
+                "fx is 1e300 pixels, but the image's side has 37; check that the focal length",
+            ),
             (1e-5, 12.5, "fx is 1e-5 pixels"),
-            (40.0, -1e9, "cy is -1e9 pixels where the image's side has 23; is the principal point"),
+            (
+                40.0,
+                -1e9,
+                "cy is -1e9 pixels, but the image's side has 23; check that the principal point",
+            ),
             (40.0, f64::INFINITY, "cy is inf"),
         ] {
             let mut bad = good.clone();

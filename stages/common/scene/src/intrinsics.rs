@@ -1,16 +1,16 @@
-use pixels::Mask;
+use pixels::{Mask, Rgba8, sample_cubic};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::lens::Distortion;
 
-/// A camera's inside, in pixels: a pinhole, and how its lens isn't one.
+/// Intrinsic parameters of a camera in pixels: a pinhole's, and the lens's distortion.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Intrinsics {
-    /// Columns.
+    /// Number of columns.
     pub width: u32,
-    /// Rows.
+    /// Number of rows.
     pub height: u32,
     /// Focal length along x.
     pub fx: f64,
@@ -20,36 +20,42 @@ pub struct Intrinsics {
     pub cx: f64,
     /// Principal point, y; the image's top edge is 0.
     pub cy: f64,
-    /// The lens's projection and distortion; a pinhole's by default.
+    /// Projection and distortion of the lens; a pinhole's by default.
     #[serde(default, skip_serializing_if = "Distortion::is_none")]
     pub distortion: Distortion,
 }
 
-/// How far, in units of the image, undoing a distortion may cut its border off at most.
-const MOST_ZOOM: f64 = 4.0;
+/// Maximum factor by which undistortion may change the focal length; chosen by hand.
+const MAX_ZOOM: f64 = 4.0;
 
-/// Places along each side of an image at which a distortion is looked at.
-const BORDER_PLACES: u32 = 64;
+/// Number of positions along each side of an image at which a distortion is checked; chosen by
+/// hand.
+const BORDER_SAMPLES: u32 = 64;
 
-/// Maximum of half a side over the focal length for a pinhole camera that takes a fisheye's place:
-/// tan 50°. At 100° across, the border has 2.4 times as many pixels per degree as the middle; wider
+/// Number of intervals on the way from the centre to a border position in which the order of rays
+/// is checked; chosen by hand.
+const ORDER_SAMPLES: u32 = 16;
+
+/// Maximum of half a side over the focal length for a pinhole camera that replaces a fisheye: tan
+/// 50°. At 100° across, the border has 2.4 times as many pixels per degree as the middle; wider
 /// views would spend ever more of the image on their borders.
 const MAX_PINHOLE_SLOPE: f64 = 1.191_753_592_594_21;
 
 impl Intrinsics {
-    /// A centred camera with square pixels that sees `angle_x` radians from left to right edge.
+    /// Creates the intrinsics of a centred camera with square pixels and a horizontal angle of view
+    /// of `angle_x` radians.
     pub fn from_angle_x(width: u32, height: u32, angle_x: f64) -> Self {
         let focal = 0.5 * f64::from(width) / (0.5 * angle_x).tan();
-        let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
+        let [cx, cy] = [width, height].map(|side| 0.5 * f64::from(side));
         Self { width, height, fx: focal, fy: focal, cx, cy, distortion: Distortion::default() }
     }
 
-    /// The same camera with another number of pixels on the same sensor. The scale may differ per
+    /// Returns the intrinsics of another image size on the same sensor. The scale may differ per
     /// axis.
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
-        let (sx, sy) =
-            (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        let sx = f64::from(width) / f64::from(self.width);
+        let sy = f64::from(height) / f64::from(self.height);
         Self {
             width,
             height,
@@ -61,108 +67,118 @@ impl Intrinsics {
         }
     }
 
-    /// Where in its image a camera without the distortion sees what this one sees at a position, in
-    /// pixels.
-    pub fn undistort(&self, at: [f64; 2]) -> [f64; 2] {
-        if self.distortion.is_none() {
-            return at;
-        }
-        let [x, y] =
-            self.distortion.undistort([(at[0] - self.cx) / self.fx, (at[1] - self.cy) / self.fy]);
+    /// Returns the plane position, in focal lengths, of an image position in pixels.
+    fn to_plane(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        [(x - self.cx) / self.fx, (y - self.cy) / self.fy]
+    }
+
+    /// Returns the image position, in pixels, of a plane position in focal lengths.
+    fn to_image(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         [self.fx.mul_add(x, self.cx), self.fy.mul_add(y, self.cy)]
     }
 
-    /// Where in its image this camera sees what one without the distortion sees at a position, in
-    /// pixels.
-    pub fn distort(&self, at: [f64; 2]) -> [f64; 2] {
+    /// Converts a distorted image position to the undistorted one, in pixels.
+    pub fn undistort(&self, position: [f64; 2]) -> [f64; 2] {
         if self.distortion.is_none() {
-            return at;
+            return position;
         }
-        let [u, v] =
-            self.distortion.distort([(at[0] - self.cx) / self.fx, (at[1] - self.cy) / self.fy]);
-        [self.fx.mul_add(u, self.cx), self.fy.mul_add(v, self.cy)]
+        self.to_image(self.distortion.undistort(self.to_plane(position)))
     }
 
-    /// The pinhole camera of the same size that sees as much as it can and nothing that this one
-    /// doesn't; in place of a fisheye lens it sees at most 100° across its longer side. `None` where
-    /// the distortion is beyond sense: its image would have to be cut to a quarter and less.
-    pub fn pinhole(&self) -> Option<Self> {
-        let pinhole = Self { distortion: Distortion::default(), ..*self };
+    /// Converts an undistorted image position to the distorted one, in pixels.
+    pub fn distort(&self, position: [f64; 2]) -> [f64; 2] {
         if self.distortion.is_none() {
-            return Some(pinhole);
+            return position;
         }
-        let zoomed = |zoom: f64| Self { fx: self.fx * zoom, fy: self.fy * zoom, ..pinhole };
-        let fits = |zoom: f64| self.sees_all_of(&zoomed(zoom));
-        let (mut low, mut high) = (self.least_zoom(), MOST_ZOOM);
-        if !fits(high) {
+        self.to_image(self.distortion.distort(self.to_plane(position)))
+    }
+
+    /// Returns the pinhole camera of the same size with the widest view inside this camera's; in
+    /// place of a fisheye lens the view is at most 100° across its longer side. `None` if the
+    /// pinhole would have to zoom by more than 4.
+    pub fn pinhole(&self) -> Option<Self> {
+        if self.distortion.is_none() {
+            return Some(self.zoomed_pinhole(1.0));
+        }
+        let mut low = self.min_zoom();
+        let mut high = MAX_ZOOM;
+        if !self.contains_view(&self.zoomed_pinhole(high)) {
             return None;
         }
-        if fits(low) {
-            return Some(zoomed(low));
+        if self.contains_view(&self.zoomed_pinhole(low)) {
+            return Some(self.zoomed_pinhole(low));
         }
         // Bisection of the zoom, until it moves no corner by a hundredth of a pixel.
         while (high - low) * f64::from(self.width.max(self.height)) > 0.01 {
             let middle = 0.5 * (low + high);
-            if fits(middle) { high = middle } else { low = middle }
+            if self.contains_view(&self.zoomed_pinhole(middle)) {
+                high = middle;
+            } else {
+                low = middle;
+            }
         }
-        Some(zoomed(high))
+        Some(self.zoomed_pinhole(high))
     }
 
-    /// Returns the least zoom of a pinhole camera that takes this one's place.
-    fn least_zoom(&self) -> f64 {
-        let least = 1.0 / MOST_ZOOM;
+    fn zoomed_pinhole(&self, zoom: f64) -> Self {
+        let distortion = Distortion::default();
+        Self { fx: self.fx * zoom, fy: self.fy * zoom, distortion, ..*self }
+    }
+
+    /// Returns the minimum zoom of a pinhole camera that replaces this one.
+    fn min_zoom(&self) -> f64 {
+        let min = 1.0 / MAX_ZOOM;
         if !self.distortion.is_fisheye() {
-            return least;
+            return min;
         }
-        let zoom = |size: u32, focal: f64| 0.5 * f64::from(size) / (focal * MAX_PINHOLE_SLOPE);
-        least.max(zoom(self.width, self.fx)).max(zoom(self.height, self.fy)).min(MOST_ZOOM)
+        let [x, y] = [(self.width, self.fx), (self.height, self.fy)]
+            .map(|(size, focal)| 0.5 * f64::from(size) / (focal * MAX_PINHOLE_SLOPE));
+        min.max(x).max(y).min(MAX_ZOOM)
     }
 
     /// Returns a pinhole's angles of view across width and height, in degrees.
     pub fn pinhole_angles(&self) -> [f64; 2] {
-        let angle = |centre: f64, size: u32, focal: f64| {
-            let sides = [centre, f64::from(size) - centre];
-            sides.map(|side| libm::atan(side / focal)).iter().sum::<f64>().to_degrees()
-        };
-        [angle(self.cx, self.width, self.fx), angle(self.cy, self.height, self.fy)]
+        [(self.cx, self.width, self.fx), (self.cy, self.height, self.fy)].map(
+            |(centre, size, focal)| {
+                let sides = [centre, f64::from(size) - centre];
+                sides.map(|side| libm::atan(side / focal)).iter().sum::<f64>().to_degrees()
+            },
+        )
     }
 
-    /// Returns the mask of pixels whose centre's ray isn't cut, or `None` if no ray is: those of a
-    /// fisheye lens are, 89° from the axis.
+    /// Returns the mask of pixels whose ray isn't cut (see [`Intrinsics::is_cut`]); `None` if no
+    /// ray is.
     pub fn lens_mask(&self) -> Option<Mask> {
         if !self.has_cut_rays() {
             return None;
         }
         let (width, height) = (self.width as usize, self.height as usize);
-        let centre = |i: usize| [(i % width) as f64 + 0.5, (i / width) as f64 + 0.5];
-        let counts = (0..width * height).map(|i| !self.is_cut(centre(i))).collect();
+        let counts = (0..width * height)
+            .map(|i| !self.is_cut([(i % width) as f64 + 0.5, (i / width) as f64 + 0.5]))
+            .collect();
         Some(Mask { width, height, counts })
     }
 
-    /// True if rays of the image are cut, as those of a fisheye lens are 89° from the axis.
+    /// True if a ray of the image is cut (see [`Intrinsics::is_cut`]).
     pub fn has_cut_rays(&self) -> bool {
-        self.border().any(|at| self.is_cut(at))
+        self.border().any(|position| self.is_cut(position))
     }
 
-    /// True if the ray at a position, in pixels, is that of another: a fisheye's ray is cut 89°
-    /// from the axis.
-    pub fn is_cut(&self, [x, y]: [f64; 2]) -> bool {
-        self.distortion.is_cut([(x - self.cx) / self.fx, (y - self.cy) / self.fy])
+    /// True if a fisheye's ray at a position, in pixels, is cut to 89° from the axis.
+    pub fn is_cut(&self, position: [f64; 2]) -> bool {
+        self.distortion.is_cut(self.to_plane(position))
     }
 
-    /// Where in this camera's image what another, at the same place, sees at a position.
-    pub fn source(&self, other: &Self, at: [f64; 2]) -> [f64; 2] {
-        let [x, y] = other.undistort(at);
-        self.distort([
-            self.fx.mul_add((x - other.cx) / other.fx, self.cx),
-            self.fy.mul_add((y - other.cy) / other.fy, self.cy),
-        ])
+    /// Returns the position in this camera's image of a position in the image of another camera
+    /// with the same pose.
+    pub fn source_position(&self, other: &Self, position: [f64; 2]) -> [f64; 2] {
+        self.distort(self.to_image(other.to_plane(other.undistort(position))))
     }
 
-    /// Positions along the image's border: its corners, and what lies between them where lines may
-    /// be bent.
+    /// Returns positions along the image's border: its corners and, if the lens bends lines,
+    /// positions between them.
     pub fn border(&self) -> impl Iterator<Item = [f64; 2]> {
-        let steps = if self.distortion.is_none() { 1 } else { BORDER_PLACES };
+        let steps = if self.distortion.is_none() { 1 } else { BORDER_SAMPLES };
         let (width, height) = (f64::from(self.width), f64::from(self.height));
         (0..steps).flat_map(move |i| {
             let share = f64::from(i) / f64::from(steps);
@@ -175,41 +191,67 @@ impl Intrinsics {
         })
     }
 
-    /// Whether each place in the image belongs to one ray.
+    /// Returns whether every image position has exactly one ray.
     pub(crate) fn has_rays(&self) -> bool {
-        let place = |[x, y]: [f64; 2]| [(x - self.cx) / self.fx, (y - self.cy) / self.fy];
-        self.distortion.is_none() || self.border().all(|at| self.distortion.can_undo(place(at)))
+        self.distortion.is_none()
+            || self
+                .border()
+                .all(|position| self.distortion.is_invertible_at(self.to_plane(position)))
     }
 
-    /// Whether the whole border of a pinhole image lies inside this camera's, and in order.
-    fn sees_all_of(&self, pinhole: &Self) -> bool {
-        // Of a bent image's border, as many places as of its own.
-        Self { distortion: self.distortion, ..*pinhole }
-            .border()
-            .all(|at| self.holds(self.source(pinhole, at)) && self.keeps_order(pinhole, at))
+    /// Returns whether the border of a pinhole's image is inside this camera's image, and the order
+    /// of rays is the same.
+    fn contains_view(&self, pinhole: &Self) -> bool {
+        // With this camera's distortion, `border` samples each side.
+        Self { distortion: self.distortion, ..*pinhole }.border().all(|position| {
+            self.contains(self.source_position(pinhole, position))
+                && self.keeps_order(pinhole, position)
+        })
     }
 
-    /// Whether a position lies in the image, or beside it by no more than a rounding error.
-    fn holds(&self, [x, y]: [f64; 2]) -> bool {
-        let (width, height) = (f64::from(self.width), f64::from(self.height));
-        let slack = 1e-6;
-        (-slack..=width + slack).contains(&x) && (-slack..=height + slack).contains(&y)
+    /// Returns whether a position is inside the image, up to rounding errors.
+    fn contains(&self, [x, y]: [f64; 2]) -> bool {
+        const SLACK: f64 = 1e-6;
+        (-SLACK..=f64::from(self.width) + SLACK).contains(&x)
+            && (-SLACK..=f64::from(self.height) + SLACK).contains(&y)
     }
 
-    /// Whether on the way from a pinhole's principal point out to a position, what is seen moves
-    /// outwards, too.
+    /// Returns whether positions on the way from a pinhole's principal point to `[x, y]` move
+    /// outwards in this camera's image, too.
     fn keeps_order(&self, pinhole: &Self, [x, y]: [f64; 2]) -> bool {
         let mut last = -1.0;
-        (0..=16).all(|i| {
-            let share = f64::from(i) / 16.0;
-            let at = |from: f64, to: f64| share.mul_add(to - from, from);
-            let [u, v] = self.source(pinhole, [at(pinhole.cx, x), at(pinhole.cy, y)]);
+        (0..=ORDER_SAMPLES).all(|i| {
+            let share = f64::from(i) / f64::from(ORDER_SAMPLES);
+            let [u, v] = self.source_position(
+                pinhole,
+                [
+                    share.mul_add(x - pinhole.cx, pinhole.cx),
+                    share.mul_add(y - pinhole.cy, pinhole.cy),
+                ],
+            );
             let radius = (u - self.cx).hypot(v - self.cy);
             let grows = radius > last;
             last = radius;
             grows
         })
     }
+}
+
+/// Resamples an image taken with a distorting lens to that of a pinhole camera of the same size and
+/// pose. Cubic interpolation preserves sharpness.
+pub fn undistort_image(image: &Rgba8, taken_with: &Intrinsics, pinhole: &Intrinsics) -> Rgba8 {
+    let mut data = Vec::with_capacity(image.data.len());
+    for y in 0..image.height {
+        for x in 0..image.width {
+            let source = taken_with.source_position(pinhole, [x as f64 + 0.5, y as f64 + 0.5]);
+            let colour = sample_cubic((image.width, image.height), source, |column, row| {
+                let pixel = 4 * (row * image.width + column);
+                [0, 1, 2, 3].map(|c| f64::from(image.data[pixel + c]))
+            });
+            data.extend(colour.map(|v| (v + 0.5) as u8));
+        }
+    }
+    Rgba8::new(image.width, image.height, data)
 }
 
 #[cfg(test)]
@@ -234,7 +276,7 @@ mod tests {
     fn a_pinhole_stays_as_it_is() {
         let pinhole = camera(Distortion::default());
         assert_eq!(pinhole.pinhole(), Some(pinhole));
-        let [x, y] = pinhole.source(&pinhole, [17.5, 3.25]);
+        let [x, y] = pinhole.source_position(&pinhole, [17.5, 3.25]);
         assert!((x - 17.5).abs() < 1e-12 && (y - 3.25).abs() < 1e-12);
         assert_eq!(pinhole.border().count(), 4);
     }
@@ -295,9 +337,9 @@ mod tests {
         #[test]
         fn a_pinhole_sees_as_much_as_there_is(camera in mild()) {
             let pinhole = camera.pinhole().expect("a mild distortion");
-            prop_assert!(camera.sees_all_of(&pinhole));
+            prop_assert!(camera.contains_view(&pinhole));
             let wider = Intrinsics { fx: pinhole.fx * 0.99, fy: pinhole.fy * 0.99, ..pinhole };
-            prop_assert!(!camera.sees_all_of(&wider));
+            prop_assert!(!camera.contains_view(&wider));
         }
 
         #[test]

@@ -3,7 +3,7 @@
 //!
 //! # Conventions
 //!
-//! Written here once, and into every `views.json` ([`Conventions`]):
+//! Every `views.json` has these conventions as text ([`Conventions`]):
 //!
 //! * **Camera**: OpenGL axes, x right, y up, looking along -z. `camera_to_world` is the 3×4 matrix
 //!   `[R | t]`, row by row.
@@ -11,12 +11,11 @@
 //!   [j, j+1): its **centre** is (i + 0.5, j + 0.5). The principal point of a centred camera is
 //!   (width/2, height/2). So resizing an image from W to W' multiplies `fx` and `cx` by W'/W and
 //!   nothing else; a half-pixel shift caps PSNR at 25–28 dB at 200 pixels.
-//! * **Distortion** is part of the intrinsics: [`Camera::ray`] and [`Camera::project`] follow it,
-//!   so that photographs stay as they were taken. Rays are straight all the same. A fisheye lens's
-//!   rays end 89° from the axis, so that depth stays positive: pixels beyond are masked.
+//! * **Distortion** is part of the intrinsics: [`Camera::ray`] and [`Camera::project`] apply it, so
+//!   photographs aren't resampled. A fisheye lens's rays end 89° from the axis, so that depth is
+//!   positive: pixels beyond are masked.
 //! * **Rays**: directions have unit length; t is the distance along the ray. **Depth** is
-//!   camera-space z-depth in scene units, -z of the point in camera space: what EXR channel `Z`
-//!   holds.
+//!   camera-space z-depth in scene units, -z of the point in camera space, in EXR channel `Z`.
 //! * **Colours**: display-encoded sRGB in [0, 1], as the paper trains and scores.
 //!
 //! ```
@@ -33,27 +32,21 @@
 mod bounds;
 mod camera;
 mod intrinsics;
-mod length;
 mod lens;
 mod pose;
 mod projection;
-mod rounding;
 mod space;
-mod undistorted;
 mod view_image;
 mod views;
 mod warp;
 
-pub use bounds::Bounds;
+pub use bounds::{Bounds, length};
 pub use camera::{Camera, CameraError, CameraRay, CameraRays, common_direction};
-pub use intrinsics::Intrinsics;
-pub use length::length;
+pub use intrinsics::{Intrinsics, undistort_image};
 pub use lens::Distortion;
 pub use pose::{Pose, looking_at, pose_of, without_scale};
 pub use projection::Projection;
-pub use rounding::power_of_two_below;
-pub use space::{Frustum, Space};
-pub use undistorted::undistorted;
+pub use space::{Frustum, Space, power_of_two_below};
 pub use view_image::{VIEW_CHANNELS, image_file, mask_file, preview_file, write_view_image};
 pub use views::{Background, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
 pub use warp::{Surface, Visibility};

@@ -1,16 +1,16 @@
 use glam::{DMat3, DVec3};
 
-/// A rigid motion from camera to world: `[R | t]`, row by row. R's columns are the camera's axes (x
-/// right, y up, z back) in world space, t is its centre.
+/// Rigid motion from camera to world: `[R | t]`, row by row. R's columns are the camera's axes (x
+/// right, y up, z back) in world space, t is the camera's centre.
 pub type Pose = [[f64; 4]; 3];
 
-/// The pose of a camera with given axes, as columns, at a centre.
+/// Returns the pose of a camera with given axes, as columns, and centre.
 pub fn pose_of(axes: DMat3, centre: DVec3) -> Pose {
     [0, 1, 2].map(|k| [axes.x_axis[k], axes.y_axis[k], axes.z_axis[k], centre[k]])
 }
 
-/// The pose of a camera that looks at a point. Where it would look straight along `up`, another
-/// axis is its right.
+/// Returns the pose of a camera that looks at a point. If it looks straight along `up`, its right
+/// axis is arbitrary.
 pub fn looking_at(from: DVec3, at: DVec3, up: DVec3) -> Pose {
     let back = (from - at).normalize_or(DVec3::Z);
     let right = up.cross(back).try_normalize().unwrap_or_else(|| back.any_orthonormal_vector());
@@ -20,14 +20,14 @@ pub fn looking_at(from: DVec3, at: DVec3, up: DVec3) -> Pose {
 /// Returns a pose moved by a vector.
 pub(crate) fn moved(pose: &Pose, by: DVec3) -> Pose {
     let mut moved = *pose;
-    for (row, by) in moved.iter_mut().zip(by.to_array()) {
-        row[3] += by;
+    for (axis, row) in moved.iter_mut().enumerate() {
+        row[3] += by[axis];
     }
     moved
 }
 
-/// Largest deviation of R·Rᵀ from the identity at which R is a rotation. Published poses are rounded
-/// to single precision; real mistakes are far off.
+/// Maximum deviation of R·Rᵀ from the identity at which R is a rotation; chosen by hand. Published
+/// poses are rounded to single precision; real mistakes are far off.
 pub(crate) const MAX_ROTATION_ERROR: f64 = 1e-2;
 
 /// Returns the largest deviation of R·Rᵀ from the identity.
@@ -41,9 +41,9 @@ pub(crate) fn rotation_of(pose: &Pose) -> DMat3 {
     DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| [pose[0][c], pose[1][c], pose[2][c]]))
 }
 
-/// Removes a uniform scale from a pose's rotation: returns the pose with the same centre, and the
-/// scale. `None` where the left 3×3 part is a rotation, or not a multiple of one. A reflection stays
-/// a reflection.
+/// Removes a uniform scale from a pose's rotation. Returns the pose with the same centre, and the
+/// scale; `None` if the left 3×3 part is a rotation, or not a multiple of one. A reflection stays a
+/// reflection.
 pub fn without_scale(pose: &Pose) -> Option<(Pose, f64)> {
     let rotation = rotation_of(pose);
     if rotation_error(rotation) <= MAX_ROTATION_ERROR {

@@ -13,7 +13,7 @@ pub enum Projection {
 }
 
 /// Maximum angle between a fisheye lens's ray and the optical axis, in radians: 89°. Beyond 90° a
-/// point has no positive depth, and just below it no useful slope.
+/// point has no positive depth; just below 90° slopes have no useful precision.
 pub(crate) const MAX_FISHEYE_ANGLE: f64 = 89.0 / 180.0 * std::f64::consts::PI;
 
 impl Projection {
@@ -22,7 +22,7 @@ impl Projection {
         *self == Self::Perspective
     }
 
-    /// Returns the plane position of the ray with slopes (x, y) against the optical axis.
+    /// Returns the plane position of the ray with slopes (x, y) relative to the optical axis.
     pub(crate) fn plane_position(self, [x, y]: [f64; 2]) -> [f64; 2] {
         match self {
             Self::Perspective => [x, y],
@@ -44,8 +44,8 @@ impl Projection {
         }
     }
 
-    /// Returns the derivative of [`Projection::plane_position`], a symmetric matrix: of x by x, of
-    /// x by y and of y by y.
+    /// Returns the derivative of [`Projection::plane_position`], a symmetric matrix: ∂x/∂x, ∂x/∂y
+    /// and ∂y/∂y.
     pub(crate) fn derivative(self, [x, y]: [f64; 2]) -> [f64; 3] {
         match self {
             Self::Perspective => [1.0, 0.0, 1.0],

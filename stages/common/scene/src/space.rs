@@ -3,35 +3,34 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::pose::{Pose, moved, pose_of, rotation_of};
-use crate::rounding::{multiple, rounded, rounded_offset, rounding_step};
 
-/// How a field sees the world: what it keeps in its unit cube.
+/// Map from the world to a field's unit cube (docs/design/004).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum Space {
-    /// The box of the bounds, scaled by its longest side: scenes that end.
+    /// Box of the bounds, scaled by its longest side: for bounded scenes.
     #[default]
     Box,
-    /// What one camera would see, its far parts small (NDC; NeRF, appendix C): forward-facing
-    /// photographs.
+    /// Normalised device coordinates of a virtual camera (NDC; NeRF, appendix C): for
+    /// forward-facing photographs.
     Ndc(Frustum),
-    /// Everything: the ball in the bounds' box as it is, and what lies outside in a shell around it
-    /// (mip-NeRF 360, eq. 10): cameras among what they see, and a background without end.
+    /// All of space: the ball in the bounds' box unscaled, everything outside contracted to a shell
+    /// around it (mip-NeRF 360, eq. 10): for unbounded scenes.
     Contraction,
 }
 
-/// What a virtual camera sees between two planes. A point (X, Y, Z) of its camera space, Z the
-/// depth, has the projective coordinates (X/Z, Y/Z) between `min` and `max` and the disparity 1/Z
-/// between `1/far` and `1/near`: straight lines stay straight, and even steps along them are fine
-/// where a camera sees finely.
+/// Frustum of a virtual camera between two planes. A point (X, Y, Z) in camera space, Z the depth,
+/// has projective coordinates (X/Z, Y/Z) between `min` and `max` and disparity 1/Z between `1/far`
+/// and `1/near`. Straight lines stay straight, and even steps along them are finest near the
+/// camera, as its resolution is.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Frustum {
-    /// Axes and centre of the virtual camera, as of any camera.
+    /// Pose of the virtual camera.
     pub camera_to_world: Pose,
-    /// Smallest slopes, X/Z (x to the right) and Y/Z (y up).
+    /// Minimum slopes, X/Z (x to the right) and Y/Z (y up).
     pub min: [f64; 2],
-    /// Largest slopes.
+    /// Maximum slopes.
     pub max: [f64; 2],
     /// Depth of the front plane.
     pub near: f64,
@@ -40,7 +39,7 @@ pub struct Frustum {
 }
 
 impl Frustum {
-    /// Whether it has an inside, all numbers finite.
+    /// Returns whether the frustum isn't empty and all its numbers are finite.
     pub fn is_valid(&self) -> bool {
         let pose = self.camera_to_world.iter().flatten();
         let finite =
@@ -56,13 +55,13 @@ impl Frustum {
         self.column(3)
     }
 
-    /// A world point in the virtual camera's space: x to the right, y up, and the depth.
+    /// Converts a world point to the virtual camera's space: x to the right, y up, and depth.
     pub fn to_camera(&self, point: DVec3) -> DVec3 {
-        self.turn(point - self.centre())
+        self.rotate_to_camera(point - self.centre())
     }
 
-    /// A world direction in the virtual camera's space.
-    pub fn turn(&self, direction: DVec3) -> DVec3 {
+    /// Converts a world direction to the virtual camera's space.
+    pub fn rotate_to_camera(&self, direction: DVec3) -> DVec3 {
         rotation_of(&self.camera_to_world).transpose() * direction * DVec3::new(1.0, 1.0, -1.0)
     }
 
@@ -71,19 +70,24 @@ impl Frustum {
         DVec3::new(x[i], y[i], z[i])
     }
 
-    /// A point of the virtual camera's space in the unit cube: slopes over the wider of their
-    /// ranges, then 0 at the front plane and 1 at the back.
+    /// Returns the wider of both ranges of slopes.
+    fn slope_range(&self) -> f64 {
+        (self.max[0] - self.min[0]).max(self.max[1] - self.min[1])
+    }
+
+    /// Converts a point of the virtual camera's space to the unit cube: slopes over the wider of
+    /// their ranges, and z from 0 at the near plane to 1 at the far plane.
     pub fn to_cube(&self, p: DVec3) -> DVec3 {
-        let side = (self.max[0] - self.min[0]).max(self.max[1] - self.min[1]);
+        let side = self.slope_range();
         let depth = (1.0 / self.near - 1.0 / p.z) / (1.0 / self.near - 1.0 / self.far);
         DVec3::new((p.x / p.z - self.min[0]) / side, (p.y / p.z - self.min[1]) / side, depth)
     }
 
-    /// The world point at a place in the unit cube.
-    pub fn to_world(&self, place: DVec3) -> DVec3 {
-        let side = (self.max[0] - self.min[0]).max(self.max[1] - self.min[1]);
-        let depth = 1.0 / (1.0 / self.near - place.z * (1.0 / self.near - 1.0 / self.far));
-        let [x, y] = [0, 1].map(|i| (place[i] * side + self.min[i]) * depth);
+    /// Converts a position in the unit cube to a world point.
+    pub fn to_world(&self, position: DVec3) -> DVec3 {
+        let side = self.slope_range();
+        let depth = 1.0 / (1.0 / self.near - position.z * (1.0 / self.near - 1.0 / self.far));
+        let [x, y] = [0, 1].map(|i| (position[i] * side + self.min[i]) * depth);
         self.column(3) + x * self.column(0) + y * self.column(1) - depth * self.column(2)
     }
 
@@ -96,16 +100,47 @@ impl Frustum {
     ///
     /// [`Bounds::rounded`]: crate::Bounds::rounded
     pub(crate) fn rounded(&self, anchor: DVec3) -> Self {
-        let side = (self.max[0] - self.min[0]).max(self.max[1] - self.min[1]);
-        let slope = |slope: f64| multiple(slope, rounding_step(side));
-        // The frustum is narrowest at its front plane: there the centre matters most.
+        let side = self.slope_range();
+        let slope_step = rounding_step(side);
+        // The frustum is narrowest at its near plane, so the centre matters most there.
         let centre = rounded_offset(self.centre(), anchor, rounding_step(self.near * side));
         Self {
             camera_to_world: pose_of(rotation_of(&self.camera_to_world), centre),
-            min: self.min.map(slope),
-            max: self.max.map(slope),
+            min: self.min.map(|slope| multiple(slope, slope_step)),
+            max: self.max.map(|slope| multiple(slope, slope_step)),
             near: rounded(self.near),
             far: rounded(self.far),
         }
     }
+}
+
+/// Relative size of a rounding step, 2⁻²⁶ (docs/design/004): a quarter of single precision in the
+/// unit cube, and far above the rounding errors of f64, even a million scene sizes from the origin.
+const STEP: f64 = 1.0 / 67_108_864.0;
+
+/// Returns the largest power of two not above a positive number; 0 for subnormal numbers.
+pub fn power_of_two_below(value: f64) -> f64 {
+    const EXPONENT: u64 = 0x7ff0_0000_0000_0000;
+    f64::from_bits(value.to_bits() & EXPONENT)
+}
+
+/// Returns the step to which lengths of a magnitude are rounded.
+pub(crate) fn rounding_step(magnitude: f64) -> f64 {
+    STEP * power_of_two_below(magnitude)
+}
+
+/// Returns the nearest multiple of a step; the number itself if the step is 0.
+pub(crate) fn multiple(value: f64, step: f64) -> f64 {
+    if step > 0.0 { (value / step).round() * step } else { value }
+}
+
+/// Rounds a number to 26 binary digits.
+pub(crate) fn rounded(value: f64) -> f64 {
+    multiple(value, rounding_step(value))
+}
+
+/// Rounds a point's offset from an anchor.
+pub(crate) fn rounded_offset(point: DVec3, anchor: DVec3, step: f64) -> DVec3 {
+    let offset = (point - anchor).to_array().map(|x| multiple(x, step));
+    anchor + DVec3::from(offset)
 }

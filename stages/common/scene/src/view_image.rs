@@ -3,23 +3,23 @@ use std::path::Path;
 use artifact::Failure;
 use pixels::{Channel, PixelError, SampleType, write_exr};
 
-/// Path of a view's image in the output of a stage that renders or changes views: EXR.
+/// Returns the path of a view's EXR image in the output of a stage that renders or changes views.
 pub fn image_file(name: &str) -> String {
     format!("images/{name}.exr")
 }
 
-/// Path of the same image for people: PNG, over the background. The runner's `--watch` shows it.
+/// Returns the path of a view's PNG preview over the background, which `--watch` displays.
 pub fn preview_file(name: &str) -> String {
     format!("previews/{name}.png")
 }
 
-/// Path of a view's [mask](crate::View::mask): PNG.
+/// Returns the path of a view's PNG [mask](crate::View::mask).
 pub fn mask_file(name: &str) -> String {
     format!("masks/{name}.png")
 }
 
-/// The channels of a rendered view: colour and opacity, premultiplied; depth; where it was asked
-/// for, the distance along the ray.
+/// Channels of a rendered view: premultiplied colour and opacity, depth, and optionally the
+/// distance along the ray.
 pub const VIEW_CHANNELS: [Channel; 6] = [
     Channel { name: "R", sample_type: SampleType::Half },
     Channel { name: "G", sample_type: SampleType::Half },
@@ -29,16 +29,16 @@ pub const VIEW_CHANNELS: [Channel; 6] = [
     Channel { name: "distance", sample_type: SampleType::Float },
 ];
 
-/// What the file says of them.
+/// Description of [`VIEW_CHANNELS`] in the file.
 const VIEW_NOTE: &str =
     "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
 
-/// Writes the EXR file of a view. `channels` are some of [`VIEW_CHANNELS`]; `band(first_row, rows,
-/// samples)` fills up to 16 rows at a time, as [`write_exr`] has it.
+/// Writes the EXR file of a view. `channels` is a subset of [`VIEW_CHANNELS`]; `band(first_row,
+/// rows, samples)` fills up to 16 rows at a time, as for [`write_exr`].
 ///
 /// # Errors
-/// [`Failure::Numerical`] with channel and pixel where a sample isn't finite; whatever `band`
-/// says; why the file can't be written.
+/// [`Failure::Numerical`] with channel and pixel if a sample isn't finite; errors of `band`; errors
+/// of writing the file.
 pub fn write_view_image<E: From<Failure> + From<PixelError>>(
     path: &Path,
     size: (usize, usize),
@@ -57,7 +57,7 @@ pub fn write_view_image<E: From<Failure> + From<PixelError>>(
     })
 }
 
-/// Why writing a view ended early.
+/// Error of [`write_exr`] or of the caller's `band`.
 enum Stopped<E> {
     Pixels(PixelError),
     Band(E),

@@ -9,51 +9,51 @@ use serde::{Deserialize, Serialize};
 use crate::bounds::Bounds;
 use crate::camera::{Camera, CameraError};
 
-/// Name of the file in every folder of views.
+/// Name of the list of views in every folder of views.
 pub const VIEWS_FILE: &str = "views.json";
 
-/// `views.json`: cameras, and the files that belong to them.
+/// List of views, `views.json`: cameras and their files.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Views {
-    /// How to read the numbers; constant.
+    /// Conventions of the numbers, as text; constant.
     pub conventions: Conventions,
-    /// What lies behind the scene.
+    /// Background behind the scene.
     pub background: Background,
-    /// Where the scene is.
+    /// Bounds of the scene.
     pub bounds: Bounds,
-    /// The views, in the data set's order.
+    /// Views in the data set's order.
     pub views: Vec<View>,
 }
 
-/// A camera and its files, as paths inside the folder of `views.json`.
+/// Camera and its files, as paths in the folder of `views.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct View {
-    /// Where it was taken from; its intrinsics have the image's size.
+    /// Camera that took the view, with the image's size.
     pub camera: Camera,
-    /// The image: PNG (RGBA with straight alpha, or RGB) or EXR (premultiplied alpha).
+    /// Image file: PNG (RGBA with straight alpha, or RGB) or EXR (premultiplied alpha).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<String>,
-    /// Which of the image's pixels count: PNG of its size, white where they do, black where they
-    /// don't. Without it: all.
+    /// Mask file: PNG of the image's size, white in pixels that count, black in others. All pixels
+    /// count if missing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<String>,
-    /// Depth: EXR, channel `Z`.
+    /// Depth file: EXR, channel `Z`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth: Option<String>,
-    /// The same view at low resolution, to look at beside the others.
+    /// Low-resolution image file of the view, for display next to other images.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub low_resolution: Option<String>,
 }
 
 impl View {
-    /// A camera without files.
+    /// Creates a view without files.
     pub fn camera_only(camera: Camera) -> Self {
         Self { camera, image: None, mask: None, depth: None, low_resolution: None }
     }
 
-    /// Its image, premultiplied RGBA, and which of its pixels count; none where it has no image.
+    /// Reads the image, premultiplied RGBA, and its mask; `None` if the view has no image.
     pub fn read_photograph(&self, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
         let Some(file) = &self.image else { return Ok(None) };
         let image = read_premultiplied(&input.path(file))?;
@@ -61,8 +61,9 @@ impl View {
         Ok(Some(Photograph { image, mask }))
     }
 
-    /// The same at low resolution; a pixel of it counts where all that lies under it does.
-    pub fn read_lr(&self, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
+    /// Reads the low-resolution image and its mask; `None` if the view has none. An LR pixel counts
+    /// if all HR pixels under it count.
+    pub fn read_lr_photograph(&self, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
         let Some(file) = &self.low_resolution else { return Ok(None) };
         let image = read_premultiplied(&input.path(file))?;
         let mask = self.mask.as_ref().map(|file| read_png(&input.path(file))).transpose()?;
@@ -70,7 +71,7 @@ impl View {
         Ok(Some(Photograph { image, mask }))
     }
 
-    /// Which pixels of its image, of that size, count; none where all do.
+    /// Reads the mask of an image of the given size; `None` if all pixels count.
     pub fn read_mask(
         &self,
         input: &GivenInput,
@@ -80,29 +81,31 @@ impl View {
     }
 }
 
-/// What a camera took: an image, and what of it shows the scene.
+/// Image taken by a camera, with its mask.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Photograph {
     /// Premultiplied RGBA, or RGB over a background.
     pub image: Image,
-    /// Which pixels count; without it all do. The others say nothing of the scene.
+    /// Mask of the pixels that count; `None` for all.
     pub mask: Option<Mask>,
 }
 
 impl Photograph {
-    /// RGB over a grey level.
+    /// Returns the photograph over a grey level: RGB.
     #[must_use]
     pub fn over(self, background: f32) -> Self {
         Self { image: self.image.over(background), ..self }
     }
 
-    /// The image, NaN where it doesn't count.
-    pub fn known(self) -> Image {
+    /// Returns the image with NaN in pixels that don't count.
+    pub fn masked_image(self) -> Image {
         let mut image = self.image;
-        let counts = self.mask.iter().flat_map(|mask| &mask.counts);
-        for (pixel, counts) in image.data.chunks_exact_mut(image.channels).zip(counts) {
-            if !counts {
-                pixel.fill(f32::NAN);
+        if let Some(mask) = self.mask {
+            let pixels = image.data.chunks_exact_mut(image.channels);
+            for (pixel, counts) in pixels.zip(mask.counts) {
+                if !counts {
+                    pixel.fill(f32::NAN);
+                }
             }
         }
         image
@@ -115,17 +118,17 @@ impl From<Image> for Photograph {
     }
 }
 
-/// The conventions in words, for whoever reads `views.json` without this crate.
+/// Conventions as text, for readers of `views.json` without this crate.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Conventions {
     /// Camera axes and matrix.
     pub camera: String,
-    /// Where pixels lie.
+    /// Positions of pixels.
     pub pixels: String,
-    /// What depth means.
+    /// Definition of depth.
     pub depth: String,
-    /// What colours mean.
+    /// Encoding of colours.
     pub colour: String,
 }
 
@@ -145,7 +148,7 @@ impl Default for Conventions {
     }
 }
 
-/// What lies behind the scene.
+/// Background behind the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Background {
@@ -153,16 +156,16 @@ pub enum Background {
     White,
     /// Black.
     Black,
-    /// Kept open: alpha is data, colours are premultiplied.
+    /// Transparent: opacity is data, colours are premultiplied.
     Alpha,
-    /// Nothing: every ray ends on something, as in photographs. Training puts another colour there
-    /// each time, so that nothing can pretend to be it.
+    /// None: every ray ends on a surface, as in photographs. Training draws a new background colour
+    /// for each ray, so that no density can imitate the background.
     Opaque,
 }
 
 impl Background {
-    /// The colour behind the scene when it has to be shown: open backgrounds are shown on white,
-    /// what is left open of an opaque scene on the mean of all colours.
+    /// Returns the grey level behind displayed images: white for a transparent background, the mean
+    /// of black and white for gaps in an opaque scene.
     pub fn shown(self) -> f32 {
         match self {
             Self::Black => 0.0,
@@ -172,46 +175,46 @@ impl Background {
     }
 }
 
-/// A `views.json` that can't be used.
+/// Error returned when `views.json` is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewsError {
-    /// No view at all.
-    #[error("{VIEWS_FILE}: it lists no views")]
+    /// The list is empty.
+    #[error("{VIEWS_FILE}: no views found")]
     Empty,
-    /// A camera that can't be.
+    /// A view's camera is invalid.
     #[error("{VIEWS_FILE}: view {name:?}: {source}")]
     Camera {
-        /// The view.
+        /// Name of the view.
         name: String,
-        /// What is wrong.
+        /// Reason.
         source: CameraError,
     },
-    /// Two views of one name, or a name that is no file name.
+    /// Two views have the same name, or a name isn't a file name.
     #[error("{VIEWS_FILE}: view name {0:?} is used twice or can't name a file")]
     Name(String),
-    /// A path out of the folder.
+    /// A path leaves the folder.
     #[error("{VIEWS_FILE}: {0}")]
     Path(String),
-    /// A box without inside.
-    #[error("{VIEWS_FILE}: bounds {0:?} have no inside")]
+    /// The bounds are empty or not finite.
+    #[error("{VIEWS_FILE}: bounds {0:?} are empty or not finite")]
     Bounds(Box<Bounds>),
 }
 
 impl Views {
-    /// Views without files.
+    /// Creates a list of views with the current conventions.
     pub fn new(background: Background, bounds: Bounds, views: Vec<View>) -> Self {
         Self { conventions: Conventions::default(), background, bounds, views }
     }
 
-    /// The view that has a camera's name and pose. Names alone say little: Blender's training and
-    /// test views have the same.
+    /// Returns the view with a camera's name and pose. Names alone are ambiguous: Blender's
+    /// training and test views have the same names.
     pub fn taken_by(&self, camera: &Camera) -> Option<&View> {
         self.views.iter().find(|v| {
             v.camera.name == camera.name && v.camera.camera_to_world == camera.camera_to_world
         })
     }
 
-    /// Reads one of these views' images over the background on which they are shown: RGB.
+    /// Reads an image of a view over the displayed background: RGB.
     pub fn read_over(&self, path: &Path) -> Result<Image, PixelError> {
         Ok(read_premultiplied(path)?.over(self.background.shown()))
     }
@@ -226,11 +229,11 @@ impl Views {
         Ok(views)
     }
 
-    /// Reads and checks the `views.json` of a folder that a run's record names.
+    /// Reads and checks the `views.json` of a folder.
     ///
     /// # Errors
     /// [`Failure::BadInput`] with file and view.
-    pub fn of_folder(folder: &Path) -> Result<Self, Failure> {
+    pub fn read_folder(folder: &Path) -> Result<Self, Failure> {
         let path = folder.join(VIEWS_FILE);
         let bytes = std::fs::read(&path).bad_input(path.display())?;
         let views: Self = serde_json::from_slice(&bytes).bad_input(path.display())?;
@@ -238,8 +241,8 @@ impl Views {
         Ok(views)
     }
 
-    /// Refuses what can't be: no views, impossible cameras, names or paths that leave the folder,
-    /// an empty box.
+    /// Fails for an empty list, invalid cameras, names or paths that leave the folder, and empty
+    /// bounds.
     pub fn check(&self) -> Result<(), ViewsError> {
         if self.views.is_empty() {
             return Err(ViewsError::Empty);
@@ -268,8 +271,8 @@ impl Views {
     }
 }
 
-/// Refuses paths that leave the folder, or that would do something to a terminal where they are
-/// printed.
+/// Fails for paths that leave the folder or contain control characters, which a terminal would
+/// interpret.
 fn check_path(path: &str) -> Result<(), ViewsError> {
     relative_path(path).map_err(|e| ViewsError::Path(e.to_string()))?;
     if path.contains(char::is_control) {

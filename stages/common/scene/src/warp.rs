@@ -3,75 +3,77 @@ use pixels::DepthMap;
 
 use crate::camera::Camera;
 
-/// The surfaces that a view sees.
+/// Surfaces of a view: camera, depth and opacity.
 #[derive(Clone, Copy, Debug)]
 pub struct Surface<'a> {
-    /// Where from; its intrinsics have the size of the map.
+    /// Camera of the view, with the map's size.
     pub camera: &'a Camera,
     /// Depth and opacity at each pixel's centre.
     pub map: DepthMap<'a>,
 }
 
-/// How one view sees a point of a surface that another sees, too.
+/// Projection of a surface point of one view in another view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Visibility {
-    /// Where in its image, in pixels from the top left corner.
-    pub place: [f32; 2],
+    /// Position in the other image, in pixels from the top left corner.
+    pub position: [f32; 2],
     /// Cosine of the angle between both lines of sight.
     pub cosine: f32,
-    /// Pixels that a length of the surface covers there for every pixel here, its slant left aside.
+    /// Resolution of the other view relative to this one at the point, in pixels per pixel; slant
+    /// is ignored.
     pub detail: f32,
 }
 
-/// Two depths are of one surface where they differ by at most this share.
-const SAME_DEPTH_SHARE: f64 = 0.02;
-/// They are of one surface, too, where the first view sees the second's point at most so many
-/// pixels from its own. Views from nearly one place tell the depth of a far wall badly, and it
-/// matters as little.
-const SAME_PLACE_PIXELS: f64 = 0.5;
+/// Maximum relative difference between two depths of one surface; chosen by hand.
+const MAX_DEPTH_DIFFERENCE: f64 = 0.02;
+/// Maximum distance in the first image between a pixel and the second view's point, for both to be
+/// one surface whatever their depths; chosen by hand. Nearby cameras determine the depth of a far
+/// wall poorly, and the error shifts the wall just as little.
+const MAX_REPROJECTION_ERROR_PIXELS: f64 = 0.5;
 
 impl Surface<'_> {
-    /// Where another view sees what this one sees at each pixel, row by row:
-    /// [`Surface::visibility`]'s places.
+    /// Returns, row by row, the position of each pixel's surface point in another view; `None`
+    /// where [`Surface::visibility`] is.
     ///
     /// # Panics
-    /// Where the map hasn't one number a pixel.
-    pub fn seen_from(&self, other: &Surface<'_>) -> Vec<Option<[f32; 2]>> {
+    /// If the map doesn't have one number per pixel.
+    pub fn positions_in(&self, other: &Surface<'_>) -> Vec<Option<[f32; 2]>> {
         let k = &self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         (0..width * height)
-            .map(|i| self.visibility(i % width, i / width, other).map(|s| s.place))
+            .map(|i| self.visibility(i % width, i / width, other).map(|s| s.position))
             .collect()
     }
 
-    /// How another view sees what this one sees at a pixel. `None` where this view sees no surface,
-    /// the other doesn't look, or something stands between.
+    /// Returns the visibility of a pixel's surface point in another view. `None` if the pixel has
+    /// no surface, or the point is outside the other image or occluded.
     ///
     /// # Panics
-    /// Where the map hasn't one number a pixel, or the pixel lies outside.
+    /// If the map doesn't have one number per pixel, or the pixel is outside.
     pub fn visibility(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Visibility> {
-        let (visibility, point) = self.look(column, row, other.camera)?;
-        let place = [column as f64 + 0.5, row as f64 + 0.5];
+        let (visibility, point) = self.project(column, row, other.camera)?;
+        let pixel = [column as f64 + 0.5, row as f64 + 0.5];
         other
-            .shows(point, visibility.place.map(f64::from), (self.camera, place))
+            .has_point(point, visibility.position.map(f64::from), (self.camera, pixel))
             .then_some(visibility)
     }
 
-    /// The same, were nothing between: how a camera would see it through whatever stands there.
+    /// Returns [`Surface::visibility`] in a camera as if nothing occluded the point.
     ///
     /// # Panics
-    /// Where the map hasn't one number a pixel, or the pixel lies outside.
-    pub fn visibility_through(
+    /// If the map doesn't have one number per pixel, or the pixel is outside.
+    pub fn unoccluded_visibility(
         &self,
         column: usize,
         row: usize,
         other: &Camera,
     ) -> Option<Visibility> {
-        self.look(column, row, other).map(|(visibility, _)| visibility)
+        self.project(column, row, other).map(|(visibility, _)| visibility)
     }
 
-    /// How a camera would see what this view sees at a pixel, and which point that is.
-    fn look(&self, column: usize, row: usize, other: &Camera) -> Option<(Visibility, DVec3)> {
+    /// Projects a pixel's surface point to another camera, regardless of occlusion; returns the
+    /// world point, too.
+    fn project(&self, column: usize, row: usize, other: &Camera) -> Option<(Visibility, DVec3)> {
         let i = row * self.camera.intrinsics.width as usize + column;
         if !self.map.has_surface(i) {
             return None;
@@ -80,49 +82,58 @@ impl Surface<'_> {
         let distance = f64::from(self.map.depth[i]) / self.camera.depth_per_distance(&ray);
         let point = ray.at(distance);
         let (x, y, _) = other.project(point)?;
-        let size = [other.intrinsics.width, other.intrinsics.height].map(f64::from);
-        // NaN lies nowhere.
-        let is_inside = (0.0..=size[0]).contains(&x) && (0.0..=size[1]).contains(&y);
-        let way = point - other.centre();
+        let [width, height] = [other.intrinsics.width, other.intrinsics.height].map(f64::from);
+        // NaN is outside.
+        let is_inside = (0.0..=width).contains(&x) && (0.0..=height).contains(&y);
+        let line = point - other.centre();
         let visibility = Visibility {
-            place: [x as f32, y as f32],
-            cosine: (ray.direction.dot(way) / way.length()) as f32,
-            detail: (other.intrinsics.fx * distance / (self.camera.intrinsics.fx * way.length()))
+            position: [x as f32, y as f32],
+            cosine: (ray.direction.dot(line) / line.length()) as f32,
+            detail: (other.intrinsics.fx * distance / (self.camera.intrinsics.fx * line.length()))
                 as f32,
         };
         is_inside.then_some((visibility, point))
     }
 
-    /// Whether what this view sees at a position is a point that another sees at a place: by the
-    /// depth of one of the four pixels around, which all lie in the image or at its border.
-    fn shows(&self, point: DVec3, [x, y]: [f64; 2], (other, place): (&Camera, [f64; 2])) -> bool {
-        let (width, height) =
-            (self.camera.intrinsics.width as usize, self.camera.intrinsics.height as usize);
-        let way = point - self.camera.centre();
-        let depth = way.dot(self.camera.forward());
-        let moved = |own: f64| self.camera.centre() + way * (own / depth);
-        let is_there = |own: f64| is_near(own, depth) || sees_at(other, moved(own), place);
-        around(y, height).into_iter().any(|row| {
-            around(x, width).into_iter().any(|column| {
-                let i = row * width + column;
-                self.map.has_surface(i) && is_there(f64::from(self.map.depth[i]))
-            })
-        })
+    /// Returns whether the surface at position (x, y) is `point`, which another camera observes at
+    /// `pixel`. One of the four surrounding pixels must have the point's depth, or a depth at which
+    /// the other camera observes the same pixel.
+    fn has_point(
+        &self,
+        point: DVec3,
+        [x, y]: [f64; 2],
+        (other, pixel): (&Camera, [f64; 2]),
+    ) -> bool {
+        let k = &self.camera.intrinsics;
+        let line = point - self.camera.centre();
+        let depth = line.dot(self.camera.forward());
+        for row in nearest_pixels(y, k.height as usize) {
+            for column in nearest_pixels(x, k.width as usize) {
+                let i = row * k.width as usize + column;
+                let own = f64::from(self.map.depth[i]);
+                if self.map.has_surface(i)
+                    && ((own - depth).abs() <= MAX_DEPTH_DIFFERENCE * depth
+                        || observes_at(other, self.camera.centre() + line * (own / depth), pixel))
+                {
+                    return true;
+                }
+            }
+        }
+        false
     }
 }
 
-/// The pixels to either side of a position along one axis.
-fn around(v: f64, size: usize) -> [usize; 2] {
+/// Returns the pixels on either side of a position along one axis, clamped to the image.
+fn nearest_pixels(v: f64, size: usize) -> [usize; 2] {
     let low = (v - 0.5).floor().max(0.0) as usize;
     [low.min(size - 1), (low + 1).min(size - 1)]
 }
 
-fn is_near(own: f64, depth: f64) -> bool {
-    (own - depth).abs() <= SAME_DEPTH_SHARE * depth
-}
-
-fn sees_at(camera: &Camera, point: DVec3, [x, y]: [f64; 2]) -> bool {
-    camera.project(point).is_some_and(|(u, v, _)| (u - x).hypot(v - y) <= SAME_PLACE_PIXELS)
+/// Returns whether a camera observes a point near an image position.
+fn observes_at(camera: &Camera, point: DVec3, [x, y]: [f64; 2]) -> bool {
+    camera
+        .project(point)
+        .is_some_and(|(u, v, _)| (u - x).hypot(v - y) <= MAX_REPROJECTION_ERROR_PIXELS)
 }
 
 #[cfg(test)]
@@ -166,7 +177,7 @@ mod tests {
                 Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } },
             );
             let mut seen = 0;
-            for (i, place) in from_a.seen_from(&from_b).into_iter().enumerate() {
+            for (i, place) in from_a.positions_in(&from_b).into_iter().enumerate() {
                 let ray = a.ray((i % 64) as f64 + 0.5, (i / 64) as f64 + 0.5);
                 let point = ray.at(f64::from(da[i]) / a.depth_per_distance(&ray));
                 let (x, y, _) = b.project(point).unwrap();
@@ -177,8 +188,8 @@ mod tests {
                 let hidden = has_plate && point.z < 0.5 && at_plate.x.abs() <= 0.3;
                 let at_edge = has_plate && (at_plate.x.abs() - 0.3).abs() < 0.1;
                 let through = from_a
-                    .visibility_through(i % 64, i / 64, &b)
-                    .map(|visibility| visibility.place);
+                    .unoccluded_visibility(i % 64, i / 64, &b)
+                    .map(|visibility| visibility.position);
                 assert!(
                     through.is_some() == inside && (place.is_none() || place == through),
                     "pixel {i} through what hides it"
@@ -200,7 +211,7 @@ mod tests {
         let (da, db) = (depths(&a, false), depths(&b, false));
         let empty = Surface { camera: &a, map: DepthMap { depth: &da, opacity: &nothing } };
         let other = Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
-        assert!(empty.seen_from(&other).iter().all(Option::is_none));
+        assert!(empty.positions_in(&other).iter().all(Option::is_none));
     }
 
     /// Pixels that a camera so far aside sees, too, where its depth is off by a factor.
@@ -212,7 +223,7 @@ mod tests {
             (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
         let other = Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
         let from = Surface { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } };
-        from.seen_from(&other).iter().flatten().count()
+        from.positions_in(&other).iter().flatten().count()
     }
 
     /// Depth that is 5 % off elsewhere is another surface, unless both look from nearly one place:
@@ -237,7 +248,7 @@ mod tests {
         let opacity = vec![1.0; 64 * 48];
         for depth in [f32::NAN, f32::INFINITY, -1.0, 0.0, 1e38, 1e-38] {
             let map = DepthMap { depth: &vec![depth; 64 * 48], opacity: &opacity };
-            Surface { camera: &a, map }.seen_from(&Surface { camera: &b, map });
+            Surface { camera: &a, map }.positions_in(&Surface { camera: &b, map });
         }
     }
 }

@@ -1,8 +1,11 @@
 use radiance::spec::{
-    BASIS, BRICK, DARK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, MET,
-    OCCUPANCY_CELLS, RAW_COLOUR, TRAINING_ROUNDS, UNSEEN, VIEW_FEATURE, VIEW_FEATURES,
+    BASIS, BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, MAX_OPTICAL_DEPTH, MAX_RAW_DENSITY,
+    MIN_HIT_WEIGHT, MIN_TOTAL_WEIGHT, MIN_TRANSMITTANCE, MIN_WEIGHT, OCCUPANCY_CELLS, RAW_COLOUR,
+    TRAINING_ROUNDS, VIEW_FEATURE, VIEW_FEATURES,
 };
-use radiance::{Architecture, Field, Met, Occupancy, Pixel, Ray, RayField, RenderError, Strides};
+use radiance::{
+    Architecture, CellHit, Field, Occupancy, Pixel, Ray, RayField, RenderError, Strides,
+};
 use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
@@ -119,7 +122,7 @@ pub(crate) struct GridForward {
     pub(crate) shaded_weight: Tensor,
     pub(crate) shaded_ray: Tensor,
     /// Densities of cells in which samples stop light; only in training.
-    pub(crate) met: Vec<Met>,
+    pub(crate) met: Vec<CellHit>,
     /// Number of samples in occupied cells; only in training.
     pub(crate) samples: usize,
     maps: RayMaps,
@@ -127,13 +130,17 @@ pub(crate) struct GridForward {
 
 /// Returns the densities of cells in which samples stop light, from the samples' weights (s × 1),
 /// positions (s × 3) and raw densities (s).
-fn met_cells(weight: &Tensor, positions: &Tensor, raw: &Tensor) -> Result<Vec<Met>, TchError> {
-    let met = weight.f_squeeze_dim(-1)?.f_gt(f64::from(MET))?.f_nonzero()?.f_squeeze_dim(-1)?;
+fn met_cells(weight: &Tensor, positions: &Tensor, raw: &Tensor) -> Result<Vec<CellHit>, TchError> {
+    let met = weight
+        .f_squeeze_dim(-1)?
+        .f_gt(f64::from(MIN_HIT_WEIGHT))?
+        .f_nonzero()?
+        .f_squeeze_dim(-1)?;
     let density = raw.f_index_select(0, &met)?.f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?;
     let positions = to_host(&positions.f_index_select(0, &met)?)?;
     let positions = positions.as_chunks::<3>().0;
     let densities = to_host(&density)?;
-    Ok(positions.iter().zip(densities).map(|(&p, density)| Met::at(p, density)).collect())
+    Ok(positions.iter().zip(densities).map(|(&p, density)| CellHit::at(p, density)).collect())
 }
 
 /// Returns the levels, from the coarsest to the finest.
@@ -231,7 +238,8 @@ fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
     }
     let is_later = ordinal.f_sub_scalar(end)?.f_remainder(later)?.f_eq(0)?;
     is_end = is_end.f_logical_or(&is_later.f_logical_and(&ordinal.f_gt(end)?)?)?;
-    let is_dark = through.f_ge(f64::from(DARK))?.f_logical_and(&is_end)?.f_mul(&exists)?;
+    let is_dark =
+        through.f_ge(f64::from(MAX_OPTICAL_DEPTH))?.f_logical_and(&is_end)?.f_mul(&exists)?;
     let is_over = is_dark.f_cumsum(1, None::<Kind>)?.f_sub(&is_dark)?.f_gt(0.0)?;
     let marched = exists.f_logical_and(&is_over.f_logical_not()?)?;
     Ok(marched.f_sum(Kind::Int64)?.f_int64_value(&[])? as usize)
@@ -333,7 +341,9 @@ impl TorchGrid {
         // Samples that are not composited get no gradient.
         let counted = no_grad(|| -> Result<Tensor, TchError> {
             let [_, transmittance, weights] = optical_depths(&tau, &kept, n, count)?;
-            transmittance.f_gt(f64::from(FAINT))?.f_logical_and(&weights.f_gt(f64::from(FAINT))?)
+            transmittance
+                .f_gt(f64::from(MIN_TRANSMITTANCE))?
+                .f_logical_and(&weights.f_gt(f64::from(MIN_WEIGHT))?)
         })?;
         let counts = counted.f_reshape([-1])?.f_index_select(0, &kept)?;
         let tau = tau.f_where_self(&counts, &tau.f_detach()?)?;
@@ -473,7 +483,7 @@ impl TorchGrid {
                 }),
                 premultiplied: own,
                 opacity: 1.0 - transmittance[i],
-                depth: if weight[i] > UNSEEN { distance[i] / weight[i] } else { far },
+                depth: if weight[i] > MIN_TOTAL_WEIGHT { distance[i] / weight[i] } else { far },
                 median_depth: if has_median[i] > 0.0 { median[i] } else { far },
             }
         });

@@ -2,7 +2,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use radiance::spec::{ADAM_BETA, ADAM_EPSILON};
-use radiance::{Field, Met, Occupancy, StepReport, Supervisor, Tally, TrainingOptions};
+use radiance::{CellHit, Field, Occupancy, StepReport, Supervisor, TrainingOptions, TrainingState};
 use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::error::TorchFieldError;
@@ -24,7 +24,7 @@ pub struct GridTrainer {
     second: Vec<Tensor>,
     /// Moving average of the parameters, late in the training.
     average: Option<Vec<Tensor>>,
-    tally: Tally,
+    tally: TrainingState,
     samples_per_ray: f64,
 }
 
@@ -38,7 +38,7 @@ struct GridPiece {
     /// Sum of the bundles' losses.
     loss: f64,
     samples: usize,
-    met: Vec<Met>,
+    met: Vec<CellHit>,
 }
 
 impl GridTrainer {
@@ -51,13 +51,13 @@ impl GridTrainer {
         let grid = TorchGrid::new(field, device)?;
         Ok(Self {
             occupancy: field.parts().2.clone(),
-            samples_per_ray: field.architecture.full_ray(),
+            samples_per_ray: field.architecture.samples_per_full_ray(),
             first: zero_moments(&grid.parameters())?,
             second: zero_moments(&grid.parameters())?,
             grid,
             options,
             average: None,
-            tally: Tally::default(),
+            tally: TrainingState::default(),
         })
     }
 
@@ -92,7 +92,7 @@ impl GridTrainer {
         &mut self,
         supervision: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
-        supervision.set_progress(self.tally.done(self.options.rays));
+        supervision.set_progress(self.tally.progress(self.options.rays));
         let rays_per_bundle = supervision.rays_per_bundle();
         let target = self.options.rays_of_step(&self.tally, self.samples_per_ray);
         let bundles = self.tally.bundles_of_step(self.options.rays, target, rays_per_bundle);
@@ -119,12 +119,12 @@ impl GridTrainer {
         self.samples_per_ray = samples as f64 / rays as f64;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum)?;
         if skipped {
-            if !self.tally.forgives() {
+            if !self.tally.record_nonfinite_step() {
                 return Err(TorchFieldError::NotFinite { step: self.tally.steps });
             }
         } else {
             no_grad(|| self.apply_gradients(&sum))?;
-            self.occupancy.keep(&met);
+            self.occupancy.raise_densities(&met);
             step.remember(supervision, &colours);
         }
         self.tally.steps += 1;
@@ -201,7 +201,7 @@ impl GridTrainer {
                 [self.first[i + 1].shallow_clone(), self.second[i + 1].shallow_clone()],
             )?;
         }
-        if options.averages(&self.tally) {
+        if options.is_averaging_step(&self.tally) {
             let current = self.grid.parameters();
             if let Some(average) = &mut self.average {
                 let weight = 1.0 - f64::from(options.ema_decay);
@@ -225,8 +225,9 @@ impl GridTrainer {
         }
         let mut densities = Vec::with_capacity(cells.len());
         for cells in cells.chunks(POSITIONS_PER_CALL) {
-            let positions =
-                columns(cells, self.grid.device, |&cell| Occupancy::place_in(cell, seed, step))?;
+            let positions = columns(cells, self.grid.device, |&cell| {
+                Occupancy::random_position(cell, seed, step)
+            })?;
             densities.extend(to_host(&self.grid.densities(&positions)?)?);
         }
         self.occupancy.update(&cells, &densities, self.grid.step() as f32);
@@ -281,7 +282,7 @@ impl GridTrainer {
         self.first = first;
         self.second = second;
         self.average = average;
-        self.tally = Tally::from_counters(tally);
+        self.tally = TrainingState::from_counters(tally);
         self.samples_per_ray = f64::from_bits(samples_per_ray);
         Ok(())
     }

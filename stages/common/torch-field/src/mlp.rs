@@ -3,7 +3,7 @@ use std::path::Path;
 
 use counter_rng::CounterRng;
 use glam::DVec3;
-use radiance::spec::UNSEEN;
+use radiance::spec::MIN_TOTAL_WEIGHT;
 use radiance::{MlpArchitecture, Pixel, Ray, RayField, RenderError};
 use rayon::prelude::*;
 use scene::{Bounds, Space};
@@ -360,7 +360,7 @@ impl Mlp {
                 colour: std::array::from_fn(|c| colour[3 * i + c]),
                 premultiplied: std::array::from_fn(|c| premultiplied[3 * i + c]),
                 opacity: opacity.clamp(0.0, 1.0),
-                depth: if opacity > UNSEEN { distance / opacity } else { far },
+                depth: if opacity > MIN_TOTAL_WEIGHT { distance / opacity } else { far },
                 median_depth: median.map_or(far, |k| t[k]),
             }
         });

@@ -2,7 +2,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use nets::Adam;
-use radiance::{MlpArchitecture, StepReport, Supervisor, Tally};
+use radiance::{MlpArchitecture, StepReport, Supervisor, TrainingState};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor};
 
@@ -35,7 +35,7 @@ pub struct MlpTrainer {
     field: Mlp,
     options: MlpTraining,
     adam: Adam,
-    tally: Tally,
+    tally: TrainingState,
     /// Number of consecutive steps in which a network was stuck.
     stuck_steps: u64,
 }
@@ -124,7 +124,7 @@ impl MlpTrainer {
     /// Creates a trainer of `field`.
     pub fn new(field: Mlp, options: MlpTraining) -> Result<Self, TorchFieldError> {
         let adam = Adam::new(field.parameters())?;
-        Ok(Self { field, options, adam, tally: Tally::default(), stuck_steps: 0 })
+        Ok(Self { field, options, adam, tally: TrainingState::default(), stuck_steps: 0 })
     }
 
     /// Returns the field in its current state.
@@ -147,7 +147,7 @@ impl MlpTrainer {
         &mut self,
         supervision: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
-        let done = self.tally.done(self.options.rays);
+        let done = self.tally.progress(self.options.rays);
         supervision.set_progress(done);
         let rays_per_bundle = supervision.rays_per_bundle();
         let Some(bundles) = self.tally.bundles_of_step(
@@ -165,7 +165,7 @@ impl MlpTrainer {
         let loss = sum.loss / bundles as f64;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum.gradients)?;
         if skipped {
-            if !self.tally.forgives() {
+            if !self.tally.record_nonfinite_step() {
                 return Err(TorchFieldError::NotFinite { step: self.tally.steps });
             }
         } else {
@@ -228,7 +228,7 @@ impl MlpTrainer {
         done: f64,
     ) -> Result<(), TchError> {
         let MlpTraining { schedule, learning_rate, learning_rate_decay, .. } = self.options;
-        let learning_rate = self.tally.rate_scale
+        let learning_rate = self.tally.learning_rate_scale
             * schedule.learning_rate(learning_rate, learning_rate_decay, done);
         self.adam.step(self.field.parameters(), gradients, learning_rate)
     }
@@ -254,7 +254,7 @@ impl MlpTrainer {
         let (adam, [tally @ .., stuck_steps]): (Adam, [u64; 6]) =
             Adam::resume(path, &self.field.named_parameters())?;
         self.adam = adam;
-        self.tally = Tally::from_counters(tally);
+        self.tally = TrainingState::from_counters(tally);
         self.stuck_steps = stuck_steps;
         Ok(())
     }

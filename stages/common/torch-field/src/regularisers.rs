@@ -1,5 +1,5 @@
 use radiance::Regularisers;
-use radiance::spec::LIKE_BACKGROUND;
+use radiance::spec::MAX_FLOATER_COLOUR_DISTANCE;
 use tch::{Kind, TchError, Tensor};
 
 use crate::grid::GridForward;
@@ -51,7 +51,7 @@ fn floater_sum(forward: &GridForward, backgrounds: &Tensor) -> Result<Tensor, Tc
         .f_square()?
         .f_sum_dim_intlist([1i64].as_slice(), true, None::<Kind>)?;
     let likeness = squared
-        .f_mul_scalar(-1.0 / f64::from(LIKE_BACKGROUND).powi(2))?
+        .f_mul_scalar(-1.0 / f64::from(MAX_FLOATER_COLOUR_DISTANCE).powi(2))?
         .f_add_scalar(1.0)?
         .f_relu()?;
     let transmittance = forward

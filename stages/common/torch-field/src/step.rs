@@ -1,6 +1,6 @@
 use std::ops::Range;
 
-use radiance::{Ray, Supervisor, Tally};
+use radiance::{Ray, Supervisor, TrainingState};
 use tch::{TchError, Tensor};
 
 use crate::error::TorchFieldError;
@@ -60,7 +60,7 @@ pub(crate) struct StepLoss {
 
 impl Step {
     /// Creates the step that follows those counted in `tally`.
-    pub(crate) fn new(tally: &Tally, bundles: usize, rays_per_bundle: usize) -> Self {
+    pub(crate) fn new(tally: &TrainingState, bundles: usize, rays_per_bundle: usize) -> Self {
         Self { first_bundle: tally.bundles, first_ray: tally.rays, bundles, rays_per_bundle }
     }
 
@@ -175,7 +175,7 @@ mod tests {
     /// Memory that holds three bundles at most: nothing is lost, nothing done twice.
     #[test]
     fn pieces_get_smaller_until_they_fit() {
-        let step = Step::new(&Tally::default(), 17, 4);
+        let step = Step::new(&TrainingState::default(), 17, 4);
         let pieces = step.run_in_pieces(three_at_most).unwrap();
         assert!(pieces.iter().all(|p| p.len() <= 3) && pieces.len() < 10);
         assert_eq!(pieces.into_iter().flatten().collect::<Vec<_>>(), (0..17).collect::<Vec<_>>());

@@ -41,7 +41,7 @@ pub(crate) fn warp(
 ) -> Option<(WarpScore, Rgba8)> {
     const UNSEEN: [u8; 4] = [120, 20, 30, 255];
     let from = Surface { camera: view.0, map: DepthMap::of(view.1)? };
-    let places = from.seen_from(&Surface { camera: other.0, map: DepthMap::of(other.1)? });
+    let places = from.positions_in(&Surface { camera: other.0, map: DepthMap::of(other.1)? });
     let (mut sum, mut seen) = (0.0, 0usize);
     let mut data = Vec::with_capacity(4 * places.len());
     for (place, truth) in places.iter().zip(view.2.data.chunks_exact(3)) {

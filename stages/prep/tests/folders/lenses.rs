@@ -206,7 +206,7 @@ fn refused_cases() -> Vec<Case> {
             },
             Expected::Refused(
                 "dataset: frame a0: lens distortion (fisheye, k1 -0.3, k2 0, k3 0, p1 0, p2 0) \
-                can't be undone within the image; are its coefficients right? (parameter lens: undo \
+                is not invertible within the image; check its coefficients (parameter lens: undo \
                 keeps what has its ray)",
             ),
         ),

@@ -1,74 +1,74 @@
-//! Rays to march, and the samples found.
+//! Input and output of marching.
 
 use crate::occupancy::Occupancy;
 use crate::ray::NormalizedRay;
-use crate::strides::Strides;
+use crate::spec::Strides;
 
-/// Where a ray's march stands: the number of its next step; [`DONE`] once it has left the box.
+/// Number of a ray's next step after it has left the box.
 pub(crate) const DONE: u32 = u32::MAX;
 
-/// Rays to march, and how.
+/// Rays to march, and their sampling.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct March<'a> {
     pub(crate) occupancy: &'a Occupancy,
     pub(crate) rays: &'a [NormalizedRay],
-    /// Share of a step by which each ray's samples are shifted.
+    /// Shift of each ray's samples, in steps.
     pub(crate) offsets: &'a [f32],
     /// Distance between samples, in cube sides.
     pub(crate) step: f32,
     pub(crate) strides: Strides,
 }
 
-/// Samples found by marching, ray by ray.
+/// Samples found by marching, by ray.
 #[derive(Debug, Default)]
-pub(crate) struct Marched {
-    /// Where each sample lies along its ray.
+pub(crate) struct MarchedSamples {
+    /// Ray parameter of each sample.
     pub(crate) t: Vec<f32>,
-    /// How many steps it stands for.
+    /// Length of each sample in steps: 1 or 2.
     pub(crate) lengths: Vec<f32>,
-    /// Its place in the unit cube.
+    /// Position of each sample in the unit cube.
     pub(crate) positions: Vec<[f32; 3]>,
-    /// First sample of each active ray, and the end.
+    /// Index of each active ray's first sample, and the end.
     pub(crate) starts: Vec<usize>,
-    pub(super) slots: Slots,
+    pub(super) slots: SampleSlots,
 }
 
-/// Samples of rays that march side by side, until all are found.
+/// Samples of rays that march in parallel lanes, before they are sorted by ray.
 #[derive(Debug, Default)]
-pub(super) struct Slots {
-    /// Most samples of a ray.
-    most: usize,
-    /// How many samples each active ray has so far.
+pub(super) struct SampleSlots {
+    /// Maximum number of samples per ray.
+    max_samples: usize,
+    /// Number of samples of each active ray so far.
     pub(super) counts: Vec<usize>,
-    /// t and length of each sample: `most` slots a ray.
+    /// t and length of each sample: `max_samples` slots per ray.
     samples: Vec<[f32; 2]>,
 }
 
-impl Slots {
+impl SampleSlots {
     #[inline(always)]
-    pub(super) fn begin(&mut self, rays: usize, most: usize) {
-        self.most = most;
+    pub(super) fn begin(&mut self, rays: usize, max_samples: usize) {
+        self.max_samples = max_samples;
         self.counts.clear();
         self.counts.resize(rays, 0);
-        self.samples.resize(rays * most, [0.0; 2]);
+        self.samples.resize(rays * max_samples, [0.0; 2]);
     }
 
-    /// t and length of an active ray's sample.
+    /// Returns t and length of an active ray's sample.
     #[inline(always)]
-    pub(super) fn sample(&self, place: usize, slot: usize) -> [f32; 2] {
-        self.samples[place * self.most + slot]
+    pub(super) fn sample(&self, active_index: usize, slot: usize) -> [f32; 2] {
+        self.samples[active_index * self.max_samples + slot]
     }
 
     /// Puts a sample into the next slot of an active ray.
     #[inline(always)]
-    pub(super) fn put(&mut self, place: usize, t: f32, length: f32) {
-        let count = &mut self.counts[place];
-        self.samples[place * self.most + *count] = [t, length];
+    pub(super) fn put(&mut self, active_index: usize, t: f32, length: f32) {
+        let count = &mut self.counts[active_index];
+        self.samples[active_index * self.max_samples + *count] = [t, length];
         *count += 1;
     }
 }
 
-impl Marched {
+impl MarchedSamples {
     #[inline(always)]
     pub(super) fn push(&mut self, t: f32, length: f32, position: [f32; 3]) {
         self.t.push(t);

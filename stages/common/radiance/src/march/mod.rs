@@ -1,9 +1,8 @@
-//! Where rays take samples: they march by equal steps, and leap over what is empty.
+//! Ray marching: samples at equal steps in occupied cells, leaps over empty cubes.
 
-mod bent;
+mod curved;
+mod lanes;
 mod marched;
-mod side_by_side;
-mod steps;
 mod straight;
 #[cfg(test)]
 mod tests;
@@ -11,23 +10,22 @@ mod tests;
 use crate::ray::RayMap;
 use crate::simd::kernel;
 
-use bent::Bent;
-pub(crate) use marched::{DONE, March, Marched};
+use curved::Curved;
+pub(crate) use marched::{DONE, March, MarchedSamples};
 use straight::Straight;
 
 kernel! {
-    /// Marches on: at most `most` more samples of each of the `active` rays, all of one scene. Step
-    /// k of a ray lies at t = enter + (k + offset)·step. An occupied cell gives a sample there;
-    /// where [`Strides`](crate::strides::Strides) are double, it gives a sample of two steps where
-    /// k is even, in the middle of both. `next` is each ray's k, from 0 to [`DONE`].
-    pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32],
-        samples: &mut Marched) {
-        let is_bent = |r: &u32| matches!(march.rays[*r as usize].map, RayMap::Contracted { .. });
-        // Of a scene with bent rays, those that meet nothing have a straight one's map.
-        if active.iter().any(is_bent) {
-            side_by_side::march::<Bent>(march, most, active, next, samples);
+    /// Finds at most `max_samples` more samples of each of the `active` rays, all of one scene.
+    /// Step k of a ray is at t = enter + (k + offset)·step and has a sample if its cell is
+    /// occupied. At double [`Strides`](crate::spec::Strides) only even steps have one: two steps
+    /// long, in the middle of both. `next` has each ray's k, from 0 to [`DONE`].
+    pub(crate) fn march<L>(march: &March<'_>, max_samples: usize, active: &[u32], next: &mut [u32],
+        samples: &mut MarchedSamples) {
+        // A scene has rays of one kind, but a ray that misses the cube has a straight one's map.
+        if active.iter().any(|&r| matches!(march.rays[r as usize].map, RayMap::Contracted { .. })) {
+            lanes::march::<Curved>(march, max_samples, active, next, samples);
         } else {
-            side_by_side::march::<Straight>(march, most, active, next, samples);
+            lanes::march::<Straight>(march, max_samples, active, next, samples);
         }
         samples.starts.push(samples.t.len());
     }

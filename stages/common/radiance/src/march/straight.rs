@@ -1,12 +1,12 @@
-//! Straight rays: through a box, and through a frustum's normalised device coordinates.
+//! Straight rays: through a box, or through a frustum in normalised device coordinates.
 
-use super::side_by_side::{LaneRays, Places, RayKind};
+use super::lanes::{LanePositions, LaneRays, RayKind};
 use crate::occupancy::Occupancy;
 use crate::ray::NormalizedRay;
 use crate::simd::LANES;
 use crate::spec::OCCUPANCY_CELLS as GRID;
 
-/// The kind of straight rays.
+/// Rays through a box or a frustum.
 pub(super) struct Straight;
 
 impl RayKind for Straight {
@@ -19,8 +19,8 @@ impl RayKind for Straight {
         occupancy.crossing(ray, inverse)
     }
 
-    /// As [`NormalizedRay::position`], whose other branch takes an exponential: the compiler would
-    /// compute it here, too.
+    /// Returns the position at t. [`NormalizedRay::position`] has a branch with an exponential,
+    /// which the compiler would evaluate for straight rays, too.
     #[inline(always)]
     fn position(ray: &NormalizedRay, t: f32) -> [f32; 3] {
         std::array::from_fn(|axis| ray.direction[axis].mul_add(t, ray.origin[axis]))
@@ -33,16 +33,20 @@ impl RayKind for Straight {
     }
 
     #[inline(always)]
-    fn exits(rays: &LaneRays, places: &Places, sizes: &[u32; LANES]) -> [f32; LANES] {
+    fn exits(
+        rays: &LaneRays,
+        lane_positions: &LanePositions,
+        sizes: &[u32; LANES],
+    ) -> [f32; LANES] {
         let mut exits = [f32::INFINITY; LANES];
-        leave_along(0, rays, places, sizes, &mut exits);
-        leave_along(1, rays, places, sizes, &mut exits);
-        leave_along(2, rays, places, sizes, &mut exits);
+        leave_along(0, rays, lane_positions, sizes, &mut exits);
+        leave_along(1, rays, lane_positions, sizes, &mut exits);
+        leave_along(2, rays, lane_positions, sizes, &mut exits);
         exits
     }
 }
 
-/// Coordinates along an axis.
+/// Returns the positions' coordinates along one axis.
 #[inline(always)]
 fn along(origin: &[f32; LANES], direction: &[f32; LANES], t: &[f32; LANES]) -> [f32; LANES] {
     let mut positions = [0.0; LANES];
@@ -52,17 +56,17 @@ fn along(origin: &[f32; LANES], direction: &[f32; LANES], t: &[f32; LANES]) -> [
     positions
 }
 
-/// Shortens `exits` to where rays leave along an axis.
+/// Shortens `exits` to the t at which rays leave their cubes along one axis.
 #[inline(always)]
 fn leave_along(
     axis: usize,
     rays: &LaneRays,
-    places: &Places,
+    lane_positions: &LanePositions,
     sizes: &[u32; LANES],
     exits: &mut [f32; LANES],
 ) {
     let (origin, direction) = (&rays.origin[axis], &rays.direction[axis]);
-    let (inverse, cells) = (&rays.inverse[axis], &places.cells[axis]);
+    let (inverse, cells) = (&rays.inverse[axis], &lane_positions.cells[axis]);
     for i in 0..LANES {
         let side = if direction[i] > 0.0 { 1 << sizes[i] } else { 0 };
         let face = ((cells[i] >> sizes[i] << sizes[i]) + side) as i32 as f32 / GRID as f32;

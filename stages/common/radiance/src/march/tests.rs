@@ -1,21 +1,21 @@
 use counter_rng::CounterRng;
 use scene::{Bounds, Space};
 
-use super::bent::EmptyCube;
-use super::{DONE, March, Marched, march};
-use crate::occupancy::{Cell, Occupancy, cell_of, corner};
+use super::curved::EmptyCube;
+use super::{DONE, March, MarchedSamples, march};
+use crate::occupancy::{Cell, Occupancy, cell_at, cell_coordinates};
 use crate::ray::{NormalizedRay, Ray, RayMap, clip, contracted_velocity};
 use crate::spec::OCCUPANCY_CELLS as GRID;
-use crate::strides::Strides;
+use crate::spec::Strides;
 
-/// What step k of a ray gives, without leaps: a sample's t and its length.
+/// Returns t and length of the sample at step k of a ray, without leaps.
 fn sample(march: &March<'_>, k: u32) -> Option<(f32, f32)> {
     let March { occupancy, rays: &[ray], step, strides, .. } = *march else {
         panic!("one ray at a time");
     };
     let t = (k as f32 + 0.3).mul_add(step, ray.enter);
     let middle = (k as f32 + 0.3 + 0.5).mul_add(step, ray.enter);
-    let c = cell_of(ray.position(t));
+    let c = cell_at(ray.position(t));
     let held = occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2]));
     if held == Cell::Empty || t >= ray.leave {
         None
@@ -31,7 +31,7 @@ const STRIDES: [Strides; 3] = [Strides::Even, Strides::ByCell, Strides::Double];
 /// All samples of a ray without leaps, and those found by marching in parts, as the renderer
 /// does.
 fn both(occupancy: &Occupancy, ray: NormalizedRay, strides: Strides) -> [Vec<(f32, f32)>; 2] {
-    let (mut next, mut found) = ([0], Marched::default());
+    let (mut next, mut found) = ([0], MarchedSamples::default());
     let step = 3.0f32.sqrt() / 512.0;
     let march_on = March { occupancy, rays: &[ray], offsets: &[0.3], step, strides };
     while next[0] != DONE {
@@ -70,7 +70,7 @@ fn planes() -> Occupancy {
 /// A plate at a face, a cell thick: little lies between the extent's faces.
 fn plate() -> Occupancy {
     let mut occupancy = Occupancy::full();
-    occupancy.set(|cell| match corner(cell, GRID) {
+    occupancy.set(|cell| match cell_coordinates(cell, GRID) {
         [x, _, 0] if x > 70 => Cell::Dense,
         _ => Cell::Empty,
     });
@@ -105,7 +105,7 @@ fn nothing_gives_no_sample() {
     }
 }
 
-/// What each ray finds doesn't depend on the rays beside it, of which some miss.
+/// Each ray's samples don't depend on the rays in other lanes, of which some miss the cube.
 #[test]
 fn rays_march_together_as_each_alone() {
     let misses = Ray { origin: [9.0; 3], direction: [1.0, 0.0, 0.0], background: [0.0; 3] };
@@ -122,7 +122,7 @@ fn rays_march_together_as_each_alone() {
             let all =
                 March { occupancy: &occupancy, rays: &rays, offsets: &offsets, step, strides };
             let (mut next, mut together) = ([0; 100], vec![Vec::new(); 100]);
-            let mut found = Marched::default();
+            let mut found = MarchedSamples::default();
             let mut active: Vec<u32> = (0..100).collect();
             while !active.is_empty() {
                 found.starts.clear();
@@ -143,7 +143,7 @@ fn rays_march_together_as_each_alone() {
             }
             for (r, together) in together.iter().enumerate() {
                 let one = March { rays: &rays[r..=r], offsets: &offsets[r..=r], ..all };
-                let (mut next, mut found) = ([0], Marched::default());
+                let (mut next, mut found) = ([0], MarchedSamples::default());
                 while next[0] != DONE {
                     march(&one, 9, &[0], &mut next, &mut found);
                 }
@@ -155,11 +155,11 @@ fn rays_march_together_as_each_alone() {
     }
 }
 
-/// Bent rays leap over empty cells, bricks and blocks of all sizes, and lose no sample.
+/// Curved rays leap over empty cells, bricks and blocks of all sizes, and lose no sample.
 #[test]
 fn bent_rays_lose_no_sample() {
     let mut occupancy = Occupancy::full();
-    let middle = |cell: usize| corner(cell, GRID).map(|c| (c as f32 + 0.5) / GRID as f32);
+    let middle = |cell: usize| cell_coordinates(cell, GRID).map(|c| (c as f32 + 0.5) / GRID as f32);
     let mut rng = CounterRng::new(3, 0, 0);
     let balls: Vec<[f32; 4]> = (0..40).map(|_| [(); 4].map(|()| rng.uniform())).collect();
     let is_inside = |p: [f32; 3], [x, y, z, size]: [f32; 4]| {
@@ -201,7 +201,7 @@ fn bent_ray(seed: u64, wide: f32) -> NormalizedRay {
     clip(&AROUND, &Ray { origin: origin.map(f64::from), direction, background: [0.0; 3] })
 }
 
-/// Bent rays leap far through empty cubes, and never out of them: as far as cells tell.
+/// Curved rays leap far through empty cubes, and never out of them: as far as cells tell.
 #[test]
 fn bent_rays_leap_within_a_cube() {
     let (mut leaps, mut far) = (0, 0);
@@ -212,14 +212,14 @@ fn bent_rays_leap_within_a_cube() {
         for size in [2, 4] {
             let at = (ray.leave - ray.enter).mul_add(rng.uniform(), ray.enter);
             let position = ray.position(at);
-            let (low, side) = (cell_of(position).map(|c| c >> size << size), 1 << size);
-            let cube = EmptyCube::around(cell_of(position).map(|c| c as u32), size);
+            let (low, side) = (cell_at(position).map(|c| c >> size << size), 1 << size);
+            let cube = EmptyCube::around(cell_at(position).map(|c| c as u32), size);
             let velocity = contracted_velocity(ray.origin, ray.direction, radii, at);
             let exit = (at + cube.time_inside(&position, &velocity)).min(ray.leave);
             assert!(exit >= at);
             for i in 0..64 {
                 let t = (exit - at).mul_add(i as f32 / 64.0, at);
-                let cell = cell_of(ray.position(t));
+                let cell = cell_at(ray.position(t));
                 let is_inside =
                     (0..3).all(|axis| (low[axis]..low[axis] + side).contains(&cell[axis]));
                 // A place at a face may lie in either cell, by rounding.

@@ -3,56 +3,60 @@ use std::path::Path;
 use safetensors::SafeTensors;
 
 use super::{Moments, Trainer};
+use crate::field::Field;
 use crate::occupancy::CELLS;
-use crate::tally::Tally;
-use crate::tensors::{FieldError, FieldProblem, Tensor, read_f32, read_u8, write_tensors};
+use crate::tensors::{
+    FieldError, FieldProblem, Tensor, read_f32, read_tensors, read_u8, write_tensors,
+};
+use crate::training_state::TrainingState;
 
 impl Trainer {
-    /// Writes all that a resumed training needs to end in the same bytes. The caller makes it
-    /// atomic.
+    /// Writes a checkpoint from which a resumed training ends in the same bytes. Not atomic: the
+    /// caller renames the file.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), FieldError> {
-        let counters = self.tally.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
+        let counters = self.state.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
         let counters: Vec<u8> = counters.flat_map(u64::to_le_bytes).collect();
         let occupied = self.field.occupancy.to_bytes();
         let average = self.average.iter();
         let average = average.flat_map(|a| {
-            [("average.grid", Tensor::F32(&a.grid)), ("average.network", Tensor::F32(&a.network))]
+            [
+                ("average.grid", Tensor::of_floats(&a.grid)),
+                ("average.network", Tensor::of_floats(&a.network)),
+            ]
         });
         let tensors: Vec<_> = average
             .chain([
-                ("counters", Tensor::U8(&counters)),
-                ("density", Tensor::F32(self.field.occupancy.density())),
-                ("first.grid", Tensor::F32(&self.first.grid)),
-                ("first.network", Tensor::F32(&self.first.network)),
-                ("grid", Tensor::F32(&self.field.grid)),
-                ("network", Tensor::F32(&self.field.network)),
-                ("occupied", Tensor::U8(&occupied)),
-                ("second.grid", Tensor::F32(&self.second.grid)),
-                ("second.network", Tensor::F32(&self.second.network)),
+                ("counters", Tensor::of_bytes(&counters)),
+                ("density", Tensor::of_floats(self.field.occupancy.density())),
+                ("first.grid", Tensor::of_floats(&self.first.grid)),
+                ("first.network", Tensor::of_floats(&self.first.network)),
+                ("grid", Tensor::of_floats(&self.field.grid)),
+                ("network", Tensor::of_floats(&self.field.network)),
+                ("occupied", Tensor::of_bytes(&occupied)),
+                ("second.grid", Tensor::of_floats(&self.second.grid)),
+                ("second.network", Tensor::of_floats(&self.second.network)),
             ])
             .collect();
         write_tensors(path, &tensors)
     }
 
-    /// The step a checkpoint was written at.
+    /// Returns the step at which a checkpoint was written.
     pub fn checkpoint_step(path: &Path) -> Result<u64, FieldError> {
-        read_counters(path, |_, counters| Ok(counters[0]))
+        read_tensors(path, |tensors| Ok(read_counters(tensors)?[0]))
     }
 
-    /// Goes on from a checkpoint of a trainer made with the same field and options. After an error
-    /// the trainer is as it was.
+    /// Resumes from a checkpoint of a trainer with the same field and options. On error the trainer
+    /// is unchanged.
     pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
-        read_counters(path, |tensors, counters| {
+        read_tensors(path, |tensors| {
+            let [state @ .., samples_per_ray] = read_counters(tensors)?;
             let field = &mut self.field;
-            let moments = |name: &str| {
-                let mut moments = Moments::zeros(field);
-                read_f32(tensors, &format!("{name}grid"), &mut moments.grid)?;
-                read_f32(tensors, &format!("{name}network"), &mut moments.network)?;
-                Ok::<_, FieldProblem>(moments)
-            };
-            let (first, second, weights) = (moments("first.")?, moments("second.")?, moments("")?);
+            let first = read_moments(tensors, "first.", field)?;
+            let second = read_moments(tensors, "second.", field)?;
+            let weights = read_moments(tensors, "", field)?;
             let is_averaged = tensors.names().contains(&"average.grid");
-            let average = is_averaged.then(|| moments("average.")).transpose()?;
+            let average =
+                is_averaged.then(|| read_moments(tensors, "average.", field)).transpose()?;
             let mut density = vec![0.0; CELLS];
             read_f32(tensors, "density", &mut density)?;
             let occupied = read_u8(tensors, "occupied", CELLS)?;
@@ -60,31 +64,27 @@ impl Trainer {
             (self.first, self.second, self.average) = (first, second, average);
             (field.grid, field.network) = (weights.grid, weights.network);
             field.occupancy.restore(density, &occupied);
-            let [tally @ .., samples_per_ray] = counters;
-            self.tally = Tally::from_counters(tally);
+            self.state = TrainingState::from_counters(state);
             self.samples_per_ray = f64::from_bits(samples_per_ray);
             Ok(())
         })
     }
 }
 
-/// Opens a checkpoint and reads its six counters.
-fn read_counters<T>(
-    path: &Path,
-    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, FieldProblem>,
-) -> Result<T, FieldError> {
-    let bytes = std::fs::read(path)
-        .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
-    counters_of(&bytes, then)
-        .map_err(|reason| FieldError::Format { path: path.to_path_buf(), reason })
+/// Reads the tensors `{prefix}grid` and `{prefix}network`.
+fn read_moments(
+    tensors: &SafeTensors<'_>,
+    prefix: &str,
+    field: &Field,
+) -> Result<Moments, FieldProblem> {
+    let mut moments = Moments::zeros(field);
+    read_f32(tensors, &format!("{prefix}grid"), &mut moments.grid)?;
+    read_f32(tensors, &format!("{prefix}network"), &mut moments.network)?;
+    Ok(moments)
 }
 
-/// The same of a checkpoint's bytes.
-fn counters_of<T>(
-    bytes: &[u8],
-    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, FieldProblem>,
-) -> Result<T, FieldProblem> {
-    let tensors = SafeTensors::deserialize(bytes)?;
-    let counters = read_u8(&tensors, "counters", 48)?;
-    then(&tensors, std::array::from_fn(|i| u64::from_le_bytes(counters.as_chunks::<8>().0[i])))
+/// Reads a checkpoint's six counters.
+fn read_counters(tensors: &SafeTensors<'_>) -> Result<[u64; 6], FieldProblem> {
+    let bytes = read_u8(tensors, "counters", 48)?;
+    Ok(std::array::from_fn(|i| u64::from_le_bytes(bytes.as_chunks::<8>().0[i])))
 }

@@ -1,86 +1,115 @@
 use counter_rng::uniform;
 
 use crate::chunk::Roulette;
+use crate::ray::Ray;
 use crate::regularisers::Regularisers;
-use crate::tally::Tally;
+use crate::training_state::TrainingState;
 
-/// Steps between those of the weights' average, and the share of the rays after which it begins.
-const AVERAGE_EVERY: u64 = 4;
-const AVERAGE_FROM: f64 = 0.7;
+/// Training steps per update of the averaged weights; chosen by hand.
+const AVERAGE_INTERVAL_STEPS: u64 = 4;
+/// Fraction of the rays after which weights are averaged (docs/design/007).
+const AVERAGE_START: f64 = 0.7;
 
-/// Samples of the last step over those of the first. Small steps find the shape early; later,
-/// larger steps have less noise.
+/// Samples of the last step over those of the first (docs/design/037): small steps find the shape
+/// early, large ones have less noise.
 const STEP_GROWTH: f64 = 8.0 / 3.0;
 
-/// How to train.
+/// Minimum number of rays of a step while rays have many samples; chosen by hand.
+const MIN_RAYS_PER_STEP: usize = 256;
+
+/// Options of a training.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrainingOptions {
-    /// Rays in all.
+    /// Number of rays of the whole training.
     pub rays: u64,
-    /// Most rays in a step.
+    /// Maximum number of rays per step.
     pub max_rays_per_step: usize,
-    /// Samples that the first steps aim at; the last steps aim at 8/3 times as many. While space is
-    /// full of semi-transparent density, steps have fewer rays.
+    /// Target number of samples of the first step; the last step has 8/3 times as many. While space
+    /// is full of semi-transparent density, steps have fewer rays.
     pub samples_per_step: usize,
-    /// Learning rate of the grid's coarsest level at its highest.
+    /// Maximum learning rate of the grid's coarsest level.
     pub learning_rate: f64,
-    /// Learning rate of a level over that of the next coarser one.
+    /// Ratio of a level's learning rate to that of the next coarser level.
     pub level_rate: f64,
-    /// Learning rate of the MLPs at its highest.
+    /// Maximum learning rate of the MLPs.
     pub mlp_learning_rate: f64,
-    /// Learning rate at the end, as a share of the highest.
+    /// Final learning rate over the maximum.
     pub learning_rate_decay: f64,
-    /// Steps of linear warm-up.
+    /// Number of steps of linear warm-up.
     pub warm_up: u64,
-    /// Share that the weights' exponential moving average keeps at each of its steps; 0 for no
-    /// average.
+    /// Decay of the weights' exponential moving average per update; 0 disables the average.
     pub ema_decay: f32,
-    /// What is asked of rays beside their colours.
+    /// Weights of the losses other than the colour error.
     pub regularisers: Regularisers,
     /// Weight decay of the networks.
     pub network_decay: f32,
-    /// Samples whose gradient is shorter than so many times the mean of those around go back to the
-    /// grid at random, as often as their share of it says and lengthened by as much (Russian
-    /// roulette): the expected gradient stays. 0 takes all back.
+    /// Threshold of Russian roulette, as a multiple m of the mean gradient norm in a chunk; 0
+    /// propagates all gradients. A sample whose norm g is below m propagates its gradient with
+    /// probability g/m, multiplied by m/g, so the expected gradient is unchanged.
     pub roulette: f32,
-    /// Seed of everything that is drawn.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
 impl TrainingOptions {
-    /// Rays in a step, where a ray had so many samples in the one before.
-    pub fn rays_of_step(&self, tally: &Tally, samples_per_ray: f64) -> usize {
-        let samples = self.samples_per_step as f64 * libm::pow(STEP_GROWTH, tally.done(self.rays));
-        let wanted = (samples / samples_per_ray.max(0.1)) as usize;
-        wanted.clamp(256, self.max_rays_per_step.max(256))
+    /// Returns the target number of rays of a step, given the last step's mean number of samples
+    /// per ray.
+    pub fn rays_of_step(&self, state: &TrainingState, samples_per_ray: f64) -> usize {
+        let growth = libm::pow(STEP_GROWTH, state.progress(self.rays));
+        let rays = self.samples_per_step as f64 * growth / samples_per_ray.max(0.1);
+        (rays as usize).clamp(MIN_RAYS_PER_STEP, self.max_rays_per_step.max(MIN_RAYS_PER_STEP))
     }
 
-    /// What learning rates are multiplied with in a step: they rise at first, and fall
-    /// exponentially.
-    pub fn schedule(&self, tally: &Tally) -> f64 {
-        let warm = ((tally.steps + 1) as f64 / self.warm_up.max(1) as f64).min(1.0);
-        tally.rate_scale * warm * libm::pow(self.learning_rate_decay, tally.done(self.rays))
+    /// Returns the factor of all learning rates in a step: linear warm-up, then exponential decay.
+    pub fn schedule(&self, state: &TrainingState) -> f64 {
+        let warm = ((state.steps + 1) as f64 / self.warm_up.max(1) as f64).min(1.0);
+        state.learning_rate_scale
+            * warm
+            * libm::pow(self.learning_rate_decay, state.progress(self.rays))
     }
 
-    /// Share of a step by which the samples of a ray are shifted, by its number in the training.
+    /// Returns the fraction of a step by which a ray's samples are shifted. `ray` counts from 0
+    /// over the whole training.
     pub fn offset(&self, ray: u64) -> f32 {
         uniform(self.seed, 4, ray)
     }
 
-    /// The draw of a chunk, by the number of its first ray.
+    /// Returns the roulette of a chunk, seeded by the index of its first ray.
     pub(super) fn roulette(&self, ray: u64) -> Roulette {
         Roulette { limit: self.roulette, draw: uniform(self.seed, 5, ray) }
     }
 
-    /// Learning rate of a level, for a schedule.
+    /// Returns the learning rate of a level, given [`TrainingOptions::schedule`].
     pub fn rate_of_level(&self, level: usize, schedule: f64) -> f64 {
         self.learning_rate * schedule * self.level_rate.powi(level as i32)
     }
 
-    /// Whether weights go into their average now.
-    pub fn averages(&self, tally: &Tally) -> bool {
+    /// Returns whether the averaged weights are updated after this step.
+    pub fn is_averaging_step(&self, state: &TrainingState) -> bool {
         self.ema_decay > 0.0
-            && tally.done(self.rays) > AVERAGE_FROM
-            && tally.steps.is_multiple_of(AVERAGE_EVERY)
+            && state.progress(self.rays) > AVERAGE_START
+            && state.steps.is_multiple_of(AVERAGE_INTERVAL_STEPS)
     }
+}
+
+/// Source of training rays and of the loss of their colours. Rays come in bundles, each with one
+/// loss: the s×s sub-pixel rays of an LR pixel are a pixel bundle.
+pub trait Supervisor: Sync {
+    /// Sets the fraction of the training's rays that have been cast. Called before every step; the
+    /// size of a bundle may depend on it alone.
+    fn set_progress(&mut self, _progress: f64) {}
+    /// Returns the number of rays per bundle in this step.
+    fn rays_per_bundle(&self) -> usize;
+    /// Casts the rays of a bundle. `bundle` counts from 0 over the whole training; random numbers
+    /// may depend on it alone.
+    fn sample_rays(&self, bundle: u64, rays: &mut [Ray]);
+    /// Returns the bundle's loss, given its rays' colours, and writes the gradient by each colour.
+    fn loss_and_gradient(
+        &self,
+        bundle: u64,
+        colours: &[[f32; 3]],
+        gradients: &mut [[f32; 3]],
+    ) -> f64;
+    /// Stores a bundle's rendered colours. Called in bundle order after each step that was applied.
+    fn remember(&mut self, _bundle: u64, _colours: &[[f32; 3]]) {}
 }

@@ -1,29 +1,28 @@
 use std::ops::Range;
 
-use super::options::TrainingOptions;
+use super::options::{Supervisor, TrainingOptions};
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
 use crate::field::Field;
-use crate::occupancy::Met;
+use crate::occupancy::CellHit;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};
-use crate::strides::Strides;
-use crate::supervisor::Supervisor;
+use crate::spec::Strides;
 
-/// What all shards of a step read.
+/// Inputs shared by all shards of a step.
 pub(super) struct StepWork<'a, S> {
     pub(super) field: &'a Field,
-    /// The networks' weights output by output.
+    /// Transposed weights of the networks.
     pub(super) transposed: &'a [f32],
     pub(super) supervision: &'a S,
     pub(super) options: &'a TrainingOptions,
     pub(super) strides: Strides,
     pub(super) first_bundle: u64,
     pub(super) first_ray: u64,
-    /// Bundles of the step.
+    /// Number of bundles of the step.
     pub(super) bundles: usize,
 }
 
-/// What a shard leaves for the sums.
+/// Results of a shard.
 #[derive(Default)]
 pub(super) struct Shard {
     pub(super) colours: Vec<[f32; 3]>,
@@ -31,8 +30,8 @@ pub(super) struct Shard {
     pub(super) network: Vec<f32>,
     pub(super) loss: f64,
     pub(super) samples: usize,
-    /// Cells where light was stopped.
-    pub(super) met: Vec<Met>,
+    /// Densities and cells of samples that stop light.
+    pub(super) hits: Vec<CellHit>,
 }
 
 /// Buffers of one thread.
@@ -48,7 +47,7 @@ pub(super) struct Worker {
 }
 
 impl Shard {
-    /// Takes a range of the step's bundles forward and back.
+    /// Runs the forward and backward pass of a range of the step's bundles.
     pub(super) fn run(
         &mut self,
         worker: &mut Worker,
@@ -57,7 +56,7 @@ impl Shard {
     ) {
         self.colours.clear();
         self.features.clear();
-        self.met.clear();
+        self.hits.clear();
         self.network.resize(work.field.network.len(), 0.0);
         self.network.fill(0.0);
         (self.loss, self.samples) = (0.0, 0);
@@ -70,7 +69,7 @@ impl Shard {
         }
     }
 
-    /// Takes a few bundles forward and back.
+    /// Runs the forward and backward pass of a chunk's bundles.
     fn run_chunk(
         &mut self,
         worker: &mut Worker,
@@ -83,9 +82,9 @@ impl Shard {
         worker.rays.resize(rays, Ray::default());
         worker.colours.resize(rays, [0.0; 3]);
         worker.gradients.resize(rays, [0.0; 3]);
-        let numbers = here.clone().map(|g| work.first_bundle + g as u64);
-        for (number, rays) in numbers.clone().zip(worker.rays.chunks_exact_mut(bundle)) {
-            supervision.sample_rays(number, rays);
+        let first_bundle = work.first_bundle + here.start as u64;
+        for (i, rays) in worker.rays.chunks_exact_mut(bundle).enumerate() {
+            supervision.sample_rays(first_bundle + i as u64, rays);
         }
         worker.clipped.clear();
         worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
@@ -96,30 +95,30 @@ impl Shard {
         worker.offsets.extend((0..rays as u64).map(|r| options.offset(first_ray + r)));
         worker.chunk.forward(field, &worker.clipped, &worker.offsets, work.strides);
         self.samples += worker.chunk.samples();
-        worker.chunk.list_met(field.step(), &mut self.met);
-        for (colour, (sum, background)) in
-            worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds))
-        {
-            *colour =
+        worker.chunk.list_hits(field.step(), &mut self.hits);
+        for (r, sum) in worker.chunk.sums.iter().enumerate() {
+            let background = worker.backgrounds[r];
+            worker.colours[r] =
                 std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
         }
-        let judged =
-            worker.colours.chunks_exact(bundle).zip(worker.gradients.chunks_exact_mut(bundle));
-        for (number, (colours, gradients)) in numbers.zip(judged) {
-            self.loss += supervision.loss_and_gradient(number, colours, gradients);
+        for (i, colours) in worker.colours.chunks_exact(bundle).enumerate() {
+            let gradients = &mut worker.gradients[i * bundle..][..bundle];
+            self.loss += supervision.loss_and_gradient(first_bundle + i as u64, colours, gradients);
         }
         self.colours.extend_from_slice(&worker.colours);
         let scale = 1.0 / work.bundles as f32;
-        worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
-        let towards = RayGradients {
+        for gradient in worker.gradients.iter_mut().flatten() {
+            *gradient *= scale;
+        }
+        let upstream = RayGradients {
             colours: &worker.gradients,
             backgrounds: &worker.backgrounds,
-            regularisers: options.regularisers.of_ray(scale, bundle),
+            regularisers: options.regularisers.per_ray(scale, bundle),
         };
         let mut network = NetworkGradients { transposed: work.transposed, sums: &mut self.network };
         worker.chunk.backward(
             field,
-            towards,
+            upstream,
             options.roulette(first_ray),
             &mut network,
             &mut self.features,

@@ -1,0 +1,281 @@
+//! Rays march in parallel lanes. Leaps of one ray depend on each other, so a ray alone would wait
+//! for each.
+
+use super::marched::{DONE, March, MarchedSamples};
+use crate::math::floor;
+use crate::occupancy::{OCCUPIED, Occupancy, cell_along};
+use crate::ray::NormalizedRay;
+use crate::simd::LANES;
+
+/// Paths of straight or curved rays through the unit cube, for all lanes at once.
+pub(super) trait RayKind {
+    /// Returns the range of t in which a ray may cross occupied cells; `None` if there is none.
+    /// `inverse` is 1 over the ray's direction.
+    fn crossing(occupancy: &Occupancy, ray: &NormalizedRay, inverse: &[f32; 3])
+    -> Option<[f32; 2]>;
+
+    /// Returns the position of one ray at t.
+    fn position(ray: &NormalizedRay, t: f32) -> [f32; 3];
+
+    /// Returns the rays' positions at t, one array per axis.
+    fn positions(rays: &LaneRays, t: &[f32; LANES]) -> [[f32; LANES]; 3];
+
+    /// Returns a t at which each ray is inside, or leaves, the empty cube of 2^size cells per side
+    /// around its position.
+    fn exits(rays: &LaneRays, lane_positions: &LanePositions, sizes: &[u32; LANES])
+    -> [f32; LANES];
+}
+
+/// Mask of an empty cube's size: shifts known to be below 32 vectorise without a check.
+const SIZE_BITS: u32 = 7;
+
+/// The rays of all lanes.
+pub(super) struct LaneRays {
+    /// Origins, one array per axis.
+    pub(super) origin: [[f32; LANES]; 3],
+    pub(super) direction: [[f32; LANES]; 3],
+    /// 1 over the direction.
+    pub(super) inverse: [[f32; LANES]; 3],
+    /// `radii` of a curved ray's map.
+    pub(super) radii: [f32; LANES],
+    offset: [f32; LANES],
+    enter: [f32; LANES],
+    leave: [f32; LANES],
+}
+
+/// Positions of the rays of all lanes.
+pub(super) struct LanePositions {
+    pub(super) t: [f32; LANES],
+    /// Positions in the unit cube, one array per axis.
+    pub(super) positions: [[f32; LANES]; 3],
+    pub(super) cells: [[u32; LANES]; 3],
+}
+
+/// State of the rays that march in lanes.
+struct RayLanes<'a> {
+    march: &'a March<'a>,
+    /// Maximum number of samples per ray.
+    max_samples: usize,
+    /// Rays to march.
+    active: &'a [u32],
+    /// Index in `active` of the next ray without a lane.
+    next_active: usize,
+    /// Bits of the lanes that have a ray.
+    occupied_lanes: u32,
+    /// Index in `active` of each lane's ray.
+    active_index: [usize; LANES],
+    rays: LaneRays,
+    /// End of each lane's range of t.
+    until: [f32; LANES],
+    /// Number of each lane's next step.
+    k: [u32; LANES],
+}
+
+/// Marches rays of one kind, see [`super::march`].
+#[inline(always)]
+pub(super) fn march<K: RayKind>(
+    march: &March<'_>,
+    max_samples: usize,
+    active: &[u32],
+    next: &mut [u32],
+    samples: &mut MarchedSamples,
+) {
+    samples.slots.begin(active.len(), max_samples);
+    let mut lanes = RayLanes::new(march, max_samples, active);
+    for lane in 0..LANES {
+        lanes.assign_ray::<K>(lane, next);
+    }
+    while lanes.occupied_lanes != 0 {
+        let (lane_positions, mut stops) = lanes.advance::<K>();
+        while stops != 0 {
+            let lane = stops.trailing_zeros() as usize;
+            stops &= stops - 1;
+            let r = active[lanes.active_index[lane]] as usize;
+            if lane_positions.t[lane] >= lanes.until[lane] {
+                next[r] = DONE;
+            } else if lanes.sample(lane, &lane_positions, samples) {
+                continue;
+            } else {
+                next[r] = lanes.k[lane];
+            }
+            lanes.assign_ray::<K>(lane, next);
+        }
+    }
+    append_slots::<K>(march.rays, active, samples);
+}
+
+/// Appends the samples in the slots, by ray.
+#[inline(always)]
+fn append_slots<K: RayKind>(rays: &[NormalizedRay], active: &[u32], samples: &mut MarchedSamples) {
+    for (active_index, &r) in active.iter().enumerate() {
+        samples.starts.push(samples.t.len());
+        for slot in 0..samples.slots.counts[active_index] {
+            let [t, length] = samples.slots.sample(active_index, slot);
+            samples.push(t, length, K::position(&rays[r as usize], t));
+        }
+    }
+}
+
+impl LaneRays {
+    #[inline(always)]
+    fn new() -> Self {
+        let (row, rows) = ([0.0; LANES], [[0.0; LANES]; 3]);
+        Self {
+            origin: rows,
+            direction: rows,
+            inverse: rows,
+            radii: row,
+            offset: row,
+            enter: row,
+            leave: row,
+        }
+    }
+
+    #[inline(always)]
+    fn set(&mut self, lane: usize, ray: &NormalizedRay, inverse: [f32; 3], offset: f32) {
+        for axis in 0..3 {
+            self.origin[axis][lane] = ray.origin[axis];
+            self.direction[axis][lane] = ray.direction[axis];
+            self.inverse[axis][lane] = inverse[axis];
+        }
+        self.radii[lane] = ray.radii();
+        (self.offset[lane], self.enter[lane], self.leave[lane]) = (offset, ray.enter, ray.leave);
+    }
+}
+
+impl<'a> RayLanes<'a> {
+    #[inline(always)]
+    fn new(march: &'a March<'a>, max_samples: usize, active: &'a [u32]) -> Self {
+        Self {
+            march,
+            max_samples,
+            active,
+            next_active: 0,
+            occupied_lanes: 0,
+            active_index: [0; LANES],
+            rays: LaneRays::new(),
+            until: [0.0; LANES],
+            k: [0; LANES],
+        }
+    }
+
+    /// Assigns to a lane the next active ray that crosses occupied cells.
+    #[inline(always)]
+    fn assign_ray<K: RayKind>(&mut self, lane: usize, next: &mut [u32]) {
+        self.occupied_lanes &= !(1 << lane);
+        while let Some(&r) = self.active.get(self.next_active) {
+            let (ray, offset) = (&self.march.rays[r as usize], self.march.offsets[r as usize]);
+            let inverse = ray.direction.map(|d| 1.0 / d);
+            self.next_active += 1;
+            let Some([from, until]) = K::crossing(self.march.occupancy, ray, &inverse) else {
+                next[r as usize] = DONE;
+                continue;
+            };
+            self.rays.set(lane, ray, inverse, offset);
+            self.until[lane] = until;
+            let first = first_step((from - ray.enter).mul_add(1.0 / self.march.step, -offset));
+            self.k[lane] = first.max(next[r as usize]);
+            self.active_index[lane] = self.next_active - 1;
+            self.occupied_lanes |= 1 << lane;
+            return;
+        }
+    }
+
+    /// Advances every ray in an empty cube to the cube's exit. Returns the rays' old positions, and
+    /// the bits of lanes whose rays are at their end or in an occupied cell.
+    #[inline(always)]
+    fn advance<K: RayKind>(&mut self) -> (LanePositions, u32) {
+        let March { occupancy, step, .. } = *self.march;
+        let LaneRays { offset, enter, .. } = &self.rays;
+        let mut t = [0.0; LANES];
+        for i in 0..LANES {
+            // Through i32, since AVX2 cannot convert u32.
+            t[i] = (self.k[i] as i32 as f32 + offset[i]).mul_add(step, enter[i]);
+        }
+        let positions = K::positions(&self.rays, &t);
+        let [x, y, z] = &positions;
+        let cells = [cells_along(x), cells_along(y), cells_along(z)];
+        let lane_positions = LanePositions { t, positions, cells };
+        let sizes = occupancy.empty_cube_sizes(&lane_positions.cells);
+        // Exits of occupied cells aren't used.
+        let exits = K::exits(&self.rays, &lane_positions, &sizes.map(|size| size & SIZE_BITS));
+        let mut stops = 0;
+        for i in 0..LANES {
+            let leap = first_step((exits[i] - enter[i]).mul_add(1.0 / step, -offset[i]));
+            let stop = (lane_positions.t[i] >= self.until[i]) | (sizes[i] == OCCUPIED);
+            self.k[i] = if stop { self.k[i] } else { leap.max(self.k[i] + 1) };
+            stops |= u32::from(stop) << i;
+        }
+        (lane_positions, stops & self.occupied_lanes)
+    }
+
+    /// Advances a lane's ray by a step, and stores the sample of that step, if its strides have
+    /// one. Returns whether the ray may have more samples.
+    #[inline(always)]
+    fn sample(
+        &mut self,
+        lane: usize,
+        lane_positions: &LanePositions,
+        samples: &mut MarchedSamples,
+    ) -> bool {
+        let March { occupancy, step, strides, .. } = *self.march;
+        let (k, active_index) = (self.k[lane], self.active_index[lane]);
+        self.k[lane] += 1;
+        let cell = [0, 1, 2].map(|axis| lane_positions.cells[axis][lane] as usize);
+        if strides.are_double_in(occupancy.is_thin(cell)) {
+            let LaneRays { offset, enter, leave, .. } = &self.rays;
+            let middle = (k as f32 + offset[lane] + 0.5).mul_add(step, enter[lane]);
+            if k & 1 == 0 && middle < leave[lane] {
+                samples.slots.put(active_index, middle, 2.0);
+            }
+        } else {
+            samples.slots.put(active_index, lane_positions.t[lane], 1.0);
+        }
+        samples.slots.counts[active_index] < self.max_samples
+    }
+}
+
+/// Returns the cells along one axis. A function per axis, since the compiler would vectorise a loop
+/// over axes.
+#[inline(always)]
+fn cells_along(positions: &[f32; LANES]) -> [u32; LANES] {
+    let mut cells = [0; LANES];
+    for i in 0..LANES {
+        cells[i] = cell_along(positions[i]);
+    }
+    cells
+}
+
+/// Maximum step number, far above that of any ray.
+const MAX_STEPS: f32 = 4_194_304.0;
+
+/// Rounds a number of steps up; 0 for NaN.
+#[inline(always)]
+pub(super) fn first_step(steps: f32) -> u32 {
+    let steps = steps.max(0.0).min(MAX_STEPS);
+    let (below, step) = floor(steps);
+    step + u32::from(steps > below)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_are_counted_exactly() {
+        for (number, step) in [
+            (f32::NAN, 0),
+            (f32::NEG_INFINITY, 0),
+            (-0.5, 0),
+            (0.0, 0),
+            (1e-9, 1),
+            (6.5, 7),
+            (7.0, 7),
+            (4_194_303.5, 4_194_304),
+            (1e9, 4_194_304),
+            (f32::INFINITY, 4_194_304),
+        ] {
+            assert_eq!(first_step(number), step, "{number}");
+        }
+    }
+}
