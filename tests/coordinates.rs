@@ -166,7 +166,7 @@ fn farthest_apart(a: &[[f32; 8]], b: &[[f32; 8]]) -> f32 {
 
 /// Weights of a field.
 fn weights(made: &Made) -> Vec<u8> {
-    std::fs::read(made.field.join(FieldFile::member(0))).unwrap()
+    std::fs::read(made.field.join(FieldFile::member_file(0))).unwrap()
 }
 
 /// Shifts that are exact in f64, and powers of two as units, change no bit of a field; shifts change

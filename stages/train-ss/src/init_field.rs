@@ -48,7 +48,7 @@ impl<'a> InitField<'a> {
 
     /// Weights of a member; where it has fewer of them, they are gone on from in turn.
     pub(crate) fn member(&self, index: u32) -> PathBuf {
-        self.input.path(&FieldFile::member(index % self.members))
+        self.input.path(&FieldFile::member_file(index % self.members))
     }
 
     /// Writes all of its members before those of `file`, and returns how many they are.
@@ -66,7 +66,7 @@ impl<'a> InitField<'a> {
             Failure::Usage(message)
         })?;
         for index in 0..self.members {
-            std::fs::copy(self.member(index), context.output_path(&FieldFile::member(index))?)
+            std::fs::copy(self.member(index), context.output_path(&FieldFile::member_file(index))?)
                 .context("cannot keep input init")?;
         }
         Ok(self.members)

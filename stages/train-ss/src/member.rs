@@ -65,7 +65,7 @@ impl<'a> Member<'a> {
         index: u32,
         before: u64,
     ) -> anyhow::Result<Self> {
-        let output = context.output_path(&FieldFile::member(index))?;
+        let output = context.output_path(&FieldFile::member_file(index))?;
         let work = context.work().map(|w| w.join(format!("member-{index}")));
         Ok(Self { context, params, model, from, output, work, before })
     }

@@ -174,7 +174,7 @@ fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
         return Err(Failure::BadInput(message.to_owned()).into());
     };
     let fields = (0..file.members)
-        .map(|i| Field::read(&input.path(&FieldFile::member(i)), architecture, file.bounds))
+        .map(|i| Field::read(&input.path(&FieldFile::member_file(i)), architecture, file.bounds))
         .collect::<Result<_, _>>()
         .bad_input("field")?;
     Ok((file, fields))

@@ -106,7 +106,7 @@ fn read_all(
     input: &GivenInput,
     device: &str,
 ) -> Result<Vec<Box<dyn RayField>>, Failure> {
-    let paths = (0..file.members).map(|i| input.path(&FieldFile::member(i)));
+    let paths = (0..file.members).map(|i| input.path(&FieldFile::member_file(i)));
     match file.field {
         FieldModel::Grid(architecture) => paths
             .map(|path| {
@@ -256,7 +256,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let fields: Vec<Field> = [3, 4].map(|seed| Field::new(architecture, bounds, seed)).into();
         for (i, field) in (0..).zip(&fields) {
-            field.write(&folder.path().join(FieldFile::member(i))).unwrap();
+            field.write(&folder.path().join(FieldFile::member_file(i))).unwrap();
         }
         let read = || Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu");
         let rays: Vec<Ray> = [-0.5, 0.0, 0.7].map(ray).into();

@@ -20,7 +20,7 @@ fn artifact(name: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     std::fs::copy(goldens().join(format!("{name}.json")), folder.path().join(FIELD_FILE)).unwrap();
     let packed = std::fs::File::open(goldens().join(format!("{name}.safetensors.gz"))).unwrap();
-    let mut weights = std::fs::File::create(folder.path().join(FieldFile::member(0))).unwrap();
+    let mut weights = std::fs::File::create(folder.path().join(FieldFile::member_file(0))).unwrap();
     std::io::copy(&mut flate2::read::GzDecoder::new(packed), &mut weights).unwrap();
     folder
 }

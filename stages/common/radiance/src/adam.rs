@@ -49,10 +49,10 @@ kernel! {
         let (weights, gradients) = (weights.as_chunks_mut::<LANES>().0,
             gradients.as_chunks_mut::<LANES>().0);
         let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
-        let most = touched.len().min(weights.len());
+        let n_blocks = touched.len().min(weights.len());
         let mut list = [0; BLOCKS_PER_SCAN];
-        for start in (0..most).step_by(BLOCKS_PER_SCAN) {
-            let marks = &mut touched[start..(start + BLOCKS_PER_SCAN).min(most)];
+        for start in (0..n_blocks).step_by(BLOCKS_PER_SCAN) {
+            let marks = &mut touched[start..(start + BLOCKS_PER_SCAN).min(n_blocks)];
             if marks.iter().fold(0, |any, m| any | m) == 0 {
                 continue;
             }

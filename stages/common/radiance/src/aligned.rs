@@ -32,7 +32,7 @@ impl Aligned {
     }
 
     /// Returns the first `len` floats with their old content; grows the array if it is shorter.
-    pub(crate) fn fit(&mut self, len: usize) -> &mut [f32] {
+    pub(crate) fn grow(&mut self, len: usize) -> &mut [f32] {
         if self.len < len {
             let mut grown = Self::zeros(len.max(2 * self.len));
             grown[..self.len].copy_from_slice(self);
@@ -100,7 +100,7 @@ mod tests {
         for len in [1, 31, 32, 33, 5000, 4, 1 << 20] {
             let last = numbers.last().copied();
             let was = numbers.len();
-            assert_eq!(numbers.fit(len).len(), len);
+            assert_eq!(numbers.grow(len).len(), len);
             assert!(numbers.as_ptr().align_offset(ALIGNMENT) == 0 && numbers.len() >= was.max(len));
             assert_eq!(was.checked_sub(1).map(|i| numbers[i]), last);
             let end = numbers.len() - 1;

@@ -80,7 +80,7 @@ impl BackwardBuffers {
     /// Chooses among the samples that count; afterwards `gradients` has those of the chosen ones.
     fn choose(&mut self, samples: &Samples, counted: &Counted, roulette: Roulette) {
         let count = counted.sample.len();
-        lengths_of(&self.gradients, self.lengths.fit(count));
+        lengths_of(&self.gradients, self.lengths.grow(count));
         let limit =
             roulette.limit * self.lengths[..count].iter().sum::<f32>() / count.max(1) as f32;
         let mut sum = roulette.draw;
@@ -122,14 +122,14 @@ impl BackwardBuffers {
         let [first, second] = field.layers.density;
         let widest = first.inputs.max(first.outputs).max(DENSITY_OUTPUTS);
         let [a, b] = &mut self.rows;
-        let (a, b) = (a.fit(widest * m), b.fit(widest * m));
+        let (a, b) = (a.grow(widest * m), b.grow(widest * m));
         for (o, row) in a[..DENSITY_OUTPUTS * m].chunks_exact_mut(m).enumerate() {
             row.iter_mut().zip(&self.gradients).for_each(|(value, gradient)| *value = gradient[o]);
             row[count..].fill(0.0);
         }
-        let features = self.features.fit(first.inputs * m);
+        let features = self.features.grow(first.inputs * m);
         gather(&self.rounds, &self.chosen, &samples.rows.features, first.inputs, features, m);
-        let hidden = self.hidden.fit(first.outputs * m);
+        let hidden = self.hidden.grow(first.outputs * m);
         gather(&self.rounds, &self.chosen, &samples.rows.hidden, first.outputs, hidden, m);
         network.backward(second, LayerInput::Hidden(hidden), m, a, b);
         network.backward(first, LayerInput::First(features), m, b, a);
@@ -193,7 +193,7 @@ impl Chunk {
     }
 
     /// Returns the number of samples with a colour in the last forward pass.
-    pub(crate) fn coloured(&self) -> usize {
+    pub(crate) fn coloured_samples(&self) -> usize {
         self.counted.sample.len()
     }
 }
@@ -205,7 +205,7 @@ impl Chunk {
         let at =
             |&k: &u32| self.samples.marched.positions[self.counted.sample[k as usize] as usize];
         (0..self.sums.len() as u32)
-            .map(|r| self.counted.of_ray(r).iter().map(at).collect())
+            .map(|r| self.counted.samples_of_ray(r).iter().map(at).collect())
             .collect()
     }
 }

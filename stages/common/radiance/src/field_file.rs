@@ -7,7 +7,7 @@ use crate::architecture::Architecture;
 use crate::architecture::{OutOfRange, check_ranges};
 
 /// Name of the description in a field artifact. Each member's weights are next to it, in
-/// [`FieldFile::member`].
+/// [`FieldFile::member_file`].
 pub const FIELD_FILE: &str = "field.json";
 
 /// Format of the weights that this build reads and writes. Formats of grid fields differ in their
@@ -54,7 +54,7 @@ pub enum FieldFileError {
 
 impl FieldFile {
     /// Returns the name of a member's weights file, next to [`FIELD_FILE`].
-    pub fn member(index: u32) -> String {
+    pub fn member_file(index: u32) -> String {
         format!("field-{index}.safetensors")
     }
 

@@ -43,7 +43,7 @@ impl Passes {
             let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
             self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
             samples[0] += self.chunk.samples();
-            samples[1] += self.chunk.coloured();
+            samples[1] += self.chunk.coloured_samples();
             if backward {
                 let ones = [[1.0; 3]; CHUNK_RAYS];
                 let upstream = RayGradients {

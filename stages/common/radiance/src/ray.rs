@@ -29,7 +29,7 @@ impl Ray {
     }
 
     /// Returns the direction in single precision.
-    fn view(&self) -> [f32; 3] {
+    fn view_direction(&self) -> [f32; 3] {
         self.direction.map(|x| x as f32)
     }
 }
@@ -103,7 +103,7 @@ fn sinh4(t: f32) -> f32 {
 /// Returns a contracted ray's point at distance `along` from the one nearest to the centre, and the
 /// point's distance from the centre, all in ball radii.
 #[inline(always)]
-fn before_contraction(origin: [f32; 3], direction: [f32; 3], along: f32) -> ([f32; 3], f32) {
+fn uncontracted_point(origin: [f32; 3], direction: [f32; 3], along: f32) -> ([f32; 3], f32) {
     let u: [f32; 3] = std::array::from_fn(|i| direction[i].mul_add(along, origin[i]));
     (u, u.iter().map(|x| x * x).sum::<f32>().sqrt())
 }
@@ -116,7 +116,7 @@ pub(crate) fn contracted_position(
     radii: f32,
     t: f32,
 ) -> [f32; 3] {
-    let (u, length) = before_contraction(origin, direction, radii * sinh4(t));
+    let (u, length) = uncontracted_point(origin, direction, radii * sinh4(t));
     let factor = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
     u.map(|x| (0.25 * factor).mul_add(x, 0.5))
 }
@@ -134,7 +134,7 @@ pub(crate) fn contracted_velocity(
     let half = 0.5 * radii;
     // A quarter of the derivative of `along`: the cube is four radii wide.
     let (along, speed) = (half * (e - 1.0 / e), half * (e + 1.0 / e));
-    let (u, length) = before_contraction(origin, direction, along);
+    let (u, length) = uncontracted_point(origin, direction, along);
     // The contraction is h(r)·u with h = (2 - 1/r) / r, and dr/d(along) = along / r.
     let inverse = 1.0 / length;
     let factor = (2.0 - inverse) * inverse;
@@ -181,7 +181,7 @@ impl NormalizedRay {
 
     /// Creates a ray that misses the cube.
     fn miss(ray: &Ray) -> Self {
-        Self { enter: 0.0, leave: 0.0, view: ray.view(), ..Self::default() }
+        Self { enter: 0.0, leave: 0.0, view: ray.view_direction(), ..Self::default() }
     }
 }
 
@@ -197,8 +197,10 @@ pub fn clip(bounds: &Bounds, ray: &Ray) -> NormalizedRay {
         Space::Ndc(frustum) => clip_to_frustum(frustum, bounds.near, origin, direction),
         Space::Contraction => Some(clip_to_contraction(bounds, origin, direction)),
     };
-    clipped
-        .map_or(NormalizedRay::miss(ray), |clipped| NormalizedRay { view: ray.view(), ..clipped })
+    clipped.map_or(NormalizedRay::miss(ray), |clipped| NormalizedRay {
+        view: ray.view_direction(),
+        ..clipped
+    })
 }
 
 fn clip_to_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {

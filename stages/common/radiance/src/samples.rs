@@ -72,7 +72,7 @@ impl DensityRows {
             (&mut self.hidden, first.outputs),
             (&mut self.outputs, second.outputs),
         ] {
-            buffer.fit(round.range(rows).end);
+            buffer.grow(round.range(rows).end);
         }
         let features = &mut self.features[round.range(first.inputs)];
         for (level, rows) in field.levels.iter().zip(features.chunks_exact_mut(FEATURES * n)) {
@@ -86,7 +86,7 @@ impl DensityRows {
 
     /// Runs the network at `n` positions (three rows) and returns its outputs, one row each.
     pub(crate) fn outputs_at(&mut self, field: &Field, positions: &[f32], n: usize) -> &[f32] {
-        self.positions.fit(3 * n).copy_from_slice(positions);
+        self.positions.grow(3 * n).copy_from_slice(positions);
         self.run(field, Round { start: 0, n, first: 0 });
         &self.outputs[..DENSITY_OUTPUTS * n]
     }
@@ -192,7 +192,7 @@ impl Samples {
         self.marched.t.resize(start + n, 0.0);
         self.marched.lengths.resize(start + n, 0.0);
         self.marched.positions.resize(start + n, [0.0; 3]);
-        self.rows.positions.fit(3 * n);
+        self.rows.positions.grow(3 * n);
         for (axis, row) in self.rows.positions[..3 * n].chunks_exact_mut(n.max(1)).enumerate() {
             for (value, p) in row.iter_mut().zip(&self.marched.positions[start..]) {
                 *value = p[axis];
@@ -206,7 +206,7 @@ impl Samples {
     fn compute_weights(&mut self, round: Round, step: f32, sums: &mut [RaySum]) {
         let Round { start, n, .. } = round;
         for buffer in [&mut self.tau, &mut self.before, &mut self.transmittance, &mut self.weight] {
-            buffer.fit(start + n);
+            buffer.grow(start + n);
         }
         let range = start..start + n;
         let tau = &mut self.tau[range.clone()];
@@ -258,7 +258,7 @@ impl Samples {
     }
 
     /// Returns the derivative of a sample's optical depth by its raw density.
-    fn slope(&self, sample: usize, raw: f32) -> f32 {
+    fn optical_depth_slope(&self, sample: usize, raw: f32) -> f32 {
         if raw < MAX_RAW_DENSITY { self.tau[sample] } else { 0.0 }
     }
 }
@@ -283,7 +283,7 @@ pub(crate) struct Counted {
 
 impl Counted {
     /// Returns the indices in `sample` of a ray's samples, from front to back.
-    pub(crate) fn of_ray(&self, ray: u32) -> &[u32] {
+    pub(crate) fn samples_of_ray(&self, ray: u32) -> &[u32] {
         &self.along[self.ray_starts[ray as usize]..self.ray_starts[ray as usize + 1]]
     }
 
@@ -326,7 +326,7 @@ impl Counted {
                 let column = i as usize - round.start;
                 let mut outputs: [f32; DENSITY_OUTPUTS] =
                     std::array::from_fn(|o| rows[o * round.n + column]);
-                outputs[0] = samples.slope(i as usize, outputs[0]);
+                outputs[0] = samples.optical_depth_slope(i as usize, outputs[0]);
                 self.outputs.push(outputs);
             }
         }

@@ -101,7 +101,7 @@ kernel! {
         for (column, &r) in counted.rays.iter().enumerate() {
             let (ray, sum) = (&rays[r as usize], &mut sums[r as usize]);
             let mut outputs = [0.0f32; DENSITY_OUTPUTS];
-            for &k in counted.of_ray(r) {
+            for &k in counted.samples_of_ray(r) {
                 let i = counted.sample[k as usize] as usize;
                 let w = samples.weight[i];
                 for (sum, value) in outputs.iter_mut().zip(&counted.outputs[k as usize]) {
@@ -125,7 +125,7 @@ kernel! {
         let m = counted.sample.len();
         for (column, &r) in counted.rays.iter().enumerate() {
             let view_colour = [0, 1, 2].map(|c| view_colour[c * n + column]);
-            for &k in counted.of_ray(r) {
+            for &k in counted.samples_of_ray(r) {
                 let k = k as usize;
                 for c in 0..3 {
                     colour[c * m + k] = counted.outputs[k][RAW_COLOUR + c] + view_colour[c];
@@ -141,7 +141,7 @@ kernel! {
         let m = counted.sample.len();
         for &r in &counted.rays {
             let sum = &mut sums[r as usize].colour;
-            for &k in counted.of_ray(r) {
+            for &k in counted.samples_of_ray(r) {
                 let w = samples.weight[counted.sample[k as usize] as usize];
                 for c in 0..3 {
                     sum[c] = w.mul_add(colour[c * m + k as usize], sum[c]);
@@ -162,7 +162,7 @@ kernel! {
         for (column, &r) in counted.rays.iter().enumerate() {
             let g = colours[r as usize];
             let mut sum = [0.0f32; 3];
-            for &k in counted.of_ray(r) {
+            for &k in counted.samples_of_ray(r) {
                 let w = samples.weight[counted.sample[k as usize] as usize];
                 for c in 0..3 {
                     let colour = colour[c * m + k as usize];
@@ -238,17 +238,17 @@ pub(crate) fn view_network<'a>(
 ) -> &'a mut [f32] {
     let Layers { view, .. } = field.layers;
     let [hidden1, hidden2] = hidden;
-    let hidden1 = hidden1.fit(view[0].outputs * n);
+    let hidden1 = hidden1.grow(view[0].outputs * n);
     multiply(view[0].matrix(&field.network), input, hidden1, n, After::Relu);
-    let hidden2 = hidden2.fit(view[1].outputs * n);
+    let hidden2 = hidden2.grow(view[1].outputs * n);
     multiply(view[1].matrix(&field.network), hidden1, hidden2, n, After::Relu);
-    let view_colour = view_colour.fit(view[2].outputs * n);
+    let view_colour = view_colour.grow(view[2].outputs * n);
     multiply(view[2].matrix(&field.network), hidden2, view_colour, n, After::Linear);
     view_colour
 }
 
 impl AlongRay {
-    fn fit(&mut self, longest: usize) {
+    fn grow(&mut self, longest: usize) {
         for buffer in [
             &mut self.transmittance,
             &mut self.weight,
@@ -256,7 +256,7 @@ impl AlongRay {
             &mut self.by_weight,
             &mut self.by_depth,
         ] {
-            buffer.fit(longest);
+            buffer.grow(longest);
         }
     }
 }
@@ -272,13 +272,13 @@ impl Shading {
         sums: &mut [RaySum],
     ) {
         let (m, n) = (counted.sample.len(), counted.rays.len().next_multiple_of(LANES));
-        let input = self.input.fit(VIEW_INPUTS * n);
+        let input = self.input.grow(VIEW_INPUTS * n);
         for row in input.chunks_exact_mut(n.max(1)) {
             row[counted.rays.len()..].fill(0.0);
         }
         composite(samples, counted, rays, sums, input, n);
         let view_colour = view_network(field, input, &mut self.hidden, &mut self.view_colour, n);
-        let colour = self.colour.fit(3 * m);
+        let colour = self.colour.grow(3 * m);
         raw_colours(counted, view_colour, n, colour);
         sigmoids(colour);
         sum_colours(samples, counted, colour, sums);
@@ -299,7 +299,7 @@ impl Shading {
         let Layers { view: [first, second, third], .. } = field.layers;
         let widest = first.outputs.max(second.outputs).max(VIEW_INPUTS);
         let [a, b] = &mut self.gradient;
-        let (a, b) = (a.fit(widest * n), b.fit(widest * n));
+        let (a, b) = (a.grow(widest * n), b.grow(widest * n));
         for row in a[..3 * n].chunks_exact_mut(n) {
             row[counted.rays.len()..].fill(0.0);
         }
@@ -313,12 +313,13 @@ impl Shading {
         gradients.clear();
         gradients.resize(m, [0.0; DENSITY_OUTPUTS]);
         let along = &mut self.along;
-        along.fit(counted.max_samples_per_ray());
+        along.grow(counted.max_samples_per_ray());
         let step = field.step();
         let channels: [&[f32]; 3] = std::array::from_fn(|c| &colour[c * m..(c + 1) * m]);
         for (column, &r) in counted.rays.iter().enumerate() {
             let (g, background) = (upstream.colours[r as usize], upstream.backgrounds[r as usize]);
-            let (indices, transmittance) = (counted.of_ray(r), sums[r as usize].transmittance);
+            let (indices, transmittance) =
+                (counted.samples_of_ray(r), sums[r as usize].transmittance);
             let len = indices.len();
             let mut composited = [0.0; DENSITY_OUTPUTS];
             for f in 0..VIEW_FEATURES {

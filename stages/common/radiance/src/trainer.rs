@@ -141,8 +141,9 @@ impl Trainer {
     ) -> Result<Option<StepReport>, TrainingError> {
         supervision.set_progress(self.state.progress(self.options.rays));
         let bundle = supervision.rays_per_bundle();
-        let wanted = self.options.rays_of_step(&self.state, self.samples_per_ray);
-        let Some(bundles) = self.state.bundles_of_step(self.options.rays, wanted, bundle) else {
+        let target_rays = self.options.rays_of_step(&self.state, self.samples_per_ray);
+        let Some(bundles) = self.state.bundles_of_step(self.options.rays, target_rays, bundle)
+        else {
             return Ok(None);
         };
         self.update_occupancy();

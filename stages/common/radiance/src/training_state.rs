@@ -31,9 +31,9 @@ impl TrainingState {
 
     /// Returns the number of bundles of the next step, given the training's rays, the step's target
     /// number of rays and the rays per bundle; `None` after the last step.
-    pub fn bundles_of_step(&self, rays: u64, wanted: usize, bundle: usize) -> Option<usize> {
-        let left = rays.saturating_sub(self.rays) as usize / bundle;
-        (left > 0).then(|| (wanted / bundle).clamp(1, left))
+    pub fn bundles_of_step(&self, rays: u64, target_rays: usize, bundle: usize) -> Option<usize> {
+        let remaining = rays.saturating_sub(self.rays) as usize / bundle;
+        (remaining > 0).then(|| (target_rays / bundle).clamp(1, remaining))
     }
 
     /// Adds bundles of `bundle` rays each to the counters.
@@ -45,12 +45,12 @@ impl TrainingState {
     /// Records a step that wasn't finite and halves the learning rates. Returns whether the
     /// training may continue.
     pub fn record_nonfinite_step(&mut self) -> bool {
-        let again = self
+        let is_repeated = self
             .last_nonfinite_step
             .is_some_and(|before| self.steps - before < MIN_STEPS_BETWEEN_FAULTS);
         self.last_nonfinite_step = Some(self.steps);
         self.learning_rate_scale *= 0.5;
-        !again
+        !is_repeated
     }
 
     /// Returns the state as numbers for a checkpoint.

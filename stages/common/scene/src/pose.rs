@@ -32,8 +32,8 @@ pub(crate) const MAX_ROTATION_ERROR: f64 = 1e-2;
 
 /// Returns the largest deviation of R·Rᵀ from the identity.
 pub(crate) fn rotation_error(rotation: DMat3) -> f64 {
-    let off = rotation * rotation.transpose() - DMat3::IDENTITY;
-    off.to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()))
+    let deviation = rotation * rotation.transpose() - DMat3::IDENTITY;
+    deviation.to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()))
 }
 
 /// Returns the rotation R of a pose, its left 3×3 part.

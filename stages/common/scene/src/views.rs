@@ -253,9 +253,9 @@ impl Views {
         let mut names = BTreeSet::new();
         for view in &self.views {
             let name = &view.camera.name;
-            let plain = relative_path(name).is_ok_and(|p| p.components().count() == 1)
+            let is_plain = relative_path(name).is_ok_and(|p| p.components().count() == 1)
                 && !name.contains(char::is_control);
-            if !plain || !names.insert(name) {
+            if !is_plain || !names.insert(name) {
                 return Err(ViewsError::Name(name.clone()));
             }
             view.camera

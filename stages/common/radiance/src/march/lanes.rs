@@ -93,7 +93,7 @@ pub(super) fn march<K: RayKind>(
             let r = active[lanes.active_index[lane]] as usize;
             if lane_positions.t[lane] >= lanes.until[lane] {
                 next[r] = DONE;
-            } else if lanes.sample(lane, &lane_positions, samples) {
+            } else if lanes.take_sample(lane, &lane_positions, samples) {
                 continue;
             } else {
                 next[r] = lanes.k[lane];
@@ -212,7 +212,7 @@ impl<'a> RayLanes<'a> {
     /// Advances a lane's ray by a step, and stores the sample of that step, if its strides have
     /// one. Returns whether the ray may have more samples.
     #[inline(always)]
-    fn sample(
+    fn take_sample(
         &mut self,
         lane: usize,
         lane_positions: &LanePositions,
