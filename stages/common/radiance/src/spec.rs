@@ -80,3 +80,13 @@ impl Strides {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rays_end_at_the_minimum_transmittance() {
+        assert!((MAX_OPTICAL_DEPTH + MIN_TRANSMITTANCE.ln()).abs() < 1e-6);
+    }
+}

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::adam::{AdamStep, adam, update_average};
 use crate::aligned::Aligned;
 use crate::field::Field;
-use crate::grid::scatter;
+use crate::grid::{Level, scatter};
 use crate::occupancy::Occupancy;
 use crate::samples::DensityRows;
 use crate::simd::LANES;
@@ -250,24 +250,18 @@ impl Trainer {
         );
 
         let shards = &self.shards;
-        let mut work = Vec::with_capacity(self.field.levels.len());
-        let mut grids = (
-            &mut self.field.grid[..],
-            &mut self.gradients.grid[..],
-            &mut self.first.grid[..],
-            &mut self.second.grid[..],
-        );
-        for ((i, level), touched) in self.field.levels.iter().enumerate().zip(&mut self.touched) {
-            let len = level.range().len();
-            let (w, rest_w) = grids.0.split_at_mut(len);
-            let (g, rest_g) = grids.1.split_at_mut(len);
-            let (m, rest_m) = grids.2.split_at_mut(len);
-            let (v, rest_v) = grids.3.split_at_mut(len);
-            grids = (rest_w, rest_g, rest_m, rest_v);
-            work.push((i, level, touched, w, g, m, v));
-        }
+        let levels = &self.field.levels;
+        let [w, g, m, v] = [
+            &mut self.field.grid,
+            &mut self.gradients.grid,
+            &mut self.first.grid,
+            &mut self.second.grid,
+        ]
+        .map(|parameters| split_by_level(levels, parameters));
+        let touched = self.touched.par_iter_mut();
+        let work = (levels.par_iter(), touched, w, g, m, v).into_par_iter().enumerate();
         // The finest levels take longest, so they go first.
-        work.into_par_iter().rev().with_max_len(1).for_each(|(i, level, touched, w, g, m, v)| {
+        work.rev().with_max_len(1).for_each(|(i, (level, touched, w, g, m, v))| {
             for shard in shards {
                 if let Some(gradients) = shard.features.levels.get(i) {
                     scatter(level, g, touched, &shard.features.positions, gradients);
@@ -329,6 +323,17 @@ impl Trainer {
         let distance = field.step();
         self.field.occupancy.update(&cells, &densities, distance);
     }
+}
+
+/// Splits one float per grid parameter into the parts of the levels.
+fn split_by_level<'a>(levels: &[Level], mut parameters: &'a mut [f32]) -> Vec<&'a mut [f32]> {
+    let mut parts = Vec::with_capacity(levels.len());
+    for level in levels {
+        let (part, rest) = parameters.split_at_mut(level.range().len());
+        parts.push(part);
+        parameters = rest;
+    }
+    parts
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
