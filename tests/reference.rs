@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use contract::{Description, ParameterSection, by_group};
+use contract::{Description, ParameterSection, group_parameters};
 use serde_json::Value;
 
 use crate::common::verbs_of;
@@ -51,7 +51,7 @@ pub(crate) fn stage_page(description: &Description) -> String {
         .unwrap();
     }
     description
-        .documented()
+        .parameter_sections()
         .iter()
         .filter(|section| !section.parameters.is_empty())
         .for_each(|s| page += &parameters(s));
@@ -75,7 +75,7 @@ fn parameters(section: &ParameterSection) -> String {
         .as_ref()
         .map_or("Parameters".to_owned(), |variant| format!("Parameters with `{variant}`"));
     let mut text = format!("\n## {title}\n");
-    for (group, members) in by_group(&section.parameters) {
+    for (group, members) in group_parameters(&section.parameters) {
         if !group.is_empty() {
             write!(text, "\n### {}{}\n", group[..1].to_uppercase(), &group[1..]).unwrap();
         }

@@ -150,16 +150,18 @@ fn reference_pages_are_current() {
 fn help_leads_to_the_reference() {
     for description in descriptions()
         .iter()
-        .filter(|d| d.documented().iter().any(|section| !section.parameters.is_empty()))
+        .filter(|d| d.parameter_sections().iter().any(|section| !section.parameters.is_empty()))
     {
         let help = Command::new(common::bin(&description.name)).arg("--help").output().unwrap();
         let help = String::from_utf8(help.stdout).unwrap();
         let page = format!("docs/reference/{}.md", description.name);
         assert!(help.contains(&page) && common::root().join(&page).exists(), "{page}");
         assert!(!help.contains("null"), "{help}");
-        for parameter in description.documented().iter().flat_map(|section| &section.parameters) {
-            let known =
-                parameter.group.is_empty() || contract::GROUPS.contains(&parameter.group.as_str());
+        for parameter in
+            description.parameter_sections().iter().flat_map(|section| &section.parameters)
+        {
+            let known = parameter.group.is_empty()
+                || contract::PARAMETER_GROUPS.contains(&parameter.group.as_str());
             assert!(known && help.contains(&format!("  {}", parameter.name)), "{parameter:?}");
             let is_choice = parameter.choices.iter().any(|(word, _)| *word == parameter.default);
             assert!(
@@ -174,7 +176,7 @@ fn help_leads_to_the_reference() {
 #[test]
 fn parameters_have_one_meaning() {
     for description in descriptions() {
-        let sections = description.documented();
+        let sections = description.parameter_sections();
         let (common, variants): (Vec<_>, Vec<_>) =
             sections.iter().partition(|section| section.variant.is_none());
         for variant in &variants {

@@ -1,79 +1,150 @@
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use artifact::{PathError, relative_path};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use crate::error::SchemaError;
-use crate::input::Input;
-use crate::output::Output;
 use crate::parameters::Schema;
 use crate::rules::{GivenInputs, Rule, RuleError};
 
-/// What `STAGE describe` prints: all that the runner knows of a stage.
+/// Output of `STAGE describe`: all that the runner knows about a stage.
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
-    /// The stage's name; also its binary's.
+    /// Name of the stage and of its binary.
     pub name: String,
-    /// Version for people; not part of a key.
+    /// Human-readable version; not part of a key.
     pub version: String,
-    /// Fingerprint of the code: part of every key.
+    /// Fingerprint of the code; part of every key.
     pub code: String,
-    /// One sentence: what the stage makes of what.
+    /// Purpose of the stage, in one sentence.
     pub summary: String,
-    /// JSON Schema of the parameters: an object, every property with its default. `x-group` names a
-    /// parameter's group; `x-default` stands for a default that is null, and is `by scene` where
-    /// the inputs decide.
+    /// JSON Schema of the parameters: an object, every property with its default. `x-group` is a
+    /// parameter's group. `x-default` describes a default that is null; `by scene` means that the
+    /// inputs determine the value.
     pub parameters: Value,
     /// Inputs by name.
     pub inputs: BTreeMap<String, Input>,
-    /// What comes out.
+    /// Artifact that the stage creates.
     pub output: Output,
-    /// Names of environment variables that change the result; their values join the key.
+    /// Names of environment variables that change the result; their values are part of the key.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub environment: Vec<String>,
-    /// A sink shows a run (times, hashes) and is never cached; its input `run` is the run's record.
+    /// True for a sink: it presents a run and is never cached. Its input `run` is the run's record.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub sink: bool,
-    /// A sink that shows what there is, where some of it couldn't be made.
+    /// True for a sink that accepts a run with failed nodes and presents the finished ones.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub partial: bool,
-    /// Whether the stage accepts `--from-checkpoint`: then it writes its output from the latest
+    /// True if the stage accepts `--from-checkpoint`, which writes the output from the latest
     /// checkpoint.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub from_checkpoint: bool,
-    /// What parameters and inputs must be together.
+    /// Constraints between parameters and inputs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub rules: Vec<Rule>,
 }
 
-/// A description that contradicts itself: what is wrong with it.
+/// Input of a stage.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Input {
+    /// Accepted kinds of artifact.
+    pub kinds: Vec<String>,
+    /// True if the stage runs without this input.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub optional: bool,
+    /// Description of the input, in one sentence.
+    pub summary: String,
+}
+
+impl Input {
+    /// Creates a required input.
+    pub fn required(kinds: &[&str], summary: &str) -> Self {
+        Self {
+            kinds: kinds.iter().map(ToString::to_string).collect(),
+            optional: false,
+            summary: summary.to_owned(),
+        }
+    }
+
+    /// Creates an optional input.
+    pub fn optional(kinds: &[&str], summary: &str) -> Self {
+        Self { optional: true, ..Self::required(kinds, summary) }
+    }
+}
+
+/// Artifact that a stage creates.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Output {
+    /// Kind of the artifact.
+    pub kind: String,
+    /// Folders of the artifact that an input may refer to (`prep/train`), with their kinds.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub subtrees: BTreeMap<String, String>,
+    /// JSON file in the artifact whose entry `resolved` has, by name, the final values of the
+    /// parameters whose default depends on the inputs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub resolved: Option<String>,
+}
+
+impl Output {
+    /// Creates an output without subtrees.
+    pub fn kind(kind: &str) -> Self {
+        Self { kind: kind.to_owned(), subtrees: BTreeMap::new(), resolved: None }
+    }
+
+    /// Adds a folder that an input may refer to.
+    #[must_use]
+    pub fn with_subtree(mut self, folder: &str, kind: &str) -> Self {
+        self.subtrees.insert(folder.to_owned(), kind.to_owned());
+        self
+    }
+
+    /// Sets the file with the final values of the parameters whose default depends on the inputs.
+    #[must_use]
+    pub fn with_resolved(mut self, file: &str) -> Self {
+        self.resolved = Some(file.to_owned());
+        self
+    }
+
+    /// Reads the final parameter values that a finished artifact records, by parameter name.
+    pub fn resolved(&self, artifact: &Path) -> Map<String, Value> {
+        let bytes = self.resolved.as_ref().and_then(|file| std::fs::read(artifact.join(file)).ok());
+        // Artifacts of older builds have no such file.
+        let file: Option<Value> = bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        file.and_then(|file| file.get("resolved")?.as_object().cloned()).unwrap_or_default()
+    }
+}
+
+/// Reason why a description is invalid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DescriptionError {
-    /// Its parameter schema.
-    #[error("its parameter schema is {0}")]
+    /// The parameter schema can't be used.
+    #[error("parameter schema: {0}")]
     Schema(#[from] SchemaError),
-    /// It doesn't say its name.
-    #[error("it has no name")]
+    /// The name is empty.
+    #[error("the description has no name")]
     Unnamed,
-    /// A folder of its output.
-    #[error("its output: {0}")]
+    /// A folder or file of the output is outside the output.
+    #[error("output: {0}")]
     Output(#[from] PathError),
-    /// A rule.
-    #[error("its rule {number}: {problem}")]
+    /// A rule can't be used.
+    #[error("rule {number}: {problem}")]
     Rule {
-        /// Which, counted from 1.
+        /// Number of the rule, counted from 1.
         number: usize,
-        /// What is wrong.
+        /// Reason why the rule can't be used.
         problem: RuleError,
     },
 }
 
 impl Description {
-    /// Says what is wrong with a description that has the right form: what it names must be there,
-    /// and its folders inside the output.
+    /// Checks the schema, and that rules refer to existing names and folders are inside the output.
     pub fn check(&self) -> Result<(), DescriptionError> {
         let schema = Schema::new(&self.parameters)?;
         if self.name.is_empty() {
@@ -89,11 +160,11 @@ impl Description {
         Ok(())
     }
 
-    /// What the first rule that isn't kept says.
+    /// Returns the message of the first rule that is violated.
     pub fn broken_rule(&self, parameters: &Value, inputs: &GivenInputs) -> Option<String> {
         self.rules
             .iter()
-            .find(|rule| !rule.is_kept(parameters, inputs))
+            .find(|rule| !rule.is_satisfied(parameters, inputs))
             .map(|rule| rule.message.clone())
     }
 }
@@ -167,12 +238,9 @@ mod tests {
         let no_schema = json!({"type": "nonsense"});
         let with = |rule: Rule| Description { rules: vec![rule], ..description() };
         for (broken, words) in [
-            (with(Rule::new("").needs("nothing")), "rule 1: there is no input \"nothing\""),
-            (with(Rule::new("").when("nothing", json!({}))), "there is no parameter \"nothing\""),
-            (
-                with(Rule::new("").must("nothing.x", json!({}))),
-                "there is no parameter \"nothing.x\"",
-            ),
+            (with(Rule::new("").needs("nothing")), "rule 1: no input \"nothing\""),
+            (with(Rule::new("").when("nothing", json!({}))), "no parameter \"nothing\""),
+            (with(Rule::new("").must("nothing.x", json!({}))), "no parameter \"nothing.x\""),
             (with(Rule::new("").must("scale", no_schema.clone())), "scale: not a JSON Schema"),
             (Description { parameters: no_schema, ..description() }, "parameter schema"),
             (Description { name: String::new(), ..description() }, "no name"),

@@ -1,4 +1,4 @@
-//! A stage's parameters as people read them: in groups, each with what it allows and its default.
+//! Human-readable documentation of a stage's parameters: groups, allowed values and defaults.
 
 use serde_json::Value;
 
@@ -7,115 +7,118 @@ use crate::parameters::DEFAULT_KEYWORD;
 use crate::tagged::Tag;
 use crate::values::Reader;
 
-/// Groups of parameters, in the order in which they are shown; a parameter without a group stands
-/// before all.
-pub const GROUPS: [&str; 7] =
+/// Groups of parameters in their order of display; parameters without a group come first.
+pub const PARAMETER_GROUPS: [&str; 7] =
     ["data", "sampling", "loss", "optimiser", "field", "network", "output"];
-/// Keyword of a parameter's schema: its group.
+/// Schema keyword for a parameter's group.
 const GROUP_KEYWORD: &str = "x-group";
 
-/// A parameter as people read it.
+/// Documentation of a parameter.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ParameterText {
-    /// Its name.
+pub struct ParameterDoc {
+    /// Name of the parameter.
     pub name: String,
-    /// Its group, one of [`GROUPS`], or nothing.
+    /// Group, one of [`PARAMETER_GROUPS`]; empty without a group.
     pub group: String,
-    /// Its meaning.
+    /// Description of the parameter.
     pub text: String,
-    /// The values it may have, in words.
+    /// Allowed values, as text.
     pub allowed: String,
-    /// The value it has when it is left out.
+    /// Value if the parameter is omitted.
     pub default: String,
-    /// The words it may be, each with its meaning.
+    /// Allowed values of a choice, each with its description.
     pub choices: Vec<(String, String)>,
 }
 
-/// Parameters that stand together: all of a stage, or those that a variant has besides.
+/// Group of parameters: those common to all variants of a stage, or those of one variant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ParameterSection {
-    /// The choice that they belong to, such as `field: grid`; nothing for those that are always
-    /// there.
+    /// Variant that the parameters belong to, such as `field: grid`; `None` for common ones.
     pub variant: Option<String>,
-    /// The parameters, by group, then by name.
-    pub parameters: Vec<ParameterText>,
+    /// Parameters, sorted by group, then by name.
+    pub parameters: Vec<ParameterDoc>,
 }
 
 impl Description {
-    /// The stage's parameters as people read them.
-    pub fn documented(&self) -> Vec<ParameterSection> {
+    /// Documents the stage's parameters: the common ones, then those of each variant.
+    pub fn parameter_sections(&self) -> Vec<ParameterSection> {
         let schema = &self.parameters;
-        // A description is checked before it is used: two tags are an error there.
+        // Two tags are an error of `Description::check`, which precedes every use.
         let Some(tag) = Tag::find(schema).ok().flatten() else {
-            return vec![ParameterSection::new(None, schema, &|_| true)];
+            return vec![ParameterSection {
+                variant: None,
+                parameters: document(schema, |_| true),
+            }];
         };
-        let forms = tag.forms(schema);
-        let is_common = |name: &str| schema["properties"].get(name).is_some();
-        let mut sections = vec![ParameterSection::new(None, &forms[0], &is_common)];
-        for (variant, form) in tag.variants().zip(&forms) {
-            let choice = format!("{}: {variant}", tag.name());
-            sections.push(ParameterSection::new(Some(choice), form, &|name| !is_common(name)));
+        let common = &schema["properties"];
+        let schemas = tag.variant_schemas(schema);
+        let parameters = document(&schemas[0], |name| common.get(name).is_some());
+        let mut sections = vec![ParameterSection { variant: None, parameters }];
+        for (index, variant) in tag.variants().enumerate() {
+            let parameters = document(&schemas[index], |name| common.get(name).is_none());
+            let variant = Some(format!("{}: {variant}", tag.name()));
+            sections.push(ParameterSection { variant, parameters });
         }
         sections
     }
 }
 
-impl ParameterSection {
-    /// Those of a schema's parameters whose names are wanted.
-    fn new(variant: Option<String>, schema: &Value, is_wanted: &dyn Fn(&str) -> bool) -> Self {
-        Self { variant, parameters: parameters(schema, is_wanted) }
+/// Documents those of a schema's parameters whose names satisfy a condition.
+fn document(schema: &Value, condition: impl Fn(&str) -> bool) -> Vec<ParameterDoc> {
+    let mut found = Vec::new();
+    for (name, property) in
+        schema.get("properties").and_then(Value::as_object).into_iter().flatten()
+    {
+        if condition(name) {
+            found.push(ParameterDoc::new(schema, name, property));
+        }
     }
-}
-
-fn parameters(schema: &Value, is_wanted: &dyn Fn(&str) -> bool) -> Vec<ParameterText> {
-    let properties = schema.get("properties").and_then(Value::as_object).into_iter().flatten();
-    let wanted = properties.filter(|(name, _)| is_wanted(name));
-    let mut found: Vec<ParameterText> =
-        wanted.map(|(name, property)| parameter(schema, name, property)).collect();
-    found.sort_by(|a, b| (place(a), &a.name).cmp(&(place(b), &b.name)));
+    found.sort_by(|a, b| (a.group_rank(), &a.name).cmp(&(b.group_rank(), &b.name)));
     found
 }
 
-/// Where a parameter's group stands among all groups.
-fn place(text: &ParameterText) -> usize {
-    GROUPS.iter().position(|group| *group == text.group).map_or(0, |at| at + 1)
-}
-
-fn parameter(schema: &Value, name: &str, property: &Value) -> ParameterText {
-    let text_of = |keyword: &str| property.get(keyword).and_then(Value::as_str).unwrap_or_default();
-    let reader = Reader::new(schema);
-    let choices: Vec<(String, String)> =
-        reader.choices(property).into_iter().flatten().map(choice).collect();
-    let default = match property.get("default") {
-        None | Some(Value::Null) if !text_of(DEFAULT_KEYWORD).is_empty() => {
-            text_of(DEFAULT_KEYWORD).to_owned()
+impl ParameterDoc {
+    fn new(schema: &Value, name: &str, property: &Value) -> Self {
+        let reader = Reader::new(schema);
+        let mut choices = Vec::new();
+        for (value, description) in reader.choices(property).into_iter().flatten() {
+            choices.push((plain(value), description.replace('\n', " ")));
         }
-        None | Some(Value::Null) => "none".to_owned(),
-        Some(default) => plain(default),
-    };
-    ParameterText {
-        name: name.to_owned(),
-        group: text_of(GROUP_KEYWORD).to_owned(),
-        text: text_of("description").replace('\n', " "),
-        allowed: allowed(property, reader.present(property), &choices),
-        default,
-        choices,
+        let default = match (property.get("default"), keyword_text(property, DEFAULT_KEYWORD)) {
+            (None | Some(Value::Null), "") => "none".to_owned(),
+            (None | Some(Value::Null), description) => description.to_owned(),
+            (Some(default), _) => plain(default),
+        };
+        Self {
+            name: name.to_owned(),
+            group: keyword_text(property, GROUP_KEYWORD).to_owned(),
+            text: keyword_text(property, "description").replace('\n', " "),
+            allowed: allowed_text(property, reader.present(property), &choices),
+            default,
+            choices,
+        }
+    }
+
+    /// Returns the position of the group in the order of display.
+    fn group_rank(&self) -> usize {
+        PARAMETER_GROUPS.iter().position(|group| *group == self.group).map_or(0, |index| index + 1)
     }
 }
 
-fn choice((word, meaning): (&Value, &str)) -> (String, String) {
-    (plain(word), meaning.replace('\n', " "))
+/// Returns the text of a schema's keyword; empty without the keyword.
+fn keyword_text<'a>(property: &'a Value, keyword: &str) -> &'a str {
+    property.get(keyword).and_then(Value::as_str).unwrap_or_default()
 }
 
-/// A value as text, without quotes.
+/// Formats a value as text, without quotes.
 pub fn plain(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
-/// The values that a parameter may have, in words.
-fn allowed(property: &Value, present: &Value, choices: &[(String, String)]) -> String {
+/// Describes the values that a parameter may have.
+fn allowed_text(property: &Value, present: &Value, choices: &[(String, String)]) -> String {
     if !choices.is_empty() {
-        return choices.iter().map(|(word, _)| word.as_str()).collect::<Vec<_>>().join(", ");
+        return choices.iter().map(|(value, _)| value.as_str()).collect::<Vec<_>>().join(", ");
     }
     let types: Vec<&str> = match present.get("type") {
         Some(Value::String(one)) => vec![one],
@@ -132,24 +135,24 @@ fn allowed(property: &Value, present: &Value, choices: &[(String, String)]) -> S
         ["array"] => "a list",
         _ => "JSON",
     };
-    let bound =
-        |keyword: &str| property.get(keyword).or_else(|| present.get(keyword)).map(short_number);
-    match (bound("minimum"), bound("maximum")) {
-        (Some(least), Some(most)) => format!("{noun} from {least} to {most}"),
-        (Some(least), None) => format!("{noun} from {least}"),
-        (None, Some(most)) => format!("{noun} up to {most}"),
+    let [min, max] = ["minimum", "maximum"]
+        .map(|keyword| property.get(keyword).or_else(|| present.get(keyword)).map(short_number));
+    match (min, max) {
+        (Some(min), Some(max)) => format!("{noun} from {min} to {max}"),
+        (Some(min), None) => format!("{noun} from {min}"),
+        (None, Some(max)) => format!("{noun} up to {max}"),
         (None, None) => noun.to_owned(),
     }
 }
 
-/// A number without the point that it doesn't need.
+/// Formats a number without a redundant `.0`.
 fn short_number(value: &Value) -> String {
     value.to_string().trim_end_matches(".0").to_owned()
 }
 
-/// Parameters by group: the groups' names in order, each with its parameters.
-pub fn by_group(parameters: &[ParameterText]) -> Vec<(&str, Vec<&ParameterText>)> {
-    let mut groups: Vec<(&str, Vec<&ParameterText>)> = Vec::new();
+/// Splits sorted parameters into groups: each group's name with its parameters.
+pub fn group_parameters(parameters: &[ParameterDoc]) -> Vec<(&str, Vec<&ParameterDoc>)> {
+    let mut groups: Vec<(&str, Vec<&ParameterDoc>)> = Vec::new();
     for parameter in parameters {
         match groups.last_mut() {
             Some((group, members)) if *group == parameter.group => members.push(parameter),

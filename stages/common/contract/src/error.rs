@@ -1,46 +1,46 @@
 use serde_json::Value;
 
-/// A parameter schema that can't be used: what is wrong with it.
+/// Reason why a parameter schema can't be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SchemaError {
-    /// It isn't one that is understood.
+    /// A part of the schema is invalid or not supported.
     #[error("not a JSON Schema: {0}")]
     Keyword(KeywordError),
-    /// Which variant's parameters there are depends on two of them.
-    #[error("one where {first} and {second} both select a variant")]
-    Selectors {
-        /// The one.
+    /// Two parameters select a variant; at most one may.
+    #[error("{first} and {second} both select a variant; at most one parameter may")]
+    TwoSelectors {
+        /// First parameter that selects a variant.
         first: String,
-        /// The other.
+        /// Second parameter that selects a variant.
         second: String,
     },
-    /// A name means two parameters.
-    #[error("one where {name} is a parameter beside {selector} and inside its {variant}")]
-    Ambiguous {
-        /// The name.
+    /// A common parameter and a variant's parameter have the same name.
+    #[error("{name} is a parameter both next to {selector} and inside its variant {variant}")]
+    AmbiguousName {
+        /// Name of both parameters.
         name: String,
-        /// The parameter that selects a variant.
+        /// Parameter that selects a variant.
         selector: String,
-        /// The variant that has one of that name, too.
+        /// Variant with a parameter of the same name.
         variant: String,
     },
 }
 
-/// What is wrong with a JSON Schema.
+/// Invalid or unsupported part of a JSON Schema.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum KeywordError {
-    /// Something that is no schema at all.
+    /// The value is not a schema.
     #[error("{0} is neither an object nor true or false")]
-    Kind(Value),
-    /// A keyword with a value that it can't have.
-    #[error("{keyword}: {value} can't stand there")]
-    Misused {
-        /// The keyword.
+    NotASchema(Value),
+    /// The keyword's value is invalid.
+    #[error("keyword {keyword} cannot have the value {value}")]
+    InvalidValue {
+        /// Keyword.
         keyword: String,
-        /// Its value.
+        /// Value of the keyword.
         value: Value,
     },
-    /// A keyword that isn't understood.
+    /// The keyword is not supported.
     #[error("keyword {0} isn't supported; leave it out")]
     Unsupported(String),
 }

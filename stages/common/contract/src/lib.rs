@@ -1,14 +1,13 @@
-//! The contract: what a stage says of itself, and how values are checked by it.
+//! A stage's description, and the checks of values against it.
 //!
-//! * [`Description`]: what `STAGE describe` prints, all that the runner knows of a stage.
-//! * [`Input`], [`Output`]: artifacts that a stage takes, and the one that it makes.
-//! * [`Schema`]: a stage's parameters: their defaults, what they may be, and the form in which they
-//!   are hashed.
-//! * [`Rule`]: what parameters and inputs must be together.
-//! * [`RENAMES`]: names that parameters and inputs had once.
-//! * [`ParameterSection`]: parameters as people read them. [`plain`]: a value as they read it.
+//! * [`Description`]: output of `STAGE describe`; all that the runner knows about a stage.
+//! * [`Input`], [`Output`]: the artifacts that a stage reads, and the one that it creates.
+//! * [`Schema`]: a stage's parameters: defaults, allowed values, and the form in which values are
+//!   hashed.
+//! * [`Rule`]: a constraint between parameters and inputs.
+//! * [`ParameterSection`]: human-readable documentation of parameters. [`plain`]: a value as text.
 //!
-//! The runner checks values by this crate before it starts a stage. The stage checks them again.
+//! The runner checks values with this crate before it starts a stage. The stage checks them again.
 //!
 //! ```
 //! use contract::Schema;
@@ -28,8 +27,6 @@
 mod describe;
 mod documented;
 mod error;
-mod input;
-mod output;
 mod parameters;
 mod rules;
 mod tagged;
@@ -38,10 +35,8 @@ mod values;
 #[cfg(test)]
 mod variant_tests;
 
-pub use describe::{Description, DescriptionError};
-pub use documented::{GROUPS, ParameterSection, ParameterText, by_group, plain};
+pub use describe::{Description, DescriptionError, Input, Output};
+pub use documented::{PARAMETER_GROUPS, ParameterDoc, ParameterSection, group_parameters, plain};
 pub use error::{KeywordError, SchemaError};
-pub use input::Input;
-pub use output::Output;
 pub use parameters::{ParameterProblem, Schema};
 pub use rules::{GivenInputs, Rule, RuleError};

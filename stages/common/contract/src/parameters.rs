@@ -6,138 +6,141 @@ use crate::tagged::Tag;
 use crate::validator::{Misfit, Validator};
 use crate::values::Reader;
 
-/// A stage's parameter schema, compiled: defaults and checks come from the types, in the runner and
-/// in the stage alike.
+/// Compiled parameter schema of a stage, from which runner and stage take defaults and checks.
 ///
-/// Parameters are given and hashed by name, on one level. One of them may select a variant of the
-/// type ([`Tag`]): then its value is the variant's name, and the variant's own parameters stand
-/// beside it. A name means one parameter of a variant at most.
+/// Parameters are given and hashed by name, without nesting. One of them may select a variant of
+/// the type ([`Tag`]): its value is the variant's name, and the variant's own parameters are on the
+/// same level. Within a variant, names are unique.
 #[derive(Debug)]
 pub struct Schema {
-    /// One for each variant, the default's first; a single one where nothing is selected.
-    forms: Vec<Form>,
+    /// One per variant, the default variant first; exactly one if there is no tag.
+    variants: Vec<VariantSchema>,
     tag: Option<Tag>,
 }
 
-/// The parameters of one variant on one level.
+/// Schema of the common parameters and those of one variant, without nesting.
 #[derive(Debug)]
-struct Form {
+struct VariantSchema {
     schema: Value,
     validator: Validator,
 }
 
-/// A parameter that doesn't fit, in words for a person.
+/// Error message for an invalid parameter.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("parameter {name}: {problem}")]
 pub struct ParameterProblem {
-    /// The parameter.
+    /// Name of the parameter.
     pub name: String,
-    /// What is wrong and what would be right.
+    /// Problem and, if known, remedy.
     pub problem: String,
 }
 
 impl Schema {
-    /// Compiles the schema that a program describes.
+    /// Compiles a stage's parameter schema.
     pub fn new(schema: &Value) -> Result<Self, SchemaError> {
         let tag = Tag::find(schema)?;
-        let forms = match &tag {
-            None => vec![Form::new(schema.clone())?],
-            Some(tag) => tag.forms(schema).into_iter().map(Form::new).collect::<Result<_, _>>()?,
-        };
-        Ok(Self { forms, tag })
+        let schemas =
+            tag.as_ref().map_or_else(|| vec![schema.clone()], |t| t.variant_schemas(schema));
+        let variants = schemas.into_iter().map(VariantSchema::new).collect::<Result<_, _>>()?;
+        Ok(Self { variants, tag })
     }
 
-    /// Names of all parameters, sorted.
+    /// Returns the names of all parameters, sorted.
     pub fn names(&self) -> Vec<&str> {
-        let mut names: Vec<&str> = self.forms.iter().flat_map(Form::names).collect();
+        let mut names: Vec<&str> = self.variants.iter().flat_map(VariantSchema::names).collect();
         names.sort_unstable();
         names.dedup();
         names
     }
 
-    /// A parameter's value in the form that is hashed: numbers as the schema's type has them, so
-    /// that 2, 2.0 and 2e0 are one value, and what equals the default as the default is written.
+    /// Converts a parameter's value to the form that is hashed: numbers in the form of their type,
+    /// so that 2, 2.0 and 2e0 are equal, and a value that equals the default written like it.
     pub fn canonical_value(&self, name: &str, value: &Value) -> Value {
-        let form = self.forms.iter().find(|form| form.property(name).is_some());
-        form.map_or_else(|| value.clone(), |form| form.canonical_value(name, value))
+        let variant = self.variants.iter().find(|variant| variant.property(name).is_some());
+        variant.map_or_else(|| value.clone(), |variant| variant.canonical_value(name, value))
     }
 
-    /// Parameters on one level, whichever way they are written: `field: {grid: {n_levels: 4}}` is
-    /// `field: grid` and `n_levels: 4`.
+    /// Converts nested parameters, `field: {grid: {n_levels: 4}}`, to unnested ones, `field: grid`
+    /// and `n_levels: 4`.
     pub fn flattened(&self, given: &Map<String, Value>) -> Map<String, Value> {
         self.tag.as_ref().map_or_else(|| given.clone(), |tag| tag.flattened(given))
     }
 
-    /// Lays later parameters over earlier ones. Where the later ones select a variant, earlier ones
-    /// that it doesn't have go.
-    pub fn lay_over(&self, given: &mut Map<String, Value>, later: &Map<String, Value>) {
+    /// Overrides earlier parameters with later ones. If the later ones select a variant, earlier
+    /// parameters of other variants are dropped.
+    pub fn override_with(&self, given: &mut Map<String, Value>, later: &Map<String, Value>) {
         let later = self.flattened(later);
         if self.tag.as_ref().is_some_and(|tag| later.contains_key(tag.name())) {
-            let (form, known) = (self.form(&later), self.names());
-            given
-                .retain(|name, _| form.property(name).is_some() || !known.contains(&name.as_str()));
+            let variant = self.selected_variant(&later);
+            let known = self.names();
+            given.retain(|name, _| {
+                variant.property(name).is_some() || !known.contains(&name.as_str())
+            });
         }
         given.extend(later);
     }
 
-    /// Every parameter with its value: the given one, else the default. The result is what is
-    /// hashed and passed to the stage.
+    /// Returns all parameters, with defaults for those not given, as they are hashed and passed to
+    /// the stage.
     pub fn resolve(&self, given: &Map<String, Value>) -> Result<Value, Vec<ParameterProblem>> {
         let given = self.flattened(given);
-        let form = self.form(&given);
-        let mut resolved = form.defaults();
+        let variant = self.selected_variant(&given);
+        let mut resolved = variant.defaults();
         let mut problems = Vec::new();
         for (name, value) in &given {
-            if form.property(name).is_some() {
-                resolved.insert(name.clone(), form.canonical_value(name, value));
+            if variant.property(name).is_some() {
+                resolved.insert(name.clone(), variant.canonical_value(name, value));
             } else {
-                let problem = self.unknown(form, name);
+                let problem = self.unknown_parameter(variant, name);
                 problems.push(ParameterProblem { name: name.clone(), problem });
             }
         }
         let resolved = Value::Object(resolved);
-        problems.extend(form.problems(&resolved));
+        for misfit in variant.validator.misfits(&resolved) {
+            problems.push(variant.problem(misfit));
+        }
         if problems.is_empty() { Ok(resolved) } else { Err(problems) }
     }
 
-    /// Resolved parameters as the stage's type has them, a variant's parameters inside it.
+    /// Converts resolved parameters to the form of the stage's type, in which a variant's
+    /// parameters are nested.
     pub fn nested(&self, resolved: &Value) -> Value {
         self.tag.as_ref().map_or_else(|| resolved.clone(), |tag| tag.nested(resolved))
     }
 
-    /// Names of the resolved parameters that are left to the scene.
+    /// Returns the names of the resolved parameters whose value depends on the scene.
     pub fn by_scene<'a>(&'a self, resolved: &'a Value) -> Vec<&'a str> {
-        let form = self.form(resolved.as_object().unwrap_or(&Map::new()));
-        let open = form.names().filter(|name| {
-            let default = form.property(name).and_then(|property| property.get(DEFAULT_KEYWORD));
+        let variant = self.selected_variant(resolved.as_object().unwrap_or(&Map::new()));
+        let scene_dependent = variant.names().filter(|name| {
+            let default = variant.property(name).and_then(|property| property.get(DEFAULT_KEYWORD));
             resolved[*name].is_null() && default.is_some_and(|default| default == BY_SCENE)
         });
-        open.collect()
+        scene_dependent.collect()
     }
 
-    /// The form that parameters select; the default's where they select none, or none that there
-    /// is.
-    fn form(&self, flat: &Map<String, Value>) -> &Form {
+    /// Returns the schema of the selected variant; of the default one if none or an unknown one is
+    /// selected.
+    fn selected_variant(&self, flat: &Map<String, Value>) -> &VariantSchema {
         let selected = self.tag.as_ref().and_then(|tag| tag.selected(flat));
-        &self.forms[selected.unwrap_or(0)]
+        &self.variants[selected.unwrap_or(0)]
     }
 
-    /// Describes the problem of a parameter that doesn't exist.
-    fn unknown(&self, form: &Form, name: &str) -> String {
-        let others = || self.forms.iter().position(|other| other.property(name).is_some());
-        match &self.tag {
-            Some(tag) if others().is_some() => tag.foreign(others().unwrap_or(0)),
-            _ => format!("unknown; {}", known_names(name, form.names())),
+    /// Describes the problem of a parameter that the selected variant doesn't have.
+    fn unknown_parameter(&self, variant: &VariantSchema, name: &str) -> String {
+        let owner = self.variants.iter().position(|other| other.property(name).is_some());
+        match (&self.tag, owner) {
+            (Some(tag), Some(owner)) => tag.other_variant_message(owner),
+            _ => format!("unknown; {}", known_names(name, variant.names())),
         }
     }
 }
 
-/// Keyword of a parameter's schema: stands for the default where that is null.
+/// Schema keyword that describes a default of null.
 pub(crate) const DEFAULT_KEYWORD: &str = "x-default";
-/// Its value where the scene decides.
+/// Description of the default if the value depends on the scene.
 const BY_SCENE: &str = "by scene";
 
-impl Form {
+impl VariantSchema {
     fn new(schema: Value) -> Result<Self, SchemaError> {
         let mut bounded = schema.clone();
         bound_formats(&mut bounded);
@@ -175,36 +178,31 @@ impl Form {
         }
     }
 
-    fn problems(&self, resolved: &Value) -> Vec<ParameterProblem> {
-        let misfits = self.validator.misfits(resolved).into_iter();
-        misfits.map(|misfit| self.problem(misfit)).collect()
-    }
-
     fn problem(&self, misfit: Misfit) -> ParameterProblem {
         let name = misfit.path.trim_start_matches('/').to_owned();
         let problem = match self.choices(&name) {
-            Some(choices) => not_one_of(&misfit.value, &choices),
+            Some(choices) => not_one_of_message(&misfit.value, &choices),
             None => misfit.problem,
         };
         ParameterProblem { name: if name.is_empty() { "(all)".to_owned() } else { name }, problem }
     }
 
-    /// The words a parameter may be, where it is a choice: the validator itself only says that no
+    /// Returns the allowed values of a choice as JSON. The validator's own message only says that no
     /// alternative fits.
     fn choices(&self, name: &str) -> Option<Vec<String>> {
-        let words = Reader::new(&self.schema).choices(self.property(name)?)?;
-        Some(words.into_iter().map(|(word, _)| word.to_string()).collect())
+        let choices = Reader::new(&self.schema).choices(self.property(name)?)?;
+        Some(choices.into_iter().map(|(value, _)| value.to_string()).collect())
     }
 }
 
-fn not_one_of(value: &Value, choices: &[String]) -> String {
-    let meant = nearest(&value.to_string(), choices.iter().map(String::as_str));
-    let meant = meant.map(|choice| format!("; did you mean {choice}?")).unwrap_or_default();
-    format!("{value} is not one of {}{meant}", choices.join(", "))
+fn not_one_of_message(value: &Value, choices: &[String]) -> String {
+    let suggestion = nearest(&value.to_string(), choices.iter().map(String::as_str))
+        .map_or_else(String::new, |choice| format!("; did you mean {choice}?"));
+    format!("{value} is not one of {}{suggestion}", choices.join(", "))
 }
 
-/// Gives integers of a size (`format`: `uint32`, …) the bounds of that size, where the schema
-/// states none: what a stage can't hold is refused before it is started.
+/// Adds the bounds of sized integers (`format`: `uint32`, …) that the schema doesn't state, so that
+/// a value out of the type's range is refused before the stage starts.
 fn bound_formats(schema: &mut Value) {
     match schema {
         Value::Object(entries) => {
@@ -219,18 +217,22 @@ fn bound_formats(schema: &mut Value) {
                 Some("int64" | "int") => Some((json!(i64::MIN), json!(i64::MAX))),
                 _ => None,
             };
-            for (name, bound) in
-                bounds.into_iter().flat_map(|(least, most)| [("minimum", least), ("maximum", most)])
-            {
-                entries.entry(name).or_insert(bound);
+            if let Some((min, max)) = bounds {
+                entries.entry("minimum").or_insert(min);
+                entries.entry("maximum").or_insert(max);
             }
-            let data = ["default", "const", "enum", "examples"];
-            entries
-                .iter_mut()
-                .filter(|(name, _)| !data.contains(&name.as_str()))
-                .for_each(|(_, inside)| bound_formats(inside));
+            for (keyword, inner) in entries {
+                // These keywords contain values, not schemas.
+                if !["default", "const", "enum", "examples"].contains(&keyword.as_str()) {
+                    bound_formats(inner);
+                }
+            }
         }
-        Value::Array(items) => items.iter_mut().for_each(bound_formats),
+        Value::Array(items) => {
+            for item in items {
+                bound_formats(item);
+            }
+        }
         _ => {}
     }
 }
@@ -275,7 +277,7 @@ mod tests {
         assert_eq!(resolve(&json!({"scale": 4})).unwrap(), all);
     }
 
-    /// What is equal has one form, so one key; a default has the same said and unsaid.
+    /// Equal values have one form, and so one key; an explicit default and an omitted parameter, too.
     #[test]
     fn equal_values_have_one_form() {
         let unsaid = resolve(&json!({})).unwrap();

@@ -4,54 +4,53 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::describe::Input;
 use crate::error::KeywordError;
-use crate::input::Input;
 use crate::validator::Validator;
 
-/// What parameters and inputs must be together, beyond what each may be alone. The runner checks it
-/// in the plan, the stage when it starts.
+/// Constraint between parameters and inputs, in addition to the checks of each alone. The runner
+/// checks rules when it plans, a stage when it starts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Rule {
-    /// When it applies: parameters, each with a JSON Schema that its value fits then.
-    /// `INPUT.PARAMETER` is a parameter of the stage that the input comes from; where that isn't
-    /// known, the rule doesn't apply.
+    /// Conditions: parameters with JSON Schemas. The rule applies if all values match.
+    /// `INPUT.PARAMETER` is a parameter of the stage that created the input; if that value is
+    /// unknown, the rule doesn't apply.
     pub when: BTreeMap<String, Value>,
-    /// Inputs that must be given then.
+    /// Inputs that are required if the rule applies.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<String>,
-    /// What parameters must fit then, likewise.
+    /// Parameters with JSON Schemas that their values must match if the rule applies.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub must: BTreeMap<String, Value>,
-    /// What to say where it isn't kept: what is wrong, and what to do.
+    /// Message if the rule is violated: the problem and the remedy.
     pub message: String,
 }
 
-/// The inputs that are given, each with the parameters of the stage that it comes from, where those
-/// are known.
+/// Given inputs by name, with the parameters of the stage that created each, if known.
 pub type GivenInputs = BTreeMap<String, Option<Value>>;
 
-/// What is wrong with a rule.
+/// Reason why a rule can't be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RuleError {
-    /// It names an input that the stage doesn't have.
-    #[error("there is no input {0:?}")]
-    Input(String),
-    /// It names a parameter that the stage doesn't have.
-    #[error("there is no parameter {0:?}")]
-    Parameter(String),
-    /// What a value must fit.
+    /// The rule refers to an input that the stage doesn't have.
+    #[error("no input {0:?}")]
+    UnknownInput(String),
+    /// The rule refers to a parameter that the stage doesn't have.
+    #[error("no parameter {0:?}")]
+    UnknownParameter(String),
+    /// A JSON Schema of the rule can't be used.
     #[error("{name}: not a JSON Schema: {reason}")]
     Schema {
-        /// The value's name.
+        /// Parameter that the schema belongs to.
         name: String,
-        /// What is wrong.
+        /// Reason why the schema can't be used.
         reason: KeywordError,
     },
 }
 
 impl Rule {
-    /// A rule that always applies and asks for nothing yet.
+    /// Creates a rule that always applies and has no requirement yet.
     pub fn new(message: &str) -> Self {
         Self {
             when: BTreeMap::new(),
@@ -61,35 +60,35 @@ impl Rule {
         }
     }
 
-    /// Applies it only where a parameter fits a JSON Schema.
+    /// Adds a condition: the rule applies only if a parameter matches a JSON Schema.
     #[must_use]
-    pub fn when(mut self, parameter: &str, fits: Value) -> Self {
-        self.when.insert(parameter.to_owned(), fits);
+    pub fn when(mut self, parameter: &str, schema: Value) -> Self {
+        self.when.insert(parameter.to_owned(), schema);
         self
     }
 
-    /// Asks for an input.
+    /// Requires an input.
     #[must_use]
     pub fn needs(mut self, input: &str) -> Self {
         self.needs.push(input.to_owned());
         self
     }
 
-    /// Asks that a parameter fits a JSON Schema.
+    /// Requires that a parameter matches a JSON Schema.
     #[must_use]
-    pub fn must(mut self, parameter: &str, fit: Value) -> Self {
-        self.must.insert(parameter.to_owned(), fit);
+    pub fn must(mut self, parameter: &str, schema: Value) -> Self {
+        self.must.insert(parameter.to_owned(), schema);
         self
     }
 
-    /// Says what is wrong with the rule itself.
+    /// Checks that the rule refers to existing names and that its schemas can be used.
     pub(crate) fn check(
         &self,
         parameters: &[&str],
         inputs: &BTreeMap<String, Input>,
     ) -> Result<(), RuleError> {
         if let Some(input) = self.needs.iter().find(|input| !inputs.contains_key(*input)) {
-            return Err(RuleError::Input(input.clone()));
+            return Err(RuleError::UnknownInput(input.clone()));
         }
         for (name, schema) in self.when.iter().chain(&self.must) {
             let is_known = match name.split_once('.') {
@@ -97,7 +96,7 @@ impl Rule {
                 None => parameters.contains(&name.as_str()),
             };
             if !is_known {
-                return Err(RuleError::Parameter(name.clone()));
+                return Err(RuleError::UnknownParameter(name.clone()));
             }
             Validator::new(schema)
                 .map_err(|reason| RuleError::Schema { name: name.clone(), reason })?;
@@ -105,29 +104,28 @@ impl Rule {
         Ok(())
     }
 
-    /// Whether parameters and inputs are as it says.
-    pub(crate) fn is_kept(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
-        let applies = self
-            .when
-            .iter()
-            .all(|(name, schema)| fits(name, schema, parameters, inputs) == Some(true));
-        if !applies {
-            return true;
-        }
-        let is_given = self.needs.iter().all(|input| inputs.contains_key(input));
-        is_given
-            && self
-                .must
-                .iter()
-                .all(|(name, schema)| fits(name, schema, parameters, inputs) != Some(false))
+    /// Returns whether parameters and inputs satisfy the rule.
+    pub(crate) fn is_satisfied(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
+        let applies =
+            self.when.iter().all(|entry| value_matches(entry, parameters, inputs) == Some(true));
+        !applies
+            || (self.needs.iter().all(|input| inputs.contains_key(input))
+                && self
+                    .must
+                    .iter()
+                    .all(|entry| value_matches(entry, parameters, inputs) != Some(false)))
     }
 }
 
-/// Whether the value of a name fits a schema; nothing where the value isn't known.
-fn fits(name: &str, schema: &Value, parameters: &Value, inputs: &GivenInputs) -> Option<bool> {
+/// Returns whether a parameter's value matches a schema; `None` if the value is unknown.
+fn value_matches(
+    (name, schema): (&String, &Value),
+    parameters: &Value,
+    inputs: &GivenInputs,
+) -> Option<bool> {
     let value = match name.split_once('.') {
         Some((input, inner)) => inputs.get(input).and_then(|made_by| made_by.as_ref()?.get(inner)),
-        None => parameters.get(name),
+        None => parameters.get(name.as_str()),
     };
     Some(Validator::new(schema).ok()?.is_valid(value?))
 }

@@ -1,12 +1,12 @@
-//! A parameter that selects a variant with parameters of its own, as an externally tagged `enum` of
-//! structs has them.
+//! Parameters that select a variant with parameters of its own: externally tagged `enum`s of
+//! structs.
 
 use serde_json::{Map, Value, json};
 
 use crate::error::SchemaError;
 use crate::values::Reader;
 
-/// Such a parameter of a type, with its variants, the default's first.
+/// Parameter that selects a variant, with its variants, the default one first.
 #[derive(Debug)]
 pub(crate) struct Tag {
     name: String,
@@ -16,13 +16,13 @@ pub(crate) struct Tag {
 #[derive(Debug)]
 struct Variant {
     name: String,
-    /// Schemas of its parameters by name.
+    /// Schemas of the variant's parameters by name.
     properties: Map<String, Value>,
 }
 
 impl Tag {
-    /// The one that a schema has, if any. Fails where there are two, or where a name would mean two
-    /// parameters of one variant.
+    /// Finds the tag of a schema. Fails if there are two, or if a variant has a parameter of the
+    /// same name as a common one.
     pub(crate) fn find(schema: &Value) -> Result<Option<Self>, SchemaError> {
         let Some(properties) = schema.get("properties").and_then(Value::as_object) else {
             return Ok(None);
@@ -33,14 +33,14 @@ impl Tag {
             .collect();
         if let [first, second, ..] = &tags[..] {
             let (first, second) = (first.name.clone(), second.name.clone());
-            return Err(SchemaError::Selectors { first, second });
+            return Err(SchemaError::TwoSelectors { first, second });
         }
         let Some(tag) = tags.pop() else { return Ok(None) };
         for variant in &tag.variants {
             if let Some(name) =
                 variant.properties.keys().find(|name| properties.contains_key(*name))
             {
-                return Err(SchemaError::Ambiguous {
+                return Err(SchemaError::AmbiguousName {
                     name: name.clone(),
                     selector: tag.name.clone(),
                     variant: variant.name.clone(),
@@ -58,78 +58,67 @@ impl Tag {
             .iter()
             .map(|alternative| Variant::read(reader, alternative))
             .collect::<Option<_>>()?;
-        let default = property
-            .get("default")
-            .and_then(Value::as_object)
-            .and_then(|default| default.keys().next());
-        if let Some(at) = variants.iter().position(|variant| Some(&variant.name) == default) {
-            variants[..=at].rotate_right(1);
+        let default =
+            property.get("default").and_then(|default| default.as_object()?.keys().next());
+        if let Some(index) = variants.iter().position(|variant| Some(&variant.name) == default) {
+            variants[..=index].rotate_right(1);
         }
         (!variants.is_empty()).then(|| Self { name: name.to_owned(), variants })
     }
 
-    /// Its name.
+    /// Returns the name of the parameter.
     pub(crate) fn name(&self) -> &str {
         &self.name
     }
 
-    /// The variants' names, the default's first.
+    /// Returns the names of the variants, the default one first.
     pub(crate) fn variants(&self) -> impl Iterator<Item = &str> {
         self.variants.iter().map(|variant| variant.name.as_str())
     }
 
-    /// A schema for each variant, with its parameters on the level of all others.
-    pub(crate) fn forms(&self, schema: &Value) -> Vec<Value> {
-        let choices: Vec<&str> = self.variants().collect();
-        self.variants.iter().map(|variant| self.form(schema, &choices, variant)).collect()
+    /// Returns one schema per variant, in which the variant's parameters are not nested.
+    pub(crate) fn variant_schemas(&self, schema: &Value) -> Vec<Value> {
+        self.variants.iter().map(|variant| self.variant_schema(schema, variant)).collect()
     }
 
-    fn form(&self, schema: &Value, choices: &[&str], variant: &Variant) -> Value {
-        let mut form = schema.clone();
-        let tag = &mut form["properties"][&self.name];
-        let mut own = json!({"enum": choices, "default": choices[0]});
-        for (keyword, value) in tag
-            .as_object()
-            .into_iter()
-            .flatten()
-            .filter(|(k, _)| !["$ref", "oneOf", "default"].contains(&k.as_str()))
-        {
-            own[keyword] = value.clone();
+    fn variant_schema(&self, schema: &Value, variant: &Variant) -> Value {
+        let mut unnested = schema.clone();
+        if let Some(tag) = unnested["properties"][&self.name].as_object_mut() {
+            tag.retain(|keyword, _| !["$ref", "oneOf"].contains(&keyword.as_str()));
+            tag.insert("enum".to_owned(), self.variants().collect());
+            tag.insert("default".to_owned(), json!(self.variants[0].name));
         }
-        *tag = own;
-        if let Some(properties) = form["properties"].as_object_mut() {
+        if let Some(properties) = unnested["properties"].as_object_mut() {
             properties.extend(variant.properties.clone());
         }
-        form
+        unnested
     }
 
-    /// The number of the variant that parameters select; none where they leave it out or name none.
+    /// Returns the index of the selected variant; `None` if no or an unknown one is selected.
     pub(crate) fn selected(&self, flat: &Map<String, Value>) -> Option<usize> {
         let name = flat.get(&self.name)?.as_str()?;
         self.variants().position(|variant| variant == name)
     }
 
-    /// Parameters with those of a variant beside its name. What isn't a variant stays, for the
-    /// validator to name.
+    /// Moves a variant's nested parameters to the level of the tag. Anything but a known variant
+    /// stays unchanged; the validator reports it.
     pub(crate) fn flattened(&self, given: &Map<String, Value>) -> Map<String, Value> {
-        let nested =
-            given.get(&self.name).and_then(Value::as_object).filter(|nested| nested.len() == 1);
-        let inside = nested
-            .and_then(|nested| nested.iter().next())
-            .and_then(|(name, inner)| Some((name, inner.as_object()?)));
-        let Some((variant, inner)) =
-            inside.filter(|(name, _)| self.variants().any(|variant| variant == *name))
+        let nested = given.get(&self.name).and_then(Value::as_object).filter(|n| n.len() == 1);
+        let Some((variant, Value::Object(inner))) = nested.and_then(|nested| nested.iter().next())
         else {
             return given.clone();
         };
-        // A name that is said outside, too, is as it is said there.
+        if !self.variants().any(|name| name == variant) {
+            return given.clone();
+        }
+        // An unnested parameter overrides a nested one of the same name.
         let mut flat = inner.clone();
         flat.extend(given.clone());
         flat.insert(self.name.clone(), json!(variant));
         flat
     }
 
-    /// Resolved parameters with those of the variant inside it, as the type has them.
+    /// Moves the selected variant's parameters into the tag, as the stage's type nests them.
     pub(crate) fn nested(&self, resolved: &Value) -> Value {
         let Some(flat) = resolved.as_object() else { return resolved.clone() };
         let Some(index) = self.selected(flat) else { return resolved.clone() };
@@ -140,8 +129,8 @@ impl Tag {
         Value::Object(nested)
     }
 
-    /// What to say of a parameter that only another variant has.
-    pub(crate) fn foreign(&self, variant: usize) -> String {
+    /// Returns the message for a parameter that only a variant that is not selected has.
+    pub(crate) fn other_variant_message(&self, variant: usize) -> String {
         format!(
             "belongs to {0}: {1}; leave it out, or choose {0}: {1}",
             self.name, self.variants[variant].name
@@ -150,8 +139,8 @@ impl Tag {
 }
 
 impl Variant {
-    /// The variant that an alternative of a tagged `enum` is: an object with one property, itself
-    /// an object.
+    /// Reads a variant from an alternative of a tagged `enum`: an object whose only property is
+    /// itself an object.
     fn read(reader: Reader<'_>, alternative: &Value) -> Option<Self> {
         let outer = alternative.get("properties")?.as_object()?;
         let (name, inner) = outer.iter().next().filter(|_| outer.len() == 1)?;

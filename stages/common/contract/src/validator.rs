@@ -1,5 +1,5 @@
-//! Checks JSON values against the part of JSON Schema (draft 2020-12) that parameters need. The
-//! whole of it would be most of a stage's compile time, and of its start.
+//! Checks of JSON values against the part of JSON Schema (draft 2020-12) that parameters need. A
+//! complete validator would dominate a stage's compile time and start-up time.
 
 use std::cmp::Ordering;
 
@@ -7,8 +7,8 @@ use serde_json::{Map, Number, Value};
 
 use crate::error::KeywordError;
 
-/// Keywords that constrain values and aren't understood: a schema that has one is refused, so that
-/// nothing passes unchecked.
+/// Unsupported keywords that constrain values. A schema with one of them is refused, so that no
+/// value passes unchecked.
 const UNSUPPORTED: [&str; 20] = [
     "$dynamicRef",
     "additionalItems",
@@ -32,143 +32,140 @@ const UNSUPPORTED: [&str; 20] = [
     "$recursiveRef",
 ];
 const TYPES: [&str; 7] = ["array", "boolean", "integer", "null", "number", "object", "string"];
-/// Deeper than any value that was read; only a schema that leads back to itself comes here.
-const DEEPEST_NESTING: usize = 512;
+/// Maximum depth of nested schemas. No JSON value is as deep; only a schema that refers to itself
+/// exceeds it.
+const MAX_DEPTH: usize = 512;
 
-/// A schema whose keywords are all understood.
+/// Validator of a schema whose keywords are all supported.
 #[derive(Clone, Debug)]
 pub(crate) struct Validator {
     root: Value,
 }
 
-/// What doesn't fit, and where.
+/// Value that violates the schema.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Misfit {
-    /// JSON pointer of the value inside the one that was checked.
+    /// JSON pointer from the checked value to the invalid one.
     pub(crate) path: String,
-    /// The value.
+    /// Invalid value.
     pub(crate) value: Value,
-    /// What is wrong with it.
+    /// Problem, as a sentence.
     pub(crate) problem: String,
 }
 
 impl Validator {
-    /// Takes a schema; the error names the keyword that can't be used.
+    /// Creates a validator; fails if a keyword of the schema is invalid or unsupported.
     pub(crate) fn new(schema: &Value) -> Result<Self, KeywordError> {
-        check(schema, schema)?;
+        check_schema(schema, schema)?;
         Ok(Self { root: schema.clone() })
     }
 
-    /// Whether a value fits.
+    /// Returns whether a value is valid.
     pub(crate) fn is_valid(&self, value: &Value) -> bool {
         self.misfits(value).is_empty()
     }
 
-    /// Everything that doesn't fit.
+    /// Finds all violations of the schema.
     pub(crate) fn misfits(&self, value: &Value) -> Vec<Misfit> {
         let mut check = Check { root: &self.root, path: Vec::new(), found: Vec::new() };
-        check.value(&self.root, value, 0);
+        check.check_value(&self.root, value, 0);
         check.found
     }
 }
 
-/// Checks a schema itself.
-fn check(root: &Value, schema: &Value) -> Result<(), KeywordError> {
+/// Checks that a schema can be used.
+fn check_schema(root: &Value, schema: &Value) -> Result<(), KeywordError> {
     let keywords = match schema {
         Value::Bool(_) => return Ok(()),
         Value::Object(keywords) => keywords,
-        other => return Err(KeywordError::Kind(other.clone())),
+        other => return Err(KeywordError::NotASchema(other.clone())),
     };
     for (keyword, value) in keywords {
-        let wrong =
-            || Err(KeywordError::Misused { keyword: keyword.clone(), value: value.clone() });
-        match keyword.as_str() {
-            "type" => {
-                let is_type = |one: &Value| one.as_str().is_some_and(|t| TYPES.contains(&t));
-                if !is_type(value) && !value.as_array().is_some_and(|all| all.iter().all(is_type)) {
-                    return wrong();
-                }
+        let is_valid = match keyword.as_str() {
+            "type" => is_type(value) || value.as_array().is_some_and(|t| t.iter().all(is_type)),
+            "enum" | "required" | "anyOf" | "oneOf" | "allOf" | "prefixItems" => value.is_array(),
+            "minimum" | "maximum" | "exclusiveMinimum" | "exclusiveMaximum" => value.is_number(),
+            "multipleOf" => value.as_f64().is_some_and(|step| step > 0.0),
+            "minLength" | "maxLength" | "minItems" | "maxItems" => value.is_u64(),
+            "$ref" => referred(root, value).is_some(),
+            "properties" | "$defs" | "definitions" => value.is_object(),
+            // Further keywords are descriptions, defaults, formats, and extensions such as `x-group`.
+            other if !UNSUPPORTED.contains(&other) => true,
+            other => return Err(KeywordError::Unsupported(other.to_owned())),
+        };
+        if !is_valid {
+            let (keyword, value) = (keyword.clone(), value.clone());
+            return Err(KeywordError::InvalidValue { keyword, value });
+        }
+        let schemas: Vec<&Value> = match (keyword.as_str(), value) {
+            ("items" | "additionalProperties" | "not", schema) => vec![schema],
+            ("anyOf" | "oneOf" | "allOf" | "prefixItems", Value::Array(all)) => {
+                all.iter().collect()
             }
-            "enum" | "required" if !value.is_array() => return wrong(),
-            "minimum" | "maximum" | "exclusiveMinimum" | "exclusiveMaximum"
-                if !value.is_number() =>
-            {
-                return wrong();
-            }
-            "multipleOf" if value.as_f64().is_none_or(|step| step <= 0.0) => return wrong(),
-            "minLength" | "maxLength" | "minItems" | "maxItems" if value.as_u64().is_none() => {
-                return wrong();
-            }
-            "$ref" if referred(root, value).is_none() => return wrong(),
-            "items" | "additionalProperties" | "not" => check(root, value)?,
-            "anyOf" | "oneOf" | "allOf" | "prefixItems" => {
-                let Some(schemas) = value.as_array() else { return wrong() };
-                schemas.iter().try_for_each(|schema| check(root, schema))?;
-            }
-            "properties" | "$defs" | "definitions" => {
-                let Some(schemas) = value.as_object() else { return wrong() };
-                schemas.values().try_for_each(|schema| check(root, schema))?;
-            }
-            other if UNSUPPORTED.contains(&other) => {
-                return Err(KeywordError::Unsupported(other.to_owned()));
-            }
-            // Descriptions, defaults, formats, and words of somebody's own.
-            _ => {}
+            ("properties" | "$defs" | "definitions", Value::Object(all)) => all.values().collect(),
+            _ => Vec::new(),
+        };
+        for schema in schemas {
+            check_schema(root, schema)?;
         }
     }
     Ok(())
 }
 
-/// The schema that a `$ref` leads to inside the same document.
+fn is_type(name: &Value) -> bool {
+    name.as_str().is_some_and(|name| TYPES.contains(&name))
+}
+
+/// Returns the schema in the same document that a `$ref` refers to.
 fn referred<'a>(root: &'a Value, reference: &Value) -> Option<&'a Value> {
     root.pointer(reference.as_str()?.strip_prefix('#')?)
 }
 
-/// A check under way.
+/// State of the check of a value.
 struct Check<'a> {
     root: &'a Value,
-    /// Keys and indices from the whole value to the part at hand.
+    /// Keys and indices from the outermost value to the current one.
     path: Vec<String>,
     found: Vec<Misfit>,
 }
 
 impl<'a> Check<'a> {
-    fn misfit(&mut self, value: &Value, problem: String) {
+    fn report(&mut self, value: &Value, problem: String) {
         let path = self.path.iter().map(|part| format!("/{part}")).collect();
         self.found.push(Misfit { path, value: value.clone(), problem });
     }
 
-    /// Checks a part of the value against a schema.
-    fn value(&mut self, schema: &'a Value, value: &Value, depth: usize) {
+    /// Checks the current value against a schema.
+    fn check_value(&mut self, schema: &'a Value, value: &Value, depth: usize) {
         let Value::Object(keywords) = schema else {
             if schema == &Value::Bool(false) {
-                self.misfit(value, format!("{value} isn't allowed"));
+                self.report(value, format!("{value} isn't allowed"));
             }
             return;
         };
-        if depth > DEEPEST_NESTING {
-            self.misfit(value, "its schema leads back to itself".to_owned());
+        if depth > MAX_DEPTH {
+            self.report(value, "its schema refers to itself".to_owned());
             return;
         }
         if let Some(schema) = keywords.get("$ref").and_then(|to| referred(self.root, to)) {
-            self.value(schema, value, depth + 1);
+            self.check_value(schema, value, depth + 1);
         }
-        self.kind(keywords, value);
+        self.check_kind(keywords, value);
         match value {
-            Value::Number(number) => self.number(keywords, number, value),
+            Value::Number(number) => self.check_number(keywords, number, value),
             Value::String(text) => {
                 let length = text.chars().count();
-                self.count(keywords, ("minLength", "maxLength"), length, "character", value);
+                self.check_length(keywords, ["minLength", "maxLength"], length, "character", value);
             }
-            Value::Array(items) => self.items(keywords, items, depth),
-            Value::Object(entries) => self.entries(keywords, entries, depth),
+            Value::Array(items) => self.check_items(keywords, items, value, depth),
+            Value::Object(entries) => self.check_entries(keywords, entries, value, depth),
             Value::Null | Value::Bool(_) => {}
         }
-        self.combined(keywords, value, depth);
+        self.check_combined(keywords, value, depth);
     }
 
-    /// `type`, `const`, `enum`.
-    fn kind(&mut self, keywords: &Map<String, Value>, value: &Value) {
+    /// Checks `type`, `const` and `enum`.
+    fn check_kind(&mut self, keywords: &Map<String, Value>, value: &Value) {
         if let Some(types) = keywords.get("type") {
             let names: Vec<&str> = match types {
                 Value::Array(names) => names.iter().filter_map(Value::as_str).collect(),
@@ -177,23 +174,23 @@ impl<'a> Check<'a> {
             if !names.iter().any(|name| is_of_type(value, name)) {
                 let s = if names.len() > 1 { "s" } else { "" };
                 let names: Vec<String> = names.iter().map(|name| format!("{name:?}")).collect();
-                self.misfit(value, format!("{value} is not of type{s} {}", names.join(", ")));
+                self.report(value, format!("{value} is not of type{s} {}", names.join(", ")));
             }
         }
         if let Some(constant) = keywords.get("const").filter(|constant| !equal(constant, value)) {
-            self.misfit(value, format!("{constant} was expected"));
+            self.report(value, format!("{constant} was expected"));
         }
         if let Some(choices) = keywords.get("enum").and_then(Value::as_array)
             && !choices.iter().any(|choice| equal(choice, value))
         {
             let choices: Vec<String> = choices.iter().map(ToString::to_string).collect();
-            self.misfit(value, format!("{value} is not one of {}", choices.join(", ")));
+            self.report(value, format!("{value} is not one of {}", choices.join(", ")));
         }
     }
 
-    fn number(&mut self, keywords: &Map<String, Value>, number: &Number, value: &Value) {
+    fn check_number(&mut self, keywords: &Map<String, Value>, number: &Number, value: &Value) {
         use Ordering::{Equal, Greater, Less};
-        for (keyword, wrong, words) in [
+        for (keyword, wrong, problem) in [
             ("minimum", &[Less][..], "less than the minimum"),
             ("maximum", &[Greater], "greater than the maximum"),
             ("exclusiveMinimum", &[Less, Equal], "less than or equal to the minimum"),
@@ -202,103 +199,106 @@ impl<'a> Check<'a> {
             if let Some(Value::Number(bound)) = keywords.get(keyword)
                 && compare(number, bound).is_none_or(|order| wrong.contains(&order))
             {
-                self.misfit(value, format!("{value} is {words} of {bound}"));
+                self.report(value, format!("{value} is {problem} of {bound}"));
             }
         }
         if let Some(Value::Number(step)) = keywords.get("multipleOf")
             && !is_multiple(number, step)
         {
-            self.misfit(value, format!("{value} is not a multiple of {step}"));
+            self.report(value, format!("{value} is not a multiple of {step}"));
         }
     }
 
-    /// Bounds of a length.
-    fn count(
+    /// Checks the bounds of a string's or array's length.
+    fn check_length(
         &mut self,
         keywords: &Map<String, Value>,
-        (least, most): (&str, &str),
-        count: usize,
+        [min, max]: [&str; 2],
+        length: usize,
         noun: &str,
         value: &Value,
     ) {
-        let bound = |keyword: &str| keywords.get(keyword).and_then(Value::as_u64);
-        let count = count as u64;
-        if let Some(bound) = bound(least).filter(|&bound| count < bound) {
-            self.misfit(value, format!("{value} has less than {bound} {noun}s"));
+        let length = length as u64;
+        let [min, max] = [min, max].map(|keyword| keywords.get(keyword).and_then(Value::as_u64));
+        if let Some(min) = min.filter(|&min| length < min) {
+            self.report(value, format!("{value} has less than {min} {noun}s"));
         }
-        if let Some(bound) = bound(most).filter(|&bound| count > bound) {
-            self.misfit(value, format!("{value} has more than {bound} {noun}s"));
+        if let Some(max) = max.filter(|&max| length > max) {
+            self.report(value, format!("{value} has more than {max} {noun}s"));
         }
     }
 
-    fn items(&mut self, keywords: &'a Map<String, Value>, items: &[Value], depth: usize) {
-        let whole = Value::Array(items.to_vec());
-        self.count(keywords, ("minItems", "maxItems"), items.len(), "item", &whole);
-        let placed = keywords.get("prefixItems").and_then(Value::as_array);
+    fn check_items(
+        &mut self,
+        keywords: &'a Map<String, Value>,
+        items: &[Value],
+        value: &Value,
+        depth: usize,
+    ) {
+        self.check_length(keywords, ["minItems", "maxItems"], items.len(), "item", value);
+        let prefix = keywords.get("prefixItems").and_then(Value::as_array);
         for (index, item) in items.iter().enumerate() {
-            let schema = placed.and_then(|schemas| schemas.get(index));
+            let schema = prefix.and_then(|schemas| schemas.get(index));
             if let Some(schema) = schema.or_else(|| keywords.get("items")) {
-                self.inside(schema, &index.to_string(), item, depth);
+                self.check_inner(schema, &index.to_string(), item, depth);
             }
         }
     }
 
-    fn entries(
+    fn check_entries(
         &mut self,
         keywords: &'a Map<String, Value>,
         entries: &Map<String, Value>,
+        value: &Value,
         depth: usize,
     ) {
         let required = keywords.get("required").and_then(Value::as_array).into_iter().flatten();
         for name in required.filter_map(Value::as_str).filter(|name| !entries.contains_key(*name)) {
-            self.misfit(&Value::Object(entries.clone()), format!("{name:?} is missing"));
+            self.report(value, format!("{name:?} is missing"));
         }
         for (name, entry) in entries {
-            match keywords.get("properties").and_then(|properties| properties.get(name)) {
-                Some(schema) => self.inside(schema, name, entry, depth),
-                None => match keywords.get("additionalProperties") {
-                    Some(Value::Bool(false)) => {
-                        let problem = format!("{name:?} is not expected");
-                        self.misfit(&Value::Object(entries.clone()), problem);
-                    }
-                    Some(schema) => self.inside(schema, name, entry, depth),
-                    None => {}
-                },
+            let schema = keywords.get("properties").and_then(|properties| properties.get(name));
+            match (schema, keywords.get("additionalProperties")) {
+                (Some(schema), _) => self.check_inner(schema, name, entry, depth),
+                (None, Some(Value::Bool(false))) => {
+                    self.report(value, format!("{name:?} is not expected"));
+                }
+                (None, Some(schema)) => self.check_inner(schema, name, entry, depth),
+                (None, None) => {}
             }
         }
     }
 
-    fn inside(&mut self, schema: &'a Value, name: &str, value: &Value, depth: usize) {
+    fn check_inner(&mut self, schema: &'a Value, name: &str, value: &Value, depth: usize) {
         self.path.push(name.to_owned());
-        self.value(schema, value, depth + 1);
+        self.check_value(schema, value, depth + 1);
         self.path.pop();
     }
 
-    /// `allOf`, `anyOf`, `oneOf`, `not`.
-    fn combined(&mut self, keywords: &'a Map<String, Value>, value: &Value, depth: usize) {
-        let list = |keyword: &str| keywords.get(keyword).and_then(Value::as_array);
-        for schema in list("allOf").into_iter().flatten() {
-            self.value(schema, value, depth + 1);
+    /// Checks `allOf`, `anyOf`, `oneOf` and `not`.
+    fn check_combined(&mut self, keywords: &'a Map<String, Value>, value: &Value, depth: usize) {
+        for schema in keywords.get("allOf").and_then(Value::as_array).into_iter().flatten() {
+            self.check_value(schema, value, depth + 1);
         }
-        let any = list("anyOf");
-        if any.is_some_and(|all| !all.iter().any(|schema| self.fits(schema, value, depth))) {
-            self.misfit(value, format!("{value} fits none of the alternatives"));
+        // Matches beyond the limit don't change the result.
+        for (keyword, limit) in [("anyOf", 1), ("oneOf", 2)] {
+            let Some(schemas) = keywords.get(keyword).and_then(Value::as_array) else { continue };
+            let matches = schemas.iter().filter(|one| self.matches(one, value, depth));
+            match matches.take(limit).count() {
+                0 => self.report(value, format!("{value} fits none of the alternatives")),
+                1 => {}
+                _ => self.report(value, format!("{value} fits several alternatives")),
+            }
         }
-        let one = list("oneOf");
-        match one.map(|all| all.iter().filter(|one| self.fits(one, value, depth)).count()) {
-            Some(0) => self.misfit(value, format!("{value} fits none of the alternatives")),
-            None | Some(1) => {}
-            Some(_) => self.misfit(value, format!("{value} fits several alternatives")),
-        }
-        if keywords.get("not").is_some_and(|schema| self.fits(schema, value, depth)) {
-            self.misfit(value, format!("{value} isn't allowed"));
+        if keywords.get("not").is_some_and(|schema| self.matches(schema, value, depth)) {
+            self.report(value, format!("{value} isn't allowed"));
         }
     }
 
-    /// Whether the value at hand fits another schema.
-    fn fits(&self, schema: &'a Value, value: &Value, depth: usize) -> bool {
+    /// Returns whether a value matches another schema.
+    fn matches(&self, schema: &'a Value, value: &Value, depth: usize) -> bool {
         let mut check = Check { root: self.root, path: Vec::new(), found: Vec::new() };
-        check.value(schema, value, depth + 1);
+        check.check_value(schema, value, depth + 1);
         check.found.is_empty()
     }
 }
@@ -314,7 +314,7 @@ fn is_of_type(value: &Value, name: &str) -> bool {
     }
 }
 
-/// Whether two values are the same, as numbers are: 2 is 2.0.
+/// Returns whether two values are equal; numbers compare by value, so 2 equals 2.0.
 fn equal(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::Number(a), Value::Number(b)) => compare(a, b) == Some(Ordering::Equal),
@@ -328,9 +328,9 @@ fn equal(a: &Value, b: &Value) -> bool {
     }
 }
 
-/// A number without a part behind the point, exactly.
+/// Returns the exact value of a whole number; `None` for fractions.
 fn whole(number: &Number) -> Option<i128> {
-    /// Far beyond 64 bits, and less than an `i128` holds.
+    /// Bound of the floats that are converted: above 64 bits, and within `i128`.
     const LIMIT: f64 = 1e36;
     if let Some(value) = number.as_u64().map(i128::from).or(number.as_i64().map(i128::from)) {
         return Some(value);
@@ -346,7 +346,7 @@ fn compare(a: &Number, b: &Number) -> Option<Ordering> {
 }
 
 fn is_multiple(number: &Number, step: &Number) -> bool {
-    /// Decimal fractions have no exact binary form: 0.3 is three times 0.1.
+    /// Tolerance of the ratio: decimal fractions are rounded, yet 0.3 is a multiple of 0.1.
     const ROUNDING: f64 = 1e-9;
     match (whole(number), whole(step)) {
         (Some(number), Some(step)) => number.checked_rem(step) == Some(0),

@@ -1,9 +1,8 @@
-//! Numbers in the form that a schema gives them: what is equal is written alike, and so hashed
-//! alike.
+//! Numbers in the form that a schema prescribes: equal values are written, and so hashed, equally.
 
 use serde_json::{Number, Value};
 
-/// A schema with what its references lead to.
+/// Reader of values by a schema, whose references are resolved in `root`.
 #[derive(Clone, Copy)]
 pub(crate) struct Reader<'a> {
     root: &'a Value,
@@ -14,9 +13,8 @@ impl<'a> Reader<'a> {
         Self { root }
     }
 
-    /// A value as a schema reads it. Where the schema has `number`, 2 becomes 2.0. Elsewhere 2.0
-    /// becomes 2. Arrays and objects likewise inside. What doesn't fit the schema stays, for the
-    /// validator to name.
+    /// Converts a value, including nested values, to the schema's form: for type `number` 2 becomes
+    /// 2.0, otherwise 2.0 becomes 2. Invalid values stay unchanged; the validator reports them.
     pub(crate) fn read(&self, schema: &'a Value, value: &Value) -> Value {
         self.read_by(&self.alternatives(&[schema]), value)
     }
@@ -24,21 +22,21 @@ impl<'a> Reader<'a> {
     fn read_by(&self, schemas: &[&'a Value], value: &Value) -> Value {
         match value {
             Value::Number(number) if schemas.iter().any(|s| has_type(s, "number")) => {
-                let is_short =
+                let is_f32 =
                     schemas.iter().any(|s| s.get("format").is_some_and(|format| format == "float"));
-                as_float(number, is_short).unwrap_or_else(|| value.clone())
+                as_float(number, is_f32).unwrap_or_else(|| value.clone())
             }
             Value::Number(number) => as_integer(number).unwrap_or_else(|| value.clone()),
             Value::Array(items) => {
                 let items = items.iter().enumerate().map(|(index, item)| {
-                    self.read_by(&self.inside(schemas, |s| item_schema(s, index)), item)
+                    self.read_by(&self.inner_schemas(schemas, |s| item_schema(s, index)), item)
                 });
                 items.collect()
             }
             Value::Object(entries) => {
                 let entries = entries.iter().map(|(name, entry)| {
-                    let inside = self.inside(schemas, |s| property_schema(s, name));
-                    (name.clone(), self.read_by(&inside, entry))
+                    let inner = self.inner_schemas(schemas, |s| property_schema(s, name));
+                    (name.clone(), self.read_by(&inner, entry))
                 });
                 Value::Object(entries.collect())
             }
@@ -46,8 +44,8 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// The schemas of what is inside a value that has these.
-    fn inside(
+    /// Returns the schemas of a nested value, found in each schema of the outer value by `find`.
+    fn inner_schemas(
         &self,
         schemas: &[&'a Value],
         find: impl Fn(&'a Value) -> Option<&'a Value>,
@@ -55,7 +53,7 @@ impl<'a> Reader<'a> {
         self.alternatives(&schemas.iter().filter_map(|s| find(s)).collect::<Vec<_>>())
     }
 
-    /// Schemas, what they refer to, and their parts and alternatives; each once.
+    /// Returns the schemas with all schemas that they refer to or combine, each once.
     fn alternatives(&self, schemas: &[&'a Value]) -> Vec<&'a Value> {
         let mut found: Vec<&Value> = Vec::new();
         let mut open = schemas.to_vec();
@@ -72,33 +70,32 @@ impl<'a> Reader<'a> {
         found
     }
 
-    /// The values that a choice may have, each with its description, where a schema is one. What
-    /// may be left out is a choice between its kind and null.
+    /// Returns the allowed values with their descriptions if the schema lists all of them. Null,
+    /// which marks an optional value, is not among them.
     pub(crate) fn choices(&self, schema: &'a Value) -> Option<Vec<(&'a Value, &'a str)>> {
         let definition = self.present(schema);
-        if let Some(words) = definition.get("enum").and_then(Value::as_array) {
-            return Some(words.iter().map(|word| (word, "")).collect());
+        if let Some(values) = definition.get("enum").and_then(Value::as_array) {
+            return Some(values.iter().map(|value| (value, "")).collect());
         }
-        let choices = definition.get("oneOf")?.as_array()?.iter().map(|one| {
-            let description = one.get("description").and_then(Value::as_str).unwrap_or_default();
-            Some((one.get("const")?, description))
-        });
-        choices.collect()
+        let mut choices = Vec::new();
+        for choice in definition.get("oneOf")?.as_array()? {
+            let description = choice.get("description").and_then(Value::as_str);
+            choices.push((choice.get("const")?, description.unwrap_or_default()));
+        }
+        Some(choices)
     }
 
-    /// The schema of a value that is there: without the null that stands for none, and behind its
-    /// reference.
+    /// Returns the schema of a value that is given: without the alternative null, and with `$ref`
+    /// resolved.
     pub(crate) fn present(&self, schema: &'a Value) -> &'a Value {
-        let is_null = |one: &&Value| one.get("type").is_some_and(|t| t == "null");
-        let inner = schema
-            .get("anyOf")
-            .and_then(Value::as_array)
-            .and_then(|of| of.iter().find(|one| !is_null(one)));
-        let schema = inner.unwrap_or(schema);
+        let alternatives = schema.get("anyOf").and_then(Value::as_array);
+        let not_null = alternatives
+            .and_then(|all| all.iter().find(|one| one.get("type").is_none_or(|t| t != "null")));
+        let schema = not_null.unwrap_or(schema);
         self.referred(schema).unwrap_or(schema)
     }
 
-    /// What a schema's `$ref` leads to inside the same document.
+    /// Returns the schema in the same document that a schema's `$ref` refers to.
     pub(crate) fn referred(&self, schema: &Value) -> Option<&'a Value> {
         self.root.pointer(schema.get("$ref")?.as_str()?.strip_prefix('#')?)
     }
@@ -113,8 +110,8 @@ fn has_type(schema: &Value, name: &str) -> bool {
 }
 
 fn item_schema(schema: &Value, index: usize) -> Option<&Value> {
-    let placed = schema.get("prefixItems").and_then(|items| items.get(index));
-    placed.or_else(|| schema.get("items"))
+    let prefix = schema.get("prefixItems").and_then(|items| items.get(index));
+    prefix.or_else(|| schema.get("items"))
 }
 
 fn property_schema<'a>(schema: &'a Value, name: &str) -> Option<&'a Value> {
@@ -122,13 +119,13 @@ fn property_schema<'a>(schema: &'a Value, name: &str) -> Option<&'a Value> {
     named.or_else(|| schema.get("additionalProperties"))
 }
 
-/// With a point, as `f64` or `f32` print; -0 is 0.
-fn as_float(number: &Number, is_short: bool) -> Option<Value> {
+/// Converts a number to a float, rounded to `f32` if the schema says so; -0 becomes 0.
+fn as_float(number: &Number, is_f32: bool) -> Option<Value> {
     let value = number.as_f64()? + 0.0;
-    Number::from_f64(if is_short { f64::from(value as f32) } else { value }).map(Value::Number)
+    Number::from_f64(if is_f32 { f64::from(value as f32) } else { value }).map(Value::Number)
 }
 
-/// Without a point, where it is whole and a 64-bit integer holds it.
+/// Converts a float to an integer if it is whole and fits into 64 bits.
 fn as_integer(number: &Number) -> Option<Value> {
     if !number.is_f64() {
         return None;

@@ -119,7 +119,9 @@ fn a_later_choice_drops_what_it_does_not_have() {
         (json!({"levels": 4}), json!({"layers": 5}), json!({"levels": 4, "layers": 5})),
     ] {
         let mut given = Map::new();
-        [&earlier, &later].into_iter().for_each(|layer| schema().lay_over(&mut given, &map(layer)));
+        [&earlier, &later]
+            .into_iter()
+            .for_each(|layer| schema().override_with(&mut given, &map(layer)));
         assert_eq!(Value::Object(given), expected, "{earlier}, then {later}");
     }
 }
@@ -144,7 +146,7 @@ fn a_name_means_one_parameter() {
         Schema::new(&twice)
             .unwrap_err()
             .to_string()
-            .contains("layers is a parameter beside field and inside its mlp")
+            .contains("layers is a parameter both next to field and inside its variant mlp")
     );
     let mut two = described();
     two["properties"]["other"] = two["properties"]["field"].clone();

@@ -327,7 +327,7 @@ impl<'a> Expansion<'a> {
                     settings.insert(setting.name.clone(), setting.value.clone());
                 }
             }
-            program.schema.lay_over(&mut given, &settings);
+            program.schema.override_with(&mut given, &settings);
         }
         program
             .schema

@@ -96,7 +96,7 @@ impl StageProgram {
     /// Overrides the `given` parameters with those of a block.
     pub fn lay_over(&self, given: &mut Map<String, Value>, block: &StageBlock) {
         for layer in block.parameter_layers() {
-            self.schema.lay_over(given, layer);
+            self.schema.override_with(given, layer);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! The end of a stage's `--help`: inputs and parameters, in groups, wrapped.
 
-use contract::{Description, ParameterText, by_group};
+use contract::{Description, ParameterDoc, group_parameters};
 use textwrap::{Options, fill};
 
 /// Columns of the help.
@@ -34,7 +34,7 @@ pub(crate) fn help_of(description: &Description) -> String {
         if let Some(variant) = &section.variant {
             text.push_str(&format!("\nWith {variant}\n"));
         }
-        for (group, parameters) in by_group(&section.parameters) {
+        for (group, parameters) in group_parameters(&section.parameters) {
             if group.is_empty() {
                 text.push('\n');
             } else {
@@ -46,7 +46,7 @@ pub(crate) fn help_of(description: &Description) -> String {
     text
 }
 
-fn parameter_entry(parameter: &ParameterText) -> String {
+fn parameter_entry(parameter: &ParameterDoc) -> String {
     entry(
         &parameter.name,
         &format!("{} [{}; default: {}]", parameter.text, parameter.allowed, parameter.default),
