@@ -143,7 +143,7 @@ fn output_that_cannot_be_written() {
         .current_dir(project.path("."))
         .output()
         .unwrap();
-    common::Finished::of(output).fails(1, &["--output taken/out", "cannot write there"]);
+    common::Finished::of(output).fails(1, &["--output taken/out", "cannot create the folder"]);
 }
 
 /// A small tmpfs as the store: needs root, as CI has; says so where it can't be mounted.

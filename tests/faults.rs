@@ -52,11 +52,7 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
         .unwrap();
     let finished = Finished::of(stopped);
     assert_eq!(finished.code, 130, "{}", finished.stderr);
-    assert!(
-        finished.stderr.contains("interrupted; run again to go on from here"),
-        "{}",
-        finished.stderr
-    );
+    assert!(finished.stderr.contains("interrupted; run again to resume"), "{}", finished.stderr);
     let checkpoint = checkpoints(&work).pop().expect("it left a checkpoint");
     assert!(!output.exists());
     // A checkpoint cut short is said and left out, not trusted.

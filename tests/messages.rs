@@ -59,7 +59,7 @@ fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
         (
             &allocation,
             1,
-            "talk: failed: out of memory: 99.5 MB more were asked for; end other programs, run \
+            "talk: failed: out of memory: 99.5 MB more were requested; end other programs, run \
             one stage at a time",
         ),
         (
@@ -391,7 +391,7 @@ fn a_terminal_that_goes_away_leaves_a_checkpoint() {
         let finished = Finished::of(child.wait_with_output().unwrap());
         assert_eq!(finished.code, code, "{}", finished.stderr);
         assert!(
-            finished.stderr.ends_with("train-ss: interrupted; run again to go on from here\n"),
+            finished.stderr.ends_with("train-ss: interrupted; run again to resume\n"),
             "{}",
             finished.stderr
         );
@@ -405,7 +405,7 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
     let stopped = Finished::of(command.env("NERF_SR_STOP_AFTER", "30000").output().unwrap());
     assert_eq!(stopped.code, 130, "{}", stopped.stderr);
     assert!(
-        stopped.stderr.contains("train-ss: failed: interrupted; run again to go on from here"),
+        stopped.stderr.contains("train-ss: failed: interrupted; run again to resume"),
         "{}",
         stopped.stderr
     );

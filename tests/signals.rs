@@ -68,7 +68,7 @@ const CASES: &[Case] = &[
     Case {
         stage: "refine",
         inputs: &[("views", "rendered"), ("refiner", "net")],
-        goes_on: Some("going on after what an earlier run has made"),
+        goes_on: Some("resuming after the parts that an earlier run has finished"),
         ..CASE
     },
     Case {
@@ -81,7 +81,7 @@ const CASES: &[Case] = &[
         stage: "render-depth",
         params: r#"{"samples_per_axis": 8, "tolerance": 0}"#,
         inputs: &[("field", "field"), ("cameras", "large-cameras")],
-        goes_on: Some("going on after what an earlier run has made"),
+        goes_on: Some("resuming after the parts that an earlier run has finished"),
         ..CASE
     },
     Case { stage: "report", inputs: &[("run", "large-report")], ..CASE },
@@ -301,7 +301,7 @@ fn interrupt_stage(
     assert!(ended.after.is_some(), "{label}: it ended before the signal: {}", ended.stderr);
     let last = ended.stderr.lines().last().unwrap_or_default();
     let is_told = last.starts_with(&format!("{}: ", case.stage))
-        && last.ends_with("interrupted; run again to go on from here");
+        && last.ends_with("interrupted; run again to resume");
     assert!(is_told, "{label}: {}", ended.stderr);
     assert_eq!(ended.code, Some(130), "{label}");
     assert!(!output.exists() && !partial.exists(), "{label}: something is left of its output");

@@ -62,7 +62,7 @@ fn a_checkpoint_becomes_a_field() {
     // A stage without checkpoints says so, and its help is silent about them.
     let words = ["--work", &work_folder, "--from-checkpoint"];
     let prep = stage("demo-scene", "{}", &[], &project.path("no"), &words);
-    prep.fails(2, &["--from-checkpoint: stage demo-scene doesn't have this option"]);
+    prep.fails(2, &["--from-checkpoint: stage demo-scene doesn't support this option"]);
 }
 
 const RAYS: [&str; 2] = ["-p", "train-ss.rays=600000"];

@@ -35,7 +35,7 @@ impl Progress {
             ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(label)
         });
         let mut pace = Pace::default();
-        pace.begin(0);
+        pace.start(0);
         let state = Mutex::new(State { done: 0, pace, shown: Instant::now() });
         Self { label, total, bar, state, stop: Arc::clone(stop) }
     }
@@ -52,10 +52,10 @@ impl Progress {
             |left: String| format!("{} of {} · {left} left", sized(done), sized(self.total));
         if let Some(bar) = &self.bar {
             bar.set_position(done);
-            bar.set_message(words(state.pace.left(done, self.total)));
+            bar.set_message(words(state.pace.time_left(done, self.total)));
         } else if self.total > 0 && state.shown.elapsed() >= LINE_INTERVAL {
             state.shown = Instant::now();
-            report_line!("{}: {}", self.label, words(state.pace.left(done, self.total)));
+            report_line!("{}: {}", self.label, words(state.pace.time_left(done, self.total)));
         }
         Ok(())
     }

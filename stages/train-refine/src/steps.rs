@@ -30,7 +30,7 @@ pub(crate) fn train(
         trainer,
         examples,
         checkpoint.as_deref(),
-        || context.interrupted(),
+        || context.is_interrupted(),
         |done, mean| progress.set(done, &note(mean)),
     )
 }

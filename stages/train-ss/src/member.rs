@@ -214,7 +214,7 @@ impl<'a> Member<'a> {
     ) -> anyhow::Result<()> {
         let Training { trainer, supervision, checkpoints, curve } = training;
         loop {
-            if self.context.interrupted() {
+            if self.context.is_interrupted() {
                 checkpoints
                     .write(&**trainer, supervision, curve)
                     .context("cannot write the checkpoint")?;

@@ -196,7 +196,7 @@ fn output_of(context: &Context, command: &mut Command) -> io::Result<process::Ou
         if let Some(status) = child.try_wait()? {
             break status;
         }
-        if context.interrupted() {
+        if context.is_interrupted() {
             child.kill()?;
         }
         std::thread::sleep(POLL_INTERVAL);

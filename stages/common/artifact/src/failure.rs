@@ -15,7 +15,7 @@ pub enum Failure {
     #[error("{0}")]
     Numerical(String),
     /// Stopped by a signal; `--work` holds what resumes it: exit code 130.
-    #[error("interrupted; run again to go on from here")]
+    #[error("interrupted; run again to resume")]
     Interrupted,
 }
 

@@ -10,7 +10,7 @@ use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use contract::Description;
-use stage::out_of_memory;
+use stage::out_of_memory_message;
 
 use crate::group::Group;
 
@@ -128,7 +128,7 @@ fn describe(
     };
     if !status.success() {
         let stderr = String::from_utf8_lossy(&stderr);
-        let message = stderr.lines().rev().find_map(out_of_memory).unwrap_or_else(|| {
+        let message = stderr.lines().rev().find_map(out_of_memory_message).unwrap_or_else(|| {
             let last = stderr.trim_end().lines().last().unwrap_or_default();
             last.replace(char::is_control, " ")
         });

@@ -121,7 +121,7 @@ impl Watcher for StageView<'_> {
             state.task.clone_from(label);
             state.pace = Pace::default();
         }
-        let left = state.pace.left(*done, *total);
+        let left = state.pace.time_left(*done, *total);
         if let Some(bar) = &self.bar {
             bar.set_length(*total);
             bar.set_position(*done);

@@ -5,7 +5,7 @@ use std::os::unix::process::ExitStatusExt as _;
 use std::path::Path;
 use std::process::ExitStatus;
 
-use stage::{MEMORY_REMEDY, out_of_memory};
+use stage::{MEMORY_REMEDY, out_of_memory_message};
 
 /// Error returned when a stage fails.
 #[derive(Debug, Clone, thiserror::Error)]
@@ -62,7 +62,7 @@ impl Exit {
         if let Some(reason) = &self.stated_reason {
             return reason.clone();
         }
-        if let Some(reason) = self.tail.iter().rev().find_map(|line| out_of_memory(line)) {
+        if let Some(reason) = self.tail.iter().rev().find_map(|line| out_of_memory_message(line)) {
             return reason;
         }
         let is_killed =

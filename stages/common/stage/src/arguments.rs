@@ -1,4 +1,4 @@
-//! What a stage's command line says.
+//! Command-line arguments of a stage.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,28 +16,28 @@ use crate::progress::ProgressMode;
 pub(crate) struct Arguments {
     #[command(subcommand)]
     pub(crate) command: Option<Command>,
-    /// JSON file with the parameters; those it leaves out have their defaults
+    /// JSON file with parameters; omitted ones have their defaults
     #[arg(long, value_name = "FILE")]
     pub(crate) params: Option<PathBuf>,
-    /// One input, e.g. --input scene=DIR; repeat for more
+    /// Input, e.g. --input scene=DIR; may be repeated
     #[arg(long = "input", value_name = "NAME=DIR")]
     pub(crate) inputs: Vec<String>,
-    /// Folder to make; it must not exist yet and appears only when complete
+    /// Folder to create; must not exist, and appears only when complete
     #[arg(long, value_name = "DIR", required = true)]
     pub(crate) output: Option<PathBuf>,
-    /// Private folder that survives an interruption (checkpoints)
+    /// Private folder for checkpoints, which survives an interruption
     #[arg(long, value_name = "DIR")]
     pub(crate) work: Option<PathBuf>,
-    /// Write the output from the latest checkpoint in --work, and don't train on
+    /// Write the output from the latest checkpoint in --work, without further training
     #[arg(long, requires = "work")]
     pub(crate) from_checkpoint: bool,
-    /// Where to compute: cpu or cuda:N
+    /// Compute device: cpu or cuda:N
     #[arg(long, default_value = "cpu")]
     pub(crate) device: String,
-    /// Threads to use; the result doesn't depend on it [default: all cores]
+    /// Number of threads; doesn't affect the result [default: all cores]
     #[arg(long, value_name = "N")]
     pub(crate) threads: Option<usize>,
-    /// How to show progress
+    /// Format of progress reports
     #[arg(long, value_enum, default_value = "plain")]
     pub(crate) progress: ProgressMode,
 }
@@ -48,7 +48,7 @@ pub(crate) enum Command {
     Describe,
 }
 
-/// The inputs' names and folders: each one known, none missing.
+/// Parses the inputs' names and folders. Fails for an unknown input and for a missing one.
 pub(crate) fn input_folders<'a>(
     given: &'a [String],
     description: &Description,
@@ -76,28 +76,57 @@ pub(crate) fn input_folders<'a>(
     Ok(folders)
 }
 
-/// The parameters from the file, checked against the schema, or the defaults: as JSON and as the
-/// stage's own type.
+/// Reads the parameters, or takes the defaults without a file. Returns the checked values as JSON
+/// and as the stage's own type.
 pub(crate) fn read_params<P: DeserializeOwned>(
     file: Option<&Path>,
     description: &Description,
 ) -> anyhow::Result<(Value, P)> {
-    let place = file.map(|f| f.display().to_string()).unwrap_or_default();
+    let context = format!("--params {}", file.unwrap_or(Path::new("")).display());
     let given = match file {
         None => serde_json::Map::new(),
         Some(path) => {
-            let bytes = fs::read(path).usage(format!("--params {place}"))?;
-            serde_json::from_slice(&bytes)
-                .usage(format!("--params {place}: expected a JSON object"))?
+            let bytes = fs::read(path).usage(&context)?;
+            serde_json::from_slice(&bytes).usage(format!("{context}: expected a JSON object"))?
         }
     };
     let schema = Schema::new(&description.parameters)
         .map_err(|e| anyhow!("the stage's own parameter schema: {e}"))?;
     let resolved = schema.resolve(&given).map_err(|problems| {
-        let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
-        Failure::Usage(format!("--params {place}: {}", lines.join("; ")))
+        let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        Failure::Usage(format!("{context}: {}", problems.join("; ")))
     })?;
-    let params = serde_path_to_error::deserialize(schema.nested(&resolved))
-        .usage(format!("--params {place}"))?;
+    let params = serde_path_to_error::deserialize(schema.nested(&resolved)).usage(&context)?;
     Ok((resolved, params))
+}
+
+/// Error returned for an invalid `--device`.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("--device {0}: no such device; expected cpu, cuda or cuda:N")]
+pub struct DeviceError(String);
+
+/// Checks that `--device` is `cpu`, `cuda` or `cuda:N`. The libraries that use a GPU check that it
+/// exists.
+pub fn check_device(name: &str) -> Result<(), DeviceError> {
+    let is_valid = match name.strip_prefix("cuda:") {
+        Some(index) => (1..=4).contains(&index.len()) && index.bytes().all(|b| b.is_ascii_digit()),
+        None => ["cpu", "cuda"].contains(&name),
+    };
+    if is_valid { Ok(()) } else { Err(DeviceError(name.to_owned())) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cpu_and_numbered_gpus_alone() {
+        for name in ["cpu", "cuda", "cuda:0", "cuda:12"] {
+            assert!(check_device(name).is_ok(), "{name}");
+        }
+        for name in ["", "gpu", "CPU", "cuda:", "cuda:x", "cuda:-1", "cuda:99999", "cuda0", "cpu:0"]
+        {
+            assert!(check_device(name).is_err(), "{name}");
+        }
+    }
 }

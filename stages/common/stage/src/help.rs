@@ -1,18 +1,18 @@
-//! The end of a stage's `--help`: inputs and parameters, in groups, wrapped.
+//! Inputs and parameters at the end of a stage's `--help`.
 
 use contract::{Description, ParameterDoc, group_parameters};
 use textwrap::{Options, fill};
 
-/// Columns of the help.
+/// Width of the help text in columns.
 const WIDTH: usize = 100;
-/// Columns before a description: two of indent, a name and a space.
+/// Width of the name column: an indent of two, a name and a space.
 const NAME_WIDTH: usize = 24;
 
-/// Inputs and parameters of a stage.
-pub(crate) fn help_of(description: &Description) -> String {
+/// Renders the inputs and parameters of a stage.
+pub(crate) fn render_help(description: &Description) -> String {
     let mut text = String::new();
     if !description.inputs.is_empty() {
-        text.push_str("Inputs, with the kinds of artifact that they take:\n");
+        text.push_str("Inputs, with the accepted kinds of artifact:\n");
         for (name, input) in &description.inputs {
             let note = if input.optional { ", optional" } else { "" };
             text.push_str(&entry(
@@ -22,14 +22,14 @@ pub(crate) fn help_of(description: &Description) -> String {
         }
         text.push('\n');
     }
-    let sections = description.documented();
+    let sections = description.parameter_sections();
     if sections.iter().all(|section| section.parameters.is_empty()) {
-        return text + "It has no parameters.\n";
+        return text + "This stage has no parameters.\n";
     }
     text.push_str(
-        "Parameters: in pipeline.yaml under `parameters:`, or as -p NAME=VALUE of nerf-sr.\n",
+        "Parameters, set in pipeline.yaml under `parameters:` or by -p NAME=VALUE of nerf-sr:\n",
     );
-    text.push_str(&format!("All about them: docs/reference/{}.md\n", description.name));
+    text.push_str(&format!("see docs/reference/{}.md for details.\n", description.name));
     for section in &sections {
         if let Some(variant) = &section.variant {
             text.push_str(&format!("\nWith {variant}\n"));
@@ -40,26 +40,22 @@ pub(crate) fn help_of(description: &Description) -> String {
             } else {
                 text.push_str(&format!("\n{}:\n", capitalised(group)));
             }
-            parameters.into_iter().for_each(|parameter| text.push_str(&parameter_entry(parameter)));
+            for ParameterDoc { name, text: meaning, allowed, default, .. } in parameters {
+                let meaning = format!("{meaning} [{allowed}; default: {default}]");
+                text.push_str(&entry(name, &meaning));
+            }
         }
     }
     text
 }
 
-fn parameter_entry(parameter: &ParameterDoc) -> String {
-    entry(
-        &parameter.name,
-        &format!("{} [{}; default: {}]", parameter.text, parameter.allowed, parameter.default),
-    )
-}
-
 fn entry(name: &str, text: &str) -> String {
-    let first = format!("  {name:<width$}", width = NAME_WIDTH - 2);
-    let further = " ".repeat(NAME_WIDTH);
-    fill(text, Options::new(WIDTH).initial_indent(&first).subsequent_indent(&further)) + "\n"
+    let label = format!("  {name:<width$}", width = NAME_WIDTH - 2);
+    let indent = " ".repeat(NAME_WIDTH);
+    fill(text, Options::new(WIDTH).initial_indent(&label).subsequent_indent(&indent)) + "\n"
 }
 
-/// A word with a capital letter.
+/// Capitalises the first letter.
 fn capitalised(word: &str) -> String {
     let mut letters = word.chars();
     letters.next().map(|first| first.to_uppercase().chain(letters).collect()).unwrap_or_default()
@@ -100,11 +96,11 @@ mod tests {
             rules: Vec::new(),
         };
         let expected = "\
-Inputs, with the kinds of artifact that they take:
+Inputs, with the accepted kinds of artifact:
   scene                 images [scene/train or views, optional]
 
-Parameters: in pipeline.yaml under `parameters:`, or as -p NAME=VALUE of nerf-sr.
-All about them: docs/reference/x.md
+Parameters, set in pipeline.yaml under `parameters:` or by -p NAME=VALUE of nerf-sr:
+see docs/reference/x.md for details.
 
   rate                  Rate. [a number from 0 to 0.5; default: none]
   rays                  Rays. [a whole number from 1; default: 5]
@@ -116,6 +112,6 @@ Loss:
   supervision           What an LR pixel is compared with, said at such length that no line of a
                         terminal could ever hold all of it. [average, kernel; default: by scene]
 ";
-        assert_eq!(help_of(&description), expected);
+        assert_eq!(render_help(&description), expected);
     }
 }

@@ -1,21 +1,21 @@
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Environment variable of the tests: a stage whose progress comes to this count is stopped then,
-/// as if by a signal.
+/// Environment variable for tests: number of finished steps at which a stage is interrupted, as if
+/// by a signal.
 pub const STOP_VARIABLE: &str = "NERF_SR_STOP_AFTER";
 
-/// Environment variable of the tests, `COUNT FILE`: a stage whose progress has come to this count
-/// slows down until the file exists. A test sees the middle of a training with it on any machine.
+/// Environment variable for tests, `COUNT FILE`: number of finished steps from which a stage is
+/// slowed until the file exists, so that a test can observe a training in progress on any machine.
 pub const SLOW_VARIABLE: &str = "NERF_SR_SLOW_UNTIL";
 
-/// Pause of a slowed stage at each report of its progress. A stage goes on, if slowly, so that it
-/// reaches its next checkpoint.
+/// Pause of a slowed stage at each progress update. The stage still advances, so that it reaches
+/// its next checkpoint.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// Stops or slows a stage at a count.
+/// Hooks of tests that interrupt or slow a stage at a given step.
 #[derive(Debug, Default)]
 pub(crate) struct TestHooks {
     stop: Option<(u64, Arc<AtomicBool>)>,
@@ -23,13 +23,18 @@ pub(crate) struct TestHooks {
 }
 
 impl TestHooks {
-    /// The hooks that [`STOP_VARIABLE`] and [`SLOW_VARIABLE`] ask for.
+    /// Reads [`STOP_VARIABLE`] and [`SLOW_VARIABLE`].
     pub(crate) fn from_environment(interrupted: &Arc<AtomicBool>) -> Self {
-        let stop = || Some((std::env::var(STOP_VARIABLE).ok()?.parse().ok()?, interrupted.clone()));
-        Self { stop: stop(), slow: std::env::var(SLOW_VARIABLE).ok().and_then(|text| slow(&text)) }
+        let stop = std::env::var(STOP_VARIABLE).ok().and_then(|count| count.parse().ok());
+        let slow = std::env::var(SLOW_VARIABLE).ok().and_then(|text| {
+            let (count, file) = text.split_once(' ')?;
+            Some((count.parse().ok()?, PathBuf::from(file)))
+        });
+        Self { stop: stop.map(|count| (count, Arc::clone(interrupted))), slow }
     }
 
-    pub(crate) fn progress(&self, done: u64) {
+    /// Interrupts or delays the stage if `done` steps have reached a hook's count.
+    pub(crate) fn apply(&self, done: u64) {
         if let Some((count, interrupted)) = &self.stop
             && done >= *count
         {
@@ -42,9 +47,4 @@ impl TestHooks {
             std::thread::sleep(PAUSE);
         }
     }
-}
-
-fn slow(text: &str) -> Option<(u64, PathBuf)> {
-    let (count, file) = text.split_once(' ')?;
-    Some((count.parse().ok()?, Path::new(file).to_owned()))
 }

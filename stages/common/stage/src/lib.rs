@@ -1,16 +1,15 @@
-//! What makes a program a stage: arguments, parameters, progress, exit codes, output.
+//! Command line of a stage: arguments, parameters, progress, exit codes, output.
 //!
 //! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked
 //!   parameters, `describe`, progress, exit codes, interruption and an atomic output for free.
-//! * [`Context`]: what a running stage has at hand: its inputs, its output, the folder for
-//!   checkpoints.
-//! * [`Progress`], [`Event`]: how far it is, for people and for the runner.
-//! * [`stop_on_signals`], [`install_panic_hook`]: how a program ends before it is done. The runner
-//!   ends so, too.
-//! * [`available_memory`], [`check_device`]: where a stage may compute, and how much it may take.
+//! * [`Context`]: inputs, output and checkpoint folder of a running stage.
+//! * [`Progress`], [`Event`]: progress reports for a terminal and for the runner.
+//! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic; the
+//!   runner uses them, too.
+//! * [`available_memory`], [`check_device`]: limits of memory, and the compute device.
 //!
-//! No pixels, no tensors, no store. What a stage says of itself is in `contract`, artifacts and
-//! failures in `artifact`.
+//! The crate knows neither images nor tensors nor the store. A stage's description is in
+//! `contract`, artifacts and failures are in `artifact`.
 //!
 //! ```no_run
 //! use contract::Output;
@@ -42,10 +41,6 @@
 
 mod arguments;
 mod context;
-mod deadline;
-#[cfg(test)]
-mod deadline_tests;
-mod device;
 mod help;
 mod hooks;
 mod memory;
@@ -55,15 +50,17 @@ mod panics;
 mod parts;
 mod progress;
 mod run;
+#[cfg(test)]
+mod signal_tests;
 mod signals;
 mod stage;
 mod staging;
 
+pub use arguments::{DeviceError, check_device};
 pub use context::{Context, SUMMARY_FILE};
-pub use device::{DeviceError, check_device};
 pub use hooks::{SLOW_VARIABLE, STOP_VARIABLE};
 pub use memory::{
-    MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory,
+    MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory_message,
     remaining_memory,
 };
 pub use panics::install_panic_hook;

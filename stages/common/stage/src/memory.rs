@@ -1,12 +1,12 @@
 use artifact::{Failure, sized};
 use sysinfo::{MemoryRefreshKind, System};
 
-/// Words of allocators before the amount that they didn't get: of Rust, libtorch, CUDA and NumPy.
-const MARKS: [&str; 4] =
+/// Phrases of allocators before the requested amount: Rust, libtorch, CUDA and NumPy.
+const PHRASES_WITH_AMOUNT: [&str; 4] =
     ["memory allocation of ", "tried to allocate ", "Tried to allocate ", "Unable to allocate "];
-/// Words that name no amount: of C++, of libtorch, of the system for a call and for a library that
-/// is loaded, of Python.
-const MARKS_WITHOUT_AMOUNT: [&str; 5] = [
+/// Phrases without an amount: C++, libtorch, the system (failed call, failed load of a library) and
+/// Python.
+const PHRASES_WITHOUT_AMOUNT: [&str; 5] = [
     "std::bad_alloc",
     "can't allocate memory",
     "Cannot allocate memory",
@@ -14,45 +14,50 @@ const MARKS_WITHOUT_AMOUNT: [&str; 5] = [
     "MemoryError",
 ];
 
-/// What an allocator's last words mean, with the amount that was asked for, where they name it, and
-/// what to do; nothing for other words.
+/// Translates an allocator's message to one with the requested amount, if known, and a remedy;
+/// `None` if the text is not about exhausted memory.
 ///
 /// ```
-/// let said = stage::out_of_memory("memory allocation of 99532800 bytes failed").unwrap();
-/// assert!(said.starts_with("out of memory: 99.5 MB more were asked for;"));
-/// assert_eq!(stage::out_of_memory("lost memory of it"), None);
+/// let text = "memory allocation of 99532800 bytes failed";
+/// let message = stage::out_of_memory_message(text).unwrap();
+/// assert!(message.starts_with("out of memory: 99.5 MB more were requested;"));
+/// assert_eq!(stage::out_of_memory_message("lost memory of it"), None);
 /// ```
-pub fn out_of_memory(text: &str) -> Option<String> {
-    let amount = MARKS.iter().find_map(|mark| amount(text.split_once(mark)?.1));
-    let amount = amount.map(|amount| format!(": {amount} more were asked for"));
-    if amount.is_none() && !MARKS_WITHOUT_AMOUNT.iter().any(|mark| text.contains(mark)) {
-        return None;
+pub fn out_of_memory_message(text: &str) -> Option<String> {
+    let amount = PHRASES_WITH_AMOUNT.iter().find_map(|p| leading_amount(text.split_once(p)?.1));
+    match amount {
+        Some(amount) => {
+            Some(format!("out of memory: {amount} more were requested; {MEMORY_REMEDY}"))
+        }
+        None if PHRASES_WITHOUT_AMOUNT.iter().any(|phrase| text.contains(phrase)) => {
+            Some(format!("out of memory; {MEMORY_REMEDY}"))
+        }
+        None => None,
     }
-    Some(format!("out of memory{}; {MEMORY_REMEDY}", amount.unwrap_or_default()))
 }
 
-/// Memory of this machine in bytes, or of its container where that has less; none where the system
-/// doesn't tell.
+/// Returns the memory of this machine in bytes, or its container's limit if lower; `None` if
+/// unknown.
 pub fn machine_memory() -> Option<u64> {
     let mut system = System::new().ok()?;
     system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
     Some(system.cgroup_limits().map_or(system.total_memory(), |limits| limits.total_memory))
 }
 
-/// The variable that says how many bytes of memory a stage may take.
+/// Environment variable that limits a stage's memory, in bytes.
 pub const MEMORY_VARIABLE: &str = "NERF_SR_MEMORY";
 
-/// Bytes of memory that a stage may take: those that are free on this machine and in its container,
-/// no more than [`MEMORY_VARIABLE`] says; none where neither is known.
+/// Returns the memory in bytes that a stage may use: the free memory of this machine and its
+/// container, limited by [`MEMORY_VARIABLE`]; `None` if neither is known.
 pub fn available_memory() -> Result<Option<u64>, Failure> {
-    let most = std::env::var(MEMORY_VARIABLE).ok().map(|text| in_bytes(&text)).transpose()?;
-    Ok(free_memory().into_iter().chain(most).min())
+    let limit = std::env::var(MEMORY_VARIABLE).ok().map(|text| parse_bytes(&text)).transpose()?;
+    Ok(free_memory().into_iter().chain(limit).min())
 }
 
-fn in_bytes(text: &str) -> Result<u64, Failure> {
+fn parse_bytes(text: &str) -> Result<u64, Failure> {
     text.parse().map_err(|_| {
         Failure::Usage(format!(
-            "{MEMORY_VARIABLE}: {text:?} is no number of bytes; for 4 GB write 4000000000"
+            "{MEMORY_VARIABLE}: {text:?} is not a number of bytes; for 4 GB write 4000000000"
         ))
     })
 }
@@ -65,11 +70,11 @@ fn free_memory() -> Option<u64> {
     Some(container.map_or(system.available_memory(), |left| left.min(system.available_memory())))
 }
 
-/// Returns the free bytes that remain when some work has its `need`; `u64::MAX` if it isn't known
-/// how many are free.
+/// Returns the free bytes that remain after `work` has taken `need`; `u64::MAX` if `free` is
+/// unknown.
 ///
 /// # Errors
-/// [`Failure::Usage`] with both numbers and the remedy if fewer are free.
+/// [`Failure::Usage`] with both numbers and the remedy if less than `need` is free.
 pub fn remaining_memory(
     work: &str,
     need: u64,
@@ -83,12 +88,12 @@ pub fn remaining_memory(
     })
 }
 
-/// What helps where memory is short.
+/// Remedy for exhausted memory.
 pub const MEMORY_REMEDY: &str = "end other programs, run one stage at a time (`nerf-sr run --jobs \
-    1`), or give it fewer or smaller images";
+    1`), or use fewer or smaller images";
 
-/// `99532800 bytes` or `2.00 GiB` at the beginning of a text.
-fn amount(text: &str) -> Option<String> {
+/// Parses `99532800 bytes` or `2.00 GiB` at the beginning of a text.
+fn leading_amount(text: &str) -> Option<String> {
     let mut words = text.split_whitespace();
     let (number, unit) = (words.next()?, words.next()?.trim_end_matches(['.', ',', ';']));
     match unit {
@@ -115,11 +120,11 @@ mod tests {
     fn some_of_it_is_free() {
         let free = free_memory().unwrap();
         assert!(free > 1 << 26 && free <= machine_memory().unwrap(), "{free}");
-        assert_eq!(in_bytes("4000000000").unwrap(), 4_000_000_000);
-        let said = in_bytes("4GB").unwrap_err().to_string();
+        assert_eq!(parse_bytes("4000000000").unwrap(), 4_000_000_000);
+        let said = parse_bytes("4GB").unwrap_err().to_string();
         assert_eq!(
             said,
-            "NERF_SR_MEMORY: \"4GB\" is no number of bytes; for 4 GB write 4000000000"
+            "NERF_SR_MEMORY: \"4GB\" is not a number of bytes; for 4 GB write 4000000000"
         );
     }
 
@@ -154,9 +159,9 @@ mod tests {
             ("memory allocation of ", None),
             ("r_0.png: No such file", None),
         ] {
-            let found = out_of_memory(said);
+            let found = out_of_memory_message(said);
             let expected = amount.map(|amount| {
-                format!("out of memory: {amount} more were asked for; {MEMORY_REMEDY}")
+                format!("out of memory: {amount} more were requested; {MEMORY_REMEDY}")
             });
             assert_eq!(found, expected, "{said}");
         }
@@ -169,7 +174,7 @@ mod tests {
             "cannot fork: Cannot allocate memory (os error 12)",
         ] {
             let expected = format!("out of memory; {MEMORY_REMEDY}");
-            assert_eq!(out_of_memory(said), Some(expected), "{said}");
+            assert_eq!(out_of_memory_message(said), Some(expected), "{said}");
         }
     }
 }

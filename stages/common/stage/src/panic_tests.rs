@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::run::run_stage_with;
 use crate::{Context, Event, Stage, install_panic_hook};
 
-/// As the schema wants it: an object.
+/// No parameters, as the object that the schema requires.
 #[derive(Default, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
 struct Params {}
 
@@ -26,9 +26,9 @@ impl Stage for Panics {
     }
 }
 
-/// Says where [`a_process_that_panics`] is to panic.
+/// Environment variable with the location at which [`a_process_that_panics`] panics.
 const WHERE: &str = "PANIC_WHERE";
-/// And what the stage there writes.
+/// Environment variable with the output of the stage there.
 const OUTPUT: &str = "PANIC_OUTPUT";
 
 #[test]
@@ -75,7 +75,7 @@ fn a_panic_in_any_thread_is_one_line_and_exit_code_70() {
         ("thread", 70, "greet: internal error: a name ("),
         ("rayon", 70, "greet: internal error: all of them ("),
         ("printing", 70, "greet: internal error: while stdout is locked ("),
-        ("memory", 1, "greet: out of memory: 99.5 MB more were asked for;"),
+        ("memory", 1, "greet: out of memory: 99.5 MB more were requested;"),
     ] {
         let output = ended(place, "0");
         let stderr = String::from_utf8(output.stderr).unwrap();

@@ -7,29 +7,30 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use artifact::printable;
 
-use crate::memory::out_of_memory;
+use crate::memory::out_of_memory_message;
 use crate::progress::failed_event;
 
-/// Exit code of a panic: a fault of the program, not of what it was given.
+/// Exit code of a panic, which is an error of the program, not of its input.
 const INTERNAL_ERROR: i32 = 70;
 
-/// From now on a panic in any thread ends the process with one line, and exit code 70. Memory that
-/// isn't to be had ends it with exit code 1: some libraries panic then. A backtrace comes before
-/// the line where `RUST_BACKTRACE` asks for it.
+/// Makes a panic in any thread end the process with a one-line message and exit code 70, or with
+/// exit code 1 if a library panics because memory is exhausted. With `RUST_BACKTRACE` a backtrace
+/// precedes the message.
 pub fn install_panic_hook(name: &'static str) {
-    std::panic::set_hook(Box::new(move |panic| end(name, panic)));
+    std::panic::set_hook(Box::new(move |panic| end_by_panic(name, panic)));
 }
 
-/// Ends at once: unwinding would leave other threads waiting, and destructors may panic again.
-fn end(name: &str, panic: &PanicHookInfo<'_>) -> ! {
-    static ENDING: AtomicBool = AtomicBool::new(false);
-    if ENDING.swap(true, Ordering::SeqCst) {
-        // Another thread's panic is being told.
+/// Ends the process without unwinding, which would leave other threads waiting, and in which
+/// destructors may panic again.
+fn end_by_panic(name: &str, panic: &PanicHookInfo<'_>) -> ! {
+    static IS_ENDING: AtomicBool = AtomicBool::new(false);
+    if IS_ENDING.swap(true, Ordering::SeqCst) {
+        // Another thread's panic is being reported.
         loop {
             std::thread::park();
         }
     }
-    let (message, code) = told(panic);
+    let (message, code) = describe_panic(panic);
     let backtrace = Backtrace::capture();
     if backtrace.status() == BacktraceStatus::Captured {
         write(std::io::stderr().as_fd(), &format!("{backtrace}"));
@@ -37,9 +38,9 @@ fn end(name: &str, panic: &PanicHookInfo<'_>) -> ! {
     end_process(name, &message, code)
 }
 
-/// Ends the process from any thread, with the reason on stderr and, for a runner, as an event.
+/// Ends the process from any thread, with a message on stderr and, if enabled, as an event.
 pub(crate) fn end_process(name: &str, message: &str, code: i32) -> ! {
-    // The line of a progress bar may be there.
+    // Clears the line of a progress bar.
     let clear = if std::io::stderr().is_terminal() { "\r\x1b[K" } else { "" };
     write(std::io::stderr().as_fd(), &format!("{clear}{name}: {message}\n"));
     if let Some(event) = failed_event(message) {
@@ -48,20 +49,21 @@ pub(crate) fn end_process(name: &str, message: &str, code: i32) -> ! {
     signal_hook::low_level::exit(code)
 }
 
-fn told(panic: &PanicHookInfo<'_>) -> (String, i32) {
-    let said = panic.payload_as_str().unwrap_or("no message");
-    if let Some(message) = out_of_memory(said) {
+/// Returns the message and the exit code of a panic.
+fn describe_panic(panic: &PanicHookInfo<'_>) -> (String, i32) {
+    let payload = panic.payload_as_str().unwrap_or("no message");
+    if let Some(message) = out_of_memory_message(payload) {
         return (message, 1);
     }
-    let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
-    let place =
-        panic.location().map(|at| format!(" ({}:{})", at.file(), at.line())).unwrap_or_default();
-    (format!("internal error: {}{place}; please report it", printable(&said)), INTERNAL_ERROR)
+    let line = payload.split_whitespace().collect::<Vec<_>>().join(" ");
+    let location =
+        panic.location().map_or_else(String::new, |l| format!(" ({}:{})", l.file(), l.line()));
+    (format!("internal error: {}{location}; please report it", printable(&line)), INTERNAL_ERROR)
 }
 
-/// Writes past the locks of `std::io::stdout` and `stderr`, which this or another thread may hold.
-fn write(to: BorrowedFd<'_>, text: &str) {
-    if let Ok(own) = to.try_clone_to_owned() {
-        File::from(own).write_all(text.as_bytes()).ok();
+/// Writes without the locks of `std::io::stdout` and `stderr`, which any thread may hold.
+fn write(file: BorrowedFd<'_>, text: &str) {
+    if let Ok(owned) = file.try_clone_to_owned() {
+        File::from(owned).write_all(text.as_bytes()).ok();
     }
 }

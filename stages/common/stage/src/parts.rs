@@ -9,16 +9,17 @@ use serde::de::DeserializeOwned;
 
 use crate::context::Context;
 
-/// In `--work`: finished parts of outputs, by what they were made from and by name. Each is a
-/// folder with a manifest, so that one cut short is seen.
-const PARTS: &str = "parts";
-/// In a part's folder: what making it returned.
-const VALUE: &str = "value.json";
+/// Folder of `--work` with finished parts of outputs, by the stage's identity and the part's name.
+/// Each part is a folder with a manifest, so that an incomplete part is recognised.
+const PARTS_FOLDER: &str = "parts";
+/// File of a part's folder with the value that `create` returned.
+const VALUE_FILE: &str = "value.json";
 
 impl Context {
-    /// Makes a part of the output, `files`, unless an earlier run of the same code on the same
-    /// inputs and parameters did and kept it in `--work`. What `make` returns is kept with it.
-    /// Nothing is where an input has no manifest: it may have changed since.
+    /// Creates a part of the output, `files`, or restores it from `--work` if an earlier run of the
+    /// same code on the same inputs and parameters has created it. The value that `create` returns
+    /// is stored with the files. Nothing is stored if an input has no manifest, since such an input
+    /// may change between runs.
     ///
     /// ```no_run
     /// # fn of(context: &stage::Context) -> anyhow::Result<()> {
@@ -36,46 +37,51 @@ impl Context {
         &self,
         name: &str,
         files: &[&str],
-        make: impl FnOnce() -> anyhow::Result<T>,
+        create: impl FnOnce() -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
         let Some((work, identity)) = self.work().zip(self.identity.as_deref()) else {
-            return make();
+            return create();
         };
-        let folder = work.join(PARTS).join(identity).join(name);
-        if let Some(value) = self.restored(&folder, files) {
-            if !self.goes_on.swap(true, Ordering::Relaxed) {
-                self.say("going on after what an earlier run has made");
+        let folder = work.join(PARTS_FOLDER).join(identity).join(name);
+        if let Some(value) = self.restore_part(&folder, files) {
+            if !self.resumed.swap(true, Ordering::Relaxed) {
+                self.say("resuming after the parts that an earlier run has finished");
             }
             return Ok(value);
         }
-        let value = make()?;
-        self.keep(&folder, files, &value)
-            .with_context(|| format!("cannot keep {}", folder.display()))?;
+        let value = create()?;
+        self.store_part(&folder, files, &value)
+            .with_context(|| format!("cannot write {}", folder.display()))?;
         Ok(value)
     }
 
-    /// What was kept of a part, its files in the output; nothing where it isn't whole.
-    fn restored<T: DeserializeOwned>(&self, folder: &Path, files: &[&str]) -> Option<T> {
+    /// Copies a stored part's files to the output and returns its value; `None` if the part is
+    /// incomplete.
+    fn restore_part<T: DeserializeOwned>(&self, folder: &Path, files: &[&str]) -> Option<T> {
         Manifest::read(folder).ok()?.check_contents(folder).ok()?;
-        let value = serde_json::from_slice(&fs::read(folder.join(VALUE)).ok()?).ok()?;
-        files
-            .iter()
-            .try_for_each(|file| copy(&folder.join(file), &self.output_path(file)?))
-            .ok()?;
+        let value = serde_json::from_slice(&fs::read(folder.join(VALUE_FILE)).ok()?).ok()?;
+        for file in files {
+            link_or_copy(&folder.join(file), &self.output_path(file).ok()?).ok()?;
+        }
         Some(value)
     }
 
-    fn keep(&self, folder: &Path, files: &[&str], value: &impl Serialize) -> anyhow::Result<()> {
-        let parts = folder.parent().expect("it lies in --work");
+    fn store_part(
+        &self,
+        folder: &Path,
+        files: &[&str],
+        value: &impl Serialize,
+    ) -> anyhow::Result<()> {
+        let parts = folder.parent().expect("the folder is in --work");
         fs::create_dir_all(parts)?;
         let partial = temporary(0o777).tempdir_in(parts)?;
         for file in files {
-            copy(&self.output_path(file)?, &partial.path().join(file))?;
+            link_or_copy(&self.output_path(file)?, &partial.path().join(file))?;
         }
-        write_json(&partial.path().join(VALUE), value)?;
+        write_json(&partial.path().join(VALUE_FILE), value)?;
         let manifest = Manifest::of_folder("part", partial.path())?;
         write_json(&partial.path().join(MANIFEST_FILE), &manifest)?;
-        // One that isn't whole gives way.
+        // A folder of this name is incomplete, since it was not restored.
         if folder.exists() {
             fs::remove_dir_all(folder)?;
         }
@@ -84,8 +90,8 @@ impl Context {
     }
 }
 
-/// A second name for a file where that can be had, else a copy.
-fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
+/// Hard-links a file, or copies it if the file system can't link.
+fn link_or_copy(from: &Path, to: &Path) -> anyhow::Result<()> {
     if let Some(folder) = to.parent() {
         fs::create_dir_all(folder)?;
     }

@@ -8,35 +8,35 @@ use serde::{Deserialize, Serialize};
 
 use crate::hooks::TestHooks;
 
-/// How a stage shows that it is getting on.
+/// Format of a stage's progress reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum ProgressMode {
-    /// A bar on a terminal, a line every ten seconds elsewhere.
+    /// A bar on a terminal, a line every ten seconds otherwise.
     Plain,
     /// JSON lines on stdout, for the runner.
     Json,
-    /// Nothing.
+    /// No reports.
     None,
 }
 
-/// A line of `--progress json`.
+/// Line of `--progress json`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "lowercase")]
 pub enum Event {
-    /// `done` of `total` steps of `label`.
+    /// Progress report.
     Progress {
-        /// What is being done.
+        /// Name of the work in progress.
         label: String,
-        /// Steps done.
+        /// Number of finished steps.
         done: u64,
-        /// Steps in all.
+        /// Total number of steps.
         total: u64,
-        /// A figure that matters (loss, PSNR), in a few words.
+        /// Current loss, PSNR or the like, as text; may be empty.
         note: String,
     },
-    /// The stage is about to end without a result. The exit code says what kind of failure it is.
+    /// Failure that ends the stage; the exit code tells its kind.
     Failed {
-        /// What is wrong and what to do, on one line, without the stage's name.
+        /// Problem and remedy on one line, without the stage's name.
         message: String,
     },
 }
@@ -46,27 +46,27 @@ impl Event {
         serde_json::to_string(self).expect("an event is plain JSON") + "\n"
     }
 
-    /// A runner that went away is no reason to stop: the stage's work still counts.
+    /// Writes the event to stdout. Errors are ignored: the stage's work is useful without a runner.
     fn emit(&self) {
         std::io::stdout().write_all(self.line().as_bytes()).ok();
     }
 }
 
-/// Whether the process has been asked for events: what ends it may come from anywhere.
-static EMITS_EVENTS: AtomicBool = AtomicBool::new(false);
+/// True if events are enabled. Global, because a panic hook or any thread may end the process.
+static EVENTS_ENABLED: AtomicBool = AtomicBool::new(false);
 
-/// From now on the process says as an event why it fails.
-pub(crate) fn emit_events() {
-    EMITS_EVENTS.store(true, Ordering::SeqCst);
+/// Enables the event that reports a failure of the process.
+pub(crate) fn enable_events() {
+    EVENTS_ENABLED.store(true, Ordering::SeqCst);
 }
 
-/// The line that tells a runner why the process fails, where it is to be told.
+/// Returns the line that reports a failure to the runner; `None` unless events are enabled.
 pub(crate) fn failed_event(message: &str) -> Option<String> {
-    let event = || Event::Failed { message: message.to_owned() }.line();
-    EMITS_EVENTS.load(Ordering::SeqCst).then(event)
+    let is_enabled = EVENTS_ENABLED.load(Ordering::SeqCst);
+    is_enabled.then(|| Event::Failed { message: message.to_owned() }.line())
 }
 
-/// Progress of one piece of long work. Cheap to call often: at most ten updates a second leave it.
+/// Progress of a long piece of work. Calls are cheap: at most ten reports a second are written.
 pub struct Progress {
     label: String,
     total: u64,
@@ -80,12 +80,13 @@ struct ProgressState {
     done: u64,
     note: String,
     pace: Pace,
-    shown: Instant,
-    is_shown: bool,
+    /// Time of the latest report, or of creation.
+    reported: Instant,
+    has_reported: bool,
 }
 
 impl Progress {
-    /// Starts at 0 of `total`.
+    /// Creates progress at 0 of `total` steps.
     pub fn new(label: &str, total: u64, mode: ProgressMode) -> Self {
         let bar = (mode == ProgressMode::Plain && std::io::stderr().is_terminal()).then(|| {
             let style = indicatif::ProgressStyle::with_template(
@@ -100,8 +101,8 @@ impl Progress {
             done: 0,
             note: String::new(),
             pace: Pace::default(),
-            shown: Instant::now(),
-            is_shown: false,
+            reported: Instant::now(),
+            has_reported: false,
         };
         Self {
             label: label.to_owned(),
@@ -113,7 +114,7 @@ impl Progress {
         }
     }
 
-    /// Creates progress that nobody sees, for tests.
+    /// Creates progress without reports, for tests.
     pub fn silent() -> Self {
         Self::new("", 0, ProgressMode::None)
     }
@@ -123,7 +124,7 @@ impl Progress {
         self
     }
 
-    /// Sets the count.
+    /// Sets the number of finished steps.
     pub fn set(&self, done: u64, note: &str) {
         self.update(|state| {
             state.done = done;
@@ -131,7 +132,7 @@ impl Progress {
         });
     }
 
-    /// Adds to the count: for work that ends in any order.
+    /// Adds finished steps, for work that finishes in any order.
     pub fn add(&self, steps: u64) {
         self.update(|state| state.done += steps);
     }
@@ -141,30 +142,30 @@ impl Progress {
         change(&mut state);
         let done = state.done;
         drop(state);
-        self.hooks.progress(done);
-        self.show();
+        self.hooks.apply(done);
+        self.report();
     }
 
     fn lock(&self) -> MutexGuard<'_, ProgressState> {
         self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
-    /// Shows the count, where it is time to.
-    fn show(&self) {
+    /// Writes a report if the interval since the latest one has passed.
+    fn report(&self) {
         let mut state = self.lock();
         let done = state.done;
-        state.pace.begin(done);
+        state.pace.start(done);
         let interval =
             if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
-        let due = state.shown.elapsed() >= Duration::from_millis(interval);
-        if self.mode == ProgressMode::None || !(due || (state.done >= self.total && state.is_shown))
-        {
+        let is_due = state.reported.elapsed() >= Duration::from_millis(interval)
+            || (done >= self.total && state.has_reported);
+        if self.mode == ProgressMode::None || !is_due {
             return;
         }
-        (state.shown, state.is_shown) = (Instant::now(), true);
-        let left = state.pace.left(done, self.total);
+        (state.reported, state.has_reported) = (Instant::now(), true);
+        let left = state.pace.time_left(done, self.total);
         if let Some(bar) = &self.bar {
-            bar.set_position(state.done);
+            bar.set_position(done);
             bar.set_message(format!("{} · {left}", state.note));
         } else if self.mode == ProgressMode::Json {
             Event::Progress {
@@ -188,33 +189,34 @@ impl Drop for Progress {
     }
 }
 
-/// How fast work gets on, from when it is first heard of: what an interrupted run did before says
-/// nothing of that.
+/// Pace of work, measured from the first report: steps of an interrupted run don't count.
 #[derive(Debug, Default)]
 pub struct Pace {
     first: Option<(Instant, u64)>,
 }
 
 impl Pace {
-    /// Is told when work is first heard of, and how much was done by then. Later calls change
-    /// nothing.
-    pub fn begin(&mut self, done: u64) -> (Instant, u64) {
+    /// Records the time and the number of finished steps at the first call; later calls change
+    /// nothing. Returns the recorded values.
+    pub fn start(&mut self, done: u64) -> (Instant, u64) {
         *self.first.get_or_insert_with(|| (Instant::now(), done))
     }
 
-    /// Time left in words, now that so much is done.
-    pub fn left(&mut self, done: u64, total: u64) -> String {
-        let (since, from) = self.begin(done);
-        in_words(since.elapsed(), done.saturating_sub(from), total.saturating_sub(done))
+    /// Estimates the remaining time, as text; `?` before the first finished step.
+    pub fn time_left(&mut self, done: u64, total: u64) -> String {
+        let (start, first) = self.start(done);
+        let steps = done.saturating_sub(first);
+        if steps == 0 {
+            return "?".to_owned();
+        }
+        let left = total.saturating_sub(done) as f64;
+        let seconds = start.elapsed().as_secs_f64() * left / steps as f64;
+        if seconds < 90.0 {
+            format!("{seconds:.0} s")
+        } else {
+            format!("{:.1} min", seconds / 60.0)
+        }
     }
-}
-
-fn in_words(elapsed: Duration, done: u64, left: u64) -> String {
-    if done == 0 {
-        return "?".to_owned();
-    }
-    let seconds = elapsed.as_secs_f64() * left as f64 / done as f64;
-    if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.1} min", seconds / 60.0) }
 }
 
 #[cfg(test)]
@@ -224,11 +226,11 @@ mod tests {
     #[test]
     fn time_left_follows_from_this_run_alone() {
         let mut pace = Pace { first: None };
-        assert_eq!(pace.left(900, 1000), "?");
+        assert_eq!(pace.time_left(900, 1000), "?");
         let (since, _) = pace.first.unwrap();
         pace.first = Some((since.checked_sub(Duration::from_secs(60)).unwrap(), 900));
         assert_eq!(
-            (pace.left(920, 1000).as_str(), pace.left(901, 1000).as_str()),
+            (pace.time_left(920, 1000).as_str(), pace.time_left(901, 1000).as_str()),
             ("4.0 min", "99.0 min")
         );
     }

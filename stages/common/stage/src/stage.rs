@@ -5,45 +5,45 @@ use serde::de::DeserializeOwned;
 
 use crate::context::Context;
 
-/// A stage of the pipeline: inputs and parameters in, one artifact out.
+/// Stage of the pipeline: creates one artifact from inputs and parameters.
 pub trait Stage {
     /// Parameters. Defaults, ranges and documentation come from the type; `#[serde(default,
-    /// deny_unknown_fields)]` is expected. One of them may be an externally tagged `enum` of
-    /// structs: it selects a variant, whose parameters are given beside it.
+    /// deny_unknown_fields)]` is expected. One field may be an externally tagged `enum` of structs:
+    /// it selects a variant, whose parameters are given on the same level.
     type Params: Serialize + DeserializeOwned + JsonSchema + Default;
-    /// Name of stage and binary.
+    /// Name of the stage and of its binary.
     const NAME: &'static str;
-    /// What it makes of what, in a sentence.
+    /// Purpose of the stage, in one sentence.
     const SUMMARY: &'static str;
-    /// Whether it shows a run and is never cached.
+    /// True if the stage is a sink, which presents a run and is never cached.
     const SINK: bool = false;
-    /// Whether it shows what there is of a run, some of which failed.
+    /// True if the sink accepts a run with failed nodes.
     const PARTIAL: bool = false;
-    /// Whether the stage accepts `--from-checkpoint` ([`Context::from_checkpoint`]).
+    /// True if the stage accepts `--from-checkpoint` ([`Context::from_checkpoint`]).
     const FROM_CHECKPOINT: bool = false;
     /// Environment variables that change the result.
     const ENVIRONMENT: &'static [&'static str] = &[];
 
-    /// Inputs by name.
+    /// Returns the inputs by name.
     fn inputs() -> Vec<(&'static str, Input)> {
         Vec::new()
     }
 
-    /// What comes out.
+    /// Returns the kind of the output and its subtrees.
     fn output() -> Output;
 
-    /// What parameters and inputs must be together.
+    /// Returns the constraints between parameters and inputs.
     fn rules() -> Vec<Rule> {
         Vec::new()
     }
 
-    /// Does the work: reads inputs and writes outputs through `context`.
+    /// Runs the stage: reads inputs and writes the output through `context`.
     ///
-    /// After a signal the stage has a second to write a checkpoint and to return; then its process
-    /// is ended. So every file outside the output must be complete whenever it has its final name.
+    /// After a signal the stage has a second to write a checkpoint and to return, then its process
+    /// ends. A file outside the output must therefore be complete before it gets its final name.
     fn run(context: &Context, params: &Self::Params) -> anyhow::Result<()>;
 
-    /// What `describe` prints; `code` is the build's fingerprint.
+    /// Describes the stage, as `describe` prints it; `code` is the build's fingerprint.
     fn describe(version: &str, code: &str) -> Description {
         Description {
             name: Self::NAME.to_owned(),

@@ -4,47 +4,47 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use artifact::{Failure, MANIFEST_FILE, Manifest, write_json};
 
-/// The output while it is being made: beside its final place, removed unless published.
+/// Unpublished output: a folder next to the final one, which is removed unless published.
 pub(crate) struct Staging {
     folder: PathBuf,
 }
 
 impl Staging {
-    /// Makes the folder. Fails where the output is there already, or can't be written.
+    /// Creates the folder. Fails if the output exists or can't be written.
     pub(crate) fn new(output: &Path) -> anyhow::Result<Self> {
         if output.exists() {
             return Err(Failure::Usage(format!(
-                "--output {}: exists already; name a new folder",
+                "--output {}: already exists; choose a new folder",
                 output.display()
             ))
             .into());
         }
         let name = output.file_name().ok_or_else(|| {
-            Failure::Usage(format!("--output {}: not a folder name", output.display()))
+            Failure::Usage(format!("--output {}: not the name of a folder", output.display()))
         })?;
         let folder = output.with_file_name(format!(".{}.partial", name.to_string_lossy()));
         if folder.exists() {
             fs::remove_dir_all(&folder)
-                .with_context(|| format!("cannot clear {}", folder.display()))?;
+                .with_context(|| format!("cannot remove {}", folder.display()))?;
         }
         fs::create_dir_all(&folder)
-            .with_context(|| format!("--output {}: cannot write there", output.display()))?;
+            .with_context(|| format!("--output {}: cannot create the folder", output.display()))?;
         Ok(Self { folder })
     }
 
-    /// Where it is being made.
+    /// Returns the path of the unpublished folder.
     pub(crate) fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Adds the manifest, after which the folder is complete.
+    /// Completes the folder with its manifest.
     pub(crate) fn complete(&self, kind: &str) -> anyhow::Result<()> {
         let manifest = Manifest::of_folder(kind, &self.folder).context("cannot hash the output")?;
         let path = self.folder.join(MANIFEST_FILE);
         write_json(&path, &manifest).with_context(|| format!("cannot write {}", path.display()))
     }
 
-    /// Gives the folder its final name.
+    /// Renames the folder to its final name.
     pub(crate) fn publish(self, output: &Path) -> anyhow::Result<()> {
         fs::rename(&self.folder, output)
             .with_context(|| format!("cannot write {}", output.display()))

@@ -54,7 +54,7 @@ fn a_process_that_works() {
 fn signalled(signal: Signal, is_deaf: bool) -> (Option<i32>, String, String, Duration) {
     let folder = tempfile::tempdir().unwrap();
     let mut command = Command::new(std::env::current_exe().unwrap());
-    command.args(["deadline_tests::a_process_that_works", "--exact", "--ignored", "--nocapture"]);
+    command.args(["signal_tests::a_process_that_works", "--exact", "--ignored", "--nocapture"]);
     command.env(OUTPUT, folder.path().join("output"));
     if is_deaf {
         command.env(IS_DEAF, "1");
@@ -79,7 +79,7 @@ fn a_signal_ends_any_stage_in_time() {
     for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
         for is_deaf in [false, true] {
             let (code, stdout, stderr, took) = signalled(signal, is_deaf);
-            let words = "work: interrupted; run again to go on from here\n";
+            let words = "work: interrupted; run again to resume\n";
             assert_eq!((code, stderr.as_str()), (Some(130), format!("working\n{words}").as_str()));
             assert_eq!(stdout.matches(r#""event":"failed""#).count(), 1, "{stdout}");
             assert!(took < Duration::from_secs(2), "{signal:?}, deaf: {is_deaf}: {took:?}");
