@@ -80,7 +80,14 @@ pub(crate) fn run_record(
         .filter(|home| home.to_str().is_some())
         .unwrap_or_default();
     let data_sets = data_sets(plan, sink);
-    Some(RunRecord { home, command: Vec::new(), data_sets, nodes, failed, unfinished })
+    Some(RunRecord {
+        pages_folder: home,
+        command: Vec::new(),
+        data_sets,
+        nodes,
+        failed,
+        unfinished,
+    })
 }
 
 /// Returns the nodes that a sink shows and their ancestors, in the plan's order.

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use artifact::{
-    MANIFEST_FILE, Manifest, RunRecord, hash_json, plain_files, print_line, write_json,
+    MANIFEST_FILE, Manifest, RunRecord, hash_json, list_output_files, print_line, write_json,
 };
 use planning::Sink;
 use serde_json::json;
@@ -84,7 +84,7 @@ pub(crate) fn run_sink(
     let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
     let output = scratch.join("output");
     call(run, sink, threads, &record, &scratch, &output)?;
-    plain_files(&output).map_err(failure)?;
+    list_output_files(&output).map_err(failure)?;
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
     if !manifest.exists() {

@@ -9,7 +9,7 @@ use std::process::{self, Command, Stdio};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::{Failure, RunNode, RunRecord, folders_of, label};
+use artifact::{Failure, RunNode, RunRecord, label, sink_folders};
 use contract::{Input, Output};
 use pixels::{DepthMap, Rgba8, common_range, read_exr, write_png};
 use rayon::prelude::*;
@@ -63,7 +63,7 @@ impl Stage for Video {
         if rendered.is_empty() {
             return Err(Failure::BadInput("run.json has no rendered views".to_owned()).into());
         }
-        for (node, prefix) in rendered.iter().zip(folders_of(&rendered)) {
+        for (node, prefix) in rendered.iter().zip(sink_folders(&rendered)) {
             make_film(context, params, &node.folder, &prefix)
                 .with_context(|| label(&node.stage, &node.point))?;
         }

@@ -26,7 +26,7 @@ mod visibility;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Failure, FailureExt as _, GivenInput, RunNode, RunRecord, folders_of};
+use artifact::{Failure, FailureExt as _, GivenInput, RunNode, RunRecord, sink_folders};
 use base64::Engine as _;
 use contract::{Input, Output};
 use pixels::{Filter, Rgba8, encode_png, resize_pillow};
@@ -94,7 +94,7 @@ impl Stage for Viewer {
             let message = "run.json has no field to show; set input `run: train-ss`";
             return Err(Failure::BadInput(message.to_owned()).into());
         }
-        for (node, prefix) in fields.iter().zip(folders_of(&fields)) {
+        for (node, prefix) in fields.iter().zip(sink_folders(&fields)) {
             write_page(context, params, &run, node, &prefix)
                 .with_context(|| format!("{} {}", node.stage, node.point).trim_end().to_owned())?;
         }

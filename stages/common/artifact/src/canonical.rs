@@ -1,28 +1,27 @@
 use serde::Serialize;
 use serde_json::Value;
 
-/// The canonical JSON of a value: keys sorted, no white space, numbers as `serde_json` prints them.
-/// Only this form is hashed.
+/// Formats a value as canonical JSON, the only form that is hashed: sorted keys, no white space,
+/// numbers as `serde_json` prints them.
 ///
 /// # Panics
-/// When the value can't be JSON at all (a map with keys that aren't strings): a programming error.
-pub fn canonical(value: &impl Serialize) -> String {
+/// If the value can't be JSON (a map whose keys aren't strings), which is a programming error.
+pub fn canonical_json(value: &impl Serialize) -> String {
     let value = serde_json::to_value(value).expect("hashed types serialise to JSON");
     let mut text = String::new();
     write(&value, &mut text);
     text
 }
 
-/// The blake3 of [`canonical`], in hexadecimal.
+/// Hashes the [`canonical_json`] of a value: blake3, in hexadecimal.
 pub fn hash_json(value: &impl Serialize) -> String {
-    blake3::hash(canonical(value).as_bytes()).to_hex().to_string()
+    blake3::hash(canonical_json(value).as_bytes()).to_hex().to_string()
 }
 
 fn write(value: &Value, out: &mut String) {
     match value {
         Value::Object(map) => {
-            // Sorted here, because `serde_json` keeps insertion order once any crate asks for its
-            // `preserve_order`.
+            // `serde_json` keeps insertion order if any crate enables its `preserve_order`.
             let mut entries: Vec<_> = map.iter().collect();
             entries.sort_by_key(|(key, _)| key.as_str());
             out.push('{');
@@ -75,10 +74,10 @@ mod tests {
     proptest! {
         #[test]
         fn canonical_form_parses_back_and_is_stable(value in any_json()) {
-            let text = canonical(&value);
+            let text = canonical_json(&value);
             let back: Value = serde_json::from_str(&text).unwrap();
             prop_assert_eq!(&back, &value);
-            prop_assert_eq!(canonical(&back), text);
+            prop_assert_eq!(canonical_json(&back), text);
         }
 
         #[test]

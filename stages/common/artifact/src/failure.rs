@@ -1,26 +1,29 @@
 use std::fmt::Display;
+use std::io;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::Path;
 
-use crate::printable::printable;
+use crate::text::printable;
 
-/// What went wrong, by what the user does next. Each kind has its exit code.
+/// Error, by the user's next step; each kind has its exit code.
 #[derive(Debug, thiserror::Error)]
 pub enum Failure {
     /// Wrong arguments or parameters: exit code 2.
     #[error("{0}")]
     Usage(String),
-    /// An input that can't be used: exit code 3.
+    /// Unusable input: exit code 3.
     #[error("{0}")]
     BadInput(String),
-    /// The numbers went wrong (NaN, divergence): exit code 4.
+    /// Numerical failure (NaN, divergence): exit code 4.
     #[error("{0}")]
     Numerical(String),
-    /// Stopped by a signal; `--work` holds what resumes it: exit code 130.
+    /// Interruption by a signal, which a run resumes from `--work`: exit code 130.
     #[error("interrupted; run again to resume")]
     Interrupted,
 }
 
 impl Failure {
-    /// The exit code of its kind.
+    /// Returns the exit code.
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,
@@ -31,17 +34,17 @@ impl Failure {
     }
 }
 
-/// The exit code of an error: that of the [`Failure`] in its chain, else 1.
+/// Returns the exit code of the [`Failure`] in an error's chain; 1 without one.
 pub fn exit_code(error: &anyhow::Error) -> u8 {
     error.chain().find_map(|cause| cause.downcast_ref::<Failure>()).map_or(1, Failure::exit_code)
 }
 
-/// An error and its causes on one line, control characters spelled out.
+/// Formats an error and its causes on one line, with control characters escaped.
 pub fn one_line(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let cause = cause.to_string();
-        // A library that prints its source in its own message would say it twice.
+        // Some libraries repeat the message of the source in their own.
         if !text.contains(&cause) {
             text = if text.is_empty() { cause } else { format!("{text}: {cause}") };
         }
@@ -49,11 +52,11 @@ pub fn one_line(error: &anyhow::Error) -> String {
     printable(&text.replace('\n', " ")).into_owned()
 }
 
-/// Turns any error into a [`Failure`] of a kind.
+/// Conversion of any error to a [`Failure`].
 pub trait FailureExt<T> {
-    /// The input can't be used: exit code 3. `context` says where.
+    /// Converts to [`Failure::BadInput`]; `context` names the input.
     fn bad_input(self, context: impl Display) -> Result<T, Failure>;
-    /// The parameters are wrong: exit code 2. `context` says which.
+    /// Converts to [`Failure::Usage`]; `context` names the argument.
     fn usage(self, context: impl Display) -> Result<T, Failure>;
 }
 
@@ -65,6 +68,18 @@ impl<T, E: Into<anyhow::Error>> FailureExt<T> for Result<T, E> {
     fn usage(self, context: impl Display) -> Result<T, Failure> {
         self.map_err(|e| Failure::Usage(format!("{context}: {}", one_line(&e.into()))))
     }
+}
+
+/// Returns the end of a message about a file without permission: its owner, and the advice how
+/// users share a store. Empty for other errors.
+pub fn permission_advice(path: &Path, error: &io::Error) -> String {
+    if error.kind() != io::ErrorKind::PermissionDenied {
+        return String::new();
+    }
+    // If the file doesn't exist or can't be reached, its folder refuses access.
+    let owner = path.ancestors().find_map(|path| path.symlink_metadata().ok());
+    let owner = owner.map(|meta| format!("; owned by user {}", meta.uid())).unwrap_or_default();
+    format!("{owner}; share a store through a group and umask 002, or choose another with --store")
 }
 
 #[cfg(test)]
@@ -81,5 +96,15 @@ mod tests {
             one_line(&bad.into()),
             r"input scene: frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file"
         );
+    }
+
+    #[test]
+    fn advice_names_the_owner_of_what_refuses_access() {
+        let dir = tempfile::tempdir().unwrap();
+        let owner = dir.path().metadata().unwrap().uid();
+        let path = dir.path().join("absent/file");
+        let advice = permission_advice(&path, &io::Error::from(io::ErrorKind::PermissionDenied));
+        assert!(advice.starts_with(&format!("; owned by user {owner}; share a store")), "{advice}");
+        assert_eq!(permission_advice(&path, &io::Error::from(io::ErrorKind::NotFound)), "");
     }
 }

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use serde::Serialize;
 
-/// Writes a file so that a reader sees the old or the new content, never a part: temporary file,
-/// fsync, rename, fsync of the folder.
+/// Writes a file atomically and durably (temporary file, fsync, rename, fsync of the folder):
+/// readers see the old or the new content.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut temporary = temporary(0o666).suffix(".partial").tempfile_in(folder)?;
@@ -16,21 +16,20 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     sync_folder(folder)
 }
 
-/// What makes a hidden temporary file (mode 0o666) or folder (0o777) whose permissions are left to
-/// the umask, so that a group can share what becomes of it; tempfile's own are the owner's alone.
+/// Returns a builder of hidden temporary files (mode 0o666) or folders (0o777). Their permissions
+/// follow the umask, so that a group can share them; those of `tempfile` are the owner's only.
 pub fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(".").permissions(fs::Permissions::from_mode(mode));
     builder
 }
 
-/// Writes a value as indented JSON that ends in a line feed: the form of every JSON file people may
-/// open.
+/// Writes a value as indented JSON with a final line feed, the form of all JSON files for users.
 pub fn write_json(path: &Path, value: &impl Serialize) -> io::Result<()> {
     fs::write(path, json_text(value)?)
 }
 
-/// Writes a value as [`write_json`] does, whole or not at all ([`write_atomically`]).
+/// Writes a value like [`write_json`], but atomically ([`write_atomically`]).
 pub fn write_json_atomically(path: &Path, value: &impl Serialize) -> io::Result<()> {
     write_atomically(path, json_text(value)?.as_bytes())
 }
@@ -39,7 +38,7 @@ fn json_text(value: &impl Serialize) -> io::Result<String> {
     Ok(serde_json::to_string_pretty(value)? + "\n")
 }
 
-/// Makes a rename in `folder` durable.
+/// Makes renames in `folder` durable.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }

@@ -6,30 +6,27 @@ use serde::de::DeserializeOwned;
 use crate::failure::{Failure, FailureExt};
 use crate::manifest::{MANIFEST_FILE, Manifest};
 
-/// An input that was given: a folder, checked against its manifest where it has one.
+/// Input folder of a stage, checked against its manifest if it has one.
 #[derive(Debug, Clone)]
 pub struct GivenInput {
     name: String,
     folder: PathBuf,
-    /// Its manifest's, where it has one.
+    /// Identity of the manifest; `None` without a manifest.
     identity: Option<String>,
 }
 
 impl GivenInput {
-    /// A folder under an input's name. With a manifest in it or above it (a subtree), its files are
-    /// checked first.
+    /// Opens a folder as the input `name`. If the folder or, for a subtree, its parent has a
+    /// manifest, the files are checked first.
     ///
     /// # Errors
-    /// [`Failure::BadInput`] where there is no such folder, or its files aren't the manifest's.
+    /// [`Failure::BadInput`] if the folder doesn't exist, or its files differ from the manifest.
     pub fn open(name: &str, folder: &Path) -> Result<Self, Failure> {
+        let context = format!("input {name}: {}", folder.display());
         if !folder.exists() {
-            return Err(Failure::BadInput(format!(
-                "input {name}: {}: no such folder",
-                folder.display()
-            )));
+            return Err(Failure::BadInput(format!("{context}: no such folder")));
         }
-        let absolute =
-            folder.canonicalize().bad_input(format!("input {name}: {}", folder.display()))?;
+        let absolute = folder.canonicalize().bad_input(&context)?;
         let manifest = if absolute.join(MANIFEST_FILE).is_file() {
             Some(Manifest::read(&absolute))
         } else if let (Some(parent), Some(subtree)) =
@@ -48,35 +45,35 @@ impl GivenInput {
         Ok(Self { name: name.to_owned(), folder: folder.to_path_buf(), identity })
     }
 
-    /// The input's name.
+    /// Returns the name of the input.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Its manifest's identity; nothing where it has no manifest.
+    /// Returns the identity of the manifest; `None` without a manifest.
     pub fn identity(&self) -> Option<&str> {
         self.identity.as_deref()
     }
 
-    /// The folder.
+    /// Returns the folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// A file of the input.
+    /// Returns the path of a file of the input.
     pub fn path(&self, file: &str) -> PathBuf {
         self.folder.join(file)
     }
 
-    /// A JSON file of the input.
+    /// Reads a JSON file of the input.
     ///
     /// # Errors
     /// [`Failure::BadInput`] with input, file and field.
     pub fn read_json<T: DeserializeOwned>(&self, file: &str) -> Result<T, Failure> {
         let path = self.path(file);
-        let place = format!("input {}: {}", self.name, path.display());
-        let bytes = fs::read(&path).bad_input(&place)?;
+        let context = format!("input {}: {}", self.name, path.display());
+        let bytes = fs::read(&path).bad_input(&context)?;
         serde_path_to_error::deserialize(&mut serde_json::Deserializer::from_slice(&bytes))
-            .bad_input(&place)
+            .bad_input(&context)
     }
 }

@@ -1,40 +1,39 @@
 use std::fs::{self, File};
 use std::io;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::advice::advice;
 use crate::canonical::hash_json;
-use crate::passed_over::is_passed_over;
-use crate::printable::shortened;
+use crate::failure::permission_advice;
+use crate::listing::{list_files, relative_path};
 
-/// The manifest's name inside an artifact.
+/// Name of the manifest inside an artifact.
 pub const MANIFEST_FILE: &str = "artifact.json";
 
-/// Version of the manifest's own form.
+/// Version of the manifest's format.
 const SCHEMA: u32 = 1;
 
-/// `artifact.json`: what an artifact is made of. Who made it, when and from what is not here: two
-/// actions may end in one object.
+/// `artifact.json`: list of an artifact's files. Origin and time are not part of it, so that two
+/// actions may create the same object.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
-    /// Kind of artifact: `dataset`, `scene`, `field`, `views`, `metrics`, …
+    /// Kind of the artifact: `dataset`, `scene`, `field`, `views`, `metrics`, …
     pub kind: String,
-    /// Version of the manifest's form.
+    /// Version of the manifest's format.
     pub schema: u32,
-    /// Every file but the manifest, sorted by path.
+    /// Files except the manifest, sorted by path.
     pub files: Vec<FileEntry>,
 }
 
-/// A file of an artifact.
+/// File of an artifact.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FileEntry {
-    /// Path inside the artifact, `/` between the parts.
+    /// Path inside the artifact, separated by `/`.
     pub path: String,
     /// Size in bytes.
     pub size: u64,
@@ -42,7 +41,7 @@ pub struct FileEntry {
     pub blake3: String,
 }
 
-/// A file that isn't what the manifest says.
+/// Difference between an artifact's files and its manifest.
 #[derive(Debug, thiserror::Error)]
 pub enum Damage {
     /// The file is missing.
@@ -50,52 +49,52 @@ pub enum Damage {
         "{path}: not found; the artifact is damaged: `nerf-sr verify --remove`, then run again"
     )]
     Missing {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// The file can't be read; the artifact may be whole.
-    #[error("cannot read {path}: {source}{}", advice(.path, .source))]
+    /// The file can't be read; the artifact may be undamaged.
+    #[error("cannot read {path}: {source}{}", permission_advice(.path, .source))]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Error of the file operation.
         source: io::Error,
     },
     /// The size differs.
     #[error(
-        "{path}: {found} bytes where the manifest says {expected}; the artifact is damaged: \
+        "{path}: {found} bytes, but {expected} in the manifest; the artifact is damaged: \
         `nerf-sr verify --remove`, then run again"
     )]
     Size {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Size by the manifest.
+        /// Size in the manifest, in bytes.
         expected: u64,
-        /// Size on disk.
+        /// Size on disk, in bytes.
         found: u64,
     },
     /// The content differs.
     #[error(
-        "{path}: the content is not what was written (blake3 differs); the artifact is damaged: \
+        "{path}: the content has changed (blake3 differs); the artifact is damaged: \
         `nerf-sr verify --remove`, then run again"
     )]
     Content {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
     /// The manifest itself can't be used.
     #[error("{path}: not a manifest: {reason}")]
     Manifest {
-        /// The manifest.
+        /// Path of the manifest.
         path: PathBuf,
-        /// Why.
+        /// Reason, as a sentence fragment.
         reason: String,
     },
 }
 
 impl Damage {
-    /// Returns the damage behind a failed file operation. A file in a folder's place leaves no doubt
-    /// that the files of the folder are missing.
+    /// Converts the error of a file operation. A path through a file instead of a folder means that
+    /// the folder's files are missing.
     fn of_file(path: PathBuf, source: io::Error) -> Self {
         match source.kind() {
             io::ErrorKind::NotFound | io::ErrorKind::NotADirectory => Self::Missing { path },
@@ -105,61 +104,66 @@ impl Damage {
 }
 
 impl Manifest {
-    /// Hashes every file below `folder` (but its manifest).
+    /// Hashes all files below `folder`, except its manifest.
     pub fn of_folder(kind: &str, folder: &Path) -> io::Result<Self> {
-        let files = list_files(folder)?
-            .into_iter()
-            .filter(|(relative, _)| relative != Path::new(MANIFEST_FILE));
-        let named = files
-            .map(|(relative, file)| Ok((manifest_path(&relative)?, file)))
-            .collect::<io::Result<_>>()?;
-        let files = hash_files(named)?;
+        let mut named = Vec::new();
+        for (relative, file) in list_files(folder)? {
+            if relative != Path::new(MANIFEST_FILE) {
+                named.push((manifest_path(&relative)?, file));
+            }
+        }
+        let entries = named.into_par_iter().map(|(path, file)| {
+            Ok(FileEntry { path, size: fs::metadata(&file)?.len(), blake3: hash_file(&file)? })
+        });
+        let mut files = entries.collect::<io::Result<Vec<_>>>()?;
+        files.sort();
         Ok(Self { kind: kind.to_owned(), schema: SCHEMA, files })
     }
 
-    /// Reads `folder/artifact.json`, refusing paths that would leave the folder.
+    /// Reads `folder/artifact.json`. Fails if a path leaves the folder.
     pub fn read(folder: &Path) -> Result<Self, Damage> {
         let path = folder.join(MANIFEST_FILE);
         let bytes = fs::read(&path).map_err(|source| Damage::of_file(path.clone(), source))?;
-        let invalid = |reason: String| Damage::Manifest { path: path.clone(), reason };
-        let manifest: Self = serde_json::from_slice(&bytes).map_err(|e| invalid(e.to_string()))?;
+        Self::parse(&bytes).map_err(|reason| Damage::Manifest { path, reason })
+    }
+
+    fn parse(bytes: &[u8]) -> Result<Self, String> {
+        let manifest: Self = serde_json::from_slice(bytes).map_err(|e| e.to_string())?;
         if manifest.schema != SCHEMA {
-            return Err(invalid(format!("schema {} where {SCHEMA} is known", manifest.schema)));
+            return Err(format!("schema {}, expected {SCHEMA}", manifest.schema));
         }
         for file in &manifest.files {
-            relative_path(&file.path).map_err(|e| invalid(e.to_string()))?;
+            relative_path(&file.path).map_err(|e| e.to_string())?;
         }
         if !manifest.files.is_sorted_by(|a, b| a.path < b.path) {
-            return Err(invalid("files are not sorted by path".to_owned()));
+            return Err("files are not sorted by path".to_owned());
         }
         Ok(manifest)
     }
 
-    /// The artifact's identity: blake3 of the manifest's canonical JSON.
+    /// Returns the artifact's identity: the blake3 of the manifest's canonical JSON.
     pub fn identity(&self) -> String {
         hash_json(self)
     }
 
-    /// The manifest of a folder inside the artifact, its kind `KIND/FOLDER`.
+    /// Returns the manifest of a folder inside the artifact, of kind `KIND/FOLDER`.
     pub fn subtree(&self, folder: &str) -> Self {
         let prefix = format!("{folder}/");
-        let files = self.files.iter().filter_map(|file| {
-            let path = file.path.strip_prefix(&prefix)?.to_owned();
-            Some(FileEntry { path, ..file.clone() })
-        });
-        Self {
-            kind: format!("{}/{folder}", self.kind),
-            schema: self.schema,
-            files: files.collect(),
+        let mut files = Vec::new();
+        for file in &self.files {
+            if let Some(path) = file.path.strip_prefix(&prefix) {
+                files.push(FileEntry { path: path.to_owned(), ..file.clone() });
+            }
         }
+        Self { kind: format!("{}/{folder}", self.kind), schema: self.schema, files }
     }
 
-    /// Bytes of all files.
+    /// Returns the total size of all files in bytes.
     pub fn size(&self) -> u64 {
         self.files.iter().map(|f| f.size).sum()
     }
 
-    /// Checks that every file is there with its size. Cheap: no content is read.
+    /// Checks that all files exist with the right size, without reading them.
     pub fn check_sizes(&self, folder: &Path) -> Result<(), Damage> {
         for file in &self.files {
             let path = folder.join(&file.path);
@@ -174,7 +178,7 @@ impl Manifest {
         Ok(())
     }
 
-    /// Checks every file's size and content; names the first that differs.
+    /// Checks the size and content of all files; returns the first difference.
     pub fn check_contents(&self, folder: &Path) -> Result<(), Damage> {
         self.check_sizes(folder)?;
         let checks: Vec<Result<(), Damage>> = self
@@ -193,81 +197,13 @@ impl Manifest {
     }
 }
 
-/// Every file below a folder with its path inside it, in the order of names. Symbolic links are
-/// followed; one that leads back up is an error that names it, and so is a FIFO, socket or device:
-/// who reads one may wait for ever.
-pub fn list_files(folder: &Path) -> io::Result<ListedFiles> {
-    list(folder, |_| false)
-}
-
-/// Files of a folder: each path inside the folder, and the file.
-pub type ListedFiles = Vec<(PathBuf, PathBuf)>;
-
-/// Lists files like [`list_files`], in a folder that a user keeps: what [`is_passed_over`] is left
-/// out, and returned second, by its path inside the folder.
-pub fn list_source_files(folder: &Path) -> io::Result<(ListedFiles, Vec<PathBuf>)> {
-    let mut passed_over = Vec::new();
-    let files = list(folder, |path| {
-        let is_left_out = is_passed_over(path);
-        if is_left_out {
-            passed_over.push(path.strip_prefix(folder).unwrap_or(path).to_path_buf());
-        }
-        is_left_out
-    })?;
-    Ok((files, passed_over))
-}
-
-/// Lists the files below a folder, but those that are left out.
-fn list(folder: &Path, mut is_left_out: impl FnMut(&Path) -> bool) -> io::Result<ListedFiles> {
-    let mut found = Vec::new();
-    for entry in walkdir::WalkDir::new(folder).follow_links(true).sort_by_file_name() {
-        let path = match &entry {
-            Ok(entry) if entry.file_type().is_dir() => None,
-            Ok(entry) => Some(entry.path()),
-            Err(error) => error.path(),
-        };
-        if path.is_some_and(&mut is_left_out) {
-            continue;
-        }
-        let entry = entry.map_err(|error| match (error.path(), error.loop_ancestor()) {
-            (Some(link), Some(up)) => io::Error::other(format!(
-                "{link:?} is a link that leads back to {up:?}; remove the link"
-            )),
-            _ => io::Error::from(error),
-        })?;
-        if entry.file_type().is_file() {
-            let relative =
-                entry.path().strip_prefix(folder).map_err(io::Error::other)?.to_path_buf();
-            found.push((relative, entry.into_path()));
-        } else if !entry.file_type().is_dir() {
-            let path = entry.path();
-            return Err(io::Error::other(format!(
-                "{path:?} is a FIFO, socket or device, which nobody can hash; remove it"
-            )));
-        }
-    }
-    Ok(found)
-}
-
-/// Path, size and blake3 of files, sorted by path.
-fn hash_files(files: Vec<(String, PathBuf)>) -> io::Result<Vec<FileEntry>> {
-    let mut entries: Vec<FileEntry> =
-        files.into_par_iter().map(|(path, file)| entry(path, &file)).collect::<io::Result<_>>()?;
-    entries.sort();
-    Ok(entries)
-}
-
-fn entry(path: String, file: &Path) -> io::Result<FileEntry> {
-    Ok(FileEntry { path, size: fs::metadata(file)?.len(), blake3: hash_file(file)? })
-}
-
-/// A path inside an artifact as its manifest has it: parts with `/` between them, all UTF-8.
+/// Converts a path inside an artifact to its form in the manifest: UTF-8, separated by `/`.
 fn manifest_path(relative: &Path) -> io::Result<String> {
     let parts: Option<Vec<&str>> =
         relative.components().map(|part| part.as_os_str().to_str()).collect();
     parts
         .map(|parts| parts.join("/"))
-        .ok_or_else(|| io::Error::other(format!("{relative:?}: a file name that isn't UTF-8")))
+        .ok_or_else(|| io::Error::other(format!("{relative:?}: the file name isn't UTF-8")))
 }
 
 fn hash_file(path: &Path) -> io::Result<String> {
@@ -276,27 +212,8 @@ fn hash_file(path: &Path) -> io::Result<String> {
     Ok(hasher.finalize().to_hex().to_string())
 }
 
-/// A path that leaves its folder, or names nothing.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{:?} is not a path inside the folder", shortened(.0))]
-pub struct PathError(String);
-
-/// A path from a file that may be hostile: relative, `/`-separated, never upwards.
-pub fn relative_path(text: &str) -> Result<PathBuf, PathError> {
-    let path = Path::new(text);
-    let plain =
-        path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
-    if text.is_empty() || !plain || text.contains('\0') {
-        // A hostile path may be as long as its file.
-        return Err(PathError(text.chars().take(200).collect()));
-    }
-    Ok(path.components().filter(|part| matches!(part, Component::Normal(_))).collect())
-}
-
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
     use super::*;
 
     fn example() -> (tempfile::TempDir, Manifest) {
@@ -367,59 +284,5 @@ mod tests {
             message.contains(r"r_\xFF\u{1b}.png") && message.contains("isn't UTF-8"),
             "{message}"
         );
-    }
-
-    #[test]
-    fn a_link_that_leads_back_is_named() {
-        let (dir, _) = example();
-        std::os::unix::fs::symlink(dir.path(), dir.path().join("train/loop")).unwrap();
-        let message = list_files(dir.path()).unwrap_err().to_string();
-        assert!(message.contains("train/loop") && message.contains("leads back"), "{message}");
-    }
-
-    /// Links to nothing and editors' files are passed over in a user's folder; in an artifact
-    /// nothing is.
-    #[test]
-    fn a_user_s_folder_has_files_that_are_passed_over() {
-        use std::os::unix::fs::symlink;
-        let (dir, _) = example();
-        let at = |name: &str| dir.path().join(name);
-        let passed_over = [".#b.txt", ".DS_Store", ".b.txt.swp", ".~lock.b.txt#", "._b.txt"];
-        for name in passed_over {
-            fs::write(at(name), "").unwrap();
-        }
-        symlink("nowhere", at("train/gone")).unwrap();
-        symlink("b.txt", at("c.txt")).unwrap();
-        let names = |files: Vec<(PathBuf, PathBuf)>| {
-            files.into_iter().map(|(relative, _)| relative.display().to_string()).collect()
-        };
-        let (files, left_out) = list_source_files(dir.path()).unwrap();
-        let files: Vec<String> = names(files);
-        assert_eq!(files, ["b.txt", "c.txt", "train/a.txt"]);
-        let left_out: BTreeSet<String> = left_out.iter().map(|p| p.display().to_string()).collect();
-        let expected = passed_over.iter().chain(&["train/gone"]).map(|name| (*name).to_owned());
-        assert_eq!(left_out, expected.collect());
-        assert!(list_files(dir.path()).unwrap_err().to_string().contains("train/gone"));
-        fs::remove_file(at("train/gone")).unwrap();
-        assert_eq!(list_files(dir.path()).unwrap().len(), files.len() + passed_over.len());
-        // A link that leads round, or into what may not be read, isn't one to nothing.
-        symlink("round", at("round")).unwrap();
-        assert!(list_source_files(dir.path()).unwrap_err().to_string().contains("round"));
-    }
-
-    #[test]
-    fn what_is_neither_file_nor_folder_is_named() {
-        let (dir, _) = example();
-        let _socket = std::os::unix::net::UnixListener::bind(dir.path().join("train/s")).unwrap();
-        let message = list_files(dir.path()).unwrap_err().to_string();
-        assert!(message.contains("train/s") && message.contains("remove it"), "{message}");
-    }
-
-    #[test]
-    fn a_manifest_can_not_point_outside() {
-        for path in ["../x", "/etc/passwd", "a/../../x", "", "a\0b"] {
-            assert!(relative_path(path).is_err(), "{path:?}");
-        }
-        assert_eq!(relative_path("./train/r_0").unwrap(), Path::new("train/r_0"));
     }
 }

@@ -239,7 +239,7 @@ fn bound_formats(schema: &mut Value) {
 
 #[cfg(test)]
 mod tests {
-    use artifact::canonical;
+    use artifact::canonical_json;
     use serde_json::json;
 
     use super::*;
@@ -291,7 +291,7 @@ mod tests {
             json!({"assumed": null}),
             json!({"place": [1.0, 0.5]}),
         ] {
-            assert_eq!(canonical(&resolve(&said).unwrap()), canonical(&unsaid), "{said}");
+            assert_eq!(canonical_json(&resolve(&said).unwrap()), canonical_json(&unsaid), "{said}");
         }
         for (one, other) in [
             (json!({"scale": 6e4}), json!({"scale": 60000})),
@@ -299,9 +299,9 @@ mod tests {
             (json!({"width": 7.0}), json!({"width": 7})),
             (json!({"place": [2, 3.0]}), json!({"place": [2.0, 3]})),
         ] {
-            let [one, other] = [one, other].map(|given| canonical(&resolve(&given).unwrap()));
+            let [one, other] = [one, other].map(|given| canonical_json(&resolve(&given).unwrap()));
             assert_eq!(one, other);
-            assert_ne!(one, canonical(&unsaid));
+            assert_ne!(one, canonical_json(&unsaid));
         }
         let problems = resolve(&json!({"rate": null})).unwrap_err();
         assert!(

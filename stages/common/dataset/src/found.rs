@@ -2,7 +2,7 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::Path;
 
-use artifact::{file_kind, has_passed_over_name};
+use artifact::{file_kind, is_ignored_name};
 
 use crate::error::DatasetError;
 use crate::misplaced::Misplaced;
@@ -28,7 +28,7 @@ pub(crate) fn find(path: &Path, wanted: &'static str) -> Found {
     if bytes > MAX_PATH_BYTES {
         return Found::Other(Misplaced::Long { path: path_buf(), bytes });
     }
-    if path.file_name().is_some_and(has_passed_over_name) {
+    if path.file_name().is_some_and(is_ignored_name) {
         return Found::Other(Misplaced::PassedOver { path: path_buf() });
     }
     match fs::metadata(path) {

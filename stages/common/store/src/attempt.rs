@@ -2,7 +2,9 @@ use std::fs;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 
-use artifact::{MANIFEST_FILE, Manifest, NotPlain, hash_json, plain_files, write_json};
+use artifact::{
+    MANIFEST_FILE, Manifest, OutputFileError, hash_json, list_output_files, write_json,
+};
 use serde_json::Value;
 
 use crate::action::{Record, Unfinished};
@@ -38,9 +40,9 @@ impl Attempt {
     /// Refuses what an artifact may not contain. Replaces each file that has a second name by a
     /// copy: whoever writes to the file under its other name would change the artifact.
     fn own_files(&self) -> Result<(), StoreError> {
-        let files = plain_files(&self.output).map_err(|problem| match problem {
-            NotPlain::Kind { .. } => StoreError::NoArtifact(problem.to_string()),
-            NotPlain::Io(source) => StoreError::Io { path: self.output.clone(), source },
+        let files = list_output_files(&self.output).map_err(|problem| match problem {
+            OutputFileError::Kind { .. } => StoreError::NoArtifact(problem.to_string()),
+            OutputFileError::Io(source) => StoreError::Io { path: self.output.clone(), source },
         })?;
         let copy = self.folder.join("copy");
         for (file, metadata) in files {

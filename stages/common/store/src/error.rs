@@ -2,14 +2,14 @@ use std::fs::{self, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use artifact::{Damage, advice};
+use artifact::{Damage, permission_advice};
 use rustix::io::Errno;
 
 /// What can go wrong in a store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// A file operation failed.
-    #[error("{path}: {source}{}", advice(.path, .source))]
+    #[error("{path}: {source}{}", permission_advice(.path, .source))]
     Io {
         /// The file.
         path: PathBuf,

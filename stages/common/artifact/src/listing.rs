@@ -1,0 +1,265 @@
+//! Lists of a folder's files, and checks of paths from files.
+
+use std::ffi::OsStr;
+use std::fs::{self, FileType, Metadata};
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::FileTypeExt as _;
+use std::path::{Component, Path, PathBuf};
+
+use crate::text::shortened;
+
+/// Lists all files below a folder, sorted by name. Follows symbolic links. Fails for a link to one
+/// of its own parents, and for a FIFO, socket or device, since reading one may block forever.
+pub fn list_files(folder: &Path) -> io::Result<ListedFiles> {
+    list_unless(folder, |_| false)
+}
+
+/// Files of a folder: path relative to the folder, and full path.
+pub type ListedFiles = Vec<(PathBuf, PathBuf)>;
+
+/// Lists the files of a user's folder like [`list_files`], without the ignored ones. Returns the
+/// relative paths of the ignored files second.
+pub fn list_source_files(folder: &Path) -> io::Result<(ListedFiles, Vec<PathBuf>)> {
+    let mut ignored = Vec::new();
+    let files = list_unless(folder, |path| {
+        let is_ignored = is_ignored(path);
+        if is_ignored {
+            ignored.push(path.strip_prefix(folder).unwrap_or(path).to_path_buf());
+        }
+        is_ignored
+    })?;
+    Ok((files, ignored))
+}
+
+/// Lists the files below a folder for which `is_excluded` is false.
+fn list_unless(
+    folder: &Path,
+    mut is_excluded: impl FnMut(&Path) -> bool,
+) -> io::Result<ListedFiles> {
+    let mut found = Vec::new();
+    for entry in walkdir::WalkDir::new(folder).follow_links(true).sort_by_file_name() {
+        let path = match &entry {
+            Ok(entry) if entry.file_type().is_dir() => None,
+            Ok(entry) => Some(entry.path()),
+            Err(error) => error.path(),
+        };
+        if path.is_some_and(&mut is_excluded) {
+            continue;
+        }
+        let entry = entry.map_err(|error| match (error.path(), error.loop_ancestor()) {
+            (Some(link), Some(parent)) => io::Error::other(format!(
+                "{link:?} is a link to its own parent {parent:?}; remove the link"
+            )),
+            _ => io::Error::from(error),
+        })?;
+        if entry.file_type().is_file() {
+            let relative =
+                entry.path().strip_prefix(folder).map_err(io::Error::other)?.to_path_buf();
+            found.push((relative, entry.into_path()));
+        } else if !entry.file_type().is_dir() {
+            let path = entry.path();
+            return Err(io::Error::other(format!(
+                "{path:?} is a FIFO, socket or device, which cannot be hashed; remove it"
+            )));
+        }
+    }
+    Ok(found)
+}
+
+/// True if a file in a user's folder is neither hashed nor read: a dangling link, or a file with an
+/// ignored name.
+fn is_ignored(path: &Path) -> bool {
+    path.file_name().is_some_and(is_ignored_name) || is_dangling(path)
+}
+
+/// True for the name of an editor's lock or swap file (`.#x` of Emacs, `.~lock.x#` of LibreOffice,
+/// `.x.swp` of Vim) or of a file of macOS (`.DS_Store`, `._x`). Programs create and delete such
+/// files at any time; they are not part of a data set.
+pub fn is_ignored_name(name: &OsStr) -> bool {
+    let name = name.as_encoded_bytes();
+    name == b".DS_Store"
+        || name.starts_with(b".#")
+        || name.starts_with(b"._")
+        || (name.starts_with(b".~lock.") && name.ends_with(b"#"))
+        || (name.starts_with(b".") && name.ends_with(b".swp"))
+}
+
+/// True for a link whose target doesn't exist. A target that can't be reached for another reason
+/// may exist.
+fn is_dangling(path: &Path) -> bool {
+    let is_link = fs::symlink_metadata(path).is_ok_and(|link| link.is_symlink());
+    is_link && fs::metadata(path).is_err_and(|error| error.kind() == ErrorKind::NotFound)
+}
+
+/// Error returned when a stage's output can't become an artifact.
+#[derive(Debug, thiserror::Error)]
+pub enum OutputFileError {
+    /// A link or a special file, whose content is elsewhere or endless.
+    #[error("{path} is {kind}; write folders and regular files only")]
+    Kind {
+        /// Path of the file, or of the output itself.
+        path: PathBuf,
+        /// Kind of the file, with an article.
+        kind: &'static str,
+    },
+    /// The output can't be listed.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+}
+
+/// Lists the regular files of a stage's output, sorted by name. Fails if the output is not a folder,
+/// or contains anything but folders and regular files. Links are refused because they would couple
+/// the artifact to files of the user.
+pub fn list_output_files(output: &Path) -> Result<Vec<(PathBuf, Metadata)>, OutputFileError> {
+    let mut files = Vec::new();
+    let entries = walkdir::WalkDir::new(output).follow_root_links(false).sort_by_file_name();
+    for entry in entries {
+        let entry = entry.map_err(io::Error::from)?;
+        let kind = entry.file_type();
+        if kind.is_file() && entry.depth() > 0 {
+            let metadata = entry.metadata().map_err(io::Error::from)?;
+            files.push((entry.into_path(), metadata));
+        } else if !kind.is_dir() {
+            return Err(OutputFileError::Kind { path: entry.into_path(), kind: file_kind(kind) });
+        }
+    }
+    Ok(files)
+}
+
+/// Names a file type, with an article.
+pub fn file_kind(file_type: FileType) -> &'static str {
+    if file_type.is_file() {
+        "a regular file"
+    } else if file_type.is_dir() {
+        "a folder"
+    } else if file_type.is_symlink() {
+        "a symbolic link"
+    } else if file_type.is_fifo() {
+        "a named pipe (FIFO)"
+    } else if file_type.is_socket() {
+        "a socket"
+    } else {
+        "a device"
+    }
+}
+
+/// Error returned for a path that is empty or leaves its folder.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{:?} is not a path inside the folder", shortened(.0))]
+pub struct PathError(String);
+
+/// Parses a relative, `/`-separated path from a file that may be hostile. Fails if the path could
+/// leave its folder.
+pub fn relative_path(text: &str) -> Result<PathBuf, PathError> {
+    let path = Path::new(text);
+    let stays_inside =
+        path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
+    if text.is_empty() || !stays_inside || text.contains('\0') {
+        // A hostile path may be as long as its file.
+        return Err(PathError(text.chars().take(200).collect()));
+    }
+    Ok(path.components().filter(|part| matches!(part, Component::Normal(_))).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+    use std::os::unix::fs::symlink;
+    use std::os::unix::net::UnixListener;
+
+    use super::*;
+
+    /// Creates a folder with the files `b.txt` and `train/a.txt`.
+    fn example() -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        fs::create_dir(dir.path().join("train")).unwrap();
+        fs::write(dir.path().join("train/a.txt"), "alpha").unwrap();
+        fs::write(dir.path().join("b.txt"), "beta").unwrap();
+        dir
+    }
+
+    #[test]
+    fn a_link_that_leads_back_is_named() {
+        let dir = example();
+        symlink(dir.path(), dir.path().join("train/loop")).unwrap();
+        let message = list_files(dir.path()).unwrap_err().to_string();
+        assert!(message.contains("train/loop") && message.contains("its own parent"), "{message}");
+    }
+
+    /// Dangling links and editors' files are ignored in a user's folder, but not in an artifact.
+    #[test]
+    fn files_in_a_users_folder_are_ignored() {
+        let dir = example();
+        let at = |name: &str| dir.path().join(name);
+        let ignored = [".#b.txt", ".DS_Store", ".b.txt.swp", ".~lock.b.txt#", "._b.txt"];
+        for name in ignored {
+            fs::write(at(name), "").unwrap();
+        }
+        symlink("nowhere", at("train/gone")).unwrap();
+        symlink("b.txt", at("c.txt")).unwrap();
+        let names = |files: Vec<(PathBuf, PathBuf)>| {
+            files.into_iter().map(|(relative, _)| relative.display().to_string()).collect()
+        };
+        let (files, left_out) = list_source_files(dir.path()).unwrap();
+        let files: Vec<String> = names(files);
+        assert_eq!(files, ["b.txt", "c.txt", "train/a.txt"]);
+        let left_out: BTreeSet<String> = left_out.iter().map(|p| p.display().to_string()).collect();
+        let expected = ignored.iter().chain(&["train/gone"]).map(|name| (*name).to_owned());
+        assert_eq!(left_out, expected.collect());
+        assert!(list_files(dir.path()).unwrap_err().to_string().contains("train/gone"));
+        fs::remove_file(at("train/gone")).unwrap();
+        assert_eq!(list_files(dir.path()).unwrap().len(), files.len() + ignored.len());
+        // A link that leads round, or into what may not be read, isn't one to nothing.
+        symlink("round", at("round")).unwrap();
+        assert!(list_source_files(dir.path()).unwrap_err().to_string().contains("round"));
+    }
+
+    #[test]
+    fn what_is_neither_file_nor_folder_is_named() {
+        let dir = example();
+        let _socket = UnixListener::bind(dir.path().join("train/s")).unwrap();
+        let message = list_files(dir.path()).unwrap_err().to_string();
+        assert!(message.contains("train/s") && message.contains("remove it"), "{message}");
+    }
+
+    #[test]
+    fn a_manifest_can_not_point_outside() {
+        for path in ["../x", "/etc/passwd", "a/../../x", "", "a\0b"] {
+            assert!(relative_path(path).is_err(), "{path:?}");
+        }
+        assert_eq!(relative_path("./train/r_0").unwrap(), Path::new("train/r_0"));
+    }
+
+    #[test]
+    fn only_folders_and_regular_files_are_plain() {
+        type Harm = fn(&Path);
+        let cases: [(&str, Harm); 6] = [
+            ("out is a symbolic link", |out| {
+                fs::rename(out, out.with_extension("real")).unwrap();
+                symlink(out.with_extension("real"), out).unwrap();
+            }),
+            ("out is a regular file", |out| {
+                fs::remove_dir_all(out).unwrap();
+                fs::write(out, "").unwrap();
+            }),
+            ("out/in/link is a symbolic link", |out| symlink("a", out.join("in/link")).unwrap()),
+            ("out/in/loop is a symbolic link", |out| symlink("..", out.join("in/loop")).unwrap()),
+            ("out/gone is a symbolic link", |out| symlink("nowhere", out.join("gone")).unwrap()),
+            ("out/socket is a socket", |out| drop(UnixListener::bind(out.join("socket")).unwrap())),
+        ];
+        for (words, harm) in cases {
+            let dir = tempfile::tempdir().unwrap();
+            let out = dir.path().join("out");
+            fs::create_dir_all(out.join("in")).unwrap();
+            fs::write(out.join("in/a"), "").unwrap();
+            let files = list_output_files(&out).unwrap();
+            assert_eq!(
+                files.into_iter().map(|file| file.0).collect::<Vec<_>>(),
+                [out.join("in/a")]
+            );
+            harm(&out);
+            let message = list_output_files(&out).unwrap_err().to_string();
+            assert!(message.contains(words) && !message.contains('\n'), "{words}: {message}");
+        }
+    }
+}
