@@ -246,7 +246,7 @@ fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
     for (scene, scene_views) in report.scenes.iter().enumerate() {
         for name in &scene_views.views {
             let view = row.view(name).filter(|_| scene == row.scene);
-            scores.push(view.map(|v| known.iter().map(|f| f.of(&v["scores"])).collect()));
+            scores.push(view.map(|v| known.iter().map(|f| f.value_in(&v["scores"])).collect()));
         }
     }
     RowData {

@@ -45,7 +45,7 @@ pub(crate) struct Row<'a> {
 impl Row<'_> {
     /// Returns the mean of a figure over the views.
     pub(crate) fn mean(&self, figure: &Figure) -> Option<f64> {
-        figure.of(self.metrics.mean())
+        figure.value_in(self.metrics.mean())
     }
 
     /// Returns the scores of a view.

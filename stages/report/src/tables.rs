@@ -24,7 +24,7 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
             }
             dl {
                 @for (figure, mean) in known.take(SUMMARY_FIGURES) {
-                    div { dt { (figure.label) } dd { (figure.text(mean)) } }
+                    div { dt { (figure.label) } dd { (figure.format_value(mean)) } }
                 }
                 @if best.training > 0.0 {
                     div { dt { "Training" } dd { (seconds(best.training)) } }
@@ -96,10 +96,10 @@ fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
     html! {
         @if is_best(figure, row, rows) {
             td class="n best" {
-                span class="star" aria-label="best" role="img" { "★" } " " (figure.text(value))
+                span class="star" aria-label="best" role="img" { "★" } " " (figure.format_value(value))
             }
         } @else {
-            td class="n" { (figure.text(value)) }
+            td class="n" { (figure.format_value(value)) }
         }
     }
 }
@@ -150,8 +150,8 @@ pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
                                     th scope="row" { (view["name"].as_str().unwrap_or_default()) }
                                     @if report.rows.len() > 1 { td { (row.label) } }
                                     @for figure in &known {
-                                        @let value = figure.of(&view["scores"]);
-                                        @let text = value.map(|value| figure.text(value));
+                                        @let value = figure.value_in(&view["scores"]);
+                                        @let text = value.map(|value| figure.format_value(value));
                                         td class="n" { (text.as_deref().unwrap_or("–")) }
                                     }
                                 }

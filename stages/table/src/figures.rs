@@ -41,7 +41,7 @@ impl Figures {
     /// Formats a value with its digits and unit.
     pub(crate) fn format(&self, name: &str, value: f64) -> String {
         if let Some(figure) = self.0.get(name) {
-            return figure.text(value);
+            return figure.format_value(value);
         }
         match (name, added(name)) {
             ("rays_per_s", _) => format!("{:.0} k", value / 1e3),

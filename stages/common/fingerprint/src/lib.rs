@@ -1,13 +1,13 @@
-//! Build-time hash of what a stage is made of: the code part of an action's key.
+//! Build-time hash of a stage's code, which is part of an action's key.
 //!
 //! A stage's `build.rs` calls [`emit`]; its `main.rs` reads `env!("STAGE_FINGERPRINT")`. The hash
-//! covers the sources of the stage's crate and of the workspace crates it may use, the part of
-//! `Cargo.lock` they reach, compiler, target and profile. It never covers the binary's bytes or an
-//! absolute path, so that moving or rebuilding a checkout reruns nothing.
+//! covers the sources of the stage's crate and of the workspace crates that it depends on, their
+//! part of `Cargo.lock`, compiler, target and profile. The binary's bytes and absolute paths are
+//! excluded, so that moving or rebuilding a checkout doesn't rerun anything.
 //!
-//! Nor does it cover Cargo features. A feature (`torch`) only adds what a stage can do: without it,
-//! a stage fails where it would be needed, and fails without a result. So whatever is made without
-//! the feature has one key, built with it or not. Crates that only a feature brings always count.
+//! Cargo features are excluded, too. A feature (`torch`) only adds functions, without which a stage
+//! fails and has no result, so results are equal with and without the feature. Optional
+//! dependencies are always included.
 //!
 //! ```no_run
 //! // build.rs
@@ -20,15 +20,15 @@ use std::{env, fs};
 
 use toml::{Table, Value};
 
-/// Environment of a build script that changes the machine code.
+/// Environment variables of a build script that change the machine code.
 const BUILD_ENV: [&str; 5] = ["TARGET", "PROFILE", "OPT_LEVEL", "DEBUG", "CARGO_ENCODED_RUSTFLAGS"];
 
-/// Sets `STAGE_FINGERPRINT` for the crate being built. Its program will look for libraries beside
-/// itself: there `make install` puts libtorch.
+/// Sets `STAGE_FINGERPRINT` for the crate being built, and the library path of its program to the
+/// program's folder, into which `make install` copies libtorch.
 ///
 /// # Panics
-/// When called outside a Cargo build script or when a manifest can't be read: the build must not go
-/// on with a shorter key.
+/// If called outside a Cargo build script or if a manifest can't be read, since the build must not
+/// continue with an incomplete key.
 pub fn emit() {
     let crate_dir = PathBuf::from(
         env::var("CARGO_MANIFEST_DIR").expect("fingerprint::emit runs in a build script"),
@@ -43,10 +43,8 @@ pub fn emit() {
 
     let mut hash = Hash::default();
     let rustc = env::var("RUSTC").expect("cargo names the compiler");
-    let version = std::process::Command::new(rustc)
-        .arg("-vV")
-        .output()
-        .expect("the compiler tells its version");
+    let version =
+        std::process::Command::new(rustc).arg("-vV").output().expect("rustc -vV succeeds");
     hash.part("rustc", &version.stdout);
     for name in BUILD_ENV {
         println!("cargo:rerun-if-env-changed={name}");
@@ -60,9 +58,8 @@ pub fn emit() {
     println!("cargo:rustc-env=STAGE_FINGERPRINT={}", hash.0.finalize().to_hex());
 }
 
-/// Adds what a crate of a workspace is made of: its sources and those of the workspace crates that
-/// it uses, the profiles, and the locked packages that they reach. Returns the folders of those
-/// crates.
+/// Hashes the sources of a crate and of the workspace crates that it depends on, the profiles, and
+/// their locked packages. Returns the folders of the crates.
 fn add_sources(hash: &mut Hash, root: &Path, crate_dir: &Path) -> Vec<PathBuf> {
     let workspace = read_toml(&root.join("Cargo.toml"));
     let profile = workspace.get("profile").map(ToString::to_string).unwrap_or_default();
@@ -91,7 +88,7 @@ fn add_sources(hash: &mut Hash, root: &Path, crate_dir: &Path) -> Vec<PathBuf> {
 struct Hash(blake3::Hasher);
 
 impl Hash {
-    /// Length-prefixed, so that no two lists of parts read alike.
+    /// Adds a part with its length, so that different lists of parts never have equal bytes.
     fn part(&mut self, name: &str, bytes: &[u8]) {
         for piece in [name.as_bytes(), bytes] {
             self.0.update(&(piece.len() as u64).to_le_bytes()).update(piece);
@@ -101,8 +98,8 @@ impl Hash {
 
 struct Crate {
     dir: PathBuf,
-    /// Names under `[dependencies]` and `[build-dependencies]`, those of single systems among them;
-    /// tests can't change an artifact.
+    /// Names under `[dependencies]` and `[build-dependencies]`, including those of single systems.
+    /// Dependencies of tests can't change an artifact.
     dependencies: Vec<String>,
 }
 
@@ -111,7 +108,7 @@ fn read_toml(path: &Path) -> Table {
     text.parse().unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The crate at `start` and every workspace crate it reaches.
+/// Finds the crate at `start` and all workspace crates that it depends on, directly or not.
 fn workspace_crates(root: &Path, workspace: &Table, start: &Path) -> BTreeMap<String, Crate> {
     let shared =
         workspace.get("workspace").and_then(|w| w.get("dependencies")).and_then(Value::as_table);
@@ -141,9 +138,8 @@ fn workspace_crates(root: &Path, workspace: &Table, start: &Path) -> BTreeMap<St
     found
 }
 
-/// What a crate depends on but for its tests: on all systems, and on some
-/// (`[target.SYSTEM.dependencies]`). What only another system needs counts, too: at worst a key
-/// changes that needn't.
+/// Returns the dependencies of a crate, without those of tests. Dependencies of other systems
+/// (`[target.SYSTEM.dependencies]`) are included; at worst a key changes unnecessarily.
 fn dependencies_of(manifest: &Table) -> Vec<(&String, &Value)> {
     let systems = manifest.get("target").and_then(Value::as_table).into_iter().flatten();
     let mut found = Vec::new();
@@ -155,7 +151,8 @@ fn dependencies_of(manifest: &Table) -> Vec<(&String, &Value)> {
     found
 }
 
-/// `name version checksum` of every package outside the workspace that `crates` reach, sorted.
+/// Returns `name version checksum` of all packages outside the workspace that `crates` depend on,
+/// directly or not.
 fn locked(lock: &Table, crates: &BTreeMap<String, Crate>) -> BTreeSet<String> {
     let packages: Vec<&Table> = lock
         .get("package")
@@ -167,36 +164,31 @@ fn locked(lock: &Table, crates: &BTreeMap<String, Crate>) -> BTreeSet<String> {
     let mut reached = BTreeSet::new();
     let mut waiting: Vec<String> = crates.values().flat_map(|c| c.dependencies.clone()).collect();
     let mut seen = BTreeSet::new();
-    while let Some(wanted) = waiting.pop() {
-        if !seen.insert(wanted.clone()) {
+    while let Some(dependency) = waiting.pop() {
+        if !seen.insert(dependency.clone()) {
             continue;
         }
-        // "name" or "name version": the second where two versions are locked.
-        let mut words = wanted.split(' ');
+        // Cargo.lock writes "name", or "name version" if several versions are locked.
+        let mut words = dependency.split(' ');
         let (name, version) = (words.next().unwrap_or_default(), words.next());
         for package in &packages {
+            let found = text(package, "version");
             if text(package, "name") != name
-                || version.is_some_and(|v| v != text(package, "version"))
+                || version.is_some_and(|version| version != found)
+                || !package.contains_key("checksum")
             {
                 continue;
             }
-            if package.contains_key("checksum") {
-                reached.insert(format!(
-                    "{name} {} {}",
-                    text(package, "version"),
-                    text(package, "checksum")
-                ));
-                let next =
-                    package.get("dependencies").and_then(Value::as_array).into_iter().flatten();
-                waiting.extend(next.filter_map(Value::as_str).map(str::to_owned));
-            }
+            reached.insert(format!("{name} {found} {}", text(package, "checksum")));
+            let next = package.get("dependencies").and_then(Value::as_array).into_iter().flatten();
+            waiting.extend(next.filter_map(Value::as_str).map(str::to_owned));
         }
     }
     reached
 }
 
-fn text(package: &Table, key: &str) -> String {
-    package.get(key).and_then(Value::as_str).unwrap_or_default().to_owned()
+fn text<'a>(package: &'a Table, key: &str) -> &'a str {
+    package.get(key).and_then(Value::as_str).unwrap_or_default()
 }
 
 #[cfg(test)]
@@ -262,7 +254,7 @@ mod tests {
         hash.0.finalize().to_hex().to_string()
     }
 
-    /// What a stage is made of is in its key, however far down. Nothing else is, nor where it lies.
+    /// The key covers direct and indirect dependencies, and neither unused crates nor folders.
     #[test]
     fn an_edited_dependency_changes_it_and_an_unused_one_does_not() {
         let own = fingerprint(None);

@@ -4,88 +4,86 @@ use serde_json::Value;
 
 use crate::figure::Figure;
 
-/// The file's name in an artifact of kind `metrics`.
+/// Name of the file in an artifact of kind `metrics`.
 pub const METRICS_FILE: &str = "metrics.json";
 
-/// `metrics.json` of any stage. A stage of somebody's own may leave out any field, or write others.
+/// `metrics.json` of any stage. A user's own stage may omit any field, or write others.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct AnyMetrics(Value);
 
-/// Why a `metrics.json` can't be read.
+/// Error returned if a `metrics.json` can't be read.
 #[derive(Debug, thiserror::Error)]
 pub enum MetricsError {
     /// The file can't be read.
     #[error("{}: {source}", file.display())]
     Io {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// Why.
+        /// Error of the read.
         source: std::io::Error,
     },
-    /// The file isn't JSON.
+    /// The file is not JSON.
     #[error("{}: {source}", file.display())]
     Json {
-        /// The file.
+        /// Path of the file.
         file: PathBuf,
-        /// Why.
+        /// Error of the parser.
         source: serde_json::Error,
     },
 }
 
 impl AnyMetrics {
-    /// Reads the file of an artifact.
+    /// Reads the file of an artifact; accepts JSON of any form.
     ///
     /// # Errors
-    /// [`MetricsError`] with the file's path. JSON of any form is taken.
+    /// [`MetricsError`] with the path of the file.
     pub fn read(folder: &Path) -> Result<Self, MetricsError> {
         let file = folder.join(METRICS_FILE);
-        let bytes = match std::fs::read(&file) {
-            Ok(bytes) => bytes,
-            Err(source) => return Err(MetricsError::Io { file, source }),
-        };
-        match serde_json::from_slice(&bytes) {
-            Ok(value) => Ok(Self(value)),
-            Err(source) => Err(MetricsError::Json { file, source }),
+        match std::fs::read(&file) {
+            Ok(bytes) => serde_json::from_slice(&bytes)
+                .map(Self)
+                .map_err(|source| MetricsError::Json { file, source }),
+            Err(source) => Err(MetricsError::Io { file, source }),
         }
     }
 
-    /// The figures; `None` where the file lists none, or one that isn't a [`Figure`].
+    /// Returns the figures; `None` if the list is missing or contains anything but a [`Figure`].
     pub fn figures(&self) -> Option<Vec<Figure>> {
         serde_json::from_value(self.0["figures"].clone()).ok()
     }
 
-    /// Names and titles of the pictures that metrics made, by name.
+    /// Returns the names and titles of the metrics' pictures, sorted by name.
     pub fn picture_titles(&self) -> Vec<(&str, &str)> {
         let titles = self.0["picture_titles"].as_object().into_iter().flatten();
         titles.filter_map(|(name, title)| Some((name.as_str(), title.as_str()?))).collect()
     }
 
-    /// Whether views have HR truth: without it `eval` scores them at LR alone.
+    /// Returns whether the views have HR ground truth; without it `eval` scores them at LR only.
     pub fn has_hr_truth(&self) -> bool {
         self.mean()["psnr"].is_number()
     }
 
-    /// Means over the views; null where there are none.
+    /// Returns the means over the views; null if missing.
     pub fn mean(&self) -> &Value {
         &self.0["mean"]
     }
 
-    /// The views; empty where the file has no list of them.
+    /// Returns the views; empty if the list is missing.
     pub fn views(&self) -> &[Value] {
         self.0["views"].as_array().map(Vec::as_slice).unwrap_or_default()
     }
 
-    /// How the figures were made, in words; null where the file doesn't say.
+    /// Returns the methods of the metrics as text; null if missing.
     pub fn conventions(&self) -> &Value {
         &self.0["conventions"]
     }
 
-    /// As [`Metrics::least_gain`](crate::Metrics::least_gain); null where there is none.
+    /// Returns [`Metrics::least_gain`](crate::Metrics::least_gain); null if missing.
     pub fn least_gain(&self) -> &Value {
         &self.0["least_gain"]
     }
 
-    /// As [`Metrics::near_references`](crate::Metrics::near_references); null where there are none.
+    /// Returns [`Metrics::near_references`](crate::Metrics::near_references); null if missing.
     pub fn near_references(&self) -> &Value {
         &self.0["near_references"]
     }
@@ -103,9 +101,9 @@ mod tests {
 
     use super::*;
 
-    /// A stage of somebody's own says what it likes.
+    /// A user's own stage may write any JSON.
     #[test]
-    fn nothing_has_to_be_there() {
+    fn all_fields_are_optional() {
         for value in [json!({"mean": {"mse": 0.25}, "views": {}, "more": 1}), json!([]), json!(3)] {
             let metrics = AnyMetrics::from(value.clone());
             assert_eq!(metrics.mean(), &value["mean"], "{value}");
@@ -127,8 +125,11 @@ mod tests {
         assert_eq!((found[0].higher_is_better, found[1].higher_is_better), (None, Some(false)));
         assert_eq!(found[1].missing.as_deref(), Some("no c"));
         let scores = json!({"a": {"b": 2.34}, "c": "none"});
-        assert_eq!(found[0].of(&scores).map(|value| found[0].text(value)), Some("2.3".to_owned()));
-        assert_eq!(found[1].of(&scores), None);
+        assert_eq!(
+            found[0].value_in(&scores).map(|value| found[0].format_value(value)),
+            Some("2.3".to_owned())
+        );
+        assert_eq!(found[1].value_in(&scores), None);
         assert_eq!(figures(json!([{"path": "a"}])), None);
     }
 

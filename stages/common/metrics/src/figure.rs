@@ -2,28 +2,29 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// A figure of `metrics.json`, and how it is shown.
-// The schema is that of `eval`'s figures. Another stage's may have more fields, or no direction.
+/// Figure of `metrics.json`: a number among the scores, with its label and format.
+// The schema describes the figures of `eval`. Those of other stages may have more fields, or none
+// for the direction.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[schemars(deny_unknown_fields)]
 pub struct Figure {
-    /// Its place among the scores: keys from the outermost on, `/` between them.
+    /// Path to the number in the scores: keys separated by `/`, the outermost first.
     pub path: String,
-    /// What it is called, with its unit.
+    /// Label, with unit.
     pub label: String,
-    /// Digits after the point.
+    /// Number of decimal places.
     pub digits: usize,
-    /// Whether more of it is better.
+    /// True if higher values are better.
     #[schemars(with = "bool")]
     pub higher_is_better: Option<bool>,
-    /// What stands where it is missing from views that have others; without it, only results that
-    /// have the figure show it.
+    /// Text displayed if the figure is missing from views that have others; without the text, only
+    /// results with the figure display it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub missing: Option<String>,
 }
 
 impl Figure {
-    /// A figure that says which way is better.
+    /// Creates a figure with a direction.
     pub fn new(path: &str, label: &str, digits: usize, higher_is_better: bool) -> Self {
         Self {
             path: path.to_owned(),
@@ -34,14 +35,14 @@ impl Figure {
         }
     }
 
-    /// Its number among the scores of a view, or among the means.
-    pub fn of(&self, scores: &Value) -> Option<f64> {
+    /// Returns the figure's number in the scores of a view, or in the means.
+    pub fn value_in(&self, scores: &Value) -> Option<f64> {
         scores.pointer(&format!("/{}", self.path))?.as_f64()
     }
 
-    /// A number of it as text, with its digits and without its unit.
-    pub fn text(&self, value: f64) -> String {
-        // A file may ask for more than the formatter takes.
+    /// Formats a value with the figure's decimal places, without unit.
+    pub fn format_value(&self, value: f64) -> String {
+        // A file may request more digits than the formatter supports.
         format!("{value:.*}", self.digits.min(f64::DIGITS as usize))
     }
 }

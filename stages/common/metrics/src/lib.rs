@@ -1,13 +1,13 @@
-//! The types of `metrics.json`: scores of views, and how their figures are shown.
+//! Types of `metrics.json`: scores of views, and the format in which they are displayed.
 //!
-//! * [`Metrics`]: the file as `eval` writes it, and as `eval` reads it from input `baseline`.
-//!   [`ViewScores`] and [`NearReferences`] are parts of it.
+//! * [`Metrics`]: the file as `eval` writes it, and as `eval` reads it from input `baseline`, with
+//!   [`ViewScores`] and [`NearReferences`].
 //! * [`Score`], [`Scores`]: numbers of one view, or means over all views, by name.
-//! * [`Figure`]: a number among the scores, and how it is shown.
-//! * [`AnyMetrics`]: the file of any stage, for `report` and `table`. No field has to be there.
+//! * [`Figure`]: a number among the scores, with its label and format.
+//! * [`AnyMetrics`]: the file of any stage, for `report` and `table`; all fields are optional.
 //!
-//! `eval` computes the scores. No stage before `eval` uses this crate, so a change here makes no
-//! training run again.
+//! `eval` computes the scores. No stage before `eval` uses this crate, so its changes don't repeat
+//! trainings.
 //!
 //! ```
 //! use metrics::{AnyMetrics, Figure, Metrics, Score, Scores};
@@ -24,14 +24,13 @@
 //! let read = AnyMetrics::from(serde_json::to_value(&written)?);
 //! assert_eq!(read.figures(), Some(written.figures.clone()));
 //! let figure = &written.figures[0];
-//! let mean = figure.of(read.mean()).unwrap();
-//! assert_eq!(figure.text(mean), "31.25");
+//! let mean = figure.value_in(read.mean()).unwrap();
+//! assert_eq!(figure.format_value(mean), "31.25");
 //! # Ok::<(), serde_json::Error>(())
 //! ```
 
 mod any_metrics;
 mod figure;
-mod score;
 
 use std::collections::BTreeMap;
 
@@ -40,53 +39,72 @@ use serde::{Deserialize, Serialize};
 
 pub use any_metrics::{AnyMetrics, METRICS_FILE, MetricsError};
 pub use figure::Figure;
-pub use score::{Score, Scores};
 
 /// `metrics.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Metrics {
-    /// How the figures were made, in words, by metric; also what was behind the scene
-    /// (`background`) and what error maps show (`error_maps`).
+    /// Method of each metric as text; also the background of the scene (`background`) and the
+    /// content of error maps (`error_maps`).
     pub conventions: BTreeMap<String, String>,
-    /// The figures, and how they are shown, the most important first.
+    /// Figures to display, the most important first.
     pub figures: Vec<Figure>,
-    /// Titles of metrics' pictures, by metric.
+    /// Titles of the metrics' pictures, by metric.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub picture_titles: BTreeMap<String, String>,
     /// Means of the per-view values.
     pub mean: Scores,
-    /// Gain in dB of the view that fares worst over input `baseline`.
+    /// Smallest PSNR gain of a view over input `baseline`, in dB.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub least_gain: Option<f64>,
-    /// Scores of the views near an HR reference, where input `references` is given.
+    /// Scores of the views near an HR reference, if input `references` is given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub near_references: Option<NearReferences>,
-    /// Every view.
+    /// Scores of all views.
     pub views: Vec<ViewScores>,
 }
 
-/// One view's scores.
+/// Scores of one view.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ViewScores {
-    /// The view.
+    /// Name of the view.
     pub name: String,
-    /// Its scores.
+    /// Scores of the view.
     pub scores: Scores,
-    /// Its error map.
+    /// File of the error map.
     pub error_map: String,
-    /// Files of pictures that metrics made, by metric.
+    /// Files of the metrics' pictures, by metric.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub pictures: BTreeMap<String, String>,
 }
 
-/// Scores of the views that look the way an HR reference does, within 60°.
+/// Scores of the views whose direction is within 60° of an HR reference's.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NearReferences {
     /// Number of these views.
     pub views: usize,
-    /// Their mean PSNR in dB.
+    /// Mean PSNR of these views in dB.
     pub psnr: f64,
 }
+
+/// Score of a metric: one number, or several related ones.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(untagged)]
+pub enum Score {
+    /// Single number.
+    One(f64),
+    /// Numbers by name.
+    Several(BTreeMap<String, f64>),
+}
+
+impl Score {
+    /// Creates a score of several numbers with their names.
+    pub fn several<const N: usize>(parts: [(&str, f64); N]) -> Self {
+        Self::Several(parts.map(|(name, value)| (name.to_owned(), value)).into())
+    }
+}
+
+/// Scores of a view, or means over views, by metric.
+pub type Scores = BTreeMap<String, Score>;
