@@ -297,7 +297,7 @@ fn links_in_a_stages_output_are_refused() {
     for (run, words) in LINKS {
         let project = scripted(run);
         project.write("own/x", "mine");
-        project.run(&["run", "text"]).fails(1, &["text", "without a proper artifact", words]);
+        project.run(&["run", "text"]).fails(1, &["text", "without a valid artifact", words]);
         assert!(project.store_listing().is_empty());
         assert_untouched(&project);
     }

@@ -32,7 +32,7 @@ pub(crate) fn export(
         let history = History::of(store, what, records_only)?;
         let entered = entered(store, stop)?;
         for (key, record) in &history.records {
-            run.needs(&entered, &record.stage, key)?;
+            run.record_action(&entered, &record.stage, key)?;
         }
         drop(entered);
         history.write(store, destination, stop)

@@ -50,14 +50,14 @@ impl Intake {
     ) -> anyhow::Result<usize> {
         let entered = entered(&self.store, &self.stop)?;
         if let Some(arrival) = arrival {
-            self.store.take_in(&entered, arrival)?;
+            self.store.import_object(&entered, arrival)?;
         }
         let mut new = 0;
         for record in records {
             if let Some(run) = &self.run {
-                run.needs(&entered, &record.stage, &record.key())?;
+                run.record_action(&entered, &record.stage, &record.key())?;
             }
-            new += usize::from(self.store.take_in_record(&entered, record)?);
+            new += usize::from(self.store.import_record(&entered, record)?);
         }
         Ok(new)
     }
@@ -80,11 +80,11 @@ pub(crate) fn entered(store: &Store, stop: &AtomicBool) -> anyhow::Result<Entere
     let (since, mut is_said) = (Instant::now(), false);
     loop {
         match store.try_enter()? {
-            Locked::Held(entered) => return Ok(entered),
-            Locked::By(_) if stop.load(Ordering::Relaxed) => {
+            Locked::Acquired(entered) => return Ok(entered),
+            Locked::HeldBy(_) if stop.load(Ordering::Relaxed) => {
                 return Err(Failure::Interrupted.into());
             }
-            Locked::By(_) => {}
+            Locked::HeldBy(_) => {}
         }
         if !is_said && since.elapsed() > Duration::from_secs(1) {
             is_said = true;

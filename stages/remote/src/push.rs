@@ -33,7 +33,7 @@ pub(crate) async fn push(
         // From here on garbage collection leaves alone what is about to be read.
         let entered = entered(store, stop)?;
         for record in &missing {
-            run.needs(&entered, &record.stage, &record.key())?;
+            run.record_action(&entered, &record.stage, &record.key())?;
         }
     }
     let pushed = push_records(store, remote, &missing, stop).await;

@@ -19,7 +19,7 @@ use std::sync::atomic::AtomicBool;
 use artifact::{Manifest, list_files};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 use stage_call::StageFailure;
-use store::{Locked, StoreError, is_taken};
+use store::{Locked, StoreError, is_lock_acquired};
 
 use crate::archive::archive_path;
 use crate::failure;
@@ -188,7 +188,11 @@ fn lock_folder(folder: &Path, stop: &AtomicBool) -> Result<File, StageFailure> {
     wait_for_lock(stop, &|_, _| {}, || {
         let file = File::open(folder)
             .map_err(|source| StoreError::Io { path: folder.to_path_buf(), source })?;
-        Ok(if is_taken(folder, file.try_lock())? { Locked::Held(file) } else { Locked::By(None) })
+        Ok(if is_lock_acquired(folder, file.try_lock())? {
+            Locked::Acquired(file)
+        } else {
+            Locked::HeldBy(None)
+        })
     })
 }
 

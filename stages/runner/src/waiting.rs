@@ -25,8 +25,8 @@ pub(crate) fn wait_for_lock<T>(
     let mut next_notice = NOTICE_DELAY;
     loop {
         match attempt().map_err(failure)? {
-            Locked::Held(held) => return Ok(held),
-            Locked::By(holder) => {
+            Locked::Acquired(held) => return Ok(held),
+            Locked::HeldBy(holder) => {
                 if stop.load(Ordering::Relaxed) {
                     let message = "interrupted while waiting for a lock".to_owned();
                     return Err(StageFailure { code: 130, message });
@@ -63,8 +63,8 @@ pub(crate) fn enter_store(
 /// Enters the store, or fails if garbage collection runs.
 pub(crate) fn try_enter_store(store: &Store) -> anyhow::Result<Entered> {
     match store.try_enter()? {
-        Locked::Held(entered) => Ok(entered),
-        Locked::By(_) => Err(anyhow::anyhow!("garbage collection is running; try again later")),
+        Locked::Acquired(entered) => Ok(entered),
+        Locked::HeldBy(_) => Err(anyhow::anyhow!("garbage collection is running; try again later")),
     }
 }
 
@@ -95,7 +95,7 @@ mod tests {
     fn a_signal_ends_a_wait() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let Locked::Held(_lock) = store.try_lock("k").unwrap() else { panic!("held") };
+        let Locked::Acquired(_lock) = store.try_lock("k").unwrap() else { panic!("held") };
         let stop = AtomicBool::new(false);
         let said = RefCell::new(Vec::new());
         let say = |holder: Option<&Holder>, _: Duration| {

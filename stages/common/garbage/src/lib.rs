@@ -19,7 +19,7 @@
 //! let store = Store::open(folder.path())?;
 //! let plan = Root { reason: "the pipeline needs it".to_owned(), ..Root::default() };
 //! let policy = Policy { keep_days: 30, drop_unfinished: false, drop_old: false };
-//! if let Locked::Held(closed) = store.try_close()? {
+//! if let Locked::Acquired(closed) = store.try_close()? {
 //!     let collection = Collection::new(&store, plan, policy)?;
 //!     for decision in collection.decisions() {
 //!         println!("{decision}");
@@ -69,7 +69,7 @@ impl Collection {
         let is_old = |run: &&store::Run| {
             !run.in_progress
                 && !submissions.contains_key(&run.id)
-                && !policy.is_recent(run.used_unix())
+                && !policy.is_recent(run.last_used_unix())
         };
         let old_runs = runs.iter().filter(is_old).map(|run| run.id.clone()).collect();
         Ok(Self { contents, kept, old_runs })

@@ -22,7 +22,7 @@ pub(crate) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
         let fitting = contents
             .records
             .iter()
-            .filter(|(_, record)| root.waiting.iter().any(|node| node.may_be(record)));
+            .filter(|(_, record)| root.waiting.iter().any(|node| node.matches(record)));
         let mut open: Vec<(String, String)> = root
             .keys
             .iter()

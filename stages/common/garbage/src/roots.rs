@@ -58,8 +58,9 @@ pub(crate) fn find_roots(
         } else if run.in_progress {
             let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
             roots.push(run_root(format!("needed by the run of process {process}"), run));
-        } else if policy.is_recent(run.used_unix()) {
-            roots.push(run_root(format!("used by a run {}", format_age(run.used_unix())), run));
+        } else if policy.is_recent(run.last_used_unix()) {
+            roots
+                .push(run_root(format!("used by a run {}", format_age(run.last_used_unix())), run));
         }
     }
     for key in store.locked_keys()? {

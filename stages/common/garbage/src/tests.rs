@@ -112,7 +112,7 @@ struct Made {
 /// at such a start stays locked until the program is loaded.
 fn held<T>(mut attempt: impl FnMut() -> Result<Locked<T>, store::StoreError>) -> T {
     loop {
-        if let Locked::Held(held) = attempt().unwrap() {
+        if let Locked::Acquired(held) = attempt().unwrap() {
             return held;
         }
         std::thread::yield_now();
@@ -162,14 +162,15 @@ fn make(case: &Case) -> Made {
                 store.pin(&entered, &format!("pin-{i}"), Vec::new(), &actions).unwrap();
             }
             Holder::Lock(number) => {
-                if let Locked::Held(lock) = store.try_lock(&key(number)).unwrap() {
+                if let Locked::Acquired(lock) = store.try_lock(&key(number)).unwrap() {
                     locks.push(lock);
                 }
             }
             Holder::Run { keys, waiting: nodes, days_ago: days, in_progress } => {
                 let run = store.begin_run(&entered, Vec::new()).unwrap();
-                keys.iter().for_each(|number| run.needs(&entered, "s", &key(number)).unwrap());
-                nodes.iter().for_each(|node| run.waits(&entered, waiting(*node)).unwrap());
+                keys.iter()
+                    .for_each(|number| run.record_action(&entered, "s", &key(number)).unwrap());
+                nodes.iter().for_each(|node| run.record_waiting(&entered, waiting(*node)).unwrap());
                 if *in_progress {
                     runs.push(run);
                 } else {
@@ -311,7 +312,7 @@ proptest! {
         }
         prop_assert_eq!(fs::read_dir(store.root().join("trash")).unwrap().count(), 0);
         for run in store.runs().unwrap() {
-            let is_recent = || unix_time() - run.used_unix() < case.keep_days * 86_400;
+            let is_recent = || unix_time() - run.last_used_unix() < case.keep_days * 86_400;
             prop_assert!(run.in_progress || is_recent());
         }
     }

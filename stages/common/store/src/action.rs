@@ -6,90 +6,89 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::error::{StoreError, at, read_if_found};
+use crate::error::{StoreError, if_found, with_path};
 use crate::folder::Store;
 use crate::lock::Entered;
 use crate::objects::is_hash;
 
-/// Version of a key's list of parts: names of parameters changed between 1 and 2.
+/// Version of a key's list of parts; names of parameters differ between versions 1 and 2.
 pub const KEY_VERSION: u64 = 2;
-/// The part that holds it.
+/// Name of the part with the version.
 pub const KEY_VERSION_PART: &str = "key version";
 
-/// `actions/KEY.json`: the whole key and what came of it. A field of a later version is passed
-/// over.
+/// `actions/KEY.json`: record of a finished action. Unknown fields, of later versions, are ignored.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Record {
     /// Name of the stage's block in pipeline.yaml.
     pub stage: String,
-    /// The sweep's point, e.g. `supersample=2`; empty without a sweep.
+    /// Point of the sweep, e.g. `supersample=2`; empty without a sweep.
     pub point: String,
-    /// Every part of the key, by name. The key is the blake3 of this map's canonical JSON.
+    /// Parts of the key, by name. The key is the blake3 of this map's canonical JSON.
     pub key_parts: Map<String, Value>,
-    /// Keys of the actions that made its inputs.
+    /// Keys of the actions that created the inputs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub made_of: Vec<String>,
-    /// Identity of the artifact that came out.
+    /// Identity of the created artifact.
     pub output: String,
-    /// When it started, seconds since 1970.
+    /// Start time in seconds since 1970.
     pub started_unix: u64,
-    /// How long it took.
+    /// Duration in seconds.
     pub seconds: f64,
-    /// Threads it had.
+    /// Number of threads.
     pub threads: usize,
-    /// Peak resident memory of its process, in bytes; records of earlier versions have none.
+    /// Peak resident memory of the process in bytes; missing in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_memory: Option<u64>,
-    /// Processor time of all its threads, in seconds; records of earlier versions have none.
+    /// Processor time of all threads in seconds; missing in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub processor_seconds: Option<f64>,
-    /// Where it ran.
+    /// Name of the machine.
     pub host: String,
-    /// What its `summary.txt` says, so that nothing of an artifact is read to show it; records of
-    /// earlier versions have none.
+    /// Content of the artifact's `summary.txt`, so that displaying it doesn't read the artifact;
+    /// missing in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub summary: Option<String>,
 }
 
 impl Record {
-    /// Whether its key is of an older version: no plan comes to it any more, though what it names
-    /// may still be wanted.
+    /// Returns whether the key has an older version. No plan yields such a key any more, but its
+    /// artifact may still be needed.
     pub fn has_old_key(&self) -> bool {
         self.key_parts.get(KEY_VERSION_PART).and_then(Value::as_u64) != Some(KEY_VERSION)
     }
 
-    /// The action's key.
+    /// Returns the key of the action.
     pub fn key(&self) -> String {
         hash_json(&self.key_parts)
     }
 }
 
-/// `partial/KEY/action.json`: an action that was begun.
+/// `partial/KEY/action.json`: an unfinished action.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Unfinished {
     /// Name of the stage's block in pipeline.yaml.
     pub stage: String,
-    /// The sweep's point.
+    /// Point of the sweep.
     pub point: String,
-    /// Every part of the key, by name.
+    /// Parts of the key, by name.
     pub key_parts: Map<String, Value>,
-    /// Keys of the actions that made its inputs.
+    /// Keys of the actions that created the inputs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub made_of: Vec<String>,
-    /// When it was begun, seconds since 1970.
+    /// Start time in seconds since 1970.
     pub started_unix: u64,
 }
 
 impl Store {
-    /// The record of a key, if the action was done and its object is whole (sizes only; see
-    /// [`Store::verify`]).
+    /// Returns the record of a key if its object is complete. Only sizes are checked; see
+    /// [`Store::verify`].
     pub fn hit(&self, key: &str) -> Result<Option<Record>, StoreError> {
         let Some(record) = self.record(key)? else { return Ok(None) };
         Ok(self.is_whole(&record.output)?.then_some(record))
     }
 
-    /// As [`Store::hit`], and where an object's files are whole but its manifest is missing, cut
-    /// short or another's, that is written again. `kind` is what the stage makes.
+    /// Returns the record like [`Store::hit`], and rewrites a missing or damaged manifest of an
+    /// object whose files are complete. `kind` is the kind of the object.
     pub fn hit_or_repair(
         &self,
         _: &Entered,
@@ -101,7 +100,7 @@ impl Store {
         Ok(is_whole.then_some(record))
     }
 
-    /// The record of a key. A damaged one counts as absent: the action is run again.
+    /// Returns the record of a key. A damaged record counts as absent, so that the action runs again.
     pub fn record(&self, key: &str) -> Result<Option<Record>, StoreError> {
         match self.undamaged_record(key) {
             Err(StoreError::Content { .. }) => Ok(None),
@@ -109,20 +108,20 @@ impl Store {
         }
     }
 
-    /// The record of a key. A damaged one, or one of another key, is [`StoreError::Content`].
+    /// Returns the record of a key; [`StoreError::Content`] if it is damaged or has another key.
     pub fn undamaged_record(&self, key: &str) -> Result<Option<Record>, StoreError> {
         let path = self.action(key, "json");
-        let Some(bytes) = read_if_found(&path)? else { return Ok(None) };
+        let Some(bytes) = if_found(&path, fs::read(&path))? else { return Ok(None) };
         let problem = match serde_json::from_slice::<Record>(&bytes) {
             Ok(record) if record.key() == key => return Ok(Some(record)),
-            Ok(_) => "the record is of another action".to_owned(),
+            Ok(_) => "the record belongs to another action".to_owned(),
             Err(error) => format!("the record is damaged: {error}"),
         };
-        let remedy = "`nerf-sr verify --remove` removes it".to_owned();
+        let remedy = "remove the record by `nerf-sr verify --remove`".to_owned();
         Err(StoreError::Content { path, problem, remedy })
     }
 
-    /// All records, sorted by key, without the damaged ones.
+    /// Returns all undamaged records, sorted by key.
     pub fn records(&self) -> Result<Vec<Record>, StoreError> {
         let mut records = Vec::new();
         for key in self.action_files()? {
@@ -131,11 +130,11 @@ impl Store {
         Ok(records)
     }
 
-    /// Keys that have any file among the actions, sorted: those of damaged records are among them.
+    /// Returns the keys of all records and logs, sorted; including those of damaged records.
     pub fn action_files(&self) -> Result<Vec<String>, StoreError> {
         let mut keys = Vec::new();
-        for name in self.names("actions")? {
-            // Other names are somebody else's.
+        for name in self.list_names("actions")? {
+            // Other files don't belong to the store.
             if let Some((key, "json" | "log")) = name.rsplit_once('.')
                 && is_hash(key)
             {
@@ -146,57 +145,50 @@ impl Store {
         Ok(keys)
     }
 
-    /// Keys of actions that haven't finished, sorted.
+    /// Returns the keys of unfinished actions, sorted.
     pub fn partials(&self) -> Result<Vec<String>, StoreError> {
-        self.names("partial")
+        self.list_names("partial")
     }
 
-    /// An action that was begun, where its file is whole: a kill may have cut the file short.
+    /// Returns an unfinished action; `None` if its file is missing or truncated by a kill.
     pub fn unfinished(&self, key: &str) -> Result<Option<Unfinished>, StoreError> {
-        let bytes = read_if_found(&self.partial(key).join("action.json"))?;
+        let path = self.partial(key).join("action.json");
+        let bytes = if_found(&path, fs::read(&path))?;
         Ok(bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok()))
     }
 
-    /// Whether an unfinished action left a checkpoint.
+    /// Returns whether an unfinished action has a checkpoint.
     pub fn has_checkpoint(&self, key: &str) -> Result<bool, StoreError> {
         let work = self.partial(key).join("work");
         for entry in walkdir::WalkDir::new(&work) {
-            match entry {
-                Ok(entry) if entry.file_type().is_file() => return Ok(true),
-                Ok(_) => {}
-                Err(error) => {
-                    let path = error.path().unwrap_or(&work).to_path_buf();
-                    let source = io::Error::from(error);
-                    if source.kind() != io::ErrorKind::NotFound {
-                        return Err(StoreError::Io { path, source });
-                    }
-                }
+            let path = entry.as_ref().map_or_else(|e| e.path().unwrap_or(&work), |e| e.path());
+            let path = path.to_path_buf();
+            let entry = if_found(&path, entry.map_err(io::Error::from))?;
+            if entry.is_some_and(|entry| entry.file_type().is_file()) {
+                return Ok(true);
             }
         }
         Ok(false)
     }
 
-    /// Writes a record, in place of the one that its key has.
+    /// Writes a record, and replaces an existing one of the key.
     pub(crate) fn write_record(&self, record: &Record) -> Result<(), StoreError> {
         let path = self.action(&record.key(), "json");
-        at(&path, write_json_atomically(&path, record))
+        with_path(&path, write_json_atomically(&path, record))
     }
 
     /// Removes an action's record and log.
     pub fn remove_record(&self, key: &str) -> Result<(), StoreError> {
-        // The record goes first: a log without a record is only a log.
+        // The record is removed first, since a log without a record is harmless.
         for path in [self.action(key, "json"), self.action(key, "log")] {
-            match fs::remove_file(&path) {
-                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-                result => at(&path, result)?,
-            }
+            if_found(&path, fs::remove_file(&path))?;
         }
         Ok(())
     }
 
     /// Removes an unfinished action with its checkpoints.
     pub fn remove_partial(&self, key: &str) -> Result<(), StoreError> {
-        self.discard(&self.partial(key))
+        self.move_to_trash(&self.partial(key)).map(|_| ())
     }
 }
 
@@ -253,7 +245,7 @@ mod tests {
         for (bytes, words) in [
             (Vec::new(), "the record is damaged"),
             (b"{\"stage\":".to_vec(), "the record is damaged"),
-            (fs::read(store.action(&b.key(), "json")).unwrap(), "of another action"),
+            (fs::read(store.action(&b.key(), "json")).unwrap(), "belongs to another action"),
         ] {
             fs::write(&path, bytes).unwrap();
             assert_eq!(store.hit(&a.key()).unwrap(), None);

@@ -8,19 +8,19 @@ use crate::folder::Store;
 use crate::lock::Entered;
 use crate::objects::make_durable;
 
-/// An artifact from another store, found whole in a scratch folder of this one.
+/// Artifact from another store, checked in a scratch folder of this store.
 #[derive(Debug)]
 pub struct Arrival {
     folder: PathBuf,
     identity: String,
-    /// Whether what lies in its place isn't whole.
+    /// True if a damaged object is to be replaced.
     replaces: bool,
 }
 
 impl Store {
-    /// Looks at what came from another store: every file against the manifest, the manifest against
-    /// the identity. Makes it durable. This takes its time; taking it in ([`Store::take_in`])
-    /// doesn't.
+    /// Checks an artifact from another store, its files against the manifest and the manifest against
+    /// the identity, and makes it durable. This step is slow, so that [`Store::import_object`] is
+    /// fast.
     pub fn check_arrival(&self, folder: &Path, identity: &str) -> Result<Arrival, StoreError> {
         let manifest = Manifest::read(folder)?;
         if manifest.identity() != identity {
@@ -33,29 +33,25 @@ impl Store {
         Ok(Arrival { folder: folder.to_path_buf(), identity: identity.to_owned(), replaces })
     }
 
-    /// Takes in an object that came from another store. A whole one that is there stays.
-    pub fn take_in(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
-        // Somebody else may have put it there meanwhile: then readers shall not miss it for a
-        // moment.
-        let is_there = !arrival.replaces && self.is_whole(&arrival.identity)?;
-        self.place(&arrival.folder, &arrival.identity, is_there)
+    /// Moves a checked object into place, unless the store has a complete one.
+    pub fn import_object(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
+        // An object that another process has stored meanwhile must not vanish even for a moment.
+        let is_stored = !arrival.replaces && self.is_whole(&arrival.identity)?;
+        self.install_object(&arrival.folder, &arrival.identity, is_stored)
     }
 
-    /// Takes in a record that came from another store, after its object; whether it was new. The
-    /// record that is there stays, unless its object isn't whole and the new one's is.
-    pub fn take_in_record(&self, _: &Entered, record: &Record) -> Result<bool, StoreError> {
-        let stays = match self.record(&record.key())? {
-            Some(known) => {
-                known == *record
-                    || self.is_whole(&known.output)?
-                    || !self.is_whole(&record.output)?
-            }
-            None => false,
-        };
-        if !stays {
-            self.write_record(record)?;
+    /// Writes a record from another store, whose object is imported first; returns whether the record
+    /// was written. An existing record stays, unless only the new one's object is complete.
+    pub fn import_record(&self, _: &Entered, record: &Record) -> Result<bool, StoreError> {
+        if let Some(existing) = self.record(&record.key())?
+            && (existing == *record
+                || self.is_whole(&existing.output)?
+                || !self.is_whole(&record.output)?)
+        {
+            return Ok(false);
         }
-        Ok(!stays)
+        self.write_record(record)?;
+        Ok(true)
     }
 }
 
@@ -88,8 +84,8 @@ mod tests {
 
     fn take_from(store: &Store, entered: &Entered, host: &str) -> (bool, String) {
         let (folder, identity) = arriving(store, "1234");
-        store.take_in(entered, &store.check_arrival(&folder, &identity).unwrap()).unwrap();
-        (store.take_in_record(entered, &record(&identity, host)).unwrap(), identity)
+        store.import_object(entered, &store.check_arrival(&folder, &identity).unwrap()).unwrap();
+        (store.import_record(entered, &record(&identity, host)).unwrap(), identity)
     }
 
     /// The first record of a whole artifact stays; damaged objects give way.

@@ -8,38 +8,38 @@ use artifact::{
 use serde_json::Value;
 
 use crate::action::{Record, Unfinished};
-use crate::error::{StoreError, at};
-use crate::folder::{Store, remove};
+use crate::error::{StoreError, with_path};
+use crate::folder::{Store, remove_if_found};
 use crate::lock::Entered;
 use crate::objects::make_durable;
 
-/// An action being carried out: where it writes.
+/// Paths of an action in progress.
 #[derive(Debug)]
 pub struct Attempt {
-    /// The stage's `--output`; doesn't exist yet.
+    /// `--output` of the stage; doesn't exist yet.
     pub output: PathBuf,
-    /// The stage's `--work`; survives a failure.
+    /// `--work` of the stage; survives a failure.
     pub work: PathBuf,
-    /// The stage's `--params`.
+    /// `--params` of the stage.
     pub params: PathBuf,
-    /// What the stage says goes here.
+    /// Log of the stage.
     pub log: PathBuf,
     folder: PathBuf,
 }
 
-/// What an attempt made, found whole.
+/// Checked and durable output of an attempt, ready to be published.
 #[derive(Debug)]
-pub struct Checked {
+pub struct CheckedOutput {
     attempt: Attempt,
     identity: String,
-    /// Whether the store has such an object already.
-    is_there: bool,
+    /// True if the store already has the object.
+    is_stored: bool,
 }
 
 impl Attempt {
-    /// Refuses what an artifact may not contain. Replaces each file that has a second name by a
-    /// copy: whoever writes to the file under its other name would change the artifact.
-    fn own_files(&self) -> Result<(), StoreError> {
+    /// Replaces hard links by copies, since writing to a file by its other name would change the
+    /// artifact. Fails for anything but folders and regular files.
+    fn copy_hard_links(&self) -> Result<(), StoreError> {
         let files = list_output_files(&self.output).map_err(|problem| match problem {
             OutputFileError::Kind { .. } => StoreError::NoArtifact(problem.to_string()),
             OutputFileError::Io(source) => StoreError::Io { path: self.output.clone(), source },
@@ -47,7 +47,7 @@ impl Attempt {
         let copy = self.folder.join("copy");
         for (file, metadata) in files {
             if metadata.nlink() > 1 {
-                at(&file, fs::copy(&file, &copy).and_then(|_| fs::rename(&copy, &file)))?;
+                with_path(&file, fs::copy(&file, &copy).and_then(|_| fs::rename(&copy, &file)))?;
             }
         }
         Ok(())
@@ -55,8 +55,8 @@ impl Attempt {
 }
 
 impl Store {
-    /// Begins an action, with its key locked. Leftovers of a killed attempt are cleared, its
-    /// checkpoints kept.
+    /// Begins an action, whose key the caller has locked. Removes the output of a killed attempt, but
+    /// keeps its checkpoints.
     pub fn begin(
         &self,
         _: &Entered,
@@ -71,64 +71,63 @@ impl Store {
             log: folder.join("log"),
             folder: folder.clone(),
         };
-        at(&folder, fs::create_dir_all(&folder))?;
+        with_path(&folder, fs::create_dir_all(&folder))?;
         for leftover in [attempt.output.clone(), folder.join(".output.partial")] {
-            at(&leftover, remove(&leftover))?;
+            remove_if_found(&leftover)?;
         }
         let file = folder.join("action.json");
-        at(&file, write_json(&file, action))?;
-        at(&attempt.params, write_json(&attempt.params, params))?;
+        with_path(&file, write_json(&file, action))?;
+        with_path(&attempt.params, write_json(&attempt.params, params))?;
         Ok(attempt)
     }
 
-    /// Looks at what an attempt made: checks the manifest against the files and makes both durable.
-    /// Refuses links and special files. This takes its time; taking it in ([`Store::publish`])
-    /// doesn't.
-    pub fn check(&self, attempt: Attempt, kind: &str) -> Result<Checked, StoreError> {
+    /// Checks the manifest of an attempt's output against the files, and makes both durable. Fails
+    /// for links and special files. This step is slow, so that [`Store::publish`] is fast.
+    pub fn check(&self, attempt: Attempt, kind: &str) -> Result<CheckedOutput, StoreError> {
         let output = &attempt.output;
         if output.symlink_metadata().is_err() {
-            return Err(StoreError::NoArtifact("its --output was not made".to_owned()));
+            return Err(StoreError::NoArtifact("--output was not created".to_owned()));
         }
-        attempt.own_files()?;
-        let found = at(output, Manifest::of_folder(kind, output))?;
+        attempt.copy_hard_links()?;
+        let found = with_path(output, Manifest::of_folder(kind, output))?;
         if !output.join(MANIFEST_FILE).exists() {
-            // The plainest stage of all, a script, may leave the hashing to the runner.
+            // A stage may leave the manifest to the runner, as simple scripts do.
             let path = output.join(MANIFEST_FILE);
-            at(&path, write_json(&path, &found))?;
+            with_path(&path, write_json(&path, &found))?;
         }
         let stated = Manifest::read(output)?;
         if stated != found {
             return Err(StoreError::NoArtifact(format!(
-                "{MANIFEST_FILE} differs from the files beside it, or its kind is not {kind:?}"
+                "{MANIFEST_FILE} differs from the files, or the kind in it is not {kind:?}"
             )));
         }
         if found.files.is_empty() {
-            return Err(StoreError::NoArtifact("it has no files".to_owned()));
+            return Err(StoreError::NoArtifact("--output has no files".to_owned()));
         }
         make_durable(output, &found)?;
         let identity = found.identity();
-        // What is there already under that name and isn't whole gives way.
-        let is_there = self.verify(&identity).is_ok();
-        Ok(Checked { attempt, identity, is_there })
+        // A damaged object of this identity is replaced.
+        let is_stored = self.verify(&identity).is_ok();
+        Ok(CheckedOutput { attempt, identity, is_stored })
     }
 
-    /// Takes in what an attempt made: moves the object, writes the record last. The record's
+    /// Publishes a checked output: moves the object into place, then writes the record, whose
     /// `output` is set to the object's identity.
     pub fn publish(
         &self,
         _: &Entered,
-        checked: Checked,
+        checked: CheckedOutput,
         mut record: Record,
     ) -> Result<Record, StoreError> {
-        let Checked { attempt, identity, is_there } = checked;
+        let CheckedOutput { attempt, identity, is_stored } = checked;
         record.output = identity;
-        self.place(&attempt.output, &record.output, is_there)?;
+        self.install_object(&attempt.output, &record.output, is_stored)?;
         let log = self.action(&record.key(), "log");
         if attempt.log.exists() {
-            at(&log, fs::rename(&attempt.log, &log))?;
+            with_path(&log, fs::rename(&attempt.log, &log))?;
         }
         self.write_record(&record)?;
-        at(&attempt.folder, fs::remove_dir_all(&attempt.folder))?;
+        with_path(&attempt.folder, fs::remove_dir_all(&attempt.folder))?;
         Ok(record)
     }
 }

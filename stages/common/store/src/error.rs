@@ -1,79 +1,81 @@
-use std::fs::{self, TryLockError};
+use std::fs::TryLockError;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use artifact::{Damage, permission_advice};
 use rustix::io::Errno;
 
-/// What can go wrong in a store.
+/// Error of a store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// A file operation failed.
     #[error("{path}: {source}{}", permission_advice(.path, .source))]
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Error of the file operation.
         source: io::Error,
     },
-    /// A record, a pin or a run's file has unusable content.
+    /// A record, a pin or a run file has invalid content.
     #[error("{path}: {problem}; {remedy}")]
     Content {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why its content is unusable.
+        /// Problem of the content.
         problem: String,
-        /// What to do.
+        /// Remedy.
         remedy: String,
     },
-    /// The file system refuses every lock.
+    /// The file system doesn't support locks.
     #[error(
         "file locks don't work on the file system of {path} ({source}); choose a folder on a local \
         disk, with --store or --out"
     )]
     NoLocks {
-        /// The file to be locked.
+        /// Path of the file to be locked.
         path: PathBuf,
-        /// Why.
+        /// Error of the lock operation.
         source: io::Error,
     },
-    /// A record or an object isn't what it should be.
+    /// An object is damaged.
     #[error(transparent)]
     Damage(#[from] Damage),
-    /// A stage ended well but left no proper artifact.
-    #[error("the stage ended without a proper artifact: {0}")]
+    /// A stage succeeded, but its output is not a valid artifact.
+    #[error("the stage ended without a valid artifact: {0}")]
     NoArtifact(String),
-    /// A newer program made the store.
+    /// A newer program has marked the store.
     #[error(
-        "{path}: the store has format {found}, this nerf-sr knows format {known}; use the newer \
+        "{path}: the store has format {found}, this nerf-sr supports format {known}; use the newer \
         nerf-sr, or another folder with --store"
     )]
     Newer {
-        /// The store.
+        /// Folder of the store.
         path: PathBuf,
-        /// Its format.
+        /// Format of the store.
         found: String,
-        /// The format that this program knows.
+        /// Format that this program supports.
         known: u32,
     },
 }
 
-/// Says of a failed file operation which file it was.
-pub(crate) fn at<T>(path: &Path, result: io::Result<T>) -> Result<T, StoreError> {
+/// Adds the path to the error of a file operation.
+pub(crate) fn with_path<T>(path: &Path, result: io::Result<T>) -> Result<T, StoreError> {
     result.map_err(|source| StoreError::Io { path: path.to_path_buf(), source })
 }
 
-/// Reads a file; `None` if it is not found. Any other error is one: a file that can't be read may
-/// well be needed.
-pub(crate) fn read_if_found(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
-    match fs::read(path) {
+/// Adds the path to the error of a file operation; `None` if the file is not found.
+pub(crate) fn if_found<T>(path: &Path, result: io::Result<T>) -> Result<Option<T>, StoreError> {
+    match result {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-        bytes => at(path, bytes).map(Some),
+        result => with_path(path, result).map(Some),
     }
 }
 
-/// Returns whether an attempt took the lock of a file; false if another process holds the lock.
-pub fn is_taken(path: &Path, attempt: Result<(), TryLockError>) -> Result<bool, StoreError> {
+/// Returns whether an attempt has acquired the lock of a file; false if another process holds it.
+pub fn is_lock_acquired(
+    path: &Path,
+    attempt: Result<(), TryLockError>,
+) -> Result<bool, StoreError> {
     match attempt {
         Ok(()) => Ok(true),
         Err(TryLockError::WouldBlock) => Ok(false),
@@ -81,7 +83,7 @@ pub fn is_taken(path: &Path, attempt: Result<(), TryLockError>) -> Result<bool, 
     }
 }
 
-/// Names the file whose lock failed, and tells file systems without locks from other failures.
+/// Converts the error of a lock operation; file systems without locks have an error of their own.
 pub(crate) fn lock_error(path: &Path, source: io::Error) -> StoreError {
     let path = path.to_path_buf();
     match Errno::from_io_error(&source) {

@@ -4,125 +4,117 @@ use std::path::{Path, PathBuf};
 
 use artifact::unix_time;
 
-use crate::error::{StoreError, at};
+use crate::error::{StoreError, if_found, with_path};
 
-/// Artifacts by content and actions by key, in one folder.
+/// Store of artifacts by content and of actions by key, in one folder.
 ///
 /// ```text
 /// objects/HASH/         an artifact: artifact.json and its files
-/// actions/KEY.json      a finished action: its whole key, its output, when, where, in how long
-/// actions/KEY.log       what it said
-/// partial/KEY/          an action that hasn't finished: action.json, what it said, and in work/
-///                       its checkpoints
-/// locks/KEY             one OS lock a key: the kernel drops it, whatever happens to the process
-/// runs/ID.jsonl         what a run needs, written while it goes on
-/// pins/NAME.jsonl       what is kept for good
-/// gate                  entered by runs for moments, closed by garbage collection
-/// format                version of all this
+/// actions/KEY.json      record of a finished action: key, output, time, machine, duration
+/// actions/KEY.log       log of a finished action
+/// partial/KEY/          an unfinished action: action.json, log, and checkpoints in work/
+/// locks/KEY             one OS lock per key, which the kernel releases when the process ends
+/// runs/ID.jsonl         actions that a run needs, written during the run
+/// pins/NAME.jsonl       actions that are kept until unpinned
+/// gate                  reader-writer lock: entered briefly by runs, closed by garbage collection
+/// format                version of this layout
 /// ```
 ///
-/// An object is made in `partial/`, checked, hashed, fsynced and renamed; the record goes last. So
-/// what is recorded is whole.
+/// An object is created in `partial/`, checked, hashed, fsynced and renamed, and its record is
+/// written last. So a record's object is complete.
 #[derive(Debug, Clone)]
 pub struct Store {
     root: PathBuf,
-    /// The format that this program knows.
+    /// Format that this program supports.
     pub(crate) format: u32,
 }
 
 impl Store {
-    /// What lies in the folder isn't looked at.
+    /// Creates the value without reading the folder.
     pub(crate) fn new(root: &Path, format: u32) -> Self {
         Self { root: root.to_path_buf(), format }
     }
 
-    /// Where the store is.
+    /// Returns the folder of the store.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// The folder of an object.
+    /// Returns the folder of an object.
     pub fn object(&self, identity: &str) -> PathBuf {
         self.root.join("objects").join(identity)
     }
 
-    /// The folder of an unfinished action.
+    /// Returns the folder of an unfinished action.
     pub fn partial(&self, key: &str) -> PathBuf {
         self.root.join("partial").join(key)
     }
 
-    /// A file that belongs to an action: `json` its record, `log` what it said.
+    /// Returns the path of an action's record (`json`) or log (`log`).
     pub fn action(&self, key: &str, extension: &str) -> PathBuf {
         self.root.join("actions").join(format!("{key}.{extension}"))
     }
 
-    /// The file of the lock between runs and garbage collection, opened.
-    pub(crate) fn gate(&self) -> Result<File, StoreError> {
+    /// Opens the file of the lock between runs and garbage collection.
+    pub(crate) fn open_gate(&self) -> Result<File, StoreError> {
         let path = self.gate_path();
-        at(&path, File::options().create(true).append(true).open(&path))
+        with_path(&path, File::options().create(true).append(true).open(&path))
     }
 
     pub(crate) fn gate_path(&self) -> PathBuf {
         self.root.join("gate")
     }
 
-    /// What a folder of the store holds, sorted; nothing where there is no such folder.
-    pub(crate) fn names(&self, folder: &str) -> Result<Vec<String>, StoreError> {
+    /// Lists the names in a folder of the store, sorted and without hidden ones; empty if the folder
+    /// is not found.
+    pub(crate) fn list_names(&self, folder: &str) -> Result<Vec<String>, StoreError> {
         let folder = self.root.join(folder);
-        let entries = match fs::read_dir(&folder) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            entries => at(&folder, entries)?,
-        };
         let mut names = Vec::new();
-        for entry in entries {
-            // A name that isn't UTF-8 is somebody else's.
-            names.extend(at(&folder, entry)?.file_name().into_string().ok());
+        for entry in if_found(&folder, fs::read_dir(&folder))?.into_iter().flatten() {
+            // A name that isn't UTF-8 doesn't belong to the store.
+            names.extend(with_path(&folder, entry)?.file_name().into_string().ok());
         }
         names.retain(|name| !name.starts_with('.'));
         names.sort_unstable();
         Ok(names)
     }
 
-    /// Takes a file or folder out of sight at once; [`Store::empty_trash`] deletes it.
-    pub(crate) fn discard(&self, path: &Path) -> Result<(), StoreError> {
+    /// Moves a file or folder to the trash, which [`Store::empty_trash`] deletes; returns whether it
+    /// existed.
+    pub(crate) fn move_to_trash(&self, path: &Path) -> Result<bool, StoreError> {
         use io::ErrorKind::{AlreadyExists, DirectoryNotEmpty};
         loop {
-            let place = self.root.join("trash").join(unique_name(unix_time())?);
-            match fs::rename(path, place) {
+            let trashed = self.root.join("trash").join(unique_name(unix_time())?);
+            match fs::rename(path, trashed) {
                 Err(error) if matches!(error.kind(), AlreadyExists | DirectoryNotEmpty) => {}
-                result => return at(path, result),
+                result => return Ok(if_found(path, result)?.is_some()),
             }
         }
     }
 
-    /// Deletes what was removed. It may take its time, and may be cut short at any point.
+    /// Deletes the content of the trash. Several processes may do so, and may be killed meanwhile.
     pub fn empty_trash(&self) -> Result<(), StoreError> {
-        for name in self.names("trash")? {
-            let path = self.root.join("trash").join(name);
-            // Somebody else may empty it, too.
-            at(&path, remove(&path))?;
+        for name in self.list_names("trash")? {
+            remove_if_found(&self.root.join("trash").join(name))?;
         }
         Ok(())
     }
 }
 
-/// Removes a file, a link or a folder, if there is one.
-pub(crate) fn remove(path: &Path) -> io::Result<()> {
+/// Removes a file, a link or a folder, if it exists.
+pub(crate) fn remove_if_found(path: &Path) -> Result<(), StoreError> {
     let removed = match path.symlink_metadata() {
         Ok(metadata) if metadata.is_dir() => fs::remove_dir_all(path),
         Ok(_) => fs::remove_file(path),
         Err(error) => Err(error),
     };
-    match removed {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-        result => result,
-    }
+    if_found(path, removed).map(|_| ())
 }
 
-/// Returns a name that sorts by time and that nobody else gives: time, process and random digits.
-/// The first process of every container has the number 1.
+/// Returns a unique name that sorts by time: time, process id and random digits. The digits matter,
+/// since the first process of every container has the id 1.
 pub(crate) fn unique_name(unix: u64) -> Result<String, StoreError> {
     let random = getrandom::u32().map_err(io::Error::from);
-    let random = at(Path::new("random numbers of the system"), random)?;
+    let random = with_path(Path::new("random numbers of the system"), random)?;
     Ok(format!("{unix}-{}-{random:08x}", std::process::id()))
 }

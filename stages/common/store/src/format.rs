@@ -4,23 +4,22 @@ use std::path::Path;
 
 use artifact::write_atomically;
 
-use crate::error::{StoreError, at, lock_error};
+use crate::error::{StoreError, if_found, lock_error, with_path};
 use crate::folder::Store;
 
-/// Version of a store's layout. It grows when an older runner could harm what a newer one wrote.
+/// Version of the store's layout; increases if an older runner could damage a newer one's files.
 pub const FORMAT: u32 = 1;
 
 impl Store {
-    /// Opens the store in a folder, making it where it isn't there. One of an older format gets
-    /// this one's mark: from then on older runners leave it alone, those that are at work with it
-    /// among them.
+    /// Opens the store in a folder, and creates it if necessary. A store of an older format is marked
+    /// with this one, after which older runners don't change it, including those in progress.
     pub fn open(root: &Path) -> Result<Self, StoreError> {
         Self::open_as(root, FORMAT)
     }
 
-    /// As a program that knows this format.
+    /// Opens the store like a program that supports `format`.
     fn open_as(root: &Path, format: u32) -> Result<Self, StoreError> {
-        at(root, fs::create_dir_all(root))?;
+        with_path(root, fs::create_dir_all(root))?;
         let store = Self::new(root, format);
         if store.check_format()?.is_none_or(|found| found < format) {
             store.mark_format()?;
@@ -30,38 +29,32 @@ impl Store {
         {
             let path = root.join(folder);
             match fs::create_dir_all(&path) {
-                // An old store that can't be written still shows what it has.
+                // An old store on a read-only file system can still be read.
                 Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => {}
-                result => at(&path, result)?,
+                result => with_path(&path, result)?,
             }
         }
         Ok(store)
     }
 
-    /// The store's format, if it has its mark; a newer one is refused.
+    /// Reads the store's format; `None` for an unmarked store. Fails for a newer format.
     pub(crate) fn check_format(&self) -> Result<Option<u32>, StoreError> {
         let path = self.root().join("format");
-        match fs::read_to_string(&path) {
-            Ok(text) => match text.trim().parse::<u32>() {
-                Ok(found) if found <= self.format => Ok(Some(found)),
-                _ => {
-                    let found = text.trim().chars().take(20).collect();
-                    Err(StoreError::Newer {
-                        path: self.root().to_path_buf(),
-                        found,
-                        known: self.format,
-                    })
-                }
-            },
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(source) => Err(StoreError::Io { path, source }),
+        let Some(text) = if_found(&path, fs::read_to_string(&path))? else { return Ok(None) };
+        match text.trim().parse::<u32>() {
+            Ok(found) if found <= self.format => Ok(Some(found)),
+            _ => Err(StoreError::Newer {
+                path: self.root().to_path_buf(),
+                found: text.trim().chars().take(20).collect(),
+                known: self.format,
+            }),
         }
     }
 
-    /// Marks the store as of this program's format. It is closed meanwhile: who enters before is
-    /// done with it, who enters later sees the mark.
+    /// Marks the store with this program's format. The store is closed meanwhile, so that other
+    /// processes have left it before or will read the mark.
     fn mark_format(&self) -> Result<(), StoreError> {
-        let gate = match self.gate() {
+        let gate = match self.open_gate() {
             Err(StoreError::Io { source, .. })
                 if source.kind() == io::ErrorKind::ReadOnlyFilesystem =>
             {
@@ -70,10 +63,10 @@ impl Store {
             gate => gate?,
         };
         gate.lock().map_err(|source| lock_error(&self.gate_path(), source))?;
-        // A still newer program may have been faster.
+        // A newer program may have marked the store meanwhile.
         self.check_format()?;
         let path = self.root().join("format");
-        at(&path, write_atomically(&path, format!("{}\n", self.format).as_bytes()))
+        with_path(&path, write_atomically(&path, format!("{}\n", self.format).as_bytes()))
     }
 }
 
@@ -117,7 +110,7 @@ mod tests {
             assert_eq!(
                 refused.unwrap().to_string(),
                 format!(
-                    "{}: the store has format 2, this nerf-sr knows format 1; use the newer \
+                    "{}: the store has format 2, this nerf-sr supports format 1; use the newer \
                     nerf-sr, or another folder with --store",
                     dir.path().display()
                 )
@@ -135,7 +128,7 @@ mod tests {
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");
     }
 
-    /// How many wait for the lock of a store: the kernel lists them with an arrow.
+    /// Returns the number of processes waiting for the lock of a store (from `/proc/locks`).
     fn waiting(store: &Store) -> usize {
         let file = format!(":{} ", fs::metadata(store.gate_path()).unwrap().ino());
         let locks = fs::read_to_string("/proc/locks").unwrap();

@@ -1,17 +1,15 @@
 use std::fs;
-use std::io;
 
-use crate::error::{StoreError, at};
-use crate::folder::{Store, remove};
+use crate::error::{StoreError, if_found, with_path};
+use crate::folder::{Store, remove_if_found};
 use crate::lock::Closed;
 
-/// Folders of the store whose files are written under a temporary name first; the store's own
-/// folder is the first.
+/// Folders whose files are written under a temporary name first, relative to the store.
 const FOLDERS: [&str; 5] = ["", "actions", "cache", "cache/sources", "pins"];
 
 impl Store {
-    /// Finished actions whose folders of work are still there, sorted: their runners were killed
-    /// right after they had written the record.
+    /// Returns the keys of finished actions whose folder in `partial/` remains, sorted: their runners
+    /// were killed right after writing the record.
     pub fn finished_partials(&self) -> Result<Vec<String>, StoreError> {
         let locked = self.locked_keys()?;
         let mut finished = Vec::new();
@@ -23,20 +21,15 @@ impl Store {
         Ok(finished)
     }
 
-    /// Removes the temporary files of writers that were killed. Whoever writes records, pins or the
-    /// format has entered the store, so none of them is at work now. A file of `cache` that is lost
-    /// is written again.
+    /// Removes the temporary files of killed processes. A process enters the store to write records,
+    /// pins or the format, so none is writing now. A lost file of `cache` is written again.
     pub fn remove_leftovers(&self, _: &Closed) -> Result<(), StoreError> {
         for folder in FOLDERS {
             let folder = self.root().join(folder);
-            let entries = match fs::read_dir(&folder) {
-                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-                entries => at(&folder, entries)?,
-            };
-            for entry in entries {
-                let entry = at(&folder, entry)?;
+            for entry in if_found(&folder, fs::read_dir(&folder))?.into_iter().flatten() {
+                let entry = with_path(&folder, entry)?;
                 if entry.file_name().to_str().is_some_and(is_temporary) {
-                    at(&entry.path(), remove(&entry.path()))?;
+                    remove_if_found(&entry.path())?;
                 }
             }
         }
@@ -44,7 +37,7 @@ impl Store {
     }
 }
 
-/// Returns whether [`artifact::write_atomically`] gives such names.
+/// Returns whether a name is a temporary one of [`artifact::write_atomically`].
 fn is_temporary(name: &str) -> bool {
     name.starts_with('.') && name.ends_with(".partial")
 }
@@ -68,7 +61,7 @@ mod tests {
         let key = done.key();
         fs::create_dir_all(store.partial(&key).join("work")).unwrap();
         begin(&store, "unfinished", None);
-        let Locked::Held(closed) = store.try_close().unwrap() else { panic!("somebody is in") };
+        let Locked::Acquired(closed) = store.try_close().unwrap() else { panic!("somebody is in") };
         store.remove_leftovers(&closed).unwrap();
         for folder in FOLDERS {
             assert!(!dir.path().join(folder).join(".aB3xYz.partial").exists(), "{folder}");

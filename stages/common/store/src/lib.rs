@@ -1,24 +1,24 @@
-//! The store: artifacts by content and actions by key, kept in one folder.
+//! The store: artifacts by content and actions by key, in one folder.
 //!
-//! * [`Store`]: the folder. It says where each thing lies. [`FORMAT`] is the version of its layout.
-//! * [`Record`], [`Unfinished`]: an action that is done, and one that was begun, by the key.
-//! * [`Attempt`], [`Checked`]: from a stage's output to an object and its record.
-//! * [`Arrival`]: an artifact that comes from another store.
-//! * [`is_hash`]: which names can be keys or identities.
-//! * [`KeyLock`]: one OS lock a key. [`Entered`] and [`Closed`]: runs and garbage collection keep
-//!   clear of each other.
-//! * [`RunFile`], [`Run`], [`Waiting`]: what runs and pins need.
+//! * [`Store`]: the folder and its layout, of version [`FORMAT`].
+//! * [`Record`], [`Unfinished`]: a finished and an unfinished action, by key.
+//! * [`Attempt`], [`CheckedOutput`]: the steps from a stage's output to an object and its record.
+//! * [`Arrival`]: an artifact from another store.
+//! * [`is_hash`]: the form of keys and identities.
+//! * [`KeyLock`]: one OS lock per key. [`Entered`] and [`Closed`]: mutual exclusion of runs and
+//!   garbage collection.
+//! * [`RunFile`], [`Run`], [`Waiting`]: the actions that runs and pins need.
 //!
-//! Only a file that is not found counts as absent. Any other error while reading is an error that
-//! names the file, for what can't be read may be needed.
+//! Only a file that is not found counts as absent. Any other error while reading is reported with
+//! the file's name, since an unreadable file may be needed.
 //!
-//! Stages don't use this crate: they write a folder, and the runner takes it in.
+//! Stages don't use this crate: they write a folder, which the runner publishes in the store.
 //!
 //! ```no_run
 //! use store::{Locked, Record, Store, Unfinished};
 //!
 //! let store = Store::open(".nerf-sr".as_ref())?;
-//! if let Locked::Held(entered) = store.try_enter()? {
+//! if let Locked::Acquired(entered) = store.try_enter()? {
 //!     let action = Unfinished { stage: "greet".to_owned(), ..Unfinished::default() };
 //!     let attempt = store.begin(&entered, &action, &serde_json::json!({}))?;
 //!     std::fs::create_dir(&attempt.output)?;
@@ -49,8 +49,8 @@ mod testing;
 
 pub use action::{KEY_VERSION, KEY_VERSION_PART, Record, Unfinished};
 pub use arrivals::Arrival;
-pub use attempt::{Attempt, Checked};
-pub use error::{StoreError, is_taken};
+pub use attempt::{Attempt, CheckedOutput};
+pub use error::{StoreError, is_lock_acquired};
 pub use folder::Store;
 pub use format::FORMAT;
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};

@@ -6,93 +6,91 @@ use std::path::{Path, PathBuf};
 use artifact::unix_time;
 use serde::{Deserialize, Serialize};
 
-use crate::error::{StoreError, at, is_taken};
+use crate::error::{StoreError, if_found, is_lock_acquired, with_path};
 use crate::folder::Store;
 
-/// The lock on a key; held while it, or a process that was handed its [`KeyLock::file`], lives.
+/// Lock on a key, held as long as this value or a process that has inherited its [`KeyLock::file`].
 #[derive(Debug)]
 pub struct KeyLock {
     file: File,
 }
 
 impl KeyLock {
-    /// The lock's file, to be handed to the stage as its standard input, which reads as empty. So
-    /// the lock outlives a runner that is killed while its stage still writes.
+    /// Returns the lock's file, which the stage inherits as its standard input and reads as empty.
+    /// So the lock outlives a runner that is killed while its stage still writes.
     pub fn file(&self) -> &File {
         &self.file
     }
 }
 
-/// Who took a lock: the content of its file.
+/// Process that holds a lock, as recorded in the lock's file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Holder {
-    /// The runner's process.
+    /// Id of the process.
     pub pid: u32,
-    /// The machine it runs on.
+    /// Name of the machine.
     pub host: String,
-    /// When it took the lock, seconds since 1970.
+    /// Time at which the lock was acquired, in seconds since 1970.
     pub since_unix: u64,
 }
 
 impl Holder {
-    /// This process, now.
+    /// Returns this process with the current time.
     pub fn this_process() -> Self {
         Self { pid: std::process::id(), host: host_name(), since_unix: unix_time() }
     }
 }
 
-/// This machine's name; empty where the system doesn't say.
+/// Returns the name of this machine; empty if unknown.
 pub fn host_name() -> String {
     fs::read_to_string("/proc/sys/kernel/hostname").map(|h| h.trim().to_owned()).unwrap_or_default()
 }
 
-/// What an attempt at a lock came to.
+/// Result of an attempt to acquire a lock.
 #[derive(Debug)]
 pub enum Locked<T> {
-    /// It is held now.
-    Held(T),
-    /// Somebody else holds it, as far as is known this one.
-    By(Option<Holder>),
+    /// The lock is acquired.
+    Acquired(T),
+    /// Another process holds the lock: this one, if known.
+    HeldBy(Option<Holder>),
 }
 
-/// The store is entered: no garbage is collected while this lives. A runner enters for the moments
-/// in which it looks for an artifact and writes down that it needs it, or takes an artifact in.
+/// Shared lock of the store: while it exists, no garbage is collected. A runner holds it briefly,
+/// to find an artifact and record that it needs the artifact, or to publish one.
 #[derive(Debug)]
 pub struct Entered {
-    /// None in a store that can't be written: nobody collects garbage there.
+    /// `None` for a store on a read-only file system, where no garbage is collected.
     _file: Option<File>,
 }
 
-/// The store is closed: nobody enters while this lives, so that garbage can be told from what a run
-/// has just made.
+/// Exclusive lock of the store: while it exists, no process enters, so that garbage is
+/// distinguishable from artifacts that a run has just created.
 #[derive(Debug)]
 pub struct Closed {
     _file: File,
 }
 
 impl Store {
-    /// Takes the lock of a key unless somebody holds it. Take it, look for the record again, then
-    /// act.
+    /// Tries to acquire the lock of a key. The caller must look for the record again afterwards,
+    /// since the previous holder may have written it.
     pub fn try_lock(&self, key: &str) -> Result<Locked<KeyLock>, StoreError> {
         let path = self.lock_path(key);
         loop {
             let mut file =
-                at(&path, File::options().create(true).read(true).append(true).open(&path))?;
-            if !is_taken(&path, file.try_lock())? {
-                return Ok(Locked::By(holder_in(&path)));
+                with_path(&path, File::options().create(true).read(true).append(true).open(&path))?;
+            if !is_lock_acquired(&path, file.try_lock())? {
+                return Ok(Locked::HeldBy(read_holder(&path)));
             }
-            // Garbage collection may have removed the file between opening and locking: then the
-            // lock is another file's.
-            if is_at(&file, &path) {
-                let text = serde_json::to_string(&Holder::this_process()).unwrap_or_default();
-                // Who holds it is for people; the lock is held either way.
-                file.set_len(0).and_then(|()| file.write_all(text.as_bytes())).ok();
-                return Ok(Locked::Held(KeyLock { file }));
+            // If garbage collection has removed the file between opening and locking, the lock is
+            // that of another file.
+            if is_file_at(&file, &path) {
+                write_holder(&mut file);
+                return Ok(Locked::Acquired(KeyLock { file }));
             }
         }
     }
 
-    /// Keys whose locks somebody holds, sorted.
+    /// Returns the keys whose locks are held, sorted.
     pub fn locked_keys(&self) -> Result<Vec<String>, StoreError> {
         let mut locked = Vec::new();
         for key in self.lock_files()? {
@@ -103,16 +101,16 @@ impl Store {
         Ok(locked)
     }
 
-    /// Keys that have a lock's file, held or not, sorted.
+    /// Returns the keys that have a lock file, held or not, sorted.
     pub fn lock_files(&self) -> Result<Vec<String>, StoreError> {
-        self.names("locks")
+        self.list_names("locks")
     }
 
-    /// Removes a key's lock file unless somebody holds the lock.
+    /// Removes the lock file of a key unless the lock is held.
     pub fn remove_lock(&self, key: &str) -> Result<(), StoreError> {
-        if let Locked::Held(lock) = self.try_lock(key)? {
+        if let Locked::Acquired(lock) = self.try_lock(key)? {
             let path = self.lock_path(key);
-            at(&path, fs::remove_file(&path))?;
+            with_path(&path, fs::remove_file(&path))?;
             drop(lock);
         }
         Ok(())
@@ -122,63 +120,61 @@ impl Store {
         self.root().join("locks").join(key)
     }
 
-    /// Enters the store unless it is closed, or a newer program has marked it meanwhile.
+    /// Tries to enter the store. Fails if a newer program has marked the store.
     pub fn try_enter(&self) -> Result<Locked<Entered>, StoreError> {
+        use io::ErrorKind::{PermissionDenied, ReadOnlyFilesystem};
         let path = self.gate_path();
-        let file = match self.gate() {
-            Err(StoreError::Io { source, .. })
-                if source.kind() == io::ErrorKind::ReadOnlyFilesystem =>
-            {
-                return Ok(Locked::Held(Entered { _file: None }));
+        let file = match self.open_gate() {
+            Err(StoreError::Io { source, .. }) if source.kind() == ReadOnlyFilesystem => {
+                return Ok(Locked::Acquired(Entered { _file: None }));
             }
-            // Who may only read the store keeps garbage collection away, too.
-            Err(StoreError::Io { source, .. })
-                if source.kind() == io::ErrorKind::PermissionDenied =>
-            {
-                at(&path, File::open(&path))?
+            // A user who may only read the store excludes garbage collection, too.
+            Err(StoreError::Io { source, .. }) if source.kind() == PermissionDenied => {
+                with_path(&path, File::open(&path))?
             }
             file => file?,
         };
-        if !is_taken(&path, file.try_lock_shared())? {
-            return Ok(Locked::By(holder_in(&path)));
+        if !is_lock_acquired(&path, file.try_lock_shared())? {
+            return Ok(Locked::HeldBy(read_holder(&path)));
         }
         self.check_format()?;
-        Ok(Locked::Held(Entered { _file: Some(file) }))
+        Ok(Locked::Acquired(Entered { _file: Some(file) }))
     }
 
-    /// Closes the store unless somebody is inside, or a newer program has marked it meanwhile.
+    /// Tries to close the store. Fails if a newer program has marked the store.
     pub fn try_close(&self) -> Result<Locked<Closed>, StoreError> {
-        let mut file = self.gate()?;
-        if !is_taken(&self.gate_path(), file.try_lock())? {
-            return Ok(Locked::By(None));
+        let mut file = self.open_gate()?;
+        if !is_lock_acquired(&self.gate_path(), file.try_lock())? {
+            return Ok(Locked::HeldBy(None));
         }
         self.check_format()?;
-        let text = serde_json::to_string(&Holder::this_process()).unwrap_or_default();
-        file.set_len(0).and_then(|()| file.write_all(text.as_bytes())).ok();
-        Ok(Locked::Held(Closed { _file: file }))
+        write_holder(&mut file);
+        Ok(Locked::Acquired(Closed { _file: file }))
     }
 }
 
-/// Returns whether somebody holds the lock of a file; nobody does if the file is not found.
+/// Returns whether the lock of a file is held; false if the file is not found.
 pub(crate) fn is_locked(path: &Path) -> Result<bool, StoreError> {
-    let file = match File::open(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
-        file => at(path, file)?,
-    };
-    Ok(!is_taken(path, file.try_lock_shared())?)
+    let Some(file) = if_found(path, File::open(path))? else { return Ok(false) };
+    Ok(!is_lock_acquired(path, file.try_lock_shared())?)
 }
 
-fn holder_in(path: &Path) -> Option<Holder> {
+fn read_holder(path: &Path) -> Option<Holder> {
     serde_json::from_slice(&fs::read(path).ok()?).ok()
 }
 
-/// Whether an open file is the one that its path names now.
-fn is_at(file: &File, path: &Path) -> bool {
-    let identity = |meta: fs::Metadata| (meta.dev(), meta.ino());
-    file.metadata()
-        .map(identity)
-        .ok()
-        .is_some_and(|open| fs::metadata(path).map(identity).is_ok_and(|named| named == open))
+/// Writes this process to a lock file. The lock is valid even if that fails.
+fn write_holder(file: &mut File) {
+    let text = serde_json::to_string(&Holder::this_process()).unwrap_or_default();
+    file.set_len(0).and_then(|()| file.write_all(text.as_bytes())).ok();
+}
+
+/// Returns whether an open file is the file at `path`.
+fn is_file_at(file: &File, path: &Path) -> bool {
+    match (file.metadata(), fs::metadata(path)) {
+        (Ok(open), Ok(named)) => open.dev() == named.dev() && open.ino() == named.ino(),
+        _ => false,
+    }
 }
 
 #[cfg(test)]
@@ -194,8 +190,8 @@ mod tests {
 
     fn held<T>(locked: Locked<T>) -> T {
         match locked {
-            Locked::Held(lock) => lock,
-            Locked::By(holder) => panic!("held by {holder:?}"),
+            Locked::Acquired(lock) => lock,
+            Locked::HeldBy(holder) => panic!("held by {holder:?}"),
         }
     }
 
@@ -204,11 +200,11 @@ mod tests {
         let (_dir, store) = store();
         let lock = held(store.try_lock("k").unwrap());
         let shared = lock.file().try_clone().unwrap();
-        let Locked::By(Some(holder)) = store.try_lock("k").unwrap() else { panic!("not held") };
+        let Locked::HeldBy(Some(holder)) = store.try_lock("k").unwrap() else { panic!("not held") };
         assert_eq!((holder.pid, holder.host), (std::process::id(), host_name()));
         drop(lock);
         assert!(
-            matches!(store.try_lock("k").unwrap(), Locked::By(Some(_))),
+            matches!(store.try_lock("k").unwrap(), Locked::HeldBy(Some(_))),
             "the stage still holds it"
         );
         drop(shared);
@@ -254,10 +250,10 @@ mod tests {
     fn nobody_enters_a_closed_store() {
         let (_dir, store) = store();
         let (one, two) = (held(store.try_enter().unwrap()), held(store.try_enter().unwrap()));
-        assert!(matches!(store.try_close().unwrap(), Locked::By(None)));
+        assert!(matches!(store.try_close().unwrap(), Locked::HeldBy(None)));
         drop((one, two));
         let closed = held(store.try_close().unwrap());
-        assert!(matches!(store.try_enter().unwrap(), Locked::By(Some(_))));
+        assert!(matches!(store.try_enter().unwrap(), Locked::HeldBy(Some(_))));
         drop(closed);
         held(store.try_enter().unwrap());
     }

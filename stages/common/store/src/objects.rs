@@ -4,23 +4,23 @@ use std::path::{Path, PathBuf};
 
 use artifact::{Damage, MANIFEST_FILE, Manifest, sync_folder, write_json_atomically};
 
-use crate::error::{StoreError, at};
+use crate::error::{StoreError, with_path};
 use crate::folder::Store;
 
 impl Store {
-    /// Identities of all objects, sorted. Names that can't be an identity are somebody else's.
+    /// Returns the identities of all objects, sorted; names that aren't hashes are foreign.
     pub fn objects(&self) -> Result<Vec<String>, StoreError> {
-        let mut names = self.names("objects")?;
+        let mut names = self.list_names("objects")?;
         names.retain(|name| is_hash(name));
         Ok(names)
     }
 
-    /// Somebody else's files and folders among the objects, sorted.
+    /// Returns the files and folders among the objects that don't belong to the store, sorted.
     pub fn foreign_entries(&self) -> Result<Vec<PathBuf>, StoreError> {
         let folder = self.root().join("objects");
         let mut foreign = Vec::new();
-        for entry in at(&folder, fs::read_dir(&folder))? {
-            let entry = at(&folder, entry)?;
+        for entry in with_path(&folder, fs::read_dir(&folder))? {
+            let entry = with_path(&folder, entry)?;
             if !entry.file_name().to_str().is_some_and(is_hash) {
                 foreign.push(entry.path());
             }
@@ -29,8 +29,8 @@ impl Store {
         Ok(foreign)
     }
 
-    /// Returns whether an object has its own manifest and files of the right sizes; no content is
-    /// read. An object that can't be read is an error.
+    /// Returns whether an object is complete: it has its own manifest and all files of the right
+    /// sizes, whose content is not read. Fails if the object can't be read.
     pub fn is_whole(&self, identity: &str) -> Result<bool, Damage> {
         let manifest = self.own_manifest(identity);
         match manifest.and_then(|manifest| manifest.check_sizes(&self.object(identity))) {
@@ -40,17 +40,17 @@ impl Store {
         }
     }
 
-    /// An object's manifest.
+    /// Reads the manifest of an object.
     pub fn manifest(&self, identity: &str) -> Result<Manifest, Damage> {
         Manifest::read(&self.object(identity))
     }
 
-    /// Re-hashes one object.
+    /// Checks an object by hashing all files.
     pub fn verify(&self, identity: &str) -> Result<(), Damage> {
         self.own_manifest(identity)?.check_contents(&self.object(identity))
     }
 
-    /// Returns an object's manifest if the manifest is the object's own.
+    /// Reads the manifest of an object; fails if the manifest belongs to another object.
     fn own_manifest(&self, identity: &str) -> Result<Manifest, Damage> {
         let manifest = self.manifest(identity)?;
         if manifest.identity() != identity {
@@ -59,88 +59,78 @@ impl Store {
         Ok(manifest)
     }
 
-    /// Writes an object's manifest again if the files beside it have the object's identity; returns
-    /// whether they have.
+    /// Rewrites the manifest of an object if its files have the object's identity; returns whether
+    /// they have.
     pub(crate) fn repair(&self, identity: &str, kind: &str) -> Result<bool, StoreError> {
         use io::ErrorKind::{NotADirectory, NotFound, Other};
         let object = self.object(identity);
         let found = match Manifest::of_folder(kind, &object) {
-            // Files are missing, or have names that no manifest can have.
+            // A file is missing, or its name is not UTF-8.
             Err(error) if matches!(error.kind(), NotFound | NotADirectory | Other) => {
                 return Ok(false);
             }
-            found => at(&object, found)?,
+            found => with_path(&object, found)?,
         };
         if found.identity() != identity {
             return Ok(false);
         }
         let path = object.join(MANIFEST_FILE);
-        at(&path, write_json_atomically(&path, &found))?;
+        with_path(&path, write_json_atomically(&path, &found))?;
         Ok(true)
     }
 
-    /// Moves a checked folder to an object's place, unless a whole object `is_there`. Two actions
-    /// may make one object at once: it is moved where there is nothing, and what is there then
-    /// stays if it is whole.
-    pub(crate) fn place(
+    /// Moves a checked folder into the place of an object, unless the object `is_stored`. Two actions
+    /// may create the same object concurrently: an undamaged object stays, a damaged one is replaced.
+    pub(crate) fn install_object(
         &self,
         folder: &Path,
         identity: &str,
-        is_there: bool,
+        is_stored: bool,
     ) -> Result<(), StoreError> {
         use io::ErrorKind::{AlreadyExists, DirectoryNotEmpty, NotADirectory};
         let object = self.object(identity);
-        if is_there && object.exists() {
+        if is_stored && object.exists() {
             return Ok(());
         }
         loop {
             match fs::rename(folder, &object) {
-                Ok(()) => return at(&object, sync_folder(&self.root().join("objects"))),
                 Err(error)
                     if matches!(
                         error.kind(),
                         AlreadyExists | DirectoryNotEmpty | NotADirectory
                     ) => {}
-                Err(source) => return Err(StoreError::Io { path: object, source }),
+                renamed => {
+                    with_path(&object, renamed)?;
+                    return with_path(&object, sync_folder(&self.root().join("objects")));
+                }
             }
             match self.verify(identity) {
                 Ok(()) => return Ok(()),
                 Err(unreadable @ Damage::Unreadable { .. }) => return Err(unreadable.into()),
-                Err(_) => {}
-            }
-            match self.discard(&object) {
-                // The other action was faster.
-                Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {}
-                result => result?,
-            }
+                Err(_) => self.move_to_trash(&object)?,
+            };
         }
     }
 
-    /// Removes an object; records that name it count as absent from then on. Somebody else may have
-    /// removed it already.
+    /// Removes an object, if it exists; records that refer to it count as absent from then on.
     pub fn remove_object(&self, identity: &str) -> Result<(), StoreError> {
-        match self.discard(&self.object(identity)) {
-            Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
-                Ok(())
-            }
-            result => result,
-        }
+        self.move_to_trash(&self.object(identity)).map(|_| ())
     }
 }
 
-/// Whether a name can be a key or an identity, in lower case as the store writes them: no other
-/// becomes part of a path.
+/// Returns whether a name is a hash in lower-case hexadecimal, as keys and identities are. Other
+/// names must not become parts of paths.
 pub fn is_hash(name: &str) -> bool {
     name.len() == 64 && name.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
 }
 
-/// Makes the files of an artifact durable, its manifest among them.
+/// Makes the files of an artifact durable, including its manifest.
 pub(crate) fn make_durable(folder: &Path, manifest: &Manifest) -> Result<(), StoreError> {
     for file in manifest.files.iter().map(|file| file.path.as_str()).chain([MANIFEST_FILE]) {
         let path = folder.join(file);
-        at(&path, File::open(&path).and_then(|f| f.sync_all()))?;
+        with_path(&path, File::open(&path).and_then(|f| f.sync_all()))?;
     }
-    at(folder, sync_folder(folder))
+    with_path(folder, sync_folder(folder))
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
 use std::collections::BTreeSet;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -8,76 +8,83 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use crate::action::Record;
-use crate::error::{StoreError, at, read_if_found};
+use crate::error::{StoreError, if_found, with_path};
 use crate::folder::Store;
 use crate::lock::{Entered, Holder, is_locked};
 
-/// A line of a run's file: what the run needs becomes known while it goes on.
+/// Line of a run's file, which grows as the needed actions become known.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum RunLine {
-    /// The first: who runs what.
+    /// First line: process and command line.
     Run { holder: Holder, command: Vec<String> },
-    /// An action whose record or checkpoints it needs.
+    /// Action whose record or checkpoints the run needs.
     Action { stage: String, key: String },
-    /// An action whose key depends on what others will make.
+    /// Action whose key depends on outputs that don't exist yet.
     Waiting(Waiting),
-    /// The last, unless the run was killed.
+    /// Last line, unless the run was killed.
     Ended { unix: u64 },
 }
 
-/// A node that can't have a key yet. Any record of its stage with its parameters may turn out to be
-/// its own.
+/// Node whose key is not known yet. Any record of its stage with its parameters may be its own.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Waiting {
-    /// Name of the program, as in the key's part `stage`.
+    /// Name of the program, as in the part `stage` of a key.
     pub program: String,
-    /// All parameters, as in the key's parts `parameter NAME`.
+    /// All parameters, as in the parts `parameter NAME` of a key.
     pub parameters: Map<String, Value>,
 }
 
 impl Waiting {
-    /// Whether a record may be the node's.
-    pub fn may_be(&self, record: &Record) -> bool {
-        let named = record
-            .key_parts
-            .iter()
-            .filter_map(|(name, value)| Some((name.strip_prefix("parameter ")?, value)));
-        record.key_parts.get("stage").and_then(Value::as_str) == Some(&self.program)
-            && named.clone().count() == self.parameters.len()
-            && named.into_iter().all(|(name, value)| self.parameters.get(name) == Some(value))
+    /// Returns whether a record may belong to the node.
+    pub fn matches(&self, record: &Record) -> bool {
+        let mut count = 0;
+        for (name, value) in &record.key_parts {
+            if let Some(name) = name.strip_prefix("parameter ") {
+                count += 1;
+                if self.parameters.get(name) != Some(value) {
+                    return false;
+                }
+            }
+        }
+        count == self.parameters.len()
+            && record.key_parts.get("stage").and_then(Value::as_str) == Some(&self.program)
     }
 }
 
-/// What is written down of a run: `runs/ID.jsonl`. A pin, `pins/NAME.jsonl`, has the same form.
+/// Content of a run's file, `runs/ID.jsonl`, or of a pin, `pins/NAME.jsonl`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Run {
-    /// The file's name without its ending.
+    /// Name of the file without extension.
     pub id: String,
-    /// Who runs it, where the file says so.
+    /// Process of the run, if recorded.
     pub holder: Option<Holder>,
-    /// The command line.
+    /// Command line.
     pub command: Vec<String>,
-    /// Keys of the actions that it needs.
+    /// Keys of the needed actions.
     pub keys: BTreeSet<String>,
-    /// Nodes whose keys weren't known when it started.
+    /// Needed nodes whose keys weren't known at the start.
     pub waiting: Vec<Waiting>,
-    /// When it ended; a run that was killed has none.
+    /// End time in seconds since 1970; `None` for a killed run and one in progress.
     pub ended_unix: Option<u64>,
-    /// Whether it goes on right now.
+    /// True if the run is in progress.
     pub in_progress: bool,
 }
 
 impl Run {
-    /// When it was last known to go on, seconds since 1970.
-    pub fn used_unix(&self) -> u64 {
+    /// Returns the last time at which the run is known to have been in progress, in seconds since 1970.
+    pub fn last_used_unix(&self) -> u64 {
         self.ended_unix.or(self.holder.as_ref().map(|h| h.since_unix)).unwrap_or_default()
     }
 
     /// Reads the file of a run or a pin; `None` if it is not found.
-    pub(crate) fn read(store: &Store, form: Form, id: &str) -> Result<Option<Self>, StoreError> {
-        let path = form.path(store, id);
-        let Some(bytes) = read_if_found(&path)? else { return Ok(None) };
+    pub(crate) fn read(
+        store: &Store,
+        kind: FileKind,
+        id: &str,
+    ) -> Result<Option<Self>, StoreError> {
+        let path = kind.path(store, id);
+        let Some(bytes) = if_found(&path, fs::read(&path))? else { return Ok(None) };
         let text = String::from_utf8_lossy(&bytes);
         let mut run = Self {
             id: id.to_owned(),
@@ -88,23 +95,23 @@ impl Run {
             ended_unix: None,
             in_progress: is_locked(&path)?,
         };
-        let mut is_whole = true;
+        let mut is_complete = true;
         for line in text.lines() {
             match serde_json::from_str(line) {
-                Ok(line) => run.take_in(line),
-                Err(_) => is_whole = false,
+                Ok(line) => run.add_line(line),
+                Err(_) => is_complete = false,
             }
         }
-        let is_sound = match form {
-            // Pins are written whole.
-            Form::Pin => is_whole && run.holder.is_some() && !run.keys.is_empty(),
-            // A line that a kill or a full disk cut short says nothing, not even the first.
-            Form::Run => run.holder.is_some() || is_cut(&text),
+        let is_valid = match kind {
+            // Pins are written atomically.
+            FileKind::Pin => is_complete && run.holder.is_some() && !run.keys.is_empty(),
+            // A kill or a full disk may truncate any line, even the first.
+            FileKind::Run => run.holder.is_some() || is_truncated(&text),
         };
-        if is_sound { Ok(Some(run)) } else { Err(form.damage(path, id)) }
+        if is_valid { Ok(Some(run)) } else { Err(kind.damage(path, id)) }
     }
 
-    fn take_in(&mut self, line: RunLine) {
+    fn add_line(&mut self, line: RunLine) {
         match line {
             RunLine::Run { holder, command } => {
                 (self.holder, self.command) = (Some(holder), command);
@@ -117,18 +124,18 @@ impl Run {
 }
 
 /// Returns whether a file ends within its first line.
-fn is_cut(text: &str) -> bool {
+fn is_truncated(text: &str) -> bool {
     text.is_empty() || (text.starts_with('{') && !text.contains('\n'))
 }
 
-/// Which of two kinds a file of [`RunLine`]s is.
+/// Kind of a file of [`RunLine`]s.
 #[derive(Clone, Copy)]
-pub(crate) enum Form {
+pub(crate) enum FileKind {
     Run,
     Pin,
 }
 
-impl Form {
+impl FileKind {
     pub(crate) fn folder(self) -> &'static str {
         match self {
             Self::Run => "runs",
@@ -137,61 +144,70 @@ impl Form {
     }
 
     pub(crate) fn path(self, store: &Store, id: &str) -> PathBuf {
-        store.root().join(self.folder()).join(format!("{id}{ENDING}"))
+        store.root().join(self.folder()).join(format!("{id}{EXTENSION}"))
     }
 
     fn damage(self, path: PathBuf, id: &str) -> StoreError {
         let (problem, remedy) = match self {
             Self::Run => (
-                "the file of a run is damaged",
-                "move it away; `gc` then keeps what that run used for no longer".to_owned(),
+                "the run's file is damaged",
+                "move the file away, after which `gc` may delete what the run used".to_owned(),
             ),
-            Self::Pin => ("the pin is damaged", format!("`nerf-sr unpin {id}`, then pin again")),
+            Self::Pin => {
+                ("the pin is damaged", format!("run `nerf-sr unpin {id}`, then pin again"))
+            }
         };
         StoreError::Content { path, problem: problem.to_owned(), remedy }
     }
 }
 
-/// Ending of the names of runs' files and pins.
-pub(crate) const ENDING: &str = ".jsonl";
+/// Extension of runs' files and pins.
+pub(crate) const EXTENSION: &str = ".jsonl";
 
-/// A run in progress, which writes down what it needs. Garbage collection keeps that as long as
-/// this lives, and as long afterwards as it is told to.
+/// Locked file of a run in progress, which records the needed actions. Garbage collection keeps
+/// these during the run, and afterwards for the time given to `gc`.
 #[derive(Debug)]
 pub struct RunFile {
     pub(crate) id: String,
-    /// None in a store that can't be written: nobody collects garbage there.
+    /// `None` for a store on a read-only file system, where no garbage is collected.
     pub(crate) file: Option<File>,
 }
 
 impl RunFile {
-    /// The run's own name.
+    /// Returns the name of the run.
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// The run needs this action. Whoever says so has entered the store, so that the action can't
-    /// go in between.
-    pub fn needs(&self, _: &Entered, stage: &str, key: &str) -> Result<(), StoreError> {
+    /// Records that the run needs an action. The caller has entered the store, so that the action
+    /// can't be deleted in between.
+    pub fn record_action(&self, _: &Entered, stage: &str, key: &str) -> Result<(), StoreError> {
         self.write(&RunLine::Action { stage: stage.to_owned(), key: key.to_owned() })
     }
 
-    /// The run may need any record that this node may have.
-    pub fn waits(&self, _: &Entered, waiting: Waiting) -> Result<(), StoreError> {
+    /// Records that the run needs a node whose key is not known yet.
+    pub fn record_waiting(&self, _: &Entered, waiting: Waiting) -> Result<(), StoreError> {
         self.write(&RunLine::Waiting(waiting))
     }
 
-    /// The run has ended; what it needed is kept for as long as its owner wants.
+    /// Records the end of the run.
     pub fn end(self) -> Result<(), StoreError> {
         self.write(&RunLine::Ended { unix: unix_time() })
     }
 
     pub(crate) fn write(&self, line: &RunLine) -> Result<(), StoreError> {
         let Some(mut file) = self.file.as_ref() else { return Ok(()) };
-        let text =
-            serde_json::to_string(line).map_err(|e| StoreError::NoArtifact(e.to_string()))?;
-        // One write a line: threads of a run share the file.
-        at(Path::new(&self.id), file.write_all(format!("{text}\n").as_bytes()))
+        let path = Path::new(&self.id);
+        // One write per line, since threads of a run share the file.
+        with_path(path, file.write_all(line.text(path)?.as_bytes()))
+    }
+}
+
+impl RunLine {
+    /// Formats the line of the file at `path`, with a line feed.
+    pub(crate) fn text(&self, path: &Path) -> Result<String, StoreError> {
+        let text = serde_json::to_string(self).map_err(std::io::Error::from);
+        Ok(with_path(path, text)? + "\n")
     }
 }
 
@@ -229,7 +245,7 @@ mod tests {
         ] {
             let record =
                 Record { key_parts: parts.as_object().unwrap().clone(), ..Record::default() };
-            assert_eq!(waiting.may_be(&record), expected, "{parts}");
+            assert_eq!(waiting.matches(&record), expected, "{parts}");
         }
     }
 }

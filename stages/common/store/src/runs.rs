@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use artifact::write_atomically;
 
-use crate::error::{StoreError, at, lock_error};
+use crate::error::{StoreError, lock_error, with_path};
 use crate::folder::{Store, unique_name};
 use crate::lock::{Entered, Holder};
-use crate::run::{ENDING, Form, Run, RunFile, RunLine};
+use crate::run::{EXTENSION, FileKind, Run, RunFile, RunLine};
 
 impl Store {
-    /// Begins a run's file. `command` is for people.
+    /// Creates the file of a new run, with its command line.
     pub fn begin_run(&self, _: &Entered, command: Vec<String>) -> Result<RunFile, StoreError> {
         let holder = Holder::this_process();
         let run = self.create_run(holder.since_unix)?;
@@ -18,12 +18,12 @@ impl Store {
         Ok(run)
     }
 
-    /// Creates the locked file of a run that begins now.
+    /// Creates the locked file of a run that starts at `unix`.
     fn create_run(&self, unix: u64) -> Result<RunFile, StoreError> {
         loop {
             let id = unique_name(unix)?;
-            let path = Form::Run.path(self, &id);
-            let opened = fs::create_dir_all(self.root().join(Form::Run.folder()))
+            let path = FileKind::Run.path(self, &id);
+            let opened = fs::create_dir_all(self.root().join(FileKind::Run.folder()))
                 .and_then(|()| File::options().create_new(true).append(true).open(&path));
             match opened {
                 Ok(file) => {
@@ -39,41 +39,41 @@ impl Store {
         }
     }
 
-    /// All runs that are written down, by their names. A damaged file is an error.
+    /// Reads all runs, sorted by name. Fails for a damaged file.
     pub fn runs(&self) -> Result<Vec<Run>, StoreError> {
-        self.read_all(Form::Run)
+        self.read_all(FileKind::Run)
     }
 
-    /// All pins, by their names. A damaged pin is an error.
+    /// Reads all pins, sorted by name. Fails for a damaged pin.
     pub fn pins(&self) -> Result<Vec<Run>, StoreError> {
-        self.read_all(Form::Pin)
+        self.read_all(FileKind::Pin)
     }
 
-    /// The run or pin of a name.
+    /// Reads the run or pin of a name.
     pub fn run_or_pin(&self, name: &str) -> Result<Option<Run>, StoreError> {
-        for form in [Form::Run, Form::Pin] {
-            // No path is made of a name that isn't there.
-            if self.run_names(form)?.iter().any(|id| id == name) {
-                return Run::read(self, form, name);
+        for kind in [FileKind::Run, FileKind::Pin] {
+            // The name is compared with existing ones first, since it may be any text.
+            if self.run_names(kind)?.iter().any(|id| id == name) {
+                return Run::read(self, kind, name);
             }
         }
         Ok(None)
     }
 
-    /// Names of all pins, damaged ones included, sorted.
+    /// Returns the names of all pins, including damaged ones, sorted.
     pub fn pin_names(&self) -> Result<Vec<String>, StoreError> {
-        self.run_names(Form::Pin)
+        self.run_names(FileKind::Pin)
     }
 
-    fn run_names(&self, form: Form) -> Result<Vec<String>, StoreError> {
-        let names = self.names(form.folder())?;
-        Ok(names.iter().filter_map(|name| Some(name.strip_suffix(ENDING)?.to_owned())).collect())
+    fn run_names(&self, kind: FileKind) -> Result<Vec<String>, StoreError> {
+        let names = self.list_names(kind.folder())?;
+        Ok(names.iter().filter_map(|name| Some(name.strip_suffix(EXTENSION)?.to_owned())).collect())
     }
 
-    fn read_all(&self, form: Form) -> Result<Vec<Run>, StoreError> {
+    fn read_all(&self, kind: FileKind) -> Result<Vec<Run>, StoreError> {
         let mut runs = Vec::new();
-        for id in self.run_names(form)? {
-            runs.extend(Run::read(self, form, &id)?);
+        for id in self.run_names(kind)? {
+            runs.extend(Run::read(self, kind, &id)?);
         }
         Ok(runs)
     }
@@ -86,38 +86,29 @@ impl Store {
         command: Vec<String>,
         actions: &[(String, String)],
     ) -> Result<(), StoreError> {
-        let mut lines = vec![RunLine::Run { holder: Holder::this_process(), command }];
-        lines.extend(
-            actions
-                .iter()
-                .map(|(stage, key)| RunLine::Action { stage: stage.clone(), key: key.clone() }),
-        );
-        let texts = lines.iter().map(serde_json::to_string).collect::<Result<Vec<_>, _>>();
-        let text = texts.map_err(|e| StoreError::NoArtifact(e.to_string()))?.join("\n") + "\n";
-        let path = Form::Pin.path(self, name);
-        at(&path, write_atomically(&path, text.as_bytes()))
-    }
-
-    /// Removes a pin, however damaged; returns whether there was one.
-    pub fn unpin(&self, name: &str) -> Result<bool, StoreError> {
-        match self.discard(&Form::Pin.path(self, name)) {
-            Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
-                Ok(false)
-            }
-            result => result.map(|()| true),
+        let path = FileKind::Pin.path(self, name);
+        let mut text = RunLine::Run { holder: Holder::this_process(), command }.text(&path)?;
+        for (stage, key) in actions {
+            text += &RunLine::Action { stage: stage.clone(), key: key.clone() }.text(&path)?;
         }
+        with_path(&path, write_atomically(&path, text.as_bytes()))
     }
 
-    /// Removes a run's file, what its sinks left, and what it submitted to a cluster.
+    /// Removes a pin, even a damaged one; returns whether it existed.
+    pub fn unpin(&self, name: &str) -> Result<bool, StoreError> {
+        self.move_to_trash(&FileKind::Pin.path(self, name))
+    }
+
+    /// Removes a run's file, the leftovers of its sinks, and its submissions to a cluster.
     pub fn remove_run(&self, id: &str) -> Result<(), StoreError> {
-        let (path, scratch) = (Form::Run.path(self, id), self.scratch(id));
-        // A sink's leftovers have no value.
+        let (path, scratch) = (FileKind::Run.path(self, id), self.scratch(id));
+        // Leftovers are worthless, so errors are ignored.
         fs::remove_dir_all(&scratch).ok();
         fs::remove_dir_all(self.root().join("slurm").join(id)).ok();
-        at(&path, fs::remove_file(&path))
+        with_path(&path, fs::remove_file(&path))
     }
 
-    /// Where a run's sinks work.
+    /// Returns the folder for temporary files of a run's sinks.
     pub fn scratch(&self, run: &str) -> PathBuf {
         self.root().join("sinks").join(run)
     }
@@ -138,12 +129,12 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let file = store.begin_run(&entered(&store), vec!["nerf-sr".into(), "run".into()]).unwrap();
-        file.needs(&entered(&store), "prep", "k1").unwrap();
+        file.record_action(&entered(&store), "prep", "k1").unwrap();
         let waiting = Waiting {
             program: "train-ss".into(),
             parameters: json!({"rays": 3}).as_object().unwrap().clone(),
         };
-        file.waits(&entered(&store), waiting.clone()).unwrap();
+        file.record_waiting(&entered(&store), waiting.clone()).unwrap();
         let run = store.runs().unwrap().remove(0);
         assert!(run.in_progress && run.ended_unix.is_none());
         assert_eq!((run.keys, run.waiting), (BTreeSet::from(["k1".to_owned()]), vec![waiting]));

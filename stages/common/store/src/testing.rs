@@ -11,7 +11,7 @@ use crate::attempt::Attempt;
 use crate::folder::Store;
 use crate::lock::{Entered, Locked};
 
-/// Ways in which a file can't be read, not even by root: a folder in its place, and a loop of links.
+/// Replacements of a file that not even root can read: a folder, and a loop of links.
 pub(crate) const UNREADABLE: [fn(&Path); 2] = [
     |path| {
         fs::remove_file(path).ok();
@@ -25,8 +25,8 @@ pub(crate) const UNREADABLE: [fn(&Path); 2] = [
 
 pub(crate) fn entered(store: &Store) -> Entered {
     match store.try_enter().unwrap() {
-        Locked::Held(entered) => entered,
-        Locked::By(_) => panic!("closed"),
+        Locked::Acquired(entered) => entered,
+        Locked::HeldBy(_) => panic!("closed"),
     }
 }
 
@@ -38,7 +38,7 @@ fn unfinished(name: &str) -> Unfinished {
     }
 }
 
-/// Begins an action and, unless told otherwise, makes its output.
+/// Begins an action and creates its output, if `content` is given.
 pub(crate) fn begin(store: &Store, name: &str, content: Option<&str>) -> Attempt {
     let attempt = store.begin(&entered(store), &unfinished(name), &json!({})).unwrap();
     if let Some(content) = content {

@@ -15,7 +15,7 @@ use store::{Entered, Locked, Record, Store, Unfinished};
 pub(crate) fn entered(store: &Store) -> Entered {
     let since = Instant::now();
     while since.elapsed() < PATIENCE {
-        if let Locked::Held(entered) = store.try_enter().unwrap() {
+        if let Locked::Acquired(entered) = store.try_enter().unwrap() {
             return entered;
         }
         std::thread::sleep(Duration::from_millis(5));

@@ -60,7 +60,7 @@ impl NodeJob<'_> {
         let key_parts = planning::key_parts(self.node, &inputs.hashes, self.device());
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
-        self.run.file.needs(&entered, &self.node.stage, &key).map_err(failure)?;
+        self.run.file.record_action(&entered, &self.node.stage, &key).map_err(failure)?;
         Ok(match self.run.store.hit(&key).map_err(failure)? {
             Some(record) => Lookup::Cached(record),
             None => Lookup::Pending(PendingAction { key_parts, inputs }),

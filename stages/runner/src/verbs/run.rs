@@ -46,8 +46,8 @@ pub(super) fn begin_run(
     let states = plan.states(store, Some(stop)).unwrap_or_default();
     for (index, node) in plan.nodes.iter().enumerate() {
         match states.get(index).and_then(State::key) {
-            Some(key) => file.needs(&entered, &node.stage, &key),
-            None => file.waits(&entered, node.waiting()),
+            Some(key) => file.record_action(&entered, &node.stage, &key),
+            None => file.record_waiting(&entered, node.waiting()),
         }
         .map_err(failure)?;
     }
