@@ -17,11 +17,11 @@ use crate::pull::pull;
 use crate::push::push;
 use crate::remote::{Access, Remote};
 use crate::selection::Selection;
-use crate::transfer::FILES_AT_ONCE;
+use crate::transfer::MAX_CONCURRENT_FILES;
 
 const NAME: &str = "nerf-sr-remote";
 
-/// Shares a store of nerf-sr between machines: finished actions and their artifacts.
+/// Share finished actions and their artifacts between stores of nerf-sr.
 ///
 /// REMOTE is a folder, or s3://bucket/prefix with credentials, region and endpoint from the usual
 /// AWS_… variables.
@@ -30,7 +30,7 @@ const NAME: &str = "nerf-sr-remote";
 struct Cli {
     #[command(subcommand)]
     verb: Verb,
-    /// The store
+    /// Folder of the store
     #[arg(
         long,
         global = true,
@@ -43,53 +43,53 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Verb {
-    /// Copy what the remote lacks to it
+    /// Copy actions that the remote lacks from the store
     Push {
         /// A folder or s3://bucket/prefix
         remote: String,
         #[command(flatten)]
         selection: Selection,
     },
-    /// Copy what the store lacks from the remote; everything is verified first
+    /// Copy actions that the store lacks from the remote, after verification
     Pull {
         /// A folder or s3://bucket/prefix
         remote: String,
         #[command(flatten)]
         selection: Selection,
     },
-    /// Write one artifact with its whole history as one file
+    /// Write one artifact with its history to a file
     Export {
-        /// An artifact's hash or an action's key, or how it begins
+        /// Hash of an artifact or key of an action, or the beginning of it
         what: String,
-        /// Path of the file to create, a tar
+        /// Path of the tar file to create
         file: PathBuf,
         /// Replace an existing regular file
         #[arg(long)]
         force: bool,
-        /// Of the history, write the records alone
+        /// Write only the records of the history, without its artifacts
         #[arg(long)]
         records_only: bool,
     },
-    /// Read what `export` wrote; everything is verified first
+    /// Import a file written by `export`, after verification
     Import {
-        /// The file
+        /// Path of the file
         file: PathBuf,
     },
     /// Print shell completions
     Completions {
-        /// For which shell
+        /// Name of the shell
         shell: clap_complete::Shell,
     },
     /// Write man pages of all verbs into a folder; `make install` calls this
     #[command(hide = true)]
     Man {
-        /// The folder
+        /// Path of the folder
         folder: PathBuf,
     },
 }
 
-/// The program: exit code 0 when all is copied, 1 when it failed, 2 for a wrong command line, 3 for
-/// what was refused, 130 when it was interrupted.
+/// Runs the program. The exit code is 0 for success, 1 for a failure, 2 for a wrong command line, 3
+/// for refused data, and 130 for an interruption.
 pub fn main() -> ExitCode {
     stage::install_panic_hook(NAME);
     match run(Cli::parse()) {
@@ -105,7 +105,8 @@ fn run(cli: Cli) -> anyhow::Result<()> {
     let stop = stage::stop_on_signals()?;
     match cli.verb {
         Verb::Push { remote, selection } => {
-            let (store, remote) = (existing(&cli.store)?, Remote::open(&remote, Access::Write)?);
+            let store = open_existing(&cli.store)?;
+            let remote = Remote::open(&remote, Access::Write)?;
             block_on(&stop, push(&store, &remote, &selection, &stop))
         }
         Verb::Pull { remote, selection } => {
@@ -115,7 +116,7 @@ fn run(cli: Cli) -> anyhow::Result<()> {
         }
         Verb::Export { what, file, force, records_only } => {
             let destination = Destination { file: &file, force };
-            export(&existing(&cli.store)?, &what, destination, records_only, &stop)
+            export(&open_existing(&cli.store)?, &what, destination, records_only, &stop)
         }
         Verb::Import { file } => {
             let imported = import(&Store::open(&cli.store)?, &file, &stop)?;
@@ -125,7 +126,7 @@ fn run(cli: Cli) -> anyhow::Result<()> {
         Verb::Completions { shell } => {
             let mut script = Vec::new();
             clap_complete::generate(shell, &mut Cli::command(), NAME, &mut script);
-            // Whoever asked for it may have gone.
+            // The reader may have closed stdout.
             std::io::stdout().write_all(&script).ok();
             Ok(())
         }
@@ -135,37 +136,39 @@ fn run(cli: Cli) -> anyhow::Result<()> {
     }
 }
 
-/// A store to read from; none is made.
-fn existing(folder: &Path) -> anyhow::Result<Store> {
+/// Opens a store to read from; fails if it doesn't exist.
+fn open_existing(folder: &Path) -> anyhow::Result<Store> {
     if !folder.join("objects").is_dir() {
-        let message = format!("{}: no store of nerf-sr; name one with --store", folder.display());
+        let message =
+            format!("{}: not a store of nerf-sr; choose one with --store", folder.display());
         return Err(Failure::BadInput(message).into());
     }
     Ok(Store::open(folder)?)
 }
 
-/// Transfers read and write files in their threads; there are as many as transfers at once.
+/// Runs transfers on as many threads as concurrent files, since they block on files.
 fn block_on(
     stop: &Arc<AtomicBool>,
     work: impl Future<Output = anyhow::Result<()>>,
 ) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(FILES_AT_ONCE)
+        .worker_threads(MAX_CONCURRENT_FILES)
         .enable_all()
         .build()?;
     let result = runtime.block_on(async {
         tokio::select! {
             result = work => result,
-            () = stopped(stop) => Err(Failure::Interrupted.into()),
+            () = wait_for_signal(stop) => Err(Failure::Interrupted.into()),
         }
     });
-    // A server that is silent holds nobody up.
+    // Connections to an unresponsive server must not delay the end.
     runtime.shutdown_timeout(Duration::from_secs(1));
     result
 }
 
-/// Ends a while after a signal: transfers look at it themselves, unless the other side is silent.
-async fn stopped(stop: &AtomicBool) {
+/// Waits for a signal, and gives transfers time to stop by themselves, which they can't while a
+/// server is unresponsive.
+async fn wait_for_signal(stop: &AtomicBool) {
     while !stop.load(Ordering::Relaxed) {
         tokio::time::sleep(Duration::from_millis(100)).await;
     }

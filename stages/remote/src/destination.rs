@@ -1,4 +1,4 @@
-//! The file that `export` creates.
+//! Destination of an export.
 
 use std::io;
 use std::path::Path;
@@ -7,16 +7,16 @@ use anyhow::Context as _;
 use artifact::{Failure, file_kind, sync_folder, temporary};
 use tempfile::NamedTempFile;
 
-use crate::leftovers::{Affixes, remove_leftovers};
+use crate::folder::{Affixes, remove_leftovers};
 
-/// Name of an archive that is being written.
-const TEMPORARY: Affixes = (".nerf-sr-export-", ".partial");
+/// Prefix and suffix of an unfinished archive's name.
+const TEMPORARY_AFFIXES: Affixes = (".nerf-sr-export-", ".partial");
 
 /// Path of an archive to be written.
 #[derive(Clone, Copy)]
 pub(crate) struct Destination<'a> {
     pub(crate) file: &'a Path,
-    /// True if a regular file is replaced.
+    /// True if an existing regular file is replaced.
     pub(crate) force: bool,
 }
 
@@ -29,8 +29,8 @@ impl Destination<'_> {
         self.file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
     }
 
-    /// Fails if the path names something that may not be replaced. Only a regular file may: writing
-    /// to a device or through a link would harm what `export` doesn't know.
+    /// Fails if the path exists and may not be replaced. Only regular files may be replaced, since
+    /// writing to a device or through a link would have unknown effects.
     pub(crate) fn check(&self) -> anyhow::Result<()> {
         let name = self.name();
         let problem = match self.file.symlink_metadata() {
@@ -51,13 +51,16 @@ impl Destination<'_> {
     /// Creates the temporary file that becomes the archive.
     pub(crate) fn begin(&self) -> anyhow::Result<NamedTempFile> {
         let folder = self.folder();
-        remove_leftovers(folder, TEMPORARY);
-        let file = temporary(0o666).prefix(TEMPORARY.0).suffix(TEMPORARY.1).tempfile_in(folder);
+        remove_leftovers(folder, TEMPORARY_AFFIXES);
+        let file = temporary(0o666)
+            .prefix(TEMPORARY_AFFIXES.0)
+            .suffix(TEMPORARY_AFFIXES.1)
+            .tempfile_in(folder);
         file.with_context(|| folder.display().to_string())
     }
 
-    /// Gives the whole archive its name. Without `force` a file that has got this name meanwhile
-    /// stays.
+    /// Renames the finished archive to its destination. Without `force`, a file created there
+    /// meanwhile is kept.
     pub(crate) fn finish(&self, mut archive: NamedTempFile) -> anyhow::Result<()> {
         archive.as_file().sync_all().with_context(|| self.name())?;
         loop {

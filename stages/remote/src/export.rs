@@ -1,3 +1,9 @@
+//! Export of an artifact with its history as an archive, which `import` reads.
+//!
+//! An archive is a tar of `export.json`, `objects/HASH/…` and `actions/KEY.json`, in this order. It
+//! contains exactly the objects and records listed in `export.json`, sorted: each object's manifest
+//! with its files in the manifest's order, then the records. Equal histories have equal bytes.
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{self, BufWriter, Read, Write};
@@ -7,43 +13,72 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{Failure, MANIFEST_FILE, Manifest, counted, print_line, report_line, sized};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use store::{Record, Store};
 
-use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
 use crate::destination::Destination;
-use crate::intake::entered;
+use crate::intake::enter;
 use crate::progress::Progress;
-use crate::selection::{one, with_history};
-use crate::transfer::Checked;
+use crate::selection::{find_unique, keys_of_artifact, records_by_key, with_history};
+use crate::transfer::{ContentCheck, STORE_REMEDY};
+
+/// Name of the first entry.
+pub(crate) const INDEX_FILE: &str = "export.json";
+/// Version of the archive's format.
+pub(crate) const EXPORT_FORMAT: u32 = 1;
+
+/// `export.json`: list of an archive's objects and records.
+#[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Index {
+    /// Version of the archive's format.
+    pub(crate) export: u32,
+    /// Format of the store that manifests and records come from.
+    pub(crate) store: u32,
+    /// Identity of the exported artifact.
+    pub(crate) artifact: String,
+    /// Identities of the archive's objects, sorted.
+    pub(crate) objects: Vec<String>,
+    /// Keys of the archive's records, sorted.
+    pub(crate) actions: Vec<String>,
+}
+
+/// Returns the path of an object's file in the archive.
+pub(crate) fn object_entry(identity: &str, file: &str) -> String {
+    format!("objects/{identity}/{file}")
+}
+
+/// Returns the path of a record in the archive.
+pub(crate) fn action_entry(key: &str) -> String {
+    format!("actions/{key}.json")
+}
 
 /// Writes one artifact with its history as one file.
 pub(crate) fn export(
     store: &Store,
-    what: &str,
+    start: &str,
     destination: Destination<'_>,
     records_only: bool,
     stop: &Arc<AtomicBool>,
 ) -> anyhow::Result<()> {
     destination.check()?;
-    let run = store.begin_run(&entered(store, stop)?, std::env::args().collect())?;
+    let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
     let id = run.id().to_owned();
-    let written = (|| {
-        let history = History::of(store, what, records_only)?;
-        let entered = entered(store, stop)?;
+    let written = History::find(store, start, records_only).and_then(|history| {
+        let entered = enter(store, stop)?;
         for (key, record) in &history.records {
             run.record_action(&entered, &record.stage, key)?;
         }
         drop(entered);
         history.write(store, destination, stop)
-    })();
-    // Reading is no use that keeps an artifact longer.
+    });
+    // An export must not prolong the life of artifacts.
     run.end()?;
     store.remove_run(&id).ok();
     written
 }
 
-/// An artifact, the actions that it came of, and the artifacts of these.
+/// Artifact with the records of its history and their stored objects.
 struct History {
     artifact: String,
     records: BTreeMap<String, Record>,
@@ -51,45 +86,33 @@ struct History {
 }
 
 impl History {
-    fn of(store: &Store, what: &str, records_only: bool) -> anyhow::Result<Self> {
-        let mut records: BTreeMap<String, Record> =
-            store.records()?.into_iter().map(|record| (record.key(), record)).collect();
-        let place = store.root().display().to_string();
+    /// Finds the history of the artifact or action whose name begins with `start`.
+    fn find(store: &Store, start: &str, records_only: bool) -> anyhow::Result<Self> {
+        let mut records = records_by_key(store)?;
+        let location = store.root().display().to_string();
         let names = records.keys().chain(records.values().map(|record| &record.output));
-        let name = one(what, names, "artifact or action", &place)?;
-        let keys: BTreeSet<String> = match records.get(&name) {
-            Some(_) => BTreeSet::from([name.clone()]),
-            None => records
-                .iter()
-                .filter(|(_, record)| record.output == name)
-                .map(|(key, _)| key.clone())
-                .collect(),
+        let name = find_unique(start, names, "artifact or action", &location)?;
+        let (artifact, keys) = match records.get(&name) {
+            Some(record) => (record.output.clone(), BTreeSet::from([name])),
+            None => (name.clone(), keys_of_artifact(&records, &name)),
         };
-        let artifact = records.get(&name).map_or(name, |record| record.output.clone());
-        if !store.is_whole(&artifact)? {
+        if !store.is_complete(&artifact)? {
             let object = store.object(&artifact);
-            return Err(Failure::BadInput(format!(
-                "{}: the artifact is not whole; run again, or pull it",
-                object.display()
-            ))
-            .into());
+            let problem = "the artifact is incomplete; run again, or pull it";
+            return Err(Failure::BadInput(format!("{}: {problem}", object.display())).into());
         }
         let history = with_history(&records, keys);
         records.retain(|key, _| history.contains(key));
         let mut objects = BTreeSet::from([artifact.clone()]);
+        let mut missing = BTreeSet::new();
         for record in records.values().filter(|_| !records_only) {
-            if store.is_whole(&record.output)? {
-                objects.insert(record.output.clone());
-            }
+            let is_complete = store.is_complete(&record.output)?;
+            let group = if is_complete { &mut objects } else { &mut missing };
+            group.insert(record.output.clone());
         }
-        let missing: BTreeSet<&String> = records
-            .values()
-            .map(|record| &record.output)
-            .filter(|o| !objects.contains(*o))
-            .collect();
-        if !records_only && !missing.is_empty() {
+        if !missing.is_empty() {
             report_line!(
-                "{} of the history not whole here: only the records are written",
+                "{} of the history incomplete in this store: writing only their records",
                 counted(missing.len(), "artifact")
             );
         }
@@ -109,102 +132,94 @@ impl History {
         let total = manifests.iter().map(|(_, manifest)| manifest.size()).sum();
         let file = destination.file;
         let temporary = destination.begin()?;
-        let mut out = Writer {
+        let mut writer = Writer {
             tar: tar::Builder::new(BufWriter::with_capacity(1 << 20, temporary)),
             name: file.display().to_string(),
             progress: Progress::new("export", total, stop),
         };
-        self.write_index(&mut out)?;
-        for (identity, manifest) in manifests {
-            out.object(&store.object(identity), identity, &manifest)?;
-        }
-        for (key, record) in &self.records {
-            out.json(&action_entry(key), record)?;
-        }
-        let temporary = out
-            .tar
-            .into_inner()
-            .and_then(|buffer| buffer.into_inner().map_err(io::IntoInnerError::into_error));
-        destination.finish(temporary.with_context(|| file.display().to_string())?)?;
-        drop(out.progress);
-        let (records, objects) =
-            (counted(self.records.len(), "record"), counted(self.objects.len(), "artifact"));
-        print_line!(
-            "{}: {} with {records} and {objects}, {}",
-            file.display(),
-            &self.artifact[..10],
-            sized(total)
-        );
-        Ok(())
-    }
-
-    fn write_index(&self, out: &mut Writer) -> anyhow::Result<()> {
         let index = Index {
-            export: EXPORT,
+            export: EXPORT_FORMAT,
             store: store::FORMAT,
             artifact: self.artifact.clone(),
             objects: self.objects.iter().cloned().collect(),
             actions: self.records.keys().cloned().collect(),
         };
-        out.json(INDEX, &index)
+        writer.write_json(INDEX_FILE, &index)?;
+        for (identity, manifest) in manifests {
+            writer.write_object(&store.object(identity), identity, &manifest)?;
+        }
+        for (key, record) in &self.records {
+            writer.write_json(&action_entry(key), record)?;
+        }
+        let temporary = writer
+            .tar
+            .into_inner()
+            .and_then(|buffer| buffer.into_inner().map_err(io::IntoInnerError::into_error));
+        destination.finish(temporary.with_context(|| file.display().to_string())?)?;
+        drop(writer.progress);
+        print_line!(
+            "{}: {} with {} and {}, {}",
+            file.display(),
+            &self.artifact[..10],
+            counted(self.records.len(), "record"),
+            counted(self.objects.len(), "artifact"),
+            sized(total)
+        );
+        Ok(())
     }
 }
 
+/// Writer of an archive.
 struct Writer {
     tar: tar::Builder<BufWriter<tempfile::NamedTempFile>>,
+    /// Name of the archive in messages.
     name: String,
     progress: Progress,
 }
 
 impl Writer {
-    fn json(&mut self, path: &str, value: &impl Serialize) -> anyhow::Result<()> {
+    fn write_json(&mut self, path: &str, value: &impl Serialize) -> anyhow::Result<()> {
         let mut bytes = serde_json::to_vec_pretty(value)?;
         bytes.push(b'\n');
-        self.entry(path, bytes.len() as u64, bytes.as_slice()).with_context(|| self.name.clone())
+        append(&mut self.tar, path, bytes.len() as u64, bytes.as_slice())
+            .with_context(|| self.name.clone())
     }
 
-    fn object(&mut self, folder: &Path, identity: &str, manifest: &Manifest) -> anyhow::Result<()> {
-        self.json(&object_entry(identity, MANIFEST_FILE), manifest)?;
+    fn write_object(
+        &mut self,
+        folder: &Path,
+        identity: &str,
+        manifest: &Manifest,
+    ) -> anyhow::Result<()> {
+        self.write_json(&object_entry(identity, MANIFEST_FILE), manifest)?;
         for entry in &manifest.files {
             let path = folder.join(&entry.path);
             let name = path.display().to_string();
-            let file = File::open(&path).with_context(|| name.clone())?;
-            let mut reading = Reading {
-                file,
-                checked: Checked::new(entry),
+            let mut reader = CheckedReader {
+                file: File::open(&path).with_context(|| name.clone())?,
+                check: ContentCheck::new(entry),
                 progress: &self.progress,
                 name: &name,
                 problem: None,
             };
-            let written = append(
-                &mut self.tar,
-                &object_entry(identity, &entry.path),
-                entry.size,
-                &mut reading,
-            );
-            if let Some(problem) = reading.problem.take() {
+            let archived = object_entry(identity, &entry.path);
+            let written = append(&mut self.tar, &archived, entry.size, &mut reader);
+            if let Some(problem) = reader.problem.take() {
                 return Err(problem);
             }
-            reading.checked.finish(
-                &name,
-                "the artifact is damaged: `nerf-sr verify --remove`, then run again",
-            )?;
+            reader.check.finish(&name, STORE_REMEDY)?;
             written.with_context(|| self.name.clone())?;
         }
         Ok(())
     }
-
-    fn entry(&mut self, path: &str, size: u64, from: impl Read) -> io::Result<()> {
-        append(&mut self.tar, path, size, from)
-    }
 }
 
-/// Nothing of the machine is in an entry: neither owner nor time.
+/// Appends an entry without owner and time, so that archives of different machines are equal.
 fn append(
     tar: &mut tar::Builder<impl Write>,
     path: &str,
     size: u64,
-    from: impl Read,
+    content: impl Read,
 ) -> io::Result<()> {
     let mut header = tar::Header::new_gnu();
     header.set_size(size);
@@ -213,23 +228,24 @@ fn append(
     header.set_uid(0);
     header.set_gid(0);
     header.set_entry_type(tar::EntryType::Regular);
-    tar.append_data(&mut header, path, from)
+    tar.append_data(&mut header, path, content)
 }
 
-/// A file on its way into the archive, compared with the manifest.
-struct Reading<'a> {
+/// Reader of an object's file that compares the content with the manifest.
+struct CheckedReader<'a> {
     file: File,
-    checked: Checked<'a>,
+    check: ContentCheck<'a>,
     progress: &'a Progress,
     name: &'a str,
+    /// Difference or interruption, which `io::Error` can't represent.
     problem: Option<anyhow::Error>,
 }
 
-impl Read for Reading<'_> {
+impl Read for CheckedReader<'_> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let count = self.file.read(buffer)?;
-        if let Err(problem) = self.checked.take(&buffer[..count], self.progress, &self.name) {
-            self.problem = Some(problem);
+        if let Err(problem) = self.check.add(&buffer[..count], self.progress, &self.name) {
+            self.problem = Some(problem.into());
             return Err(io::Error::other("stopped"));
         }
         Ok(count)

@@ -1,104 +1,104 @@
 use std::fmt;
 use std::fs::File;
-use std::io::{self, BufReader, Read, Write as _};
+use std::io::{BufReader, Read, Write as _};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, file_kind, sized};
+use artifact::{Failure, FailureExt as _, FileEntry, MANIFEST_FILE, counted, file_kind, sized};
+use serde_json::Value;
 use store::{Arrival, Record, Store, is_hash};
 
-use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
-use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, create, read_manifest, read_record};
+use crate::export::{EXPORT_FORMAT, INDEX_FILE, Index, action_entry, object_entry};
+use crate::intake::{
+    Intake, MAX_MANIFEST_BYTES, MAX_RECORD_BYTES, create_file, parse_record, read_manifest,
+};
 use crate::progress::Progress;
-use crate::transfer::Checked;
+use crate::transfer::ContentCheck;
 
-/// A longer path is no path.
-const PATH_LIMIT: u64 = 8 << 10;
-const PIECE_BYTES: usize = 1 << 18;
-const REMEDY: &str = "nothing is taken in; export it again from a whole store";
+/// Maximum length of a path in an archive, in bytes; twice that of Linux.
+const MAX_PATH_BYTES: u64 = 8 << 10;
+/// Number of bytes that are read and hashed at a time.
+const BUFFER_BYTES: usize = 1 << 18;
+const REMEDY: &str = "nothing was imported; export the artifact again from a complete store";
 
-/// Content of an archive that was read.
+/// Summary of an imported archive.
 #[derive(Debug)]
 pub struct Imported {
     records: usize,
     objects: usize,
-    /// Size of the archive.
+    /// Size of the archive in bytes.
     bytes: u64,
-    /// Number of records that the store didn't have.
+    /// Number of records that the store lacked.
     new: usize,
 }
 
 impl fmt::Display for Imported {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (records, objects) =
-            (counted(self.records, "record"), counted(self.objects, "artifact"));
-        let (size, new) = (sized(self.bytes), self.new);
-        write!(f, "{records} and {objects} read ({size}), {new} records new")
+        let records = counted(self.records, "record");
+        let objects = counted(self.objects, "artifact");
+        write!(f, "{records} and {objects} read ({}), {} records new", sized(self.bytes), self.new)
     }
 }
 
-/// Reads what `export` wrote. Nothing is taken in before all is verified.
+/// Imports an archive written by `export`, after verifying all of it.
 pub fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyhow::Result<Imported> {
     let name = file.display().to_string();
-    let (total, open) = open(file)?;
-    let mut archive = tar::Archive::new(BufReader::with_capacity(1 << 20, open));
+    let (file, bytes) = open(file)?;
+    let mut archive = tar::Archive::new(BufReader::with_capacity(1 << 20, file));
     let entries = archive.entries().with_context(|| name.clone())?.raw(true);
     let intake = Intake::begin(store, stop)?;
     let mut reader =
-        Reader { entries, intake: &intake, name, progress: Progress::new("import", total, stop) };
-    let index = reader.index()?;
+        Reader { entries, intake: &intake, name, progress: Progress::new("import", bytes, stop) };
+    let index = reader.read_index()?;
     let mut arrivals = Vec::new();
     for identity in &index.objects {
-        arrivals.push((identity, reader.object(identity)?));
+        arrivals.push((identity, reader.read_object(identity)?));
     }
     let mut records = Vec::new();
     for key in &index.actions {
         let entry = action_entry(key);
-        let bytes = reader.small(&entry, RECORD_LIMIT)?;
-        records.push(read_record(&bytes, key, &reader.name_of(&entry))?);
+        let bytes = reader.read_small(&entry, MAX_RECORD_BYTES)?;
+        records.push(parse_record(&bytes, key, &reader.entry_name(&entry))?);
     }
-    reader.end(&index, &records)?;
+    reader.check_end(&index, &records)?;
     drop(reader);
-    let new = take_in(&intake, &arrivals, records)?;
+    let new = import_all(&intake, &arrivals, records)?;
     intake.end()?;
-    Ok(Imported { records: index.actions.len(), objects: index.objects.len(), bytes: total, new })
+    Ok(Imported { records: index.actions.len(), objects: index.objects.len(), bytes, new })
 }
 
-/// Opens an archive; returns its size, too. A named pipe would be waited for, and a device has no
-/// end.
-fn open(file: &Path) -> anyhow::Result<(u64, File)> {
-    let unreadable =
-        |problem: io::Error| Failure::BadInput(format!("{}: {problem}", file.display()));
-    let found = file.metadata().map_err(unreadable)?;
+/// Opens an archive and returns its size in bytes. Only regular files are accepted, since a named
+/// pipe may block and a device may be endless.
+fn open(path: &Path) -> Result<(File, u64), Failure> {
+    let name = path.display().to_string();
+    let found = path.metadata().bad_input(&name)?;
     if !found.is_file() {
-        let (name, kind) = (file.display(), file_kind(found.file_type()));
+        let kind = file_kind(found.file_type());
         let problem = format!("{name} is {kind}, not a regular file; save the archive as a file");
-        return Err(Failure::BadInput(problem).into());
+        return Err(Failure::BadInput(problem));
     }
-    Ok((found.len(), File::open(file).map_err(unreadable)?))
+    Ok((File::open(path).bad_input(&name)?, found.len()))
 }
 
-/// Objects first, each with its records, and then records that stand alone. How many records are
-/// new.
-fn take_in(
+/// Imports the objects, each followed by its records, then the other records. Returns the number of
+/// new records.
+fn import_all(
     intake: &Intake,
     arrivals: &[(&String, Option<Arrival>)],
     mut records: Vec<Record>,
 ) -> anyhow::Result<usize> {
     let mut new = 0;
     for (identity, arrival) in arrivals {
-        let (own, others) =
-            records.into_iter().partition::<Vec<_>, _>(|record| record.output == **identity);
-        new += intake.take_in(arrival.as_ref(), &own)?;
-        records = others;
+        let own: Vec<_> = records.extract_if(.., |record| record.output == **identity).collect();
+        new += intake.import(arrival.as_ref(), &own)?;
     }
-    Ok(new + intake.take_in(None, &records)?)
+    Ok(new + intake.import(None, &records)?)
 }
 
-/// Reads entry after entry; any that isn't the next one is refused, so none decides where it is
-/// written.
+/// Reader of an archive's entries in the expected order. Since any other entry is refused, the
+/// archive can't choose the paths that are written.
 struct Reader<'a, R: Read> {
     entries: tar::Entries<'a, R>,
     intake: &'a Intake,
@@ -107,149 +107,157 @@ struct Reader<'a, R: Read> {
 }
 
 impl<'a, R: Read> Reader<'a, R> {
-    fn name_of(&self, entry: &str) -> String {
+    /// Returns the name of an entry in messages.
+    fn entry_name(&self, entry: &str) -> String {
         format!("{}: {entry}", self.name)
     }
 
-    fn refuse(&self, reason: impl std::fmt::Display) -> anyhow::Error {
-        Failure::BadInput(format!("{}: {reason}; {REMEDY}", self.name)).into()
+    /// Creates the error for an invalid archive.
+    fn refuse(&self, problem: impl fmt::Display) -> anyhow::Error {
+        Failure::BadInput(format!("{}: {problem}; {REMEDY}", self.name)).into()
     }
 
-    /// The next entry, if it is the expected one.
-    fn next(&mut self, expected: &str) -> anyhow::Result<tar::Entry<'a, R>> {
-        let mut long = None;
+    /// Returns the next entry. Fails unless it is the expected one.
+    fn next_entry(&mut self, expected: &str) -> anyhow::Result<tar::Entry<'a, R>> {
+        let mut long_path = None;
         loop {
             let entry = match self.entries.next() {
                 Some(Ok(entry)) => entry,
                 Some(Err(error)) => {
-                    return Err(self
-                        .refuse(format!("no tar file where {expected:?} should follow: {error}")));
+                    let problem = format!("not a tar file, expected {expected:?}: {error}");
+                    return Err(self.refuse(problem));
                 }
-                None => return Err(self.refuse(format!("it ends before {expected:?}"))),
+                None => return Err(self.refuse(format!("the archive ends before {expected:?}"))),
             };
             let kind = entry.header().entry_type();
-            if kind.is_gnu_longname() && long.is_none() {
+            if kind.is_gnu_longname() && long_path.is_none() {
                 let mut path = Vec::new();
-                let read = entry.take(PATH_LIMIT).read_to_end(&mut path);
+                let read = entry.take(MAX_PATH_BYTES).read_to_end(&mut path);
                 read.map_err(|e| self.refuse(format!("{expected:?}: {e}")))?;
                 path.pop_if(|last| *last == 0);
-                long = Some(path);
+                long_path = Some(path);
                 continue;
             }
-            let path = long.unwrap_or_else(|| entry.header().path_bytes().into_owned());
+            let path = long_path.unwrap_or_else(|| entry.header().path_bytes().into_owned());
             let found: String = String::from_utf8_lossy(&path).chars().take(200).collect();
             if kind != tar::EntryType::Regular {
-                return Err(self.refuse(format!("{found:?} is no plain file ({kind:?})")));
+                return Err(self.refuse(format!("{found:?} is not a regular file ({kind:?})")));
             }
             if path != expected.as_bytes() {
-                return Err(self.refuse(format!("{found:?} where {expected:?} should follow")));
+                return Err(self.refuse(format!("expected {expected:?}, found {found:?}")));
             }
             return Ok(entry);
         }
     }
 
-    /// The content of an entry that is small unless somebody means harm.
-    fn small(&mut self, expected: &str, limit: u64) -> anyhow::Result<Vec<u8>> {
-        let entry = self.next(expected)?;
+    /// Reads an entry of at most `max_bytes`; a larger one is damaged or hostile.
+    fn read_small(&mut self, expected: &str, max_bytes: u64) -> anyhow::Result<Vec<u8>> {
+        let entry = self.next_entry(expected)?;
         let size = entry.size();
-        if size > limit {
-            return Err(self.refuse(format!("{expected:?} has {size} bytes, more than {limit}")));
+        if size > max_bytes {
+            let problem = format!("{expected:?} has {size} bytes, more than {max_bytes}");
+            return Err(self.refuse(problem));
         }
         let mut bytes = Vec::new();
-        let read = entry.take(limit).read_to_end(&mut bytes);
+        let read = entry.take(max_bytes).read_to_end(&mut bytes);
         read.map_err(|e| self.refuse(format!("{expected:?}: {e}")))?;
         if bytes.len() as u64 != size {
-            return Err(self.refuse(format!("it ends within {expected:?}")));
+            return Err(self.refuse(format!("the archive ends within {expected:?}")));
         }
         self.progress.add(size)?;
         Ok(bytes)
     }
 
-    fn index(&mut self) -> anyhow::Result<Index> {
-        let bytes = self.small(INDEX, MANIFEST_LIMIT)?;
-        let value: serde_json::Value =
-            serde_json::from_slice(&bytes).map_err(|e| self.refuse(format!("{INDEX}: {e}")))?;
-        for (field, known) in [("export", EXPORT), ("store", store::FORMAT)] {
-            if value
-                .get(field)
-                .and_then(serde_json::Value::as_u64)
-                .is_none_or(|found| found > u64::from(known))
-            {
-                let found = value.get(field).cloned().unwrap_or_default();
-                return Err(self.refuse(format!(
-                    "{field} format {found}, this nerf-sr-remote knows {known}; use the newer one"
-                )));
-            }
-        }
-        let index: Index =
-            serde_json::from_value(value).map_err(|e| self.refuse(format!("{INDEX}: {e}")))?;
-        for names in [&index.objects, &index.actions] {
-            if !names.iter().all(|name| is_hash(name)) || !names.is_sorted_by(|a, b| a < b) {
-                return Err(self.refuse(format!("{INDEX}: names that are no sorted hashes")));
-            }
-        }
-        Ok(index)
+    fn read_index(&mut self) -> anyhow::Result<Index> {
+        let bytes = self.read_small(INDEX_FILE, MAX_MANIFEST_BYTES)?;
+        parse_index(&bytes).map_err(|problem| self.refuse(problem))
     }
 
-    /// An object, put together in the scratch folder and found whole; none where the store has it.
-    fn object(&mut self, identity: &str) -> anyhow::Result<Option<Arrival>> {
-        let is_here = self.intake.store.is_whole(identity)?;
+    /// Reads an object into the scratch folder and checks it; `None` if the store has the object.
+    fn read_object(&mut self, identity: &str) -> anyhow::Result<Option<Arrival>> {
+        let is_stored = self.intake.store.is_complete(identity)?;
         let folder = self.intake.scratch(identity);
         let first = object_entry(identity, MANIFEST_FILE);
-        let bytes = self.small(&first, MANIFEST_LIMIT)?;
+        let bytes = self.read_small(&first, MAX_MANIFEST_BYTES)?;
         let path = folder.join(MANIFEST_FILE);
         let written = std::fs::create_dir_all(&folder).and_then(|()| std::fs::write(&path, bytes));
         written.with_context(|| path.display().to_string())?;
-        let manifest = read_manifest(&folder, identity, &self.name_of(&first))?;
+        let manifest = read_manifest(&folder, identity, &self.entry_name(&first))?;
         for file in &manifest.files {
-            self.file(identity, file, (!is_here).then(|| folder.join(&file.path)).as_deref())?;
+            let target = (!is_stored).then(|| folder.join(&file.path));
+            self.read_file(identity, file, target.as_deref())?;
         }
-        if is_here {
-            Ok(None)
-        } else {
-            Ok(Some(self.intake.store.check_arrival(&folder, identity)?))
+        if is_stored {
+            return Ok(None);
         }
+        Ok(Some(self.intake.store.check_arrival(&folder, identity)?))
     }
 
-    /// A file of an object, written where it isn't here yet.
-    fn file(&mut self, identity: &str, file: &FileEntry, to: Option<&Path>) -> anyhow::Result<()> {
+    /// Reads and checks a file of an object, and writes it to `target`, if given.
+    fn read_file(
+        &mut self,
+        identity: &str,
+        file: &FileEntry,
+        target: Option<&Path>,
+    ) -> anyhow::Result<()> {
         let path = object_entry(identity, &file.path);
-        let mut entry = self.next(&path)?;
+        let mut entry = self.next_entry(&path)?;
         if entry.size() != file.size {
-            let sizes = format!("{} bytes where the manifest says {}", entry.size(), file.size);
+            let sizes = format!("{} bytes, but {} in the manifest", entry.size(), file.size);
             return Err(self.refuse(format!("{path:?} has {sizes}")));
         }
-        let mut out = to.map(create).transpose()?;
-        let name = self.name_of(&path);
-        let mut checked = Checked::new(file);
-        let mut piece = vec![0; PIECE_BYTES];
+        let mut output = target.map(create_file).transpose()?;
+        let name = self.entry_name(&path);
+        let mut check = ContentCheck::new(file);
+        let mut buffer = vec![0; BUFFER_BYTES];
         loop {
             let count =
-                entry.read(&mut piece).map_err(|e| self.refuse(format!("{path:?}: {e}")))?;
+                entry.read(&mut buffer).map_err(|e| self.refuse(format!("{path:?}: {e}")))?;
             if count == 0 {
-                return checked.finish(&name, REMEDY);
+                return check.finish(&name, REMEDY);
             }
-            checked.take(&piece[..count], &self.progress, &name)?;
-            if let Some(out) = &mut out {
-                out.write_all(&piece[..count]).with_context(|| path.clone())?;
+            check.add(&buffer[..count], &self.progress, &name)?;
+            if let Some(output) = &mut output {
+                output.write_all(&buffer[..count]).with_context(|| path.clone())?;
             }
         }
     }
 
-    /// Nothing may follow, and every object must have a record.
-    fn end(&mut self, index: &Index, records: &[Record]) -> anyhow::Result<()> {
+    /// Fails if the archive has further entries, or an object without a record.
+    fn check_end(&mut self, index: &Index, records: &[Record]) -> anyhow::Result<()> {
         if let Some(entry) = self.entries.next() {
             let name = entry.map_or_else(
                 |e| e.to_string(),
                 |e| String::from_utf8_lossy(&e.header().path_bytes()).into_owned(),
             );
-            return Err(self.refuse(format!("{name:?} where the end should be")));
+            return Err(self.refuse(format!("{name:?} after the last entry")));
         }
-        let has_record =
-            |identity: &String| records.iter().any(|record| record.output == *identity);
-        match index.objects.iter().chain([&index.artifact]).find(|identity| !has_record(identity)) {
-            Some(identity) => Err(self.refuse(format!("no record says what made {identity:?}"))),
-            None => Ok(()),
+        for identity in index.objects.iter().chain([&index.artifact]) {
+            if !records.iter().any(|record| record.output == *identity) {
+                return Err(self.refuse(format!("no record of the artifact {identity:?}")));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Parses an archive's index; the error is the problem, as text.
+fn parse_index(bytes: &[u8]) -> Result<Index, String> {
+    let value: Value = serde_json::from_slice(bytes).map_err(|e| format!("{INDEX_FILE}: {e}"))?;
+    for (field, known) in [("export", EXPORT_FORMAT), ("store", store::FORMAT)] {
+        let found = value.get(field).cloned().unwrap_or_default();
+        if found.as_u64().is_none_or(|found| found > u64::from(known)) {
+            return Err(format!(
+                "{field} format {found}, this nerf-sr-remote supports {known}; use the newer \
+                nerf-sr-remote"
+            ));
         }
     }
+    let index: Index = serde_json::from_value(value).map_err(|e| format!("{INDEX_FILE}: {e}"))?;
+    for names in [&index.objects, &index.actions] {
+        if !names.iter().all(|name| is_hash(name)) || !names.is_sorted_by(|a, b| a < b) {
+            return Err(format!("{INDEX_FILE}: names are not sorted hashes"));
+        }
+    }
+    Ok(index)
 }

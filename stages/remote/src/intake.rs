@@ -8,21 +8,21 @@ use std::time::{Duration, Instant};
 use artifact::{Damage, Failure, FileEntry, MANIFEST_FILE, Manifest, relative_path, report_line};
 use store::{Arrival, Entered, Locked, Record, RunFile, Store, is_hash};
 
-/// A record is a few kilobytes.
-pub(crate) const RECORD_LIMIT: u64 = 4 << 20;
-/// A manifest has some 150 bytes a file.
-pub(crate) const MANIFEST_LIMIT: u64 = 64 << 20;
+/// Maximum size of a record in bytes; usual ones have a few kilobytes.
+pub(crate) const MAX_RECORD_BYTES: u64 = 4 << 20;
+/// Maximum size of a manifest in bytes; usual ones have about 150 bytes per file.
+pub(crate) const MAX_MANIFEST_BYTES: u64 = 64 << 20;
 
-/// Maximum number of folders in a path, with the file. `std::fs::remove_dir_all` keeps each folder
-/// on its way open, and a process may often open 1024 files.
+/// Maximum number of components of a path. `std::fs::remove_dir_all` opens all folders of a path at
+/// once, and many systems limit a process to 1024 open files.
 const MAX_DEPTH: usize = 100;
-/// Maximum number of characters of a refused path in a message.
-const SHOWN_CHARS: usize = 200;
-/// Maximum length of a path, in bytes: the folders above also need some of the system's 4096.
+/// Maximum number of characters of a refused path in a message. Chosen by hand.
+const MAX_QUOTED_CHARACTERS: usize = 200;
+/// Maximum length of a path in bytes, which leaves most of the system's 4096 to the folders above.
 const MAX_PATH_BYTES: usize = 1000;
 
-/// What is being copied into a store. It is a run: garbage collection leaves alone what a run
-/// needs, and clears what a killed one left behind.
+/// Import of artifacts into a store. The store records the import as a run, so that garbage
+/// collection keeps the imported artifacts, and deletes the leftovers of a killed import.
 pub(crate) struct Intake {
     pub(crate) store: Store,
     run: Option<RunFile>,
@@ -32,23 +32,23 @@ pub(crate) struct Intake {
 
 impl Intake {
     pub(crate) fn begin(store: &Store, stop: &Arc<AtomicBool>) -> anyhow::Result<Self> {
-        let run = store.begin_run(&entered(store, stop)?, std::env::args().collect())?;
+        let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
         let folder = store.scratch(run.id());
         Ok(Self { store: store.clone(), run: Some(run), folder, stop: Arc::clone(stop) })
     }
 
-    /// Where an artifact is put together.
+    /// Returns the folder in which an artifact is assembled.
     pub(crate) fn scratch(&self, identity: &str) -> PathBuf {
         self.folder.join(identity)
     }
 
-    /// Takes in an object, if one is given, then its records; how many of these are new.
-    pub(crate) fn take_in(
+    /// Imports an object, if given, then its records. Returns the number of new records.
+    pub(crate) fn import(
         &self,
         arrival: Option<&Arrival>,
         records: &[Record],
     ) -> anyhow::Result<usize> {
-        let entered = entered(&self.store, &self.stop)?;
+        let entered = enter(&self.store, &self.stop)?;
         if let Some(arrival) = arrival {
             self.store.import_object(&entered, arrival)?;
         }
@@ -62,7 +62,7 @@ impl Intake {
         Ok(new)
     }
 
-    /// All is there.
+    /// Records the end of the import.
     pub(crate) fn end(mut self) -> anyhow::Result<()> {
         Ok(self.run.take().map_or(Ok(()), RunFile::end)?)
     }
@@ -70,85 +70,95 @@ impl Intake {
 
 impl Drop for Intake {
     fn drop(&mut self) {
-        // What is left over has no value, and is cleared with the run's file at the latest.
-        std::fs::remove_dir_all(&self.folder).ok();
+        // Garbage collection removes the folder if this fails.
+        fs::remove_dir_all(&self.folder).ok();
     }
 }
 
-/// Enters the store; waits while garbage is collected.
-pub(crate) fn entered(store: &Store, stop: &AtomicBool) -> anyhow::Result<Entered> {
-    let (since, mut is_said) = (Instant::now(), false);
+/// Enters the store; waits until garbage collection has finished.
+pub(crate) fn enter(store: &Store, stop: &AtomicBool) -> anyhow::Result<Entered> {
+    let start = Instant::now();
+    let mut is_reported = false;
     loop {
-        match store.try_enter()? {
-            Locked::Acquired(entered) => return Ok(entered),
-            Locked::HeldBy(_) if stop.load(Ordering::Relaxed) => {
-                return Err(Failure::Interrupted.into());
-            }
-            Locked::HeldBy(_) => {}
+        if let Locked::Acquired(entered) = store.try_enter()? {
+            return Ok(entered);
         }
-        if !is_said && since.elapsed() > Duration::from_secs(1) {
-            is_said = true;
-            report_line!("waits for garbage collection");
+        if stop.load(Ordering::Relaxed) {
+            return Err(Failure::Interrupted.into());
+        }
+        if !is_reported && start.elapsed() > Duration::from_secs(1) {
+            is_reported = true;
+            report_line!("waiting for garbage collection");
         }
         std::thread::sleep(Duration::from_millis(20));
     }
 }
 
-/// A record from elsewhere: of this key, and with names that paths may be made of.
-pub(crate) fn read_record(bytes: &[u8], key: &str, name: &str) -> anyhow::Result<Record> {
-    let refuse = |reason: String| Failure::BadInput(format!("{name}: {reason}"));
-    let record: Record =
-        serde_json::from_slice(bytes).map_err(|e| refuse(format!("not a record: {e}")))?;
-    if record.key() != key {
-        return Err(refuse(
-            "the content is not what was written (its key is not its name)".to_owned(),
-        )
-        .into());
-    }
-    match std::iter::once(&record.output).chain(&record.made_of).find(|name| !is_hash(name)) {
-        Some(name) => Err(refuse(format!("{name:?} is not a hash")).into()),
-        None => Ok(record),
-    }
-}
-
-/// The manifest from elsewhere in a scratch folder: of this identity, and with paths as nerf-sr
-/// writes them.
-pub(crate) fn read_manifest(folder: &Path, identity: &str, name: &str) -> anyhow::Result<Manifest> {
-    let refuse = |reason: String| Failure::BadInput(format!("{name}: {reason}"));
-    let manifest = Manifest::read(folder).map_err(|damage| match damage {
-        Damage::Manifest { reason, .. } => refuse(format!("not a manifest: {reason}")),
-        other => refuse(other.to_string()),
-    })?;
-    if manifest.identity() != identity {
-        return Err(refuse(
-            "the content is not what was written (its blake3 is not the artifact's name)"
-                .to_owned(),
-        )
-        .into());
-    }
-    if manifest.files.iter().try_fold(0_u64, |sum, file| sum.checked_add(file.size)).is_none() {
-        return Err(refuse("sizes that no disk has".to_owned()).into());
-    }
-    match manifest.files.iter().find(|file| !is_plain(file)) {
-        Some(file) => {
-            let path: String = file.path.chars().take(SHOWN_CHARS).collect();
-            Err(refuse(format!("{path:?} is not the path of an artifact's file")).into())
+/// Parses a record from a remote or an archive, called `name` in messages. Fails if its key differs
+/// from `key`, or if it contains anything but hashes that may become parts of paths.
+pub(crate) fn parse_record(bytes: &[u8], key: &str, name: &str) -> Result<Record, Failure> {
+    let problem = match serde_json::from_slice::<Record>(bytes) {
+        Err(error) => format!("not a record: {error}"),
+        Ok(record) if record.key() != key => {
+            "the content has changed (its key differs from its name)".to_owned()
         }
-        None => Ok(manifest),
-    }
+        Ok(record) => {
+            let invalid = record.made_of.iter().chain([&record.output]).find(|name| !is_hash(name));
+            match invalid.cloned() {
+                Some(name) => format!("{name:?} is not a hash"),
+                None => return Ok(record),
+            }
+        }
+    };
+    Err(Failure::BadInput(format!("{name}: {problem}")))
 }
 
-/// Returns whether a path is one as nerf-sr writes them, and can be created and removed again.
-fn is_plain(file: &FileEntry) -> bool {
+/// Reads a manifest from a remote or an archive, called `name` in messages, in a scratch folder.
+/// Fails if its identity differs, or if it contains paths that nerf-sr doesn't write.
+pub(crate) fn read_manifest(
+    folder: &Path,
+    identity: &str,
+    name: &str,
+) -> Result<Manifest, Failure> {
+    let problem = match Manifest::read(folder) {
+        Err(Damage::Manifest { reason, .. }) => format!("not a manifest: {reason}"),
+        Err(damage) => damage.to_string(),
+        Ok(manifest) if manifest.identity() != identity => {
+            "the content has changed (its blake3 differs from the artifact's name)".to_owned()
+        }
+        Ok(manifest) => match invalid_file(&manifest) {
+            Some(problem) => problem,
+            None => return Ok(manifest),
+        },
+    };
+    Err(Failure::BadInput(format!("{name}: {problem}")))
+}
+
+/// Describes the first entry of a manifest that can't be a file of an artifact.
+fn invalid_file(manifest: &Manifest) -> Option<String> {
+    let mut total: u64 = 0;
+    for file in &manifest.files {
+        let Some(sum) = total.checked_add(file.size) else {
+            return Some("the total size exceeds 64 bits".to_owned());
+        };
+        total = sum;
+    }
+    let file = manifest.files.iter().find(|file| !has_valid_path(file))?;
+    let path: String = file.path.chars().take(MAX_QUOTED_CHARACTERS).collect();
+    Some(format!("{path:?} is not the path of an artifact's file"))
+}
+
+/// Returns whether nerf-sr writes such a path, and it can be created and removed again.
+fn has_valid_path(file: &FileEntry) -> bool {
     file.path != MANIFEST_FILE
         && file.path.len() <= MAX_PATH_BYTES
         && relative_path(&file.path).is_ok_and(|path| path.to_str() == Some(file.path.as_str()))
         && file.path.split('/').count() <= MAX_DEPTH
 }
 
-/// Creates a file of an artifact in a scratch folder. A path that this file system doesn't take is
-/// the sender's mistake; any other failure would meet all files.
-pub(crate) fn create(path: &Path) -> anyhow::Result<File> {
+/// Creates a file of an artifact in a scratch folder. A path that the file system doesn't support is
+/// bad input; any other error would concern all files.
+pub(crate) fn create_file(path: &Path) -> anyhow::Result<File> {
     let folder = path.parent().unwrap_or(path);
     fs::create_dir_all(folder).and_then(|()| File::create_new(path)).map_err(|error| {
         let name = path.display().to_string();

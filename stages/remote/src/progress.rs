@@ -7,11 +7,11 @@ use artifact::{Failure, report_line, sized};
 use indicatif::{ProgressBar, ProgressStyle};
 use stage::Pace;
 
-/// Between two lines where there is no terminal.
-const LINE_INTERVAL: Duration = Duration::from_secs(10);
+/// Interval between reports without a terminal.
+const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Bytes done of bytes in all, with the time left: a bar on a terminal, a line now and then
-/// elsewhere. Knows of signals, too: work looks at both between two pieces.
+/// Progress in bytes with the remaining time: a bar on a terminal, otherwise a line at intervals.
+/// Also checks for signals, since work does both between two pieces of data.
 pub(crate) struct Progress {
     label: &'static str,
     total: u64,
@@ -23,11 +23,11 @@ pub(crate) struct Progress {
 struct State {
     done: u64,
     pace: Pace,
-    shown: Instant,
+    reported: Instant,
 }
 
 impl Progress {
-    /// With a total of 0 it looks at signals alone.
+    /// Creates progress; with a total of 0 it only checks for signals.
     pub(crate) fn new(label: &'static str, total: u64, stop: &Arc<AtomicBool>) -> Self {
         let bar = (total > 0 && std::io::stderr().is_terminal()).then(|| {
             let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}")
@@ -36,11 +36,11 @@ impl Progress {
         });
         let mut pace = Pace::default();
         pace.start(0);
-        let state = Mutex::new(State { done: 0, pace, shown: Instant::now() });
+        let state = Mutex::new(State { done: 0, pace, reported: Instant::now() });
         Self { label, total, bar, state, stop: Arc::clone(stop) }
     }
 
-    /// Counts bytes that were transferred; an error once a signal has come.
+    /// Counts transferred bytes. Fails if a signal has interrupted the program.
     pub(crate) fn add(&self, bytes: u64) -> Result<(), Failure> {
         if self.stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted);
@@ -48,20 +48,24 @@ impl Progress {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.done += bytes;
         let done = state.done;
-        let words =
-            |left: String| format!("{} of {} · {left} left", sized(done), sized(self.total));
+        let is_due = self.total > 0 && state.reported.elapsed() >= REPORT_INTERVAL;
+        if self.bar.is_none() && !is_due {
+            return Ok(());
+        }
+        let left = state.pace.time_left(done, self.total);
+        let text = format!("{} of {} · {left} left", sized(done), sized(self.total));
         if let Some(bar) = &self.bar {
             bar.set_position(done);
-            bar.set_message(words(state.pace.time_left(done, self.total)));
-        } else if self.total > 0 && state.shown.elapsed() >= LINE_INTERVAL {
-            state.shown = Instant::now();
-            report_line!("{}: {}", self.label, words(state.pace.time_left(done, self.total)));
+            bar.set_message(text);
+        } else {
+            state.reported = Instant::now();
+            report_line!("{}: {text}", self.label);
         }
         Ok(())
     }
 
-    /// Says something in between, on stderr.
-    pub(crate) fn say(&self, line: &str) {
+    /// Logs a line on stderr without disturbing the bar.
+    pub(crate) fn log(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| report_line!("{line}")),
             None => report_line!("{line}"),

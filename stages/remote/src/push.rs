@@ -3,16 +3,16 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{FileEntry, MANIFEST_FILE, Manifest, counted, print_line, report_line, sized};
+use artifact::{MANIFEST_FILE, Manifest, counted, print_line, report_line, sized};
 use store::{Record, Store};
 
-use crate::intake::entered;
+use crate::intake::enter;
 use crate::progress::Progress;
 use crate::remote::{Access, Remote};
-use crate::selection::Selection;
-use crate::transfer::{Transfer, all};
+use crate::selection::{Selection, records_by_key};
+use crate::transfer::{Transfer, run_all};
 
-/// Copies finished actions and their artifacts to a remote that lacks them.
+/// Copies finished actions and their artifacts to a remote, unless it has them.
 pub(crate) async fn push(
     store: &Store,
     remote: &Remote,
@@ -20,38 +20,36 @@ pub(crate) async fn push(
     stop: &Arc<AtomicBool>,
 ) -> anyhow::Result<()> {
     remote.check_format(Access::Write).await?;
-    let place = store.root().display().to_string();
-    let records: BTreeMap<String, Record> =
-        store.records()?.into_iter().map(|record| (record.key(), record)).collect();
-    let selected = selection.of(&records, &place)?;
-    let run = store.begin_run(&entered(store, stop)?, std::env::args().collect())?;
+    let records = records_by_key(store)?;
+    let selected = selection.keys_among(&records, &store.root().display().to_string())?;
+    let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
     let id = run.id().to_owned();
-    let there: BTreeSet<String> = remote.records().await?.keys.into_iter().collect();
-    let missing: Vec<&Record> =
-        selected.iter().filter(|key| !there.contains(*key)).map(|key| &records[key]).collect();
+    let existing: BTreeSet<String> = remote.records().await?.keys.into_iter().collect();
+    let missing: Vec<&Record> = selected.difference(&existing).map(|key| &records[key]).collect();
     {
-        // From here on garbage collection leaves alone what is about to be read.
-        let entered = entered(store, stop)?;
+        // Protects the actions from garbage collection during the push.
+        let entered = enter(store, stop)?;
         for record in &missing {
             run.record_action(&entered, &record.stage, &record.key())?;
         }
     }
     let pushed = push_records(store, remote, &missing, stop).await;
-    // Reading is no use that keeps an artifact longer.
+    // A push must not prolong the life of artifacts.
     run.end()?;
     store.remove_run(&id).ok();
     let (actions, bytes) = pushed?;
-    let known = selected.len() - missing.len();
     print_line!(
-        "{}: {} pushed ({}), {known} there already",
+        "{}: {} pushed ({}), {} already present",
         remote.name(""),
         counted(actions, "action"),
-        sized(bytes)
+        sized(bytes),
+        selected.len() - missing.len()
     );
     Ok(())
 }
 
-/// How many records went, and bytes of their artifacts.
+/// Pushes records with their artifacts. Returns the number of pushed records and the size of their
+/// artifacts in bytes.
 async fn push_records(
     store: &Store,
     remote: &Remote,
@@ -60,29 +58,31 @@ async fn push_records(
 ) -> anyhow::Result<(usize, u64)> {
     let mut by_output: BTreeMap<String, Vec<Record>> = BTreeMap::new();
     let mut sizes = BTreeMap::new();
-    let mut without = 0;
+    let mut skipped = 0;
     for &record in records {
-        if !store.is_whole(&record.output)? {
-            without += 1;
+        if !store.is_complete(&record.output)? {
+            skipped += 1;
             continue;
         }
         sizes.insert(record.output.clone(), store.manifest(&record.output)?.size());
         by_output.entry(record.output.clone()).or_default().push(record.clone());
     }
-    if without > 0 {
-        report_line!("{} left out: their artifacts are not whole here", counted(without, "action"));
+    if skipped > 0 {
+        let actions = counted(skipped, "action");
+        report_line!("{actions} skipped: their artifacts are incomplete in this store");
     }
     let actions = by_output.values().map(Vec::len).sum();
     let total = sizes.values().sum();
     let transfer = Transfer::new(remote, Progress::new("push", total, stop));
-    all(by_output.into_iter().map(|(output, records)| {
+    run_all(by_output.into_iter().map(|(output, records)| {
         push_object(store.clone(), Arc::clone(&transfer), output, records)
     }))
     .await?;
     Ok((actions, total))
 }
 
-/// Files first, then the manifest, then the records: whoever starts from a record finds all.
+/// Pushes an artifact's files, then its manifest, then its records, so that a remote's records refer
+/// to complete artifacts.
 async fn push_object(
     store: Store,
     transfer: Arc<Transfer>,
@@ -90,20 +90,17 @@ async fn push_object(
     records: Vec<Record>,
 ) -> anyhow::Result<()> {
     let folder = store.object(&output);
-    let manifest = Manifest::read(&folder)?;
     let object = format!("objects/{output}");
-    let there = transfer.remote.has_files(&object, &manifest.files).await?;
-    let mut missing = Vec::new();
-    for (entry, is_there) in manifest.files.into_iter().zip(there) {
-        if is_there {
-            transfer.progress.add(entry.size)?;
-        } else {
-            missing.push((folder.join(&entry.path), format!("{object}/{}", entry.path), entry));
-        }
+    let mut files = Manifest::read(&folder)?.files;
+    for existing in transfer.remote.remove_existing(&object, &mut files).await? {
+        transfer.progress.add(existing.size)?;
     }
-    all(missing
-        .into_iter()
-        .map(|(from, to, entry)| upload(Arc::clone(&transfer), from, to, entry)))
+    run_all(files.into_iter().map(|entry| {
+        let transfer = Arc::clone(&transfer);
+        let source = folder.join(&entry.path);
+        let target = format!("{object}/{}", entry.path);
+        async move { transfer.upload(&source, &target, &entry).await }
+    }))
     .await?;
     let path = folder.join(MANIFEST_FILE);
     let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
@@ -115,13 +112,4 @@ async fn push_object(
         transfer.remote.write(&format!("actions/{}.json", record.key()), bytes).await?;
     }
     Ok(())
-}
-
-async fn upload(
-    transfer: Arc<Transfer>,
-    from: std::path::PathBuf,
-    to: String,
-    entry: FileEntry,
-) -> anyhow::Result<()> {
-    transfer.upload(&from, &to, &entry).await
 }

@@ -1,53 +1,66 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use artifact::{Failure, counted};
-use store::Record;
+use store::{Record, Store, StoreError};
 
-/// Which actions are copied.
+/// Selection of the actions to copy.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub(crate) struct Selection {
-    /// Only this action, by its key or how that begins; may be given several times
+    /// Copy only this action, given by its key or the beginning of it; may be repeated
     #[arg(long = "key", value_name = "KEY")]
     pub(crate) keys: Vec<String>,
-    /// Only the actions that made this artifact, by its hash or how that begins; may be given
-    /// several times
+    /// Copy only the actions that created this artifact, given by its hash or the beginning of it;
+    /// may be repeated
     #[arg(long = "artifact", value_name = "HASH")]
     pub(crate) artifacts: Vec<String>,
-    /// Also the actions that those were made of
+    /// Also copy the actions that created their inputs, directly or not
     #[arg(long)]
     pub(crate) history: bool,
 }
 
 impl Selection {
-    /// Keys of the actions that are meant, out of these records. `place` is where they lie, in
-    /// words.
-    pub(crate) fn of(
+    /// True if all actions are selected.
+    pub(crate) fn is_all(&self) -> bool {
+        self.keys.is_empty() && self.artifacts.is_empty()
+    }
+
+    /// Returns the keys of the selected actions among `records`, whose `location` messages name.
+    pub(crate) fn keys_among(
         &self,
         records: &BTreeMap<String, Record>,
-        place: &str,
+        location: &str,
     ) -> anyhow::Result<BTreeSet<String>> {
-        if self.keys.is_empty() && self.artifacts.is_empty() {
+        if self.is_all() {
             return Ok(records.keys().cloned().collect());
         }
         let mut selected = BTreeSet::new();
         for start in &self.keys {
-            selected.insert(one(start, records.keys(), "action", place)?);
+            selected.insert(find_unique(start, records.keys(), "action", location)?);
         }
         for start in &self.artifacts {
-            let identity =
-                one(start, records.values().map(|record| &record.output), "artifact", place)?;
-            selected.extend(
-                records
-                    .iter()
-                    .filter(|(_, record)| record.output == identity)
-                    .map(|(key, _)| key.clone()),
-            );
+            let outputs = records.values().map(|record| &record.output);
+            let identity = find_unique(start, outputs, "artifact", location)?;
+            selected.extend(keys_of_artifact(records, &identity));
         }
         Ok(if self.history { with_history(records, selected) } else { selected })
     }
 }
 
-/// Keys, and those of all actions that they were made of, where there is a record of them.
+/// Reads all records of a store.
+pub(crate) fn records_by_key(store: &Store) -> Result<BTreeMap<String, Record>, StoreError> {
+    Ok(store.records()?.into_iter().map(|record| (record.key(), record)).collect())
+}
+
+/// Returns the keys of the actions that created an artifact.
+pub(crate) fn keys_of_artifact(
+    records: &BTreeMap<String, Record>,
+    identity: &str,
+) -> BTreeSet<String> {
+    let matching = records.iter().filter(|(_, record)| record.output == identity);
+    matching.map(|(key, _)| key.clone()).collect()
+}
+
+/// Adds the keys of all actions that created inputs, directly or not, as far as recorded.
 pub(crate) fn with_history(
     records: &BTreeMap<String, Record>,
     keys: BTreeSet<String>,
@@ -63,19 +76,22 @@ pub(crate) fn with_history(
     found
 }
 
-/// The one name that begins so.
-pub(crate) fn one<'a>(
+/// Returns the only name that begins with `start`; `noun` describes the names in messages.
+pub(crate) fn find_unique<'a>(
     start: &str,
     names: impl Iterator<Item = &'a String>,
-    what: &str,
-    place: &str,
+    noun: &str,
+    location: &str,
 ) -> anyhow::Result<String> {
     let found: BTreeSet<&String> =
         names.filter(|name| !start.is_empty() && name.starts_with(start)).collect();
     let problem = match found.len() {
         1 => return Ok(found.into_iter().cloned().collect()),
-        0 => format!("{place}: no {what} {start:?}; `nerf-sr status` shows what there is"),
-        count => format!("{place}: {} begin with {start:?}; give more of it", counted(count, what)),
+        0 => format!("{location}: no {noun} {start:?}; `nerf-sr status` lists the actions"),
+        count => format!(
+            "{location}: {} begin with {start:?}; give more characters",
+            counted(count, noun)
+        ),
     };
     Err(Failure::Usage(problem).into())
 }
@@ -116,7 +132,7 @@ mod tests {
             (&[], &["h2"], false, Err("no artifact \"h2\"")),
         ] {
             let selection = Selection { keys: words(keys), artifacts: words(artifacts), history };
-            match (selection.of(&records(), "there"), expected) {
+            match (selection.keys_among(&records(), "there"), expected) {
                 (Ok(found), Ok(expected)) => {
                     assert_eq!(found.into_iter().collect::<Vec<_>>(), expected);
                 }

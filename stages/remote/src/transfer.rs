@@ -10,66 +10,66 @@ use futures_util::StreamExt as _;
 use object_store::{ObjectStoreExt as _, WriteMultipart};
 use tokio::sync::Semaphore;
 
-use crate::intake::create;
+use crate::intake::create_file;
 use crate::progress::Progress;
 use crate::remote::Remote;
 
-/// Files that are on their way at once, and threads.
-pub(crate) const FILES_AT_ONCE: usize = 8;
-/// A larger file goes up in parts of this size. Each file holds three of them at most, which bounds
-/// the memory.
-const LEAST_PART_BYTES: u64 = 6 << 20;
-/// S3 takes 10,000 parts a file.
-const MOST_PARTS: u64 = 9_000;
+/// Maximum number of concurrent transfers, and number of threads. Chosen by hand.
+pub(crate) const MAX_CONCURRENT_FILES: usize = 8;
+/// Minimum size of a part in bytes; larger files are uploaded in parts. At most three parts of a file
+/// are in memory. S3 requires at least 5 MiB.
+const MIN_PART_BYTES: u64 = 6 << 20;
+/// Maximum number of parts of a file; S3 supports 10,000.
+const MAX_PARTS: u64 = 9_000;
 
-/// What all transfers share.
+/// State shared by all transfers.
 pub(crate) struct Transfer {
     pub(crate) remote: Remote,
     pub(crate) progress: Progress,
-    places: Semaphore,
+    slots: Semaphore,
 }
 
 impl Transfer {
     pub(crate) fn new(remote: &Remote, progress: Progress) -> Arc<Self> {
-        Arc::new(Self { remote: remote.clone(), progress, places: Semaphore::new(FILES_AT_ONCE) })
+        Arc::new(Self {
+            remote: remote.clone(),
+            progress,
+            slots: Semaphore::new(MAX_CONCURRENT_FILES),
+        })
     }
 
-    /// Uploads a file of an artifact. A file that isn't what the manifest says never appears on the
-    /// remote.
+    /// Uploads a file of an artifact, which appears on the remote only if it matches the manifest.
     pub(crate) async fn upload(
         &self,
-        from: &Path,
-        to: &str,
+        source: &Path,
+        target: &str,
         entry: &FileEntry,
     ) -> anyhow::Result<()> {
-        let _place = self.places.acquire().await?;
-        let file = File::open(from).with_context(|| from.display().to_string())?;
-        let mut checked = Checked::new(entry);
-        if entry.size <= LEAST_PART_BYTES {
+        let _slot = self.slots.acquire().await?;
+        let name = source.display();
+        let file = File::open(source).with_context(|| name.to_string())?;
+        let mut check = ContentCheck::new(entry);
+        if entry.size <= MIN_PART_BYTES {
             let mut bytes = Vec::new();
-            file.take(entry.size + 1)
-                .read_to_end(&mut bytes)
-                .with_context(|| from.display().to_string())?;
-            checked.take(&bytes, &self.progress, &from.display())?;
-            checked.finish(&from.display(), LOCAL_REMEDY)?;
-            return self.remote.write(to, bytes).await;
+            let read = file.take(entry.size + 1).read_to_end(&mut bytes);
+            read.with_context(|| name.to_string())?;
+            check.add(&bytes, &self.progress, &name)?;
+            check.finish(&name, STORE_REMEDY)?;
+            return self.remote.write(target, bytes).await;
         }
-        let part = LEAST_PART_BYTES.max(entry.size.div_ceil(MOST_PARTS));
-        let staged = self.remote.staged(to);
-        let upload = self
-            .remote
-            .files
-            .put_multipart(&staged)
-            .await
-            .with_context(|| self.remote.failed(to))?;
-        let mut upload = WriteMultipart::new_with_chunk_size(upload, part as usize);
-        match self.write_parts(&mut upload, file, part, checked, from).await {
+        let part_bytes = MIN_PART_BYTES.max(entry.size.div_ceil(MAX_PARTS));
+        let staged = self.remote.staged_path(target);
+        let upload = self.remote.files.put_multipart(&staged).await;
+        let upload = upload.with_context(|| self.remote.name_with_hint(target))?;
+        let mut upload = WriteMultipart::new_with_chunk_size(upload, part_bytes as usize);
+        match self.write_parts(&mut upload, &file, part_bytes, check, source).await {
             Ok(()) => {
-                upload.finish().await.with_context(|| self.remote.failed(to))?;
-                self.remote.place(&staged, to).await
+                let finished = upload.finish().await;
+                finished.with_context(|| self.remote.name_with_hint(target))?;
+                self.remote.publish(&staged, target).await
             }
             Err(error) => {
-                // The first error counts, whatever became of the clean-up.
+                // The first error is reported, even if the clean-up fails.
                 upload.abort().await.ok();
                 Err(error)
             }
@@ -79,93 +79,90 @@ impl Transfer {
     async fn write_parts(
         &self,
         upload: &mut WriteMultipart,
-        file: File,
-        part: u64,
-        mut checked: Checked<'_>,
-        from: &Path,
+        file: &File,
+        part_bytes: u64,
+        mut check: ContentCheck<'_>,
+        source: &Path,
     ) -> anyhow::Result<()> {
+        let name = source.display();
         loop {
-            let mut bytes = Vec::with_capacity(part as usize);
-            (&file)
-                .take(part)
-                .read_to_end(&mut bytes)
-                .with_context(|| from.display().to_string())?;
+            let mut bytes = Vec::with_capacity(part_bytes as usize);
+            let read = file.take(part_bytes).read_to_end(&mut bytes);
+            read.with_context(|| name.to_string())?;
             if bytes.is_empty() {
-                return checked.finish(&from.display(), LOCAL_REMEDY);
+                return check.finish(&name, STORE_REMEDY);
             }
-            checked.take(&bytes, &self.progress, &from.display())?;
+            check.add(&bytes, &self.progress, &name)?;
             upload.wait_for_capacity(2).await?;
             upload.put(bytes.into());
         }
     }
 
-    /// Fetches a file of an artifact into a scratch folder; one that isn't what the manifest says
-    /// is refused.
+    /// Downloads a file of an artifact into a scratch folder. Fails if it differs from the manifest.
     pub(crate) async fn download(
         &self,
-        from: &str,
-        to: &Path,
+        source: &str,
+        target: &Path,
         entry: &FileEntry,
     ) -> anyhow::Result<()> {
-        let _place = self.places.acquire().await?;
-        let name = self.remote.name(from);
-        let Some(found) = self.remote.get(from).await? else {
-            return Err(
-                Failure::BadInput(format!("{name}: it is not there; {REMOTE_REMEDY}")).into()
-            );
+        let _slot = self.slots.acquire().await?;
+        let name = self.remote.name(source);
+        let Some(found) = self.remote.get(source).await? else {
+            return Err(Failure::BadInput(format!("{name}: not found; {REMOTE_REMEDY}")).into());
         };
-        let mut file = create(to)?;
-        let mut checked = Checked::new(entry);
+        let mut file = create_file(target)?;
+        let mut check = ContentCheck::new(entry);
         let mut stream = found.into_stream();
         while let Some(piece) = stream.next().await {
-            let piece = piece.map_err(|error| self.remote.unreadable(from, error))?;
-            checked.take(&piece, &self.progress, &name)?;
-            file.write_all(&piece).with_context(|| to.display().to_string())?;
+            let piece = piece.map_err(|error| self.remote.read_error(source, error))?;
+            check.add(&piece, &self.progress, &name)?;
+            file.write_all(&piece).with_context(|| target.display().to_string())?;
         }
-        checked.finish(&name, REMOTE_REMEDY)
+        check.finish(&name, REMOTE_REMEDY)
     }
 }
 
-const LOCAL_REMEDY: &str = "the artifact is damaged: `nerf-sr verify --remove`, then run again";
-const REMOTE_REMEDY: &str = "nothing of its artifact is taken in; delete this file and the \
-    action's record there, and push from a whole store";
+/// Remedy for a damaged artifact of the store.
+pub(crate) const STORE_REMEDY: &str =
+    "the artifact is damaged: `nerf-sr verify --remove`, then run again";
+const REMOTE_REMEDY: &str = "the artifact was not pulled; delete this file and the action's record \
+    on the remote, and push again from a complete store";
 
-/// Compares a stream with what a manifest says of it.
-pub(crate) struct Checked<'a> {
+/// Comparison of a file's content with its manifest, piece by piece.
+pub(crate) struct ContentCheck<'a> {
     entry: &'a FileEntry,
     size: u64,
     hasher: blake3::Hasher,
 }
 
-impl<'a> Checked<'a> {
+impl<'a> ContentCheck<'a> {
     pub(crate) fn new(entry: &'a FileEntry) -> Self {
         Self { entry, size: 0, hasher: blake3::Hasher::new() }
     }
 
-    /// The next piece; an error as soon as there is too much.
-    pub(crate) fn take(
+    /// Adds the next piece. Fails if the content is too long.
+    pub(crate) fn add(
         &mut self,
         piece: &[u8],
         progress: &Progress,
         name: &dyn std::fmt::Display,
-    ) -> anyhow::Result<()> {
+    ) -> Result<(), Failure> {
         self.size += piece.len() as u64;
-        if self.size > self.entry.size {
-            let expected = self.entry.size;
-            return Err(Failure::BadInput(format!(
-                "{name}: more than the {expected} bytes that the manifest says"
-            ))
-            .into());
+        let expected = self.entry.size;
+        if self.size > expected {
+            let problem = format!("{name}: more than the {expected} bytes in the manifest");
+            return Err(Failure::BadInput(problem));
         }
         self.hasher.update(piece);
-        Ok(progress.add(piece.len() as u64)?)
+        progress.add(piece.len() as u64)
     }
 
+    /// Fails if the complete content differs from the manifest.
     pub(crate) fn finish(self, name: &dyn std::fmt::Display, remedy: &str) -> anyhow::Result<()> {
         let problem = if self.size != self.entry.size {
-            format!("{} bytes where the manifest says {}", self.size, self.entry.size)
+            format!("{} bytes, but {} in the manifest", self.size, self.entry.size)
         } else if self.hasher.finalize().to_hex().as_str() != self.entry.blake3 {
-            "the content is not what was written (blake3 differs)".to_owned()
+            "the content has changed (blake3 differs)".to_owned()
         } else {
             return Ok(());
         };
@@ -173,25 +170,26 @@ impl<'a> Checked<'a> {
     }
 }
 
-/// Carries out tasks, some at once, until one fails; what the others began is dropped.
-pub(crate) async fn all<T: Send + 'static>(
+/// Runs tasks concurrently and returns their results in order of completion. If one fails, the
+/// others are cancelled.
+pub(crate) async fn run_all<T: Send + 'static>(
     tasks: impl Iterator<Item = impl Future<Output = anyhow::Result<T>> + Send + 'static>,
 ) -> anyhow::Result<Vec<T>> {
     let mut results = Vec::new();
     let mut running = tokio::task::JoinSet::new();
     for task in tasks {
-        if running.len() >= FILES_AT_ONCE {
-            results.extend(next(&mut running).await?);
+        if running.len() >= MAX_CONCURRENT_FILES {
+            results.extend(next_result(&mut running).await?);
         }
         running.spawn(task);
     }
-    while let Some(result) = next(&mut running).await? {
+    while let Some(result) = next_result(&mut running).await? {
         results.push(result);
     }
     Ok(results)
 }
 
-async fn next<T: 'static>(
+async fn next_result<T: 'static>(
     running: &mut tokio::task::JoinSet<anyhow::Result<T>>,
 ) -> anyhow::Result<Option<T>> {
     running.join_next().await.transpose()?.transpose()

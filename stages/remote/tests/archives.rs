@@ -94,10 +94,10 @@ fn what_is_not_whole_is_not_exported() {
         &store,
         &records[3].key(),
         3,
-        "metrics.json: the content is not what was written",
+        "metrics.json: the content has changed",
     );
     fs::remove_file(&path).unwrap();
-    assert_not_exported(dir.path(), &store, &records[3].key(), 3, "the artifact is not whole");
+    assert_not_exported(dir.path(), &store, &records[3].key(), 3, "the artifact is incomplete");
 }
 
 /// An entry of an archive, as bytes say it.
@@ -201,7 +201,7 @@ const HARM: &[(&str, Harm)] = &[
     ("not a path inside", |s| s.manifest(|m| m.files[0].path = "/tmp/evil".into())),
     ("not the path of", |s| s.manifest(|m| m.files[0].path = "artifact.json".into())),
     ("not sorted", |s| s.manifest(|m| m.files.push(m.files[0].clone()))),
-    ("sizes that no disk has", |s| {
+    ("the total size exceeds 64 bits", |s| {
         s.manifest(|m| {
             let huge = ["x", "y"].map(|path| FileEntry {
                 path: path.into(),
@@ -212,48 +212,52 @@ const HARM: &[(&str, Harm)] = &[
         });
     }),
     ("schema 2", |s| s.manifest(|m| m.schema = 2)),
-    ("no plain file (Symlink)", |s| s.entries[FILE].kind = tar::EntryType::Symlink),
-    ("no plain file (Link)", |s| s.entries[FILE].kind = tar::EntryType::Link),
-    ("no plain file (Directory)", |s| s.entries[FILE].kind = tar::EntryType::Directory),
-    ("no plain file (Fifo)", |s| s.entries[FILE].kind = tar::EntryType::Fifo),
-    ("no plain file (GNUSparse)", |s| s.entries[FILE].kind = tar::EntryType::GNUSparse),
-    ("no plain file (XHeader)", |s| s.entries[FILE].kind = tar::EntryType::XHeader),
-    ("where \"export.json\"", |s| {
+    ("not a regular file (Symlink)", |s| s.entries[FILE].kind = tar::EntryType::Symlink),
+    ("not a regular file (Link)", |s| s.entries[FILE].kind = tar::EntryType::Link),
+    ("not a regular file (Directory)", |s| s.entries[FILE].kind = tar::EntryType::Directory),
+    ("not a regular file (Fifo)", |s| s.entries[FILE].kind = tar::EntryType::Fifo),
+    ("not a regular file (GNUSparse)", |s| s.entries[FILE].kind = tar::EntryType::GNUSparse),
+    ("not a regular file (XHeader)", |s| s.entries[FILE].kind = tar::EntryType::XHeader),
+    ("expected \"export.json\"", |s| {
         let long = vec![b'x'; 1 << 20];
         s.entries.insert(0, Entry { kind: tar::EntryType::GNULongName, ..plain("long", &long) });
     }),
-    ("no plain file (GNULongName)", |s| {
+    ("not a regular file (GNULongName)", |s| {
         let long = Entry { kind: tar::EntryType::GNULongName, ..plain("long", b"export.json") };
         s.entries.splice(0..0, [long.clone(), long]);
     }),
-    ("17 bytes where the manifest says 15", |s| s.entries[FILE].bytes.extend(b"  ")),
-    ("14 bytes where the manifest says 15", |s| s.entries[FILE].bytes.truncate(14)),
-    ("9000000000 bytes where", |s| s.entries[FILE].size = Some(9_000_000_000)),
+    ("17 bytes, but 15 in the manifest", |s| s.entries[FILE].bytes.extend(b"  ")),
+    ("14 bytes, but 15 in the manifest", |s| s.entries[FILE].bytes.truncate(14)),
+    ("9000000000 bytes, but", |s| s.entries[FILE].size = Some(9_000_000_000)),
     ("has 9000000000 bytes, more than", |s| s.entries[INDEX].size = Some(9_000_000_000)),
     ("has 9000000000 bytes, more than", |s| s.entries[RECORD].size = Some(9_000_000_000)),
-    ("it ends within", |s| s.entries[RECORD].size = Some(1_000_000)),
-    ("metrics.json: the content is not what was written", |s| s.entries[FILE].bytes[3] ^= 1),
-    ("its blake3 is not the artifact's name", |s| {
+    ("the archive ends within", |s| s.entries[RECORD].size = Some(1_000_000)),
+    ("metrics.json: the content has changed", |s| s.entries[FILE].bytes[3] ^= 1),
+    ("its blake3 differs from the artifact's name", |s| {
         let manifest = Manifest { kind: "other".into(), ..s.manifest.clone() };
         s.entries[MANIFEST].bytes = serde_json::to_vec(&manifest).unwrap();
     }),
     ("not a manifest", |s| s.entries[MANIFEST].bytes = b"[]".to_vec()),
     ("not a record", |s| s.entries[RECORD].bytes = b"{}".to_vec()),
-    ("its key is not its name", |s| s.record(|r| drop(r.key_parts.insert("x".into(), json!(1))))),
+    ("its key differs from its name", |s| {
+        s.record(|r| drop(r.key_parts.insert("x".into(), json!(1))))
+    }),
     ("is not a hash", |s| s.record(|r| r.output = "../../../evil".into())),
     ("is not a hash", |s| s.record(|r| r.made_of = vec!["/tmp/evil".into()])),
-    ("no record says what made", |s| s.record(|r| r.output = "0".repeat(64))),
-    ("no record says what made", |s| s.index(|i| i["artifact"] = json!("0".repeat(64)))),
-    ("no sorted hashes", |s| s.index(|i| i["objects"] = json!(["../../evil"]))),
-    ("no sorted hashes", |s| s.index(|i| i["actions"] = json!([i["actions"][0], i["actions"][0]]))),
+    ("no record of the artifact", |s| s.record(|r| r.output = "0".repeat(64))),
+    ("no record of the artifact", |s| s.index(|i| i["artifact"] = json!("0".repeat(64)))),
+    ("not sorted hashes", |s| s.index(|i| i["objects"] = json!(["../../evil"]))),
+    ("not sorted hashes", |s| {
+        s.index(|i| i["actions"] = json!([i["actions"][0], i["actions"][0]]))
+    }),
     ("export format 2", |s| s.index(|i| i["export"] = json!(2))),
     ("store format 2", |s| s.index(|i| i["store"] = json!(2))),
     ("export format null", |s| s.index(|i| *i = json!([]))),
     ("unknown field `more`", |s| s.index(|i| i["more"] = json!(1))),
-    ("where the end should be", |s| s.entries.push(plain("more", b""))),
-    ("it ends before \"actions/", |s| s.entries.truncate(RECORD)),
-    ("where \"export.json\" should follow", |s| drop(s.entries.remove(INDEX))),
-    ("where \"objects/", |s| s.entries.swap(MANIFEST, FILE)),
+    ("after the last entry", |s| s.entries.push(plain("more", b""))),
+    ("the archive ends before \"actions/", |s| s.entries.truncate(RECORD)),
+    ("expected \"export.json\", found", |s| drop(s.entries.remove(INDEX))),
+    ("expected \"objects/", |s| s.entries.swap(MANIFEST, FILE)),
 ];
 
 fn small_export(dir: &Path) -> (Vec<Entry>, Record, Manifest) {
@@ -318,8 +322,8 @@ fn cut_and_flipped_archives() {
     for length in [0, 1, 511, 512, 700, 1024, 1536, 2048, 2600, end - 600, end - 512] {
         refused(dir.path(), &whole[..length], "");
     }
-    refused(dir.path(), b"neither tar nor anything else\n", "no tar file");
-    refused(dir.path(), &vec![b'x'; 2048], "no tar file");
+    refused(dir.path(), b"neither tar nor anything else\n", "not a tar file");
+    refused(dir.path(), &vec![b'x'; 2048], "not a tar file");
     for place in (0..end).step_by(41) {
         let mut bytes = whole.clone();
         bytes[place] ^= 1;

@@ -19,12 +19,12 @@ fn what_is_pushed_is_pulled() {
     let setup = Setup::new();
     let remote = setup.remote();
     let out = succeed(&mut command(setup.store.root(), &["push", &remote]));
-    assert!(out.contains("4 actions pushed (13.6 MB), 0 there already"), "{out}");
+    assert!(out.contains("4 actions pushed (13.6 MB), 0 already present"), "{out}");
     let out = succeed(&mut command(setup.store.root(), &["push", &remote]));
-    assert!(out.contains("0 actions pushed (0 bytes), 4 there already"), "{out}");
+    assert!(out.contains("0 actions pushed (0 bytes), 4 already present"), "{out}");
     assert!(setup.store.runs().unwrap().is_empty(), "a push keeps nothing longer");
     let out = succeed(&mut command(&setup.path("other"), &["pull", &remote]));
-    assert!(out.contains("4 actions pulled (13.6 MB), 0 here already"), "{out}");
+    assert!(out.contains("4 actions pulled (13.6 MB), 0 already present"), "{out}");
     let other = Store::open(&setup.path("other")).unwrap();
     assert_equal(&setup.store, &other);
     assert_tidy(&other);
@@ -34,7 +34,7 @@ fn what_is_pushed_is_pulled() {
         "collection must leave what was pulled"
     );
     let out = succeed(&mut command(&setup.path("other"), &["pull", &remote]));
-    assert!(out.contains("0 actions pulled (0 bytes), 4 here already"), "{out}");
+    assert!(out.contains("0 actions pulled (0 bytes), 4 already present"), "{out}");
     // The layout is a store's.
     let train = &setup.records[2];
     for file in [
@@ -130,19 +130,19 @@ fn harm_is_refused_by_name() {
         ("metrics.json", "more than the 15 bytes", |s| {
             edit(&on_remote(s, 3, "metrics.json"), |b| b.push(b' '));
         }),
-        ("metrics.json", "14 bytes where the manifest says 15", |s| {
+        ("metrics.json", "14 bytes, but 15 in the manifest", |s| {
             edit(&on_remote(s, 3, "metrics.json"), |b| b.truncate(14));
         }),
-        ("metrics.json", "it is not there", |s| {
+        ("metrics.json", "not found", |s| {
             fs::remove_file(on_remote(s, 3, "metrics.json")).unwrap();
         }),
-        (MANIFEST_FILE, "it is not there", |s| {
+        (MANIFEST_FILE, "not found", |s| {
             fs::remove_file(on_remote(s, 3, MANIFEST_FILE)).unwrap();
         }),
         (MANIFEST_FILE, "not a manifest", |s| {
             edit(&on_remote(s, 3, MANIFEST_FILE), |b| b.truncate(20));
         }),
-        (MANIFEST_FILE, "its blake3 is not the artifact's name", |s| {
+        (MANIFEST_FILE, "its blake3 differs from the artifact's name", |s| {
             fs::copy(on_remote(s, 0, MANIFEST_FILE), on_remote(s, 3, MANIFEST_FILE))
                 .map(|_| ())
                 .unwrap();
@@ -178,7 +178,7 @@ fn harm_is_refused_by_name() {
             lead_outside(s, &format!("{}x", "a/".repeat(400)));
         }),
         (".json", "not a record", |s| edit(&record_file(s, 3), |b| b.truncate(40))),
-        (".json", "its key is not its name", |s| {
+        (".json", "its key differs from its name", |s| {
             fs::copy(record_file(s, 0), record_file(s, 3)).map(|_| ()).unwrap();
         }),
         (".json", "\"../../evil\" is not a hash", |s| {
@@ -304,11 +304,11 @@ fn other_formats_and_places_are_refused_in_one_line() {
     fs::remove_file(setup.path("remote/format")).unwrap();
     refused(&["pull", &remote], &setup.path("other"), 3, "nothing was pushed here");
     let inside = store.display().to_string();
-    refused(&["push", &inside], store, 2, "a store of nerf-sr's own");
-    refused(&["pull", "gs://bucket"], &setup.path("other"), 2, "gs:// is not known");
-    refused(&["pull", "s3://"], &setup.path("other"), 2, "names no bucket");
+    refused(&["push", &inside], store, 2, "the folder is a store");
+    refused(&["pull", "gs://bucket"], &setup.path("other"), 2, "unknown scheme gs://");
+    refused(&["pull", "s3://"], &setup.path("other"), 2, "bucket missing");
     refused(&["pull", "/nowhere"], &setup.path("other"), 3, "no such folder");
-    refused(&["push", &remote], &setup.path("none"), 3, "no store of nerf-sr");
+    refused(&["push", &remote], &setup.path("none"), 3, "not a store of nerf-sr");
     assert!(!setup.path("none").exists());
     fs::write(store.join("format"), "2\n").unwrap();
     for words in [&["push", &remote][..], &["export", "abc", "/tmp/x.tar"]] {

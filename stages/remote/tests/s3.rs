@@ -106,7 +106,7 @@ fn two_machines_share_a_store_through_s3() {
         "{err}"
     );
     let out = server.succeed(store.root(), &["push", REMOTE]);
-    assert!(out.contains("4 actions pushed (13.6 MB), 0 there already"), "{out}");
+    assert!(out.contains("4 actions pushed (13.6 MB), 0 already present"), "{out}");
     server.succeed(&place("other"), &["pull", REMOTE]);
     let other = Store::open(&place("other")).unwrap();
     assert_equal(&store, &other);
@@ -114,12 +114,12 @@ fn two_machines_share_a_store_through_s3() {
     assert!(
         server
             .succeed(store.root(), &["push", REMOTE])
-            .contains("0 actions pushed (0 bytes), 4 there already")
+            .contains("0 actions pushed (0 bytes), 4 already present")
     );
     assert!(
         server
             .succeed(other.root(), &["pull", REMOTE])
-            .contains("0 actions pulled (0 bytes), 4 here already")
+            .contains("0 actions pulled (0 bytes), 4 already present")
     );
     // What another machine makes comes back.
     make(&other, "more", &[&records[3]], &[("x", bytes(1000, 9))]);
@@ -135,7 +135,7 @@ fn two_machines_share_a_store_through_s3() {
     server.request("PUT", &path, &content);
     let (code, _, err) = said(&mut server.command(&place("third"), &["pull", REMOTE]));
     assert!(
-        code == 3 && err.contains(&format!("{REMOTE}/{file}: the content is not what was written")),
+        code == 3 && err.contains(&format!("{REMOTE}/{file}: the content has changed")),
         "{err}"
     );
     let third = Store::open(&place("third")).unwrap();

@@ -84,7 +84,7 @@ impl Store {
     /// [`Store::verify`].
     pub fn hit(&self, key: &str) -> Result<Option<Record>, StoreError> {
         let Some(record) = self.record(key)? else { return Ok(None) };
-        Ok(self.is_whole(&record.output)?.then_some(record))
+        Ok(self.is_complete(&record.output)?.then_some(record))
     }
 
     /// Returns the record like [`Store::hit`], and rewrites a missing or damaged manifest of an
@@ -96,8 +96,8 @@ impl Store {
         kind: &str,
     ) -> Result<Option<Record>, StoreError> {
         let Some(record) = self.record(key)? else { return Ok(None) };
-        let is_whole = self.is_whole(&record.output)? || self.repair(&record.output, kind)?;
-        Ok(is_whole.then_some(record))
+        let is_complete = self.is_complete(&record.output)? || self.repair(&record.output, kind)?;
+        Ok(is_complete.then_some(record))
     }
 
     /// Returns the record of a key. A damaged record counts as absent, so that the action runs again.

@@ -36,7 +36,7 @@ impl Store {
     /// Moves a checked object into place, unless the store has a complete one.
     pub fn import_object(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
         // An object that another process has stored meanwhile must not vanish even for a moment.
-        let is_stored = !arrival.replaces && self.is_whole(&arrival.identity)?;
+        let is_stored = !arrival.replaces && self.is_complete(&arrival.identity)?;
         self.install_object(&arrival.folder, &arrival.identity, is_stored)
     }
 
@@ -45,8 +45,8 @@ impl Store {
     pub fn import_record(&self, _: &Entered, record: &Record) -> Result<bool, StoreError> {
         if let Some(existing) = self.record(&record.key())?
             && (existing == *record
-                || self.is_whole(&existing.output)?
-                || !self.is_whole(&record.output)?)
+                || self.is_complete(&existing.output)?
+                || !self.is_complete(&record.output)?)
         {
             return Ok(false);
         }

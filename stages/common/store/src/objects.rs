@@ -31,7 +31,7 @@ impl Store {
 
     /// Returns whether an object is complete: it has its own manifest and all files of the right
     /// sizes, whose content is not read. Fails if the object can't be read.
-    pub fn is_whole(&self, identity: &str) -> Result<bool, Damage> {
+    pub fn is_complete(&self, identity: &str) -> Result<bool, Damage> {
         let manifest = self.own_manifest(identity);
         match manifest.and_then(|manifest| manifest.check_sizes(&self.object(identity))) {
             Ok(()) => Ok(true),
@@ -173,7 +173,7 @@ mod tests {
             damage(&path);
             let checked = store.check(begin(&store, "b", Some("1234")), "text").unwrap();
             for problem in [
-                store.is_whole(&done.output).map_err(StoreError::from).err(),
+                store.is_complete(&done.output).map_err(StoreError::from).err(),
                 store.hit(&done.key()).err(),
                 store.verify(&done.output).map_err(StoreError::from).err(),
                 store.publish(&entered(&store), checked, Record::default()).err(),

@@ -189,7 +189,10 @@ mod tests {
             assert_eq!((store.runs().is_ok(), store.pins().is_ok()), (is_run, is_pin), "{text:?}");
             if let Err(error) = store.runs() {
                 let said = error.to_string();
-                assert!(said.contains("runs/x.jsonl") && said.contains("move it away"), "{said}");
+                assert!(
+                    said.contains("runs/x.jsonl") && said.contains("move the file away"),
+                    "{said}"
+                );
             }
             if let Err(error) = store.pins() {
                 let said = error.to_string();
