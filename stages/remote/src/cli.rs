@@ -43,14 +43,14 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Verb {
-    /// Copy actions that the remote lacks from the store
+    /// Copy missing actions to the remote
     Push {
         /// A folder or s3://bucket/prefix
         remote: String,
         #[command(flatten)]
         selection: Selection,
     },
-    /// Copy actions that the store lacks from the remote, after verification
+    /// Copy missing actions from the remote, after verification
     Pull {
         /// A folder or s3://bucket/prefix
         remote: String,

@@ -1,8 +1,9 @@
 //! A folder as a remote: the parts that `object_store` doesn't provide.
 //!
-//! `object_store` reads and writes files, but blocks on named pipes, and ends a listing at the first
-//! unreadable entry. Here one bad entry doesn't affect the others. Each push also has a folder for
-//! incomplete files, which `object_store` would leave next to complete ones when it is killed.
+//! `object_store` reads and writes files, but blocks on named pipes, and ends a listing at the
+//! first unreadable entry. Here one bad entry doesn't affect the others. Each push also has a
+//! folder for incomplete files, which `object_store` would leave next to complete ones when it is
+//! killed.
 
 use std::fs;
 use std::io;
@@ -133,7 +134,8 @@ impl Listing {
 }
 
 /// Idle time after which the process of a temporary file counts as killed. A live process writes
-/// many times a second; the margin, chosen by hand, covers clock differences and suspended machines.
+/// many times a second; the margin, chosen by hand, covers clock differences and suspended
+/// machines.
 const MIN_IDLE_TIME: Duration = Duration::from_secs(3600);
 
 /// Prefix and suffix of the names of temporary files.

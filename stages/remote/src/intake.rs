@@ -156,8 +156,8 @@ fn has_valid_path(file: &FileEntry) -> bool {
         && file.path.split('/').count() <= MAX_DEPTH
 }
 
-/// Creates a file of an artifact in a scratch folder. A path that the file system doesn't support is
-/// bad input; any other error would concern all files.
+/// Creates a file of an artifact in a scratch folder. A path that the file system doesn't support
+/// is bad input; any other error would concern all files.
 pub(crate) fn create_file(path: &Path) -> anyhow::Result<File> {
     let folder = path.parent().unwrap_or(path);
     fs::create_dir_all(folder).and_then(|()| File::create_new(path)).map_err(|error| {

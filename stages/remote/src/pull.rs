@@ -62,8 +62,8 @@ pub(crate) async fn pull(
     }
 }
 
-/// Fetches the records of the selected actions that the store lacks. Returns them with the number of
-/// selected actions that the store has.
+/// Fetches the records of the selected actions that the store lacks. Returns them with the number
+/// of selected actions that the store has.
 async fn fetch_missing_records(
     store: &Store,
     remote: &Remote,
@@ -210,8 +210,8 @@ async fn fetch_object(
     Ok((intake.import(Some(&arrival), &records)?, bytes))
 }
 
-/// Returns bad input as the inner error, since it doesn't affect other artifacts, and any other error
-/// as the outer one.
+/// Returns bad input as the inner error, since it doesn't affect other artifacts, and any other
+/// error as the outer one.
 async fn separate_bad_input<T>(
     task: impl Future<Output = anyhow::Result<T>>,
 ) -> anyhow::Result<anyhow::Result<T>> {

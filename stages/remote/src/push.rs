@@ -81,8 +81,8 @@ async fn push_records(
     Ok((actions, total))
 }
 
-/// Pushes an artifact's files, then its manifest, then its records, so that a remote's records refer
-/// to complete artifacts.
+/// Pushes an artifact's files, then its manifest, then its records, so that a remote's records
+/// refer to complete artifacts.
 async fn push_object(
     store: Store,
     transfer: Arc<Transfer>,

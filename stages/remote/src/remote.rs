@@ -64,7 +64,8 @@ impl Remote {
             Some(("s3", rest)) => Self::open_s3(rest.trim_end_matches('/'), name),
             Some((scheme, _)) => {
                 let message = format!(
-                    "{location}: unknown scheme {scheme}://; a remote is a folder or s3://bucket/prefix"
+                    "{location}: unknown scheme {scheme}://; a remote is a folder or \
+                    s3://bucket/prefix"
                 );
                 Err(Failure::Usage(message).into())
             }
@@ -100,7 +101,8 @@ impl Remote {
         })
     }
 
-    /// Opens a prefix of an S3 bucket; credentials, region and endpoint come from `AWS_…` variables.
+    /// Opens a prefix of an S3 bucket; credentials, region and endpoint come from `AWS_…`
+    /// variables.
     fn open_s3(rest: &str, name: String) -> anyhow::Result<Self> {
         let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
         if bucket.is_empty() {

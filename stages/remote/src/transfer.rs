@@ -16,8 +16,8 @@ use crate::remote::Remote;
 
 /// Maximum number of concurrent transfers, and number of threads. Chosen by hand.
 pub(crate) const MAX_CONCURRENT_FILES: usize = 8;
-/// Minimum size of a part in bytes; larger files are uploaded in parts. At most three parts of a file
-/// are in memory. S3 requires at least 5 MiB.
+/// Minimum size of a part in bytes; larger files are uploaded in parts. At most three parts of a
+/// file are in memory. S3 requires at least 5 MiB.
 const MIN_PART_BYTES: u64 = 6 << 20;
 /// Maximum number of parts of a file; S3 supports 10,000.
 const MAX_PARTS: u64 = 9_000;
@@ -98,7 +98,8 @@ impl Transfer {
         }
     }
 
-    /// Downloads a file of an artifact into a scratch folder. Fails if it differs from the manifest.
+    /// Downloads a file of an artifact into a scratch folder. Fails if it differs from the
+    /// manifest.
     pub(crate) async fn download(
         &self,
         source: &str,

@@ -107,9 +107,9 @@ pub enum OutputFileError {
     Io(#[from] io::Error),
 }
 
-/// Lists the regular files of a stage's output, sorted by name. Fails if the output is not a folder,
-/// or contains anything but folders and regular files. Links are refused because they would couple
-/// the artifact to files of the user.
+/// Lists the regular files of a stage's output, sorted by name. Fails if the output is not a
+/// folder, or contains anything but folders and regular files. Links are refused because they would
+/// couple the artifact to files of the user.
 pub fn list_output_files(output: &Path) -> Result<Vec<(PathBuf, Metadata)>, OutputFileError> {
     let mut files = Vec::new();
     let entries = walkdir::WalkDir::new(output).follow_root_links(false).sort_by_file_name();

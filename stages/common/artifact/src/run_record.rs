@@ -139,7 +139,7 @@ pub fn label(stage: &str, point: &str) -> String {
 
 /// Error returned for a node that requires a later one.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("run.json: {stage}{} requires a node that doesn't precede it", input_text(.input.as_deref()))]
+#[error("run.json: {stage}{} requires a later node", input_text(.input.as_deref()))]
 pub struct RunRecordError {
     stage: String,
     /// Input that refers to the later node; `None` for an unfinished node.

@@ -1,7 +1,7 @@
 //! Text of messages: printing, escaping, numbers, suggestions for misspelled names, and warnings.
 //!
-//! Printing never fails: if the reader of stdout or stderr is gone (`| head -1`, a closed terminal),
-//! the program continues with the same exit code.
+//! Printing never fails: if the reader of stdout or stderr is gone (`| head -1`, a closed
+//! terminal), the program continues with the same exit code.
 
 use std::borrow::Cow;
 use std::io::Write;

@@ -80,8 +80,8 @@ impl Schema {
         given.extend(later);
     }
 
-    /// Returns all parameters, with defaults for those not given, as they are hashed and passed to
-    /// the stage.
+    /// Returns all parameters, with defaults for those not given, in the form that is hashed and
+    /// passed to the stage.
     pub fn resolve(&self, given: &Map<String, Value>) -> Result<Value, Vec<ParameterProblem>> {
         let given = self.flattened(given);
         let variant = self.selected_variant(&given);
@@ -187,8 +187,8 @@ impl VariantSchema {
         ParameterProblem { name: if name.is_empty() { "(all)".to_owned() } else { name }, problem }
     }
 
-    /// Returns the allowed values of a choice as JSON. The validator's own message only says that no
-    /// alternative fits.
+    /// Returns the allowed values of a choice as JSON. The validator's own message only says that
+    /// no alternative fits.
     fn choices(&self, name: &str) -> Option<Vec<String>> {
         let choices = Reader::new(&self.schema).choices(self.property(name)?)?;
         Some(choices.into_iter().map(|(value, _)| value.to_string()).collect())
@@ -277,7 +277,8 @@ mod tests {
         assert_eq!(resolve(&json!({"scale": 4})).unwrap(), all);
     }
 
-    /// Equal values have one form, and so one key; an explicit default and an omitted parameter, too.
+    /// Equal values have one form, and so one key; an explicit default and an omitted parameter,
+    /// too.
     #[test]
     fn equal_values_have_one_form() {
         let unsaid = resolve(&json!({})).unwrap();

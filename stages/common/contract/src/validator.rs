@@ -89,7 +89,8 @@ fn check_schema(root: &Value, schema: &Value) -> Result<(), KeywordError> {
             "minLength" | "maxLength" | "minItems" | "maxItems" => value.is_u64(),
             "$ref" => referred(root, value).is_some(),
             "properties" | "$defs" | "definitions" => value.is_object(),
-            // Further keywords are descriptions, defaults, formats, and extensions such as `x-group`.
+            // Further keywords are descriptions, defaults, formats, and extensions such as
+            // `x-group`.
             other if !UNSUPPORTED.contains(&other) => true,
             other => return Err(KeywordError::Unsupported(other.to_owned())),
         };
@@ -221,7 +222,7 @@ impl<'a> Check<'a> {
         let length = length as u64;
         let [min, max] = [min, max].map(|keyword| keywords.get(keyword).and_then(Value::as_u64));
         if let Some(min) = min.filter(|&min| length < min) {
-            self.report(value, format!("{value} has less than {min} {noun}s"));
+            self.report(value, format!("{value} has fewer than {min} {noun}s"));
         }
         if let Some(max) = max.filter(|&max| length > max) {
             self.report(value, format!("{value} has more than {max} {noun}s"));

@@ -30,9 +30,9 @@ fn values_fit_or_not() {
         (json!({"exclusiveMaximum": 1}), json!(0), json!(1.0), "greater than or equal to"),
         (json!({"multipleOf": 1}), json!(2.0), json!(2.7), "2.7 is not a multiple of 1"),
         (json!({"multipleOf": 0.1}), json!(0.3), json!(0.35), "not a multiple of 0.1"),
-        (json!({"minLength": 2}), json!("äö"), json!("ä"), "has less than 2 characters"),
+        (json!({"minLength": 2}), json!("äö"), json!("ä"), "has fewer than 2 characters"),
         (json!({"maxLength": 2}), json!("äö"), json!("abc"), "has more than 2 characters"),
-        (json!({"minItems": 1}), json!([0]), json!([]), "[] has less than 1 items"),
+        (json!({"minItems": 1}), json!([0]), json!([]), "[] has fewer than 1 items"),
         (json!({"maxItems": 1}), json!([0]), json!([0, 1]), "has more than 1 items"),
         (json!({"items": {"type": "null"}}), json!([null]), json!([null, 1]), "1 is not of type"),
         (

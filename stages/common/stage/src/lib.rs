@@ -4,8 +4,8 @@
 //!   parameters, `describe`, progress, exit codes, interruption and an atomic output for free.
 //! * [`Context`]: inputs, output and checkpoint folder of a running stage.
 //! * [`Progress`], [`Event`]: progress reports for a terminal and for the runner.
-//! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic; the
-//!   runner uses them, too.
+//! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic;
+//!   the runner uses them, too.
 //! * [`available_memory`], [`check_device`]: limits of memory, and the compute device.
 //!
 //! The crate knows neither images nor tensors nor the store. A stage's description is in

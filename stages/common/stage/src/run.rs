@@ -25,9 +25,9 @@ use crate::staging::Staging;
 /// Environment variable with the runner's process id, which tells a stage to watch its runner.
 pub const RUNNER_VARIABLE: &str = "NERF_SR_RUNNER";
 
-/// Runs a stage as a program: parses the arguments, checks and runs the stage, publishes the output,
-/// and maps errors and panics to an exit code. A failure is reported in one line on stderr, and with
-/// `--progress json` also as an event on stdout.
+/// Runs a stage as a program: parses the arguments, checks and runs the stage, publishes the
+/// output, and maps errors and panics to an exit code. A failure is reported in one line on stderr,
+/// and with `--progress json` also as an event on stdout.
 pub fn run_stage<S: Stage>(version: &'static str, code: &str) -> ExitCode {
     run_stage_with::<S>(version, code, std::env::args_os())
 }
@@ -84,32 +84,8 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     if is_for_runner {
         enable_events();
     }
-    let (resolved, params) = read_params::<S::Params>(arguments.params.as_deref(), description)?;
-    let folders = input_folders(&arguments.inputs, description)?;
-    // The runner checks rules about the stages that created the inputs, which are unknown here.
-    let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
-    if let Some(problem) = description.broken_rule(&resolved, &given) {
-        return Err(Failure::Usage(problem).into());
-    }
-    if arguments.from_checkpoint && !S::FROM_CHECKPOINT {
-        let problem = format!(
-            "--from-checkpoint: stage {} doesn't support this option; leave it out",
-            S::NAME
-        );
-        return Err(Failure::Usage(problem).into());
-    }
-    let threads = match arguments.threads {
-        Some(0) => {
-            return Err(Failure::Usage("--threads 0: at least 1 is required".to_owned()).into());
-        }
-        Some(n) => n,
-        None => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
-    };
+    let (params, threads, inputs) = check_arguments::<S>(&arguments, description)?;
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
-    let mut inputs = BTreeMap::new();
-    for (name, folder) in folders {
-        inputs.insert(name.to_owned(), GivenInput::open(name, folder)?);
-    }
     let interrupted = stop_on_signals()?;
     if is_for_runner {
         end_with_runner(Arc::clone(&interrupted))?;
@@ -144,6 +120,39 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     end.claim();
     result?;
     staging.publish(&output)
+}
+
+/// Checks the arguments and returns the parameters, the number of threads, and the inputs.
+fn check_arguments<S: Stage>(
+    arguments: &Arguments,
+    description: &Description,
+) -> anyhow::Result<(S::Params, usize, BTreeMap<String, GivenInput>)> {
+    let (resolved, params) = read_params::<S::Params>(arguments.params.as_deref(), description)?;
+    let folders = input_folders(&arguments.inputs, description)?;
+    // The runner checks rules about the stages that created the inputs, which are unknown here.
+    let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
+    if let Some(problem) = description.broken_rule(&resolved, &given) {
+        return Err(Failure::Usage(problem).into());
+    }
+    if arguments.from_checkpoint && !S::FROM_CHECKPOINT {
+        let problem = format!(
+            "--from-checkpoint: stage {} doesn't support this option; leave it out",
+            S::NAME
+        );
+        return Err(Failure::Usage(problem).into());
+    }
+    let threads = match arguments.threads {
+        Some(0) => {
+            return Err(Failure::Usage("--threads 0: at least 1 is required".to_owned()).into());
+        }
+        Some(n) => n,
+        None => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+    };
+    let mut inputs = BTreeMap::new();
+    for (name, folder) in folders {
+        inputs.insert(name.to_owned(), GivenInput::open(name, folder)?);
+    }
+    Ok((params, threads, inputs))
 }
 
 /// Interrupts the stage when its runner is killed, so that it writes a checkpoint and doesn't keep

@@ -10,8 +10,8 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::panics::end_process;
 
-/// Time after a signal in which a stage may write a checkpoint and end by itself. Chosen by hand, so
-/// that the process ends within two seconds, including the time to free many gigabytes.
+/// Time after a signal in which a stage may write a checkpoint and end by itself. Chosen by hand,
+/// so that the process ends within two seconds, including the time to free many gigabytes.
 const GRACE_PERIOD: Duration = Duration::from_secs(1);
 /// Interval between checks of the flag that signals set.
 const CHECK_INTERVAL: Duration = Duration::from_millis(50);

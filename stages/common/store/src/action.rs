@@ -100,7 +100,8 @@ impl Store {
         Ok(is_complete.then_some(record))
     }
 
-    /// Returns the record of a key. A damaged record counts as absent, so that the action runs again.
+    /// Returns the record of a key. A damaged record counts as absent, so that the action runs
+    /// again.
     pub fn record(&self, key: &str) -> Result<Option<Record>, StoreError> {
         match self.undamaged_record(key) {
             Err(StoreError::Content { .. }) => Ok(None),

@@ -18,9 +18,9 @@ pub struct Arrival {
 }
 
 impl Store {
-    /// Checks an artifact from another store, its files against the manifest and the manifest against
-    /// the identity, and makes it durable. This step is slow, so that [`Store::import_object`] is
-    /// fast.
+    /// Checks an artifact from another store, its files against the manifest and the manifest
+    /// against the identity, and makes it durable. This step is slow, so that
+    /// [`Store::import_object`] is fast.
     pub fn check_arrival(&self, folder: &Path, identity: &str) -> Result<Arrival, StoreError> {
         let manifest = Manifest::read(folder)?;
         if manifest.identity() != identity {
@@ -40,8 +40,8 @@ impl Store {
         self.install_object(&arrival.folder, &arrival.identity, is_stored)
     }
 
-    /// Writes a record from another store, whose object is imported first; returns whether the record
-    /// was written. An existing record stays, unless only the new one's object is complete.
+    /// Writes a record from another store, whose object is imported first; returns whether the
+    /// record was written. An existing record stays, unless only the new one's object is complete.
     pub fn import_record(&self, _: &Entered, record: &Record) -> Result<bool, StoreError> {
         if let Some(existing) = self.record(&record.key())?
             && (existing == *record

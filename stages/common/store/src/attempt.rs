@@ -55,8 +55,8 @@ impl Attempt {
 }
 
 impl Store {
-    /// Begins an action, whose key the caller has locked. Removes the output of a killed attempt, but
-    /// keeps its checkpoints.
+    /// Begins an action, whose key the caller has locked. Removes the output of a killed attempt,
+    /// but keeps its checkpoints.
     pub fn begin(
         &self,
         _: &Entered,

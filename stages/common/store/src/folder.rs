@@ -65,8 +65,8 @@ impl Store {
         self.root.join("gate")
     }
 
-    /// Lists the names in a folder of the store, sorted and without hidden ones; empty if the folder
-    /// is not found.
+    /// Lists the names in a folder of the store, sorted and without hidden ones; empty if the
+    /// folder is not found.
     pub(crate) fn list_names(&self, folder: &str) -> Result<Vec<String>, StoreError> {
         let folder = self.root.join(folder);
         let mut names = Vec::new();
@@ -79,8 +79,8 @@ impl Store {
         Ok(names)
     }
 
-    /// Moves a file or folder to the trash, which [`Store::empty_trash`] deletes; returns whether it
-    /// existed.
+    /// Moves a file or folder to the trash, which [`Store::empty_trash`] deletes; returns whether
+    /// it existed.
     pub(crate) fn move_to_trash(&self, path: &Path) -> Result<bool, StoreError> {
         use io::ErrorKind::{AlreadyExists, DirectoryNotEmpty};
         loop {

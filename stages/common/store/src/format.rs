@@ -11,8 +11,9 @@ use crate::folder::Store;
 pub const FORMAT: u32 = 1;
 
 impl Store {
-    /// Opens the store in a folder, and creates it if necessary. A store of an older format is marked
-    /// with this one, after which older runners don't change it, including those in progress.
+    /// Opens the store in a folder, and creates it if necessary. A store of an older format is
+    /// marked with this one, after which older runners don't change it, including those in
+    /// progress.
     pub fn open(root: &Path) -> Result<Self, StoreError> {
         Self::open_as(root, FORMAT)
     }

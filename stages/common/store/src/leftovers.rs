@@ -8,8 +8,8 @@ use crate::lock::Closed;
 const FOLDERS: [&str; 5] = ["", "actions", "cache", "cache/sources", "pins"];
 
 impl Store {
-    /// Returns the keys of finished actions whose folder in `partial/` remains, sorted: their runners
-    /// were killed right after writing the record.
+    /// Returns the keys of finished actions whose folder in `partial/` remains, sorted: their
+    /// runners were killed right after writing the record.
     pub fn finished_partials(&self) -> Result<Vec<String>, StoreError> {
         let locked = self.locked_keys()?;
         let mut finished = Vec::new();
@@ -21,8 +21,9 @@ impl Store {
         Ok(finished)
     }
 
-    /// Removes the temporary files of killed processes. A process enters the store to write records,
-    /// pins or the format, so none is writing now. A lost file of `cache` is written again.
+    /// Removes the temporary files of killed processes. A process enters the store to write
+    /// records, pins or the format, so none is writing now. A lost file of `cache` is written
+    /// again.
     pub fn remove_leftovers(&self, _: &Closed) -> Result<(), StoreError> {
         for folder in FOLDERS {
             let folder = self.root().join(folder);

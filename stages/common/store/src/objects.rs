@@ -79,8 +79,9 @@ impl Store {
         Ok(true)
     }
 
-    /// Moves a checked folder into the place of an object, unless the object `is_stored`. Two actions
-    /// may create the same object concurrently: an undamaged object stays, a damaged one is replaced.
+    /// Moves a checked folder into the place of an object, unless the object `is_stored`. Two
+    /// actions may create the same object concurrently: an undamaged object stays, a damaged one is
+    /// replaced.
     pub(crate) fn install_object(
         &self,
         folder: &Path,

@@ -72,7 +72,8 @@ pub struct Run {
 }
 
 impl Run {
-    /// Returns the last time at which the run is known to have been in progress, in seconds since 1970.
+    /// Returns the last time at which the run is known to have been in progress, in seconds since
+    /// 1970.
     pub fn last_used_unix(&self) -> u64 {
         self.ended_unix.or(self.holder.as_ref().map(|h| h.since_unix)).unwrap_or_default()
     }

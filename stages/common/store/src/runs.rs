@@ -164,8 +164,8 @@ mod tests {
     const FIRST: &str = r#"{"run":{"holder":{"pid":1,"host":"h","since_unix":5},"command":[]}}"#;
     const ACTION: &str = r#"{"action":{"stage":"s","key":"k"}}"#;
 
-    /// What a kill or a full disk leaves of a run's file is read as far as it goes. A pin is written
-    /// whole, so it is read whole or not at all.
+    /// What a kill or a full disk leaves of a run's file is read as far as it goes. A pin is
+    /// written whole, so it is read whole or not at all.
     #[test]
     fn damaged_files_of_runs_and_pins_are_errors() {
         let (whole, ended) = (format!("{FIRST}\n{ACTION}\n"), r#"{"ended":{"unix":9}}"#);
