@@ -24,7 +24,7 @@ pub(crate) async fn pull(
     // Metadata is small, so only signals are checked while it is fetched.
     let signals = Arc::new(Progress::new("pull", 0, stop));
     let mut refused = Vec::new();
-    let (missing, known) =
+    let (missing, existing) =
         fetch_missing_records(store, remote, selection, &signals, &mut refused).await?;
     let intake = Arc::new(Intake::begin(store, stop)?);
     let objects = fetch_manifests(&intake, remote, missing, &signals, &mut refused).await?;
@@ -46,7 +46,7 @@ pub(crate) async fn pull(
         transfer.progress.log(problem);
     }
     print_line!(
-        "{}: {} pulled ({}), {known} already present",
+        "{}: {} pulled ({}), {existing} already present",
         remote.name(""),
         counted(actions, "action"),
         sized(bytes)
@@ -82,7 +82,7 @@ async fn fetch_missing_records(
     } else if selection.artifacts.is_empty() && !selection.history {
         keys.retain(|key| selection.keys.iter().any(|start| key.starts_with(start)));
     }
-    let known = count - keys.len();
+    let existing = count - keys.len();
     let tasks = keys
         .into_iter()
         .map(|key| separate_bad_input(fetch_record(remote.clone(), Arc::clone(progress), key)));
@@ -93,8 +93,8 @@ async fn fetch_missing_records(
     let count = selected.len();
     let missing: Vec<Record> =
         keys_without_hit(store, selected)?.iter().filter_map(|key| records.remove(key)).collect();
-    let known = if selection.is_all() { known } else { count - missing.len() };
-    Ok((missing, known))
+    let existing = if selection.is_all() { existing } else { count - missing.len() };
+    Ok((missing, existing))
 }
 
 /// Returns the keys of the actions that the store lacks.

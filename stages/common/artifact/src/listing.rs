@@ -209,7 +209,7 @@ mod tests {
         assert!(list_files(dir.path()).unwrap_err().to_string().contains("train/gone"));
         fs::remove_file(at("train/gone")).unwrap();
         assert_eq!(list_files(dir.path()).unwrap().len(), files.len() + ignored.len());
-        // A link that leads round, or into what may not be read, isn't one to nothing.
+        // A circular link, or one to an unreadable file, is not dangling.
         symlink("round", at("round")).unwrap();
         assert!(list_source_files(dir.path()).unwrap_err().to_string().contains("round"));
     }

@@ -256,7 +256,7 @@ mod tests {
         );
     }
 
-    /// A missing file is damage; a file that can't be read may be whole.
+    /// A missing file is damage; an unreadable one may be undamaged.
     #[test]
     fn missing_and_unreadable_files_differ() {
         let (dir, manifest) = example();

@@ -87,7 +87,7 @@ fn check_schema(root: &Value, schema: &Value) -> Result<(), KeywordError> {
             "minimum" | "maximum" | "exclusiveMinimum" | "exclusiveMaximum" => value.is_number(),
             "multipleOf" => value.as_f64().is_some_and(|step| step > 0.0),
             "minLength" | "maxLength" | "minItems" | "maxItems" => value.is_u64(),
-            "$ref" => referred(root, value).is_some(),
+            "$ref" => resolve_reference(root, value).is_some(),
             "properties" | "$defs" | "definitions" => value.is_object(),
             // Further keywords are descriptions, defaults, formats, and extensions such as
             // `x-group`.
@@ -118,7 +118,7 @@ fn is_type(name: &Value) -> bool {
 }
 
 /// Returns the schema in the same document that a `$ref` refers to.
-fn referred<'a>(root: &'a Value, reference: &Value) -> Option<&'a Value> {
+pub(crate) fn resolve_reference<'a>(root: &'a Value, reference: &Value) -> Option<&'a Value> {
     root.pointer(reference.as_str()?.strip_prefix('#')?)
 }
 
@@ -148,7 +148,9 @@ impl<'a> Check<'a> {
             self.report(value, "its schema refers to itself".to_owned());
             return;
         }
-        if let Some(schema) = keywords.get("$ref").and_then(|to| referred(self.root, to)) {
+        if let Some(schema) =
+            keywords.get("$ref").and_then(|reference| resolve_reference(self.root, reference))
+        {
             self.check_value(schema, value, depth + 1);
         }
         self.check_kind(keywords, value);
@@ -178,11 +180,12 @@ impl<'a> Check<'a> {
                 self.report(value, format!("{value} is not of type{s} {}", names.join(", ")));
             }
         }
-        if let Some(constant) = keywords.get("const").filter(|constant| !equal(constant, value)) {
+        if let Some(constant) = keywords.get("const").filter(|constant| !are_equal(constant, value))
+        {
             self.report(value, format!("{constant} was expected"));
         }
         if let Some(choices) = keywords.get("enum").and_then(Value::as_array)
-            && !choices.iter().any(|choice| equal(choice, value))
+            && !choices.iter().any(|choice| are_equal(choice, value))
         {
             let choices: Vec<String> = choices.iter().map(ToString::to_string).collect();
             self.report(value, format!("{value} is not one of {}", choices.join(", ")));
@@ -311,26 +314,29 @@ fn is_of_type(value: &Value, name: &str) -> bool {
         Value::String(_) => name == "string",
         Value::Array(_) => name == "array",
         Value::Object(_) => name == "object",
-        Value::Number(number) => name == "number" || (name == "integer" && whole(number).is_some()),
+        Value::Number(number) => {
+            name == "number" || (name == "integer" && exact_integer(number).is_some())
+        }
     }
 }
 
 /// Returns whether two values are equal; numbers compare by value, so 2 equals 2.0.
-fn equal(a: &Value, b: &Value) -> bool {
+fn are_equal(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::Number(a), Value::Number(b)) => compare(a, b) == Some(Ordering::Equal),
         (Value::Array(a), Value::Array(b)) => {
-            a.len() == b.len() && a.iter().zip(b).all(|(a, b)| equal(a, b))
+            a.len() == b.len() && a.iter().zip(b).all(|(a, b)| are_equal(a, b))
         }
         (Value::Object(a), Value::Object(b)) => {
-            a.len() == b.len() && a.iter().all(|(name, a)| b.get(name).is_some_and(|b| equal(a, b)))
+            a.len() == b.len()
+                && a.iter().all(|(name, a)| b.get(name).is_some_and(|b| are_equal(a, b)))
         }
         _ => a == b,
     }
 }
 
 /// Returns the exact value of a whole number; `None` for fractions.
-fn whole(number: &Number) -> Option<i128> {
+fn exact_integer(number: &Number) -> Option<i128> {
     /// Bound of the floats that are converted: above 64 bits, and within `i128`.
     const LIMIT: f64 = 1e36;
     if let Some(value) = number.as_u64().map(i128::from).or(number.as_i64().map(i128::from)) {
@@ -340,7 +346,7 @@ fn whole(number: &Number) -> Option<i128> {
 }
 
 fn compare(a: &Number, b: &Number) -> Option<Ordering> {
-    match (whole(a), whole(b)) {
+    match (exact_integer(a), exact_integer(b)) {
         (Some(a), Some(b)) => Some(a.cmp(&b)),
         _ => a.as_f64()?.partial_cmp(&b.as_f64()?),
     }
@@ -349,7 +355,7 @@ fn compare(a: &Number, b: &Number) -> Option<Ordering> {
 fn is_multiple(number: &Number, step: &Number) -> bool {
     /// Tolerance of the ratio: decimal fractions are rounded, yet 0.3 is a multiple of 0.1.
     const ROUNDING: f64 = 1e-9;
-    match (whole(number), whole(step)) {
+    match (exact_integer(number), exact_integer(step)) {
         (Some(number), Some(step)) => number.checked_rem(step) == Some(0),
         _ => {
             let (Some(number), Some(step)) = (number.as_f64(), step.as_f64()) else { return false };

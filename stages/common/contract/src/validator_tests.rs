@@ -138,7 +138,7 @@ fn schemas_that_cannot_be_used() {
     }
 }
 
-/// A schema may use itself for parts of a value, but not for the value itself.
+/// A schema may refer to itself for nested values, but not for the value itself.
 #[test]
 fn schemas_that_lead_back_to_themselves() {
     let tree = json!({"type": "array", "items": {"$ref": "#"}});

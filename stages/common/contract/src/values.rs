@@ -2,6 +2,8 @@
 
 use serde_json::{Number, Value};
 
+use crate::validator::resolve_reference;
+
 /// Reader of values by a schema, whose references are resolved in `root`.
 #[derive(Clone, Copy)]
 pub(crate) struct Reader<'a> {
@@ -97,7 +99,7 @@ impl<'a> Reader<'a> {
 
     /// Returns the schema in the same document that a schema's `$ref` refers to.
     pub(crate) fn referred(&self, schema: &Value) -> Option<&'a Value> {
-        self.root.pointer(schema.get("$ref")?.as_str()?.strip_prefix('#')?)
+        resolve_reference(self.root, schema.get("$ref")?)
     }
 }
 

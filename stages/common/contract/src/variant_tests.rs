@@ -1,4 +1,4 @@
-//! Parameters of which one selects a variant.
+//! Parameters that select a variant.
 
 use serde_json::{Map, Value, json};
 
@@ -95,7 +95,7 @@ fn foreign_and_unknown_parameters_are_refused() {
     }
 }
 
-/// A variant that is selected later comes with its own defaults; what all variants have stays.
+/// A variant that is selected later has its own defaults; common parameters stay.
 #[test]
 fn a_later_choice_drops_what_it_does_not_have() {
     for (earlier, later, expected) in [

@@ -91,15 +91,15 @@ impl Context {
 }
 
 /// Hard-links a file, or copies it if the file system can't link.
-fn link_or_copy(from: &Path, to: &Path) -> anyhow::Result<()> {
-    if let Some(folder) = to.parent() {
+fn link_or_copy(source: &Path, target: &Path) -> anyhow::Result<()> {
+    if let Some(folder) = target.parent() {
         fs::create_dir_all(folder)?;
     }
-    if to.exists() {
-        fs::remove_file(to)?;
+    if target.exists() {
+        fs::remove_file(target)?;
     }
-    if fs::hard_link(from, to).is_err() {
-        fs::copy(from, to)?;
+    if fs::hard_link(source, target).is_err() {
+        fs::copy(source, target)?;
     }
     Ok(())
 }

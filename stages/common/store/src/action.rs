@@ -210,12 +210,12 @@ mod tests {
         fs::remove_file(store.object(&done.output).join("x")).unwrap();
         assert_eq!(store.hit(&done.key()).unwrap(), None);
         assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text").unwrap(), None);
-        // Made again, the damaged object is replaced.
+        // Creating the artifact again replaces the damaged object.
         make(&store, "a", "1234");
         store.verify(&done.output).unwrap();
     }
 
-    /// A record that can't be read is no missing one; each look names it.
+    /// An unreadable record is not a missing one; every access names it.
     #[test]
     fn unreadable_records_are_errors() {
         for damage in UNREADABLE {
@@ -235,8 +235,7 @@ mod tests {
         }
     }
 
-    /// A damaged record counts as absent, unless one asks for it; and so does another action's: a
-    /// swapped file is no hit.
+    /// A damaged record counts as absent, as does one of another action (a swapped file).
     #[test]
     fn damaged_records_are_no_hits() {
         let dir = tempfile::tempdir().unwrap();
@@ -258,7 +257,7 @@ mod tests {
         fs::write(dir.path().join("actions/notes.json"), "mine").unwrap();
         let mut keys = [a.key(), b.key()];
         keys.sort();
-        assert_eq!(store.action_files().unwrap(), keys, "the others are somebody else's");
+        assert_eq!(store.action_files().unwrap(), keys, "other files are foreign");
     }
 
     #[test]
@@ -282,8 +281,7 @@ mod tests {
         }
     }
 
-    /// Whatever became of a manifest, it is written again; whatever stands in an object's place, it
-    /// gives way to the object.
+    /// Damaged manifests are rewritten; anything in the place of an object is replaced.
     #[test]
     fn manifests_are_repaired_and_objects_replaced() {
         let dir = tempfile::tempdir().unwrap();

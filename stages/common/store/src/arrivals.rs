@@ -88,7 +88,7 @@ mod tests {
         (store.import_record(entered, &record(&identity, host)).unwrap(), identity)
     }
 
-    /// The first record of a whole artifact stays; damaged objects give way.
+    /// The first record of a complete artifact stays; damaged objects are replaced.
     #[test]
     fn what_is_whole_stays() {
         let dir = tempfile::tempdir().unwrap();

@@ -153,8 +153,7 @@ mod tests {
         assert!(store.partials().unwrap().is_empty());
     }
 
-    /// Nothing is written through a link, whatever the output is a link to, and the next attempt
-    /// begins anew.
+    /// Links are never followed for writing, and the next attempt starts over.
     #[test]
     fn links_and_special_files_are_refused() {
         type Harm = fn(&Path, &Path);
@@ -185,7 +184,7 @@ mod tests {
         assert_eq!(store.hit(&make(&store, "k", "1").key()).unwrap().unwrap().stage, "k");
     }
 
-    /// A file's other name is the user's: what is written there changes no artifact.
+    /// Writing to a file by its other name doesn't change the artifact.
     #[test]
     fn hard_links_become_copies() {
         let dir = tempfile::tempdir().unwrap();

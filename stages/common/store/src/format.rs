@@ -95,8 +95,7 @@ mod tests {
         }
     }
 
-    /// A newer program marks the store as its own when it opens it. An older one that is at work
-    /// there changes nothing from then on.
+    /// A newer program marks the store when it opens it, after which an older one changes nothing.
     #[test]
     fn an_older_program_at_work_stops_when_a_newer_one_comes() {
         let dir = tempfile::tempdir().unwrap();
@@ -122,7 +121,7 @@ mod tests {
             (newer.objects().unwrap(), newer.hit(&done.key()).unwrap()),
             (vec![done.output.clone()], Some(done))
         );
-        // It makes what the older one left half made.
+        // The newer program completes the action of the older one.
         let made = make(&newer, "b", "5678");
         assert_eq!(newer.hit(&made.key()).unwrap(), Some(made));
         Store::open_as(dir.path(), 2).unwrap();
@@ -136,8 +135,7 @@ mod tests {
         locks.lines().filter(|line| line.contains("->") && line.contains(&file)).count()
     }
 
-    /// Who is inside when a newer program comes is waited for. Of several newer ones the newest has
-    /// the store.
+    /// A newer program waits until others have left the store. Of several, the newest wins.
     #[test]
     fn a_newer_program_waits_for_who_is_inside() {
         let dir = tempfile::tempdir().unwrap();
@@ -155,7 +153,7 @@ mod tests {
             assert_eq!(
                 fs::read_to_string(dir.path().join("format")).unwrap(),
                 "1\n",
-                "not while somebody is inside"
+                "not while another process is inside"
             );
             drop(inside);
             openings.map(|opening| opening.join().unwrap())

@@ -211,7 +211,7 @@ mod tests {
         held(store.try_lock("k").unwrap());
     }
 
-    /// The stage's standard input reads as empty, whatever the lock's file says.
+    /// The stage's standard input reads as empty, although the lock's file has content.
     #[test]
     fn a_shared_lock_reads_as_empty() {
         let (_dir, store) = store();
@@ -234,7 +234,7 @@ mod tests {
         assert!(!dir.path().join("locks/k").exists());
     }
 
-    /// A lock's file that can't be read may be held.
+    /// An unreadable lock file may be held.
     #[test]
     fn unreadable_locks_are_errors() {
         let (dir, store) = store();

@@ -162,7 +162,7 @@ mod tests {
         }
     }
 
-    /// An object that can't be read may be whole: it is neither a miss nor replaced.
+    /// An unreadable object may be complete: it is neither a miss nor replaced.
     #[test]
     fn unreadable_objects_are_errors() {
         let [folder, looped] = UNREADABLE;
@@ -187,7 +187,7 @@ mod tests {
         }
     }
 
-    /// Actions with different keys mend one damaged object at once, again and again.
+    /// Actions with different keys repair one damaged object concurrently.
     #[test]
     fn actions_at_once_make_one_object() {
         let dir = tempfile::tempdir().unwrap();

@@ -141,7 +141,7 @@ mod tests {
         let id = file.id().to_owned();
         file.end().unwrap();
         let path = dir.path().join(format!("runs/{id}.jsonl"));
-        // What a kill cut short is left out.
+        // A truncated line is ignored.
         let text = fs::read_to_string(&path).unwrap() + "{\"action\":{\"sta";
         fs::write(&path, text).unwrap();
         let run = store.runs().unwrap().remove(0);
@@ -164,8 +164,8 @@ mod tests {
     const FIRST: &str = r#"{"run":{"holder":{"pid":1,"host":"h","since_unix":5},"command":[]}}"#;
     const ACTION: &str = r#"{"action":{"stage":"s","key":"k"}}"#;
 
-    /// What a kill or a full disk leaves of a run's file is read as far as it goes. A pin is
-    /// written whole, so it is read whole or not at all.
+    /// A truncated run file is read as far as possible. A pin is written atomically, so a truncated
+    /// one is damaged.
     #[test]
     fn damaged_files_of_runs_and_pins_are_errors() {
         let (whole, ended) = (format!("{FIRST}\n{ACTION}\n"), r#"{"ended":{"unix":9}}"#);
@@ -221,7 +221,7 @@ mod tests {
         }
     }
 
-    /// Two containers share a store, a second and the process number 1.
+    /// Two containers may share a store, a second and the process id 1.
     #[test]
     fn names_of_runs_have_random_digits() {
         let dir = tempfile::tempdir().unwrap();
