@@ -195,8 +195,8 @@ impl Sample {
 type Harm = fn(&mut Sample);
 
 const HARM: &[(&str, Harm)] = &[
-    ("\"../../evil\" where", |s| s.entries[FILE].path = "../../evil".into()),
-    ("\"/tmp/evil\" where", |s| s.entries[FILE].path = "/tmp/evil".into()),
+    ("found \"../../evil\"", |s| s.entries[FILE].path = "../../evil".into()),
+    ("found \"/tmp/evil\"", |s| s.entries[FILE].path = "/tmp/evil".into()),
     ("not a path inside", |s| s.manifest(|m| m.files[0].path = "../../../../evil".into())),
     ("not a path inside", |s| s.manifest(|m| m.files[0].path = "/tmp/evil".into())),
     ("not the path of", |s| s.manifest(|m| m.files[0].path = "artifact.json".into())),
