@@ -1,5 +1,4 @@
 use serde::Serialize;
-use serde_json::Value;
 
 /// Formats a value as canonical JSON, the only form that is hashed: sorted keys, no white space,
 /// numbers as `serde_json` prints them.
@@ -7,10 +6,10 @@ use serde_json::Value;
 /// # Panics
 /// If the value can't be JSON (a map whose keys aren't strings), which is a programming error.
 pub fn canonical_json(value: &impl Serialize) -> String {
-    let value = serde_json::to_value(value).expect("hashed types serialise to JSON");
-    let mut text = String::new();
-    write(&value, &mut text);
-    text
+    let mut value = serde_json::to_value(value).expect("hashed types serialise to JSON");
+    // `serde_json` keeps insertion order if any crate enables its `preserve_order`.
+    value.sort_all_objects();
+    value.to_string()
 }
 
 /// Hashes the [`canonical_json`] of a value: blake3, in hexadecimal.
@@ -18,41 +17,12 @@ pub fn hash_json(value: &impl Serialize) -> String {
     blake3::hash(canonical_json(value).as_bytes()).to_hex().to_string()
 }
 
-fn write(value: &Value, out: &mut String) {
-    match value {
-        Value::Object(map) => {
-            // `serde_json` keeps insertion order if any crate enables its `preserve_order`.
-            let mut entries: Vec<_> = map.iter().collect();
-            entries.sort_by_key(|(key, _)| key.as_str());
-            out.push('{');
-            for (i, (key, value)) in entries.into_iter().enumerate() {
-                if i > 0 {
-                    out.push(',');
-                }
-                out.push_str(&Value::from(key.as_str()).to_string());
-                out.push(':');
-                write(value, out);
-            }
-            out.push('}');
-        }
-        Value::Array(items) => {
-            out.push('[');
-            for (i, item) in items.iter().enumerate() {
-                if i > 0 {
-                    out.push(',');
-                }
-                write(item, out);
-            }
-            out.push(']');
-        }
-        other => out.push_str(&other.to_string()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use super::*;
     use proptest::prelude::*;
+    use serde_json::Value;
+
+    use super::*;
 
     fn any_json() -> impl Strategy<Value = Value> {
         let leaf = prop_oneof![

@@ -39,8 +39,7 @@ pub fn out_of_memory_message(text: &str) -> Option<String> {
 /// Returns the memory of this machine in bytes, or its container's limit if lower; `None` if
 /// unknown.
 pub fn machine_memory() -> Option<u64> {
-    let mut system = System::new().ok()?;
-    system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
+    let system = measure_memory()?;
     Some(system.cgroup_limits().map_or(system.total_memory(), |limits| limits.total_memory))
 }
 
@@ -63,11 +62,19 @@ fn parse_bytes(text: &str) -> Result<u64, Failure> {
 }
 
 fn free_memory() -> Option<u64> {
+    let system = measure_memory()?;
+    let free = system.available_memory();
+    Some(
+        system
+            .cgroup_limits()
+            .map_or(free, |limits| free.min(limits.total_memory.saturating_sub(limits.rss))),
+    )
+}
+
+fn measure_memory() -> Option<System> {
     let mut system = System::new().ok()?;
     system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
-    let container =
-        system.cgroup_limits().map(|limits| limits.total_memory.saturating_sub(limits.rss));
-    Some(container.map_or(system.available_memory(), |left| left.min(system.available_memory())))
+    Some(system)
 }
 
 /// Returns the free bytes that remain after `work` has taken `need`; `u64::MAX` if `free` is
