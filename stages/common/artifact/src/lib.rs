@@ -24,7 +24,6 @@
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
-mod canonical;
 mod failure;
 mod fsio;
 mod given_input;
@@ -33,9 +32,11 @@ mod manifest;
 mod run_record;
 mod text;
 
-pub use canonical::{canonical_json, hash_json};
 pub use failure::{Failure, FailureExt, exit_code, one_line, permission_advice};
-pub use fsio::{sync_folder, temporary, write_atomically, write_json, write_json_atomically};
+pub use fsio::{
+    canonical_json, hash_json, sync_folder, temporary, write_atomically, write_json,
+    write_json_atomically,
+};
 pub use given_input::GivenInput;
 pub use listing::{
     ListedFiles, OutputFileError, PathError, file_kind, is_ignored_name, list_files,

@@ -6,8 +6,8 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::canonical::hash_json;
 use crate::failure::permission_advice;
+use crate::fsio::hash_json;
 use crate::listing::{list_files, relative_path};
 
 /// Name of the manifest inside an artifact.
