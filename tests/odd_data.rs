@@ -164,7 +164,7 @@ fn poses_that_cannot_be_are_refused() {
         assert_eq!(project.store_listing(), Vec::<String>::new());
     }
     let (project, folder) = project(1, 4);
-    project.run(&["run"]).fails(2, &["scale = 2 makes LR images of 1 pixels from HR images of 1"]);
+    project.run(&["run"]).fails(2, &["scale = 2 gives LR and HR images the same width of 1 pixels"]);
     drop(folder);
 }
 
@@ -177,7 +177,7 @@ fn poses_that_look_wrong_are_warned_of() {
         (|_| {}, ""),
         (
             |list| list["frames"].as_array_mut().unwrap().truncate(1),
-            "there is 1 training view: nothing tells how far anything is",
+            "there is only 1 training view: depth cannot be estimated",
         ),
         (|list| pose(list, 2)[0][3] = json!(-3000.0), "training view r_2 is "),
         (
@@ -185,8 +185,8 @@ fn poses_that_look_wrong_are_warned_of() {
                 (list["w"], list["h"], list["cx"], list["cy"]) =
                     (json!(32), json!(32), json!(8), json!(8));
             },
-            "4 of 6 views have a principal point far from the middle, first training view r_0: \
-            (4.0, 4.0) in 16×16 pixels",
+            "4 of 6 views have a principal point far from the image centre (first: training \
+            view r_0 with (4.0, 4.0) in 16×16 pixels",
         ),
     ];
     for (change, words) in warnings {

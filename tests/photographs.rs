@@ -61,8 +61,8 @@ fn every_form_gives_the_same_cameras_and_images() {
         assert_eq!(made.code, 0, "{}: {}", form.name, made.stderr);
         let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
         for words in [
-            "17 views to train on, 3 others for testing",
-            "as if made by box; HR is 48×48",
+            "17 training views, 3 test views",
+            "with assumed kernel box; HR is 48×48",
             "20 photographs",
         ] {
             assert!(summary.contains(words), "{words} isn't in {summary}");

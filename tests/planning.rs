@@ -196,7 +196,7 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         ),
         (
             &["-p", "prep.scale=2.7", "-p", "kernel=average"],
-            "stage prep: parameter kernel: average needs a whole scale",
+            "stage prep: parameter kernel: average requires an integer scale",
         ),
         (
             &["-p", "background=alpha", "-p", "supervision=kernel"],
@@ -227,7 +227,7 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         .fails(2, &["input weights is missing", "convert-weights.py"]);
     let inputs = [("dataset", views.as_path())];
     common::stage("prep", r#"{"kernel": "average", "scale": 1.5}"#, &inputs, &none, &[])
-        .fails(2, &["average needs a whole scale"]);
+        .fails(2, &["average requires an integer scale"]);
 }
 
 /// Sinks are drawn and explained.

@@ -95,7 +95,7 @@ fn objects_on_white_stay_in_a_box_on_white() {
             prepared(&project, &folder, &json!({"lr_width": 50, "scale": 2}));
         assert_eq!((background.as_str(), space.as_str()), ("white", "box"), "{scene}: {notes}");
         assert!(
-            notes.contains("borders are one flat colour (255 255 255) in 10 of 10 views looked at"),
+            notes.contains("borders are one flat colour (255 255 255) in 10 of 10 sampled views"),
             "{notes}"
         );
     }
@@ -121,7 +121,7 @@ fn photographs_of_a_scene_that_goes_on_are_opaque_and_unbounded() {
     let folder = project.path("photographs");
     let (background, space, notes) = demo(&project, &folder, "around", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"), "{notes}");
-    assert!(notes.contains("of 12 views looked at: the scene goes on behind"), "{notes}");
+    assert!(notes.contains("of 12 sampled views: the scene continues behind"), "{notes}");
     let (background, space, notes) = demo(&project, &folder, "forward", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
     let (background, space, notes) = demo(&project, &folder, "around", false);

@@ -1,46 +1,46 @@
-//! What lies behind a scene, by the borders of its images.
+//! Estimates a scene's background from the borders of its images (docs/design/035).
 
 use std::fmt::{self, Display, Formatter};
 
-use artifact::{FailureExt as _, WARNING};
+use artifact::{FailureExt as _, WARNING, counted};
 use dataset::Frame;
 use pixels::Rgba8;
 use rayon::prelude::*;
 use scene::Background;
 
-use crate::frame_name::frame_name;
+use crate::error::frame_label;
 use crate::strips::Strips;
 
-/// Views that are looked at, spread evenly: enough to tell nine of ten.
-pub(crate) const MOST_VIEWS: usize = 20;
-/// Levels by which a flat colour may vary: JPEG's noise beside nothing else. A clear sky varies by
-/// more from corner to corner.
-const MOST_NOISE_LEVELS: u8 = 8;
+/// Maximum number of views to sample, spread evenly: enough to tell nine in ten (docs/design/035).
+pub(crate) const MAX_VIEWS: usize = 20;
+/// Maximum deviation of a flat colour in 8-bit levels: JPEG noise on a uniform area. A clear sky
+/// varies more from corner to corner (docs/design/035).
+const MAX_NOISE_LEVELS: u8 = 8;
 
-/// What lies behind a scene.
+/// Evidence of what is behind a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Behind {
+pub(crate) enum Backdrop {
     /// Images have alpha.
     Transparent,
     /// Borders are one flat colour.
     Flat([u8; 3]),
-    /// More of the scene.
+    /// Borders show more of the scene.
     Scene,
 }
 
-/// What one image shows behind the scene.
+/// Content of one image's border.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Border {
-    /// It has alpha.
+    /// The image has alpha.
     Transparent,
-    /// Nine tenths of its border's pixels are like their median.
+    /// Nine tenths of the border's pixels are similar to their median.
     Flat([u8; 3]),
     /// Anything else.
     Mixed,
 }
 
 impl Border {
-    /// Looks at an image.
+    /// Classifies an image's border.
     pub(crate) fn of(image: &Rgba8) -> Self {
         if image.data.chunks_exact(4).any(|p| p[3] != u8::MAX) {
             return Self::Transparent;
@@ -50,18 +50,19 @@ impl Border {
         let columns = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
         let border: Vec<[u8; 3]> =
             rows.chain(columns).map(|(x, y)| colour(image, y * width + x)).collect();
-        let middle = median(&border);
-        let alike = border.iter().filter(|colour| is_like(**colour, middle)).count();
-        if 10 * alike >= 9 * border.len() { Self::Flat(middle) } else { Self::Mixed }
+        let median = median_colour(&border);
+        let similar = border.iter().filter(|colour| is_similar(**colour, median)).count();
+        if 10 * similar >= 9 * border.len() { Self::Flat(median) } else { Self::Mixed }
     }
 }
 
-/// What the borders of some images show.
+/// Combined borders of the sampled views.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Borders {
-    pub(crate) behind: Behind,
-    /// Views whose borders are the flat colour, and views looked at.
+    pub(crate) backdrop: Backdrop,
+    /// Number of views whose borders are the flat colour.
     flat: usize,
+    /// Number of sampled views.
     views: usize,
     strips: Option<CommonStrips>,
 }
@@ -70,99 +71,110 @@ pub(crate) struct Borders {
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct CommonStrips {
     strips: Strips,
-    /// Number of views that have them.
+    /// Number of views with these strips.
     views: usize,
-    /// True if all views' masks leave them out.
+    /// True if the masks of all these views exclude the strips.
     are_masked: bool,
 }
 
 impl Borders {
-    /// Of all that were looked at. One image with alpha makes all transparent. A flat colour must
-    /// be that of nine in ten views.
+    /// Samples the borders of training views, spread evenly; only the first view's if that has
+    /// alpha. At most one image per thread is in memory.
+    pub(crate) fn inspect(frames: &[&Frame]) -> anyhow::Result<Self> {
+        let count = frames.len().min(MAX_VIEWS);
+        if count > 0 && inspect_view(frames[0])?.border == Border::Transparent {
+            return Ok(Self::new(&[Border::Transparent]));
+        }
+        let sampled =
+            (0..count).into_par_iter().map(|i| inspect_view(frames[i * frames.len() / count]));
+        let views = sampled.collect::<anyhow::Result<Vec<ViewBorder>>>()?;
+        let borders: Vec<Border> = views.iter().map(|view| view.border).collect();
+        Ok(Self::new(&borders).with_strips(&views))
+    }
+
+    /// Combines the borders of sampled views. One image with alpha makes the backdrop transparent;
+    /// nine in ten views must share a flat colour.
     pub(crate) fn new(borders: &[Border]) -> Self {
         let views = borders.len();
         if borders.contains(&Border::Transparent) {
-            return Self { behind: Behind::Transparent, flat: 0, views, strips: None };
+            return Self { backdrop: Backdrop::Transparent, flat: 0, views, strips: None };
         }
-        let colour = |b: &Border| if let Border::Flat(c) = b { Some(*c) } else { None };
-        let known: Vec<[u8; 3]> = borders.iter().filter_map(colour).collect();
-        let common = median(&known);
-        let flat = known.iter().filter(|colour| is_like(**colour, common)).count();
-        let behind =
-            if views > 0 && 10 * flat >= 9 * views { Behind::Flat(common) } else { Behind::Scene };
-        Self { behind, flat, views, strips: None }
+        let mut colours: Vec<[u8; 3]> = Vec::new();
+        for border in borders {
+            if let Border::Flat(colour) = border {
+                colours.push(*colour);
+            }
+        }
+        let median = median_colour(&colours);
+        let flat = colours.iter().filter(|colour| is_similar(**colour, median)).count();
+        let is_flat = views > 0 && 10 * flat >= 9 * views;
+        let backdrop = if is_flat { Backdrop::Flat(median) } else { Backdrop::Scene };
+        Self { backdrop, flat, views, strips: None }
     }
 
-    /// Takes in the strips of the views, and whether masks leave these out. A frame of strips is no
-    /// background.
-    fn with_strips(mut self, views: &[(Option<Strips>, bool)]) -> Self {
-        let strips: Vec<Option<Strips>> = views.iter().map(|(strips, _)| *strips).collect();
-        let common = Strips::common(&strips).filter(|_| self.behind != Behind::Transparent);
+    /// Adds the strips that the views have in common. A frame of strips is not a background.
+    fn with_strips(mut self, views: &[ViewBorder]) -> Self {
+        let strips: Vec<Option<Strips>> = views.iter().map(|view| view.strips).collect();
+        let common = Strips::common(&strips).filter(|_| self.backdrop != Backdrop::Transparent);
         if let Some((strips, count)) = common {
-            let are_masked = views.iter().all(|(strips, is_masked)| strips.is_none() || *is_masked);
+            let are_masked = views.iter().all(|view| view.strips.is_none() || view.are_masked);
             self.strips = Some(CommonStrips { strips, views: count, are_masked });
             if strips.is_frame() {
-                self.behind = Behind::Scene;
+                self.backdrop = Backdrop::Scene;
             }
         }
         self
     }
 
-    /// Returns the signs by which the background is known, a line each, with what to do about
-    /// strips.
-    pub(crate) fn signs(&self) -> Vec<String> {
-        let mut signs = Vec::new();
+    /// Returns the evidence for the background, one note per line, and the remedy for strips.
+    pub(crate) fn notes(&self) -> Vec<String> {
+        let mut notes = Vec::new();
         let is_frame = self.strips.as_ref().is_some_and(|common| common.strips.is_frame());
-        if self.behind != Behind::Transparent && !is_frame {
-            signs.push(self.to_string());
+        if self.backdrop != Backdrop::Transparent && !is_frame {
+            notes.push(self.to_string());
         }
         if let Some(CommonStrips { strips, views, are_masked }) = &self.strips {
-            let place = format!("{strips} in {views} of {} views looked at", self.views);
-            signs.push(if *are_masked {
-                format!("{place} are masked out and are not a background")
+            let found = format!("{strips} in {views} of {} sampled views", self.views);
+            notes.push(if *are_masked {
+                format!("{found} are masked out; they are not a background")
             } else {
                 format!(
-                    "{WARNING}{place}, as undistortion and letterboxing leave them, are not a \
+                    "{WARNING}{found} seem to come from undistortion or letterboxing, not from a \
                     background: mask them out (masks/NAME.png, mask_path) or crop the photographs"
                 )
             });
         }
-        signs
+        notes
     }
 
-    /// What rays see behind everything. A flat colour that is neither white nor black counts as a
-    /// wall, a part of the scene.
+    /// Returns the background that rays see behind the scene. A flat colour that is neither white
+    /// nor black is a wall: part of the scene.
     pub(crate) fn background(&self) -> Background {
-        match self.behind {
-            Behind::Transparent => Background::White,
-            Behind::Flat(colour) if is_like(colour, [u8::MAX; 3]) => Background::White,
-            Behind::Flat(colour) if is_like(colour, [0; 3]) => Background::Black,
-            Behind::Flat(_) | Behind::Scene => Background::Opaque,
+        match self.backdrop {
+            Backdrop::Transparent => Background::White,
+            Backdrop::Flat(colour) if is_similar(colour, [u8::MAX; 3]) => Background::White,
+            Backdrop::Flat(colour) if is_similar(colour, [0; 3]) => Background::Black,
+            Backdrop::Flat(_) | Backdrop::Scene => Background::Opaque,
         }
     }
 }
 
-/// In words.
+/// Formats the evidence for the log.
 impl Display for Borders {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let Self { flat, views, .. } = self;
-        let of = artifact::counted(*views, "view");
-        match self.behind {
-            Behind::Transparent => write!(f, "images have alpha"),
-            Behind::Flat([r, g, b]) => {
-                write!(
-                    f,
-                    "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of \
-                    {of} looked at"
-                )
-            }
-            Behind::Scene => {
-                write!(
-                    f,
-                    "images have no alpha, and borders of one flat colour in {flat} of {of} \
-                    looked at: the scene goes on behind"
-                )
-            }
+        let flat = self.flat;
+        let views = counted(self.views, "sampled view");
+        match self.backdrop {
+            Backdrop::Transparent => write!(f, "images have alpha"),
+            Backdrop::Flat([r, g, b]) => write!(
+                f,
+                "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of {views}"
+            ),
+            Backdrop::Scene => write!(
+                f,
+                "images have no alpha; borders are one flat colour in {flat} of {views}: the scene \
+                continues behind the object, background opaque"
+            ),
         }
     }
 }
@@ -171,12 +183,12 @@ fn colour(image: &Rgba8, pixel: usize) -> [u8; 3] {
     std::array::from_fn(|c| image.data[4 * pixel + c])
 }
 
-fn is_like(colour: [u8; 3], other: [u8; 3]) -> bool {
-    colour.iter().zip(other).all(|(a, b)| a.abs_diff(b) <= MOST_NOISE_LEVELS)
+fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
+    (0..3).all(|c| colour[c].abs_diff(other[c]) <= MAX_NOISE_LEVELS)
 }
 
-/// The median of each channel; black where there is none.
-fn median(colours: &[[u8; 3]]) -> [u8; 3] {
+/// Returns the median of each channel; black for an empty list.
+fn median_colour(colours: &[[u8; 3]]) -> [u8; 3] {
     std::array::from_fn(|c| {
         let mut values: Vec<u8> = colours.iter().map(|colour| colour[c]).collect();
         values.sort_unstable();
@@ -184,42 +196,28 @@ fn median(colours: &[[u8; 3]]) -> [u8; 3] {
     })
 }
 
-/// Looks at the borders of training views, spread evenly; where the first has alpha, at no other.
-/// No more images than threads are held at once.
-pub(crate) fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
-    let count = frames.len().min(MOST_VIEWS);
-    if count > 0 && look(frames[0])?.border == Border::Transparent {
-        return Ok(Borders::new(&[Border::Transparent]));
-    }
-    let chosen = (0..count).into_par_iter().map(|i| look(frames[i * frames.len() / count]));
-    let views = chosen.collect::<anyhow::Result<Vec<View>>>()?;
-    let borders: Vec<Border> = views.iter().map(|view| view.border).collect();
-    let strips: Vec<_> = views.iter().map(|view| (view.strips, view.are_masked)).collect();
-    Ok(Borders::new(&borders).with_strips(&strips))
-}
-
-/// Border of a view's image.
-struct View {
+/// Border of one view's image.
+struct ViewBorder {
     border: Border,
     strips: Option<Strips>,
-    /// True if the view's mask leaves the strips out.
+    /// True if the view's mask excludes the strips.
     are_masked: bool,
 }
 
-fn look(frame: &Frame) -> anyhow::Result<View> {
-    let image = frame.photograph().bad_input(frame_name(frame))?;
+fn inspect_view(frame: &Frame) -> anyhow::Result<ViewBorder> {
+    let image = frame.photograph().bad_input(frame_label(frame))?;
     let mut border = Border::of(&image);
-    // Outside of its circle a fisheye photograph is black, whatever lies behind the scene.
+    // Fisheye photographs are black outside their image circle, whatever the background.
     if matches!(border, Border::Flat(_)) && frame.intrinsics().has_cut_rays() {
         border = Border::Mixed;
     }
     let strips = if border == Border::Transparent { None } else { Strips::of(&image) };
     let mut are_masked = false;
     if let Some(strips) = &strips {
-        let mask = frame.mask().bad_input(frame_name(frame))?;
+        let mask = frame.mask().bad_input(frame_label(frame))?;
         are_masked = mask.is_some_and(|mask| strips.are_masked(&mask));
     }
-    Ok(View { border, strips, are_masked })
+    Ok(ViewBorder { border, strips, are_masked })
 }
 
 #[cfg(test)]
@@ -258,13 +256,13 @@ mod tests {
         assert_eq!(white.background(), Background::White);
         assert_eq!(
             white.to_string(),
-            "images have no alpha; borders are one flat colour (251 251 251) in 3 of 3 views \
-            looked at"
+            "images have no alpha; borders are one flat colour (251 251 251) in 3 of 3 \
+            sampled views"
         );
         assert_eq!(of(&views(&picture([3; 3], 3, 0), 1)).background(), Background::Black);
         // A tenth of a border may be something else, and a tenth of the views.
         let cut = views(&picture([255; 3], 0, 12), 3);
-        assert_eq!(of(&cut).behind, Behind::Scene);
+        assert_eq!(of(&cut).backdrop, Backdrop::Scene);
         let mut most = views(&picture([255; 3], 0, 0), 9);
         most.push(picture([120; 3], 60, 0));
         assert_eq!(of(&most).background(), Background::White);
@@ -272,20 +270,23 @@ mod tests {
         assert_eq!(of(&most).background(), Background::Opaque);
         // Walls: each view has another flat colour, or all the same grey.
         let walls: Vec<Rgba8> = (0..5).map(|i| picture([50 * i; 3], 0, 0)).collect();
-        assert_eq!(of(&walls).behind, Behind::Scene);
+        assert_eq!(of(&walls).backdrop, Backdrop::Scene);
         let grey = of(&views(&picture([128; 3], 0, 0), 5));
-        assert_eq!((grey.behind, grey.background()), (Behind::Flat([128; 3]), Background::Opaque));
+        assert_eq!(
+            (grey.backdrop, grey.background()),
+            (Backdrop::Flat([128; 3]), Background::Opaque)
+        );
         assert_eq!(of(&[]).background(), Background::Opaque);
     }
 
     #[test]
-    fn alpha_says_it_all() {
+    fn one_image_with_alpha_is_enough() {
         let mut image = picture([10, 200, 30], 90, 0);
         image.data[7] = 254;
         let borders = of(&[picture([0; 3], 0, 0), image]);
         assert_eq!(
-            (borders.behind, borders.background()),
-            (Behind::Transparent, Background::White)
+            (borders.backdrop, borders.background()),
+            (Backdrop::Transparent, Background::White)
         );
     }
 }

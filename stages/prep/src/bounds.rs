@@ -1,3 +1,5 @@
+//! A scene's extent and space, from cameras and depths (docs/design/004, 035).
+
 use glam::{DMat3, DVec3};
 use scene::{
     Bounds, Camera, CameraRay, Frustum, Space, common_direction, pose_of, power_of_two_below,
@@ -5,157 +7,162 @@ use scene::{
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Spaces a field can have, by name.
+/// Space of a field's unit cube.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SpaceKind {
-    /// A box around what the cameras look at: scenes that end.
+    /// A box around the region that the cameras face, for bounded scenes.
     Box,
-    /// Normalised device coordinates: forward-facing photographs, whose far parts need less detail.
+    /// Normalised device coordinates, for forward-facing photographs: distant parts get less
+    /// detail.
     Ndc,
-    /// The box, and all around it, ever coarser with the distance: cameras among what they see.
+    /// The box and, ever coarser with distance, everything around it, for cameras inside the scene.
     Contraction,
 }
 
-/// A space that can't be had.
+/// Error returned when a requested space doesn't suit the cameras.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum SpaceError {
-    /// Nothing says how near the scene comes.
+pub(crate) enum SpaceError {
     #[error(
-        "parameter space: ndc needs to know how near and far each view sees, and the data set \
-        doesn't say; give near and far, or choose box"
+        "parameter space: ndc requires the depth range of each view, which the data set lacks; \
+        give near and far, or choose box"
     )]
     NoDepths,
-    /// Lenses that see more than a frustum holds.
     #[error(
-        "parameter space: ndc can't hold what a fisheye lens sees; choose box or contraction, or \
-        lens: undo"
+        "parameter space: ndc cannot contain the view of a fisheye lens; choose box or \
+        contraction, or lens: undo"
     )]
     Fisheye,
-    /// Cameras that look every way.
-    #[error("parameter space: ndc needs cameras that look one way; choose box or contraction")]
+    /// Cameras whose directions differ too much for a common frustum.
+    #[error(
+        "parameter space: ndc requires cameras that face one direction; choose box or contraction"
+    )]
     NotForward,
 }
 
-/// What lies so many box halves from the box's middle needs more than a box.
-const MOST_BOX_HALVES: f64 = 2.5;
+/// Minimum distance from the box's centre, in half sides of the box, at which points call for the
+/// contraction (docs/design/004).
+const MIN_CONTRACTION_HALVES: f64 = 2.5;
 
-/// A posed view, and between which depths it sees anything, where that is known.
-pub type SeenDepths = (Camera, Option<[f64; 2]>);
+/// Camera with its depth range [nearest, farthest], if known.
+pub(crate) type CameraDepths = (Camera, Option<[f64; 2]>);
 
-/// Where the scene is, and the space that suits it. It is NDC where all cameras look one way and
-/// the depths they see are known, the contraction where something is known to lie far outside the
-/// box, else the box. Where images say that the scene goes on behind what is looked at (`goes_on`)
-/// and depths aren't known, no box is known to hold it: depths are guessed where cameras look one
-/// way, and elsewhere it is the contraction. A `kind` that is given is taken. The box is that of
-/// the training views; `others` are cameras that will look, too.
+/// Returns the scene's bounds, around the training views; `others` are test views, which the space
+/// must suit, too.
 ///
-/// Far from the origin everything is computed from a point near the cameras: sums of large
-/// coordinates lose the digits in which cameras differ.
-pub fn place(
-    training: &[SeenDepths],
-    others: &[SeenDepths],
-    goes_on: bool,
+/// Without a requested `kind` the space is NDC if all cameras face one direction and their depths
+/// are known, the contraction if known depths reach far outside the box, otherwise the box. In an
+/// unbounded scene (opaque background) with unknown depths no box can be trusted to contain it:
+/// depths are guessed if the cameras face one direction, otherwise the space is the contraction.
+///
+/// All is computed relative to a point near the cameras: sums of large coordinates would lose the
+/// digits in which cameras differ.
+pub(crate) fn scene_bounds(
+    training: &[CameraDepths],
+    others: &[CameraDepths],
+    is_unbounded: bool,
     kind: Option<SpaceKind>,
 ) -> Result<Bounds, SpaceError> {
     let origin = near_point(training);
     if origin == DVec3::ZERO {
-        return place_near_origin(training, others, goes_on, kind);
+        return bounds_near_origin(training, others, is_unbounded, kind);
     }
     let (training, others) = (moved(training, -origin), moved(others, -origin));
-    let bounds = place_near_origin(&training, &others, goes_on, kind)?;
-    // Rounded as training rounds them, while there are digits left to round.
+    let bounds = bounds_near_origin(&training, &others, is_unbounded, kind)?;
+    // Rounded as `train-ss` does, before the shift uses up the digits.
     let anchor = training.first().map_or(DVec3::ZERO, |(camera, _)| camera.centre());
     Ok(bounds.rounded(anchor).moved(origin))
 }
 
-fn moved(sights: &[SeenDepths], by: DVec3) -> Vec<SeenDepths> {
-    sights.iter().map(|(camera, depths)| (camera.moved(by), *depths)).collect()
+fn moved(views: &[CameraDepths], offset: DVec3) -> Vec<CameraDepths> {
+    views.iter().map(|(camera, depths)| (camera.moved(offset), *depths)).collect()
 }
 
-/// Step of [`near_point`] over a scene's extent. Up to half of it from the origin, f64 keeps ten
-/// digits of the extent.
+/// Step of [`near_point`], relative to the scene's extent (docs/design/004). Within half a step of
+/// the origin, f64 represents at least ten digits of the extent.
 const NEAR_POINT_STEP: f64 = 1024.0;
 
-/// Returns a point near the cameras, a multiple of a step much larger than what is known of the
-/// scene: the origin itself for scenes around it.
-fn near_point(sights: &[SeenDepths]) -> DVec3 {
-    let Some(first) = sights.first().map(|(camera, _)| camera.centre()) else { return DVec3::ZERO };
+/// Returns a point near the cameras, a multiple of a step much larger than the scene's known
+/// extent, so that scenes around the origin get the origin.
+fn near_point(views: &[CameraDepths]) -> DVec3 {
+    let Some(first) = views.first().map(|(camera, _)| camera.centre()) else { return DVec3::ZERO };
     let mut extent = 0.0f64;
-    for (camera, depths) in sights {
+    for (camera, depths) in views {
         let farthest = depths.map_or(0.0, |[_, farthest]| farthest);
         extent = extent.max(camera.centre().distance(first)).max(farthest);
     }
     let step = NEAR_POINT_STEP * power_of_two_below(extent);
     let point = (first / step).round() * step;
-    // Cameras in one place have no extent, and need none.
+    // The step is 0 for cameras at one position.
     if point.is_finite() { point } else { DVec3::ZERO }
 }
 
-/// As [`place`], for scenes near the origin.
-fn place_near_origin(
-    training: &[SeenDepths],
-    others: &[SeenDepths],
-    goes_on: bool,
+/// [`scene_bounds`] of a scene near the origin.
+fn bounds_near_origin(
+    training: &[CameraDepths],
+    others: &[CameraDepths],
+    is_unbounded: bool,
     kind: Option<SpaceKind>,
 ) -> Result<Bounds, SpaceError> {
-    let boxed = bounds_of(training);
-    let goes_on_unseen = goes_on && training.iter().any(|(_, depths)| depths.is_none());
-    let guessed = if goes_on_unseen { guessed_depths(training) } else { None };
+    let boxed = box_bounds(training);
+    let has_unknown_extent = is_unbounded && training.iter().any(|(_, depths)| depths.is_none());
+    let guessed = if has_unknown_extent { guess_depths(training) } else { None };
     match kind {
         Some(SpaceKind::Box) => Ok(boxed),
-        Some(SpaceKind::Ndc) => in_ndc(training, others, guessed),
-        Some(SpaceKind::Contraction) => Ok(contracted(boxed, training)),
-        None => Ok(match in_ndc(training, others, guessed) {
+        Some(SpaceKind::Ndc) => ndc_bounds(training, others, guessed),
+        Some(SpaceKind::Contraction) => Ok(contracted_bounds(boxed, training)),
+        None => Ok(match ndc_bounds(training, others, guessed) {
             Ok(bounds) => bounds,
-            Err(_) if goes_on_unseen || reaches_beyond(&boxed, training) => {
-                contracted(boxed, training)
+            Err(_) if has_unknown_extent || reaches_beyond(&boxed, training) => {
+                contracted_bounds(boxed, training)
             }
             Err(_) => boxed,
         }),
     }
 }
 
-fn in_ndc(
-    training: &[SeenDepths],
-    others: &[SeenDepths],
+fn ndc_bounds(
+    training: &[CameraDepths],
+    others: &[CameraDepths],
     guessed: Option<[f64; 2]>,
 ) -> Result<Bounds, SpaceError> {
-    let known = |(camera, depths): &SeenDepths| (camera.clone(), depths.or(guessed));
-    let all: Vec<SeenDepths> = training.iter().chain(others).map(known).collect();
-    if all.iter().any(|(camera, _)| camera.intrinsics.distortion.is_fisheye()) {
-        return Err(SpaceError::Fisheye);
+    let mut all: Vec<CameraDepths> = Vec::with_capacity(training.len() + others.len());
+    for (camera, depths) in training.iter().chain(others) {
+        if camera.intrinsics.distortion.is_fisheye() {
+            return Err(SpaceError::Fisheye);
+        }
+        all.push((camera.clone(), depths.or(guessed)));
     }
     let space = Space::Ndc(frustum(&all)?);
-    Ok(Bounds { space, ..around_frusta(&all).ok_or(SpaceError::NoDepths)? })
+    Ok(Bounds { space, ..frusta_bounds(&all).ok_or(SpaceError::NoDepths)? })
 }
 
-/// Share of the distance to what cameras look at before which nothing is taken to lie, and how many
-/// times as far they see.
+/// Guessed nearest and farthest depth, relative to the distance of the cameras' focus
+/// (docs/design/035).
 const GUESSED_DEPTH_FACTORS: [f64; 2] = [0.25, 50.0];
 
-/// Depths that cameras which look one way may see, by the cameras alone: around the point that they
-/// look at, or where their axes are parallel, around a place four times as far away as they stand
-/// apart. Too near a guess costs detail and loses nothing. `None` where they look every way, or
-/// stand in one place.
-fn guessed_depths(sights: &[SeenDepths]) -> Option<[f64; 2]> {
-    let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
+/// Guesses the depth range of cameras that face one direction, from the point where their axes
+/// cross or, for parallel axes, from four times the cameras' extent (docs/design/035). A guess that
+/// is too near costs detail but cuts nothing off. `None` for cameras that face several directions
+/// or are at one position.
+fn guess_depths(views: &[CameraDepths]) -> Option<[f64; 2]> {
+    let cameras: Vec<&Camera> = views.iter().map(|(camera, _)| camera).collect();
     let forward = common_direction(cameras.iter().copied())?;
     let mean = cameras.iter().map(|c| c.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
-    let apart = 2.0 * cameras.iter().map(|c| (c.centre() - mean).length()).fold(0.0, f64::max);
-    let focus = crossing(&cameras, LEAST_DETERMINANT)
+    let extent = 2.0 * cameras.iter().map(|c| (c.centre() - mean).length()).fold(0.0, f64::max);
+    let focus = crossing_point(&cameras, MIN_FOCUS_DETERMINANT)
         .map(|point| (point - mean).dot(forward))
-        .filter(|distance| *distance > apart);
-    let distance = focus.unwrap_or(4.0 * apart);
+        .filter(|distance| *distance > extent);
+    let distance = focus.unwrap_or(4.0 * extent);
     (distance > 0.0).then(|| GUESSED_DEPTH_FACTORS.map(|factor| factor * distance))
 }
 
-/// What all cameras see, from the middle of them: the frustum of NDC.
-fn frustum(sights: &[SeenDepths]) -> Result<Frustum, SpaceError> {
-    let forward = common_direction(sights.iter().map(|(c, _)| c)).ok_or(SpaceError::NotForward)?;
-    let up = mean(sights, |c| c.rotation().y_axis);
+/// Returns the NDC frustum that contains all views, from their mean centre.
+fn frustum(views: &[CameraDepths]) -> Result<Frustum, SpaceError> {
+    let forward = common_direction(views.iter().map(|(c, _)| c)).ok_or(SpaceError::NotForward)?;
+    let up = mean(views, |c| c.rotation().y_axis);
     let right = forward.cross(up).try_normalize().ok_or(SpaceError::NotForward)?;
-    let (up, centre) = (right.cross(forward), mean(sights, Camera::centre));
+    let (up, centre) = (right.cross(forward), mean(views, Camera::centre));
     let mut frustum = Frustum {
         camera_to_world: pose_of(DMat3::from_cols(right, up, -forward), centre),
         min: [f64::INFINITY; 2],
@@ -163,57 +170,55 @@ fn frustum(sights: &[SeenDepths]) -> Result<Frustum, SpaceError> {
         near: f64::INFINITY,
         far: 0.0,
     };
-    for (camera, depths) in sights {
+    for (camera, depths) in views {
         let [nearest, farthest] = depths.ok_or(SpaceError::NoDepths)?;
-        // Known depths are those of points that were found; twice as far may be more.
-        for corner in border(camera, [0.9 * nearest, 2.0 * farthest]) {
+        // Known depths are those of matched points; surfaces may be twice as far.
+        for corner in border_points(camera, [0.9 * nearest, 2.0 * farthest]) {
             let p = frustum.to_camera(corner);
             if p.z <= 0.0 {
                 return Err(SpaceError::NotForward);
             }
             for (i, slope) in [p.x / p.z, p.y / p.z].into_iter().enumerate() {
-                (frustum.min[i], frustum.max[i]) =
-                    (frustum.min[i].min(slope), frustum.max[i].max(slope));
+                frustum.min[i] = frustum.min[i].min(slope);
+                frustum.max[i] = frustum.max[i].max(slope);
             }
-            (frustum.near, frustum.far) = (frustum.near.min(p.z), frustum.far.max(p.z));
+            frustum.near = frustum.near.min(p.z);
+            frustum.far = frustum.far.max(p.z);
         }
     }
     if frustum.is_valid() { Ok(frustum) } else { Err(SpaceError::NotForward) }
 }
 
-fn mean(sights: &[SeenDepths], of: fn(&Camera) -> DVec3) -> DVec3 {
-    sights.iter().map(|(camera, _)| of(camera)).sum::<DVec3>() / sights.len().max(1) as f64
+fn mean(views: &[CameraDepths], vector: fn(&Camera) -> DVec3) -> DVec3 {
+    views.iter().map(|(camera, _)| vector(camera)).sum::<DVec3>() / views.len().max(1) as f64
 }
 
-/// Whether more lies outside the box than a box can hold.
-fn reaches_beyond(bounds: &Bounds, sights: &[SeenDepths]) -> bool {
+/// True if most views have known depths far outside the box.
+fn reaches_beyond(bounds: &Bounds, views: &[CameraDepths]) -> bool {
     let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
-    let reach = MOST_BOX_HALVES * 0.5 * bounds.longest_side();
-    let far = sights.iter().filter(|(camera, depths)| {
+    let reach = MIN_CONTRACTION_HALVES * 0.5 * bounds.longest_side();
+    let far = views.iter().filter(|(camera, depths)| {
         depths.is_some_and(|[_, farthest]| farthest > (camera.centre() - centre).length() + reach)
     });
-    2 * far.count() > sights.len()
+    2 * far.count() > views.len()
 }
 
-/// The same box with all around it: from where the nearest view sees something to far beyond the
-/// farthest. Where cameras look outwards, away from the box's middle, it reaches twice as far as
-/// they stand: to what is near them.
-fn contracted(boxed: Bounds, sights: &[SeenDepths]) -> Bounds {
+/// Extends a box to the contraction, with near and far wide enough for all known depths. If most
+/// cameras face away from the box's centre, the box reaches twice as far as the cameras, so that it
+/// contains what is near them (docs/design/035).
+fn contracted_bounds(boxed: Bounds, views: &[CameraDepths]) -> Bounds {
     let centre = 0.5 * (DVec3::from(boxed.min) + DVec3::from(boxed.max));
-    let outwards = |(camera, _): &&SeenDepths| camera.forward().dot(camera.centre() - centre) > 0.0;
-    let looks_out = 2 * sights.iter().filter(outwards).count() > sights.len();
-    let stands =
-        sights.iter().map(|(camera, _)| (camera.centre() - centre).length()).fold(0.0, f64::max);
-    let radius = (0.5 * boxed.longest_side()).max(if looks_out { 2.0 * stands } else { 0.0 });
-    let half = if looks_out {
-        DVec3::splat(radius)
-    } else {
-        0.5 * (DVec3::from(boxed.max) - DVec3::from(boxed.min))
-    };
-    let known = sights.iter().filter_map(|(_, depths)| *depths);
+    let outward = views.iter().filter(|(c, _)| c.forward().dot(c.centre() - centre) > 0.0);
+    let faces_outward = 2 * outward.count() > views.len();
+    let camera_distance =
+        views.iter().map(|(camera, _)| (camera.centre() - centre).length()).fold(0.0, f64::max);
+    let half_side = 0.5 * boxed.longest_side();
+    let radius = if faces_outward { half_side.max(2.0 * camera_distance) } else { half_side };
+    let known = views.iter().filter_map(|(_, depths)| *depths);
     let near = known.clone().map(|d| 0.5 * d[0]).fold(0.05 * radius, f64::min);
     let far = known.map(|d| 10.0 * d[1]).fold(100.0 * radius, f64::max);
-    let (min, max) = if looks_out {
+    let (min, max) = if faces_outward {
+        let half = DVec3::splat(radius);
         ((centre - half).to_array(), (centre + half).to_array())
     } else {
         (boxed.min, boxed.max)
@@ -221,50 +226,57 @@ fn contracted(boxed: Bounds, sights: &[SeenDepths]) -> Bounds {
     Bounds { min, max, near, far, space: Space::Contraction }
 }
 
-/// Places along each side of a grid over a fisheye image.
-const FISHEYE_PLACES: u32 = 16;
+/// Number of cells along each side of the sampling grid over a fisheye image; chosen by hand.
+const FISHEYE_GRID_CELLS: u32 = 16;
 
-/// Returns points on the border of what a camera sees between two depths. A fisheye camera sees a
-/// part of a ball between two distances, whose border is everywhere in the image.
-fn border(camera: &Camera, depths: [f64; 2]) -> Vec<DVec3> {
+/// Returns points on the border of a camera's view between two depths. A fisheye view is a part of
+/// a spherical shell, so that its extreme points may be anywhere in the image.
+fn border_points(camera: &Camera, depths: [f64; 2]) -> Vec<DVec3> {
     let k = &camera.intrinsics;
-    if !k.distortion.is_fisheye() {
-        let rays = k.border().map(|[x, y]| camera.ray(x, y));
-        let points =
-            |ray: CameraRay| depths.map(|depth| ray.at(depth / camera.depth_per_distance(&ray)));
-        return rays.flat_map(points).collect();
-    }
-    let at = |place: u32, size: u32| f64::from(place * size) / f64::from(FISHEYE_PLACES);
     let mut points = Vec::new();
-    for row in 0..=FISHEYE_PLACES {
-        for column in 0..=FISHEYE_PLACES {
-            let ray = camera.ray(at(column, k.width), at(row, k.height));
+    if !k.distortion.is_fisheye() {
+        for [x, y] in k.border() {
+            let ray: CameraRay = camera.ray(x, y);
+            points.extend(depths.map(|depth| ray.at(depth / camera.depth_per_distance(&ray))));
+        }
+        return points;
+    }
+    for row in 0..=FISHEYE_GRID_CELLS {
+        for column in 0..=FISHEYE_GRID_CELLS {
+            let x = f64::from(column * k.width) / f64::from(FISHEYE_GRID_CELLS);
+            let y = f64::from(row * k.height) / f64::from(FISHEYE_GRID_CELLS);
+            let ray = camera.ray(x, y);
             points.extend(depths.map(|distance| ray.at(distance)));
         }
     }
     points
 }
 
-/// A box around what all cameras look at, from the cameras alone where they say enough.
+/// Minimum determinant of [`crossing_point`] for the centre of a box; chosen by hand.
+const MIN_CENTRE_DETERMINANT: f64 = 1e-3;
+/// Minimum determinant of [`crossing_point`] for the focus of cameras that face one direction,
+/// whose axes are nearly parallel; chosen by hand.
+const MIN_FOCUS_DETERMINANT: f64 = 1e-9;
+
+/// Returns a box around the region that all cameras face, from the cameras alone if possible.
 ///
-/// The centre is the point nearest to all optical axes; the box reaches as far as the widest camera
-/// sees at that distance, so that a scene which fits into its views fits into the box. Cameras that
-/// look past each other (one view, a forward-facing row) leave the centre open along their axes.
-/// Then the box is around all that they see between the nearest and the farthest depth that is
-/// known of each; where nothing is known, it is put at distance 4 of the mean camera, the Blender
-/// scenes' habit.
-fn bounds_of(sights: &[SeenDepths]) -> Bounds {
-    let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
-    let centre = if let Some(crossing) = crossing(&cameras, 1e-3) {
+/// The centre is the point nearest to all optical axes; the half side is the half width of the
+/// widest view at that distance, so that a scene that fits into its views fits into the box. If the
+/// axes don't cross (one view, a forward-facing row), the box surrounds the views between their
+/// known depths or, without depths, a point at distance 4 before the mean camera, the convention of
+/// the Blender scenes.
+fn box_bounds(views: &[CameraDepths]) -> Bounds {
+    let cameras: Vec<&Camera> = views.iter().map(|(camera, _)| camera).collect();
+    let centre = if let Some(crossing) = crossing_point(&cameras, MIN_CENTRE_DETERMINANT) {
         crossing
-    } else if let Some(bounds) = around_frusta(sights) {
+    } else if let Some(bounds) = frusta_bounds(views) {
         return bounds;
     } else {
-        let forward = mean(sights, Camera::forward).normalize_or(DVec3::NEG_Z);
-        mean(sights, Camera::centre) + 4.0 * forward
+        let forward = mean(views, Camera::forward).normalize_or(DVec3::NEG_Z);
+        mean(views, Camera::centre) + 4.0 * forward
     };
     let widest = cameras.iter().map(|camera| half_width(camera, centre)).fold(0.0, f64::max);
-    // A twentieth more: silhouettes that touch the border.
+    // A twentieth more, for silhouettes that touch the image border.
     let half = 1.05 * widest.max(f64::MIN_POSITIVE.sqrt());
     let box_only = Bounds {
         min: (centre - DVec3::splat(half)).to_array(),
@@ -273,32 +285,30 @@ fn bounds_of(sights: &[SeenDepths]) -> Bounds {
         far: 0.0,
         space: Space::Box,
     };
-    with_range(box_only, cameras)
+    with_ray_range(box_only, &cameras)
 }
 
-/// Largest slope of a fisheye view's border that a box follows: 45° from the axis. Farther out, a
-/// box around what the cameras look at would hold the cameras.
+/// Maximum slope of a fisheye view's border that a box follows: 45° from the axis. A wider box
+/// around the region that the cameras face would contain the cameras (docs/design/005).
 const MAX_FISHEYE_SLOPE: f64 = 1.0;
 
-/// Half the longer side of what a camera sees as far away as a place.
-fn half_width(camera: &Camera, place: DVec3) -> f64 {
+/// Returns half the longer side of a camera's view at the distance of `point`.
+fn half_width(camera: &Camera, point: DVec3) -> f64 {
     let k = &camera.intrinsics;
     let [x, y] = [0.5 * f64::from(k.width) / k.fx, 0.5 * f64::from(k.height) / k.fy];
     let slope = if k.distortion.is_fisheye() {
-        let [across, down] = [[x, 0.0], [0.0, y]].map(|at| k.distortion.undistort(at));
-        across[0].max(down[1]).min(MAX_FISHEYE_SLOPE)
+        let [right, bottom] = [[x, 0.0], [0.0, y]].map(|border| k.distortion.undistort(border));
+        right[0].max(bottom[1]).min(MAX_FISHEYE_SLOPE)
     } else {
         x.max(y)
     };
-    (camera.centre() - place).length() * slope
+    (camera.centre() - point).length() * slope
 }
 
-/// The determinant of axes that say nothing of where they cross.
-const LEAST_DETERMINANT: f64 = 1e-9;
-
-/// The point nearest to all optical axes, where they cross well enough: the determinant is 0 for
-/// parallel axes and 8/27 for axes from all sides.
-fn crossing(cameras: &[&Camera], least: f64) -> Option<DVec3> {
+/// Returns the point nearest to all optical axes in the least-squares sense, if they cross well
+/// enough: the determinant of the mean projection is 0 for parallel axes and 8/27 for axes from all
+/// sides.
+fn crossing_point(cameras: &[&Camera], min_determinant: f64) -> Option<DVec3> {
     let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
         let d = camera.forward();
@@ -307,18 +317,18 @@ fn crossing(cameras: &[&Camera], least: f64) -> Option<DVec3> {
         right += across * camera.centre();
     }
     let mean = normal * (1.0 / cameras.len().max(1) as f64);
-    (mean.determinant() > least).then(|| normal.inverse() * right)
+    (mean.determinant() > min_determinant).then(|| normal.inverse() * right)
 }
 
-/// A box around what each camera sees between its depths, a tenth more to either side. `None` where
-/// a camera has none.
-fn around_frusta(sights: &[SeenDepths]) -> Option<Bounds> {
+/// Returns a box around all views between their depths, with a margin of a tenth. `None` if a
+/// view's depths are unknown.
+fn frusta_bounds(views: &[CameraDepths]) -> Option<Bounds> {
     let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
-    for (camera, depths) in sights {
+    for (camera, depths) in views {
         let [nearest, farthest] = (*depths)?;
         near = near.min(0.9 * nearest);
-        for corner in border(camera, [0.9 * nearest, 1.1 * farthest]) {
+        for corner in border_points(camera, [0.9 * nearest, 1.1 * farthest]) {
             (min, max) = (min.min(corner), max.max(corner));
             far = far.max((corner - camera.centre()).length());
         }
@@ -327,11 +337,8 @@ fn around_frusta(sights: &[SeenDepths]) -> Option<Bounds> {
     bounds.is_valid().then_some(bounds)
 }
 
-/// The same box with near and far from its nearest and farthest point over all cameras.
-pub(crate) fn with_range<'a>(
-    bounds: Bounds,
-    cameras: impl IntoIterator<Item = &'a Camera>,
-) -> Bounds {
+/// Sets near and far to the distances of the box's nearest and farthest point over all cameras.
+fn with_ray_range(bounds: Bounds, cameras: &[&Camera]) -> Bounds {
     let (min, max) = (DVec3::from(bounds.min), DVec3::from(bounds.max));
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
     for camera in cameras {
@@ -339,7 +346,7 @@ pub(crate) fn with_range<'a>(
         near = near.min((c - c.clamp(min, max)).length());
         far = far.max((c - min).abs().max((c - max).abs()).length());
     }
-    // Inside the box a sliver is left out: a surface on the lens is never meant.
+    // Cameras inside the box skip a sliver: no surface is on the lens.
     Bounds { near: near.max(1e-3 * far), far, ..bounds }
 }
 
@@ -372,7 +379,7 @@ mod tests {
     fn the_box_is_around_what_all_cameras_see_at_any_scale() {
         for scale in [1e-6, 1.0, 1e6] {
             let target = scale * DVec3::new(0.5, -0.3, 0.2);
-            let bounds = bounds_of(&sights(&circle(target, 4.0 * scale), None));
+            let bounds = box_bounds(&sights(&circle(target, 4.0 * scale), None));
             let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
             assert!((centre - target).length() < 1e-6 * scale, "{bounds:?}");
             let half = 0.5 * (bounds.max[0] - bounds.min[0]) / scale;
@@ -383,7 +390,7 @@ mod tests {
 
     #[test]
     fn one_camera_has_a_box_too() {
-        let bounds = bounds_of(&[(looking_at(DVec3::new(4.0, 0.0, 0.5), DVec3::ZERO), None)]);
+        let bounds = box_bounds(&[(looking_at(DVec3::new(4.0, 0.0, 0.5), DVec3::ZERO), None)]);
         assert!(bounds.near > 0.0 && bounds.far > bounds.near && bounds.far.is_finite());
     }
 
@@ -397,7 +404,7 @@ mod tests {
                 looking_at(from, from + DVec3::Y)
             })
             .collect();
-        let bounds = bounds_of(&sights(&row, Some([2.0, 10.0])));
+        let bounds = box_bounds(&sights(&row, Some([2.0, 10.0])));
         for camera in &row {
             for (x, y) in [(0.0, 0.0), (100.0, 50.0), (50.0, 100.0), (50.0, 50.0)] {
                 let ray = camera.ray(x, y);
@@ -413,11 +420,11 @@ mod tests {
             }
         }
         assert!(bounds.max[1] < 11.1 && bounds.min[1] > 1.5, "{bounds:?}");
-        let unknown = bounds_of(&sights(&row, None));
+        let unknown = box_bounds(&sights(&row, None));
         assert!(unknown.is_valid() && unknown != bounds);
     }
 
-    fn sights(cameras: &[Camera], depths: Option<[f64; 2]>) -> Vec<SeenDepths> {
+    fn sights(cameras: &[Camera], depths: Option<[f64; 2]>) -> Vec<CameraDepths> {
         cameras.iter().map(|c| (c.clone(), depths)).collect()
     }
 
@@ -434,7 +441,7 @@ mod tests {
                     )
                 })
                 .collect();
-            let bounds = place(
+            let bounds = scene_bounds(
                 &sights(&row[1..], Some([2.0 * scale, 10.0 * scale])),
                 &sights(&row[..1], Some([2.0 * scale, 9.0 * scale])),
                 false,
@@ -447,7 +454,7 @@ mod tests {
                 "{frustum:?}"
             );
             for camera in &row {
-                for corner in border(camera, [2.0 * scale, 15.0 * scale]) {
+                for corner in border_points(camera, [2.0 * scale, 15.0 * scale]) {
                     let p = frustum.to_cube(frustum.to_camera(corner)).to_array();
                     assert!(p.iter().all(|x| (-1e-9..=1.0 + 1e-9).contains(x)), "{p:?}");
                 }
@@ -456,7 +463,7 @@ mod tests {
     }
 
     /// Cameras around, forward without and with depths, and outwards: a scene of each space.
-    fn scenes() -> [(Vec<SeenDepths>, bool); 4] {
+    fn scenes() -> [(Vec<CameraDepths>, bool); 4] {
         let ring = circle(DVec3::new(0.5, -0.3, 0.2), 4.0);
         let outwards = ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre()));
         [
@@ -476,14 +483,14 @@ mod tests {
         camera.moved((grid * camera.centre()).round() / grid - camera.centre())
     }
 
-    fn placed(sights: &[SeenDepths], goes_on: bool, shift: DVec3, scale: f64) -> Bounds {
-        let moved = |(camera, depths): &SeenDepths| {
+    fn placed(sights: &[CameraDepths], is_unbounded: bool, shift: DVec3, scale: f64) -> Bounds {
+        let moved = |(camera, depths): &CameraDepths| {
             let centre = on_grid(camera).centre();
             let moved = on_grid(camera).moved(scale * (centre + shift) - centre);
             (moved, depths.map(|depths| depths.map(|depth| scale * depth)))
         };
-        let all: Vec<SeenDepths> = sights.iter().map(moved).collect();
-        place(&all, &all[..1], goes_on, None).unwrap().rounded(all[0].0.centre())
+        let all: Vec<CameraDepths> = sights.iter().map(moved).collect();
+        scene_bounds(&all, &all[..1], is_unbounded, None).unwrap().rounded(all[0].0.centre())
     }
 
     fn scaled(bounds: Bounds, by: f64) -> Bounds {
@@ -510,17 +517,17 @@ mod tests {
     /// don't know where the scene lies.
     #[test]
     fn bounds_move_with_the_scene() {
-        for (sights, goes_on) in scenes() {
-            let here = placed(&sights, goes_on, DVec3::ZERO, 1.0);
+        for (sights, is_unbounded) in scenes() {
+            let here = placed(&sights, is_unbounded, DVec3::ZERO, 1.0);
             for shift in [
                 DVec3::new(500_000.0, 4_649_776.0, 120.0),
                 DVec3::new(4_027_893.75, 307_045.625, 4_919_474.875),
                 DVec3::new(-7.25, 300.0, 1024.0),
             ] {
-                assert_eq!(placed(&sights, goes_on, shift, 1.0), here.moved(shift), "{shift}");
+                assert_eq!(placed(&sights, is_unbounded, shift, 1.0), here.moved(shift), "{shift}");
             }
             for scale in [1.0 / 131_072.0, 0.5, 65_536.0] {
-                let there = placed(&sights, goes_on, DVec3::ZERO, scale);
+                let there = placed(&sights, is_unbounded, DVec3::ZERO, scale);
                 assert_eq!(there, scaled(here, scale), "{scale}");
             }
         }
@@ -539,7 +546,7 @@ mod tests {
     fn the_space_is_what_the_cameras_see() {
         let ring = circle(DVec3::ZERO, 4.0);
         let chosen =
-            |depths, kind| place(&sights(&ring, depths), &[], false, kind).map(|b| b.space);
+            |depths, kind| scene_bounds(&sights(&ring, depths), &[], false, kind).map(|b| b.space);
         assert_eq!(chosen(None, None), Ok(Space::Box));
         assert_eq!(chosen(Some([3.0, 5.0]), None), Ok(Space::Box));
         assert_eq!(chosen(Some([3.0, 40.0]), None), Ok(Space::Contraction));
@@ -548,10 +555,13 @@ mod tests {
         assert_eq!(chosen(Some([3.0, 5.0]), Some(SpaceKind::Ndc)), Err(SpaceError::NotForward));
         let one = [looking_at(DVec3::Y, DVec3::ZERO)];
         assert_eq!(
-            place(&sights(&one, None), &[], false, Some(SpaceKind::Ndc)),
+            scene_bounds(&sights(&one, None), &[], false, Some(SpaceKind::Ndc)),
             Err(SpaceError::NoDepths)
         );
-        assert_eq!(place(&sights(&one, None), &[], false, None).map(|b| b.space), Ok(Space::Box));
+        assert_eq!(
+            scene_bounds(&sights(&one, None), &[], false, None).map(|b| b.space),
+            Ok(Space::Box)
+        );
     }
 
     /// The camera behind an equidistant lens that sees so many degrees across.
@@ -567,7 +577,7 @@ mod tests {
     fn fisheye_cameras_have_a_box_or_a_contraction() {
         let row: Vec<Camera> = (0..5).map(|i| fisheye(&parallel(1.0, i), 160.0)).collect();
         let seen = sights(&row, Some([2.0, 10.0]));
-        let bounds = bounds_of(&seen);
+        let bounds = box_bounds(&seen);
         for camera in &row {
             for (x, y) in [(0.0, 0.0), (3.0, 50.0), (51.0, 97.0), (50.0, 50.0), (70.0, 20.0)] {
                 for distance in [2.0, 5.0, 10.0] {
@@ -577,23 +587,28 @@ mod tests {
             }
         }
         assert!(bounds.longest_side() < 24.0 && bounds.far < 11.1, "{bounds:?}");
-        assert_eq!(place(&seen, &[], false, Some(SpaceKind::Ndc)), Err(SpaceError::Fisheye));
-        let known = place(&seen, &[], false, None).unwrap();
+        assert_eq!(scene_bounds(&seen, &[], false, Some(SpaceKind::Ndc)), Err(SpaceError::Fisheye));
+        let known = scene_bounds(&seen, &[], false, None).unwrap();
         assert_eq!(known.space, Space::Box);
-        let unknown = place(&sights(&row, None), &[], true, None).unwrap();
+        let unknown = scene_bounds(&sights(&row, None), &[], true, None).unwrap();
         assert_eq!(unknown.space, Space::Contraction);
         // Test views count, too.
         let pinholes: Vec<Camera> = (0..5).map(|i| parallel(1.0, i)).collect();
         let others = sights(&row[..1], Some([2.0, 10.0]));
         assert_eq!(
-            place(&sights(&pinholes, Some([2.0, 10.0])), &others, false, Some(SpaceKind::Ndc)),
+            scene_bounds(
+                &sights(&pinholes, Some([2.0, 10.0])),
+                &others,
+                false,
+                Some(SpaceKind::Ndc)
+            ),
             Err(SpaceError::Fisheye)
         );
         // The box around what they look at doesn't hold them, however wide their view is.
         for (degrees, half) in [(60.0, 1.05 * 4.0 * f64::to_radians(30.0).tan()), (180.0, 4.2)] {
             let around = circle(DVec3::ZERO, 4.0);
             let ring: Vec<Camera> = around.iter().map(|c| fisheye(c, degrees)).collect();
-            let found = 0.5 * bounds_of(&sights(&ring, None)).longest_side();
+            let found = 0.5 * box_bounds(&sights(&ring, None)).longest_side();
             assert!((found - half).abs() < 1e-9, "{degrees}: {found}");
         }
     }
@@ -614,10 +629,10 @@ mod tests {
 
     /// Without any depth: where images say that the scene goes on, cameras say how.
     #[test]
-    fn a_scene_that_goes_on_is_in_no_box() {
+    fn an_unbounded_scene_is_not_in_a_box() {
         for scale in [1e-3, 1.0, 1e3] {
             let ring = circle(DVec3::ZERO, 4.0 * scale);
-            let around = place(&sights(&ring, None), &[], true, None).unwrap();
+            let around = scene_bounds(&sights(&ring, None), &[], true, None).unwrap();
             assert_eq!(around.space, Space::Contraction);
             let half = 0.5 * around.longest_side() / scale;
             assert!(
@@ -628,12 +643,13 @@ mod tests {
             );
             // Where depths are known they decide.
             let known =
-                place(&sights(&ring, Some([3.0 * scale, 5.0 * scale])), &[], true, None).unwrap();
+                scene_bounds(&sights(&ring, Some([3.0 * scale, 5.0 * scale])), &[], true, None)
+                    .unwrap();
             assert_eq!(known.space, Space::Box);
             // From within: a room.
             let outwards: Vec<Camera> =
                 ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre())).collect();
-            let room = place(&sights(&outwards, None), &[], true, None).unwrap();
+            let room = scene_bounds(&sights(&outwards, None), &[], true, None).unwrap();
             assert_eq!(room.space, Space::Contraction);
             assert!((7.9..8.5).contains(&(0.5 * room.longest_side() / scale)), "{room:?}");
             // Forward: parallel axes, and axes that meet at a distance of 6.
@@ -642,9 +658,13 @@ mod tests {
                 ((0..5).map(|i| meeting(scale, i)).collect(), 6.0),
             ];
             for (cameras, distance) in forward {
-                let seen =
-                    place(&sights(&cameras, None), &sights(&cameras[1..2], None), true, None)
-                        .unwrap();
+                let seen = scene_bounds(
+                    &sights(&cameras, None),
+                    &sights(&cameras[1..2], None),
+                    true,
+                    None,
+                )
+                .unwrap();
                 let Space::Ndc(frustum) = seen.space else { panic!("{seen:?}") };
                 assert!(
                     frustum.near < 0.3 * distance * scale && frustum.near > 0.1 * distance * scale,
@@ -654,7 +674,7 @@ mod tests {
             }
             // One camera says nothing of how far anything is.
             assert_eq!(
-                place(&sights(&ring[..1], None), &[], true, None).unwrap().space,
+                scene_bounds(&sights(&ring[..1], None), &[], true, None).unwrap().space,
                 Space::Contraction
             );
         }

@@ -2,13 +2,14 @@ use pixels::{Filter, Image, Kernel, Resampling, Rgba8, average_pool, resize_pill
 
 use crate::sizes::Sizes;
 
-/// Extension of the LR files: 8-bit PNG, or EXR where nothing is rounded.
+/// Returns the extension of LR files: 8-bit PNG, or EXR for the unrounded `average`.
 pub(crate) fn extension(kernel: Kernel) -> &'static str {
     if kernel == Kernel::Average { "exr" } else { "png" }
 }
 
-/// LR pixels beside one that its mask has to be clear of, too: beyond them lie a kernel's last lobe
-/// and less than a tenth of its weight.
+/// Returns the number of neighbouring LR pixels that must be unmasked, too, for a pixel to count:
+/// beyond them are only a kernel's last lobe and less than a tenth of its weight
+/// (docs/design/005).
 pub(crate) fn mask_reach(kernel: Kernel) -> usize {
     match kernel {
         Kernel::Lanczos | Kernel::Bicubic => 1,
@@ -16,17 +17,17 @@ pub(crate) fn mask_reach(kernel: Kernel) -> usize {
     }
 }
 
-/// An LR image as its kernel gives it.
+/// LR image in its kernel's precision.
 #[derive(Clone, Debug, PartialEq)]
-pub enum LrImage {
-    /// Rounded to 8 bits, alpha straight.
+pub(crate) enum LrImage {
+    /// Rounded to 8 bits, straight alpha.
     Bytes(Rgba8),
-    /// Not rounded, alpha premultiplied.
+    /// Unrounded, premultiplied alpha.
     Floats(Image),
 }
 
 impl LrImage {
-    /// The same shrunk once more, by the same kernel.
+    /// Downscales the image once more by the same kernel.
     pub(crate) fn shrunk(&self, (width, height): (usize, usize), kernel: Kernel) -> Self {
         match self {
             Self::Bytes(image) => Self::Bytes(resize_pillow(image, width, height, kernel.filter())),
@@ -38,7 +39,7 @@ impl LrImage {
         }
     }
 
-    /// Columns and rows.
+    /// Returns width and height.
     pub(crate) fn size(&self) -> (usize, usize) {
         match self {
             Self::Bytes(image) => (image.width, image.height),
@@ -47,25 +48,25 @@ impl LrImage {
     }
 }
 
-/// The HR image by Lanczos from the photograph, and the LR image from that 8-bit HR one: two steps,
-/// as the paper's code does.
+/// Creates the HR image from the photograph by Lanczos, and the LR image from that 8-bit HR image:
+/// two steps, as in the paper's code.
 ///
 /// # Panics
-/// With [`Kernel::Average`] when the sizes aren't whole multiples.
-pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LrImage) {
-    let size = |(w, h): (u32, u32)| (w as usize, h as usize);
-    let (hr_size, lr_size) = (size(sizes.hr), size(sizes.lr));
-    let hr = resize_pillow(image, hr_size.0, hr_size.1, Filter::Lanczos);
+/// With [`Kernel::Average`] if the HR size isn't an integer multiple of the LR size.
+pub(crate) fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LrImage) {
+    let [hr_width, hr_height] = [sizes.hr.0, sizes.hr.1].map(|length| length as usize);
+    let [lr_width, lr_height] = [sizes.lr.0, sizes.lr.1].map(|length| length as usize);
+    let hr = resize_pillow(image, hr_width, hr_height, Filter::Lanczos);
     let lr = match kernel {
         Kernel::Lanczos | Kernel::Bicubic | Kernel::Box => {
-            LrImage::Bytes(resize_pillow(&hr, lr_size.0, lr_size.1, kernel.filter()))
+            LrImage::Bytes(resize_pillow(&hr, lr_width, lr_height, kernel.filter()))
         }
         Kernel::Average => {
-            let pooled = average_pool(&hr, hr_size.0 / lr_size.0, hr_size.1 / lr_size.1);
+            let pooled = average_pool(&hr, hr_width / lr_width, hr_height / lr_height);
             let mut floats = pooled.expect("an average is refused for sizes that don't divide");
-            // The mean of straight colours times the mean alpha: what the paper's code composites.
-            for p in floats.data.chunks_exact_mut(4) {
-                (0..3).for_each(|c| p[c] *= p[3]);
+            // Mean straight colour times mean alpha, which the paper's code composites.
+            for [r, g, b, a] in floats.data.as_chunks_mut::<4>().0 {
+                (*r, *g, *b) = (*r * *a, *g * *a, *b * *a);
             }
             LrImage::Floats(floats)
         }

@@ -1,37 +1,39 @@
 use artifact::{Failure, number};
+use dataset::Frame;
 
 use crate::bounds::SpaceError;
 use crate::sizes::{SizeError, Sizes};
 
-/// Parameters that a data set can't have. Functions fail with a [`Failure`] made of it, which has
-/// the exit code.
+/// Returns `frame NAME`, the prefix of messages about a frame.
+pub(crate) fn frame_label(frame: &Frame) -> String {
+    format!("frame {}", frame.name)
+}
+
+/// Error returned when parameters don't suit the data set; converts into [`Failure::Usage`].
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(crate) enum ParameterError {
-    #[error(
-        "parameter split: the data set doesn't say which views are for testing; choose holdout or \
-        paper"
-    )]
+    #[error("parameter split: the data set has no split of its own; choose holdout or paper")]
     NoSplit,
     #[error(
-        "parameter lr_width: with lr_source photographs their own width is the LR width; leave \
-        lr_width out"
+        "parameter lr_width: with lr_source photographs, the LR width is that of the photographs; \
+        omit lr_width"
     )]
-    WidthOfPhotographs,
-    #[error("parameter kernel: average makes LR images and can't be assumed; choose box")]
+    LrWidthOfPhotographs,
+    #[error("parameter kernel: average cannot be assumed for photographs; choose box")]
     AssumedAverage,
-    /// The kernel takes the mean of whole pixels.
+    /// Kernel `average` with a fractional scale: it averages whole pixels only.
     #[error(
-        "parameter kernel: average needs a whole scale, not {:?} → {:?}; choose box",
+        "parameter kernel: average requires an integer scale, found {:?} → {:?}; choose box",
         .0.hr, .0.lr
     )]
-    UnevenAverage(Sizes),
+    FractionalAverage(Sizes),
     #[error("parameters: {0}")]
     Sizes(SizeError),
     #[error(transparent)]
     Space(#[from] SpaceError),
-    #[error("parameter {name}: {} is not a distance", number(*value))]
-    NoDistance { name: &'static str, value: f64 },
-    #[error("parameter near: {} is not before far = {}", number(*near), number(*far))]
+    #[error("parameter {name}: {} is not a valid distance", number(*value))]
+    InvalidDistance { name: &'static str, value: f64 },
+    #[error("parameter near: {} is not less than far = {}", number(*near), number(*far))]
     NearAndFar { near: f64, far: f64 },
 }
 
@@ -41,13 +43,12 @@ impl From<ParameterError> for Failure {
     }
 }
 
-/// Training views that were all taken by the same camera at the same place.
+/// Error returned when all training views have equal poses.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "all {views} training views have the same pose: nothing tells how far anything is; are the \
-    poses right?"
+    "all {views} training views have the same pose: depth cannot be estimated; check the poses"
 )]
 pub(crate) struct SamePose {
-    /// How many there are.
+    /// Number of training views.
     pub(crate) views: usize,
 }

@@ -5,30 +5,30 @@ use scene::{Camera, Intrinsics};
 
 use crate::error::ParameterError;
 use crate::params::{LrSource, Params};
-use crate::sizes::{Sizes, enlarged, scaled, sizes};
+use crate::sizes::{Sizes, downscaled_sizes, enlarged_sizes, scaled_length};
 
-/// Which images are made of photographs: whether there is HR truth, at which sizes, by which
-/// kernel.
+/// Images that are created from photographs: whether HR truth exists, sizes and kernel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ImagePlan {
-    /// Whether LR images are made from HR ones.
+    /// True if LR images are downscaled from HR images.
     pub(crate) has_truth: bool,
-    /// The kernel that makes LR images, or is taken to have made them.
+    /// Kernel that creates LR images, or is assumed to have created them.
     pub(crate) kernel: Kernel,
-    /// Sizes of the first training view, and its own.
+    /// LR and HR size of the first training view.
     pub(crate) sizes: Sizes,
+    /// Size of the first training view's photograph.
     pub(crate) native: (u32, u32),
 }
 
 impl ImagePlan {
-    /// Of a data set's training and test views. What parameters can't have is said.
+    /// Derives the plan from a data set and parameters; fails if they contradict each other.
     pub(crate) fn new(set: &Dataset, split: &Split, params: &Params) -> Result<Self, Failure> {
         let has_truth = match params.lr_source {
             Some(source) => source == LrSource::Downscaled,
             None => set.format.is_benchmark() || params.lr_width.is_some(),
         };
         if !has_truth && params.lr_width.is_some() {
-            return Err(ParameterError::WidthOfPhotographs.into());
+            return Err(ParameterError::LrWidthOfPhotographs.into());
         }
         if !has_truth && params.kernel == Some(Kernel::Average) {
             return Err(ParameterError::AssumedAverage.into());
@@ -37,74 +37,72 @@ impl ImagePlan {
         let first = set.frames[split.train[0]].intrinsics();
         let native = (first.width, first.height);
         let sizes = if has_truth {
-            sizes(native, params.lr_width, params.hr_width, params.scale)
+            downscaled_sizes(native, params.lr_width, params.hr_width, params.scale)
         } else {
-            enlarged(native, params.hr_width, params.scale)
+            enlarged_sizes(native, params.hr_width, params.scale)
         };
-        let sizes = sizes.map_err(ParameterError::Sizes)?;
-        let plan = Self { has_truth, kernel, sizes, native };
+        let plan = Self { has_truth, kernel, sizes: sizes.map_err(ParameterError::Sizes)?, native };
         if kernel == Kernel::Average {
-            let mut all = split
-                .train
-                .iter()
-                .chain(&split.test)
-                .map(|&i| plan.sizes_of(&set.frames[i].intrinsics()));
-            if let Some(odd) = all.find(|sizes| !sizes.is_integer()) {
-                return Err(ParameterError::UnevenAverage(odd).into());
+            for &i in split.train.iter().chain(&split.test) {
+                let sizes = plan.sizes_of(&set.frames[i].intrinsics());
+                if !sizes.is_integer() {
+                    return Err(ParameterError::FractionalAverage(sizes).into());
+                }
             }
         }
         Ok(plan)
     }
 
-    /// LR and HR size of a view: other shapes are shrunk as much as the first view is.
+    /// Returns LR and HR size of a view: views of other sizes are scaled by the first view's
+    /// factors.
     pub(crate) fn sizes_of(&self, native: &Intrinsics) -> Sizes {
         let Sizes { lr, hr } = self.sizes;
-        Sizes { lr: self.size_beside(lr, native), hr: self.size_beside(hr, native) }
+        Sizes { lr: self.scaled_like_first(native, lr), hr: self.scaled_like_first(native, hr) }
     }
 
-    /// Size of a view beside the first view's.
-    fn size_beside(&self, first: (u32, u32), native: &Intrinsics) -> (u32, u32) {
+    /// Scales a view's size as the first view's native size was scaled to `first`.
+    fn scaled_like_first(&self, native: &Intrinsics, first: (u32, u32)) -> (u32, u32) {
         let (width, height) = self.native;
-        (scaled(native.width, width, first.0), scaled(native.height, height, first.1))
+        (scaled_length(native.width, width, first.0), scaled_length(native.height, height, first.1))
     }
 
-    /// A camera at LR size.
-    pub(crate) fn at_lr(&self, camera: &Camera) -> Camera {
+    /// Resizes a camera to LR size.
+    pub(crate) fn lr_camera(&self, camera: &Camera) -> Camera {
         let (width, height) = self.sizes_of(&camera.intrinsics).lr;
         camera.resized(width, height)
     }
 
-    /// A camera at HR size.
-    pub(crate) fn at_hr(&self, camera: &Camera) -> Camera {
+    /// Resizes a camera to HR size.
+    pub(crate) fn hr_camera(&self, camera: &Camera) -> Camera {
         let (width, height) = self.sizes_of(&camera.intrinsics).hr;
         camera.resized(width, height)
     }
 
-    /// Size of an LR image shrunk as HR images were to make LR ones.
-    pub(crate) fn one_size_down(&self, (width, height): (u32, u32)) -> (u32, u32) {
+    /// Returns the size of an LR image downscaled once more by the same factor.
+    pub(crate) fn downscaled_size(&self, (width, height): (u32, u32)) -> (u32, u32) {
         let Sizes { lr, hr } = self.sizes;
-        (scaled(width, hr.0, lr.0), scaled(height, hr.1, lr.1))
+        (scaled_length(width, hr.0, lr.0), scaled_length(height, hr.1, lr.1))
     }
 
-    /// What was chosen, in a line.
-    pub(crate) fn choice(&self, split: &Split) -> String {
+    /// Describes views, sizes and kernel for the log.
+    pub(crate) fn note(&self, split: &Split) -> String {
         let Sizes { lr, hr } = self.sizes;
         let kernel = format!("{:?}", self.kernel).to_lowercase();
-        let both = split.train.iter().filter(|i| split.test.contains(i)).count();
-        let (train, test) = (counted(split.train.len(), "view"), split.test.len());
-        let parts = match both {
-            0 => format!("{train} to train on, {} for testing", counted(test, "other")),
-            _ => format!("{train} to train on, {test} for testing, {both} of them for both"),
-        };
+        let shared = split.train.iter().filter(|i| split.test.contains(i)).count();
+        let train = counted(split.train.len(), "training view");
+        let mut views = format!("{train}, {}", counted(split.test.len(), "test view"));
+        if shared > 0 {
+            views += &format!(" ({shared} in both)");
+        }
         if self.has_truth {
             format!(
-                "{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}",
+                "{views}; LR images ({}×{}) are downscaled from HR images ({}×{}) by {kernel}",
                 lr.0, lr.1, hr.0, hr.1
             )
         } else {
             format!(
-                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}; HR \
-                is {}×{}",
+                "{views}; the photographs are the LR images ({}×{}), with assumed kernel {kernel}; \
+                HR is {}×{}",
                 lr.0, lr.1, hr.0, hr.1
             )
         }

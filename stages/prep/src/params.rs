@@ -9,54 +9,55 @@ use crate::bounds::SpaceKind;
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the LR images in pixels; the height follows the aspect. Default: the HR width
+    /// Width of the LR images in pixels; the height follows the aspect ratio. Default: the HR width
     /// divided by `scale`.
     #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub lr_width: Option<u32>,
     /// Width of the HR images in pixels. Default: `lr_width` times `scale`, or the width of the
-    /// images given.
+    /// data set's images.
     #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub hr_width: Option<u32>,
-    /// HR width over LR width. It needn't be given beside both widths.
+    /// HR width over LR width. Optional if both widths are given.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "output", "x-default" = "2"))]
     pub scale: Option<f64>,
-    /// Where LR images come from: `photographs` as given, without HR ground truth, or `downscaled`
-    /// from HR images by `kernel`. Default: `downscaled` for a benchmark's data set and with
-    /// `lr_width`, else `photographs`.
+    /// Source of the LR images: the `photographs` themselves, without HR ground truth, or images
+    /// `downscaled` from HR images by `kernel`. Default: `downscaled` for benchmark formats (Blender,
+    /// LLFF) and with `lr_width`, otherwise `photographs`.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub lr_source: Option<LrSource>,
-    /// Kernel that makes LR images from HR ones. With `lr_source: photographs`, the kernel that is
-    /// assumed to have made them. Default: `lanczos` for downscaled images, `box` for photographs.
+    /// Degradation kernel from HR to LR images. With `lr_source: photographs`, the assumed kernel of
+    /// the photographs. Default: `lanczos` for downscaled images, `box` for photographs.
     #[schemars(extend("x-group" = "data", "x-default" = "by `lr_source`"))]
     pub kernel: Option<Kernel>,
-    /// Treatment of lens distortion and of fisheye lenses, where the data set states them.
+    /// Treatment of lens distortion and of fisheye lenses that the data set describes.
     #[schemars(extend("x-group" = "data"))]
     pub lens: LensHandling,
-    /// What lies behind the scene. Default: `white` where images have alpha. Without alpha `white`
-    /// or `black` where the borders of nine in ten views are that colour and no strips, else
-    /// `opaque`.
+    /// Background of the scene. Default: `white` if images have alpha. Without alpha, `white` or
+    /// `black` if the borders of nine in ten views have that colour and are not strips of
+    /// undistortion or letterboxing, otherwise `opaque`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub background: Option<Background>,
-    /// Distance along rays before which nothing lies. Default: from the cameras.
+    /// Distance along rays at which the scene starts. Default: derived from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub near: Option<f64>,
-    /// Distance along rays behind which nothing lies. Default: from the cameras.
+    /// Distance along rays at which the scene ends. Default: derived from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub far: Option<f64>,
-    /// Space that the field keeps in its unit cube. Default: `ndc` where all cameras look one way
-    /// and the nearest depth is known or the background is `opaque`, `contraction` where else it is
-    /// `opaque` or points are known far outside the space that the cameras look at, else `box`.
+    /// Space of the field's unit cube. Default: `ndc` if all cameras face one direction and their
+    /// depths are known or the background is `opaque`; otherwise `contraction` if the background is
+    /// `opaque` and depths are unknown, or known points are far outside the region that the cameras
+    /// face; otherwise `box`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub space: Option<SpaceKind>,
-    /// Which views are for training and which for testing. Default: the data set's own split, else
-    /// `holdout`.
+    /// Split into training and test views. Default: the data set's own split, or `holdout` if it has
+    /// none.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub split: Option<SplitKind>,
-    /// Maximum number of test views, spread evenly.
+    /// Maximum number of test views, chosen at even intervals.
     #[schemars(range(min = 1), extend("x-group" = "data", "x-default" = "all"))]
     pub test_views: Option<u32>,
-    /// Number of training views that are kept at HR, as references. The first view is one; each
-    /// further one has the camera farthest from those before.
+    /// Number of training views that are also stored at HR, as references. The first view is one;
+    /// each further reference has the camera farthest from the previous references.
     #[schemars(extend("x-group" = "data"))]
     pub hr_references: u32,
 }
@@ -81,41 +82,41 @@ impl Default for Params {
     }
 }
 
-/// What is done about lens distortion, where the data say what it is.
+/// Treatment of lens distortion that the data set describes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum LensHandling {
-    /// Rays follow it: photographs stay as they were taken, to the last pixel, and so do rendered
-    /// views. Pixels more than 89° from the axis of a fisheye lens are masked.
+    /// Rays follow the distortion: photographs are unchanged, and rendered views have the same
+    /// distortion. Pixels more than 89° from the axis of a fisheye lens are masked.
     Follow,
-    /// Photographs are resampled to what pinhole cameras would have taken, and lose a border. A
-    /// fisheye lens's pinhole camera sees at most 100° across the longer side.
+    /// Photographs are resampled to pinhole cameras, which crops their border. The field of view in
+    /// place of a fisheye lens is at most 100° along the longer side.
     Undo,
-    /// Photographs are taken for a pinhole's: the habit with LLFF's scenes, whose files don't speak
-    /// of lenses. To compare with.
+    /// Photographs are treated as those of pinhole cameras, as is customary for LLFF scenes, whose
+    /// files don't describe lenses. For comparison with published results.
     Ignore,
 }
 
-/// Where LR images come from.
+/// Source of the LR images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum LrSource {
-    /// The photographs as they are given; there is no HR truth.
+    /// The unmodified photographs; HR truth doesn't exist.
     Photographs,
-    /// HR images, made smaller by `kernel`.
+    /// HR images, downscaled by `kernel`.
     Downscaled,
 }
 
-/// Ways to part views for training from views for testing.
+/// Split of the views into training and test views.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SplitKind {
-    /// As the data set itself says.
+    /// The data set's own split.
     Given,
-    /// Every eighth view, the first among them, is for testing alone: what a figure needs to be
-    /// honest.
+    /// Every eighth view, starting with the first, is a test view and never trained on, so that
+    /// scores measure unseen views.
     Holdout,
-    /// All views are for both, references excepted, which aren't tested: the paper's way with
-    /// photographs.
+    /// All views are training views, and all except references are test views: the paper's protocol
+    /// for photographs.
     Paper,
 }

@@ -1,90 +1,87 @@
+//! Checks of implausible poses (docs/design/030).
+
 use artifact::counted;
 use glam::DVec3;
 use scene::{Camera, Intrinsics, length};
 
 use crate::error::SamePose;
 
-/// Cameras that are so many times as far from the middle of all as half of them are, at least, are
-/// far off. One that is doubles the box as often as that; walks through a room have 2 to 5.
-const FAR_OFF_RATIO: f64 = 20.0;
-/// Fewer cameras say too little of where the others stand.
-const LEAST_CAMERAS: usize = 4;
-/// A principal point farther from the middle of the image, as a share of its length, is far from
-/// it. Real lenses have a hundredth.
-const OFF_CENTRE_SHARE: f64 = 0.2;
-/// Relative errors of coordinates in double precision, which were computed by a few operations, and
-/// of coordinates that all fit into single precision.
+/// Distance of an outlier camera from the centre, relative to the median distance. Walks through a
+/// room have 2 to 5; the threshold is chosen by hand.
+const MIN_OUTLIER_RATIO: f64 = 20.0;
+/// Minimum number of cameras whose median distance is meaningful; chosen by hand.
+const MIN_CAMERAS: usize = 4;
+/// Maximum offset of a plausible principal point from the image centre, relative to the image side.
+/// Real lenses have 0.01; the threshold is chosen by hand.
+const MAX_CENTRE_OFFSET: f64 = 0.2;
+/// Relative error of coordinates that a few operations in double precision computed.
 const DOUBLE_ERROR: f64 = 8.0 * f64::EPSILON;
+/// Relative error of coordinates that were rounded to single precision.
 const SINGLE_ERROR: f64 = f32::EPSILON as f64;
-/// Cameras whose centres are known to less than this share of their distance from each other have
-/// poses too coarse for a sharp field: a thousandth is a pixel or so.
-const COARSE_SHARE: f64 = 1e-3;
+/// Maximum rounding error of camera centres, relative to their distance from each other, for a
+/// sharp field: 0.001 is about one pixel.
+const MAX_CENTRE_ERROR: f64 = 1e-3;
 
-/// Refuses training views that were all taken by the same camera at the same place: whatever they
-/// show, it isn't one scene seen from several sides.
+/// Fails if all training views have the same pose: they don't observe one scene from several sides.
 pub(crate) fn check(training: &[Camera]) -> Result<(), SamePose> {
-    match training {
-        [first, others @ ..]
-            if !others.is_empty()
-                && others.iter().all(|c| c.camera_to_world == first.camera_to_world) =>
-        {
-            Err(SamePose { views: training.len() })
-        }
-        _ => Ok(()),
+    let [first, others @ ..] = training else { return Ok(()) };
+    let are_equal = others.iter().all(|c| c.camera_to_world == first.camera_to_world);
+    if others.is_empty() || !are_equal {
+        return Ok(());
     }
+    Err(SamePose { views: training.len() })
 }
 
-/// What looks wrong about cameras, a line each.
+/// Returns a warning for each implausible property of the cameras.
 pub(crate) fn warnings(training: &[Camera], test: &[Camera]) -> Vec<String> {
     let mut found = Vec::new();
     if training.len() == 1 {
         found.push(
-            "there is 1 training view: nothing tells how far anything is; add views from \
-            other sides"
+            "there is only 1 training view: depth cannot be estimated; add views from other \
+            directions"
                 .to_owned(),
         );
     }
-    found.extend(one_place(training));
-    let named = |kind: &'static str| move |camera| Named { camera, kind };
-    let all: Vec<Named> =
-        training.iter().map(named("training")).chain(test.iter().map(named("test"))).collect();
-    found.extend(far_off(&all));
+    found.extend(single_position(training));
+    let mut all: Vec<LabelledCamera> = Vec::new();
+    for (cameras, split) in [(training, "training"), (test, "test")] {
+        all.extend(cameras.iter().map(|camera| LabelledCamera { camera, split }));
+    }
+    found.extend(outliers(&all));
     found.extend(off_centre(&all));
     found
 }
 
-/// A camera, and what its view is for.
+/// Camera with its part of the split; displays as `training view NAME`.
 #[derive(Clone, Copy)]
-struct Named<'a> {
+struct LabelledCamera<'a> {
     camera: &'a Camera,
-    kind: &'static str,
+    split: &'static str,
 }
 
-impl std::fmt::Display for Named<'_> {
+impl std::fmt::Display for LabelledCamera<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} view {}", self.kind, self.camera.name)
+        write!(f, "{} view {}", self.split, self.camera.name)
     }
 }
 
-/// Cameras in one place, up to rounding, and cameras whose centres are rounded too coarsely: poses
-/// of a georeferenced scene in single precision.
-fn one_place(cameras: &[Camera]) -> Option<String> {
+/// Detects cameras at one position up to rounding, and cameras whose centres are rounded too
+/// coarsely, such as georeferenced poses in single precision.
+fn single_position(cameras: &[Camera]) -> Option<String> {
     let [first, others @ ..] = cameras else { return None };
     let distances = others.iter().map(|camera| camera.centre().distance(first.centre()));
-    let (apart, error) = (distances.fold(0.0, f64::max), rounding_error(cameras));
-    if others.is_empty() || error < COARSE_SHARE * apart {
+    let (extent, error) = (distances.fold(0.0, f64::max), rounding_error(cameras));
+    if others.is_empty() || error < MAX_CENTRE_ERROR * extent {
         return None;
     }
     let count = cameras.len();
-    Some(if apart <= error {
-        format!(
-            "all {count} training cameras stand in one place: nothing tells how far anything is"
-        )
+    Some(if extent <= error {
+        format!("all {count} training cameras are at the same position: depth cannot be estimated")
     } else {
         format!(
-            "the {count} training cameras stand up to {} units apart, but their centres are known \
-            only to {}: subtract an offset from all centres before they are rounded",
-            length(apart, 3),
+            "the {count} training cameras are up to {} units apart, but their centres are rounded \
+            to {}: subtract an offset from all centres before rounding",
+            length(extent, 3),
             length(error, 3)
         )
     })
@@ -92,48 +89,50 @@ fn one_place(cameras: &[Camera]) -> Option<String> {
 
 /// Returns the error of the cameras' coordinates that follows from their number format.
 fn rounding_error(cameras: &[Camera]) -> f64 {
-    let coordinates = || cameras.iter().flat_map(|camera| camera.centre().to_array());
-    let are_single = coordinates().all(|x| f64::from(x as f32) == x);
-    let largest = coordinates().fold(0.0, |largest: f64, x| largest.max(x.abs()));
+    let coordinates: Vec<f64> =
+        cameras.iter().flat_map(|camera| camera.centre().to_array()).collect();
+    let are_single = coordinates.iter().all(|x| f64::from(*x as f32) == *x);
+    let largest = coordinates.iter().fold(0.0, |largest: f64, x| largest.max(x.abs()));
     largest * if are_single { SINGLE_ERROR } else { DOUBLE_ERROR }
 }
 
-/// Cameras far away from the others, by the medians: those hold whatever a few cameras do.
-fn far_off(all: &[Named]) -> Option<String> {
-    let centres: Vec<DVec3> = all.iter().map(|named| named.camera.centre()).collect();
+/// Detects cameras far from the others. Medians, unlike means, are insensitive to a few outliers.
+fn outliers(all: &[LabelledCamera]) -> Option<String> {
+    let centres: Vec<DVec3> = all.iter().map(|labelled| labelled.camera.centre()).collect();
     let middle = DVec3::from([0, 1, 2].map(|i| median(centres.iter().map(|centre| centre[i]))));
-    let away: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
-    let usual = median(away.iter().copied());
-    if all.len() < LEAST_CAMERAS || usual <= 0.0 {
+    let distances: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
+    let usual = median(distances.iter().copied());
+    if all.len() < MIN_CAMERAS || usual <= 0.0 {
         return None;
     }
-    let far: Vec<usize> = (0..all.len()).filter(|&i| away[i] > FAR_OFF_RATIO * usual).collect();
+    let far: Vec<usize> =
+        (0..all.len()).filter(|&i| distances[i] > MIN_OUTLIER_RATIO * usual).collect();
+    let first = *far.first()?;
     let more = if far.len() > 1 { format!(" (and {} more)", far.len() - 1) } else { String::new() };
-    far.first().map(|&first| {
-        format!(
-            "{} is {:.0} times as far from the middle of all cameras as half of them{more}; is its \
-            pose right? The scene's bounds follow from all poses",
-            all[first],
-            away[first] / usual
-        )
-    })
+    Some(format!(
+        "{} is {:.0} times as far from the cameras' centre as the median camera{more}; check its \
+        pose: the scene's bounds depend on all poses",
+        all[first],
+        distances[first] / usual
+    ))
 }
 
-/// The middle of some numbers in order; 0 of none.
-fn median(of: impl Iterator<Item = f64>) -> f64 {
-    let mut sorted: Vec<f64> = of.collect();
+/// Returns the upper median; 0 for no values.
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut sorted: Vec<f64> = values.collect();
     sorted.sort_unstable_by(f64::total_cmp);
     sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Principal points far from the middles of images: commonly numbers for images of another size.
-fn off_centre(all: &[Named]) -> Option<String> {
-    let off: Vec<&Named> = all.iter().filter(|n| is_off_centre(&n.camera.intrinsics)).collect();
+/// Detects principal points far from the image centre: usually intrinsics for another image size.
+fn off_centre(all: &[LabelledCamera]) -> Option<String> {
+    let off: Vec<&LabelledCamera> =
+        all.iter().filter(|labelled| is_off_centre(&labelled.camera.intrinsics)).collect();
     let first = off.first()?;
     let k = &first.camera.intrinsics;
     Some(format!(
-        "{} of {} have a principal point far from the middle, first {first}: ({:.1}, {:.1}) in \
-        {}×{} pixels; are cx, cy, w and h for one size?",
+        "{} of {} have a principal point far from the image centre (first: {first} with \
+        ({:.1}, {:.1}) in {}×{} pixels); do cx, cy, w and h refer to the same size?",
         off.len(),
         counted(all.len(), "view"),
         k.cx,
@@ -144,8 +143,9 @@ fn off_centre(all: &[Named]) -> Option<String> {
 }
 
 fn is_off_centre(k: &Intrinsics) -> bool {
-    let off = |at: f64, length: u32| (at / f64::from(length) - 0.5).abs() > OFF_CENTRE_SHARE;
-    off(k.cx, k.width) || off(k.cy, k.height)
+    [(k.cx, k.width), (k.cy, k.height)]
+        .iter()
+        .any(|(c, side)| (c / f64::from(*side) - 0.5).abs() > MAX_CENTRE_OFFSET)
 }
 
 #[cfg(test)]
@@ -195,8 +195,8 @@ mod tests {
         let (utm, ecef) = ([500_000.0, 4_649_776.0, 120.0], [4_027_893.75, 307_045.6, 4_919_474.9]);
         for offset in [utm, ecef] {
             for (scale, words) in [
-                (0.025, "all 8 training cameras stand in one place"),
-                (10.0, "units apart, but their centres are known only to 0.5"),
+                (0.025, "all 8 training cameras are at the same position"),
+                (10.0, "units apart, but their centres are rounded to 0.5"),
             ] {
                 let mut there: Vec<Camera> =
                     ring(8, scale, 0.0).iter().map(|c| c.moved(offset.into())).collect();
@@ -255,14 +255,14 @@ mod tests {
         assert_one_warning(
             &ring(1, 1.0, 0.0),
             &ring(3, 1.0, 0.0),
-            "there is 1 training view: nothing tells how far",
+            "there is only 1 training view: depth cannot be estimated",
         );
         let turning: Vec<Camera> =
             (0..5).map(|i| camera("t", f64::from(i), [3.0, 1.0, 4.0])).collect();
-        assert_one_warning(&turning, &[], "all 5 training cameras stand in one place");
+        assert_one_warning(&turning, &[], "all 5 training cameras are at the same position");
         let utm = DVec3::new(500_000.0, 4_649_776.0, 120.0);
         let there: Vec<Camera> = turning.iter().map(|camera| camera.moved(utm)).collect();
-        assert_one_warning(&there, &[], "all 5 training cameras stand in one place");
+        assert_one_warning(&there, &[], "all 5 training cameras are at the same position");
         let mut far = ring(8, 1.0, 0.0);
         far[5].camera_to_world[0][3] = 1e6;
         assert_one_warning(&far, &ring(3, 1.0, 0.0), "training view r_5 is 3");
@@ -270,7 +270,7 @@ mod tests {
         assert_one_warning(
             &far,
             &ring(3, 1.0, 0.0),
-            "as half of them (and 1 more); is its pose right?",
+            "as the median camera (and 1 more); check its pose",
         );
         let mut far = ring(3, 1.0, 0.0);
         far[0].camera_to_world[1][3] = 500.0;
@@ -281,8 +281,8 @@ mod tests {
         assert_one_warning(
             &shrunk,
             &ring(2, 1.0, 0.0),
-            "4 of 8 views have a principal point far from the middle, first training view r_2: \
-            (8.0, 6.0) in 32×24",
+            "4 of 8 views have a principal point far from the image centre (first: training view \
+            r_2 with (8.0, 6.0) in 32×24",
         );
     }
 }

@@ -2,25 +2,28 @@ use artifact::{Failure, WARNING};
 use dataset::{Dataset, Frame, Split};
 use scene::{Background, Bounds, Camera, Space, length};
 
-use crate::bounds::{SeenDepths, place};
+use crate::bounds::{CameraDepths, scene_bounds};
 use crate::error::{ParameterError, SamePose};
 use crate::image_plan::ImagePlan;
 use crate::params::Params;
-use crate::{pose_warnings, references};
+use crate::pose_warnings;
+use crate::split::choose_references;
 
-/// All that is decided of a scene before anything is written.
+/// All decisions about a scene before anything is written.
 pub(crate) struct ScenePlan<'a> {
     pub(crate) images: ImagePlan,
     pub(crate) background: Background,
     pub(crate) bounds: Bounds,
-    /// Training views, and which of them are kept at HR.
+    /// Training views.
     pub(crate) train: Vec<&'a Frame>,
+    /// Indices of the training views that are references.
     pub(crate) references: Vec<usize>,
+    /// Test views.
     pub(crate) test: Vec<&'a Frame>,
 }
 
 impl<'a> ScenePlan<'a> {
-    /// Of a data set, with what lies behind the scene.
+    /// Plans a scene; fails if bounds or parameters are invalid.
     pub(crate) fn new(
         set: &'a Dataset,
         split: &Split,
@@ -32,41 +35,41 @@ impl<'a> ScenePlan<'a> {
         let test: Vec<&Frame> = split.test.iter().map(|&i| &set.frames[i]).collect();
         let bounds = bounds(&train, &test, params, background)?;
         let count = if images.has_truth { params.hr_references as usize } else { 0 };
-        let references =
-            references::choose(train.iter().map(|frame| frame.camera().centre()), count);
+        let references = choose_references(train.iter().map(|f| f.camera().centre()), count);
         Ok(Self { images, background, bounds, train, references, test })
     }
 }
 
-/// Message about cameras that see a box which is a point for f64.
-const NO_INSIDE: &str = "dataset: the box that the cameras see has no inside; are the poses right, \
-    and their unit?";
+/// Message about a bounding box whose sides vanish in f64.
+const EMPTY_BOX: &str =
+    "dataset: the scene's bounding box has no volume; check the poses and their unit";
 
-/// Where a scene is, by what its cameras see and by what the user says of it.
+/// Returns the scene's bounds from cameras, depths and parameters.
 fn bounds(
     train: &[&Frame],
     test: &[&Frame],
     params: &Params,
     background: Background,
 ) -> Result<Bounds, Failure> {
-    // What the user says of all views stands in for what isn't known of each.
+    // Given near and far replace unknown depths of views.
     let given = params
         .near
         .zip(params.far)
         .map(|(near, far)| [near, far])
         .filter(|[near, far]| 0.0 < *near && near < far);
-    let (train, test) = (sights(train, given), sights(test, given));
-    let goes_on = background == Background::Opaque;
-    let mut bounds = place(&train, &test, goes_on, params.space).map_err(ParameterError::from)?;
+    let (train, test) = (camera_depths(train, given), camera_depths(test, given));
+    let is_unbounded = background == Background::Opaque;
+    let mut bounds =
+        scene_bounds(&train, &test, is_unbounded, params.space).map_err(ParameterError::from)?;
     if !bounds.is_valid() {
-        return Err(Failure::BadInput(NO_INSIDE.to_owned()));
+        return Err(Failure::BadInput(EMPTY_BOX.to_owned()));
     }
     for (name, given, bound) in
         [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)]
     {
         if let Some(value) = given {
             if !value.is_finite() {
-                return Err(ParameterError::NoDistance { name, value }.into());
+                return Err(ParameterError::InvalidDistance { name, value }.into());
             }
             *bound = value;
         }
@@ -80,55 +83,47 @@ fn bounds(
     Ok(bounds)
 }
 
-/// What views see, between given depths where a view's own aren't known.
-fn sights(frames: &[&Frame], given: Option<[f64; 2]>) -> Vec<SeenDepths> {
+/// Pairs cameras with their depth ranges, or with the given range where a view's own is unknown.
+fn camera_depths(frames: &[&Frame], given: Option<[f64; 2]>) -> Vec<CameraDepths> {
     frames.iter().map(|f| (f.camera(), f.depths.or(given))).collect()
 }
 
-/// Warnings of what looks wrong about poses; such as can't be right are refused.
-pub(crate) fn warnings_of_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, SamePose> {
-    let camera = |&i: &usize| set.frames[i].camera();
-    let training: Vec<Camera> = split.train.iter().map(camera).collect();
-    let test: Vec<Camera> =
-        split.test.iter().filter(|i| !split.train.contains(i)).map(camera).collect();
+/// Returns warnings about implausible poses; fails if all training poses are equal.
+pub(crate) fn check_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, SamePose> {
+    let training: Vec<Camera> = split.train.iter().map(|&i| set.frames[i].camera()).collect();
+    let only_test = split.test.iter().filter(|i| !split.train.contains(i));
+    let test: Vec<Camera> = only_test.map(|&i| set.frames[i].camera()).collect();
     pose_warnings::check(&training)?;
-    Ok(pose_warnings::warnings(&training, &test)
-        .into_iter()
-        .map(|text| format!("{WARNING}{text}"))
-        .collect())
+    let warnings = pose_warnings::warnings(&training, &test);
+    Ok(warnings.into_iter().map(|text| format!("{WARNING}{text}")).collect())
 }
 
-/// Space and background, in words.
+/// Describes space and background for the log.
 pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
-    let behind = match background {
-        Background::White => "on white",
-        Background::Black => "on black",
-        Background::Alpha => "the background kept open",
-        Background::Opaque => "nothing behind",
+    let background = match background {
+        Background::White => "white",
+        Background::Black => "black",
+        Background::Alpha => "alpha",
+        Background::Opaque => "opaque",
     };
+    let side = length(bounds.longest_side(), 3);
     let space = match bounds.space {
-        Space::Box => {
-            format!(
-                "space: a box of {} units, seen from {} to {}",
-                length(bounds.longest_side(), 3),
-                length(bounds.near, 3),
-                length(bounds.far, 3)
-            )
-        }
+        Space::Box => format!(
+            "space: box of {side} units, rays from {} to {}",
+            length(bounds.near, 3),
+            length(bounds.far, 3)
+        ),
         Space::Ndc(f) => format!(
-            "space: all cameras look one way, so NDC, from depth {} to {}",
+            "space: NDC, since all cameras face one direction; depth from {} to {}",
             length(f.near, 3),
             length(f.far, 3)
         ),
-        Space::Contraction => {
-            format!(
-                "space: a ball of {} units, and all around it up to {}, contracted",
-                length(bounds.longest_side(), 3),
-                length(bounds.far, 0)
-            )
-        }
+        Space::Contraction => format!(
+            "space: contraction around a ball of {side} units, rays up to {}",
+            length(bounds.far, 0)
+        ),
     };
-    format!("{space}; {behind}")
+    format!("{space}; background {background}")
 }
 
 #[cfg(test)]
@@ -140,7 +135,7 @@ mod tests {
 
     use super::*;
     use crate::params::SplitKind;
-    use crate::split::split;
+    use crate::split::split_views;
 
     fn frame(i: usize, count: usize) -> Frame {
         let (sin, cos) = (i as f64 / count as f64 * std::f64::consts::TAU).sin_cos();
@@ -174,7 +169,7 @@ mod tests {
         params: &Params,
         background: Background,
     ) -> Result<(ImagePlan, Bounds, Vec<usize>), Failure> {
-        let split = split(set, params)?;
+        let split = split_views(set, params)?;
         let images = ImagePlan::new(set, &split, params)?;
         let plan = ScenePlan::new(set, &split, params, images, background)?;
         Ok((plan.images, plan.bounds, plan.references))
@@ -215,11 +210,11 @@ mod tests {
         assert_eq!(near_and_far(&set, Some(1.5), Some(7.0)).unwrap(), (1.5, 7.0));
         assert_eq!(
             near_and_far(&set, Some(7.0), Some(1.5)).unwrap_err().to_string(),
-            "parameter near: 7 is not before far = 1.5"
+            "parameter near: 7 is not less than far = 1.5"
         );
         assert_eq!(
             near_and_far(&set, None, Some(f64::INFINITY)).unwrap_err().to_string(),
-            "parameter far: inf is not a distance"
+            "parameter far: inf is not a valid distance"
         );
     }
 
@@ -228,10 +223,13 @@ mod tests {
     fn spaces_are_printed_with_their_digits() {
         let (near, far) = (2e-5, 9e-5);
         for (space, note) in [
-            (Space::Box, "space: a box of 6.00e-5 units, seen from 2.00e-5 to 9.00e-5; on black"),
+            (
+                Space::Box,
+                "space: box of 6.00e-5 units, rays from 2.00e-5 to 9.00e-5; background black",
+            ),
             (
                 Space::Contraction,
-                "space: a ball of 6.00e-5 units, and all around it up to 9.00e-5, contracted; on \
+                "space: contraction around a ball of 6.00e-5 units, rays up to 9.00e-5; background \
                 black",
             ),
         ] {
@@ -251,8 +249,7 @@ mod tests {
         assert!(matches!(refused, Failure::BadInput(_)));
         assert_eq!(
             refused.to_string(),
-            "dataset: the box that the cameras see has no inside; are the poses right, and their \
-            unit?"
+            "dataset: the scene's bounding box has no volume; check the poses and their unit"
         );
     }
 
@@ -275,6 +272,9 @@ mod tests {
         let kernel =
             Params { kernel: Some(pixels::Kernel::Average), scale: Some(2.7), ..Params::default() };
         let kernel = refused(Format::Blender, &kernel);
-        assert!(kernel.starts_with("parameter kernel: average needs a whole scale"), "{kernel}");
+        assert!(
+            kernel.starts_with("parameter kernel: average requires an integer scale"),
+            "{kernel}"
+        );
     }
 }

@@ -1,30 +1,32 @@
-//! Uniform strips at the sides of images, as undistortion and letterboxing leave them.
+//! Detects uniform strips at the sides of images, left by undistortion or letterboxing
+//! (docs/design/005). Thresholds are chosen by hand.
 
 use std::fmt::{self, Display, Formatter};
 
 use pixels::{Mask, Rgba8};
 
-/// Levels by which a strip's colour may vary: JPEG rings next to the photograph.
+/// Maximum deviation of a strip's colour in 8-bit levels: JPEG rings next to the photograph.
 const MAX_NOISE_LEVELS: u8 = 16;
-/// Percentage of a line's pixels that have a strip's colour.
+/// Minimum percentage of a line's pixels that have the strip's colour.
 const MIN_FLAT_PERCENT: usize = 95;
-/// Maximum percentage of pixels with the strip's colour right inside a strip, and in the corners
-/// inside all strips. Next to an object on a background there are more: its corners are empty.
+/// Maximum percentage of pixels with the strip's colour in the line next to a strip, and in the
+/// corners inside all strips. An object on a background exceeds it: its corners are empty.
 const MAX_INSIDE_PERCENT: usize = 50;
-/// Part of the image inside the strips that a corner takes along each side, as its denominator.
-const CORNER_PART: usize = 8;
-/// Lines that interpolation blends at a strip's edge.
+/// Side of the image inside the strips over the side of a corner.
+const CORNER_DIVISOR: usize = 8;
+/// Number of lines that interpolation blends at a strip's edge.
 const BLENDED_LINES: usize = 1;
-/// Maximum part of a side that a strip takes, as its denominator, where all four sides have one:
-/// objects on a background have wider margins.
-const FRAME_PART: usize = 5;
-/// Maximum part of a side, as its denominator, where other sides have no strip: upright photographs
-/// in a wide format have wide ones.
-const PAIR_PART: usize = 2;
+/// Minimum ratio of an image's side to a strip's width if all four sides have a strip: margins
+/// around objects on a background are wider.
+const MIN_FRAME_RATIO: usize = 5;
+/// Minimum ratio of an image's side to any strip's width. It is small, since upright photographs in
+/// a wide format have wide strips.
+const MIN_RATIO: usize = 2;
 
-/// Widths of an image's uniform strips in pixels: top, right, bottom, left.
+/// Uniform strips of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Strips {
+    /// Widths in pixels: top, right, bottom, left.
     pub(crate) widths: [usize; 4],
     pub(crate) colour: [u8; 3],
 }
@@ -32,16 +34,16 @@ pub(crate) struct Strips {
 const SIDES: [&str; 4] = ["top", "right", "bottom", "left"];
 
 impl Strips {
-    /// Finds the strips of an opaque image.
+    /// Finds the strips of an opaque image; `None` without any.
     pub(crate) fn of(image: &Rgba8) -> Option<Self> {
         let colours = [0, 1, 2, 3].map(|side| flat_colour(&line(image, side, 0, [0, 0])));
         let mut widths = [0; 4];
         for (side, colour) in colours.iter().enumerate() {
             let Some(colour) = colour else { continue };
-            let (length, limit) = (depth(image, side), depth(image, side) / PAIR_PART);
-            let is_strip = |at: &usize| is_flat(&line(image, side, *at, [0, 0]), *colour);
-            let width = (0..length).take_while(is_strip).count();
-            widths[side] = if width < limit { width } else { 0 };
+            let count = line_count(image, side);
+            let width =
+                (0..count).take_while(|i| is_flat(&line(image, side, *i, [0, 0]), *colour)).count();
+            widths[side] = if width < count / MIN_RATIO { width } else { 0 };
         }
         for (side, colour) in colours.iter().enumerate() {
             let Some(colour) = colour.filter(|_| widths[side] > 0) else { continue };
@@ -53,42 +55,41 @@ impl Strips {
             }
         }
         let is_frame = widths.iter().all(|width| *width > 0);
-        let is_wide = (0..4).any(|side| FRAME_PART * widths[side] > depth(image, side));
+        let is_wide = (0..4).any(|side| MIN_FRAME_RATIO * widths[side] > line_count(image, side));
         let first = (0..4).find(|side| widths[*side] > 0)?;
         let colour = colours[first]?;
         (!(is_frame && is_wide)).then_some(Self { widths, colour })
     }
 
-    /// Returns the strips that nine in ten views have on the same sides, with their median widths,
-    /// and the number of these views.
+    /// Returns the strips that nine in ten views have on the same sides, with median widths, and the
+    /// number of views that have them.
     pub(crate) fn common(views: &[Option<Self>]) -> Option<(Self, usize)> {
         let found: Vec<Self> = views.iter().flatten().copied().collect();
         let widths = median_widths(&found);
         let sides = widths.map(|width| width > 0);
-        let has_these = |strips: &&Self| strips.widths.map(|width| width > 0) == sides;
-        let first = found.iter().find(has_these)?;
-        let count = found.iter().filter(has_these).count();
+        let mut same = found.iter().filter(|strips| strips.widths.map(|width| width > 0) == sides);
+        let first = same.next()?;
+        let count = 1 + same.count();
         (10 * count >= 9 * views.len()).then_some((Self { widths, ..*first }, count))
     }
 
-    /// True if strips are on all four sides, so that borders look like a background.
+    /// True if all four sides have strips, which resemble a background.
     pub(crate) fn is_frame(&self) -> bool {
         self.widths.iter().all(|width| *width > 0)
     }
 
-    /// True if a mask leaves the strips out.
+    /// True if a mask excludes all pixels of the strips.
     pub(crate) fn are_masked(&self, mask: &Mask) -> bool {
         let [top, right, bottom, left] = self.widths;
         let (columns, rows) = (left..mask.width - right, top..mask.height - bottom);
-        (0..mask.counts.len())
-            .filter(|at| {
-                !(columns.contains(&(at % mask.width)) && rows.contains(&(at / mask.width)))
-            })
-            .all(|at| !mask.counts[at])
+        (0..mask.counts.len()).all(|i| {
+            let is_inside = columns.contains(&(i % mask.width)) && rows.contains(&(i / mask.width));
+            is_inside || !mask.counts[i]
+        })
     }
 }
 
-/// Names the colour and the sides that have a strip.
+/// Formats the colour and the widths of the sides that have a strip.
 impl Display for Strips {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let sides = (0..4).filter(|side| self.widths[*side] > 0);
@@ -108,69 +109,73 @@ fn median_widths(strips: &[Strips]) -> [usize; 4] {
     })
 }
 
-/// Lines from a side to the opposite one.
-fn depth(image: &Rgba8, side: usize) -> usize {
+/// Returns the number of lines parallel to a side.
+fn line_count(image: &Rgba8, side: usize) -> usize {
     if side.is_multiple_of(2) { image.height } else { image.width }
 }
 
-/// Returns the colours of a line parallel to a side, without some pixels at its ends (left and
-/// right, or top and bottom).
-fn line(image: &Rgba8, side: usize, at: usize, ends: [usize; 2]) -> Vec<[u8; 3]> {
-    let (across, along) = (depth(image, side), depth(image, side + 1));
-    if at >= across {
+/// Returns the colours of line `index` parallel to a side, counted from that side, without
+/// `ends` pixels at its left and right, or top and bottom.
+fn line(image: &Rgba8, side: usize, index: usize, ends: [usize; 2]) -> Vec<[u8; 3]> {
+    let count = line_count(image, side);
+    if index >= count {
         return Vec::new();
     }
-    let at = if side == 1 || side == 2 { across - 1 - at } else { at };
-    let pixel = |i: usize| {
-        if side.is_multiple_of(2) { colour(image, i, at) } else { colour(image, at, i) }
-    };
-    (ends[0]..along.saturating_sub(ends[1])).map(pixel).collect()
+    let index = if side == 1 || side == 2 { count - 1 - index } else { index };
+    let pixels = ends[0]..line_count(image, side + 1).saturating_sub(ends[1]);
+    if side.is_multiple_of(2) {
+        pixels.map(|x| colour(image, x, index)).collect()
+    } else {
+        pixels.map(|y| colour(image, index, y)).collect()
+    }
+}
+
+/// Returns the indices near both ends of a row or column inside strips.
+fn corner_indices(first: usize, end: usize) -> impl Iterator<Item = usize> {
+    let (first, end) = (first + BLENDED_LINES, end.saturating_sub(BLENDED_LINES));
+    let length = (end.saturating_sub(first) / CORNER_DIVISOR).max(1);
+    let near = first..(first + length).min(end);
+    near.chain(end.saturating_sub(length).max(first)..end)
 }
 
 /// Returns the colours of the four corners inside strips.
 fn corners(image: &Rgba8, [top, right, bottom, left]: [usize; 4]) -> Vec<[u8; 3]> {
-    let near_ends = |first: usize, end: usize| {
-        let (first, end) = (first + BLENDED_LINES, end.saturating_sub(BLENDED_LINES));
-        let length = (end.saturating_sub(first) / CORNER_PART).max(1);
-        let near = first..(first + length).min(end);
-        near.chain(end.saturating_sub(length).max(first)..end)
-    };
     let mut colours = Vec::new();
-    for y in near_ends(top, image.height - bottom) {
-        for x in near_ends(left, image.width - right) {
+    for y in corner_indices(top, image.height - bottom) {
+        for x in corner_indices(left, image.width - right) {
             colours.push(colour(image, x, y));
         }
     }
     colours
 }
 
-/// True if pixels show more than a strip's colour.
+/// True if at least half of the pixels differ from a strip's colour.
 fn is_content(pixels: &[[u8; 3]], strip: [u8; 3]) -> bool {
-    let alike = pixels.iter().filter(|pixel| is_like(**pixel, strip)).count();
-    !pixels.is_empty() && 100 * alike <= MAX_INSIDE_PERCENT * pixels.len()
+    let similar = pixels.iter().filter(|pixel| is_similar(**pixel, strip)).count();
+    !pixels.is_empty() && 100 * similar <= MAX_INSIDE_PERCENT * pixels.len()
 }
 
 fn colour(image: &Rgba8, x: usize, y: usize) -> [u8; 3] {
     std::array::from_fn(|c| image.data[4 * (y * image.width + x) + c])
 }
 
-/// Returns the colour of a line that has one.
+/// Returns the median colour of a line if the line is flat.
 fn flat_colour(line: &[[u8; 3]]) -> Option<[u8; 3]> {
-    let mut middle = [0; 3];
-    for (c, value) in middle.iter_mut().enumerate() {
+    let mut median = [0; 3];
+    for (c, value) in median.iter_mut().enumerate() {
         let mut values: Vec<u8> = line.iter().map(|colour| colour[c]).collect();
         values.sort_unstable();
         *value = *values.get(values.len() / 2)?;
     }
-    is_flat(line, middle).then_some(middle)
+    is_flat(line, median).then_some(median)
 }
 
 fn is_flat(line: &[[u8; 3]], colour: [u8; 3]) -> bool {
-    let alike = line.iter().filter(|pixel| is_like(**pixel, colour)).count();
-    !line.is_empty() && 100 * alike >= MIN_FLAT_PERCENT * line.len()
+    let similar = line.iter().filter(|pixel| is_similar(**pixel, colour)).count();
+    !line.is_empty() && 100 * similar >= MIN_FLAT_PERCENT * line.len()
 }
 
-fn is_like(colour: [u8; 3], other: [u8; 3]) -> bool {
+fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
     (0..3).all(|c| colour[c].abs_diff(other[c]) <= MAX_NOISE_LEVELS)
 }
 

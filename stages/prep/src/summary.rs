@@ -8,40 +8,40 @@ use serde::{Deserialize, Serialize};
 use crate::scene_plan::ScenePlan;
 use crate::sizes::Sizes;
 
-/// `scene.json`: what `prep` found and chose, for people.
+/// `scene.json`: human-readable record of `prep`'s findings and choices.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SceneSummary {
-    /// Form of the data set.
+    /// Format of the data set.
     pub format: String,
-    /// Size of the data's own images.
+    /// Width and height of the data set's images.
     pub native: [u32; 2],
-    /// Size of the HR images.
+    /// Width and height of the HR images.
     pub hr: [u32; 2],
-    /// Size of the LR images.
+    /// Width and height of the LR images.
     pub lr: [u32; 2],
-    /// HR over LR, per axis.
+    /// HR size over LR size along x and y.
     pub scale: [f64; 2],
-    /// Whether LR images were made from HR ones.
+    /// True if LR images were downscaled from HR images.
     pub has_truth: bool,
-    /// How LR images were made, or are taken to have been made.
+    /// Kernel that created the LR images, or is assumed to have created them.
     pub kernel: Kernel,
-    /// What lies behind the scene.
+    /// Background of the scene.
     pub background: Background,
-    /// Where the scene is.
+    /// Extent and space of the scene.
     pub bounds: Bounds,
     /// Number of training views.
     pub train: usize,
     /// Number of test views.
     pub test: usize,
-    /// Whether test views have true depth.
+    /// True if test views have true depth.
     pub has_depth: bool,
-    /// What was found and chosen, a line each.
+    /// Findings and choices, one per line.
     pub notes: Vec<String>,
 }
 
 impl SceneSummary {
-    /// Of a scene that was made, with what was found and chosen.
+    /// Summarises a written scene.
     pub(crate) fn new(set: &Dataset, plan: &ScenePlan<'_>, notes: Vec<String>) -> Self {
         let ScenePlan { images, background, bounds, train, test, .. } = plan;
         let Sizes { lr, hr } = images.sizes;
@@ -62,8 +62,8 @@ impl SceneSummary {
         }
     }
 
-    /// A line for people, and warnings after it.
-    pub(crate) fn in_words(&self) -> String {
+    /// Formats the stage's summary line, followed by the warnings.
+    pub(crate) fn text(&self) -> String {
         let warnings: Vec<String> =
             self.notes.iter().filter_map(|n| n.strip_prefix(WARNING)).map(str::to_owned).collect();
         let ([lr_width, lr_height], [hr_width, hr_height]) = (self.lr, self.hr);

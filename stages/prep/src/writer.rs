@@ -14,15 +14,15 @@ use scene::{VIEWS_FILE, View, Views, mask_file};
 use stage::{Context, Progress};
 
 use crate::degrade::{self, LrImage, degrade};
-use crate::frame_name::frame_name;
+use crate::error::frame_label;
 use crate::scene_plan::ScenePlan;
 
-/// Writes a scene's subtrees. No more images than threads are held at once.
+/// Writer of a scene's subtrees. At most one image per thread is in memory.
 pub(crate) struct SceneWriter<'a> {
     context: &'a Context,
     plan: &'a ScenePlan<'a>,
     progress: Progress,
-    /// Names and clipped pixels of EXR photographs, by file.
+    /// Frame names and clipped pixels of EXR photographs, by file.
     clipping: Mutex<BTreeMap<PathBuf, (String, Clipping)>>,
 }
 
@@ -32,7 +32,7 @@ impl<'a> SceneWriter<'a> {
         Self { context, plan, progress, clipping: Mutex::default() }
     }
 
-    /// Writes everything.
+    /// Writes all subtrees.
     pub(crate) fn write(&self) -> anyhow::Result<()> {
         self.write_training_images()?;
         self.write_train_and_downscaled()?;
@@ -42,7 +42,7 @@ impl<'a> SceneWriter<'a> {
         self.write_truth_and_cameras()
     }
 
-    /// Returns a warning of the pixels that are brighter than white, if there are any.
+    /// Returns a warning about pixels brighter than 1, if any.
     pub(crate) fn clipping_note(&self) -> Option<String> {
         let all = self.clipping.lock().unwrap_or_else(PoisonError::into_inner);
         let mut with_clipped = all.values().filter(|(_, clipping)| clipping.clipped > 0);
@@ -50,8 +50,8 @@ impl<'a> SceneWriter<'a> {
         let count = 1 + with_clipped.count();
         let sum: Clipping = all.values().map(|(_, clipping)| *clipping).sum();
         Some(format!(
-            "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and are clipped to 1, in {count} of \
-            {}, first frame {first}",
+            "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and clipped to 1, in {count} of {} \
+            (first: frame {first})",
             sum.clipped,
             sum.pixels,
             100.0 * sum.clipped as f64 / sum.pixels as f64,
@@ -76,15 +76,16 @@ impl<'a> SceneWriter<'a> {
         )
     }
 
-    /// `train`: LR images; `downscaled`: the same task one size down, where its solution is known.
+    /// Writes the views of `train` and of `downscaled`, the same task at a lower resolution, where
+    /// the solution is known.
     fn write_train_and_downscaled(&self) -> anyhow::Result<()> {
         let images = &self.plan.images;
         let train: Vec<View> = self.plan.train.iter().map(|f| self.training_view(f)).collect();
-        let downscaled = train.iter().map(|view| self.one_size_down(view)).collect();
+        let downscaled = train.iter().map(|view| self.downscaled_view(view)).collect();
         self.write_views("downscaled", downscaled)?;
         self.write_views("train", train)?;
         self.write_degradation("train", images.kernel, images.sizes.hr)?;
-        // LR images that weren't rounded are shrunk by the box: the same, and for any size.
+        // `shrunk` downscales unrounded LR images by the box filter, which suits any scale.
         let kernel = if images.kernel == Kernel::Average { Kernel::Box } else { images.kernel };
         self.write_degradation("downscaled", kernel, images.sizes.lr)
     }
@@ -94,27 +95,24 @@ impl<'a> SceneWriter<'a> {
         View {
             image: Some(format!("images/{}.{}", frame.name, degrade::extension(images.kernel))),
             mask: mask_name(frame),
-            ..View::camera_only(images.at_lr(&frame.camera()))
+            ..View::camera_only(images.lr_camera(&frame.camera()))
         }
     }
 
-    fn one_size_down(&self, view: &View) -> View {
+    fn downscaled_view(&self, view: &View) -> View {
         let k = &view.camera.intrinsics;
-        let (width, height) = self.plan.images.one_size_down((k.width, k.height));
+        let (width, height) = self.plan.images.downscaled_size((k.width, k.height));
         View { camera: view.camera.resized(width, height), ..view.clone() }
     }
 
-    /// `train-cameras`: the training cameras at HR size.
+    /// Writes `train-cameras`, the training cameras at HR size.
     fn write_train_cameras(&self) -> anyhow::Result<()> {
-        let views = self
-            .plan
-            .train
-            .iter()
-            .map(|frame| View::camera_only(self.plan.images.at_hr(&frame.camera())));
+        let ScenePlan { train, images, .. } = self.plan;
+        let views = train.iter().map(|f| View::camera_only(images.hr_camera(&f.camera())));
         self.write_views("train-cameras", views.collect())
     }
 
-    /// `references`: training views at HR size, where there are any.
+    /// Writes the views of `references`, training views at HR size, if any.
     fn write_references(&self) -> anyhow::Result<()> {
         if self.plan.references.is_empty() {
             return Ok(());
@@ -127,11 +125,12 @@ impl<'a> SceneWriter<'a> {
         View {
             image: Some(format!("images/{}.png", frame.name)),
             mask: mask_name(frame),
-            ..View::camera_only(self.plan.images.at_hr(&frame.camera()))
+            ..View::camera_only(self.plan.images.hr_camera(&frame.camera()))
         }
     }
 
-    /// `truth`: test views at HR size, with their LR photographs; `cameras`: their cameras alone.
+    /// Writes the views of `truth`, test views at HR size with their LR photographs, and of
+    /// `cameras`, their cameras.
     fn write_truth_and_cameras(&self) -> anyhow::Result<()> {
         let images = &self.plan.images;
         let truth: Vec<View> = self.plan.test.iter().map(|frame| self.test_view(frame)).collect();
@@ -158,7 +157,7 @@ impl<'a> SceneWriter<'a> {
                 frame.name,
                 degrade::extension(images.kernel)
             )),
-            ..View::camera_only(images.at_hr(&frame.camera()))
+            ..View::camera_only(images.hr_camera(&frame.camera()))
         }
     }
 
@@ -180,37 +179,41 @@ impl<'a> SceneWriter<'a> {
         })
     }
 
-    /// Writes all that is made of a frame to train on: LR image, the same one size down, HR
-    /// reference, and their masks.
+    /// Writes the images of a training frame: LR image, downscaled LR image, HR reference, and their
+    /// masks.
     fn write_training_image(&self, frame: &Frame, is_reference: bool) -> anyhow::Result<()> {
         let (hr, lr) = self.images(frame)?;
         let name = &frame.name;
         self.write_lr("train/images", name, &lr)?;
-        let mask = frame.mask().bad_input(frame_name(frame))?;
+        let mask = frame.mask().bad_input(frame_label(frame))?;
         let lr_mask = mask.as_ref().map(|mask| self.lr_mask(mask, &lr));
-        lr_mask.iter().try_for_each(|mask| self.write_mask("train", name, mask))?;
+        if let Some(mask) = &lr_mask {
+            self.write_mask("train", name, mask)?;
+        }
         if let Some(hr) = hr.filter(|_| is_reference) {
             self.write_hr("references", name, &hr)?;
-            mask.iter().try_for_each(|m| {
-                self.write_mask("references", name, &m.resized((hr.width, hr.height), 0))
-            })?;
+            if let Some(mask) = &mask {
+                self.write_mask("references", name, &mask.resized((hr.width, hr.height), 0))?;
+            }
         }
         let lr_size = self.plan.images.sizes_of(&frame.intrinsics()).lr;
-        let (width, height) = self.plan.images.one_size_down(lr_size);
+        let (width, height) = self.plan.images.downscaled_size(lr_size);
         let downscaled = lr.shrunk((width as usize, height as usize), self.plan.images.kernel);
         self.write_lr("downscaled/images", name, &downscaled)?;
-        let downscaled_mask = lr_mask.map(|mask| self.lr_mask(&mask, &downscaled));
-        downscaled_mask.iter().try_for_each(|mask| self.write_mask("downscaled", name, mask))
+        if let Some(mask) = lr_mask {
+            self.write_mask("downscaled", name, &self.lr_mask(&mask, &downscaled))?;
+        }
+        Ok(())
     }
 
-    /// Writes all that is made of a frame to test by: HR image, LR image, mask and depth.
+    /// Writes the images of a test frame: HR image, LR image, mask and depth.
     fn write_test_image(&self, frame: &Frame) -> anyhow::Result<()> {
         let (hr, lr) = self.images(frame)?;
         if let Some(hr) = &hr {
             self.write_hr("truth", &frame.name, hr)?;
         }
         self.write_lr("truth/low", &frame.name, &lr)?;
-        if let Some(mask) = frame.mask().bad_input(frame_name(frame))? {
+        if let Some(mask) = frame.mask().bad_input(frame_label(frame))? {
             let mask = match &hr {
                 Some(hr) => mask.resized((hr.width, hr.height), 0),
                 None => self.lr_mask(&mask, &lr),
@@ -219,14 +222,14 @@ impl<'a> SceneWriter<'a> {
         }
         if let (Some(depth), Some(hr)) = (&frame.depth, hr) {
             self.write_depth(depth, &frame.name, (hr.width, hr.height))
-                .bad_input(frame_name(frame))?;
+                .bad_input(frame_label(frame))?;
         }
         Ok(())
     }
 
-    /// The HR image, where there is one, and the LR image.
+    /// Creates a frame's HR image, if the plan has HR truth, and its LR image.
     fn images(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LrImage)> {
-        let (image, clipping) = frame.photograph_and_clipping().bad_input(frame_name(frame))?;
+        let (image, clipping) = frame.photograph_and_clipping().bad_input(frame_label(frame))?;
         if clipping.pixels > 0 {
             let mut all = self.clipping.lock().unwrap_or_else(PoisonError::into_inner);
             all.insert(frame.image.clone(), (frame.name.clone(), clipping));
@@ -243,8 +246,8 @@ impl<'a> SceneWriter<'a> {
     }
 
     fn write_hr(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
-        write_png(&self.context.output_path(&format!("{subtree}/images/{name}.png"))?, image)
-            .map_err(Into::into)
+        let path = self.context.output_path(&format!("{subtree}/images/{name}.png"))?;
+        Ok(write_png(&path, image)?)
     }
 
     fn write_mask(&self, subtree: &str, name: &str, mask: &Mask) -> anyhow::Result<()> {
@@ -252,16 +255,13 @@ impl<'a> SceneWriter<'a> {
         Ok(write_png(&path, &mask.to_rgba8())?)
     }
 
-    /// The mask of an LR image: what its pixels were made from must count. Photographs that are LR
-    /// themselves keep theirs.
+    /// Returns the mask of an LR image: all HR pixels under an LR pixel must count. Photographs that
+    /// are the LR images keep their masks.
     fn lr_mask(&self, mask: &Mask, image: &LrImage) -> Mask {
-        let size = image.size();
-        let around = if size == (mask.width, mask.height) {
-            0
-        } else {
-            degrade::mask_reach(self.plan.images.kernel)
-        };
-        mask.resized(size, around)
+        let is_same_size = image.size() == (mask.width, mask.height);
+        let kernel = self.plan.images.kernel;
+        let margin = if is_same_size { 0 } else { degrade::mask_reach(kernel) };
+        mask.resized(image.size(), margin)
     }
 
     fn write_lr(&self, folder: &str, name: &str, image: &LrImage) -> anyhow::Result<()> {
@@ -291,8 +291,8 @@ impl<'a> SceneWriter<'a> {
         Ok(())
     }
 
-    /// True depth at HR size: that of the nearest native pixel centre, since averaging depths
-    /// across an edge invents surfaces.
+    /// Writes true depth at HR size, sampled at the nearest native pixel centre: averaging depths
+    /// across an edge would invent surfaces.
     fn write_depth(
         &self,
         source: &Path,
@@ -300,10 +300,9 @@ impl<'a> SceneWriter<'a> {
         (width, height): (usize, usize),
     ) -> anyhow::Result<()> {
         let native = read_exr(source)?.with_finite(&DEPTH_CHANNELS, source)?;
-        let shown = source.display().to_string();
+        let source = source.display().to_string();
         let map = DepthMap::of(&native)
-            .with_context(|| format!("{}: depth needs channels Z and A", printable(&shown)))?;
-        let nearest = |i: usize, from: usize, to: usize| (2 * i + 1) * from / (2 * to);
+            .with_context(|| format!("{}: depth requires channels Z and A", printable(&source)))?;
         let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
         let channels = [
             Channel { name: "A", sample_type: SampleType::Half },
@@ -316,12 +315,10 @@ impl<'a> SceneWriter<'a> {
             "Z: z-depth of the nearest native pixel centre; A: 0 where nothing is seen",
             |first, _, samples| {
                 for (i, sample) in samples.chunks_exact_mut(2).enumerate() {
-                    let (x, y) = (
-                        nearest(i % width, native.width, width),
-                        nearest(first + i / width, native.height, height),
-                    );
-                    let at = y * native.width + x;
-                    sample.copy_from_slice(&[map.opacity[at], map.depth[at]]);
+                    let x = nearest_index(i % width, native.width, width);
+                    let y = nearest_index(first + i / width, native.height, height);
+                    let pixel = y * native.width + x;
+                    sample.copy_from_slice(&[map.opacity[pixel], map.depth[pixel]]);
                 }
                 Ok(())
             },
@@ -329,7 +326,12 @@ impl<'a> SceneWriter<'a> {
     }
 }
 
-/// A mask's file, where a frame has one.
+/// Returns the index among `native` pixels whose centre is nearest to that of pixel `i` of `count`.
+fn nearest_index(i: usize, native: usize, count: usize) -> usize {
+    (2 * i + 1) * native / (2 * count)
+}
+
+/// Returns the path of a frame's mask in its subtree; `None` without a mask.
 fn mask_name(frame: &Frame) -> Option<String> {
     frame.is_masked().then(|| mask_file(&frame.name))
 }

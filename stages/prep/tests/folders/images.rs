@@ -144,7 +144,7 @@ fn border_cases() -> Vec<Case> {
             Expected::Scene(with_lines(
                 held_out("a#", 10, &[COLMAP]),
                 &[
-                    "warning: uniform strips at the border (colour 2 2 2; top 3, right 3, bottom 3, left 3 pixels) in 8 of 8 views looked at, as undistortion and letterboxing leave them, are not a background: mask them out (masks/NAME.png, mask_path) or crop the photographs",
+                    "warning: uniform strips at the border (colour 2 2 2; top 3, right 3, bottom 3, left 3 pixels) in 8 of 8 sampled views seem to come from undistortion or letterboxing, not from a background: mask them out (masks/NAME.png, mask_path) or crop the photographs",
                 ],
             )),
         ),
@@ -154,7 +154,7 @@ fn border_cases() -> Vec<Case> {
             Expected::Scene(with_lines(
                 held_out("a#", 10, &[COLMAP]),
                 &[
-                    "warning: uniform strips at the border (colour 2 2 2; top 2, bottom 3 pixels) in 8 of 8 views looked at, as undistortion and letterboxing leave them, are not a background: mask them out (masks/NAME.png, mask_path) or crop the photographs",
+                    "warning: uniform strips at the border (colour 2 2 2; top 2, bottom 3 pixels) in 8 of 8 sampled views seem to come from undistortion or letterboxing, not from a background: mask them out (masks/NAME.png, mask_path) or crop the photographs",
                 ],
             )),
         ),
@@ -170,7 +170,7 @@ fn border_cases() -> Vec<Case> {
             Expected::Scene(with_lines(
                 scene,
                 &[
-                    "uniform strips at the border (colour 2 2 2; top 3, right 3, bottom 3, left 3 pixels) in 8 of 8 views looked at are masked out and are not a background",
+                    "uniform strips at the border (colour 2 2 2; top 3, right 3, bottom 3, left 3 pixels) in 8 of 8 sampled views are masked out; they are not a background",
                 ],
             ))
         }),
@@ -180,7 +180,7 @@ fn border_cases() -> Vec<Case> {
             Expected::Scene(with_lines(
                 held_out("a#", 10, &[COLMAP]),
                 &[
-                    "images have no alpha; borders are one flat colour (0 0 0) in 8 of 8 views looked at",
+                    "images have no alpha; borders are one flat colour (0 0 0) in 8 of 8 sampled views",
                 ],
             )),
         ),
@@ -257,7 +257,7 @@ pub(crate) fn cases() -> Vec<Case> {
             Expected::Scene(with_lines(
                 held_out("a#", 3, &[THREE]),
                 &[
-                    "warning: 16 of 768 pixels (2.08 %) are brighter than 1 and are clipped to 1, in 1 of 3 EXR photographs, first frame a1",
+                    "warning: 16 of 768 pixels (2.08 %) are brighter than 1 and clipped to 1, in 1 of 3 EXR photographs (first: frame a1)",
                 ],
             ))
         }),
