@@ -91,7 +91,7 @@ impl<'a> ScoredView<'a> {
 fn fill(name: &str, mask: &Mask, truth: &mut Image, found: &Image) -> anyhow::Result<f64> {
     let mask = mask.resized((truth.width, truth.height), 0);
     mask.fill(truth, found);
-    if mask.share() == 0.0 {
+    if mask.counted_fraction() == 0.0 {
         let message =
             format!("view {name}: its mask leaves no pixel to score; remove the view or its mask");
         return Err(Failure::BadInput(message).into());

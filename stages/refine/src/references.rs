@@ -59,7 +59,7 @@ pub(crate) fn read_references(
 /// A reference as it would look with the exposure of the images that the field learnt from, and
 /// what to say where it had another.
 fn same_exposure(reference: KnownView) -> (KnownView, Option<String>) {
-    let Some(exposure) = reference.exposure().filter(|exposure| !exposure.is_none()) else {
+    let Some(exposure) = reference.exposure().filter(|exposure| !exposure.is_negligible()) else {
         return (reference, None);
     };
     let [r, g, b] = exposure.gain;

@@ -37,15 +37,15 @@ pub(crate) fn checked(
         let (name, reference) = (&view.camera.name, &mut photograph.image);
         let [mut shrunk, own] = compared(reference, &own, kernel);
         if let Some(exposure) =
-            Exposure::between(&own, &shrunk, 1).filter(|exposure| !exposure.is_none())
+            Exposure::fit(&own, &shrunk, 1).filter(|exposure| !exposure.is_negligible())
         {
             let [r, g, b] = exposure.gain;
             say(format!(
                 "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): \
                 taken back"
             ));
-            exposure.take_back(reference);
-            exposure.take_back(&mut shrunk);
+            exposure.undo(reference);
+            exposure.undo(&mut shrunk);
             packed = PackedPhotograph::new(&photograph, memory).context(NO_PLACE)?;
         }
         let alike = alikeness(&shrunk, &own);
@@ -266,7 +266,7 @@ mod tests {
     #[test]
     fn exposures_are_taken_back_from_under_alpha() {
         let mut dark = striped(0.6, 0.1);
-        Exposure { gain: [0.6; 3], offset: [0.1; 3] }.take_back(&mut dark);
+        Exposure { gain: [0.6; 3], offset: [0.1; 3] }.undo(&mut dark);
         let off = dark
             .data
             .iter()

@@ -330,7 +330,7 @@ pub(crate) mod tests {
         let message = look(&path).unwrap_err().to_string();
         assert!(
             message.ends_with(
-                "20000×20000 pixels; at most 268435456 are read (16384×16384, for \
+                "20000×20000 pixels exceed the limit of 268435456 (16384×16384, for \
                     example): make the image smaller"
             ),
             "{message}"

@@ -1,8 +1,8 @@
 use crate::image_buffer::Image;
 
-/// What an image of that size (columns, rows) shows at a position in pixels from its top left
-/// corner: cubic interpolation (Catmull and Rom 1974) of its pixels, whose centres lie at halves;
-/// beyond its border it goes on. Nothing is clamped.
+/// Interpolates an image of the given (width, height) at a position in pixels from its top left
+/// corner, by Catmull-Rom splines (Catmull and Rom 1974). Pixel centres are at half-integers; border
+/// pixels repeat outside the image. Values are not clamped.
 pub fn sample_cubic<const N: usize>(
     (width, height): (usize, usize),
     [x, y]: [f64; 2],
@@ -13,22 +13,25 @@ pub fn sample_cubic<const N: usize>(
     let (across, down) = (catmull_rom(x - left), catmull_rom(y - top));
     let mut sum = [0.0; N];
     for (j, wy) in down.iter().enumerate() {
-        let row = place(top, j, height);
+        let row = sample_index(top, j, height);
         for (i, wx) in across.iter().enumerate() {
-            let pixel = pixel(place(left, i, width), row);
-            (0..N).for_each(|c| sum[c] += wx * wy * pixel[c]);
+            let pixel = pixel(sample_index(left, i, width), row);
+            for c in 0..N {
+                sum[c] += wx * wy * pixel[c];
+            }
         }
     }
     sum
 }
 
-/// The `k`th of four samples along an axis with so many, of which `first` is the second.
+/// Returns the index of the `k`-th of four samples along an axis of `count` pixels; `second` is the
+/// unclamped index of the second sample.
 #[inline]
-fn place(first: f64, k: usize, end: usize) -> usize {
-    ((first + k as f64 - 1.0).max(0.0) as usize).min(end - 1)
+fn sample_index(second: f64, k: usize, count: usize) -> usize {
+    ((second + k as f64 - 1.0).max(0.0) as usize).min(count - 1)
 }
 
-/// Weights of the four samples around a place between the second and the third.
+/// Returns the weights of four samples at a position `t` of 0 to 1 between the second and the third.
 fn catmull_rom(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [
@@ -40,16 +43,16 @@ fn catmull_rom(t: f64) -> [f64; 4] {
 }
 
 impl Image {
-    /// The first three channels at a position in pixels from the top left corner, by
+    /// Interpolates the first three channels at a position in pixels from the top left corner, by
     /// [`sample_cubic`], clamped to [0, 1].
     ///
     /// # Panics
-    /// With fewer channels.
-    pub fn colour_at(&self, place: [f32; 2]) -> [f32; 3] {
+    /// With fewer than three channels.
+    pub fn colour_at(&self, position: [f32; 2]) -> [f32; 3] {
         let size = (self.width, self.height);
-        let colour = sample_cubic(size, place.map(f64::from), |column, row| {
-            let at = (row * self.width + column) * self.channels;
-            [0, 1, 2].map(|c| f64::from(self.data[at + c]))
+        let colour = sample_cubic(size, position.map(f64::from), |column, row| {
+            let first = (row * self.width + column) * self.channels;
+            [0, 1, 2].map(|c| f64::from(self.data[first + c]))
         });
         colour.map(|v| (v as f32).clamp(0.0, 1.0))
     }

@@ -1,66 +1,78 @@
+use crate::colour::{Palette, heat};
 use crate::exr_file::ExrImage;
-use crate::heat::{Palette, heat};
 use crate::image_buffer::Rgba8;
 
-/// Depth and opacity of a view, a number a pixel, row by row: channels `Z` and `A` of its EXR file.
-/// There are as many of both.
+/// Depth and opacity of a view's pixels, row by row: channels `Z` and `A` of its EXR file. Both
+/// slices have the same length.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthMap<'a> {
-    /// Camera-space z-depth in scene units: positive before the camera, and without meaning where
-    /// opacity is 0.
+    /// Camera-space z-depth in scene units: positive before the camera, undefined where opacity is
+    /// 0.
     pub depth: &'a [f32],
-    /// Opacity, in 0 to 1.
+    /// Opacity in [0, 1].
     pub opacity: &'a [f32],
 }
 
+/// Minimum opacity of a surface: the median depth is defined from one half on.
+const MIN_SURFACE_OPACITY: f32 = 0.5;
+
 fn is_surface(opacity: f32) -> bool {
-    opacity >= 0.5
+    opacity >= MIN_SURFACE_OPACITY
 }
 
 impl<'a> DepthMap<'a> {
-    /// The depth map of an image. `None` where one of the channels is missing.
+    /// Wraps the channels of an EXR image; `None` if one is missing.
     pub fn of(image: &'a ExrImage) -> Option<Self> {
         Some(Self { depth: image.channel("Z")?, opacity: image.channel("A")? })
     }
 
-    /// Whether a pixel, counted row by row, shows a surface: its opacity is at least one half.
+    /// True if the pixel with this row-major index has an opacity of at least one half.
     ///
     /// # Panics
-    /// Where the pixel lies outside.
+    /// If the index is out of range.
     pub fn has_surface(&self, pixel: usize) -> bool {
         is_surface(self.opacity[pixel])
     }
 
-    /// The range of surfaces' depths that an image of them shows, in scene units: from the nearest
-    /// hundredth to the farthest, since a floater or two must not take the whole scale. `None`
-    /// where there is no surface.
+    /// Returns the 1 % and 99 % quantiles of the surfaces' depths in scene units, the range to draw:
+    /// a few floaters must not stretch it. `None` without a surface.
     pub fn range(&self) -> Option<(f32, f32)> {
-        let surfaces = self.depth.iter().zip(self.opacity).filter(|(_, a)| is_surface(**a));
-        let mut seen: Vec<f32> = surfaces.map(|(z, _)| *z).collect();
-        seen.sort_by(f32::total_cmp);
-        let at = |share: f32| seen.get(((seen.len().max(1) - 1) as f32 * share) as usize).copied();
-        at(0.01).zip(at(0.99))
+        let surfaces = (0..self.depth.len()).filter(|i| self.has_surface(*i));
+        let mut depths: Vec<f32> = surfaces.map(|i| self.depth[i]).collect();
+        depths.sort_by(f32::total_cmp);
+        let last = depths.len().checked_sub(1)? as f32;
+        Some((depths[(last * 0.01) as usize], depths[(last * 0.99) as usize]))
     }
 
-    /// Depth as colours from near (warm) to far, even in disparity where the far end is many times
-    /// as far; white where nothing stands. The range is in scene units, `width` in pixels.
+    /// Draws depth from near (warm) to far (cold) over white. `width` is in pixels, the range in
+    /// scene units; a range with a ratio above 4 is drawn linearly in disparity.
     ///
     /// # Panics
-    /// Where the map hasn't whole rows of that width, or depths and opacities aren't as many.
-    pub fn draw(&self, width: usize, (near, far): (f32, f32)) -> Rgba8 {
-        let scale = |z: f32| if far > 4.0 * near && near > 0.0 { -1.0 / z.max(near) } else { z };
-        let (low, high) = (scale(near), scale(far));
-        let pixels = self.depth.iter().zip(self.opacity).flat_map(|(z, a)| {
-            let value = 1.0 - (scale(*z) - low) / (high - low).max(f32::MIN_POSITIVE);
-            let heat = heat(Palette::Depth, 0.08 + 0.84 * value.clamp(0.0, 1.0));
-            let over = |c: u8| (f32::from(c) * a + 255.0 * (1.0 - a)).round() as u8;
-            [over(heat[0]), over(heat[1]), over(heat[2]), 255]
-        });
-        Rgba8::new(width, self.depth.len() / width.max(1), pixels.collect())
+    /// If the number of pixels isn't a multiple of `width`, or depths and opacities differ in
+    /// number.
+    pub fn draw(&self, width: usize, range: (f32, f32)) -> Rgba8 {
+        let (low, high) = (scaled_depth(range.0, range), scaled_depth(range.1, range));
+        let mut data = Vec::with_capacity(4 * self.depth.len());
+        for (i, z) in self.depth.iter().enumerate() {
+            let alpha = self.opacity[i];
+            let value = 1.0 - (scaled_depth(*z, range) - low) / (high - low).max(f32::MIN_POSITIVE);
+            // Without the palette's darkest ends.
+            let colour = heat(Palette::Depth, 0.08 + 0.84 * value.clamp(0.0, 1.0));
+            for c in colour {
+                data.push((f32::from(c) * alpha + 255.0 * (1.0 - alpha)).round() as u8);
+            }
+            data.push(u8::MAX);
+        }
+        Rgba8::new(width, self.depth.len() / width.max(1), data)
     }
 }
 
-/// One range for several images, so that a depth has the same colour in all of them.
+/// Returns depth, or negated disparity for a range with a ratio above 4.
+fn scaled_depth(z: f32, (near, far): (f32, f32)) -> f32 {
+    if far > 4.0 * near && near > 0.0 { -1.0 / z.max(near) } else { z }
+}
+
+/// Returns the union of several images' ranges, so that a depth has the same colour in all images.
 pub fn common_range(ranges: impl IntoIterator<Item = (f32, f32)>) -> Option<(f32, f32)> {
     ranges.into_iter().reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
 }

@@ -1,79 +1,79 @@
 use std::path::PathBuf;
 
-/// An image that can't be read or written.
+/// Error returned when an image can't be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum PixelError {
-    /// The file is not there, or reading or writing failed.
+    /// The operating system reported an error.
     #[error("{path}: {source}")]
     Io {
-        /// The file.
+        /// Path of the image.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file is no image of the kind, is cut short or damaged.
+    /// The file is not an image of the expected format, or is truncated or damaged.
     #[error("{path}: {reason}; export the image again")]
     Format {
-        /// The file.
+        /// Path of the image.
         path: PathBuf,
-        /// What is wrong.
+        /// Reason, as a sentence fragment.
         reason: String,
     },
-    /// The file is an image of a format that isn't read.
-    #[error("{path} is a {format} image, which is not read; convert: {command}")]
+    /// The image format is not supported.
+    #[error("{path} is a {format} image, which is not supported; convert: {command}")]
     Unread {
-        /// The file.
+        /// Path of the image.
         path: PathBuf,
         /// Name of the format.
         format: &'static str,
         /// Shell command that converts the file.
         command: String,
     },
-    /// An image that is larger than any that is read.
+    /// The image has more than [`MAX_PIXELS`] pixels.
     #[error(
-        "{path}: {width}×{height} pixels; at most {MAX_PIXELS} are read (16384×16384, for \
-        example): make the image smaller"
+        "{path}: {width}×{height} pixels exceed the limit of {MAX_PIXELS} (such as 16384×16384); \
+        make the image smaller"
     )]
     TooLarge {
-        /// The file.
+        /// Path of the image.
         path: PathBuf,
-        /// Columns.
+        /// Width in pixels.
         width: usize,
-        /// Rows.
+        /// Height in pixels.
         height: usize,
     },
-    /// A sample that isn't finite was about to be written.
-    #[error("{path}: channel {channel} holds {value} at pixel ({x}, {y}); nothing was written")]
+    /// A sample to write is NaN or infinite.
+    #[error("{path}: channel {channel} is {value} at pixel ({x}, {y}); nothing was written")]
     NotFinite {
-        /// The file.
+        /// Path of the image.
         path: PathBuf,
-        /// The channel.
+        /// Name of the channel.
         channel: String,
-        /// Column.
+        /// Column of the pixel.
         x: usize,
-        /// Row.
+        /// Row of the pixel.
         y: usize,
-        /// The sample.
+        /// Value of the sample.
         value: f32,
     },
-    /// A file has a sample that isn't finite.
+    /// A sample of a file is NaN or infinite.
     #[error(
-        "{path}: channel {channel} is {value} at column {x}, row {y}; such a pixel has no colour \
-        or depth: export the image again without it"
+        "{path}: channel {channel} is {value} at column {x}, row {y}; export the image again with \
+        finite samples"
     )]
     NotFiniteInput {
-        /// The file.
+        /// Path of the image.
         path: PathBuf,
-        /// The channel.
+        /// Name of the channel.
         channel: String,
-        /// Column.
+        /// Column of the pixel.
         x: usize,
-        /// Row.
+        /// Row of the pixel.
         y: usize,
-        /// The sample.
+        /// Value of the sample.
         value: f32,
     },
 }
 
-/// More pixels than any image has; a header that says so is damaged or hostile.
+/// Maximum number of pixels of an image: a header that claims more is damaged or hostile.
 pub const MAX_PIXELS: usize = 1 << 28;

@@ -11,43 +11,44 @@ use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
 
 use crate::error::{MAX_PIXELS, PixelError};
 use crate::image_buffer::Image;
+use crate::png_file::read_png;
 
 /// Precision of an EXR channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SampleType {
-    /// 16 bits: colour and opacity.
+    /// 16-bit float, for colour and opacity.
     Half,
-    /// 32 bits: depth.
+    /// 32-bit float, for depth.
     Float,
 }
 
-/// A channel to write.
+/// Description of a channel to write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Channel {
-    /// `R`, `G`, `B`, `A`, `Z`, or a telling name.
+    /// Name: `R`, `G`, `B`, `A`, `Z`, or a descriptive one.
     pub name: &'static str,
-    /// Its precision.
+    /// Precision of the samples.
     pub sample_type: SampleType,
 }
 
-/// Channels of a view's colours, premultiplied by the last.
+/// Channels of a view's colours, premultiplied by alpha.
 pub const COLOUR_CHANNELS: [&str; 4] = ["R", "G", "B", "A"];
 /// Channels of a depth map.
 pub const DEPTH_CHANNELS: [&str; 2] = ["Z", "A"];
 
-/// What an EXR file holds.
+/// Content of an EXR file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExrImage {
-    /// Columns.
+    /// Width in pixels.
     pub width: usize,
-    /// Rows.
+    /// Height in pixels.
     pub height: usize,
     /// Name and samples of every channel, sorted by name.
     pub channels: Vec<(String, Vec<f32>)>,
 }
 
 impl ExrImage {
-    /// The samples of a channel.
+    /// Returns the samples of a channel.
     pub fn channel(&self, name: &str) -> Option<&[f32]> {
         self.channels.iter().find(|(n, _)| n == name).map(|(_, samples)| samples.as_slice())
     }
@@ -57,20 +58,20 @@ impl ExrImage {
     pub fn with_finite(self, names: &[&str], path: &Path) -> Result<Self, PixelError> {
         for name in names {
             let samples = self.channel(name).unwrap_or_default();
-            if let Some(at) = samples.iter().position(|sample| !sample.is_finite()) {
+            if let Some(index) = samples.iter().position(|sample| !sample.is_finite()) {
                 return Err(PixelError::NotFiniteInput {
                     path: path.to_path_buf(),
                     channel: (*name).to_owned(),
-                    x: at % self.width,
-                    y: at / self.width,
-                    value: samples[at],
+                    x: index % self.width,
+                    y: index / self.width,
+                    value: samples[index],
                 });
             }
         }
         Ok(self)
     }
 
-    /// Channels R, G, B and A together, where it has them.
+    /// Returns channels R, G, B and A as one image; `None` if one is missing.
     pub fn premultiplied(&self) -> Option<Image> {
         let [Some(r), Some(g), Some(b), Some(a)] = COLOUR_CHANNELS.map(|name| self.channel(name))
         else {
@@ -81,15 +82,15 @@ impl ExrImage {
     }
 }
 
-/// Rows compressed together by ZIP16.
+/// Number of rows that ZIP16 compresses together.
 const BAND_ROWS: usize = 16;
 
-/// Writes an EXR file (scan lines, ZIP) whose bytes repeat: increasing line order, compressed in
-/// order, one attribute.
+/// Writes an EXR file (scan lines, ZIP) with reproducible bytes: increasing line order, sequential
+/// compression, one attribute.
 ///
-/// `band(first_row, rows, samples)` fills up to 16 rows at a time, `channels` interleaved in the
-/// order given, so memory doesn't grow with the image. `note` says what the colours are. A sample
-/// that isn't finite stops the writing.
+/// `band(first_row, rows, samples)` fills up to 16 rows at a time, with `channels` interleaved in
+/// the given order, so that memory doesn't grow with the image. `note` describes the colours. Fails
+/// at the first sample that isn't finite.
 pub fn write_exr<E: From<PixelError>>(
     path: &Path,
     (width, height): (usize, usize),
@@ -137,33 +138,29 @@ pub fn write_exr<E: From<PixelError>>(
     }
 }
 
-/// The header of a file with channels in their order of names.
+/// Creates the header; `channels` are sorted by name.
 fn header<'a>(
     size: (usize, usize),
     channels: impl Iterator<Item = &'a Channel>,
     note: &str,
 ) -> Header {
-    let described = channels.map(|channel| {
-        let sample_type = match channel.sample_type {
+    let descriptions = channels.map(|channel| ChannelDescription {
+        name: Text::from(channel.name),
+        sample_type: match channel.sample_type {
             SampleType::Half => exr::meta::attribute::SampleType::F16,
             SampleType::Float => exr::meta::attribute::SampleType::F32,
-        };
-        ChannelDescription {
-            name: Text::from(channel.name),
-            sample_type,
-            quantize_linearly: false,
-            sampling: (1, 1).into(),
-        }
+        },
+        quantize_linearly: false,
+        sampling: (1, 1).into(),
     });
-    let list = ChannelList::new(described.collect());
-    // The crate's default line order isn't fixed: of 40 writings of one image no two files were
-    // equal (shared/facts/pipelines.md).
+    let list = ChannelList::new(descriptions.collect());
+    // The crate's default line order varies: among 40 files of one image no two were equal.
     let mut header = Header::new(Text::from("views"), size, list.list).with_encoding(
         Compression::ZIP16,
         BlockDescription::ScanLines,
         LineOrder::Increasing,
     );
-    // A second custom attribute would land in a hash map, in no fixed order.
+    // Custom attributes are in a hash map: two would have no fixed order.
     header.own_attributes.layer_name = None;
     header.own_attributes.other.insert(Text::from("note"), AttributeValue::Text(Text::from(note)));
     header
@@ -176,18 +173,19 @@ fn check_finite(
     first: usize,
     samples: &[f32],
 ) -> Result<(), PixelError> {
-    let Some(at) = samples.iter().position(|v| !v.is_finite()) else { return Ok(()) };
-    let pixel = at / channels.len();
+    let Some(index) = samples.iter().position(|v| !v.is_finite()) else { return Ok(()) };
+    let pixel = index / channels.len();
     Err(PixelError::NotFinite {
         path: path.to_path_buf(),
-        channel: channels[at % channels.len()].name.to_owned(),
+        channel: channels[index % channels.len()].name.to_owned(),
         x: pixel % width,
         y: first + pixel / width,
-        value: samples[at],
+        value: samples[index],
     })
 }
 
-/// Line by line, channel by channel (sorted by name), native-endian: the form `exr` compresses.
+/// Returns the samples line by line, channel by channel (sorted by name), native-endian: the layout
+/// that `exr` compresses.
 fn block_bytes(samples: &[f32], width: usize, channels: &[Channel], order: &[usize]) -> Vec<u8> {
     let mut data = Vec::with_capacity(samples.len() * 4);
     for line in samples.chunks_exact(width * channels.len()) {
@@ -195,20 +193,23 @@ fn block_bytes(samples: &[f32], width: usize, channels: &[Channel], order: &[usi
             let line = line.iter().skip(channel).step_by(channels.len());
             match channels[channel].sample_type {
                 SampleType::Half => {
-                    // Largest finite half; beyond it a conversion would make infinity.
-                    line.for_each(|&v| {
+                    for v in line {
+                        // ±65504, the largest finite half; larger values would become infinite.
                         data.extend(half::f16::from_f32(v.clamp(-65504.0, 65504.0)).to_ne_bytes());
-                    });
+                    }
                 }
-                SampleType::Float => line.for_each(|v| data.extend(v.to_ne_bytes())),
+                SampleType::Float => {
+                    for v in line {
+                        data.extend(v.to_ne_bytes());
+                    }
+                }
             }
         }
     }
     data
 }
 
-/// A file, and what is wrong with it.
-fn format(path: &Path, reason: &str) -> PixelError {
+fn format_error(path: &Path, reason: &str) -> PixelError {
     PixelError::Format { path: path.to_path_buf(), reason: reason.to_owned() }
 }
 
@@ -218,23 +219,22 @@ fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
         .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
 }
 
-/// Columns and rows of the first layer, by the header alone; one that asks for more pixels than any
-/// view has is refused.
+/// Reads width and height of the first layer from the header; fails above [`MAX_PIXELS`].
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
-    let meta = header_of(path)?;
-    let first = meta.headers.first().ok_or_else(|| format(path, "it has no layer"))?;
+    let meta = read_header(path)?;
+    let first = meta.headers.first().ok_or_else(|| format_error(path, "no layer"))?;
     Ok((first.layer_size.width(), first.layer_size.height()))
 }
 
-/// Returns the bytes of memory that [`read_exr`] takes, by the header alone: each sample as it is
+/// Returns the peak memory of [`read_exr`] in bytes, estimated from the header: each sample as
 /// stored, and as f32.
 pub fn exr_reading_bytes(path: &Path) -> Result<u64, PixelError> {
-    let layers = header_of(path)?.headers;
+    let layers = read_header(path)?.headers;
     let samples = layers.iter().map(|h| (h.layer_size.area() * h.channels.list.len()) as u64);
     Ok(8 * samples.sum::<u64>())
 }
 
-fn header_of(path: &Path) -> Result<MetaData, PixelError> {
+fn read_header(path: &Path) -> Result<MetaData, PixelError> {
     let meta = MetaData::read_from_buffered(open(path)?, false).map_err(|e| exr_error(path, e))?;
     if let Some(header) = meta.headers.iter().find(|h| h.layer_size.area() > MAX_PIXELS) {
         let (width, height) = (header.layer_size.width(), header.layer_size.height());
@@ -256,7 +256,7 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
         .from_buffered(open(path)?)
         .map_err(|e| exr_error(path, e))?;
     let layer =
-        image.layer_data.into_iter().next().ok_or_else(|| format(path, "it has no layer"))?;
+        image.layer_data.into_iter().next().ok_or_else(|| format_error(path, "no layer"))?;
     let (width, height) = (layer.size.width(), layer.size.height());
     let channels = layer
         .channel_data
@@ -272,11 +272,18 @@ fn exr_error(path: &Path, error: exr::error::Error) -> PixelError {
         exr::error::Error::Io(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
             PixelError::Io { path: path.to_path_buf(), source }
         }
-        other => PixelError::Format {
-            path: path.to_path_buf(),
-            reason: format!("not a whole EXR ({other})"),
-        },
+        other => format_error(path, &format!("incomplete or damaged EXR ({other})")),
     }
+}
+
+/// Reads a view's image as premultiplied RGBA, from a PNG with straight alpha or none, or from an
+/// EXR with premultiplied channels R, G, B, A.
+pub fn read_premultiplied(path: &Path) -> Result<Image, PixelError> {
+    if path.extension().is_none_or(|e| e != "exr") {
+        return Ok(Image::premultiplied(&read_png(path)?));
+    }
+    let image = read_exr(path)?.with_finite(&COLOUR_CHANNELS, path)?;
+    image.premultiplied().ok_or_else(|| format_error(path, "expected channels R, G, B and A"))
 }
 
 #[cfg(test)]
@@ -373,7 +380,7 @@ mod tests {
         for (value, words) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf"), (-f32::INFINITY, "-inf")]
         {
             let message = image(value).with_finite(&DEPTH_CHANNELS, path).unwrap_err().to_string();
-            let expected = format!("a.exr: channel Z is {words} at column 2, row 1; such a pixel");
+            let expected = format!("a.exr: channel Z is {words} at column 2, row 1; export");
             assert!(message.starts_with(&expected), "{message}");
             // Nobody reads the depth of a colour.
             assert!(image(value).with_finite(&COLOUR_CHANNELS, path).is_ok());

@@ -5,20 +5,20 @@ use crate::error::PixelError;
 use crate::image_buffer::{Image, Rgba8};
 use crate::png_file::read_png;
 
-/// Which pixels of an image count, row by row; the others show what doesn't belong to the scene,
-/// people who walked by for example.
+/// Mask of an image's pixels. Those that don't count show something that isn't part of the scene,
+/// such as passers-by.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mask {
-    /// Columns.
+    /// Width in pixels.
     pub width: usize,
-    /// Rows.
+    /// Height in pixels.
     pub height: usize,
-    /// For each pixel whether it counts.
+    /// True for each pixel that counts, row by row.
     pub counts: Vec<bool>,
 }
 
 impl Mask {
-    /// From an image: what is dark or transparent there doesn't count.
+    /// Creates a mask from an image, whose dark and transparent pixels don't count.
     pub fn of(image: &Rgba8) -> Self {
         Self {
             width: image.width,
@@ -27,12 +27,12 @@ impl Mask {
         }
     }
 
-    /// Reads a PNG, see [`Mask::of`], for an image of that size.
+    /// Reads a mask from a PNG ([`Mask::of`]); fails if its size differs from the given one.
     pub fn read(path: &Path, (width, height): (usize, usize)) -> Result<Self, PixelError> {
         let image = read_png(path)?;
         if (image.width, image.height) != (width, height) {
             let reason = format!(
-                "{}×{} pixels where its image has {width}×{height}",
+                "mask is {}×{} pixels, its image {width}×{height}",
                 image.width, image.height
             );
             return Err(PixelError::Format { path: path.to_path_buf(), reason });
@@ -40,55 +40,55 @@ impl Mask {
         Ok(Self::of(&image))
     }
 
-    /// White where a pixel counts, black elsewhere.
+    /// Draws the mask: white where a pixel counts, black elsewhere.
     pub fn to_rgba8(&self) -> Rgba8 {
         let pixel = |&counts: &bool| if counts { [255; 4] } else { [0, 0, 0, 255] };
         Rgba8::new(self.width, self.height, self.counts.iter().flat_map(pixel).collect())
     }
 
-    /// The mask of the image at another size: a pixel counts where all that lies under it does, and
-    /// under so many pixels around it, which its kernel reads.
+    /// Resizes the mask: a new pixel counts if all old pixels under it and under the `margin` new
+    /// pixels around it count, which are those that the image's kernel reads.
     #[must_use]
-    pub fn resized(&self, (width, height): (usize, usize), around: usize) -> Self {
-        // Across first: `around` may be wide.
-        let mut narrow = vec![true; width * self.height];
-        for (row, line) in
-            narrow.chunks_exact_mut(width.max(1)).zip(self.counts.chunks_exact(self.width.max(1)))
-        {
-            row.iter_mut().enumerate().for_each(|(x, counts)| {
-                *counts = line[under(x, around, width, self.width)].iter().all(|c| *c);
-            });
+    pub fn resized(&self, (width, height): (usize, usize), margin: usize) -> Self {
+        // Rows first, then columns: a wide margin stays cheap.
+        let mut narrow = Vec::with_capacity(width * self.height);
+        for y in 0..self.height {
+            let line = &self.counts[y * self.width..(y + 1) * self.width];
+            for x in 0..width {
+                let covered = covered_range(x, margin, width, self.width);
+                narrow.push(line[covered].iter().all(|counts| *counts));
+            }
         }
-        let counts = (0..width * height).map(|i| {
-            let mut rows = under(i / width, around, height, self.height);
-            rows.all(|y| narrow[y * width + i % width])
-        });
-        Self { width, height, counts: counts.collect() }
+        let mut counts = Vec::with_capacity(width * height);
+        for y in 0..height {
+            for x in 0..width {
+                let mut rows = covered_range(y, margin, height, self.height);
+                counts.push(rows.all(|row| narrow[row * width + x]));
+            }
+        }
+        Self { width, height, counts }
     }
 
-    /// Share of the pixels that count.
-    pub fn share(&self) -> f64 {
+    /// Returns the fraction of pixels that count.
+    pub fn counted_fraction(&self) -> f64 {
         self.counts.iter().filter(|c| **c).count() as f64 / self.counts.len().max(1) as f64
     }
 
-    /// Gives an image another's pixels where its own don't count, so that the two don't differ
-    /// there.
+    /// Replaces an image's masked pixels by another image's, so that both are equal there.
     ///
     /// # Panics
-    /// When the sizes differ.
+    /// If the sizes differ.
     pub fn fill(&self, image: &mut Image, other: &Image) {
         let size = (self.width, self.height);
         assert!(
             (image.width, image.height) == size && (other.width, other.height) == size,
             "a mask and its images have one size"
         );
-        let pixels = image
-            .data
-            .chunks_exact_mut(image.channels)
-            .zip(other.data.chunks_exact(other.channels));
-        for ((to, from), counts) in pixels.zip(&self.counts) {
+        let channels = image.channels.min(other.channels);
+        for (i, counts) in self.counts.iter().enumerate() {
             if !counts {
-                to.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
+                let to = &mut image.data[i * image.channels..][..channels];
+                to.copy_from_slice(&other.data[i * other.channels..][..channels]);
             }
         }
     }
@@ -98,10 +98,10 @@ fn is_bright(p: &[u8]) -> bool {
     p[..3].iter().map(|&v| u16::from(v)).sum::<u16>() >= 3 * 128 && p[3] >= 128
 }
 
-/// Of `from` columns or rows, those under the pixels around one of `to`.
-fn under(at: usize, around: usize, to: usize, from: usize) -> Range<usize> {
-    let (first, end) = (at.saturating_sub(around), (at + 1 + around).min(to));
-    first * from / to..(end * from).div_ceil(to)
+/// Returns the `old` columns or rows under one of `new`, with `margin` new ones to either side.
+fn covered_range(index: usize, margin: usize, new: usize, old: usize) -> Range<usize> {
+    let (first, end) = (index.saturating_sub(margin), (index + 1 + margin).min(new));
+    first * old / new..(end * old).div_ceil(new)
 }
 
 #[cfg(test)]
@@ -125,7 +125,7 @@ mod tests {
         );
         assert_eq!(Mask::of(&image), mask(4, &["#..#"]));
         assert_eq!(Mask::of(&mask(4, &["#..#"]).to_rgba8()), mask(4, &["#..#"]));
-        assert_eq!(mask(4, &["#..#"]).share(), 0.5);
+        assert_eq!(mask(4, &["#..#"]).counted_fraction(), 0.5);
     }
 
     /// Another size leaves out whatever a pixel that doesn't count has a part in, and nothing else.
@@ -138,7 +138,7 @@ mod tests {
         // Four columns of one and a half: the last two have a part in column 4 or 5.
         assert_eq!(whole.resized((4, 4), 0), mask(4, &["####", "###.", "####", "####"]));
         assert_eq!(whole.resized((4, 1), 0), mask(4, &["###."]));
-        assert_eq!(whole.resized((12, 8), 0).share(), 23.0 / 24.0);
+        assert_eq!(whole.resized((12, 8), 0).counted_fraction(), 23.0 / 24.0);
     }
 
     #[test]

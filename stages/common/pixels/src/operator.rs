@@ -1,9 +1,8 @@
 use crate::image_buffer::Image;
 use crate::pillow_resample::{Filter, coefficients};
 
-/// A resampling along one axis as a linear map in floats: output `i` is Σ weight·input over a run
-/// of inputs that starts at `first(i)`. Every run has the same length, so that a caller's loop has
-/// too; what pads it weighs 0.
+/// Linear resampling along one axis in floats: output `i` is Σ weight·input over a run of inputs.
+/// All runs have one length, so that callers' loops have a fixed length; padding weights are 0.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AxisTaps {
     inputs: usize,
@@ -13,10 +12,10 @@ pub struct AxisTaps {
 }
 
 impl AxisTaps {
-    /// The weights with which Pillow resizes `inputs` samples to `outputs`, before it rounds them.
+    /// Computes Pillow's unrounded weights from `inputs` samples to `outputs`.
     ///
     /// # Panics
-    /// When a side is 0.
+    /// If a side is 0.
     pub fn new(filter: Filter, inputs: usize, outputs: usize) -> Self {
         assert!(inputs > 0 && outputs > 0, "a side of 0 pixels can't be resized");
         let runs: Vec<(usize, Vec<f64>)> = if inputs == outputs {
@@ -27,43 +26,45 @@ impl AxisTaps {
         let length = runs.iter().map(|(_, w)| w.len()).max().unwrap_or(0);
         let mut weights = vec![0.0; length * outputs];
         let mut firsts = Vec::with_capacity(outputs);
-        for ((first, run), padded) in runs.iter().zip(weights.chunks_exact_mut(length)) {
+        for (i, (first, run)) in runs.iter().enumerate() {
             // A run near the end starts earlier, so that its padding stays inside.
             let start = (*first).min(inputs - length);
-            for (to, &from) in padded[first - start..].iter_mut().zip(run) {
-                *to = from as f32;
+            for (k, weight) in run.iter().enumerate() {
+                weights[i * length + first - start + k] = *weight as f32;
             }
             firsts.push(start);
         }
         Self { inputs, length, firsts, weights }
     }
 
-    /// First input of output `i`, and the weights of the run that begins there.
+    /// Returns the first input of output `i`, and the weights of the run that begins there.
     pub fn run(&self, i: usize) -> (usize, &[f32]) {
         (self.firsts[i], &self.weights[i * self.length..(i + 1) * self.length])
     }
 
-    /// What an input weighs in an output.
+    /// Returns the weight of an input in an output; 0 outside the output's run.
     pub fn weight(&self, output: usize, input: usize) -> f32 {
         let (first, weights) = self.run(output);
         input.checked_sub(first).and_then(|k| weights.get(k)).copied().unwrap_or(0.0)
     }
 
-    /// Number of outputs.
+    /// Returns the number of outputs.
     pub fn outputs(&self) -> usize {
         self.firsts.len()
     }
 
-    /// Weights P = (s·K·Kᵀ)⁻¹·K of the map's pseudo-inverse K⁺ = s·Pᵀ, where s = inputs/outputs:
-    /// along one axis, the smallest change to the inputs that adds r to the outputs is K⁺·r. Shares
-    /// of the whole are like K's own, so that a flat r asks as much of every input as Kᵀ·r does;
-    /// where K weakens fine detail, P makes up for it. Weights farther than `reach` outputs from an
-    /// input are left out.
+    /// Computes the weights P = (s·K·Kᵀ)⁻¹·K of the pseudo-inverse K⁺ = s·Pᵀ, with
+    /// s = inputs/outputs: along one axis, the smallest change of the inputs that adds r to the
+    /// outputs is K⁺·r. The factor s makes P sum to 1 as K does, so that a constant r changes every
+    /// input as much as Kᵀ·r does; detail that K attenuates is amplified. Weights farther than
+    /// `reach` outputs from an input are omitted.
     pub fn inverse(&self, reach: usize) -> Self {
         let (n, scale) = (self.outputs(), self.inputs as f64 / self.outputs() as f64);
-        // Gram matrix: banded, since a run overlaps few others.
-        let overlap = |d: usize| (0..n - d).any(|a| self.dot(a, a + d) != 0.0);
-        let band = (1..n).take_while(|d| overlap(*d)).last().unwrap_or(0);
+        // The Gram matrix is banded: a run overlaps few others.
+        let band = (1..n)
+            .take_while(|d| (0..n - d).any(|a| self.dot(a, a + d) != 0.0))
+            .last()
+            .unwrap_or(0);
         // Lower Cholesky factor, row by row: column a - band + k of row a is factor[a][k].
         let mut factor = vec![vec![0.0; band + 1]; n];
         for a in 0..n {
@@ -97,11 +98,11 @@ impl AxisTaps {
             let centre = ((q as f64 + 0.5) * scale - 0.5 * length as f64).round().max(0.0) as usize;
             let first = centre.min(self.inputs - length);
             firsts.push(first);
-            // Beyond 2·reach nothing of z is left, and no run comes here from farther away.
+            // Beyond 2·reach z vanishes, and no run reaches here from farther away.
             let near = q.saturating_sub(4 * reach)..(q + 4 * reach + 1).min(n);
             weights.extend((first..first + length).map(|i| {
-                let apart = ((i as f64 + 0.5) / scale - (q as f64 + 0.5)).abs();
-                let within = f64::from(u8::from(apart <= reach as f64));
+                let distance = ((i as f64 + 0.5) / scale - (q as f64 + 0.5)).abs();
+                let within = f64::from(u8::from(distance <= reach as f64));
                 (within * near.clone().map(|a| z[a] * f64::from(self.weight(a, i))).sum::<f64>())
                     as f32
             }));
@@ -109,46 +110,46 @@ impl AxisTaps {
         Self { inputs: self.inputs, length, firsts, weights }
     }
 
-    /// Product of two outputs' weights.
+    /// Returns the inner product of two outputs' weights.
     fn dot(&self, a: usize, b: usize) -> f64 {
         let (first, weights) = self.run(a);
-        (first..).zip(weights).map(|(i, &w)| f64::from(w) * f64::from(self.weight(b, i))).sum()
+        let products = weights.iter().enumerate();
+        products.map(|(k, &w)| f64::from(w) * f64::from(self.weight(b, first + k))).sum()
     }
 }
 
-/// Keeps the pseudo-inverse bounded: what a kernel weakens to less than this share of power isn't
-/// asked for.
+/// Ridge that bounds the pseudo-inverse: frequencies that a kernel attenuates below this power are
+/// not restored; chosen by hand.
 const RIDGE: f64 = 0.02;
 
-/// A separable resampling of images as a linear operator: what
-/// [`resize_pillow`](crate::resize_pillow) does, without its rounding and clipping. `apply` and
-/// `adjoint` are each other's transpose.
+/// Separable resampling of images as a linear operator: [`resize_pillow`](crate::resize_pillow)
+/// without rounding and clipping. `apply` and `adjoint` are each other's transpose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Resampling {
-    /// Along rows.
+    /// Resampling along rows.
     pub x: AxisTaps,
-    /// Along columns.
+    /// Resampling along columns.
     pub y: AxisTaps,
 }
 
 impl Resampling {
-    /// From images of one size (width, height) to another.
+    /// Creates the operator from one (width, height) to another.
     ///
     /// # Panics
-    /// When a side is 0.
+    /// If a side is 0.
     pub fn new(filter: Filter, from: (usize, usize), to: (usize, usize)) -> Self {
         Self { x: AxisTaps::new(filter, from.0, to.0), y: AxisTaps::new(filter, from.1, to.1) }
     }
 
-    /// [`AxisTaps::inverse`] along both axes.
+    /// Computes [`AxisTaps::inverse`] along both axes.
     pub fn inverse(&self, reach: usize) -> Self {
         Self { x: self.x.inverse(reach), y: self.y.inverse(reach) }
     }
 
-    /// The resampled image.
+    /// Resamples an image.
     ///
     /// # Panics
-    /// When the image hasn't the operator's input size.
+    /// Unless the image has the operator's input size.
     pub fn apply(&self, image: &Image) -> Image {
         assert_eq!(
             (image.width, image.height),
@@ -157,34 +158,29 @@ impl Resampling {
         );
         let (width, height, channels) = (self.x.outputs(), self.y.outputs(), image.channels);
         let mut narrow = vec![0.0; width * image.height * channels];
-        for (row, out) in image
-            .data
-            .chunks_exact(image.width * channels)
-            .zip(narrow.chunks_exact_mut(width * channels))
-        {
+        for (j, row) in image.data.chunks_exact(image.width * channels).enumerate() {
+            let out = &mut narrow[j * width * channels..(j + 1) * width * channels];
             for (i, pixel) in out.chunks_exact_mut(channels).enumerate() {
                 let (first, weights) = self.x.run(i);
-                for (from, w) in row[first * channels..].chunks_exact(channels).zip(weights) {
-                    (0..channels).for_each(|c| pixel[c] += w * from[c]);
+                for (k, w) in weights.iter().enumerate() {
+                    add_scaled(pixel, *w, &row[(first + k) * channels..][..channels]);
                 }
             }
         }
         let mut data = vec![0.0; width * height * channels];
         for (j, out) in data.chunks_exact_mut(width * channels).enumerate() {
             let (first, weights) = self.y.run(j);
-            for (row, w) in
-                narrow[first * width * channels..].chunks_exact(width * channels).zip(weights)
-            {
-                out.iter_mut().zip(row).for_each(|(sum, v)| *sum += w * v);
+            for (k, w) in weights.iter().enumerate() {
+                add_scaled(out, *w, &narrow[(first + k) * out.len()..][..out.len()]);
             }
         }
         Image::new(width, height, channels, data)
     }
 
-    /// The transpose: spreads each output sample over the inputs it was made from.
+    /// Applies the transpose: spreads each output sample over its inputs.
     ///
     /// # Panics
-    /// When the image hasn't the operator's output size.
+    /// Unless the image has the operator's output size.
     pub fn adjoint(&self, image: &Image) -> Image {
         assert_eq!(
             (image.width, image.height),
@@ -195,22 +191,29 @@ impl Resampling {
         let mut tall = vec![0.0; image.width * height * channels];
         for (j, row) in image.data.chunks_exact(image.width * channels).enumerate() {
             let (first, weights) = self.y.run(j);
-            for (out, w) in tall[first * row.len()..].chunks_exact_mut(row.len()).zip(weights) {
-                out.iter_mut().zip(row).for_each(|(sum, v)| *sum += w * v);
+            for (k, w) in weights.iter().enumerate() {
+                add_scaled(&mut tall[(first + k) * row.len()..][..row.len()], *w, row);
             }
         }
         let mut data = vec![0.0; width * height * channels];
-        for (row, out) in
-            tall.chunks_exact(image.width * channels).zip(data.chunks_exact_mut(width * channels))
-        {
+        for (j, row) in tall.chunks_exact(image.width * channels).enumerate() {
+            let out = &mut data[j * width * channels..(j + 1) * width * channels];
             for (i, pixel) in row.chunks_exact(channels).enumerate() {
                 let (first, weights) = self.x.run(i);
-                for (to, w) in out[first * channels..].chunks_exact_mut(channels).zip(weights) {
-                    (0..channels).for_each(|c| to[c] += w * pixel[c]);
+                for (k, w) in weights.iter().enumerate() {
+                    add_scaled(&mut out[(first + k) * channels..][..channels], *w, pixel);
                 }
             }
         }
         Image::new(width, height, channels, data)
+    }
+}
+
+/// Adds `weight · values` to the sums.
+#[inline]
+fn add_scaled(sums: &mut [f32], weight: f32, values: &[f32]) {
+    for (sum, value) in sums.iter_mut().zip(values) {
+        *sum += weight * value;
     }
 }
 

@@ -1,21 +1,21 @@
 //! Pillow's 8-bit resampling (Pillow 12.3, `Resample.c`), to the last bit.
 //!
-//! What makes it bit-exact: RGBA is premultiplied in 8 bits first; the horizontal pass comes first
-//! and is clipped to 8 bits before the vertical one; weights are computed in f64, normalised, and
+//! Bit-exactness requires that RGBA is premultiplied in 8 bits first, that the horizontal pass is
+//! clipped to 8 bits before the vertical one, and that weights are computed in f64, normalised, and
 //! rounded to 22 bits.
 
 use std::borrow::Cow;
 
 use crate::image_buffer::Rgba8;
 
-/// A resampling kernel, widened by the scale when shrinking (so it is an anti-aliasing filter).
+/// Resampling kernel, widened by the scale when downscaling, which makes it an anti-aliasing filter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Filter {
-    /// Box, half a pixel to either side.
+    /// Box: half a pixel to either side.
     Box,
-    /// Cubic convolution with a = -1/2, two pixels to either side.
+    /// Cubic convolution with a = -1/2: two pixels to either side.
     Bicubic,
-    /// sinc windowed by a wider sinc, three pixels to either side.
+    /// Windowed sinc: three pixels to either side.
     Lanczos,
 }
 
@@ -30,7 +30,7 @@ impl Filter {
 
     fn weight(self, x: f64) -> f64 {
         match self {
-            // Half-open, so that a tie belongs to one side only.
+            // Half-open, so that a sample on the edge counts on one side only.
             Self::Box => f64::from(u8::from(x > -0.5 && x <= 0.5)),
             Self::Bicubic => {
                 const A: f64 = -0.5;
@@ -62,44 +62,50 @@ fn sinc(x: f64) -> f64 {
     libm::sin(x) / x
 }
 
+/// Fractional bits of the integer weights, as in Pillow.
 const PRECISION_BITS: u32 = 32 - 8 - 2;
 
-/// The weights of one output sample: they apply to input samples `first..first + weights.len()`.
+/// Integer weights of one output sample, for inputs `first..first + weights.len()`.
 struct Taps {
     first: usize,
     weights: Vec<i32>,
 }
 
-/// First input sample and normalised weights of each output sample.
+/// Returns the first input and the normalised weights of each output.
 pub(crate) fn coefficients(input: usize, output: usize, filter: Filter) -> Vec<(usize, Vec<f64>)> {
     let scale = input as f64 / output as f64;
     let stretch = scale.max(1.0);
     let support = filter.support() * stretch;
-    (0..output)
-        .map(|i| {
-            let centre = (i as f64 + 0.5) * scale;
-            // `as` truncates towards zero and saturates at 0, as the C code's cast and clamp do.
-            let first = (centre - support + 0.5) as usize;
-            let end = ((centre + support + 0.5) as usize).min(input);
-            let mut weights: Vec<f64> = (first..end)
-                .map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / stretch)))
-                .collect();
-            let sum: f64 = weights.iter().sum();
-            if sum != 0.0 {
-                weights.iter_mut().for_each(|w| *w /= sum);
+    let mut runs = Vec::with_capacity(output);
+    for i in 0..output {
+        let centre = (i as f64 + 0.5) * scale;
+        // `as` truncates towards zero and saturates at 0, like the C code's cast and clamp.
+        let first = (centre - support + 0.5) as usize;
+        let end = ((centre + support + 0.5) as usize).min(input);
+        let mut weights: Vec<f64> = (first..end)
+            .map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / stretch)))
+            .collect();
+        let sum: f64 = weights.iter().sum();
+        if sum != 0.0 {
+            for weight in &mut weights {
+                *weight /= sum;
             }
-            (first, weights)
-        })
-        .collect()
+        }
+        runs.push((first, weights));
+    }
+    runs
 }
 
 fn taps(input: usize, output: usize, filter: Filter) -> Vec<Taps> {
     let runs = coefficients(input, output, filter).into_iter();
-    runs.map(|(first, weights)| Taps { first, weights: weights.into_iter().map(fixed).collect() })
-        .collect()
+    runs.map(|(first, weights)| Taps {
+        first,
+        weights: weights.into_iter().map(fixed_point).collect(),
+    })
+    .collect()
 }
 
-fn fixed(weight: f64) -> i32 {
+fn fixed_point(weight: f64) -> i32 {
     let w = weight * f64::from(1 << PRECISION_BITS);
     (if w < 0.0 { w - 0.5 } else { w + 0.5 }) as i32
 }
@@ -108,10 +114,10 @@ fn clip(accumulated: i32) -> u8 {
     (accumulated >> PRECISION_BITS).clamp(0, 255) as u8
 }
 
-/// Resizes as `PIL.Image.resize((width, height), filter)` does on an RGBA image.
+/// Resizes an image with the bits of Pillow's `Image.resize((width, height), filter)` on RGBA.
 ///
 /// # Panics
-/// When a side is 0.
+/// If a side is 0.
 pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter) -> Rgba8 {
     assert!(
         width > 0 && height > 0 && image.width > 0 && image.height > 0,
@@ -127,9 +133,10 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
         for row in current.data.chunks_exact(image.width * 4) {
             for tap in &taps {
                 let mut sum = [1 << (PRECISION_BITS - 1); 4];
-                for (pixel, &w) in row[tap.first * 4..].chunks_exact(4).zip(&tap.weights) {
+                let pixels = &row.as_chunks::<4>().0[tap.first..][..tap.weights.len()];
+                for (k, &w) in tap.weights.iter().enumerate() {
                     for c in 0..4 {
-                        sum[c] += i32::from(pixel[c]) * w;
+                        sum[c] += i32::from(pixels[k][c]) * w;
                     }
                 }
                 data.extend(sum.map(clip));
@@ -144,9 +151,8 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
         let mut sums = vec![0i32; row_len];
         for tap in &taps {
             sums.fill(1 << (PRECISION_BITS - 1));
-            for (row, &w) in
-                current.data[tap.first * row_len..].chunks_exact(row_len).zip(&tap.weights)
-            {
+            for (k, &w) in tap.weights.iter().enumerate() {
+                let row = &current.data[(tap.first + k) * row_len..][..row_len];
                 for (sum, &v) in sums.iter_mut().zip(row) {
                     *sum += i32::from(v) * w;
                 }
@@ -158,8 +164,8 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
     straightened(current.into_owned())
 }
 
-/// Pillow's RGBA → RGBa: c·a/255, rounded, in 8 bits. An opaque image, which may be large, stays
-/// as it is.
+/// Premultiplies like Pillow's RGBA → RGBa: c·a/255, rounded, in 8 bits. An opaque image isn't
+/// copied, since it may be large.
 fn premultiplied(image: &Rgba8) -> Cow<'_, Rgba8> {
     if image.data.as_chunks::<4>().0.iter().all(|p| p[3] == u8::MAX) {
         return Cow::Borrowed(image);
@@ -175,7 +181,7 @@ fn premultiplied(image: &Rgba8) -> Cow<'_, Rgba8> {
     Cow::Owned(out)
 }
 
-/// Pillow's RGBa → RGBA: 255·c/a, truncated and clipped.
+/// Undoes premultiplication like Pillow's RGBa → RGBA: 255·c/a, truncated and clipped.
 fn straightened(mut image: Rgba8) -> Rgba8 {
     for p in image.data.chunks_exact_mut(4) {
         let alpha = u32::from(p[3]);

@@ -5,29 +5,29 @@ use std::path::{Path, PathBuf};
 use crate::error::{MAX_PIXELS, PixelError};
 use crate::image_buffer::Rgba8;
 
-/// Reads any PNG as 8-bit RGBA; one without alpha is opaque.
+/// Reads a PNG of any type as 8-bit RGBA; without alpha it is opaque.
 pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
     let file =
         File::open(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
-    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     let mut reader = image::ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
-    let image = reader
-        .decode()
-        .map_err(|e| format(format!("not a whole PNG of at most {MAX_PIXELS} pixels ({e})")))?;
+    let image = reader.decode().map_err(|e| PixelError::Format {
+        path: path.to_path_buf(),
+        reason: format!("not a complete PNG of at most {MAX_PIXELS} pixels ({e})"),
+    })?;
     Ok(image.into())
 }
 
-/// Writes RGBA, or RGB where every pixel is opaque.
+/// Writes a PNG: RGB if all pixels are opaque, otherwise RGBA.
 pub fn write_png(path: &Path, image: &Rgba8) -> Result<(), PixelError> {
     let bytes = encode_png(image);
     std::fs::write(path, bytes)
         .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
 }
 
-/// The bytes that [`write_png`] writes.
+/// Returns the bytes that [`write_png`] writes.
 pub fn encode_png(image: &Rgba8) -> Vec<u8> {
     let opaque = image.data.chunks_exact(4).all(|p| p[3] == 255);
     let rgb: Vec<u8>;
@@ -53,14 +53,14 @@ fn encoder<W: Write>(out: W, width: usize, height: usize, alpha: bool) -> png::E
     encoder
 }
 
-/// Writes an opaque RGB PNG some rows at a time, so that memory doesn't grow with the image.
+/// Incremental writer of an opaque RGB PNG: memory doesn't grow with the image.
 pub struct PngRows {
     stream: png::StreamWriter<'static, BufWriter<File>>,
     path: PathBuf,
 }
 
 impl PngRows {
-    /// Starts a file.
+    /// Creates the file and writes its header.
     pub fn create(path: &Path, width: usize, height: usize) -> Result<Self, PixelError> {
         let file = File::create(path)
             .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
@@ -77,7 +77,7 @@ impl PngRows {
             .map_err(|source| PixelError::Io { path: self.path.clone(), source })
     }
 
-    /// Ends the file; all rows must have been written.
+    /// Finishes the file after the last row.
     pub fn finish(self) -> Result<(), PixelError> {
         let path = self.path;
         self.stream.finish().map_err(|e| png_error(&path, e))

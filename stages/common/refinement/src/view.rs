@@ -134,13 +134,13 @@ impl KnownView {
     /// Estimates the exposure of the ground truth relative to the rendered view, which has the
     /// exposure of the field's training images. Returns `None` if the images determine no exposure.
     pub fn exposure(&self) -> Option<Exposure> {
-        Exposure::between(&self.rendered.view, &self.truth, BLOCK_SIDE)
+        Exposure::fit(&self.rendered.view, &self.truth, BLOCK_SIDE)
     }
 
     /// Corrects the ground truth to the exposure of the rendered view.
     #[must_use]
     pub fn with_corrected_exposure(mut self, exposure: &Exposure) -> Self {
-        exposure.take_back(&mut self.truth);
+        exposure.undo(&mut self.truth);
         self
     }
 }
@@ -188,12 +188,13 @@ mod tests {
 
     #[test]
     fn another_exposure_is_found_and_taken_away() {
-        assert!(view(1.0, 0.0).exposure().unwrap().is_none());
+        assert!(view(1.0, 0.0).exposure().unwrap().is_negligible());
         for (gain, offset) in [(0.6, 0.0), (0.8, 0.1), (1.2, -0.05)] {
             let dark = view(gain, offset);
             let exposure = dark.exposure().unwrap();
             assert!(
-                !exposure.is_none() && exposure.gain.iter().all(|g| (g / gain - 1.0).abs() < 0.05),
+                !exposure.is_negligible()
+                    && exposure.gain.iter().all(|g| (g / gain - 1.0).abs() < 0.05),
                 "{exposure:?}"
             );
             let offsets = exposure.offset.map(|o| (o - offset).abs());

@@ -193,28 +193,28 @@ fn format_cases() -> Vec<Case> {
             "HEIC",
             |folder| unread(folder, "images/b.HEIC", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"),
             Expected::Refused(
-                "dataset: DIR/transforms.json: frame 1 (images/b.HEIC): DIR/images/b.HEIC is a HEIC image, which is not read; convert: magick mogrify -format jpg -quality 98 'DIR/images'/*.HEIC",
+                "dataset: DIR/transforms.json: frame 1 (images/b.HEIC): DIR/images/b.HEIC is a HEIC image, which is not supported; convert: magick mogrify -format jpg -quality 98 'DIR/images'/*.HEIC",
             ),
         ),
         case(
             "WebP that is named PNG",
             |folder| unread(folder, "images/b.png", b"RIFF\x10\0\0\0WEBPVP8 \0\0\0\0"),
             Expected::Refused(
-                "dataset: DIR/transforms.json: frame 1 (images/b.png): DIR/images/b.png is a WebP image, which is not read; convert: magick mogrify -format png 'DIR/images'/*.png",
+                "dataset: DIR/transforms.json: frame 1 (images/b.png): DIR/images/b.png is a WebP image, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.png",
             ),
         ),
         case(
             "TIFF",
             |folder| unread(folder, "images/b.tif", b"II*\0\x08\0\0\0\0\0\0\0"),
             Expected::Refused(
-                "dataset: DIR/transforms.json: frame 1 (images/b.tif): DIR/images/b.tif is a TIFF image, which is not read; convert: magick mogrify -format png 'DIR/images'/*.tif",
+                "dataset: DIR/transforms.json: frame 1 (images/b.tif): DIR/images/b.tif is a TIFF image, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.tif",
             ),
         ),
         case(
             "BMP",
             |folder| unread(folder, "images/b.bmp", b"BM\x46\0\0\0\0\0\0\0\x36\0\0\0"),
             Expected::Refused(
-                "dataset: DIR/transforms.json: frame 1 (images/b.bmp): DIR/images/b.bmp is a BMP image, which is not read; convert: magick mogrify -format png 'DIR/images'/*.bmp",
+                "dataset: DIR/transforms.json: frame 1 (images/b.bmp): DIR/images/b.bmp is a BMP image, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.bmp",
             ),
         ),
         case(
@@ -245,7 +245,7 @@ fn format_cases() -> Vec<Case> {
                 }
             },
             Expected::Refused(
-                "dataset: DIR/poses_bounds.npy: 2 poses for 0 images in images/ (2 in WebP, which is not read; convert: magick mogrify -format png 'DIR/images'/*.webp); counts must match, or view_imgs.txt list the images with poses",
+                "dataset: DIR/poses_bounds.npy: 2 poses for 0 images in images/ (2 in WebP, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.webp); counts must match, or view_imgs.txt list the images with poses",
             ),
         ),
     ]

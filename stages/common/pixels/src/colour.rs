@@ -1,5 +1,5 @@
-/// Display-encoded sRGB of linear light (IEC 61966-2-1). Pure arithmetic and `libm`, so the same
-/// bits on every machine.
+/// Encodes linear light as display sRGB (IEC 61966-2-1). Uses only arithmetic and `libm`, so that
+/// results are equal on all machines.
 pub fn srgb_from_linear(linear: f64) -> f64 {
     let linear = linear.clamp(0.0, 1.0);
     if linear <= 0.003_130_8 {
@@ -9,10 +9,30 @@ pub fn srgb_from_linear(linear: f64) -> f64 {
     }
 }
 
-/// Linear light of display-encoded sRGB; undoes [`srgb_from_linear`].
+/// Decodes display sRGB to linear light, the inverse of [`srgb_from_linear`].
 pub fn linear_from_srgb(encoded: f64) -> f64 {
     let encoded = encoded.clamp(0.0, 1.0);
     if encoded <= 0.040_45 { encoded / 12.92 } else { libm::pow((encoded + 0.055) / 1.055, 2.4) }
+}
+
+/// Colour scale.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Palette {
+    /// Dark to light, for errors (inferno).
+    Error,
+    /// Rainbow-like with even steps, for depth (turbo).
+    Depth,
+}
+
+/// Returns a palette's colour for a value, clamped to [0, 1].
+pub fn heat(palette: Palette, value: f32) -> [u8; 3] {
+    let gradient = match palette {
+        Palette::Error => colorous::INFERNO,
+        Palette::Depth => colorous::TURBO,
+    };
+    // Unlike `clamp`, `max` maps NaN to 0.
+    let colour = gradient.eval_continuous(f64::from(value.max(0.0).min(1.0)));
+    [colour.r, colour.g, colour.b]
 }
 
 #[cfg(test)]
