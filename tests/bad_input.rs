@@ -77,7 +77,7 @@ fn datasets_that_cannot_be_used() {
         |_, d| std::fs::remove_file(d.join("train/r_2.png")).unwrap(),
         &[],
         3,
-        &["transforms_train.json: frame 2", "r_2.png is not there"],
+        &["transforms_train.json: frame 2", "r_2.png not found"],
     );
     refused(
         |_, d| {
@@ -86,7 +86,7 @@ fn datasets_that_cannot_be_used() {
         },
         &[],
         3,
-        &["frame r_1", "train/r_1.png", "not a whole image"],
+        &["frame r_1", "train/r_1.png", "incomplete or damaged image"],
     );
     refused(
         |_, d| edit(&d.join("transforms_train.json"), &first_number(d), "NaN"),

@@ -140,7 +140,7 @@ const DAMAGES: &[Damage] = &[
                 list["frames"][1]["file_path"] = json!("x".repeat(5_000_000));
             });
         },
-        &["transforms_train.json: frame 1 (xxx", "x…): ", "no file has so long a name (5000"],
+        &["transforms_train.json: frame 1 (xxx", "x…): ", "path is too long (5000"],
     ),
     (
         |data| edit_training(data, |list| list["frames"][1]["fl_x"] = json!("y".repeat(5_000_000))),

@@ -39,7 +39,7 @@ const SHORT: [&str; 12] = [
 #[test]
 fn what_init_writes_runs_as_it_is() {
     let project = empty();
-    let demo = "Blender's form (transforms_train.json): 21 photographs".to_owned();
+    let demo = "Blender (transforms_train.json): 21 photographs".to_owned();
     let mut folders = vec![("data", demo, "downscaled")];
     for form in FORMS {
         (form.write)(&project);

@@ -53,7 +53,7 @@ fn names_from_files_are_printed_without_control_characters() {
     let missing = project.run(&["run"]);
     missing.fails(
         3,
-        &[r"frame 1 (./train/\u{1b}]0;PWN\u{7}\u{1b}[31m\nred)", "is not there; remove the frame"],
+        &[r"frame 1 (./train/\u{1b}]0;PWN\u{7}\u{1b}[31m\nred)", "not found; remove the frame"],
     );
     assert!(is_plain(&missing.stderr) && is_plain(&missing.stdout), "{}", missing.stderr);
     // An image may have such a name; its view hasn't.
@@ -110,7 +110,7 @@ fn text_as_other_editors_save_it() {
     let wide: Vec<u8> =
         format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
     std::fs::write(&path, wide).unwrap();
-    project.run(&["run"]).fails(3, &["transforms_train.json: is UTF-16; save it as UTF-8"]);
+    project.run(&["run"]).fails(3, &["transforms_train.json: file is UTF-16; save it as UTF-8"]);
 }
 
 /// Damage to the list of training views, the exit code, and words of the refusal.
@@ -236,7 +236,10 @@ fn what_stands_where_an_image_should_be_is_named() {
             "is a named pipe (FIFO), not an image",
         ),
         (|at| symlink("/dev/zero", at).unwrap(), "r_1.png is a device, not an image"),
-        (|at| symlink("r_1.png", at).unwrap(), "r_1.png is a symbolic link that leads nowhere"),
+        (
+            |at| symlink("r_1.png", at).unwrap(),
+            "r_1.png is a symbolic link that cannot be followed",
+        ),
     ];
     for (put, words) in cases {
         let (project, folder) = project(16, 4);

@@ -391,7 +391,7 @@ fn assert_same(set: &Dataset, cameras: &[Camera]) {
     assert_eq!(set.frames.len(), cameras.len());
     for camera in cameras {
         let frame = set.frames.iter().find(|f| f.name == camera.name).unwrap();
-        assert_eq!(frame.taken_with, camera.intrinsics);
+        assert_eq!(frame.stored_intrinsics, camera.intrinsics);
         let off =
             |r: usize, c: usize| (frame.camera_to_world[r][c] - camera.camera_to_world[r][c]).abs();
         assert!((0..12).all(|i| off(i / 4, i % 4) < 1e-12), "{}", camera.name);

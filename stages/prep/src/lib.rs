@@ -143,7 +143,7 @@ fn check_lenses(set: &Dataset) -> Result<(), Failure> {
     for frame in &set.frames {
         if let Err(error) = frame.camera().check() {
             let message = format!(
-                "dataset: {}: {error}; parameter lens: undo keeps the valid part of the image",
+                "dataset: {}: {error} (parameter lens: undo keeps the valid part of the image)",
                 frame_label(frame)
             );
             return Err(Failure::BadInput(message));

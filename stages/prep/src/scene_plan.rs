@@ -147,7 +147,7 @@ mod tests {
             turn: Turn::Stored,
             mask: None,
             depth: None,
-            taken_with: Intrinsics::from_angle_x(80, 60, 0.7),
+            stored_intrinsics: Intrinsics::from_angle_x(80, 60, 0.7),
             pinhole: None,
             camera_to_world,
             depths: None,
@@ -243,7 +243,7 @@ mod tests {
     fn boxes_without_an_inside_are_refused() {
         let mut set = ring(Format::Blender, 8);
         for frame in &mut set.frames {
-            (frame.taken_with.fx, frame.taken_with.fy) = (1e300, 1e300);
+            (frame.stored_intrinsics.fx, frame.stored_intrinsics.fy) = (1e300, 1e300);
         }
         let refused = planned(&set, &Params::default(), Background::White).unwrap_err();
         assert!(matches!(refused, Failure::BadInput(_)));

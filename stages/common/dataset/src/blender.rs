@@ -5,15 +5,14 @@ use artifact::{WARNING, counted};
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::file_reason::FileReason;
+use crate::file_status::is_file;
 use crate::format::Format;
-use crate::found::is_file;
-use crate::frame_file::{FrameFile, Missing, lookup_of};
-use crate::nearby::misspelt_test_file;
+use crate::frame_file::{FrameFile, MissingImages, lookup_of};
+use crate::nearby::find_misspelt_test_file;
 use crate::split::Split;
 
-/// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic
-/// scenes. An image that isn't there is an error, and names may leave out `.png`. Without test
-/// views the folder doesn't say which views are for testing.
+/// Reads `transforms_train.json` and, if it exists, `transforms_test.json`: NeRF's synthetic scenes.
+/// A missing image is an error; names may omit `.png`. Without test views the data set has no split.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let train_file = FrameFile::read(&folder.join("transforms_train.json"))?;
     let test_path = folder.join("transforms_test.json");
@@ -21,30 +20,29 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let files: Vec<&FrameFile> =
         [Some(&train_file), test_file.as_ref()].into_iter().flatten().collect();
     let mut lookup = lookup_of(folder, &files);
-    let (mut frames, mut sides, mut absent_depths) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut frames, mut counts, mut depth_notes) = (Vec::new(), Vec::new(), Vec::new());
     for file in &files {
-        let read = file.frames(&mut lookup, Missing::Refused)?;
-        absent_depths.extend(read.depth_note());
-        sides.push(read.frames.len());
+        let read = file.frames(&mut lookup, MissingImages::Refused)?;
+        depth_notes.extend(read.depth_note());
+        counts.push(read.frames.len());
         frames.extend(read.frames);
     }
-    let train = sides[0];
-    if train == 0 {
+    if counts[0] == 0 {
         return Err(DatasetError::format(train_file.path(), FileReason::NoFrames));
     }
-    let (train, test) = (0..train, train..frames.len());
+    let (train, test) = (0..counts[0], counts[0]..frames.len());
     let mut notes = vec![if test.is_empty() {
-        format!("Blender's form: {}; none is said to be for testing", counted(train.len(), "view"))
+        format!("Blender format: {}, no test views", counted(train.len(), "view"))
     } else {
         format!(
-            "Blender's form: {}, {}",
+            "Blender format: {}, {}",
             counted(train.len(), "training view"),
             counted(test.len(), "test view")
         )
     }];
     notes.extend(lookup.notes());
-    notes.extend(absent_depths);
-    if let Some(found) = misspelt_test_file(folder).filter(|_| test_file.is_none()) {
+    notes.extend(depth_notes);
+    if let Some(found) = find_misspelt_test_file(folder).filter(|_| test_file.is_none()) {
         notes.push(format!(
             "{WARNING}found {found}, which is not read; did you mean transforms_test.json?"
         ));
@@ -82,14 +80,14 @@ mod tests {
         let frame = &set.frames[0];
         assert_eq!(frame.name, "r_0");
         assert_eq!(frame.camera_to_world[2], [0., 0., 1., 4.]);
-        assert_eq!(frame.taken_with, scene::Intrinsics::from_angle_x(10, 6, 0.7));
+        assert_eq!(frame.stored_intrinsics, scene::Intrinsics::from_angle_x(10, 6, 0.7));
         // Both sides have an r_0.
         let merged = set.merged();
         assert_eq!([&merged.frames[0].name, &merged.frames[1].name], ["r_0", "test_r_0"]);
         assert_eq!(merged.split, None);
     }
 
-    /// Nothing says which views are for testing where there is no file of them, or none in it.
+    /// A missing and an empty file of test views mean the same.
     #[test]
     fn there_need_be_no_test_views() {
         let dir = folder(&with_pose("1"));
@@ -100,7 +98,7 @@ mod tests {
         let missing = Dataset::read(dir.path()).unwrap();
         assert_eq!((missing.frames.len(), &missing.split), (1, &None));
         assert_eq!(missing, empty);
-        assert_eq!(missing.notes, ["Blender's form: 1 view; none is said to be for testing"]);
+        assert_eq!(missing.notes, ["Blender format: 1 view, no test views"]);
         assert_eq!(missing.clone().merged(), missing);
         std::fs::create_dir(&test).unwrap();
         let message = Dataset::read(dir.path()).unwrap_err().to_string();
@@ -124,13 +122,13 @@ mod tests {
         std::fs::remove_file(&image).unwrap();
         let message = || Dataset::read(dir.path()).unwrap_err().to_string();
         assert!(
-            message().ends_with("r_0.png is not there; remove the frame or restore the file"),
+            message().ends_with("r_0.png not found; remove the frame or restore the file"),
             "{}",
             message()
         );
         std::os::unix::fs::symlink("r_0.png", &image).unwrap();
         assert!(
-            message().contains("r_0.png is a symbolic link that leads nowhere"),
+            message().contains("r_0.png is a symbolic link that cannot be followed"),
             "{}",
             message()
         );
@@ -177,7 +175,7 @@ mod tests {
             (with_pose("1").replace("0.7", "0"), "focal length inf"),
             (with_pose("1").replace("0.7", "3.2"), "between 0 and π"),
             (with_pose("1").replace("./train/r_0", "../r_0"), "not a path inside"),
-            (with_pose("1").replace("r_0", "r_1"), "r_1.png is not there"),
+            (with_pose("1").replace("r_0", "r_1"), "r_1.png not found"),
             (r#"{"camera_angle_x": 0.7, "frames": []}"#.to_owned(), "`frames` is empty"),
             (with_pose("1")[..60].to_owned(), "line 1"),
             (with_pose("1").replace("[0,1,0,0],", ""), "transform_matrix"),
@@ -203,7 +201,7 @@ mod tests {
         let rigid = [[0.0, 0.0, 1.0, 7.0], [1.0, 0.0, 0.0, 8.0], [0.0, 1.0, 0.0, 4.0]];
         assert_eq!(set.frames[0].camera_to_world, rigid);
         let note = "warning: rotations of 1 of 2 views have a scale of 0.25, which is removed; \
-            centres stay";
+            centres are unchanged";
         assert!(set.notes.iter().any(|found| found == note), "{:?}", set.notes);
         let plain = Dataset::read(folder(&with_pose("1.004")).path()).unwrap();
         assert_eq!(plain.notes.len(), 1, "rounding is no scale: {:?}", plain.notes);

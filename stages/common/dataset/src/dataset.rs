@@ -1,33 +1,35 @@
+use std::collections::BTreeSet;
+
 use artifact::{WARNING, counted};
 use scene::Intrinsics;
 
 use crate::error::DatasetError;
 use crate::file_reason::FileReason;
 use crate::format::Format;
-use crate::frame::Frame;
+use crate::frame::{Frame, Turn};
 use crate::split::Split;
-use crate::turn::Turn;
+use crate::text::counted_with_verb;
 
-/// Posed photographs.
+/// Posed photographs of a folder.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dataset {
-    /// How the folder has them.
+    /// Format of the folder.
     pub format: Format,
-    /// All of them: in the file's order, or by name where a file has none.
+    /// All frames, in the order of the file that lists them, or by name if none does.
     pub frames: Vec<Frame>,
-    /// What the folder itself says of which are for training and which for testing.
+    /// The folder's own split into training and test views.
     pub split: Option<Split>,
-    /// What was found and chosen, a line each, for people.
+    /// Human-readable findings and choices, one per line.
     pub notes: Vec<String>,
 }
 
 impl Dataset {
-    /// All frames together, whatever the folder itself says of their use. Blender's training and
-    /// test views have the same names: then the one for testing is called `test_NAME`.
+    /// Removes the folder's own split. A test view with the name of a training view, as in Blender
+    /// scenes, is renamed `test_NAME`.
     #[must_use]
     pub fn merged(mut self) -> Self {
         let split = self.split.take().unwrap_or_default();
-        let mut taken: std::collections::BTreeSet<String> =
+        let mut taken: BTreeSet<String> =
             split.train.iter().map(|&i| self.frames[i].name.clone()).collect();
         for &i in &split.test {
             let name = &mut self.frames[i].name;
@@ -38,7 +40,8 @@ impl Dataset {
         self
     }
 
-    /// Has rays follow the lenses. The pixels for which a lens has no ray are masked, and counted.
+    /// Keeps the lenses' distortion; adds a note on the pixels that are masked because their lens
+    /// has no ray for them.
     #[must_use]
     pub fn followed(mut self) -> Self {
         let mut known: Vec<(Intrinsics, usize)> = Vec::new();
@@ -67,124 +70,117 @@ impl Dataset {
         self
     }
 
-    /// Has images read with their lens's distortion undone: resampled to what pinhole cameras would
-    /// have taken, of the same size, with a border cut off where the lens saw no more. Of a fisheye
-    /// lens's view at most 100° across remain.
+    /// Makes images be read without lens distortion: resampled to pinhole cameras of the same size,
+    /// which crops their border. The field of view in place of a fisheye lens is at most 100°.
     pub fn undistorted(mut self) -> Result<Self, DatasetError> {
-        let (mut undone, mut angles) = (0, Vec::new());
-        for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {
-            let pinhole = frame.taken_with.pinhole().ok_or_else(|| {
-                let reason = FileReason::Distortion(frame.taken_with.distortion);
-                DatasetError::format(&frame.image, reason)
+        let (mut undistorted, mut angles) = (0, Vec::new());
+        for frame in self.frames.iter_mut().filter(|f| f.has_distortion()) {
+            let distortion = frame.stored_intrinsics.distortion;
+            let pinhole = frame.stored_intrinsics.pinhole().ok_or_else(|| {
+                DatasetError::format(&frame.image, FileReason::Distortion(distortion))
             })?;
             frame.pinhole = Some(pinhole);
-            if frame.taken_with.distortion.is_fisheye() {
+            if distortion.is_fisheye() {
                 angles.push(pinhole.pinhole_angles());
             } else {
-                undone += 1;
+                undistorted += 1;
             }
         }
         self.notes.extend(angles_note(&angles));
-        if undone > 0 {
-            self.notes
-                .push(format!("lens distortion of {} is undone", counted(undone, "photograph")));
+        if undistorted > 0 {
+            let count = counted(undistorted, "photograph");
+            self.notes.push(format!("lens distortion of {count} is removed"));
         }
         Ok(self)
     }
 
-    /// Takes all lenses for free of distortion.
+    /// Treats all lenses as free of distortion.
     #[must_use]
     pub fn without_distortion(mut self) -> Self {
         let mut ignored = 0;
-        for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {
-            frame.taken_with.distortion = scene::Distortion::default();
+        for frame in self.frames.iter_mut().filter(|f| f.has_distortion()) {
+            frame.stored_intrinsics.distortion = scene::Distortion::default();
             ignored += 1;
         }
         if ignored > 0 {
-            self.notes
-                .push(format!("lens distortion of {} is ignored", counted(ignored, "photograph")));
+            let count = counted(ignored, "photograph");
+            self.notes.push(format!("lens distortion of {count} is ignored"));
         }
         self
     }
 
-    /// Removes a uniform scale from the rotations of poses, and warns of it. Centres stay: they are
-    /// where the program that wrote the poses meant cameras to be.
+    /// Removes a uniform scale from the rotations of poses, with a warning. Centres are unchanged:
+    /// the program that wrote the poses placed the cameras there.
     pub(crate) fn remove_scales(&mut self) {
-        let (mut count, mut least, mut largest) = (0, f64::INFINITY, 0.0f64);
+        let (mut count, mut smallest, mut largest) = (0, f64::INFINITY, 0.0f64);
         for frame in &mut self.frames {
             if let Some((rigid, scale)) = scene::without_scale(&frame.camera_to_world) {
                 frame.camera_to_world = rigid;
                 count += 1;
-                (least, largest) = (least.min(scale), largest.max(scale));
+                smallest = smallest.min(scale);
+                largest = largest.max(scale);
             }
         }
         if count > 0 {
-            let [least, largest] = [least, largest].map(four_digits);
-            let range = if least == largest { least } else { format!("{least} to {largest}") };
+            let [smallest, largest] = [smallest, largest].map(with_four_digits);
+            let range =
+                if smallest == largest { smallest } else { format!("{smallest} to {largest}") };
             self.notes.push(format!(
                 "{WARNING}rotations of {count} of {} have a scale of {range}, which is removed; \
-                centres stay",
+                centres are unchanged",
                 counted(self.frames.len(), "view")
             ));
         }
     }
 
-    /// Says what is done to images that aren't all alike, upright and from a pinhole.
-    pub(crate) fn note_what_is_special(&mut self) {
-        let count = |is: &dyn Fn(&Frame) -> bool| self.frames.iter().filter(|f| is(f)).count();
-        let fisheye = count(&|f| f.taken_with.distortion.is_fisheye());
-        let (distorted, turned) = (
-            count(&|f| !f.taken_with.distortion.is_none()) - fisheye,
-            count(&|f| f.turn == Turn::Upright),
-        );
-        let assumed = count(&|f| f.turn == Turn::Assumed);
-        let size = |f: &Frame| (f.taken_with.width, f.taken_with.height);
-        let sizes: std::collections::BTreeSet<_> = self.frames.iter().map(size).collect();
-        if distorted > 0 {
-            let have = if distorted == 1 { "has" } else { "have" };
-            self.notes.push(format!("{} {have} lens distortion", counted(distorted, "photograph")));
+    /// Adds notes on lens distortion, EXIF orientations and differing sizes.
+    pub(crate) fn add_image_notes(&mut self) {
+        let frames = &self.frames;
+        let fisheye = frames.iter().filter(|f| f.stored_intrinsics.distortion.is_fisheye()).count();
+        let distorted = frames.iter().filter(|f| f.has_distortion()).count() - fisheye;
+        let upright = frames.iter().filter(|f| f.turn == Turn::Upright).count();
+        let assumed = frames.iter().filter(|f| f.turn == Turn::Assumed).count();
+        for (count, verbs, text) in [
+            (distorted, ["has", "have"], "lens distortion"),
+            (fisheye, ["was", "were"], "taken with a fisheye lens"),
+            (upright, ["is", "are"], "turned upright, as EXIF data require"),
+            (
+                assumed,
+                ["has", "have"],
+                "an EXIF orientation that the camera's width and height neither confirm nor \
+                contradict; assuming that poses refer to the stored image",
+            ),
+        ] {
+            if count > 0 {
+                let subject = counted_with_verb(count, "photograph", verbs);
+                self.notes.push(format!("{subject} {text}"));
+            }
         }
-        if fisheye > 0 {
-            let were = if fisheye == 1 { "was" } else { "were" };
-            self.notes.push(format!(
-                "{} {were} taken with a fisheye lens",
-                counted(fisheye, "photograph")
-            ));
-        }
-        if turned > 0 {
-            let are = if turned == 1 { "is" } else { "are" };
-            self.notes.push(format!(
-                "{} {are} turned upright, as EXIF data ask",
-                counted(turned, "photograph")
-            ));
-        }
-        if assumed > 0 {
-            let have = if assumed == 1 { "has" } else { "have" };
-            self.notes.push(format!(
-                "{} {have} an EXIF orientation that the camera's width and height neither confirm \
-                nor contradict; assumed: poses are those of the image as stored",
-                counted(assumed, "photograph")
-            ));
-        }
+        let sizes: BTreeSet<(u32, u32)> = self
+            .frames
+            .iter()
+            .map(|f| (f.stored_intrinsics.width, f.stored_intrinsics.height))
+            .collect();
         if let (Some(first), Some(last), true) = (sizes.first(), sizes.last(), sizes.len() > 1) {
-            let text = |(w, h): &(u32, u32)| format!("{w}×{h}");
             self.notes.push(format!(
-                "photographs of {} sizes, from {} to {}",
+                "photographs have {} sizes, from {}×{} to {}×{}",
                 sizes.len(),
-                text(first),
-                text(last)
+                first.0,
+                first.1,
+                last.0,
+                last.1
             ));
         }
     }
 }
 
 /// Formats a number with at most four significant digits.
-fn four_digits(value: f64) -> String {
+fn with_four_digits(value: f64) -> String {
     let rounded = format!("{value:.3e}").parse().unwrap_or(value);
     format!("{rounded:?}")
 }
 
-/// Describes the pinhole cameras in place of fisheye cameras, by their angles of view.
+/// Describes the pinhole cameras in place of fisheye cameras, by their fields of view in degrees.
 fn angles_note(angles: &[[f64; 2]]) -> Option<String> {
     let first = angles.first()?;
     let [mut narrowest, mut widest] = [first, first];
@@ -192,20 +188,15 @@ fn angles_note(angles: &[[f64; 2]]) -> Option<String> {
         narrowest = if angles[0] < narrowest[0] { angles } else { narrowest };
         widest = if angles[0] > widest[0] { angles } else { widest };
     }
-    let text = |[across, down]: &[f64; 2]| format!("{across:.1}°×{down:.1}°");
-    let range = if text(narrowest) == text(widest) {
-        text(widest)
-    } else {
-        format!("{} to {}", text(narrowest), text(widest))
-    };
-    let photographs = counted(angles.len(), "fisheye photograph");
-    let (are, cameras) = if angles.len() == 1 {
-        ("is", "a pinhole camera that sees")
-    } else {
-        ("are", "pinhole cameras that see")
-    };
+    let [narrowest, widest] =
+        [narrowest, widest].map(|[across, down]| format!("{across:.1}°×{down:.1}°"));
+    let range = if narrowest == widest { widest } else { format!("{narrowest} to {widest}") };
+    let (subject, cameras) = (
+        counted_with_verb(angles.len(), "fisheye photograph", ["is", "are"]),
+        if angles.len() == 1 { "a pinhole camera" } else { "pinhole cameras" },
+    );
     Some(format!(
-        "{photographs} {are} resampled for {cameras} {range}; what lies beyond is cut off"
+        "{subject} resampled to {cameras} with a field of view of {range}; the rest is cropped"
     ))
 }
 
@@ -272,8 +263,8 @@ mod tests {
     fn undone_fisheye_lenses_have_a_known_angle() {
         let dir = tempfile::tempdir().unwrap();
         let set = fisheye_set(dir.path()).undistorted().unwrap();
-        let said = "3 fisheye photographs are resampled for pinhole cameras that see 91.3°×75.0° to \
-            100.0°×83.6°; what lies beyond is cut off";
+        let said = "3 fisheye photographs are resampled to pinhole cameras with a field of view of \
+            91.3°×75.0° to 100.0°×83.6°; the rest is cropped";
         assert_eq!(set.notes.last().unwrap(), said);
         assert!(set.frames[0].mask().unwrap().is_none() && set.frames[1].is_masked());
     }

@@ -1,228 +1,104 @@
 use std::borrow::Cow;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use artifact::{counted, number, shortened};
 use scene::Distortion;
 
+use crate::file_status::{FileProblem, path_text};
 use crate::lookup::LookupError;
-use crate::misplaced::{Misplaced, shown};
 use crate::npy::ArrayReason;
 
-/// Why a file isn't of its form. Text of the file is as it is there; [`DatasetError`] escapes it.
-///
-/// [`DatasetError`]: crate::DatasetError
+/// Reason why a file is invalid. Text of the file is unescaped here;
+/// [`DatasetError`](crate::DatasetError) escapes it.
 #[derive(Debug, thiserror::Error)]
-pub enum FileReason {
-    /// Something about a line of a text file.
+pub(crate) enum FileReason {
+    /// Problem in a line of a text file, counted from 1.
     #[error("line {line}: {reason}")]
-    Line {
-        /// Which, counted from 1.
-        line: usize,
-        /// What is wrong there.
-        reason: Box<Self>,
-    },
-    /// Something about a place in a binary file.
+    Line { line: usize, reason: Box<Self> },
+    /// Problem at an offset in a binary file.
     #[error("byte {byte}: {reason}")]
-    Byte {
-        /// How many bytes are before it.
-        byte: usize,
-        /// What is wrong there.
-        reason: Box<Self>,
-    },
-    /// Something about a camera of a binary file.
+    Byte { byte: usize, reason: Box<Self> },
     #[error("camera {id}: {reason}")]
-    Camera {
-        /// Its number.
-        id: u32,
-        /// What is wrong with it.
-        reason: Box<Self>,
-    },
-    /// Something about an image of a binary file.
+    Camera { id: u32, reason: Box<Self> },
     #[error("image {id} ({}): {reason}", shortened(name))]
-    Image {
-        /// Its number.
-        id: u32,
-        /// Its name.
-        name: String,
-        /// What is wrong with it.
-        reason: Box<Self>,
-    },
-    /// Text that is encoded otherwise.
-    #[error("is UTF-16; save it as UTF-8")]
+    Image { id: u32, name: String, reason: Box<Self> },
+    #[error("file is UTF-16; save it as UTF-8")]
     Utf16,
-    /// Text that isn't.
+    /// Text that isn't UTF-8; `word` is its first invalid word with escaped bytes.
     #[error(
-        "{} is not UTF-8; save the file as UTF-8, and rename what it names so",
+        "{} is not UTF-8; save the file as UTF-8, and rename files with such names",
         shortened(word)
     )]
-    NoText {
-        /// The first word that isn't, its bytes spelled out.
-        word: String,
-    },
-    /// A name in a binary file that isn't text.
-    #[error("{what}, {}, is not UTF-8; rename the file, and make the model again", shortened(name))]
-    NoName {
-        /// Whose name.
-        what: &'static str,
-        /// The name, its bytes spelled out.
-        name: String,
-    },
-    /// It isn't the JSON that was expected.
-    #[error("{}", json_problem(.0))]
-    Json(#[from] serde_json::Error),
-    /// It isn't the array that was expected.
-    #[error("not a NumPy array of N×{columns} numbers: {reason}")]
-    Array {
-        /// Numbers of a row.
-        columns: usize,
-        /// What is wrong with it.
-        reason: ArrayReason,
-    },
-    /// Something is missing.
-    #[error("{what} is missing")]
-    Missing {
-        /// What.
-        what: &'static str,
-    },
-    /// A word isn't a number.
-    #[error("{what}: {:?} is not a number of its kind", shortened(word))]
-    NoNumber {
-        /// What it is to say.
-        what: &'static str,
-        /// The word.
-        word: String,
-    },
-    /// It ends too early.
-    #[error("the file ends within {what}; it is cut short, copy it again")]
-    CutShort {
-        /// Where.
-        what: &'static str,
-    },
-    /// Text without an end.
-    #[error("{what} doesn't end")]
-    Endless {
-        /// What text.
-        what: &'static str,
-    },
-    /// It claims more than it holds.
-    #[error("{count} {what} can't be in the {left} bytes that follow")]
-    TooMany {
-        /// How much it claims.
-        count: u64,
-        /// Of what.
-        what: &'static str,
-        /// The bytes that there are.
-        left: usize,
-    },
-    /// It ends too late.
-    #[error("there is more after the last of the {what}; is it another file?")]
-    More {
-        /// What it lists.
-        what: &'static str,
-    },
-    /// A number of no camera model.
+    NotUtf8 { word: String },
+    /// Name in a binary file that isn't UTF-8, with escaped bytes.
     #[error(
-        "camera {id} has model {model}, which this program doesn't know (a newer COLMAP's?); \
-        undistort with colmap image_undistorter"
+        "{what}, {}, is not UTF-8; rename the file, and create the model again",
+        shortened(name)
     )]
-    ModelNumber {
-        /// The camera.
-        id: u32,
-        /// The number.
-        model: u32,
-    },
-    /// A name of no camera model.
+    NameNotUtf8 { what: &'static str, name: String },
+    #[error("{}", json_message(.0))]
+    Json(#[from] serde_json::Error),
+    #[error("not a NumPy array of N×{columns} numbers: {reason}")]
+    Array { columns: usize, reason: ArrayReason },
+    #[error("{what} is missing")]
+    Missing { what: &'static str },
+    #[error("{what}: {:?} is not a valid number", shortened(word))]
+    InvalidNumber { what: &'static str, word: String },
+    #[error("the file ends within {what}; copy it again")]
+    CutShort { what: &'static str },
+    /// Text without a terminating null byte.
+    #[error("{what} is not terminated")]
+    Unterminated { what: &'static str },
+    /// Number of entries that exceeds the rest of the file.
+    #[error("{count} {what} don't fit into the remaining {left} bytes")]
+    CountTooLarge { count: u64, what: &'static str, left: usize },
+    #[error("unexpected data after the last of the {what}; is this the right file?")]
+    TrailingData { what: &'static str },
     #[error(
-        "camera model {:?} is unknown (a newer COLMAP's?); undistort with colmap \
+        "camera {id} has unknown model {model} (from a newer COLMAP?); undistort with colmap \
+        image_undistorter"
+    )]
+    UnknownModelNumber { id: u32, model: u32 },
+    #[error(
+        "camera model {:?} is unknown (from a newer COLMAP?); undistort with colmap \
         image_undistorter",
         shortened(model)
     )]
-    ModelName {
-        /// The name.
-        model: String,
-    },
-    /// A camera model that isn't read.
+    UnknownModelName { model: String },
     #[error("camera model {model} is not supported; undistort with colmap image_undistorter")]
-    Model {
-        /// Its name.
-        model: String,
-    },
-    /// A camera model with too many parameters or too few.
+    UnsupportedModel { model: String },
     #[error("{model} has {expected} parameters, not {found}")]
-    Parameters {
-        /// Its name.
-        model: String,
-        /// How many it has.
-        expected: usize,
-        /// How many there are.
-        found: usize,
-    },
-    /// A size that no image has.
-    #[error("its size is {width}×{height}")]
-    Size {
-        /// Columns.
-        width: u64,
-        /// Rows.
-        height: u64,
-    },
-    /// A quaternion that is no rotation.
-    #[error("its rotation ({}) is none", .0.map(number).join(", "))]
+    ParameterCount { model: String, expected: usize, found: usize },
+    #[error("image size {width}×{height} is invalid")]
+    InvalidSize { width: u64, height: u64 },
+    #[error("({}) is not a rotation quaternion", .0.map(number).join(", "))]
     Rotation([f64; 4]),
-    /// A list of frames has none.
-    #[error("`frames` is empty; at least one view is needed")]
+    #[error("`frames` is empty; at least one view is required")]
     NoFrames,
-    /// A model has no images.
-    #[error("it has no images; at least one is needed")]
+    #[error("the model has no images; at least one is required")]
     NoImages,
-    /// None of the images that it names is there.
+    /// None of the named images exists; `folder` contains all of them, if known.
     #[error(
         "none of the {count} images exists{} (first missing: {})",
-        place(folder.as_deref()), shortened(first)
+        folder.as_ref().map(|folder| format!(" in {}", path_text(folder))).unwrap_or_default(),
+        shortened(first)
     )]
-    ImagesMissing {
-        /// How many it names.
-        count: usize,
-        /// Where they should be, if all in one folder.
-        folder: Option<PathBuf>,
-        /// The first.
-        first: String,
-    },
-    /// A list of file names for a split has no name of a frame.
+    ImagesMissing { count: usize, folder: Option<PathBuf>, first: String },
+    /// None of the names in a list of a split belongs to a frame.
     #[error("none of the {count} names in {list} is that of a frame (first: {first})")]
-    NoFrameListed {
-        /// Key of the list.
-        list: &'static str,
-        /// Number of names in the list.
-        count: usize,
-        /// First name.
-        first: String,
-    },
-    /// A name leads to no single file inside the folder.
+    NoFrameListed { list: &'static str, count: usize, first: String },
     #[error(transparent)]
     Lookup(#[from] LookupError),
-    /// The second line of an image in a text file is missing.
     #[error("line {line} should be the points of image {image} (an empty line if there are none)")]
-    PointsExpected {
-        /// Line, counted from 1.
-        line: usize,
-        /// Number of the image, as the file writes it.
-        image: String,
-    },
-    /// No folder has an image for every pose.
-    #[error("{poses} poses {}", listed(folders))]
-    Counts {
-        /// How many poses there are.
-        poses: usize,
-        /// The folders of images.
-        folders: Vec<ImageFolder>,
-    },
-    /// Distortion that can't be undone.
-    #[error("lens distortion {0} leaves no pinhole's image; are its coefficients right?")]
+    PointsExpected { line: usize, image: String },
+    #[error("{poses} poses {}", folders_text(folders))]
+    Counts { poses: usize, folders: Vec<ImageFolder> },
+    #[error("lens distortion {0} leaves no pinhole image; are its coefficients right?")]
     Distortion(Distortion),
 }
 
 /// Returns the message of a JSON error, cut where serde repeats a long string.
-fn json_problem(error: &serde_json::Error) -> String {
+fn json_message(error: &serde_json::Error) -> String {
     let text = error.to_string();
     match shortened(&text) {
         Cow::Borrowed(_) => text,
@@ -234,45 +110,33 @@ impl FileReason {
     pub(crate) fn on_line(self, line: usize) -> Self {
         Self::Line { line, reason: Box::new(self) }
     }
-
-    pub(crate) fn of_camera(self, id: u32) -> Self {
-        Self::Camera { id, reason: Box::new(self) }
-    }
-
-    pub(crate) fn of_image(self, id: u32, name: &str) -> Self {
-        Self::Image { id, name: name.to_owned(), reason: Box::new(self) }
-    }
 }
 
-/// A folder with images.
+/// Folder with images, for [`FileReason::Counts`].
 #[derive(Debug)]
-pub struct ImageFolder {
-    /// Its name.
-    pub name: String,
-    /// How many it has.
-    pub images: usize,
-    /// The first thing in it that is named like an image and can't be read.
-    pub odd: Option<Misplaced>,
-    /// Number and format of its images in a format that isn't read, with the remedy.
-    pub unread: Option<String>,
+pub(crate) struct ImageFolder {
+    pub(crate) name: String,
+    /// Number of images.
+    pub(crate) images: usize,
+    /// First entry that is named like an image but can't be read.
+    pub(crate) unusable: Option<FileProblem>,
+    /// Number and format of images in an unsupported format, with the remedy.
+    pub(crate) unsupported: Option<String>,
 }
 
-fn place(folder: Option<&Path>) -> String {
-    folder.map(|folder| format!(" in {}", shown(folder))).unwrap_or_default()
-}
-
-fn listed(folders: &[ImageFolder]) -> String {
+/// Lists the folders with their numbers of images.
+fn folders_text(folders: &[ImageFolder]) -> String {
     if folders.is_empty() {
         return "without a folder images next to them".to_owned();
     }
-    let one = |ImageFolder { name, images, odd, unread }: &ImageFolder| {
-        let remark = odd.as_ref().map(ToString::to_string).or_else(|| unread.clone());
+    let mut listed = Vec::new();
+    for ImageFolder { name, images, unusable, unsupported } in folders {
+        let remark = unusable.as_ref().map(ToString::to_string).or_else(|| unsupported.clone());
         let remark = remark.map(|remark| format!(" ({remark})")).unwrap_or_default();
-        format!("{} in {name}/{remark}", counted(*images, "image"))
-    };
-    let each: Vec<String> = folders.iter().map(one).collect();
+        listed.push(format!("{} in {name}/{remark}", counted(*images, "image")));
+    }
     format!(
-        "for {}; counts must match, or view_imgs.txt list the images with poses",
-        each.join(" and ")
+        "for {}; counts must match, or view_imgs.txt must list the images that have poses",
+        listed.join(" and ")
     )
 }

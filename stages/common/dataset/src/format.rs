@@ -1,42 +1,42 @@
 use std::fmt;
 
-/// Forms of folders.
+/// Format of a data set's folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// NeRF's synthetic scenes: `transforms_train.json`, `transforms_test.json` if there are test
-    /// views, one angle for all, PNG.
+    /// views, one angle of view for all frames, PNG.
     Blender,
-    /// instant-ngp's and nerfstudio's: `transforms.json`, intrinsics for all or for each, lens
+    /// instant-ngp and nerfstudio: `transforms.json` with intrinsics for all frames or for each, lens
     /// distortion, masks.
     Transforms,
-    /// LLFF's: `poses_bounds.npy` beside `images` (or `images_4`, `images_8`, …).
+    /// LLFF: `poses_bounds.npy` next to `images` (or `images_4`, `images_8`, …).
     Llff,
-    /// COLMAP's: `sparse/0` and so on, binary or text, beside `images`; of several models the one
+    /// COLMAP: `sparse/0` and so on, binary or text, next to `images`; among several models the one
     /// with most images.
     Colmap,
 }
 
-/// What is known of a form.
+/// Names and properties of a format.
 struct Description {
-    /// As `Display` has it.
+    /// Name in artifacts.
     name: &'static str,
-    /// What a folder that has it is called.
+    /// Name in the log, with the file that identifies the format.
     title: &'static str,
-    /// What a folder that has none should have.
+    /// File that identifies the format, for the message about a folder without a data set.
     sign: &'static str,
     is_benchmark: bool,
 }
 
 impl Format {
-    /// The most explicit first: a folder often has what its poses were made from, too.
+    /// All formats, the most explicit first: a folder often contains the source of its poses, too.
     pub(crate) const ALL: [Self; 4] = [Self::Blender, Self::Transforms, Self::Llff, Self::Colmap];
 
-    /// What to call it, with what it is found by: `COLMAP (sparse)`.
+    /// Returns the format's name with the file that identifies it: `COLMAP (sparse)`.
     pub fn title(self) -> &'static str {
         self.description().title
     }
 
-    /// Whether benchmarks' scenes come so, whose images are HR truth rather than LR photographs.
+    /// True for formats of benchmarks, whose images are HR truth rather than LR photographs.
     pub fn is_benchmark(self) -> bool {
         self.description().is_benchmark
     }
@@ -45,7 +45,7 @@ impl Format {
         match self {
             Self::Blender => Description {
                 name: "blender",
-                title: "Blender's form (transforms_train.json)",
+                title: "Blender (transforms_train.json)",
                 sign: "transforms_train.json (Blender)",
                 is_benchmark: true,
             },
@@ -77,8 +77,8 @@ impl fmt::Display for Format {
     }
 }
 
-/// What a folder should have one of, in words.
-pub(crate) fn signs() -> String {
+/// Lists the files that identify a data set.
+pub(crate) fn expected_files() -> String {
     let signs = Format::ALL.map(|format| format.description().sign);
     match signs.split_last() {
         Some((last, others)) => format!("{}, or {last}", others.join(", ")),
@@ -92,7 +92,7 @@ mod tests {
 
     use super::*;
 
-    /// A new form doesn't compile here, and then needs its place in the list, too.
+    /// A new format doesn't compile here, and then needs its place in the list, too.
     fn number(format: Format) -> usize {
         match format {
             Format::Blender => 0,
@@ -103,11 +103,11 @@ mod tests {
     }
 
     #[test]
-    fn forms_differ_and_all_are_told() {
+    fn formats_differ_and_are_all_listed() {
         assert_eq!(Format::ALL.map(number), [0, 1, 2, 3]);
         let names: BTreeSet<String> = Format::ALL.iter().map(Format::to_string).collect();
         assert_eq!(names.len(), Format::ALL.len());
-        let words = signs();
+        let words = expected_files();
         assert!(Format::ALL.iter().all(|format| words.contains(format.description().sign)));
     }
 }

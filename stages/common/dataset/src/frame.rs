@@ -5,44 +5,74 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of, without_scale};
 
-use crate::error::DatasetError;
-use crate::frame_reason::FrameReason;
-use crate::mask_file::MaskFile;
-use crate::misplaced::shown;
-use crate::turn::Turn;
+use crate::error::{DatasetError, FrameReason};
+use crate::file_status::path_text;
+use crate::masks::MaskFile;
 
-/// A posed photograph.
+/// Treatment of a photograph's EXIF orientation. Poses usually refer to stored images, so that a
+/// photograph is turned only if its camera has the turned shape (docs/design/005).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Turn {
+    /// Stored pixels: EXIF requires no turn, or the camera has the stored shape.
+    #[default]
+    Stored,
+    /// Pixels turned as EXIF requires.
+    Upright,
+    /// Stored pixels by assumption: EXIF requires a turn, and both shapes fit the camera.
+    Assumed,
+}
+
+/// Posed photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// Unique within its side of the folder's own split; fit for a file's name.
+    /// Name of the view, unique within its side of the folder's own split and valid as a file name.
     pub name: String,
-    /// The image: PNG, JPEG or EXR.
+    /// Path of the image: PNG, JPEG or EXR.
     pub image: PathBuf,
-    /// Treatment of its EXIF orientation.
+    /// Treatment of the image's EXIF orientation.
     pub turn: Turn,
     /// Mask of the pixels that count.
     pub mask: Option<MaskFile>,
-    /// True depth (EXR, channels `Z` and `A`), where the data has it.
+    /// Path of the true depth (EXR, channels `Z` and `A`), if any.
     pub depth: Option<PathBuf>,
-    /// What it was taken with; its size is the stored image's.
-    pub taken_with: Intrinsics,
-    /// Where distortion is to be undone, the pinhole camera as whose image it is read.
+    /// Intrinsics of the stored image.
+    pub stored_intrinsics: Intrinsics,
+    /// Pinhole camera to which the image is resampled, if distortion is removed.
     pub pinhole: Option<Intrinsics>,
-    /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world
+    /// Pose `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world
     /// space.
     pub camera_to_world: Pose,
-    /// Depth of the nearest and of the farthest point that it is known to see, along its axis,
-    /// where the data says so; through a fisheye lens their distances.
+    /// Smallest and largest known depth of observed points along the axis; through a fisheye lens
+    /// their distances.
     pub depths: Option<[f64; 2]>,
 }
 
 impl Frame {
-    /// The inside of its camera.
-    pub fn intrinsics(&self) -> Intrinsics {
-        self.pinhole.unwrap_or(self.taken_with)
+    /// Creates a frame without name, mask and depths.
+    pub(crate) fn new(
+        image: PathBuf,
+        (stored_intrinsics, turn): (Intrinsics, Turn),
+        camera_to_world: Pose,
+    ) -> Self {
+        Self {
+            name: String::new(),
+            image,
+            turn,
+            mask: None,
+            depth: None,
+            stored_intrinsics,
+            pinhole: None,
+            camera_to_world,
+            depths: None,
+        }
     }
 
-    /// Its camera; [`Frame::photograph`] reads what that sees.
+    /// Returns the intrinsics of [`Frame::camera`].
+    pub fn intrinsics(&self) -> Intrinsics {
+        self.pinhole.unwrap_or(self.stored_intrinsics)
+    }
+
+    /// Returns the camera of [`Frame::photograph`].
     pub fn camera(&self) -> Camera {
         Camera {
             name: self.name.clone(),
@@ -51,17 +81,20 @@ impl Frame {
         }
     }
 
-    /// True if some of its pixels may not count.
+    /// True if some pixels may not count.
     pub fn is_masked(&self) -> bool {
         self.mask.is_some() || self.intrinsics().has_cut_rays()
     }
 
-    /// Refuses what no camera can be, except a uniform scale of the rotation, which
-    /// [`Dataset::read`](crate::Dataset::read) removes. Whether each place in a distorted image has
-    /// its ray is asked
-    /// where that matters.
+    pub(crate) fn has_distortion(&self) -> bool {
+        !self.stored_intrinsics.distortion.is_none()
+    }
+
+    /// Fails if the camera is invalid. Allows a uniform scale of the rotation, which
+    /// [`Dataset::read`](crate::Dataset::read) removes, and pixels without a ray, which matter only
+    /// to some uses.
     pub(crate) fn check(&self) -> Result<(), CameraError> {
-        let distortion = self.taken_with.distortion;
+        let distortion = self.stored_intrinsics.distortion;
         if !distortion.is_finite() {
             return Err(CameraError::Distortion(distortion));
         }
@@ -74,33 +107,45 @@ impl Frame {
     }
 }
 
-/// The pose of a world-to-camera motion x' = R·x + t with axes right, down, forward (COLMAP,
-/// OpenCV).
+/// Converts a world-to-camera transform x' = R·x + t with axes right, down, forward (COLMAP,
+/// OpenCV) to a pose.
 pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> Pose {
-    let back = rotation.transpose();
-    let axes = DMat3::from_cols(back.x_axis, -back.y_axis, -back.z_axis);
-    pose_of(axes, -(back * translation))
+    let inverse = rotation.transpose();
+    let axes = DMat3::from_cols(inverse.x_axis, -inverse.y_axis, -inverse.z_axis);
+    pose_of(axes, -(inverse * translation))
 }
 
-/// Separators between the parts of a name with folders; the second tells `a/b` from `a_b`.
+/// Separators between the parts of a name with folders; the second one tells `a/b` from `a_b`.
 const SEPARATORS: [&str; 2] = ["_", "__"];
 
-/// Names for images, by their paths inside the data set: the files' names alone where those differ,
-/// otherwise with their folders.
-pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
-    let mut names = each_name(list, paths, |path| text(path.file_stem()))?;
+/// Names frames by the paths of their images inside the data set: by file names if those are unique,
+/// otherwise with their folders. `list` is the file that lists the frames.
+pub(crate) fn assign_names(
+    frames: &mut [Frame],
+    list: &Path,
+    paths: &[PathBuf],
+) -> Result<(), DatasetError> {
+    for (i, name) in unique_names(list, paths)?.into_iter().enumerate() {
+        frames[i].name = name;
+    }
+    Ok(())
+}
+
+/// Returns the shortest unique names of images, see [`assign_names`].
+pub(crate) fn unique_names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
+    let mut names = each_name(list, paths, |path| printable_part(path.file_stem()))?;
     for separator in SEPARATORS {
-        if first_twice(&names).is_none() {
+        if first_duplicate(&names).is_none() {
             return Ok(names);
         }
         names = each_name(list, paths, |path| name_with_folders(path, separator))?;
     }
-    match first_twice(&names) {
+    match first_duplicate(&names) {
         None => Ok(names),
         Some((first, second)) => {
-            let (name, first) = (names[second].clone(), shown(&paths[first]));
-            let reason = FrameReason::SecondName { name, first };
-            Err(DatasetError::frame(list, second, &shown(&paths[second]), reason))
+            let (name, first) = (names[second].clone(), path_text(&paths[first]));
+            let reason = FrameReason::DuplicateName { name, first };
+            Err(DatasetError::frame(list, second, &path_text(&paths[second]), reason))
         }
     }
 }
@@ -112,27 +157,28 @@ fn each_name(
 ) -> Result<Vec<String>, DatasetError> {
     let mut names = Vec::with_capacity(paths.len());
     for (index, path) in paths.iter().enumerate() {
-        let of_frame = |reason| DatasetError::frame(list, index, &shown(path), reason);
-        names.push(name(path).map_err(of_frame)?);
+        let name = name(path).map_err(|e| DatasetError::frame(list, index, &path_text(path), e))?;
+        names.push(name);
     }
     Ok(names)
 }
 
 fn name_with_folders(path: &Path, separator: &str) -> Result<String, FrameReason> {
-    let whole = path.with_extension("");
-    let parts = whole.iter().map(|part| text(Some(part))).collect::<Result<Vec<_>, _>>()?;
+    let path = path.with_extension("");
+    let parts =
+        path.iter().map(|part| printable_part(Some(part))).collect::<Result<Vec<_>, _>>()?;
     Ok(parts.join(separator))
 }
 
-/// A part of a path as text. Names become files' names and are printed everywhere: no control
-/// characters.
-fn text(part: Option<&OsStr>) -> Result<String, FrameReason> {
-    let name = part.and_then(OsStr::to_str).ok_or(FrameReason::NoName)?;
+/// Returns a part of a path as text without control characters: names become file names and are
+/// printed.
+fn printable_part(part: Option<&OsStr>) -> Result<String, FrameReason> {
+    let name = part.and_then(OsStr::to_str).ok_or(FrameReason::NameNotUtf8)?;
     Ok(name.replace(char::is_control, "_"))
 }
 
-/// Returns the indices of the first two frames that share a name.
-fn first_twice(names: &[String]) -> Option<(usize, usize)> {
+/// Returns the indices of the first two equal names.
+fn first_duplicate(names: &[String]) -> Option<(usize, usize)> {
     let mut seen = BTreeMap::new();
     for (index, name) in names.iter().enumerate() {
         if let Some(first) = seen.insert(name, index) {
@@ -147,7 +193,7 @@ mod tests {
     use super::*;
 
     fn names_of(paths: &[&str]) -> Result<Vec<String>, DatasetError> {
-        names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>())
+        unique_names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>())
     }
 
     #[test]
@@ -163,11 +209,11 @@ mod tests {
         for (paths, words) in [
             (
                 &["x/a.jpg", "x/a.png"][..],
-                "frame 1 (x/a.png): its view would be named \"x__a\", as that of x/a.jpg; rename",
+                "frame 1 (x/a.png): view name \"x__a\" is already that of x/a.jpg; rename",
             ),
             (
                 &["a\n.png", "a\t.png"],
-                "frame 1 (a\\t.png): its view would be named \"a_\", as that of a\\n.png; rename",
+                "frame 1 (a\\t.png): view name \"a_\" is already that of a\\n.png; rename",
             ),
         ] {
             let message = names_of(paths).unwrap_err().to_string();
@@ -175,10 +221,10 @@ mod tests {
         }
         let odd =
             <std::ffi::OsStr as std::os::unix::ffi::OsStrExt>::from_bytes(b"images/\xff\xfe.png");
-        let message = names("list".as_ref(), &[PathBuf::from(odd)]).unwrap_err().to_string();
+        let message = unique_names("list".as_ref(), &[PathBuf::from(odd)]).unwrap_err().to_string();
         assert_eq!(
             message,
-            "list: frame 0 (images/\\xFF\\xFE.png): its name is not UTF-8; rename the file"
+            "list: frame 0 (images/\\xFF\\xFE.png): file name is not UTF-8; rename the file"
         );
     }
 

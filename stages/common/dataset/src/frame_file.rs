@@ -1,29 +1,28 @@
-//! Files that list frames: `transforms.json` and its relatives.
+//! Reads files that list frames: `transforms.json`, `transforms_train.json` and so on.
 
 use std::path::{Path, PathBuf};
 
 use artifact::counted;
 
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FrameReason};
 use crate::file_reason::FileReason;
-use crate::frame::{Frame, names};
-use crate::frame_reason::FrameReason;
+use crate::file_status::FileProblem;
+use crate::frame::{Frame, assign_names};
 use crate::lookup::{Located, Lookup};
-use crate::mask_file::{MaskFile, MaskKind};
-use crate::misplaced::Misplaced;
-use crate::number::words_as_text;
+use crate::masks::{MaskFile, MaskKind};
+use crate::number::quote_python_numbers;
 use crate::photograph::is_exr;
-use crate::split_lists::{FrameNames, SplitLists};
+use crate::split::{FrameNames, SplitLists};
 use crate::text::read_text;
 use crate::transforms::{FrameEntry, Transforms, read_frame};
 
-/// Treatment of a frame whose image doesn't exist.
+/// Treatment of frames whose image doesn't exist.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Missing {
-    /// The frame is an error.
+pub(crate) enum MissingImages {
+    /// A missing image is an error.
     Refused,
-    /// The frame is left out, and counted.
-    LeftOut,
+    /// The frame is skipped and counted.
+    Skipped,
 }
 
 /// Parsed file of frames.
@@ -32,34 +31,34 @@ pub(crate) struct FrameFile {
     transforms: Transforms,
 }
 
-/// Frames of a file, and the names without a file.
+/// Frames of a file, and names of missing files.
 #[derive(Default)]
 pub(crate) struct ReadFrames {
     pub(crate) frames: Vec<Frame>,
     pub(crate) names: FrameNames,
-    /// Frames whose image doesn't exist, where these are left out.
-    missing: Absent,
-    /// Depth images that don't exist, and wouldn't be used.
-    depths: Absent,
+    /// Skipped frames whose image doesn't exist.
+    missing: MissingNames,
+    /// Missing depth images in formats that aren't used anyway.
+    missing_depths: MissingNames,
 }
 
-/// Number of names without a file, and the first of them.
+/// Number of missing files, and the name of the first.
 #[derive(Default)]
-struct Absent {
+struct MissingNames {
     count: usize,
     first: Option<String>,
 }
 
-impl Absent {
+impl MissingNames {
     fn add(&mut self, name: &str) {
         self.count += 1;
         self.first.get_or_insert_with(|| name.to_owned());
     }
 }
 
-/// Looks up the names of all files of frames of a data set.
+/// Creates the lookup for the names in all frame files of a data set.
 pub(crate) fn lookup_of(folder: &Path, files: &[&FrameFile]) -> Lookup {
-    let (mut names, mut again): (Vec<&str>, Vec<&str>) = Default::default();
+    let (mut names, mut repeated): (Vec<&str>, Vec<&str>) = Default::default();
     for file in files {
         for frame in &file.transforms.frames {
             names.push(&frame.file_path);
@@ -67,26 +66,27 @@ pub(crate) fn lookup_of(folder: &Path, files: &[&FrameFile]) -> Lookup {
             names.extend(frame.depth_file_path.as_deref());
         }
         let SplitLists { train, test, val } = file.split_lists();
-        again.extend([train, test, val].into_iter().flatten().map(String::as_str));
+        repeated.extend([train, test, val].into_iter().flatten().map(String::as_str));
     }
-    Lookup::in_folder(folder, &names, &again)
+    Lookup::in_folder(folder, &names, &repeated)
 }
 
 impl ReadFrames {
-    /// Returns the line on frames that are left out.
+    /// Returns the note on skipped frames, if any.
     pub(crate) fn missing_note(&self) -> Option<String> {
         let first = self.missing.first.as_ref()?;
         let (count, frames) = (self.missing.count, self.frames.len() + self.missing.count);
-        Some(format!("{count} of {frames} frames have no picture and are left out, first {first}"))
+        Some(format!(
+            "{count} of {frames} frames have no image file and are skipped (first: {first})"
+        ))
     }
 
-    /// Returns the line on depth images that don't exist.
+    /// Returns the note on missing depth images, if any.
     pub(crate) fn depth_note(&self) -> Option<String> {
-        let first = self.depths.first.as_ref()?;
-        let count = counted(self.depths.count, "depth image");
-        let verb = if self.depths.count == 1 { "does" } else { "do" };
+        let first = self.missing_depths.first.as_ref()?;
+        let count = counted(self.missing_depths.count, "depth image");
         Some(format!(
-            "{count} (depth_file_path) {verb} not exist, first {first}; only EXR depth is used"
+            "{count} (depth_file_path) not found (first: {first}); only EXR depth is used"
         ))
     }
 }
@@ -113,36 +113,38 @@ impl FrameFile {
         }
     }
 
-    /// Reads the frames; there may be none.
+    /// Reads the frames, if any.
     pub(crate) fn frames(
         &self,
         lookup: &mut Lookup,
-        on_missing: Missing,
+        on_missing: MissingImages,
     ) -> Result<ReadFrames, DatasetError> {
         let (mut read, mut labels) = (ReadFrames::default(), Vec::new());
         for (index, entry) in self.transforms.frames.iter().enumerate() {
-            let of_frame =
+            let frame_error =
                 |reason| DatasetError::frame(&self.path, index, &entry.file_path, reason);
-            let located = lookup.find(&entry.file_path).map_err(|e| of_frame(e.into()))?;
+            let located = lookup.find(&entry.file_path).map_err(|e| frame_error(e.into()))?;
             let file = match located {
                 Located::File(file) => file,
-                Located::Nothing(found) if on_missing == Missing::Refused => {
+                Located::Missing(problem) if on_missing == MissingImages::Refused => {
                     let remedy = "remove the frame or restore the file";
-                    return Err(of_frame(FrameReason::Place { found, remedy }));
+                    return Err(frame_error(FrameReason::File { problem, remedy }));
                 }
-                Located::Nothing(_) => {
+                Located::Missing(_) => {
                     read.missing.add(&entry.file_path);
                     continue;
                 }
-                Located::Other(found) => {
+                Located::Unusable(problem) => {
                     let remedy = "remove the frame or name its image";
-                    return Err(of_frame(FrameReason::Place { found, remedy }));
+                    return Err(frame_error(FrameReason::File { problem, remedy }));
                 }
             };
             let image = lookup.root().join(&file.path);
-            let mut frame = read_frame(image, entry, &self.transforms.shared).map_err(of_frame)?;
-            frame.mask = mask_of(lookup, entry).map_err(of_frame)?;
-            frame.depth = depth_of(lookup, entry, &mut read.depths).map_err(of_frame)?;
+            let shared = &self.transforms.shared;
+            let mut frame = read_frame(image, entry, shared).map_err(frame_error)?;
+            frame.mask = find_mask(lookup, entry).map_err(frame_error)?;
+            frame.depth =
+                find_depth(lookup, entry, &mut read.missing_depths).map_err(frame_error)?;
             read.names.add(read.frames.len(), &entry.file_path, file.path);
             read.frames.push(frame);
             labels.push(file.label);
@@ -152,54 +154,52 @@ impl FrameFile {
                 FileReason::ImagesMissing { count: read.missing.count, folder: None, first };
             return Err(DatasetError::format(&self.path, reason));
         }
-        for (frame, name) in read.frames.iter_mut().zip(names(&self.path, &labels)?) {
-            frame.name = name;
-        }
+        assign_names(&mut read.frames, &self.path, &labels)?;
         Ok(read)
     }
 }
 
-/// Finds the mask that a frame names, if it names one.
-fn mask_of(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>, FrameReason> {
+/// Finds the mask that a frame names, if any.
+fn find_mask(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>, FrameReason> {
     let Some(name) = &entry.mask_path else { return Ok(None) };
     match lookup.find(name)? {
         Located::File(file) => {
             let path = lookup.root().join(file.path);
             Ok(Some(MaskFile { path, kind: MaskKind::Listed }))
         }
-        Located::Nothing(found) | Located::Other(found) => Err(not_beside(found)),
+        Located::Missing(problem) | Located::Unusable(problem) => Err(unusable_entry(problem)),
     }
 }
 
-/// Finds the depth image that a frame names. Only EXR has true depth: nerfstudio's PNG files are
-/// estimates, so that they may be missing.
-fn depth_of(
+/// Finds the depth image that a frame names, if any. Only EXR contains true depth; nerfstudio's PNG
+/// files are estimates and may be missing.
+fn find_depth(
     lookup: &mut Lookup,
     entry: &FrameEntry,
-    absent: &mut Absent,
+    missing: &mut MissingNames,
 ) -> Result<Option<PathBuf>, FrameReason> {
     let Some(name) = &entry.depth_file_path else { return Ok(None) };
     match lookup.find(name) {
         Ok(Located::File(file)) => {
             Ok(Some(lookup.root().join(file.path)).filter(|path| is_exr(path)))
         }
-        Ok(Located::Nothing(_) | Located::Other(_)) | Err(_) if !is_exr(Path::new(name)) => {
-            absent.add(name);
+        Ok(Located::Missing(_) | Located::Unusable(_)) | Err(_) if !is_exr(Path::new(name)) => {
+            missing.add(name);
             Ok(None)
         }
-        Ok(Located::Nothing(found) | Located::Other(found)) => Err(not_beside(found)),
+        Ok(Located::Missing(problem) | Located::Unusable(problem)) => Err(unusable_entry(problem)),
         Err(error) => Err(error.into()),
     }
 }
 
-fn not_beside(found: Misplaced) -> FrameReason {
-    FrameReason::Place { found, remedy: "remove the entry or restore the file" }
+fn unusable_entry(problem: FileProblem) -> FrameReason {
+    FrameReason::File { problem, remedy: "remove the entry or restore the file" }
 }
 
-/// Parses the JSON; where it fails on Python's `NaN` and `Infinity`, those are taken for numbers,
-/// so that the frame can be named.
+/// Parses the JSON. Python's `NaN` and `Infinity` are accepted as numbers, so that the later error
+/// names the frame.
 fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
-    serde_json::from_str(text).or_else(|error| match words_as_text(text) {
+    serde_json::from_str(text).or_else(|error| match quote_python_numbers(text) {
         Some(readable) => serde_json::from_str(&readable).map_err(|_| error),
         None => Err(error),
     })

@@ -1,24 +1,24 @@
-//! Huffman-coded bits of a JPEG scan (ITU-T T.81, annexes C and F), skipped rather than decoded.
+//! Skips the Huffman-coded bits of a JPEG scan (ITU-T T.81, annexes C, F and G).
 
 use crate::jpeg::RESTART_MARKERS;
 
-/// Bits that a table resolves by one lookup.
+/// Maximum length of codes that one table lookup resolves.
 const LOOKUP_BITS: u32 = 9;
 const MAX_CODE_BITS: u32 = 16;
 
-/// A Huffman table.
+/// Huffman table.
 #[derive(Debug)]
 pub(crate) struct Table {
-    /// Length and symbol by the next bits; length 0 for longer codes.
+    /// Code length and symbol, indexed by the next bits; length 0 for longer codes.
     lookup: Vec<(u8, u8)>,
-    /// For each length, the end of its codes as 16 bits, and what to add to a code to get its
+    /// End of the codes of each length, extended to 16 bits, and the offset from a code to its
     /// symbol's index.
     ends: [(u32, i32); MAX_CODE_BITS as usize + 1],
     symbols: Vec<u8>,
 }
 
 impl Table {
-    /// Reads the table at the beginning of a segment, and returns the rest of the segment.
+    /// Reads the table at the beginning of a segment; returns it and the rest of the segment.
     pub(crate) fn read(bytes: &[u8]) -> Option<(Self, &[u8])> {
         let (counts, rest) = bytes.split_at_checked(MAX_CODE_BITS as usize)?;
         let count = counts.iter().map(|count| usize::from(*count)).sum();
@@ -29,7 +29,8 @@ impl Table {
             symbols: symbols.to_vec(),
         };
         let (mut code, mut index) = (0u32, 0usize);
-        for (length, count) in (1..=MAX_CODE_BITS).zip(counts) {
+        for (i, count) in counts.iter().enumerate() {
+            let length = i as u32 + 1;
             let first = code;
             code += u32::from(*count);
             if code > 1 << length {
@@ -46,16 +47,17 @@ impl Table {
         Some((table, rest))
     }
 
-    /// Enters codes of one length, whose symbols begin at `index`.
+    /// Adds codes of one length to the lookup; their symbols begin at `index`.
     fn fill_lookup(&mut self, length: u32, codes: std::ops::Range<u32>, index: usize) {
         let spare = LOOKUP_BITS - length;
-        for (code, symbol) in codes.zip(index..) {
+        for (i, code) in codes.enumerate() {
             let first = (code << spare) as usize;
-            self.lookup[first..first + (1 << spare)].fill((length as u8, self.symbols[symbol]));
+            let symbol = self.symbols[index + i];
+            self.lookup[first..first + (1 << spare)].fill((length as u8, symbol));
         }
     }
 
-    /// Returns length and symbol of the code at the beginning of 16 bits.
+    /// Returns the length and symbol of the code at the beginning of 16 bits.
     fn decode(&self, bits: u32) -> Option<(u32, u8)> {
         let (length, symbol) = self.lookup[(bits >> (MAX_CODE_BITS - LOOKUP_BITS)) as usize];
         if length > 0 {
@@ -72,21 +74,21 @@ impl Table {
     }
 }
 
-/// Coefficients that a scan has for each block.
+/// Range of coefficients in a scan (spectral selection).
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Band {
     /// First and last coefficient in zigzag order; 0 is DC.
     first: u32,
     last: u32,
-    /// True if the scan adds a bit to coefficients that have their higher ones.
+    /// True if the scan adds a lower bit to known coefficients (successive approximation).
     is_refinement: bool,
 }
 
 impl Band {
-    /// All coefficients of a sequential JPEG.
+    /// Band of a sequential JPEG: all coefficients.
     pub(crate) const ALL: Self = Self { first: 0, last: 63, is_refinement: false };
 
-    /// Reads the end of a progressive scan's header.
+    /// Parses the end of a progressive scan's header; `None` if it is invalid.
     pub(crate) fn read(header: &[u8]) -> Option<Self> {
         let [first, last, approximation] = *header.first_chunk()?;
         let is_valid = last < 64 && first <= last && (first > 0 || last == 0);
@@ -110,29 +112,30 @@ impl Band {
     }
 }
 
-/// Entropy-coded data up to the next marker.
+/// Reader of entropy-coded data up to the next marker.
 pub(crate) struct Bits<'a> {
     bytes: &'a [u8],
-    /// Index of the next byte that isn't in `buffer`.
-    at: usize,
-    /// The next bits, from the highest.
+    /// Offset of the next byte to load into `buffer`.
+    offset: usize,
+    /// Next bits, from the highest.
     buffer: u64,
+    /// Number of bits in `buffer`.
     count: u32,
-    /// Blocks without further coefficients of the band (EOBRUN).
+    /// Number of blocks without further coefficients of the band (EOBRUN).
     empty_blocks: u32,
 }
 
 impl<'a> Bits<'a> {
-    pub(crate) fn new(bytes: &'a [u8], at: usize) -> Self {
-        Self { bytes, at, buffer: 0, count: 0, empty_blocks: 0 }
+    pub(crate) fn new(bytes: &'a [u8], offset: usize) -> Self {
+        Self { bytes, offset, buffer: 0, count: 0, empty_blocks: 0 }
     }
 
-    /// Returns the index of a byte after the data that were read, at or before the next marker.
+    /// Returns an offset after the data that were read, at or before the next marker.
     pub(crate) fn position(&self) -> usize {
-        self.at
+        self.offset
     }
 
-    /// Skips a block of a scan with DC; `None` where data end or no code fits.
+    /// Skips a block of a scan with DC; `None` if data end or a code is invalid.
     pub(crate) fn skip_block(&mut self, band: Band, tables: [Option<&Table>; 2]) -> Option<()> {
         let [dc, ac] = tables;
         let length = match dc {
@@ -155,8 +158,8 @@ impl<'a> Bits<'a> {
         Some(())
     }
 
-    /// Skips a block of a progressive scan without DC (G.1.2.2 and G.1.2.3). `known` has a bit for
-    /// each coefficient that isn't 0; bits of further ones are added.
+    /// Skips a block of a progressive scan without DC (G.1.2.2 and G.1.2.3). `known` has the bits of
+    /// non-zero coefficients; those of new ones are added.
     pub(crate) fn skip_band(&mut self, band: Band, table: &Table, known: &mut u64) -> Option<()> {
         let mut coefficient = band.first;
         while self.empty_blocks == 0 && coefficient <= band.last {
@@ -185,8 +188,8 @@ impl<'a> Bits<'a> {
         Some(())
     }
 
-    /// Skips the bits of known coefficients before the coefficient that follows so many zeros, and
-    /// returns that one.
+    /// Skips the refinement bits of known coefficients, and returns the coefficient after the given
+    /// number of zeros.
     fn refine(&mut self, first: u32, last: u32, mut zeros: u32, known: u64) -> Option<u32> {
         for coefficient in first..=last {
             if known >> coefficient & 1 == 1 {
@@ -200,18 +203,17 @@ impl<'a> Bits<'a> {
         Some(last + 1)
     }
 
-    /// Resumes after the next restart marker; returns false if another marker or the end comes
-    /// first.
+    /// Resumes after the next restart marker; false if another marker or the end comes first.
     pub(crate) fn restart(&mut self) -> bool {
         (self.buffer, self.count, self.empty_blocks) = (0, 0, 0);
-        while let Some([first, second]) = self.bytes.get(self.at..self.at + 2) {
+        while let Some([first, second]) = self.bytes.get(self.offset..self.offset + 2) {
             match (first, second) {
                 (0xff, marker) if RESTART_MARKERS.contains(marker) => {
-                    self.at += 2;
+                    self.offset += 2;
                     return true;
                 }
                 (0xff, 1..=0xfe) => return false,
-                _ => self.at += 1,
+                _ => self.offset += 1,
             }
         }
         false
@@ -226,13 +228,13 @@ impl<'a> Bits<'a> {
         Some(symbol)
     }
 
-    /// Number of zeros and bits of the coefficient after them.
+    /// Reads the number of zeros, and the number of bits of the coefficient after them.
     fn run(&mut self, table: &Table) -> Option<(u32, u32)> {
         let symbol = self.symbol(table)?;
         Some((u32::from(symbol >> 4), u32::from(symbol & 15)))
     }
 
-    /// Takes fewer than 16 bits as a number.
+    /// Reads a number of fewer than 16 bits.
     fn bits(&mut self, count: u32) -> Option<u32> {
         if self.count < count {
             self.fill();
@@ -251,17 +253,17 @@ impl<'a> Bits<'a> {
         Some(())
     }
 
-    /// Reads bytes up to a marker; a 0 after 255 is no data.
+    /// Fills the buffer up to the next marker; a 0 after 255 is a stuffed byte, not data.
     fn fill(&mut self) {
         while self.count <= 56 {
-            let Some(byte) = self.bytes.get(self.at) else { return };
+            let Some(byte) = self.bytes.get(self.offset) else { return };
             if *byte == 0xff {
-                if self.bytes.get(self.at + 1) != Some(&0) {
+                if self.bytes.get(self.offset + 1) != Some(&0) {
                     return;
                 }
-                self.at += 1;
+                self.offset += 1;
             }
-            self.at += 1;
+            self.offset += 1;
             self.count += 8;
             self.buffer |= u64::from(*byte) << (64 - self.count);
         }

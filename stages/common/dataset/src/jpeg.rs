@@ -1,13 +1,13 @@
-//! Finds rows that a JPEG has no data for (ITU-T T.81). The decoder fills such rows with grey, or
-//! shows them coarser, without an error.
+//! Finds rows without data in a JPEG (ITU-T T.81). The decoder fills such rows with grey, or decodes
+//! them more coarsely, without an error.
 //!
-//! Scans are walked by their Huffman codes. Like libjpeg, this accepts any bytes after the end marker
-//! (EOI). Unlike Pillow, it accepts a sequential JPEG that lacks the end marker alone: no pixel is
-//! missing. A progressive JPEG needs its end marker, since nothing else tells how many scans there
-//! should be.
+//! Huffman codes are skipped scan by scan. Like libjpeg, this accepts any bytes after the end marker
+//! (EOI). Unlike Pillow, it accepts a sequential JPEG that lacks only the end marker: no pixel is
+//! missing. A progressive JPEG needs its end marker, since nothing else determines the number of
+//! scans.
 //!
-//! A header that can't be parsed is left to the decoder, whose message names it. After the first
-//! scan it is damage: there the decoder goes on with what it has.
+//! An invalid header before the first scan is left to the decoder, which reports it. After the first
+//! scan the decoder ignores an invalid header, so that it counts as damage here.
 
 use std::ops::{Range, RangeInclusive};
 
@@ -15,7 +15,7 @@ use pixels::MAX_PIXELS;
 
 use crate::huffman::{Band, Bits, Table};
 
-/// A marker without a meaning.
+/// Marker without a segment, which is skipped.
 const TEM: u8 = 0x01;
 const SOF_BASELINE: u8 = 0xc0;
 const SOF_EXTENDED: u8 = 0xc1;
@@ -28,37 +28,28 @@ pub(crate) const END_MARKER: [u8; 2] = [0xff, EOI];
 const SOS: u8 = 0xda;
 const DRI: u8 = 0xdd;
 
-/// Maximum number of scans, which is the decoder's own.
+/// Maximum number of scans, that of the decoder.
 const MAX_SCANS: usize = 100;
-/// Number of zeros at the end of a file that can't be image data.
-const MIN_FILLING_BYTES: usize = 16;
+/// Minimum number of zeros at the end of a file that can't be image data; chosen by hand.
+const MIN_PADDING_BYTES: usize = 16;
 
-/// Extent of a JPEG's image data.
+/// Completeness of a JPEG's image data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Extent {
-    /// All data, or a file that the decoder refuses.
+    /// Complete data, or a file that the decoder refuses.
     Whole,
-    /// All rows; the end marker is missing.
+    /// Complete rows without the end marker.
     Unterminated,
-    /// Rows without all of their data.
-    Missing {
-        /// Number of these rows.
-        rows: u32,
-        /// Number of rows of the image.
-        of: u32,
-    },
-    /// A progressive JPEG that lacks data: rows lack detail.
-    Coarse {
-        /// Number of the scan that lacks data or is the last one, counted from 1.
-        scan: usize,
-        /// Number of rows of the image.
-        rows: u32,
-    },
+    /// Incomplete rows, of the image's height in rows.
+    Missing { rows: u32, height: u32 },
+    /// Progressive JPEG without all detail; `scan` is the first incomplete or the last scan, counted
+    /// from 1.
+    Coarse { scan: usize, height: u32 },
 }
 
-/// Finds how much of its image data a JPEG has.
+/// Checks the completeness of a JPEG's image data.
 pub(crate) fn extent(bytes: &[u8]) -> Extent {
-    let mut walk = Walk { bytes: without_filling(bytes), ..Walk::default() };
+    let mut walk = Walk { bytes: without_padding(bytes), ..Walk::default() };
     let is_terminated = walk.read_to_end();
     if is_terminated.is_none() && walk.scans == 0 {
         return Extent::Whole;
@@ -66,13 +57,13 @@ pub(crate) fn extent(bytes: &[u8]) -> Extent {
     walk.extent(is_terminated == Some(true)).unwrap_or(Extent::Whole)
 }
 
-/// Cuts off zeros that an interrupted copy has in place of the rest: they would be valid codes.
-fn without_filling(bytes: &[u8]) -> &[u8] {
+/// Removes zeros at the end, left by an interrupted copy: they would be valid codes.
+fn without_padding(bytes: &[u8]) -> &[u8] {
     let end = bytes.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
-    if bytes.len() - end < MIN_FILLING_BYTES { bytes } else { &bytes[..end] }
+    if bytes.len() - end < MIN_PADDING_BYTES { bytes } else { &bytes[..end] }
 }
 
-/// Header of the frame (SOF).
+/// Frame header (SOF).
 struct Frame {
     is_progressive: bool,
     width: u32,
@@ -82,40 +73,40 @@ struct Frame {
 
 struct Component {
     id: u8,
-    /// Sampling factors: blocks of an MCU along a row and a column.
+    /// Sampling factors: blocks of an MCU along x and y.
     factors: [u32; 2],
-    /// Number of image rows without all of their data; `None` before the component's scan.
+    /// Number of incomplete image rows; `None` before the component's first scan.
     missing: Option<u32>,
-    /// For each block of a progressive JPEG, a bit for each coefficient that isn't 0.
+    /// Bits of the non-zero coefficients of each block, for a progressive JPEG.
     coefficients: Vec<u64>,
 }
 
-/// A component's part in a scan (SOS).
+/// Component of a scan (SOS).
 struct Part {
-    /// Index in the frame.
+    /// Index of the component in the frame.
     component: usize,
-    /// Numbers of the tables for DC and AC coefficients.
+    /// Indices of the tables for DC and AC coefficients.
     tables: [usize; 2],
 }
 
-/// A walk through a file's segments and scans.
+/// Reader of a file's segments and scans.
 #[derive(Default)]
 struct Walk<'a> {
     bytes: &'a [u8],
-    at: usize,
+    /// Offset of the next byte to read.
+    offset: usize,
     frame: Option<Frame>,
-    /// Tables for DC and for AC coefficients, by number.
+    /// Tables for DC and for AC coefficients, by index.
     tables: [[Option<Table>; 4]; 2],
-    /// Number of MCUs between restart markers; 0 without such markers.
+    /// Number of MCUs between restart markers; 0 without restart markers.
     restart_interval: usize,
     scans: usize,
-    /// Number of the first scan that lacks data, counted from 1.
+    /// First incomplete scan, counted from 1.
     damaged_scan: Option<usize>,
 }
 
 impl<'a> Walk<'a> {
-    /// Walks to the end marker, or to the end of the file (false); `None` where a segment can't be
-    /// parsed.
+    /// Reads up to the end marker; false if the file ends without one, `None` at an invalid segment.
     fn read_to_end(&mut self) -> Option<bool> {
         loop {
             let marker = match self.next_marker() {
@@ -130,7 +121,7 @@ impl<'a> Walk<'a> {
                 DHT => self.read_tables(segment)?,
                 DRI => self.restart_interval = usize::from(u16_at(segment, 0)?),
                 SOF_BASELINE | SOF_EXTENDED | SOF_PROGRESSIVE if self.frame.is_none() => {
-                    self.frame = Some(frame(segment, marker == SOF_PROGRESSIVE)?);
+                    self.frame = Some(parse_frame(segment, marker == SOF_PROGRESSIVE)?);
                 }
                 SOF_BASELINE | SOF_EXTENDED | SOF_PROGRESSIVE => return None,
                 SOS if self.scans == MAX_SCANS => return None,
@@ -140,23 +131,23 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// Finds the next marker, past anything else.
+    /// Finds the next marker; skips other bytes.
     fn next_marker(&mut self) -> Option<u8> {
-        while let Some([first, second]) = self.bytes.get(self.at..self.at + 2) {
+        while let Some([first, second]) = self.bytes.get(self.offset..self.offset + 2) {
             if let (0xff, 1..=0xfe) = (first, second) {
-                self.at += 2;
+                self.offset += 2;
                 return Some(*second);
             }
-            self.at += 1;
+            self.offset += 1;
         }
         None
     }
 
-    /// Takes the segment after a marker, without its length; `None` where the file ends first.
+    /// Reads the segment after a marker, without its length; `None` if the file ends first.
     fn segment(&mut self) -> Option<&'a [u8]> {
-        let length = usize::from(u16_at(self.bytes, self.at)?).max(2);
-        let segment = self.bytes.get(self.at + 2..self.at + length)?;
-        self.at += length;
+        let length = usize::from(u16_at(self.bytes, self.offset)?).max(2);
+        let segment = self.bytes.get(self.offset + 2..self.offset + length)?;
+        self.offset += length;
         Some(segment)
     }
 
@@ -170,29 +161,32 @@ impl<'a> Walk<'a> {
         Some(())
     }
 
-    /// Walks a scan.
+    /// Skips a scan, and counts its incomplete rows.
     fn read_scan(&mut self, segment: &[u8]) -> Option<()> {
         let frame = self.frame.as_mut()?;
-        let (parts, rest) = parts(segment, frame)?;
+        let (parts, rest) = parse_parts(segment, frame)?;
         let band = if frame.is_progressive { Band::read(rest)? } else { Band::ALL };
-        let alone = if let [part] = &parts[..] { Some(part.component) } else { None };
-        let grid = Grid::new(frame, alone);
-        let mut bits = Bits::new(self.bytes, self.at);
+        let single = if let [part] = &parts[..] { Some(part.component) } else { None };
+        let grid = Grid::new(frame, single);
+        let mut bits = Bits::new(self.bytes, self.offset);
         let missing = if band.has_dc() {
-            let blocks = blocks(&parts, frame, &self.tables, band)?;
-            grid.missing_rows(&mut bits, self.restart_interval, |bits, _| {
-                blocks.iter().try_for_each(|tables| bits.skip_block(band, *tables))
+            let blocks = block_tables(&parts, frame, &self.tables, band)?;
+            grid.incomplete_rows(&mut bits, self.restart_interval, |bits, _| {
+                for tables in &blocks {
+                    bits.skip_block(band, *tables)?;
+                }
+                Some(())
             })
         } else {
-            let component = &mut frame.components[alone?];
+            let component = &mut frame.components[single?];
             let table = self.tables[1].get(parts[0].tables[1])?.as_ref()?;
-            component.coefficients.resize(grid.mcus(), 0);
+            component.coefficients.resize(grid.mcu_count(), 0);
             let known = &mut component.coefficients;
-            grid.missing_rows(&mut bits, self.restart_interval, |bits, block| {
+            grid.incomplete_rows(&mut bits, self.restart_interval, |bits, block| {
                 bits.skip_band(band, table, &mut known[block])
             })
         };
-        self.at = bits.position();
+        self.offset = bits.position();
         self.scans += 1;
         if missing > 0 {
             self.damaged_scan.get_or_insert(self.scans);
@@ -204,27 +198,26 @@ impl<'a> Walk<'a> {
         Some(())
     }
 
-    /// Returns the extent of a file that ends here, with or without the end marker; `None` without
-    /// a frame.
+    /// Returns the completeness of a file that ends here; `None` without a frame.
     fn extent(&self, is_terminated: bool) -> Option<Extent> {
         let Frame { is_progressive, height, components, .. } = self.frame.as_ref()?;
         let missing = components.iter().map(|c| c.missing.unwrap_or(*height)).max()?;
         Some(match (missing, is_terminated) {
             (0, true) => Extent::Whole,
             _ if *is_progressive => {
-                Extent::Coarse { scan: self.damaged_scan.unwrap_or(self.scans), rows: *height }
+                Extent::Coarse { scan: self.damaged_scan.unwrap_or(self.scans), height: *height }
             }
             (0, false) => Extent::Unterminated,
-            (rows, _) => Extent::Missing { rows, of: *height },
+            (rows, _) => Extent::Missing { rows, height: *height },
         })
     }
 }
 
-/// Tables of the blocks of an MCU (DC, AC), as far as a scan has these coefficients.
+/// DC and AC table of a block, if the scan has these coefficients.
 type Tables<'a> = [Option<&'a Table>; 2];
 
-/// Returns the tables of each block of an MCU; `None` where a table is missing.
-fn blocks<'a>(
+/// Returns the tables of each block of an MCU; `None` if a table is missing.
+fn block_tables<'a>(
     parts: &[Part],
     frame: &Frame,
     tables: &'a [[Option<Table>; 4]; 2],
@@ -241,22 +234,21 @@ fn blocks<'a>(
     Some(blocks)
 }
 
-/// MCUs of a scan.
+/// Grid of a scan's MCUs.
 struct Grid {
     columns: usize,
     rows: usize,
-    /// Image rows of an MCU.
+    /// Number of image rows per MCU.
     rows_per_mcu: usize,
     height: usize,
 }
 
 impl Grid {
-    /// Creates the grid of all components together, or of one that is alone in its scan.
-    fn new(frame: &Frame, alone: Option<usize>) -> Self {
-        let most =
-            |axis: usize| frame.components.iter().map(|c| c.factors[axis]).max().unwrap_or(1);
-        let [across, down] = [most(0), most(1)];
-        let (columns, rows, rows_per_mcu) = match alone {
+    /// Creates the grid of all components, or of the single component of a scan.
+    fn new(frame: &Frame, single: Option<usize>) -> Self {
+        let [across, down] =
+            [0, 1].map(|axis| frame.components.iter().map(|c| c.factors[axis]).max().unwrap_or(1));
+        let (columns, rows, rows_per_mcu) = match single {
             None => (frame.width.div_ceil(8 * across), frame.height.div_ceil(8 * down), 8 * down),
             Some(component) => {
                 let [own_across, own_down] = frame.components[component].factors;
@@ -272,18 +264,18 @@ impl Grid {
         Self { columns, rows, rows_per_mcu, height }
     }
 
-    fn mcus(&self) -> usize {
+    fn mcu_count(&self) -> usize {
         self.columns * self.rows
     }
 
-    /// Counts image rows without all of their data; `skip` skips an MCU, `None` where data end.
-    fn missing_rows(
+    /// Counts incomplete image rows; `skip` skips an MCU, and returns `None` if data end.
+    fn incomplete_rows(
         &self,
         bits: &mut Bits<'_>,
         restart_interval: usize,
         mut skip: impl FnMut(&mut Bits<'_>, usize) -> Option<()>,
     ) -> u32 {
-        let all = self.mcus();
+        let all = self.mcu_count();
         let interval = if restart_interval == 0 { all } else { restart_interval };
         let (mut mcu, mut counted, mut missing) = (0, 0, 0);
         while mcu < all {
@@ -304,7 +296,7 @@ impl Grid {
         missing
     }
 
-    /// Number of image rows in rows of MCUs.
+    /// Returns the number of image rows in rows of MCUs.
     fn image_rows(&self, rows: Range<usize>) -> u32 {
         let [first, end] =
             [rows.start, rows.end].map(|row| self.height.min(row * self.rows_per_mcu));
@@ -312,7 +304,8 @@ impl Grid {
     }
 }
 
-fn frame(segment: &[u8], is_progressive: bool) -> Option<Frame> {
+/// Parses a frame header; `None` if it is invalid or the image too large.
+fn parse_frame(segment: &[u8], is_progressive: bool) -> Option<Frame> {
     let (height, width) = (u32::from(u16_at(segment, 1)?), u32::from(u16_at(segment, 3)?));
     let mut components = Vec::new();
     for [id, factors, _] in segment.get(6..)?.as_chunks().0 {
@@ -322,13 +315,13 @@ fn frame(segment: &[u8], is_progressive: bool) -> Option<Frame> {
         }
         components.push(Component { id: *id, factors, missing: None, coefficients: Vec::new() });
     }
-    let is_read = components.len() == usize::from(segment[5])
+    let is_valid = components.len() == usize::from(segment[5])
         && u64::from(width) * u64::from(height) <= MAX_PIXELS as u64;
-    is_read.then_some(Frame { is_progressive, width, height, components })
+    is_valid.then_some(Frame { is_progressive, width, height, components })
 }
 
-/// Parses the components of a scan, and returns the rest of its header.
-fn parts<'a>(segment: &'a [u8], frame: &Frame) -> Option<(Vec<Part>, &'a [u8])> {
+/// Parses the components of a scan; returns them and the rest of its header.
+fn parse_parts<'a>(segment: &'a [u8], frame: &Frame) -> Option<(Vec<Part>, &'a [u8])> {
     let (count, rest) = segment.split_first()?;
     let (listed, rest) = rest.split_at_checked(2 * usize::from(*count))?;
     let mut parts = Vec::with_capacity(usize::from(*count));
@@ -339,8 +332,8 @@ fn parts<'a>(segment: &'a [u8], frame: &Frame) -> Option<(Vec<Part>, &'a [u8])> 
     (!parts.is_empty()).then_some((parts, rest))
 }
 
-fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
-    Some(u16::from_be_bytes(*bytes.get(at..)?.first_chunk()?))
+fn u16_at(bytes: &[u8], offset: usize) -> Option<u16> {
+    Some(u16::from_be_bytes(*bytes.get(offset..)?.first_chunk()?))
 }
 
 #[cfg(test)]

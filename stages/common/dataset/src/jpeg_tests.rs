@@ -60,7 +60,7 @@ fn missing_rows_are_counted() {
                 let zeros = [cut, &[0; 512]].concat();
                 let ended = [cut, &END_MARKER].concat();
                 let (found, rows) = match extent(cut) {
-                    it @ Extent::Missing { rows, of: ROWS } => (it, rows),
+                    it @ Extent::Missing { rows, height: ROWS } => (it, rows),
                     Extent::Unterminated => (Extent::Whole, 0),
                     other => panic!("{case}: {other:?} at {end}"),
                 };
@@ -94,20 +94,20 @@ fn a_progressive_jpeg_needs_its_end() {
             assert_eq!(extent(&bytes), Extent::Whole);
             for end in (bytes.len() / 4..bytes.len()).step_by(17) {
                 let found = extent(&bytes[..end]);
-                assert!(matches!(found, Extent::Coarse { rows: ROWS, .. }), "{found:?} at {end}");
+                assert!(matches!(found, Extent::Coarse { height: ROWS, .. }), "{found:?} at {end}");
             }
         }
     }
 }
 
-/// A lost piece is found where restart markers let the decoder go on after it.
+/// A lost piece is found even if restart markers let the decoder resume after it.
 #[test]
 fn a_lost_piece_is_missing() {
     let bytes = jpeg(SIZE, Some(SamplingFactor::R_4_4_4), false, 6);
     let marker = |n: u8| bytes.windows(2).position(|w| w == [0xff, 0xd0 + n]).unwrap();
     let (from, to) = (marker(2), marker(3));
     let lost = [&bytes[..from + 12], &bytes[to..]].concat();
-    assert_eq!(extent(&lost), Extent::Missing { rows: 8, of: ROWS });
+    assert_eq!(extent(&lost), Extent::Missing { rows: 8, height: ROWS });
 }
 
 #[test]

@@ -2,10 +2,10 @@ use scene::Distortion;
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::frame_reason::FrameReason;
+use crate::error::FrameReason;
 use crate::number::Number;
 
-/// Lens of all frames of a `transforms.json`, or of one: instant-ngp's and nerfstudio's words.
+/// Lens of all frames of a `transforms.json`, or of one, with instant-ngp's and nerfstudio's keys.
 #[derive(Clone, Default, Deserialize)]
 pub(crate) struct LensEntry {
     camera_model: Option<String>,
@@ -26,7 +26,7 @@ pub(crate) struct LensEntry {
     p1: Option<Number>,
     p2: Option<Number>,
     is_fisheye: Option<bool>,
-    // instant-ngp's other projections.
+    // Other projections of instant-ngp, which are not supported.
     equirectangular: Option<Value>,
     latlong: Option<Value>,
     orthographic: Option<Value>,
@@ -67,17 +67,17 @@ impl LensEntry {
         )
     }
 
-    /// Returns the distortion, or an error for a model that isn't read. Of a fisheye lens k1 to k4
-    /// are OpenCV's. Of a perspective lens k4 is Brown's fourth radial term, as nerfstudio has it,
-    /// unless the model is OpenCV's rational one, which alone has k5 and k6.
+    /// Returns the distortion; fails for a model that isn't supported. For a fisheye lens k1 to k4
+    /// are OpenCV's. For a perspective lens k4 is Brown's fourth radial term, as in nerfstudio,
+    /// unless the model is OpenCV's rational one, the only one with k5 and k6.
     pub(crate) fn distortion(&self) -> Result<Distortion, FrameReason> {
-        if let Some(model) = self.other_projection() {
-            return Err(FrameReason::Model { model: model.to_owned() });
+        if let Some(model) = self.unsupported_projection() {
+            return Err(FrameReason::UnsupportedModel { model: model.to_owned() });
         }
-        let or_zero = |k: Option<Number>| k.map_or(0.0, |k| k.0);
-        let [k1, k2, k3, k4] = [self.k1, self.k2, self.k3, self.k4].map(or_zero);
-        let [k5, k6] = [self.k5, self.k6].map(or_zero);
-        let tangential = [self.p1, self.p2].map(or_zero);
+        let [k1, k2, k3, k4, k5, k6, p1, p2] =
+            [self.k1, self.k2, self.k3, self.k4, self.k5, self.k6, self.p1, self.p2]
+                .map(|coefficient| coefficient.map_or(0.0, |number| number.0));
+        let tangential = [p1, p2];
         let model = self.camera_model.as_deref().unwrap_or("OPENCV");
         let (is_fisheye, is_rational) = match model {
             "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL"
@@ -88,28 +88,30 @@ impl LensEntry {
             | "RADIAL_FISHEYE"
             | "SIMPLE_FISHEYE"
             | "FISHEYE" => (true, false),
-            _ => return Err(FrameReason::Model { model: model.to_owned() }),
+            _ => return Err(FrameReason::UnsupportedModel { model: model.to_owned() }),
         };
         let radial = [k1, k2, k3, k4];
         Ok(if is_fisheye {
             Distortion { tangential, ..Distortion::fisheye(radial) }
         } else if is_rational {
-            let above = Distortion::brown([k1, k2, k3], tangential);
-            Distortion { denominator: [k4, k5, k6], ..above }
+            let numerator = Distortion::brown([k1, k2, k3], tangential);
+            Distortion { denominator: [k4, k5, k6], ..numerator }
         } else {
             Distortion { radial, tangential, ..Distortion::default() }
         })
     }
 
-    /// Returns the name of a projection that instant-ngp has and this program hasn't.
-    fn other_projection(&self) -> Option<&'static str> {
-        let is_true = |value: &Option<Value>| *value == Some(Value::Bool(true));
-        let flags = [
-            ("equirectangular", is_true(&self.equirectangular)),
-            ("latlong", is_true(&self.latlong)),
-            ("orthographic", is_true(&self.orthographic)),
-            ("ftheta", self.ftheta_p0.is_some()),
-        ];
-        flags.into_iter().find(|(_, has)| *has).map(|(name, _)| name)
+    /// Returns the name of instant-ngp's projection if it isn't supported.
+    fn unsupported_projection(&self) -> Option<&'static str> {
+        for (name, flag) in [
+            ("equirectangular", &self.equirectangular),
+            ("latlong", &self.latlong),
+            ("orthographic", &self.orthographic),
+        ] {
+            if *flag == Some(Value::Bool(true)) {
+                return Some(name);
+            }
+        }
+        self.ftheta_p0.as_ref().map(|_| "ftheta")
     }
 }

@@ -6,122 +6,108 @@ use scene::{Distortion, Intrinsics, pose_of};
 
 use crate::colmap;
 use crate::dataset::Dataset;
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FrameReason};
 use crate::file_reason::{FileReason, ImageFolder};
+use crate::file_status::{FileStatus, check_link, file_status, is_file, is_hidden, path_text};
 use crate::format::Format;
-use crate::found::{Found, check_link, find, is_file, is_hidden};
-use crate::frame::{Frame, names};
-use crate::frame_reason::FrameReason;
+use crate::frame::{Frame, unique_names};
 use crate::lookup::{Located, Lookup};
 use crate::masks::without_dynamic_masks;
-use crate::misplaced::shown;
 use crate::npy::{ArrayReason, read_matrix};
-use crate::photograph::{Stored, fitted, is_image_name, look};
+use crate::photograph::{ImageHeader, fit_camera, is_image_name, read_header};
 use crate::text::read_text;
 use crate::unread::unread_images;
 
-/// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal
+/// Numbers per photograph: a 3×5 matrix (axes down, right and back; centre; height, width and focal
 /// length), near and far.
 const NUMBERS: usize = 17;
 
-/// Reads `poses_bounds.npy` (Mildenhall et al. 2019) and the images beside it, sorted by name.
+/// Reads `poses_bounds.npy` (Mildenhall et al. 2019) and the images next to it, sorted by name.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("poses_bounds.npy");
     let rows = read_numbers(&path)?;
     check_link(&folder.join("images"))?;
-    let Photographs { images, labels, notes } = photographs(folder, &path, rows.len())?;
-    let names = names(&path, &labels)?;
-    let (distortion, note) = distortion(folder, &rows);
+    let Photographs { images, labels, mut notes } = find_photographs(folder, &path, rows.len())?;
+    let names = unique_names(&path, &labels)?;
+    let (distortion, note) = colmap_distortion(folder, &rows);
     let mut frames = Vec::with_capacity(rows.len());
-    for (index, ((row, image), name)) in rows.iter().zip(images).zip(names).enumerate() {
-        let file = name.clone();
-        let of_frame = |reason| DatasetError::frame(&path, index, &file, reason);
-        let frame = look(&image)
-            .map_err(FrameReason::from)
-            .and_then(|stored| frame(row, distortion, stored, name, image));
-        frames.push(frame.map_err(of_frame)?);
+    for (index, image) in images.into_iter().enumerate() {
+        let name = &names[index];
+        let frame = read_frame(&rows[index], distortion, name, image)
+            .map_err(|reason| DatasetError::frame(&path, index, name, reason))?;
+        frames.push(frame);
     }
-    let mut notes = notes;
     notes.extend(note);
     Ok(Dataset { format: Format::Llff, frames, split: None, notes })
 }
 
-/// The lens's distortion, which the file doesn't have: the poses come from COLMAP, and hold for the
-/// lens that it found. Where its model lies beside them, with one camera of their focal length,
-/// that says it.
-fn distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<String>) {
+/// Returns the lens distortion of COLMAP's model next to the poses, with a note if it is unknown.
+/// LLFF's file has no distortion, but its poses are COLMAP's and refer to the lens of that model if
+/// that has one camera with their focal length (docs/design/005).
+fn colmap_distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<String>) {
     let camera = match colmap::only_camera(folder) {
         Ok(Some(camera)) if !camera.distortion.is_none() => camera,
         Ok(_) => return (Distortion::default(), None),
         Err(e) => {
-            return (Distortion::default(), Some(format!("lens distortion is not known: {e}")));
+            return (Distortion::default(), Some(format!("lens distortion is unknown: {e}")));
         }
     };
     if rows.iter().all(|row| has_focal_length_of(&camera, row)) {
         (camera.distortion, None)
     } else {
         let note = format!(
-            "lens distortion is not known: the model in sparse has another focal length ({} of {} \
-            pixels)",
+            "lens distortion is unknown: the model in sparse has a different focal length ({} at a \
+            width of {} pixels)",
             camera.fx, camera.width
         );
         (Distortion::default(), Some(note))
     }
 }
 
-/// Whether a photograph has a camera's focal length, each in parts of its width.
+/// True if a photograph's focal length, relative to its width, equals the camera's.
 fn has_focal_length_of(camera: &Intrinsics, row: &[f64; NUMBERS]) -> bool {
     let (width, focal) = (row[9], row[14]);
     (camera.fx * width / (f64::from(camera.width) * focal) - 1.0).abs() < 1e-3
 }
 
-fn frame(
+fn read_frame(
     row: &[f64; NUMBERS],
     distortion: Distortion,
-    stored: Stored,
-    name: String,
+    name: &str,
     image: PathBuf,
 ) -> Result<Frame, FrameReason> {
-    let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
-    let (down, right, back, centre, inside) =
-        (column(0), column(1), column(2), column(3), column(4));
-    let [height, width, focal] = inside.to_array();
-    let (width, height) = (whole(width, "width")?, whole(height, "height")?);
+    let stored: ImageHeader = read_header(&image)?;
+    let [down, right, back, centre, inner] =
+        [0, 1, 2, 3, 4].map(|c| DVec3::new(row[c], row[5 + c], row[10 + c]));
+    let [height, width, focal] = inner.to_array();
+    let (width, height) = (side_length(width, "width")?, side_length(height, "height")?);
     let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
-    let (taken_with, turn) =
-        fitted(Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion }, stored)?;
+    let intrinsics = Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion };
+    let fitted = fit_camera(intrinsics, stored)?;
     let (near, far) = (row[15], row[16]);
     if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
-        return Err(FrameReason::Depths { near, far });
+        return Err(FrameReason::InvalidDepths { near, far });
     }
     let camera_to_world = pose_of(DMat3::from_cols(right, -down, back), centre);
-    let frame = Frame {
-        name,
-        image,
-        turn,
-        mask: None,
-        depth: None,
-        taken_with,
-        pinhole: None,
-        camera_to_world,
-        depths: Some([near, far]),
-    };
+    let mut frame = Frame::new(image, fitted, camera_to_world);
+    frame.name = name.to_owned();
+    frame.depths = Some([near, far]);
     frame.check()?;
     Ok(frame)
 }
 
-fn whole(value: f64, name: &'static str) -> Result<u32, FrameReason> {
+fn side_length(value: f64, name: &'static str) -> Result<u32, FrameReason> {
     if (1.0..=f64::from(u32::MAX)).contains(&value) {
         Ok(value.round() as u32)
     } else {
-        Err(FrameReason::Empty { name, value })
+        Err(FrameReason::InvalidSide { name, value })
     }
 }
 
-/// Photographs of the poses, in the poses' order.
+/// Photographs in the order of the poses.
 struct Photographs {
     images: Vec<PathBuf>,
-    /// Paths whose stems name the views, inside the data set's folder.
+    /// Paths inside the data set's folder that name the views.
     labels: Vec<PathBuf>,
     notes: Vec<String>,
 }
@@ -134,52 +120,52 @@ impl Photographs {
     }
 }
 
-/// Returns all images of `images`, or of the largest of `images_2`, `images_4` … that has one for
-/// every pose. Where none has, a list may name the images with poses.
-fn photographs(folder: &Path, path: &Path, poses: usize) -> Result<Photographs, DatasetError> {
+/// Finds the folder with one image per pose: `images`, or the first of `images_2`, `images_3` and so
+/// on. Without such a folder, a list may name the images that have poses.
+fn find_photographs(folder: &Path, path: &Path, poses: usize) -> Result<Photographs, DatasetError> {
     let mut names = vec!["images".to_owned()];
     names.extend((2..=64).map(|n| format!("images_{n}")));
     let mut folders = Vec::new();
     for name in names {
-        let Some((files, mut folder_of_images)) = images_of(folder, &name) else { continue };
+        let Some((files, image_folder)) = list_images(folder, &name) else { continue };
         if files.len() == poses {
-            let inside = files.iter().filter_map(|p| p.strip_prefix(folder).ok());
-            let labels = inside.map(Path::to_path_buf).collect();
+            let relative = files.iter().filter_map(|p| p.strip_prefix(folder).ok());
+            let labels = relative.map(Path::to_path_buf).collect();
             return Ok(Photographs::new(files, labels, &name));
         }
-        folder_of_images.images = files.len();
-        folders.push(folder_of_images);
+        folders.push(image_folder);
     }
-    match listed_photographs(folder, path, poses)? {
+    match find_listed_photographs(folder, path, poses)? {
         Some(found) => Ok(found),
         None => Err(DatasetError::format(path, FileReason::Counts { poses, folders })),
     }
 }
 
-/// Returns a folder's images by name, and what else is named like an image. Names that begin with a
-/// dot and instant-ngp's masks are no images.
-fn images_of(folder: &Path, name: &str) -> Option<(Vec<PathBuf>, ImageFolder)> {
+/// Lists a folder's images by name, and describes the folder for an error. Hidden files and
+/// instant-ngp's masks are not images.
+fn list_images(folder: &Path, name: &str) -> Option<(Vec<PathBuf>, ImageFolder)> {
     let path = folder.join(name);
     let entries = std::fs::read_dir(&path).ok()?.flatten().map(|entry| entry.path());
-    let mut named: Vec<PathBuf> = entries.filter(|path| !is_hidden(path)).collect();
-    named.sort();
-    let unread = unread_images(&named);
-    named.retain(|path| is_image_name(path));
-    let mut named = without_dynamic_masks(named);
-    let mut odd = None;
-    named.retain(|path| match find(path, "an image") {
-        Found::File => true,
-        Found::Nothing(found) | Found::Other(found) => {
-            odd.get_or_insert(found);
+    let mut files: Vec<PathBuf> = entries.filter(|path| !is_hidden(path)).collect();
+    files.sort();
+    let unsupported = unread_images(&files);
+    files.retain(|path| is_image_name(path));
+    let mut files = without_dynamic_masks(files);
+    let mut unusable = None;
+    files.retain(|path| match file_status(path, "an image") {
+        FileStatus::File => true,
+        FileStatus::Missing(problem) | FileStatus::Unusable(problem) => {
+            unusable.get_or_insert(problem);
             false
         }
     });
-    Some((named, ImageFolder { name: name.to_owned(), images: 0, odd, unread }))
+    let images = files.len();
+    Some((files, ImageFolder { name: name.to_owned(), images, unusable, unsupported }))
 }
 
-/// Returns the images that `view_imgs.txt` (imgs2poses) or COLMAP's model next to the poses names,
-/// if one of them has a name for every pose. Poses are in the order of names.
-fn listed_photographs(
+/// Finds the images listed by `view_imgs.txt` (imgs2poses) or by COLMAP's model next to the poses,
+/// if one of the lists has one name per pose. Poses are in the order of names.
+fn find_listed_photographs(
     folder: &Path,
     path: &Path,
     poses: usize,
@@ -191,48 +177,47 @@ fn listed_photographs(
         let names = text.lines().map(|line| line.trim().to_owned());
         lists.push(("view_imgs.txt", names.filter(|name| !name.is_empty()).collect()));
     }
-    // A model that can't be read names no images.
+    // A model that can't be read counts as an empty list.
     lists.push(("sparse", colmap::image_names(folder).unwrap_or_default()));
     let Some((source, mut names)) = lists.into_iter().find(|(_, names)| names.len() == poses)
     else {
         return Ok(None);
     };
     names.sort();
-    let named: Vec<&str> = names.iter().map(String::as_str).collect();
-    let mut lookup = Lookup::in_images(folder, &named);
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let mut lookup = Lookup::in_images(folder, &names);
     let (mut images, mut labels) = (Vec::new(), Vec::new());
-    for (index, name) in named.iter().enumerate() {
-        let of_frame = |reason| DatasetError::frame(path, index, name, reason);
-        match lookup.find(name).map_err(|e| of_frame(e.into()))? {
+    for (index, name) in names.iter().enumerate() {
+        let frame_error = |reason| DatasetError::frame(path, index, name, reason);
+        match lookup.find(name).map_err(|e| frame_error(e.into()))? {
             Located::File(file) => {
                 images.push(folder.join(&file.path));
                 labels.push(file.label);
             }
-            Located::Nothing(found) | Located::Other(found) => {
+            Located::Missing(problem) | Located::Unusable(problem) => {
                 let remedy = "restore the photograph";
-                return Err(of_frame(FrameReason::Place { found, remedy }));
+                return Err(frame_error(FrameReason::File { problem, remedy }));
             }
         }
     }
-    let from = lookup.base().strip_prefix(folder).map(shown).unwrap_or_default();
+    let from = lookup.base().strip_prefix(folder).map(path_text).unwrap_or_default();
     let mut found = Photographs::new(images, labels, &from);
-    found.notes.push(format!("{source} names the photographs with poses"));
+    found.notes.push(format!("photographs with poses are listed by {source}"));
     found.notes.extend(lookup.notes());
     Ok(Some(found))
 }
 
-/// The array's rows.
+/// Reads the array's rows.
 fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
-    let bytes = std::fs::read(path)
-        .map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })?;
-    let matrix = read_matrix(&bytes).map_err(|reason| no_array(path, reason))?;
+    let bytes = std::fs::read(path).map_err(|source| DatasetError::io(path, source))?;
+    let matrix = read_matrix(&bytes).map_err(|reason| array_error(path, reason))?;
     if matrix.columns != NUMBERS || matrix.numbers.is_empty() {
-        return Err(no_array(path, ArrayReason::Shape(vec![matrix.rows, matrix.columns])));
+        return Err(array_error(path, ArrayReason::Shape(vec![matrix.rows, matrix.columns])));
     }
     Ok(matrix.numbers.as_chunks().0.to_vec())
 }
 
-fn no_array(path: &Path, reason: ArrayReason) -> DatasetError {
+fn array_error(path: &Path, reason: ArrayReason) -> DatasetError {
     DatasetError::format(path, FileReason::Array { columns: NUMBERS, reason })
 }
 
@@ -280,7 +265,7 @@ mod tests {
         assert_eq!(frame.name, "IMG_1");
         assert_eq!(frame.camera_to_world, [[1., 0., 0., 1.], [0., 1., 0., 2.], [0., 0., 1., 3.]]);
         assert_eq!(
-            frame.taken_with,
+            frame.stored_intrinsics,
             Intrinsics {
                 width: 40,
                 height: 30,
@@ -296,7 +281,7 @@ mod tests {
 
     fn distortion_and_notes(folder: &Path) -> (f64, String) {
         let set = Dataset::read(folder).unwrap();
-        (set.frames[0].taken_with.distortion.radial[0], set.notes.join("; "))
+        (set.frames[0].stored_intrinsics.distortion.radial[0], set.notes.join("; "))
     }
 
     /// The file can't say what its poses' lens does to lines; the model that they come from can.
@@ -319,8 +304,8 @@ mod tests {
             )
         );
         for (text, words) in [
-            ("1 SIMPLE_RADIAL 160 120 150 80 60 0.02\n", "another focal length"),
-            ("1 SIMPLE_RADIAL 160 120 nothing\n", "distortion is not known"),
+            ("1 SIMPLE_RADIAL 160 120 150 80 60 0.02\n", "a different focal length"),
+            ("1 SIMPLE_RADIAL 160 120 nothing\n", "distortion is unknown"),
             ("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n2 PINHOLE 160 120 140 140 80 60\n", "LLFF"),
             ("1 SIMPLE_PINHOLE 160 120 140 80 60\n", "LLFF"),
         ] {

@@ -1,4 +1,4 @@
-//! Masks that lie next to images, and the log of all masks.
+//! Finds masks next to images, and logs which masks are used.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -7,39 +7,77 @@ use artifact::{WARNING, counted};
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
+use crate::file_status::path_text;
 use crate::format::Format;
-use crate::frame::Frame;
+use crate::frame::{Frame, Turn};
 use crate::lookup::{Listings, LookupError};
-use crate::mask_file::{MaskFile, MaskKind};
-use crate::misplaced::shown;
-use crate::photograph::{IMAGE_EXTENSIONS, has_shape_of, look};
-use crate::turn::Turn;
-use crate::unused_masks::unused_masks;
+use crate::photograph::{IMAGE_EXTENSIONS, has_aspect_of, read_header};
+use crate::text::counted_with_verb;
+use crate::unused_masks::unused_mask_warnings;
+
+/// Mask of a photograph.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MaskFile {
+    /// Path of the mask's image.
+    pub path: PathBuf,
+    /// Convention by which the mask was found.
+    pub kind: MaskKind,
+}
+
+/// Convention for masks of photographs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum MaskKind {
+    /// `mask_path` of a frame (nerfstudio). Black is excluded.
+    Listed,
+    /// `masks/NAME.png` next to the images' folder. Black is excluded.
+    Named,
+    /// `masks/NAME.EXT.png` next to the images' folder (COLMAP). Black is excluded.
+    NamedWithExtension,
+    /// `dynamic_mask_NAME.png` next to the image (instant-ngp). White is excluded.
+    Dynamic,
+}
+
+impl MaskKind {
+    /// True if white, not black, is excluded.
+    pub fn is_inverted(self) -> bool {
+        self == Self::Dynamic
+    }
+
+    /// Returns the convention's name for the log.
+    fn title(self) -> &'static str {
+        match self {
+            Self::Listed => "mask_path",
+            Self::Named => "masks/NAME.png",
+            Self::NamedWithExtension => "masks/NAME.EXT.png",
+            Self::Dynamic => "dynamic_mask_NAME.png",
+        }
+    }
+}
 
 /// Folder of masks next to the images' folder.
 const MASKS: &str = "masks";
-/// Start of instant-ngp's names for masks.
-const DYNAMIC_MASK: &str = "dynamic_mask_";
+/// Prefix of instant-ngp's mask names.
+const DYNAMIC_PREFIX: &str = "dynamic_mask_";
 
-/// Finds the masks of frames that name none, and notes which masks are used.
+/// Finds the masks of frames that don't name one, and adds notes on all masks.
 pub(crate) fn add_masks(folder: &Path, set: &mut Dataset) -> Result<(), DatasetError> {
     let mut listings = Listings::new(folder);
     let has_masks_folder = matches!(set.format, Format::Llff | Format::Colmap);
     for frame in set.frames.iter_mut().filter(|frame| frame.mask.is_none()) {
         let Ok(image) = frame.image.strip_prefix(folder) else { continue };
-        let found = mask_beside(&mut listings, image, has_masks_folder);
+        let found = find_mask(&mut listings, image, has_masks_folder);
         let found = found.map_err(|reason| DatasetError::format(&frame.image, reason))?;
         frame.mask = found.map(|(path, kind)| MaskFile { path: folder.join(path), kind });
     }
-    set.notes.extend(usage(&set.frames));
-    set.notes.extend(sizes(folder, &set.frames)?);
-    set.notes.extend(unused_masks(&mut listings, set.format, &set.frames));
+    set.notes.extend(usage_note(&set.frames));
+    set.notes.extend(size_notes(folder, &set.frames)?);
+    set.notes.extend(unused_mask_warnings(&mut listings, set.format, &set.frames));
     Ok(())
 }
 
-/// Finds the mask next to an image: `masks/NAME.png` or `masks/NAME.EXT.png`, or else instant-ngp's
+/// Finds the mask of an image: `masks/NAME.png` or `masks/NAME.EXT.png`, otherwise instant-ngp's
 /// `dynamic_mask_NAME.png`.
-fn mask_beside(
+fn find_mask(
     listings: &mut Listings,
     image: &Path,
     has_masks_folder: bool,
@@ -48,121 +86,121 @@ fn mask_beside(
     else {
         return Ok(None);
     };
-    let named = format!("{stem}.png");
     if has_masks_folder {
-        let mut names = vec![(named.clone(), MaskKind::Named)];
-        let long = IMAGE_EXTENSIONS.map(|extension| format!("{stem}{extension}.png"));
-        names.extend(long.map(|name| (name, MaskKind::NamedWithExtension)));
-        let inside = inside_images(parent);
-        for masks in listings.alike(Path::new(""), MASKS) {
-            if let Some(found) = only_file(listings, &Path::new(&masks).join(&inside), &names)? {
+        let mut names = vec![(format!("{stem}.png"), MaskKind::Named)];
+        for extension in IMAGE_EXTENSIONS {
+            names.push((format!("{stem}{extension}.png"), MaskKind::NamedWithExtension));
+        }
+        let sub_folder = without_images_folder(parent);
+        for masks in listings.case_variants(Path::new(""), MASKS) {
+            let folder = Path::new(&masks).join(&sub_folder);
+            if let Some(found) = find_single_file(listings, &folder, &names)? {
                 return Ok(Some(found));
             }
         }
     }
-    only_file(listings, parent, &[(format!("{DYNAMIC_MASK}{named}"), MaskKind::Dynamic)])
+    let name = format!("{DYNAMIC_PREFIX}{stem}.png");
+    find_single_file(listings, parent, &[(name, MaskKind::Dynamic)])
 }
 
-/// Returns the folder of an image inside the images' folder.
-fn inside_images(parent: &Path) -> PathBuf {
+/// Returns an image's folder relative to the images' folder.
+fn without_images_folder(parent: &Path) -> PathBuf {
     let mut parts = parent.iter();
     let first = parts.next().and_then(|part| part.to_str()).unwrap_or_default();
     let is_images = first.eq_ignore_ascii_case("images") || first.starts_with("images_");
     if is_images { parts.collect() } else { parent.to_path_buf() }
 }
 
-/// Returns the one file of a folder that has one of the names, in either case.
-fn only_file(
+/// Finds the single file of a folder with one of the names, in any case; fails if there are several.
+fn find_single_file(
     listings: &mut Listings,
     folder: &Path,
     names: &[(String, MaskKind)],
 ) -> Result<Option<(PathBuf, MaskKind)>, LookupError> {
     let mut found: Vec<(PathBuf, MaskKind)> = Vec::new();
     for (name, kind) in names {
-        let files = listings.alike(folder, name).into_iter().map(|same| folder.join(same));
-        let files: Vec<PathBuf> = files.filter(|file| listings.is_file(file)).collect();
-        found.extend(files.into_iter().map(|file| (file, *kind)));
+        for variant in listings.case_variants(folder, name) {
+            let file = folder.join(variant);
+            if listings.is_file(&file) {
+                found.push((file, *kind));
+            }
+        }
     }
     found.sort();
     match &found[..] {
         [] => Ok(None),
         [only] => Ok(Some(only.clone())),
         [(first, _), (second, _), ..] => Err(LookupError::Ambiguous {
-            name: shown(&folder.join(&names[0].0)),
+            name: path_text(&folder.join(&names[0].0)),
             first: first.clone(),
             second: second.clone(),
         }),
     }
 }
 
-/// Returns the line on how many views have masks of which kind.
-fn usage(frames: &[Frame]) -> Option<String> {
+/// Returns the note on the number of views with masks of each kind, if any.
+fn usage_note(frames: &[Frame]) -> Option<String> {
     let mut kinds: BTreeMap<MaskKind, usize> = BTreeMap::new();
     for mask in frames.iter().filter_map(|frame| frame.mask.as_ref()) {
         *kinds.entry(mask.kind).or_default() += 1;
     }
     let masked: usize = kinds.values().sum();
-    let whole = frames.len() - masked;
     if masked == 0 {
         return None;
     }
-    let each: Vec<String> = kinds
-        .iter()
-        .map(|(kind, count)| {
-            let colour = if kind.is_inverted() { "white" } else { "black" };
-            format!("{} for {count}: {colour} is left out", kind.title())
-        })
-        .collect();
+    let mut parts = Vec::new();
+    for (kind, count) in kinds {
+        let colour = if kind.is_inverted() { "white" } else { "black" };
+        parts.push(format!("{count} by {}, where {colour} is excluded", kind.title()));
+    }
     let have = if masked == 1 { "has a mask" } else { "have masks" };
-    let rest = match whole {
-        0 => String::new(),
-        1 => "; 1 is used whole".to_owned(),
-        count => format!("; {count} are used whole"),
-    };
     let views = counted(frames.len(), "view");
-    Some(format!("{masked} of {views} {have}{rest} ({})", each.join(", ")))
+    Some(format!("{masked} of {views} {have} ({})", parts.join("; ")))
 }
 
-/// Returns a line on masks of another size than their photographs', and one on masks of another
-/// shape.
-fn sizes(folder: &Path, frames: &[Frame]) -> Result<Vec<String>, DatasetError> {
-    let (mut smaller, mut misshapen) = (Vec::new(), Vec::new());
+/// Returns a note on masks that differ from their photographs in size, and a warning about those
+/// that differ in aspect ratio.
+fn size_notes(folder: &Path, frames: &[Frame]) -> Result<Vec<String>, DatasetError> {
+    let (mut resized, mut distorted) = (Vec::new(), Vec::new());
     for frame in frames {
         let Some(mask) = &frame.mask else { continue };
-        let stored = look(&mask.path)?;
+        let stored = read_header(&mask.path)?;
         let (mut width, mut height) = stored.size;
         if frame.turn == Turn::Upright && stored.is_sideways() {
             (width, height) = (height, width);
         }
-        let k = frame.taken_with;
+        let k = frame.stored_intrinsics;
         if (width, height) != (k.width, k.height) {
-            let path = shown(mask.path.strip_prefix(folder).unwrap_or(&mask.path));
+            let path = path_text(mask.path.strip_prefix(folder).unwrap_or(&mask.path));
             let sizes = format!("{path}: {width}×{height} for {}×{}", k.width, k.height);
-            let is_copy = has_shape_of(&k, width, height);
-            if is_copy { &mut smaller } else { &mut misshapen }.push(sizes);
+            let is_copy = has_aspect_of(&k, width, height);
+            if is_copy { &mut resized } else { &mut distorted }.push(sizes);
         }
     }
-    let line = |warning: &str, what: &str, masks: &[String]| {
-        let first = masks.first()?;
-        let count = counted(masks.len(), "mask");
-        let verb = if masks.len() == 1 { "has" } else { "have" };
-        Some(format!(
-            "{warning}{count} {verb} another {what} than the photograph; resampled by nearest \
-            neighbour ({first})"
-        ))
-    };
-    Ok([line("", "size", &smaller), line(WARNING, "shape", &misshapen)]
-        .into_iter()
-        .flatten()
-        .collect())
+    let mut notes = Vec::new();
+    for (prefix, property, masks) in [("", "size", resized), (WARNING, "aspect ratio", distorted)] {
+        if let Some(first) = masks.first() {
+            let subject = counted_with_verb(masks.len(), "mask", ["differs", "differ"]);
+            notes.push(format!(
+                "{prefix}{subject} from the photograph in {property}; resampled by nearest \
+                neighbour (first: {first})"
+            ));
+        }
+    }
+    Ok(notes)
 }
 
 /// Returns a folder's images without instant-ngp's masks of these images.
 pub(crate) fn without_dynamic_masks(images: Vec<PathBuf>) -> Vec<PathBuf> {
-    let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
-    let stems: BTreeSet<String> = images.iter().map(|path| stem(path)).collect();
-    let is_mask = |path: &Path| {
-        stem(path).strip_prefix(DYNAMIC_MASK).is_some_and(|masked| stems.contains(masked))
-    };
-    images.into_iter().filter(|path| !is_mask(path)).collect()
+    let stems: BTreeSet<String> = images.iter().map(|path| lowercase_stem(path)).collect();
+    let mut images = images;
+    images.retain(|path| {
+        let stem = lowercase_stem(path);
+        !stem.strip_prefix(DYNAMIC_PREFIX).is_some_and(|masked| stems.contains(masked))
+    });
+    images
+}
+
+fn lowercase_stem(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().to_lowercase()
 }

@@ -1,36 +1,28 @@
-//! A matrix as NumPy saves one, in versions 1 to 3 of its format.
+//! Reads matrices in NumPy's format, versions 1 to 3.
 
-/// Bytes of the longest header. That of a matrix has a hundred, and NumPy reads no longer ones
-/// unless it is told to.
-const LONGEST_HEADER: usize = 10_000;
+/// Maximum length of a header, which is NumPy's default limit. A matrix has about a hundred bytes.
+const MAX_HEADER_BYTES: usize = 10_000;
 
-/// Why a file isn't such a matrix.
+/// Reason why a file isn't a readable matrix.
 #[derive(Debug, PartialEq, thiserror::Error)]
-pub enum ArrayReason {
-    /// It isn't NumPy's at all.
-    #[error("it doesn't begin as one")]
-    Beginning,
-    /// A header that NumPy wouldn't read.
-    #[error("its header has {length} bytes; NumPy reads {LONGEST_HEADER}")]
-    LongHeader {
-        /// Its bytes.
-        length: usize,
-    },
-    /// A header without an entry of the right kind.
-    #[error("its header has no {0}")]
+pub(crate) enum ArrayReason {
+    #[error("magic string or version is wrong, or the header is incomplete")]
+    Preamble,
+    #[error("header has {length} bytes; the maximum is {MAX_HEADER_BYTES}")]
+    LongHeader { length: usize },
+    /// Header without a valid entry; contains the entry's name and type.
+    #[error("header has no {0}")]
     Entry(&'static str),
-    /// Another shape.
-    #[error("its shape is {0:?}")]
+    #[error("shape is {0:?}")]
     Shape(Vec<usize>),
-    /// Something else than numbers that are read.
-    #[error("it holds {0:?}")]
-    Kind(String),
-    /// Fewer numbers than its header says.
-    #[error("it is cut short")]
+    #[error("element type is {0:?}, not a float")]
+    ElementType(String),
+    /// Fewer numbers than the header's shape requires.
+    #[error("file is cut short")]
     CutShort,
 }
 
-/// Numbers of a two-dimensional array, row by row.
+/// Two-dimensional array, row by row.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Matrix {
     pub(crate) rows: usize,
@@ -38,42 +30,41 @@ pub(crate) struct Matrix {
     pub(crate) numbers: Vec<f64>,
 }
 
-/// Reads a whole file.
+/// Reads a matrix of floats from a file's bytes.
 pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, ArrayReason> {
-    let (header, data) = parts(bytes).ok_or(ArrayReason::Beginning)?;
-    if header.len() > LONGEST_HEADER {
+    let (header, data) = split_header(bytes).ok_or(ArrayReason::Preamble)?;
+    if header.len() > MAX_HEADER_BYTES {
         return Err(ArrayReason::LongHeader { length: header.len() });
     }
-    let kind = entry(header, "descr")
-        .and_then(quoted)
+    let element_type = entry(header, "descr")
+        .and_then(parse_string)
         .ok_or(ArrayReason::Entry("descr that is a string"))?;
     let is_by_columns = entry(header, "fortran_order")
-        .and_then(truth)
+        .and_then(parse_bool)
         .ok_or(ArrayReason::Entry("fortran_order that is True or False"))?;
     let shape = entry(header, "shape")
-        .and_then(lengths)
-        .ok_or(ArrayReason::Entry("shape of whole numbers"))?;
+        .and_then(parse_shape)
+        .ok_or(ArrayReason::Entry("shape of integers"))?;
     let [rows, columns] = shape[..] else { return Err(ArrayReason::Shape(shape)) };
     let count = rows.checked_mul(columns).ok_or(ArrayReason::Shape(shape))?;
-    let stored = match kind {
+    let stored = match element_type {
         "<f8" | "=f8" => numbers(data, count, f64::from_le_bytes),
         ">f8" => numbers(data, count, f64::from_be_bytes),
         "<f4" | "=f4" => numbers(data, count, |bytes| f64::from(f32::from_le_bytes(bytes))),
         ">f4" => numbers(data, count, |bytes| f64::from(f32::from_be_bytes(bytes))),
-        _ => return Err(ArrayReason::Kind(kind.to_owned())),
+        _ => return Err(ArrayReason::ElementType(element_type.to_owned())),
     };
     let stored = stored.ok_or(ArrayReason::CutShort)?;
     let numbers = if is_by_columns {
-        let at = |i: usize| stored[i % columns * rows + i / columns];
-        (0..count).map(at).collect()
+        (0..count).map(|i| stored[i % columns * rows + i / columns]).collect()
     } else {
         stored
     };
     Ok(Matrix { rows, columns, numbers })
 }
 
-/// The header's text and the data behind it.
-fn parts(bytes: &[u8]) -> Option<(&str, &[u8])> {
+/// Splits a file into the header's text and the data after it.
+fn split_header(bytes: &[u8]) -> Option<(&str, &[u8])> {
     let rest = bytes.strip_prefix(b"\x93NUMPY")?;
     let (length, rest) = match *rest {
         [1, _, a, b, ref rest @ ..] => (u32::from(u16::from_le_bytes([a, b])), rest),
@@ -84,21 +75,21 @@ fn parts(bytes: &[u8]) -> Option<(&str, &[u8])> {
     Some((std::str::from_utf8(header).ok()?, data))
 }
 
-/// What stands behind a key of the header, a Python dictionary, up to its end.
+/// Returns the header's text after a key; the header is a Python dictionary.
 fn entry<'a>(header: &'a str, key: &str) -> Option<&'a str> {
     let keys = [format!("'{key}':"), format!("\"{key}\":")];
     let rest = keys.iter().find_map(|key| Some(header.split_once(key.as_str())?.1))?;
     Some(rest.trim_start())
 }
 
-/// The string that a text begins with, between quotes.
-fn quoted(text: &str) -> Option<&str> {
+/// Parses the quoted string at the beginning of a text.
+fn parse_string(text: &str) -> Option<&str> {
     let quote = text.chars().next().filter(|c| matches!(c, '\'' | '"'))?;
     Some(text[1..].split_once(quote)?.0)
 }
 
-/// The truth value that a text begins with, before the next entry.
-fn truth(text: &str) -> Option<bool> {
+/// Parses Python's `True` or `False` at the beginning of a text.
+fn parse_bool(text: &str) -> Option<bool> {
     match text.split([',', '}']).next()?.trim_end() {
         "True" => Some(true),
         "False" => Some(false),
@@ -106,14 +97,14 @@ fn truth(text: &str) -> Option<bool> {
     }
 }
 
-/// The lengths in the brackets that a text begins with. Python 2 wrote `20L`.
-fn lengths(text: &str) -> Option<Vec<usize>> {
+/// Parses the tuple of integers at the beginning of a text. Python 2 wrote `20L`.
+fn parse_shape(text: &str) -> Option<Vec<usize>> {
     let (lengths, _) = text.strip_prefix('(')?.split_once(')')?;
     let words = lengths.split(',').map(str::trim).filter(|word| !word.is_empty());
     words.map(|word| word.strip_suffix('L').unwrap_or(word).parse().ok()).collect()
 }
 
-/// So many numbers; none where the data have fewer, before anything is allocated.
+/// Decodes `count` numbers; `None`, without an allocation, if the data have fewer.
 fn numbers<const N: usize>(
     data: &[u8],
     count: usize,
@@ -168,14 +159,14 @@ mod tests {
         let data = [0; 48];
         let huge = format!("({0}, {0})", usize::MAX);
         for (kind, shape, words) in [
-            ("'<i8'", "(2, 3)", "it holds \"<i8\""),
+            ("'<i8'", "(2, 3)", "element type is \"<i8\""),
             ("[('x', '<f8')]", "(2, 3)", "no descr"),
-            ("'<f8'", "(2, 3, 1)", "its shape is [2, 3, 1]"),
-            ("'<f8'", "()", "its shape is []"),
+            ("'<f8'", "(2, 3, 1)", "shape is [2, 3, 1]"),
+            ("'<f8'", "()", "shape is []"),
             ("'<f8'", "(2, -3)", "no shape"),
             ("'<f8'", "((((2, 3))))", "no shape"),
             ("'<f8'", "(2, 4)", "cut short"),
-            ("'<f8'", &huge, "its shape is"),
+            ("'<f8'", &huge, "shape is"),
         ] {
             let reason =
                 read_matrix(&file(1, &header(kind, shape), &data)).unwrap_err().to_string();
@@ -203,23 +194,23 @@ mod tests {
     fn headers_that_cannot_be_are_refused_in_words() {
         let (good, data) = (header("'<f8'", "(2, 3)"), [0; 48]);
         for version in [0, 4, 255] {
-            assert_refused(&file(version, &good, &data), "it doesn't begin as one");
+            assert_refused(&file(version, &good, &data), "magic string or version is wrong");
         }
         // One that claims to reach beyond the file: by a byte, and as far as can be.
         let all = (good.len() + data.len()) as u32;
-        assert_refused(&claiming(all + 1, &good, &data), "it doesn't begin as one");
-        assert_refused(&claiming(u32::MAX, &good, &data), "it doesn't begin as one");
+        assert_refused(&claiming(all + 1, &good, &data), "magic string or version is wrong");
+        assert_refused(&claiming(u32::MAX, &good, &data), "magic string or version is wrong");
         // One without length, and one that reaches into the data, which aren't text.
         assert_refused(&claiming(0, &good, &data), "no descr");
         let numbers = [0xff; 48];
         let mut reaching = file(1, &good, &numbers);
         reaching[8] += 1;
-        assert_refused(&reaching, "it doesn't begin as one");
+        assert_refused(&reaching, "magic string or version is wrong");
         for order in ["", "Truth", "1", "'True'", "true", "None"] {
             let odd = file(1, &padded_header("<f8", order), &data);
             assert_refused(&odd, "no fortran_order that is True or False");
         }
-        for (length, is_read) in [(LONGEST_HEADER, true), (LONGEST_HEADER + 1, false)] {
+        for (length, is_read) in [(MAX_HEADER_BYTES, true), (MAX_HEADER_BYTES + 1, false)] {
             let padded = good.clone() + &" ".repeat(length - good.len());
             assert_eq!(read_matrix(&file(2, &padded, &data)).is_ok(), is_read, "{length}");
         }

@@ -2,11 +2,11 @@ use std::fmt;
 
 use serde::de::{Deserialize, Deserializer, Error, Unexpected, Visitor};
 
-/// A number of a JSON file; also what Python writes that JSON doesn't have, once [`words_as_text`]
-/// has made text of it.
+/// Number in a JSON file, including Python's non-finite numbers after [`quote_python_numbers`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Number(pub(crate) f64);
 
+/// Python's words for numbers that JSON lacks.
 const WORDS: [(&str, f64); 3] =
     [("NaN", f64::NAN), ("-Infinity", f64::NEG_INFINITY), ("Infinity", f64::INFINITY)];
 
@@ -44,9 +44,9 @@ impl Visitor<'_> for NumberOrWord {
     }
 }
 
-/// JSON in which Python's words for what is no number stand in quotes, so that they can be parsed
-/// and their places named. `None` where there are none.
-pub(crate) fn words_as_text(json: &str) -> Option<String> {
+/// Puts quotes around Python's `NaN` and `Infinity` outside strings, so that JSON with them can be
+/// parsed; `None` if there are none.
+pub(crate) fn quote_python_numbers(json: &str) -> Option<String> {
     let (mut text, mut rest, mut is_string) = (String::with_capacity(json.len() + 64), json, false);
     while let Some(next) = rest.chars().next() {
         let word = WORDS
@@ -59,7 +59,7 @@ pub(crate) fn words_as_text(json: &str) -> Option<String> {
                 rest = &rest[word.len()..];
                 continue;
             }
-            // What is escaped ends no string.
+            // An escaped quote doesn't end the string.
             (None, '\\') if is_string => 1 + rest[1..].chars().next().map_or(0, char::len_utf8),
             (None, '"') => {
                 is_string = !is_string;
@@ -78,14 +78,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_are_numbers_outside_of_names_alone() {
+    fn only_words_outside_strings_are_numbers() {
         let json = r#"{"NaN.png \" Infinity": [1, NaN, -Infinity, Infinity, "NaN é", -2.5e3]}"#;
-        let text = words_as_text(json).unwrap();
+        let text = quote_python_numbers(json).unwrap();
         assert_eq!(
             text,
             r#"{"NaN.png \" Infinity": [1, "NaN", "-Infinity", "Infinity", "NaN é", -2.5e3]}"#
         );
-        assert_eq!(words_as_text(r#"{"Infinity": [1]}"#), None);
+        assert_eq!(quote_python_numbers(r#"{"Infinity": [1]}"#), None);
         let numbers: Vec<Number> =
             serde_json::from_str(r#"[1, -1, "NaN", "-Infinity", "Infinity", 0.5]"#).unwrap();
         assert!(numbers[2].0.is_nan());

@@ -1,5 +1,7 @@
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, Cursor, Seek};
+use std::iter::Sum;
+use std::ops::Add;
 use std::path::Path;
 
 use image::metadata::Orientation;
@@ -10,18 +12,15 @@ use pixels::{
 };
 use scene::{Intrinsics, undistort_image};
 
-use crate::clipping::Clipping;
-use crate::error::DatasetError;
-use crate::frame::Frame;
-use crate::frame_reason::FrameReason;
+use crate::error::{DatasetError, FrameReason};
+use crate::frame::{Frame, Turn};
 use crate::jpeg::{END_MARKER, Extent, extent};
-use crate::turn::Turn;
-use crate::unread::refusal;
+use crate::unread::unsupported_error;
 
-/// Extensions of the images that are read.
+/// Extensions of supported images.
 pub(crate) const IMAGE_EXTENSIONS: [&str; 4] = [".png", ".jpg", ".jpeg", ".exr"];
 
-/// True if a file's name is that of an image.
+/// True if a file's name is that of a supported image.
 pub fn is_image_name(path: &Path) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "exr"))
@@ -35,7 +34,11 @@ fn io_error(path: &Path, source: io::Error) -> PixelError {
     PixelError::Io { path: path.to_path_buf(), source }
 }
 
-/// Opens a decoder of a PNG or JPEG, recognised by content rather than by name.
+fn format_error(path: &Path, reason: String) -> PixelError {
+    PixelError::Format { path: path.to_path_buf(), reason }
+}
+
+/// Creates the decoder of a PNG or JPEG, recognised by content rather than by name.
 fn decoder<R: BufRead + Seek + 'static>(
     file: R,
     path: &Path,
@@ -48,158 +51,203 @@ fn decoder<R: BufRead + Seek + 'static>(
     let reason = match reader.format() {
         Some(ImageFormat::Png | ImageFormat::Jpeg) => match reader.into_decoder() {
             Ok(decoder) => return Ok(decoder),
-            Err(error) => format!("its header can't be read ({})", error.to_string().trim_end()),
+            Err(error) => format!("cannot read its header ({})", error.to_string().trim_end()),
         },
-        _ => match refusal(path) {
+        _ => match unsupported_error(path) {
             Some(error) => return Err(error),
             None => "neither PNG, JPEG nor EXR".to_owned(),
         },
     };
-    Err(PixelError::Format { path: path.to_path_buf(), reason })
+    Err(format_error(path, reason))
 }
 
 /// Size and orientation of an image, from its header.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Stored {
-    /// Columns and rows.
+pub(crate) struct ImageHeader {
+    /// Width and height of the stored image.
     pub(crate) size: (u32, u32),
-    /// Turn that its EXIF data ask for.
+    /// Orientation from EXIF data.
     pub(crate) orientation: Orientation,
 }
 
-impl Stored {
-    /// True if EXIF asks for a quarter turn.
+impl ImageHeader {
+    /// True if EXIF requires a quarter turn.
     pub(crate) fn is_sideways(self) -> bool {
         use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
         matches!(self.orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
     }
 
-    /// Treatment of the image where its camera's shape doesn't settle that.
+    /// Returns the treatment of the orientation if the camera's shape doesn't settle it.
     pub(crate) fn assumed_turn(self) -> Turn {
         if self.orientation == Orientation::NoTransforms { Turn::Stored } else { Turn::Assumed }
     }
 }
 
-/// Looks at an image's header.
-pub(crate) fn look(path: &Path) -> Result<Stored, PixelError> {
-    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
+/// Reads size and orientation from an image's header.
+pub(crate) fn read_header(path: &Path) -> Result<ImageHeader, PixelError> {
     if is_exr(path) {
         let (width, height) = exr_size(path)?;
         let size = (width as u32, height as u32);
-        return Ok(Stored { size, orientation: Orientation::NoTransforms });
+        return Ok(ImageHeader { size, orientation: Orientation::NoTransforms });
     }
     let file = File::open(path).map_err(|source| io_error(path, source))?;
     let mut decoder = decoder(BufReader::new(file), path)?;
     let (width, height) = decoder.dimensions();
     if width == 0 || height == 0 {
-        return Err(format(format!("{width}×{height} pixels")));
+        return Err(format_error(path, format!("{width}×{height} pixels")));
     }
     if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 {
         let (width, height) = (width as usize, height as usize);
         return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
     }
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    Ok(Stored { size: (width, height), orientation })
+    Ok(ImageHeader { size: (width, height), orientation })
 }
 
-/// Returns the intrinsics for the stored image, whose size may differ from the camera's, but not in
-/// shape, and the treatment of its EXIF orientation.
-pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, Turn), FrameReason> {
+/// Resizes a camera to the stored image, stored or turned; returns the intrinsics and the treatment
+/// of the EXIF orientation. Fails if the aspect ratios differ.
+pub(crate) fn fit_camera(
+    k: Intrinsics,
+    stored: ImageHeader,
+) -> Result<(Intrinsics, Turn), FrameReason> {
     let (width, height) = stored.size;
-    let is_turned_fit = stored.is_sideways() && has_shape_of(&k, height, width);
+    let is_turned_fit = stored.is_sideways() && has_aspect_of(&k, height, width);
     let is_turned_exactly = stored.is_sideways() && (k.height, k.width) == stored.size;
     if (k.width, k.height) == stored.size {
         let is_settled = stored.is_sideways() && width != height;
         Ok((k, if is_settled { Turn::Stored } else { stored.assumed_turn() }))
-    } else if has_shape_of(&k, width, height) && !is_turned_exactly {
+    } else if has_aspect_of(&k, width, height) && !is_turned_exactly {
         let is_settled = stored.is_sideways() && !is_turned_fit;
         let turn = if is_settled { Turn::Stored } else { stored.assumed_turn() };
         Ok((k.resized(width, height), turn))
     } else if is_turned_fit {
         Ok((k.resized(height, width), Turn::Upright))
     } else {
-        Err(FrameReason::Shape { image: stored.size, camera: (k.width, k.height) })
+        Err(FrameReason::AspectRatio { image: stored.size, camera: (k.width, k.height) })
     }
 }
 
-/// True if an image of a size may be a smaller copy of the camera's.
-pub(crate) fn has_shape_of(k: &Intrinsics, width: u32, height: u32) -> bool {
-    let (across, down) = (
-        f64::from(width) / f64::from(k.width.max(1)),
-        f64::from(height) / f64::from(k.height.max(1)),
-    );
-    // A smaller copy's sides are rounded.
-    (across / down - 1.0).abs() <= 0.01 + 1.0 / f64::from(width.min(height).max(1))
+/// Maximum deviation between the aspect ratios of an image and its camera, in addition to rounding;
+/// chosen by hand.
+const MAX_ASPECT_DEVIATION: f64 = 0.01;
+
+/// True if an image of a size may be a resized copy of the camera's.
+pub(crate) fn has_aspect_of(k: &Intrinsics, width: u32, height: u32) -> bool {
+    let x_scale = f64::from(width) / f64::from(k.width.max(1));
+    let y_scale = f64::from(height) / f64::from(k.height.max(1));
+    let rounding = 1.0 / f64::from(width.min(height).max(1));
+    (x_scale / y_scale - 1.0).abs() <= MAX_ASPECT_DEVIATION + rounding
 }
 
-/// Reads an image with its stored pixels, or turned as its EXIF data ask. One that isn't whole is
-/// refused.
-fn read(path: &Path, turned: bool) -> Result<(Rgba8, Clipping), PixelError> {
-    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
+/// Reads an image, as stored or turned upright by EXIF. Fails if the image is incomplete.
+fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelError> {
     if is_exr(path) {
-        return encoded(path);
+        return read_exr_photograph(path);
     }
     let mut bytes = fs::read(path).map_err(|source| io_error(path, source))?;
     if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
-        complete(&mut bytes).map_err(format)?;
+        complete_jpeg(&mut bytes).map_err(|reason| format_error(path, reason))?;
     }
     let mut decoder = decoder(Cursor::new(bytes), path)?;
-    let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
-        .map_err(|e| format(format!("not a whole image ({e})")))?;
-    if turned {
-        image.apply_orientation(turn);
+        .map_err(|e| format_error(path, format!("incomplete or damaged image ({e})")))?;
+    if is_upright {
+        image.apply_orientation(orientation);
     }
     Ok((image.into(), Clipping::default()))
 }
 
-/// Refuses a JPEG that lacks image data, which its decoder would replace by grey. A missing end
-/// marker is added: without it the decoder leaves out the last rows.
-fn complete(jpeg: &mut Vec<u8>) -> Result<(), String> {
+/// Fails if a JPEG lacks image data, which its decoder would replace by grey. Adds a missing end
+/// marker, without which the decoder omits the last rows.
+fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<(), String> {
     match extent(jpeg) {
         Extent::Whole => Ok(()),
         Extent::Unterminated => {
             jpeg.extend(END_MARKER);
             Ok(())
         }
-        Extent::Missing { rows, of } => {
-            Err(format!("cut short or damaged: {rows} of {of} rows are missing"))
+        Extent::Missing { rows, height } => {
+            Err(format!("cut short or damaged: {rows} of {height} rows are missing"))
         }
-        Extent::Coarse { scan, rows } => Err(format!(
-            "cut short or damaged in scan {scan} of a progressive JPEG: detail of all {rows} rows is \
-            missing"
+        Extent::Coarse { scan, height } => Err(format!(
+            "cut short or damaged in scan {scan} of a progressive JPEG: detail of all {height} rows \
+            is missing"
         )),
     }
 }
 
-/// An EXR's linear light, display-encoded.
-fn encoded(path: &Path) -> Result<(Rgba8, Clipping), PixelError> {
+/// Reads an EXR with linear light and encodes it for display.
+fn read_exr_photograph(path: &Path) -> Result<(Rgba8, Clipping), PixelError> {
     let image = read_exr(path)?.with_finite(&COLOUR_CHANNELS, path)?;
-    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
-    let [r, g, b] = ["R", "G", "B"]
-        .map(|name| image.channel(name).ok_or_else(|| format(format!("no channel {name}"))));
+    let [r, g, b] = ["R", "G", "B"].map(|name| {
+        image.channel(name).ok_or_else(|| format_error(path, format!("no channel {name}")))
+    });
     let (r, g, b, a) = (r?, g?, b?, image.channel("A"));
-    let pixel = |i: usize| ([r[i], g[i], b[i]], a.map_or(1.0, |a| a[i]));
-    let count = image.width * image.height;
-    let pixels = (0..count).map(pixel).flat_map(|(colour, alpha)| encoded_pixel(colour, alpha));
-    let encoded = Rgba8::new(image.width, image.height, pixels.collect());
-    let clipping = (0..count).map(pixel).map(|(colour, alpha)| Clipping::of_pixel(colour, alpha));
-    Ok((encoded, clipping.sum()))
+    let mut data = Vec::with_capacity(4 * r.len());
+    let mut clipping = Clipping::default();
+    for i in 0..r.len() {
+        let (colour, alpha) = ([r[i], g[i], b[i]], a.map_or(1.0, |a| a[i]));
+        data.extend(encode_pixel(colour, alpha));
+        clipping = clipping + Clipping::of_pixel(colour, alpha);
+    }
+    Ok((Rgba8::new(image.width, image.height, data), clipping))
 }
 
-/// EXR files keep premultiplied colours, ours straight ones.
-fn encoded_pixel(colour: [f32; 3], alpha: f32) -> [u8; 4] {
-    let encode = |v: f32| to_u8(srgb_from_linear(f64::from((v / alpha).clamp(0.0, 1.0))) as f32);
-    let [r, g, b] = colour.map(|v| if alpha > 0.0 { encode(v) } else { 0 });
+/// Encodes a premultiplied linear colour as straight 8-bit sRGB.
+fn encode_pixel(colour: [f32; 3], alpha: f32) -> [u8; 4] {
+    if alpha <= 0.0 {
+        return [0, 0, 0, to_u8(alpha)];
+    }
+    let [r, g, b] = colour.map(|v| {
+        let straight = (v / alpha).clamp(0.0, 1.0);
+        to_u8(srgb_from_linear(f64::from(straight)) as f32)
+    });
     [r, g, b, to_u8(alpha)]
+}
+
+/// Maximum relative excess over 1 of a colour divided by its alpha that rounding to half floats
+/// explains.
+const HALF_ROUNDING: f32 = 1.0 / 1024.0;
+
+/// Number of pixels whose colour is clipped to 1. Only EXR files have brighter pixels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Clipping {
+    /// Number of clipped pixels.
+    pub clipped: u64,
+    /// Number of pixels of the EXR files.
+    pub pixels: u64,
+}
+
+impl Clipping {
+    /// Counts one pixel of a premultiplied colour.
+    fn of_pixel(colour: [f32; 3], alpha: f32) -> Self {
+        let limit = alpha * (1.0 + HALF_ROUNDING);
+        let is_clipped = alpha > 0.0 && colour.iter().any(|value| *value > limit);
+        Self { clipped: is_clipped.into(), pixels: 1 }
+    }
+}
+
+impl Add for Clipping {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self { clipped: self.clipped + other.clipped, pixels: self.pixels + other.pixels }
+    }
+}
+
+impl Sum for Clipping {
+    fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
+        all.fold(Self::default(), Self::add)
+    }
 }
 
 /// Bytes of an 8-bit RGBA pixel.
 const RGBA_BYTES: u64 = 4;
-/// Bytes that decoding a JPEG takes for a pixel besides: a progressive one's coefficients.
+/// Additional bytes per pixel while a JPEG is decoded: coefficients of a progressive one.
 const COEFFICIENT_BYTES: u64 = 6;
 
-/// Returns the bytes of memory that reading an image takes at its peak, by its header alone.
+/// Returns the peak memory of reading an image in bytes, estimated from its header.
 fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
     if is_exr(path) {
         let (width, height) = exr_size(path)?;
@@ -213,69 +261,64 @@ fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
 }
 
 impl Frame {
-    /// Returns the bytes of memory that [`Frame::photograph`] takes at its peak, by the image's
-    /// header.
+    /// Returns the peak memory of [`Frame::photograph`] in bytes, estimated from the image's header.
     pub fn reading_bytes(&self) -> Result<u64, DatasetError> {
         Ok(reading_bytes(&self.image)?)
     }
 
-    /// The image that [`Frame::camera`] sees: as it was taken, or with its distortion undone, as
-    /// sharp as it was.
+    /// Reads the image of [`Frame::camera`], as taken or with its distortion removed.
     pub fn photograph(&self) -> Result<Rgba8, DatasetError> {
         Ok(self.photograph_and_clipping()?.0)
     }
 
-    /// Returns [`Frame::photograph`], and how many of its pixels were brighter than white.
+    /// Reads [`Frame::photograph`], and counts its pixels brighter than 1.
     pub fn photograph_and_clipping(&self) -> Result<(Rgba8, Clipping), DatasetError> {
-        let (image, clipping) = read(&self.image, self.turn == Turn::Upright)?;
-        let k = self.taken_with;
+        let (image, clipping) = read_image(&self.image, self.turn == Turn::Upright)?;
+        let k = self.stored_intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
             let reason = format!(
-                "{}×{} pixels where its camera has {}×{}",
+                "image is {}×{} pixels, its camera {}×{}",
                 image.width, image.height, k.width, k.height
             );
-            return Err(PixelError::Format { path: self.image.clone(), reason }.into());
+            return Err(format_error(&self.image, reason).into());
         }
-        Ok((self.seen(image), clipping))
+        Ok((self.without_distortion(image), clipping))
     }
 
-    /// Returns which of [`Frame::photograph`]'s pixels count: those of its mask whose rays the lens
-    /// has. `None` if all do. A mask of another size than the photograph's is resampled by nearest
-    /// neighbour.
+    /// Returns the mask of [`Frame::photograph`]: pixels that count in its mask file and have a ray.
+    /// `None` if all pixels count. A mask file of a different size is resampled by nearest neighbour.
     pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
         let lens = self.intrinsics().lens_mask();
         let Some(file) = &self.mask else { return Ok(lens) };
-        let (image, _) = read(&file.path, self.turn == Turn::Upright)?;
-        let size = (self.taken_with.width as usize, self.taken_with.height as usize);
-        let mut mask = Mask::of(&self.seen(nearest(&image, size)));
-        if file.kind.is_inverted() {
-            mask.counts.iter_mut().for_each(|counts| *counts = !*counts);
-        }
-        if let Some(lens) = lens {
-            let counts = mask.counts.iter_mut().zip(lens.counts);
-            counts.for_each(|(counts, has_ray)| *counts &= has_ray);
+        let (image, _) = read_image(&file.path, self.turn == Turn::Upright)?;
+        let k = self.stored_intrinsics;
+        let resized = resize_nearest(&image, (k.width as usize, k.height as usize));
+        let mut mask = Mask::of(&self.without_distortion(resized));
+        for (i, counts) in mask.counts.iter_mut().enumerate() {
+            let has_ray = lens.as_ref().is_none_or(|lens| lens.counts[i]);
+            *counts = (*counts != file.kind.is_inverted()) && has_ray;
         }
         Ok(Some(mask))
     }
 
-    /// Returns an image of the photograph's pixels as the camera sees it.
-    fn seen(&self, image: Rgba8) -> Rgba8 {
+    /// Resamples an image of the stored size to the pinhole camera, if distortion is removed.
+    fn without_distortion(&self, image: Rgba8) -> Rgba8 {
         match &self.pinhole {
-            Some(pinhole) => undistort_image(&image, &self.taken_with, pinhole),
+            Some(pinhole) => undistort_image(&image, &self.stored_intrinsics, pinhole),
             None => image,
         }
     }
 }
 
-/// Returns an image at another size: each pixel is that of the nearest pixel centre.
-fn nearest(image: &Rgba8, (width, height): (usize, usize)) -> Rgba8 {
+/// Resizes an image by nearest neighbour.
+fn resize_nearest(image: &Rgba8, (width, height): (usize, usize)) -> Rgba8 {
     let mut data = Vec::with_capacity(4 * width * height);
     for y in 0..height {
         let row = (2 * y + 1) * image.height / (2 * height);
         for x in 0..width {
             let column = (2 * x + 1) * image.width / (2 * width);
-            let at = 4 * (row * image.width + column);
-            data.extend_from_slice(&image.data[at..at + 4]);
+            let first = 4 * (row * image.width + column);
+            data.extend_from_slice(&image.data[first..first + 4]);
         }
     }
     Rgba8::new(width, height, data)
@@ -311,27 +354,27 @@ pub(crate) mod tests {
             .unwrap();
         std::fs::write(&path, &bytes).unwrap();
         assert_eq!(
-            look(&path).unwrap(),
-            Stored { size: (32, 16), orientation: Orientation::NoTransforms }
+            read_header(&path).unwrap(),
+            ImageHeader { size: (32, 16), orientation: Orientation::NoTransforms }
         );
-        let read = super::read(&path, false).unwrap().0;
+        let read = super::read_image(&path, false).unwrap().0;
         let worst = read.data.iter().zip(&image.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst < 12, "{worst}");
         for end in 0..bytes.len() {
             std::fs::write(&path, &bytes[..end]).unwrap();
-            drop(super::read(&path, false));
+            drop(super::read_image(&path, false));
         }
-        // What its header says is looked at before anything is allocated, and the limit is said.
+        // The header is checked before anything is allocated, and the message names the limit.
         let mut huge = bytes.clone();
         let frame = huge.windows(2).position(|marker| marker == b"\xff\xc0").unwrap();
         huge[frame + 5..frame + 9]
             .copy_from_slice(&[20_000u16.to_be_bytes(), 20_000u16.to_be_bytes()].concat());
         std::fs::write(&path, &huge).unwrap();
-        let message = look(&path).unwrap_err().to_string();
+        let message = read_header(&path).unwrap_err().to_string();
         assert!(
             message.ends_with(
-                "20000×20000 pixels exceed the limit of 268435456 (16384×16384, for \
-                    example): make the image smaller"
+                "20000×20000 pixels exceed the limit of 268435456 (such as 16384×16384); make the \
+                image smaller"
             ),
             "{message}"
         );
@@ -344,24 +387,32 @@ pub(crate) mod tests {
         );
         turned.extend(&bytes[2..]);
         std::fs::write(&path, &turned).unwrap();
-        let stored = look(&path).unwrap();
+        let stored = read_header(&path).unwrap();
         assert!(stored.size == (32, 16) && stored.is_sideways());
         let of = |width, height| Intrinsics::from_angle_x(width, height, 0.5);
-        assert_eq!(fitted(of(32, 16), stored).unwrap(), (of(32, 16), Turn::Stored));
-        assert_eq!(fitted(of(64, 32), stored).unwrap(), (of(64, 32).resized(32, 16), Turn::Stored));
-        assert_eq!(fitted(of(16, 32), stored).unwrap(), (of(16, 32), Turn::Upright));
-        assert!(fitted(of(32, 32), stored).unwrap_err().to_string().contains("another shape"));
-        let upright = super::read(&path, true).unwrap().0;
+        assert_eq!(fit_camera(of(32, 16), stored).unwrap(), (of(32, 16), Turn::Stored));
+        assert_eq!(
+            fit_camera(of(64, 32), stored).unwrap(),
+            (of(64, 32).resized(32, 16), Turn::Stored)
+        );
+        assert_eq!(fit_camera(of(16, 32), stored).unwrap(), (of(16, 32), Turn::Upright));
+        assert!(
+            fit_camera(of(32, 32), stored)
+                .unwrap_err()
+                .to_string()
+                .contains("aspect ratios must match")
+        );
+        let upright = super::read_image(&path, true).unwrap().0;
         assert_eq!((upright.width, upright.height), (16, 32));
         assert!(
             upright.data[0] < 20 && upright.data[1] > 200,
             "its bottom left corner is now its top left one"
         );
         std::fs::write(&path, "no image").unwrap();
-        assert!(look(&path).unwrap_err().to_string().contains("a.png"));
+        assert!(read_header(&path).unwrap_err().to_string().contains("a.png"));
         let other = dir.path().join("a.dat");
         std::fs::write(&other, "no image").unwrap();
-        assert!(look(&other).unwrap_err().to_string().contains("neither PNG, JPEG nor EXR"));
+        assert!(read_header(&other).unwrap_err().to_string().contains("neither PNG, JPEG nor EXR"));
     }
 
     /// A NaN is neither black nor transparent, and an infinity isn't white.
@@ -375,7 +426,7 @@ pub(crate) mod tests {
                 (r, g, b, a)
             })
             .unwrap();
-            super::read(&path, false)
+            super::read_image(&path, false)
         };
         assert!(read_with([1e9, -1.0, 0.0, 1.0]).is_ok());
         for (index, channel) in COLOUR_CHANNELS.into_iter().enumerate() {
@@ -395,7 +446,7 @@ pub(crate) mod tests {
         let path = dir.path().join("a.jpg");
         let read = |bytes: &[u8]| {
             fs::write(&path, bytes).unwrap();
-            super::read(&path, false).map_err(|error| error.to_string())
+            super::read_image(&path, false).map_err(|error| error.to_string())
         };
         let bytes = jpeg((40, 64), Some(SamplingFactor::R_4_2_0), false, 3);
         let whole = read(&bytes).unwrap();
@@ -411,7 +462,7 @@ pub(crate) mod tests {
             (&bytes[..third], "a.jpg: cut short or damaged: 32 of 64 rows are missing; export"),
             (&bytes[..bytes.len() - 9], "a.jpg: cut short or damaged: 16 of 64 rows are missing;"),
             (&bytes[..100], "a.jpg: cut short or damaged: 64 of 64 rows are missing; export"),
-            (&bytes[..20], "a.jpg: its header can't be read (Format error"),
+            (&bytes[..20], "a.jpg: cannot read its header (Format error"),
             (&progressive[..progressive.len() - 1], "detail of all 64 rows is missing; export"),
         ] {
             let message = read(bytes).unwrap_err();
@@ -424,7 +475,7 @@ pub(crate) mod tests {
         [(128.0 + 90.0 * (6.0 * u).sin()) as u8, (128.0 + 90.0 * (5.0 * v).cos()) as u8, 60, 255]
     }
 
-    /// Where a distorted position comes from, by fixed-point iteration.
+    /// Returns the ray through a distorted position, by fixed-point iteration.
     fn ray_through(intrinsics: &Intrinsics, x: f64, y: f64) -> [f64; 2] {
         let seen = [(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy];
         let mut at = seen;

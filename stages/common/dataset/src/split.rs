@@ -1,26 +1,135 @@
-/// Which frames are for training and which for testing, by their numbers.
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use artifact::{counted, relative_path};
+
+use crate::file_reason::FileReason;
+use crate::lookup::{Located, Lookup, LookupError};
+
+/// Indices of training and test frames.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Split {
-    /// For training.
+    /// Indices of the training frames.
     pub train: Vec<usize>,
-    /// For testing.
+    /// Indices of the test frames.
     pub test: Vec<usize>,
 }
 
 impl Split {
-    /// Every frame for both: the paper's way with photographs.
+    /// Uses every frame for both training and testing: the paper's protocol for photographs.
     pub fn all(count: usize) -> Self {
         Self { train: (0..count).collect(), test: (0..count).collect() }
     }
 
-    /// Every `every`-th frame, the first among them, is for testing and for nothing else: LLFF's
-    /// way. One frame alone is both.
+    /// Holds out every `every`-th frame, starting with the first, for testing: LLFF's protocol. A
+    /// single frame is used for both.
     pub fn hold_out(count: usize, every: usize) -> Self {
         let (test, train): (Vec<_>, Vec<_>) = (0..count).partition(|i| i % every.max(1) == 0);
         if train.is_empty() { Self::all(count) } else { Self { train, test } }
     }
 }
 
+/// nerfstudio's lists of file names. An empty list counts as absent.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct SplitLists<'a> {
+    pub(crate) train: &'a [String],
+    pub(crate) test: &'a [String],
+    pub(crate) val: &'a [String],
+}
+
+/// Frames by the names and files that split lists may contain.
+#[derive(Debug, Default)]
+pub(crate) struct FrameNames {
+    by_name: BTreeMap<PathBuf, Vec<usize>>,
+}
+
+impl FrameNames {
+    /// Adds a frame with its name in the data set and its file.
+    pub(crate) fn add(&mut self, frame: usize, name: &str, file: PathBuf) {
+        let name = relative_path(name).unwrap_or_else(|_| PathBuf::from(name));
+        for path in BTreeSet::from([name, file]) {
+            self.by_name.entry(path).or_default().push(frame);
+        }
+    }
+
+    fn find(&self, name: &str, lookup: &mut Lookup) -> Result<&[usize], FileReason> {
+        let literal = relative_path(name).unwrap_or_else(|_| PathBuf::from(name));
+        if let Some(frames) = self.by_name.get(&literal) {
+            return Ok(frames);
+        }
+        let frames = match lookup.find_repeated(name) {
+            Ok(Located::File(file)) => self.by_name.get(&file.path),
+            Err(ambiguous @ LookupError::Ambiguous { .. }) => return Err(ambiguous.into()),
+            _ => None,
+        };
+        Ok(frames.map(Vec::as_slice).unwrap_or_default())
+    }
+}
+
+impl SplitLists<'_> {
+    /// Returns the split of `count` frames that the lists describe, with notes. Validation views are
+    /// test views if there are no others. If only one side is listed, unlisted frames are on the
+    /// other side.
+    pub(crate) fn split(
+        &self,
+        count: usize,
+        names: &FrameNames,
+        lookup: &mut Lookup,
+    ) -> Result<(Option<Split>, Vec<String>), FileReason> {
+        let mut notes = Vec::new();
+        let train = listed_frames("train_filenames", self.train, names, lookup, &mut notes)?;
+        let test = listed_frames("test_filenames", self.test, names, lookup, &mut notes)?;
+        let val = listed_frames("val_filenames", self.val, names, lookup, &mut notes)?;
+        let listed: BTreeSet<usize> = train.iter().chain(&test).chain(&val).copied().collect();
+        let unlisted: BTreeSet<usize> = (0..count).filter(|i| !listed.contains(i)).collect();
+        let mut split = [train, if test.is_empty() { val } else { test }];
+        for (side, noun) in [(0, "training view"), (1, "test view")] {
+            let is_missing = split[side].is_empty() && !split[1 - side].is_empty();
+            if is_missing && !unlisted.is_empty() {
+                let views = counted(unlisted.len(), noun);
+                notes.push(format!("{views}: the frames in no list"));
+                split[side].clone_from(&unlisted);
+            }
+        }
+        if split.iter().any(BTreeSet::is_empty) {
+            return Ok((None, notes));
+        }
+        let [train, test] = split.map(|frames| frames.into_iter().collect());
+        Ok((Some(Split { train, test }), notes))
+    }
+}
+
+/// Returns the frames of a list. Names without a frame are noted; a list of only such names is an
+/// error.
+fn listed_frames(
+    list: &'static str,
+    list_names: &[String],
+    names: &FrameNames,
+    lookup: &mut Lookup,
+    notes: &mut Vec<String>,
+) -> Result<BTreeSet<usize>, FileReason> {
+    let (mut found, mut unknown) = (BTreeSet::new(), Vec::new());
+    for name in list_names {
+        let frames = names.find(name, lookup)?;
+        found.extend(frames);
+        if frames.is_empty() {
+            unknown.push(name);
+        }
+    }
+    if let Some(first) = unknown.first() {
+        if found.is_empty() {
+            let (count, first) = (unknown.len(), (*first).clone());
+            return Err(FileReason::NoFrameListed { list, count, first });
+        }
+        let names = counted(list_names.len(), "name");
+        let have = if unknown.len() == 1 { "has" } else { "have" };
+        notes.push(format!(
+            "{} of {names} in {list} {have} no frame (first: {first})",
+            unknown.len()
+        ));
+    }
+    Ok(found)
+}
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,19 +1,25 @@
 use std::path::Path;
 
+use artifact::counted;
+
 use crate::error::DatasetError;
 use crate::file_reason::FileReason;
 
-/// A whole text file: UTF-8, with or without a byte order mark.
+/// Formats a count with its noun and verb, such as `1 mask has` or `2 masks have`.
+pub(crate) fn counted_with_verb(count: usize, noun: &str, [one, many]: [&str; 2]) -> String {
+    format!("{} {}", counted(count, noun), if count == 1 { one } else { many })
+}
+
+/// Reads a text file in UTF-8, with or without a byte order mark.
 pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {
-    let bytes = std::fs::read(path)
-        .map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })?;
-    decoded(bytes).map_err(|reason| DatasetError::format(path, reason))
+    let bytes = std::fs::read(path).map_err(|source| DatasetError::io(path, source))?;
+    decode(bytes).map_err(|reason| DatasetError::format(path, reason))
 }
 
 const UTF8_MARK: &[u8] = b"\xef\xbb\xbf";
 
-/// The text of a file, or what it is instead and what to do about that.
-fn decoded(mut bytes: Vec<u8>) -> Result<String, FileReason> {
+/// Decodes a file's text; fails with the encoding or the first word that isn't UTF-8.
+fn decode(mut bytes: Vec<u8>) -> Result<String, FileReason> {
     if is_utf16(&bytes) {
         return Err(FileReason::Utf16);
     }
@@ -21,19 +27,19 @@ fn decoded(mut bytes: Vec<u8>) -> Result<String, FileReason> {
         bytes.drain(..UTF8_MARK.len());
     }
     String::from_utf8(bytes).map_err(|error| {
-        let (bytes, place) = (error.as_bytes(), error.utf8_error().valid_up_to());
-        let line = 1 + bytes[..place].iter().filter(|b| **b == b'\n').count();
-        let (before, after) = bytes.split_at(place);
+        let (bytes, offset) = (error.as_bytes(), error.utf8_error().valid_up_to());
+        let line = 1 + bytes[..offset].iter().filter(|b| **b == b'\n').count();
+        let (before, after) = bytes.split_at(offset);
         let start = before.iter().rposition(u8::is_ascii_whitespace).map_or(0, |space| space + 1);
         let end = after
             .iter()
             .position(u8::is_ascii_whitespace)
-            .map_or(bytes.len(), |space| place + space);
-        FileReason::NoText { word: bytes[start..end].escape_ascii().to_string() }.on_line(line)
+            .map_or(bytes.len(), |space| offset + space);
+        FileReason::NotUtf8 { word: bytes[start..end].escape_ascii().to_string() }.on_line(line)
     })
 }
 
-/// Whether a byte order mark says so, or a null byte beside the first character.
+/// True if the text begins with a UTF-16 byte order mark, or has a null byte in its first character.
 fn is_utf16(bytes: &[u8]) -> bool {
     matches!(bytes, [0xff, 0xfe, ..] | [0xfe, 0xff, ..] | [0, _, ..] | [_, 0, ..])
 }
@@ -48,16 +54,19 @@ mod tests {
 
     #[test]
     fn marks_are_no_text_and_other_encodings_are_named() {
-        assert_eq!(decoded(b"\xef\xbb\xbf{}".to_vec()).unwrap(), "{}");
-        assert_eq!(decoded("Bäume\r\n".into()).unwrap(), "Bäume\r\n");
-        assert_eq!(decoded(Vec::new()).unwrap(), "");
+        assert_eq!(decode(b"\xef\xbb\xbf{}".to_vec()).unwrap(), "{}");
+        assert_eq!(decode("Bäume\r\n".into()).unwrap(), "Bäume\r\n");
+        assert_eq!(decode(Vec::new()).unwrap(), "");
         for text in ["{}", "\u{feff}{}"] {
             for bytes in [utf16(text, u16::to_le_bytes), utf16(text, u16::to_be_bytes)] {
-                assert_eq!(decoded(bytes).unwrap_err().to_string(), "is UTF-16; save it as UTF-8");
+                assert_eq!(
+                    decode(bytes).unwrap_err().to_string(),
+                    "file is UTF-16; save it as UTF-8"
+                );
             }
         }
         let latin = b"# list\n1 2 B\xe4ume.png \xff\n".to_vec();
-        let reason = decoded(latin).unwrap_err().to_string();
+        let reason = decode(latin).unwrap_err().to_string();
         assert!(
             reason.starts_with(r"line 2: B\xe4ume.png is not UTF-8; save the file as UTF-8"),
             "{reason}"

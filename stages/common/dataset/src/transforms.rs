@@ -5,24 +5,22 @@ use scene::{CameraError, Intrinsics};
 use serde::Deserialize;
 
 use crate::dataset::Dataset;
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FrameReason};
 use crate::file_reason::FileReason;
 use crate::format::Format;
-use crate::frame::Frame;
-use crate::frame_file::{FrameFile, Missing, lookup_of};
-use crate::frame_reason::FrameReason;
+use crate::frame::{Frame, Turn};
+use crate::frame_file::{FrameFile, MissingImages, lookup_of};
 use crate::lens_entry::LensEntry;
 use crate::number::Number;
-use crate::photograph::{Stored, fitted, look};
-use crate::turn::Turn;
+use crate::photograph::{ImageHeader, fit_camera, read_header};
 
-/// `transforms.json`. What a frame doesn't say for itself holds for all.
+/// Content of `transforms.json`; `shared` contains defaults for all frames.
 #[derive(Deserialize)]
 pub(crate) struct Transforms {
     #[serde(flatten)]
     pub(crate) shared: LensEntry,
     pub(crate) frames: Vec<FrameEntry>,
-    /// nerfstudio's own split, by file name.
+    /// File names of nerfstudio's split.
     pub(crate) train_filenames: Option<Vec<String>>,
     pub(crate) test_filenames: Option<Vec<String>>,
     pub(crate) val_filenames: Option<Vec<String>>,
@@ -33,17 +31,17 @@ pub(crate) struct FrameEntry {
     pub(crate) file_path: String,
     pub(crate) mask_path: Option<String>,
     pub(crate) depth_file_path: Option<String>,
-    /// `None` is `null`: what some programs write for a NaN.
+    /// Pose, row by row; `None` is `null`, which some programs write for NaN.
     transform_matrix: Vec<Vec<Option<Number>>>,
     #[serde(flatten)]
     own: LensEntry,
 }
 
-/// Reads `transforms.json`: instant-ngp's form and nerfstudio's.
+/// Reads `transforms.json`, the format of instant-ngp and nerfstudio.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let file = FrameFile::read(&folder.join("transforms.json"))?;
     let mut lookup = lookup_of(folder, &[&file]);
-    let read = file.frames(&mut lookup, Missing::LeftOut)?;
+    let read = file.frames(&mut lookup, MissingImages::Skipped)?;
     if read.frames.is_empty() {
         return Err(DatasetError::format(file.path(), FileReason::NoFrames));
     }
@@ -62,7 +60,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     Ok(Dataset { format: Format::Transforms, frames: read.frames, split, notes })
 }
 
-/// Reads a frame without its mask and depth.
+/// Reads a frame without its name, mask and depth.
 pub(crate) fn read_frame(
     image: PathBuf,
     entry: &FrameEntry,
@@ -71,25 +69,15 @@ pub(crate) fn read_frame(
     let mut camera_to_world = [[0.0; 4]; 3];
     let matrix = &entry.transform_matrix;
     if !(3..=4).contains(&matrix.len()) || matrix.iter().any(|row| row.len() != 4) {
-        return Err(FrameReason::Matrix);
+        return Err(FrameReason::MatrixSize);
     }
     for (row, values) in camera_to_world.iter_mut().enumerate() {
         for (column, value) in values.iter_mut().enumerate() {
             *value = matrix[row][column].map_or(f64::NAN, |number| number.0);
         }
     }
-    let (taken_with, turn) = intrinsics(&entry.own.or(shared), look(&image)?)?;
-    let frame = Frame {
-        name: String::new(),
-        image,
-        turn,
-        mask: None,
-        depth: None,
-        taken_with,
-        pinhole: None,
-        camera_to_world,
-        depths: None,
-    };
+    let fitted = intrinsics(&entry.own.or(shared), read_header(&image)?)?;
+    let frame = Frame::new(image, fitted, camera_to_world);
     match frame.check() {
         Ok(()) => Ok(frame),
         Err(
@@ -102,35 +90,36 @@ pub(crate) fn read_frame(
     }
 }
 
-/// What an image was taken with, and whether it has to be turned.
-fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, Turn), FrameReason> {
+/// Returns an image's intrinsics and the treatment of its EXIF orientation.
+fn intrinsics(entry: &LensEntry, stored: ImageHeader) -> Result<(Intrinsics, Turn), FrameReason> {
     let distortion = entry.distortion()?;
-    // The size that the numbers are for; the stored image may be a smaller copy.
-    let (width, height) =
-        (whole(entry.w, "w", stored.size.0)?, whole(entry.h, "h", stored.size.1)?);
-    let fx = focal(entry.fl_x, entry.camera_angle_x, "camera_angle_x", width)?;
-    let fy = focal(entry.fl_y, entry.camera_angle_y, "camera_angle_y", height)?;
+    // The size to which the intrinsics refer; the stored image may be a smaller copy.
+    let width = side_length(entry.w, "w", stored.size.0)?;
+    let height = side_length(entry.h, "h", stored.size.1)?;
+    let fx = focal_length(entry.fl_x, entry.camera_angle_x, "camera_angle_x", width)?;
+    let fy = focal_length(entry.fl_y, entry.camera_angle_y, "camera_angle_y", height)?;
     let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
         return Err(FrameReason::NoFocalLength);
     };
-    let or = |number: Option<Number>, otherwise: f64| number.map_or(otherwise, |number| number.0);
-    let (cx, cy) = (or(entry.cx, 0.5 * f64::from(width)), or(entry.cy, 0.5 * f64::from(height)));
-    let (k, turn) = fitted(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)?;
-    // A size that the file doesn't give is the stored image's, which proves nothing.
+    let cx = entry.cx.map_or(0.5 * f64::from(width), |cx| cx.0);
+    let cy = entry.cy.map_or(0.5 * f64::from(height), |cy| cy.0);
+    let (k, turn) = fit_camera(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)?;
+    // Without w and h the camera has the stored shape by assumption, which settles no turn.
     let is_assumed = turn == Turn::Stored && (entry.w.is_none() || entry.h.is_none());
     Ok((k, if is_assumed { stored.assumed_turn() } else { turn }))
 }
 
-fn whole(value: Option<Number>, name: &'static str, stored: u32) -> Result<u32, FrameReason> {
+/// Returns a side of the image in pixels; `stored` is the default.
+fn side_length(value: Option<Number>, name: &'static str, stored: u32) -> Result<u32, FrameReason> {
     match value {
         None => Ok(stored),
         Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
-        Some(Number(value)) => Err(FrameReason::Empty { name, value }),
+        Some(Number(value)) => Err(FrameReason::InvalidSide { name, value }),
     }
 }
 
-/// The focal length in pixels, as it is given or from the angle of view across `size` pixels.
-fn focal(
+/// Returns the focal length in pixels, given directly or by the angle of view across `size` pixels.
+fn focal_length(
     length: Option<Number>,
     angle: Option<Number>,
     name: &'static str,
@@ -143,7 +132,7 @@ fn focal(
         }
         (None, Some(Number(angle))) => {
             let focal = 0.5 / (0.5 * angle).tan();
-            Err(FrameReason::Angle { name, angle, focal })
+            Err(FrameReason::InvalidAngle { name, angle, focal })
         }
         (None, None) => Ok(None),
     }
@@ -182,7 +171,7 @@ mod tests {
         let head = r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1,
             "p2": 0.01, "camera_model": "OPENCV""#;
         let set = set(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
-        let of = |i: usize| set.frames[i].taken_with;
+        let of = |i: usize| set.frames[i].stored_intrinsics;
         let distortion = Distortion::brown([0.0; 3], [0.0, 0.01]);
         assert_eq!(
             of(0),
@@ -203,7 +192,7 @@ mod tests {
         assert!(
             set.notes
                 .iter()
-                .any(|n| n.contains("1 of 3 frames have no picture") && n.contains("gone.png")),
+                .any(|n| n.contains("1 of 3 frames have no image file") && n.contains("gone.png")),
             "{:?}",
             set.notes
         );
@@ -215,7 +204,7 @@ mod tests {
         let set =
             set(&frames(r#""fl_x": 200, "cx": 80, "cy": 60, "w": 160, "h": 120"#, "")).unwrap();
         assert_eq!(
-            set.frames[0].taken_with,
+            set.frames[0].stored_intrinsics,
             Intrinsics {
                 width: 40,
                 height: 30,
@@ -240,7 +229,9 @@ mod tests {
     }
 
     fn lens(head: &str) -> Distortion {
-        set(&frames(&format!(r#""fl_x": 50, {head}"#), "")).unwrap().frames[0].taken_with.distortion
+        set(&frames(&format!(r#""fl_x": 50, {head}"#), "")).unwrap().frames[0]
+            .stored_intrinsics
+            .distortion
     }
 
     /// The same letters are other coefficients in other models.
@@ -281,9 +272,9 @@ mod tests {
             (r#""fl_x": 50, "camera_model": "FISHEYE624""#, "", "\"FISHEYE624\" is not supported"),
             (r#""fl_x": 50, "latlong": true"#, "", "latlong"),
             (r#""fl_x": 50, "k4": Infinity"#, "", "k4 inf"),
-            (r#""fl_x": 50, "w": 40, "h": 40"#, "", "another shape"),
+            (r#""fl_x": 50, "w": 40, "h": 40"#, "", "aspect ratios must match"),
             (r#""fl_x": 50, "w": 0"#, "", "w is 0"),
-            (r#""fl_x": 50"#, r#""mask_path": "masks/a.png","#, "masks/a.png is not there"),
+            (r#""fl_x": 50"#, r#""mask_path": "masks/a.png","#, "masks/a.png not found"),
             (r#""fl_x": 50"#, r#""mask_path": "../a.png","#, "not a path inside"),
             (r#""camera_angle_x": 7"#, "", "between 0 and π"),
         ] {

@@ -1,4 +1,4 @@
-//! Formats of images that aren't read, and the commands that convert them.
+//! Image formats that aren't supported, and the commands that convert them.
 
 use std::fs::File;
 use std::io::Read as _;
@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 use pixels::PixelError;
 
-/// Format of images that isn't read.
+/// Image format that isn't supported.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct UnreadFormat {
     name: &'static str,
     extensions: &'static [&'static str],
-    /// Format to convert to: JPEG where images are photographs of a telephone.
+    /// Format to convert to, with options: JPEG for phone photographs.
     target: &'static str,
 }
 
@@ -25,16 +25,16 @@ const BMP: UnreadFormat = UnreadFormat { name: "BMP", extensions: &["bmp"], targ
 const GIF: UnreadFormat = UnreadFormat { name: "GIF", extensions: &["gif"], target: "png" };
 const FORMATS: [UnreadFormat; 6] = [HEIC, AVIF, WEBP, TIFF, BMP, GIF];
 
-/// Bytes at a file's start that tell its format.
+/// Number of bytes at a file's start that identify its format.
 const SIGNATURE_BYTES: usize = 12;
 
 impl UnreadFormat {
-    fn of_name(path: &Path) -> Option<Self> {
+    fn from_name(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
         FORMATS.into_iter().find(|format| format.extensions.contains(&extension.as_str()))
     }
 
-    fn of_signature(bytes: &[u8; SIGNATURE_BYTES]) -> Option<Self> {
+    fn from_signature(bytes: &[u8; SIGNATURE_BYTES]) -> Option<Self> {
         match bytes {
             [_, _, _, _, b'f', b't', b'y', b'p', b'a', b'v', b'i', _] => Some(AVIF),
             [_, _, _, _, b'f', b't', b'y', b'p', b'h' | b'm', ..] => Some(HEIC),
@@ -46,7 +46,7 @@ impl UnreadFormat {
         }
     }
 
-    /// Returns the command that converts all files with a file's extension, next to that file.
+    /// Returns the command that converts all files in a file's folder with its extension.
     fn command(self, path: &Path) -> String {
         let folder = path.parent().unwrap_or(Path::new(".")).display().to_string();
         let files = match path.extension().and_then(|extension| extension.to_str()) {
@@ -58,18 +58,17 @@ impl UnreadFormat {
     }
 }
 
-/// True if a file's name is that of an image whose format isn't read.
+/// True if a file's name is that of an image in an unsupported format.
 pub fn is_unread_name(path: &Path) -> bool {
-    UnreadFormat::of_name(path).is_some()
+    UnreadFormat::from_name(path).is_some()
 }
 
-/// Returns the refusal of a file whose content, or else name, is an image of a format that isn't
-/// read.
-pub(crate) fn refusal(path: &Path) -> Option<PixelError> {
+/// Returns the error for an image in an unsupported format, recognised by content, otherwise by name.
+pub(crate) fn unsupported_error(path: &Path) -> Option<PixelError> {
     let mut bytes = [0; SIGNATURE_BYTES];
     let is_read = File::open(path).and_then(|mut file| file.read_exact(&mut bytes)).is_ok();
-    let format = UnreadFormat::of_signature(&bytes).filter(|_| is_read);
-    let format = format.or_else(|| UnreadFormat::of_name(path))?;
+    let format = UnreadFormat::from_signature(&bytes).filter(|_| is_read);
+    let format = format.or_else(|| UnreadFormat::from_name(path))?;
     Some(PixelError::Unread {
         path: path.to_path_buf(),
         format: format.name,
@@ -77,15 +76,15 @@ pub(crate) fn refusal(path: &Path) -> Option<PixelError> {
     })
 }
 
-/// Returns the number and format of unread images among files, with the command that converts them;
-/// nothing where there are none.
+/// Returns the number and format of unsupported images among files, with the command that converts
+/// them; `None` if there are none.
 pub fn unread_images(files: &[PathBuf]) -> Option<String> {
     let mut unread = files.iter().filter(|path| is_unread_name(path));
     let first = unread.next()?;
-    let format = UnreadFormat::of_name(first)?;
+    let format = UnreadFormat::from_name(first)?;
     let count = 1 + unread.count();
     Some(format!(
-        "{count} in {}, which is not read; convert: {}",
+        "{count} in {}, which is not supported; convert: {}",
         format.name,
         format.command(first)
     ))
@@ -111,13 +110,13 @@ mod tests {
         ] {
             let path = dir.path().join(name);
             std::fs::write(&path, bytes).unwrap();
-            let message = refusal(&path).unwrap().to_string();
+            let message = unsupported_error(&path).unwrap().to_string();
             assert!(message.contains(&format!("{name} is a {format} image")), "{message}");
         }
         let png = dir.path().join("d.png");
         std::fs::write(&png, b"\x89PNG\r\n\x1a\n\0\0\0\0").unwrap();
-        assert!(refusal(&png).is_none());
-        assert!(refusal(&dir.path().join("gone.png")).is_none());
+        assert!(unsupported_error(&png).is_none());
+        assert!(unsupported_error(&dir.path().join("gone.png")).is_none());
     }
 
     #[test]

@@ -1,85 +1,90 @@
-//! Warnings of files that look like masks and that no view uses.
+//! Warns about files that look like masks but that no view uses.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use artifact::{WARNING, counted};
 
+use crate::file_status::path_text;
 use crate::format::Format;
 use crate::frame::Frame;
 use crate::lookup::Listings;
-use crate::misplaced::shown;
 use crate::photograph::is_image_name;
 
-/// Folders inside a folder of masks that are searched, in levels.
+/// Maximum depth of sub-folders to search in a folder of masks; chosen by hand.
 const MAX_DEPTH: usize = 4;
 
-/// Returns a warning for each folder with images that look like masks and are not used: folders
-/// such as `masks` next to the images' folders, and files such as `a_mask.png` next to images.
-pub(crate) fn unused_masks(
+/// Returns a warning for each folder with images that look like masks but aren't used: folders such
+/// as `masks` next to the images' folders, and files such as `a_mask.png` next to images.
+pub(crate) fn unused_mask_warnings(
     listings: &mut Listings,
     format: Format,
     frames: &[Frame],
 ) -> Vec<String> {
     let root = listings.root().to_path_buf();
-    let inside = |path: &Path| path.strip_prefix(&root).unwrap_or(path).to_path_buf();
-    let images: BTreeSet<PathBuf> = frames.iter().map(|frame| inside(&frame.image)).collect();
-    let masks = frames.iter().filter_map(|frame| frame.mask.as_ref());
-    let used: BTreeSet<PathBuf> = masks.map(|mask| inside(&mask.path)).collect();
+    let (mut images, mut used): (BTreeSet<PathBuf>, BTreeSet<PathBuf>) = Default::default();
+    for frame in frames {
+        images.insert(relative(&root, &frame.image));
+        used.extend(frame.mask.as_ref().map(|mask| relative(&root, &mask.path)));
+    }
     let parents: BTreeSet<&Path> = images.iter().filter_map(|image| image.parent()).collect();
     let mut above: BTreeSet<&Path> = parents.iter().filter_map(|parent| parent.parent()).collect();
     above.insert(Path::new(""));
-    let mut places: Vec<(PathBuf, Vec<PathBuf>)> = Vec::new();
+    let mut candidates: Vec<(PathBuf, Vec<PathBuf>)> = Vec::new();
     for folder in above {
         for name in listings.names(folder) {
             let path = folder.join(&name);
             let is_copy = !used.is_empty() && is_reduced_copy(&name);
             if looks_like_mask(&name) && !is_copy && listings.is_folder(&path) {
-                places.push((path.clone(), images_below(listings, &path, MAX_DEPTH)));
+                candidates.push((path.clone(), images_below(listings, &path, MAX_DEPTH)));
             }
         }
     }
     for folder in parents {
         let mut files = images_in(listings, folder);
-        files
-            .retain(|file| file.file_stem().is_some_and(|s| looks_like_mask(&s.to_string_lossy())));
-        places.push((folder.to_path_buf(), files));
+        files.retain(|file| {
+            file.file_stem().is_some_and(|stem| looks_like_mask(&stem.to_string_lossy()))
+        });
+        candidates.push((folder.to_path_buf(), files));
     }
     let mut warnings = Vec::new();
-    for (folder, mut files) in places {
+    for (folder, mut files) in candidates {
         files.retain(|file| !used.contains(file) && !images.contains(file));
         warnings.extend(warning(format, &folder, &files));
     }
     warnings
 }
 
+fn relative(root: &Path, path: &Path) -> PathBuf {
+    path.strip_prefix(root).unwrap_or(path).to_path_buf()
+}
+
 fn warning(format: Format, folder: &Path, files: &[PathBuf]) -> Option<String> {
     let first = files.first()?;
-    let count = counted(files.len(), "file");
-    let (looks, is) = if files.len() == 1 { ("looks", "is") } else { ("look", "are") };
-    let like = if files.len() == 1 { "a mask" } else { "masks" };
-    let place = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    let count = counted(files.len(), "unused file");
+    let look_like = if files.len() == 1 { "looks like a mask" } else { "look like masks" };
+    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     let remedy = match format {
         Format::Blender | Format::Transforms => "name masks in their frames' mask_path",
         Format::Llff | Format::Colmap => {
-            "masks are named masks/NAME.png or masks/NAME.EXT.png after their photographs"
+            "name the mask of NAME.EXT masks/NAME.png or masks/NAME.EXT.png"
         }
     };
     Some(format!(
-        "{WARNING}{count} in {} {looks} like {like} and {is} not used, first {}; {remedy}",
-        shown(place),
-        shown(first)
+        "{WARNING}{count} in {} {look_like} (first: {}); {remedy}",
+        path_text(folder),
+        path_text(first)
     ))
 }
 
-/// True if one of a name's words is that of a mask.
+/// True if one of a name's words means a mask.
 fn looks_like_mask(name: &str) -> bool {
     let lower = name.to_lowercase();
     let mut words = lower.split(|c: char| !c.is_alphabetic());
     words.any(|word| matches!(word, "mask" | "masks" | "segmentation" | "segmentations"))
 }
 
-/// True for nerfstudio's `masks_2`, `masks_4` …: smaller copies of `masks`.
+/// True for nerfstudio's reduced copies of `masks`: `masks_2`, `masks_4` and so on.
 fn is_reduced_copy(name: &str) -> bool {
     name.strip_prefix("masks_").is_some_and(|factor| factor.parse::<u32>().is_ok())
 }

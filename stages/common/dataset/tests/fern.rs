@@ -19,7 +19,7 @@ fn fern_is_read() {
     assert_eq!((set.format, set.frames.len()), (Format::Llff, 20));
     let frame = &set.frames[0];
     assert_eq!(frame.name, "IMG_4026");
-    let k = frame.taken_with;
+    let k = frame.stored_intrinsics;
     assert_eq!((k.width, k.height, k.cx, k.cy), (4032, 3024, 2016.0, 1512.0));
     assert!((k.fx - 3260.5).abs() < 1.0, "{}", k.fx);
     // All look the same way, from near each other, at what is some focal lengths of a scene away.

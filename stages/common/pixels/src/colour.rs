@@ -15,6 +15,17 @@ pub fn linear_from_srgb(encoded: f64) -> f64 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { libm::pow((encoded + 0.055) / 1.055, 2.4) }
 }
 
+/// Converts one of 256 levels to [0, 1].
+pub(crate) fn from_u8(level: u8) -> f32 {
+    f32::from(level) / 255.0
+}
+
+/// Returns the nearest of 256 levels for a value, clamped to [0, 1].
+pub fn to_u8(value: f32) -> u8 {
+    // `as` saturates and maps NaN to 0.
+    (value * 255.0 + 0.5) as u8
+}
+
 /// Colour scale.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Palette {

@@ -1,5 +1,7 @@
 use image::DynamicImage;
 
+use crate::colour::{from_u8, to_u8};
+
 /// 8-bit RGBA image with straight alpha, row by row from the top.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rgba8 {
@@ -120,16 +122,6 @@ impl Image {
         });
         Rgba8::new(self.width, self.height, pixels.collect())
     }
-}
-
-fn from_u8(level: u8) -> f32 {
-    f32::from(level) / 255.0
-}
-
-/// Returns the nearest of 256 levels for a value, clamped to [0, 1].
-pub fn to_u8(value: f32) -> u8 {
-    // `as` saturates and maps NaN to 0.
-    (value * 255.0 + 0.5) as u8
 }
 
 /// Returns the peak signal-to-noise ratio in dB (peak 1) of a mean squared error, at most 100 dB,

@@ -38,7 +38,7 @@ mod operator;
 mod pillow_resample;
 mod png_file;
 
-pub use colour::{Palette, heat, linear_from_srgb, srgb_from_linear};
+pub use colour::{Palette, heat, linear_from_srgb, srgb_from_linear, to_u8};
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel, average_pool};
 pub use depth_map::{DepthMap, common_range};
@@ -48,7 +48,7 @@ pub use exr_file::{
     COLOUR_CHANNELS, Channel, DEPTH_CHANNELS, ExrImage, SampleType, exr_reading_bytes, exr_size,
     read_exr, read_premultiplied, write_exr,
 };
-pub use image_buffer::{Image, Rgba8, psnr_of, to_u8};
+pub use image_buffer::{Image, Rgba8, psnr_of};
 pub use mask::Mask;
 pub use operator::{AxisTaps, Resampling};
 pub use pillow_resample::{Filter, resize_pillow};

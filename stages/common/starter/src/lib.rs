@@ -224,7 +224,7 @@ fn image_parameters(set: &Dataset) -> String {
 /// the command that estimates their cameras.
 fn read_error(folder: &Path, error: DatasetError) -> StarterError {
     let images = UnposedImages::find(folder);
-    if !matches!(error, DatasetError::Unknown { nearby: None, .. }) || images.files.is_empty() {
+    if !error.is_unrecognised() || images.files.is_empty() {
         return StarterError::Dataset(error);
     }
     StarterError::NoCameras {

@@ -10,7 +10,7 @@ fn set(format: Format, sizes: &[(u32, u32)]) -> Dataset {
         turn: Turn::Stored,
         mask: None,
         depth: None,
-        taken_with: Intrinsics::from_angle_x(width, height, 0.7),
+        stored_intrinsics: Intrinsics::from_angle_x(width, height, 0.7),
         pinhole: None,
         camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]],
         depths: None,

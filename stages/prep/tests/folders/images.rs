@@ -11,7 +11,7 @@ use super::kit::{
 };
 
 const THREE: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
-const COLMAP: &str = "COLMAP: 10 photographs of sparse/0";
+const COLMAP: &str = "COLMAP: 10 photographs from sparse/0";
 
 /// EXR photographs; the second has 16 pixels of 40.
 fn exr(folder: &Path) {
@@ -107,7 +107,7 @@ fn unread(folder: &Path, name: &str, content: &[u8]) {
 }
 
 fn exif_cases() -> Vec<Case> {
-    const ASSUMED: &str = "3 photographs have an EXIF orientation that the camera's width and height neither confirm nor contradict; assumed: poses are those of the image as stored";
+    const ASSUMED: &str = "3 photographs have an EXIF orientation that the camera's width and height neither confirm nor contradict; assuming that poses refer to the stored image";
     vec![
         case(
             "colmap#1456: a square, turned by 90°",
@@ -128,7 +128,11 @@ fn exif_cases() -> Vec<Case> {
             "the camera has the turned shape",
             |folder| oriented(folder, (SIDE, 12), 6, (12, SIDE)),
             of_size(
-                held_out("a#", 3, &[THREE, "3 photographs are turned upright, as EXIF data ask"]),
+                held_out(
+                    "a#",
+                    3,
+                    &[THREE, "3 photographs are turned upright, as EXIF data require"],
+                ),
                 12.0,
                 16.0,
             ),
@@ -162,7 +166,10 @@ fn border_cases() -> Vec<Case> {
             let mut scene = held_out(
                 "a#",
                 10,
-                &[COLMAP, "10 of 10 views have masks (masks/NAME.png for 10: black is left out)"],
+                &[
+                    COLMAP,
+                    "10 of 10 views have masks (10 by masks/NAME.png, where black is excluded)",
+                ],
             );
             for view in scene.train.iter_mut().chain(&mut scene.test) {
                 view.mask = Some(is_inside);
@@ -229,7 +236,7 @@ fn format_cases() -> Vec<Case> {
                     3,
                     &[
                         THREE,
-                        "1 file name differs from its file in the extension (images/b.HEIC is images/b.jpg)",
+                        "1 file name found with a different extension (first: images/b.HEIC is images/b.jpg)",
                     ],
                 );
                 scene.train[0].name = "b".to_owned();
@@ -245,7 +252,7 @@ fn format_cases() -> Vec<Case> {
                 }
             },
             Expected::Refused(
-                "dataset: DIR/poses_bounds.npy: 2 poses for 0 images in images/ (2 in WebP, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.webp); counts must match, or view_imgs.txt list the images with poses",
+                "dataset: DIR/poses_bounds.npy: 2 poses for 0 images in images/ (2 in WebP, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.webp); counts must match, or view_imgs.txt must list the images that have poses",
             ),
         ),
     ]
@@ -273,7 +280,7 @@ pub(crate) fn cases() -> Vec<Case> {
             },
             {
                 let mut scene =
-                    held_out("a#", 3, &[THREE, "photographs of 2 sizes, from 12×16 to 16×16"]);
+                    held_out("a#", 3, &[THREE, "photographs have 2 sizes, from 12×16 to 16×16"]);
                 scene.train[0].inside = [12.0, 16.0, 20.0, 20.0, 6.0, 8.0];
                 Expected::Scene(scene)
             },

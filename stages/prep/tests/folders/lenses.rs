@@ -34,7 +34,7 @@ fn with_lens(notes: &[&'static str], lens: &Value) -> Scene {
 }
 
 const LISTED: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
-const COLMAP: &str = "COLMAP: 3 photographs of sparse/0";
+const COLMAP: &str = "COLMAP: 3 photographs from sparse/0";
 const BENT: &str = "3 photographs have lens distortion";
 const FISHEYE: &str = "3 photographs were taken with a fisheye lens";
 
@@ -170,8 +170,8 @@ fn refused_cases() -> Vec<Case> {
                 write(folder.join("sparse/0/cameras.bin"), [&numbers[..], &[0; 128]].concat());
             },
             Expected::Refused(
-                "dataset: DIR/sparse/0/cameras.bin: byte 32: camera 1 has model 11, which this \
-                program doesn't know (a newer COLMAP's?); undistort with colmap image_undistorter",
+                "dataset: DIR/sparse/0/cameras.bin: byte 32: camera 1 has unknown model \
+                11 (from a newer COLMAP?); undistort with colmap image_undistorter",
             ),
         ),
         case(
@@ -186,8 +186,8 @@ fn refused_cases() -> Vec<Case> {
             "a newer COLMAP's name",
             |folder| colmap(folder, "1 EUCM 16 16 20 20 8 8 0.6 1.1\n"),
             Expected::Refused(
-                "dataset: DIR/sparse/0/cameras.txt: line 1: camera model \"EUCM\" is unknown (a \
-                newer COLMAP's?); undistort with colmap image_undistorter",
+                "dataset: DIR/sparse/0/cameras.txt: line 1: camera model \"EUCM\" is unknown \
+                (from a newer COLMAP?); undistort with colmap image_undistorter",
             ),
         ),
         case(
@@ -207,7 +207,7 @@ fn refused_cases() -> Vec<Case> {
             Expected::Refused(
                 "dataset: frame a0: lens distortion (fisheye, k1 -0.3, k2 0, k3 0, p1 0, p2 0) \
                 is not invertible within the image; check its coefficients (parameter lens: undo \
-                keeps what has its ray)",
+                keeps the valid part of the image)",
             ),
         ),
     ]

@@ -45,7 +45,7 @@ fn masked(mut scene: Scene, numbers: &[usize], counts: fn(u32, u32) -> bool) -> 
     Expected::Scene(scene)
 }
 
-const TEN: &str = "COLMAP: 10 photographs of sparse/0";
+const TEN: &str = "COLMAP: 10 photographs from sparse/0";
 const THREE: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
 
 fn colmap_cases() -> Vec<Case> {
@@ -62,7 +62,7 @@ fn colmap_cases() -> Vec<Case> {
                     10,
                     &[
                         TEN,
-                        "3 of 10 views have masks; 7 are used whole (masks/NAME.png for 3: black is left out)",
+                        "3 of 10 views have masks (3 by masks/NAME.png, where black is excluded)",
                     ],
                 ),
                 &[3, 4, 5],
@@ -81,7 +81,7 @@ fn colmap_cases() -> Vec<Case> {
                     10,
                     &[
                         TEN,
-                        "10 of 10 views have masks (masks/NAME.EXT.png for 10: black is left out)",
+                        "10 of 10 views have masks (10 by masks/NAME.EXT.png, where black is excluded)",
                     ],
                 ),
                 &Vec::from_iter(0..10),
@@ -111,8 +111,8 @@ fn colmap_cases() -> Vec<Case> {
                 10,
                 &[
                     TEN,
-                    "warning: 2 files in masks look like masks and are not used, first masks/b0.png; masks are named masks/NAME.png or masks/NAME.EXT.png after their photographs",
-                    "warning: 1 file in segmentation looks like a mask and is not used, first segmentation/a0.png; masks are named masks/NAME.png or masks/NAME.EXT.png after their photographs",
+                    "warning: 2 unused files in masks look like masks (first: masks/b0.png); name the mask of NAME.EXT masks/NAME.png or masks/NAME.EXT.png",
+                    "warning: 1 unused file in segmentation looks like a mask (first: segmentation/a0.png); name the mask of NAME.EXT masks/NAME.png or masks/NAME.EXT.png",
                 ],
             )),
         ),
@@ -134,7 +134,7 @@ fn llff_cases() -> Vec<Case> {
                     9,
                     &[
                         "LLFF (poses_bounds.npy): 9 photographs from images",
-                        "1 of 9 views has a mask; 8 are used whole (masks/NAME.png for 1: black is left out)",
+                        "1 of 9 views has a mask (1 by masks/NAME.png, where black is excluded)",
                     ],
                 ),
                 &[1],
@@ -154,7 +154,7 @@ fn llff_cases() -> Vec<Case> {
                     9,
                     &[
                         "LLFF (poses_bounds.npy): 9 photographs from images",
-                        "9 of 9 views have masks (dynamic_mask_NAME.png for 9: white is left out)",
+                        "9 of 9 views have masks (9 by dynamic_mask_NAME.png, where white is excluded)",
                     ],
                 ),
                 &Vec::from_iter(0..9),
@@ -173,10 +173,7 @@ fn transforms_cases() -> Vec<Case> {
                 held_out(
                     "a#",
                     3,
-                    &[
-                        THREE,
-                        "2 of 3 views have masks; 1 is used whole (mask_path for 2: black is left out)",
-                    ],
+                    &[THREE, "2 of 3 views have masks (2 by mask_path, where black is excluded)"],
                 ),
                 &[0, 2],
                 left_half,
@@ -191,8 +188,8 @@ fn transforms_cases() -> Vec<Case> {
                     3,
                     &[
                         THREE,
-                        "2 of 3 views have masks; 1 is used whole (mask_path for 2: black is left out)",
-                        "2 masks have another size than the photograph; resampled by nearest neighbour (masks/m0.png: 8×8 for 16×16)",
+                        "2 of 3 views have masks (2 by mask_path, where black is excluded)",
+                        "2 masks differ from the photograph in size; resampled by nearest neighbour (first: masks/m0.png: 8×8 for 16×16)",
                     ],
                 ),
                 &[0, 2],
@@ -208,8 +205,8 @@ fn transforms_cases() -> Vec<Case> {
                     3,
                     &[
                         THREE,
-                        "2 of 3 views have masks; 1 is used whole (mask_path for 2: black is left out)",
-                        "warning: 2 masks have another shape than the photograph; resampled by nearest neighbour (masks/m0.png: 2×16 for 16×16)",
+                        "2 of 3 views have masks (2 by mask_path, where black is excluded)",
+                        "warning: 2 masks differ from the photograph in aspect ratio; resampled by nearest neighbour (first: masks/m0.png: 2×16 for 16×16)",
                     ],
                 ),
                 &[0, 2],
@@ -230,8 +227,8 @@ fn transforms_cases() -> Vec<Case> {
                     3,
                     &[
                         THREE,
-                        "2 of 3 views have masks; 1 is used whole (dynamic_mask_NAME.png for 2: white is left out)",
-                        "warning: 1 file in images looks like a mask and is not used, first images/b_mask.png; name masks in their frames' mask_path",
+                        "2 of 3 views have masks (2 by dynamic_mask_NAME.png, where white is excluded)",
+                        "warning: 1 unused file in images looks like a mask (first: images/b_mask.png); name masks in their frames' mask_path",
                     ],
                 ),
                 &[0, 1],
@@ -250,7 +247,7 @@ fn transforms_cases() -> Vec<Case> {
                 3,
                 &[
                     THREE,
-                    "warning: 3 files in masks look like masks and are not used, first masks/a0.png; name masks in their frames' mask_path",
+                    "warning: 3 unused files in masks look like masks (first: masks/a0.png); name masks in their frames' mask_path",
                 ],
             )),
         ),
@@ -263,7 +260,7 @@ fn transforms_cases() -> Vec<Case> {
                 write_transforms(folder, &list);
             },
             Expected::Refused(
-                "dataset: DIR/transforms.json: frame 1 (images/a1.png): DIR/masks/a1.png is not there; remove the entry or restore the file",
+                "dataset: DIR/transforms.json: frame 1 (images/a1.png): DIR/masks/a1.png not found; remove the entry or restore the file",
             ),
         ),
     ]

@@ -36,8 +36,8 @@ fn windows_scene() -> Scene {
         test: views("a_#", 0..1),
         notes: vec![
             "transforms.json (instant-ngp, nerfstudio): 3 photographs",
-            r"6 file names contain backslashes, read as slashes (images\a_0.png is images/a_0.png)",
-            "3 of 3 views have masks (mask_path for 3: black is left out)",
+            r"6 file names found with slashes instead of backslashes (first: images\a_0.png is images/a_0.png)",
+            "3 of 3 views have masks (3 by mask_path, where black is excluded)",
         ],
         further: Vec::new(),
     };
@@ -92,7 +92,7 @@ fn rig(folder: &Path) {
 }
 
 fn rig_scene() -> Scene {
-    let mut scene = held_out("#", 3, &["COLMAP: 3 photographs of sparse/0"]);
+    let mut scene = held_out("#", 3, &["COLMAP: 3 photographs from sparse/0"]);
     scene.test[0].name = "back_1".to_owned();
     scene.train[0].name = "front_1".to_owned();
     scene.train[1].name = "front_A DJI  (2)".to_owned();
@@ -109,7 +109,7 @@ fn blender(folder: &Path, names: &str, files: &str) {
 }
 
 fn blender_scene(notes: &[&'static str]) -> Scene {
-    let mut all = vec!["Blender's form: 2 training views, 1 test view"];
+    let mut all = vec!["Blender format: 2 training views, 1 test view"];
     all.extend(notes);
     Scene { train: views("r_#", 0..2), test: views("r_#", 2..3), notes: all, ..Scene::default() }
 }
@@ -129,7 +129,7 @@ pub(crate) fn cases() -> Vec<Case> {
                 2,
                 &[
                     "transforms.json (instant-ngp, nerfstudio): 2 photographs",
-                    r"1 file name contains backslashes, read as slashes (images\a_1.png is images/a_1.png)",
+                    r"1 file name found with slashes instead of backslashes (first: images\a_1.png is images/a_1.png)",
                 ],
             );
             scene.test[0].name = r"images\a_0".to_owned();
@@ -141,7 +141,7 @@ pub(crate) fn cases() -> Vec<Case> {
             read(
                 "a_#",
                 &[
-                    r"10 file names are absolute paths, read without the first 4 parts (C:\Users\x\scene\images\a_0.png is images/a_0.png)",
+                    r"10 file names found without the first 4 parts of absolute paths (first: C:\Users\x\scene\images\a_0.png is images/a_0.png)",
                 ],
             ),
         ),
@@ -151,7 +151,7 @@ pub(crate) fn cases() -> Vec<Case> {
             read(
                 "a_#",
                 &[
-                    "10 file names are absolute paths, read without the first 3 parts (/home/x/scene/images/a_0.png is images/a_0.png)",
+                    "10 file names found without the first 3 parts of absolute paths (first: /home/x/scene/images/a_0.png is images/a_0.png)",
                 ],
             ),
         ),
@@ -175,7 +175,7 @@ pub(crate) fn cases() -> Vec<Case> {
             read(
                 "r_#",
                 &[
-                    "10 file names differ from their files in the extension (images/r_0 is images/r_0.jpg)",
+                    "10 file names found with a different extension (first: images/r_0 is images/r_0.jpg)",
                 ],
             ),
         ),
@@ -192,7 +192,7 @@ pub(crate) fn cases() -> Vec<Case> {
             read(
                 "r_#",
                 &[
-                    "10 file names differ from their files in the extension (images/r_0 is images/r_0.JPEG)",
+                    "10 file names found with a different extension (first: images/r_0 is images/r_0.JPEG)",
                 ],
             ),
         ),
@@ -202,7 +202,7 @@ pub(crate) fn cases() -> Vec<Case> {
             read(
                 "000#",
                 &[
-                    "10 file names differ from their files in the extension (images/0000.png is images/0000.png.png)",
+                    "10 file names found with a different extension (first: images/0000.png is images/0000.png.png)",
                 ],
             ),
         ),
@@ -212,7 +212,7 @@ pub(crate) fn cases() -> Vec<Case> {
             read(
                 "000#",
                 &[
-                    "10 file names differ from their files in the extension (images/0000.jpg.jpg is images/0000.jpg)",
+                    "10 file names found with a different extension (first: images/0000.jpg.jpg is images/0000.jpg)",
                 ],
             ),
         ),
@@ -222,7 +222,7 @@ pub(crate) fn cases() -> Vec<Case> {
             read(
                 "frame_#",
                 &[
-                    "10 file names differ from their files in case (images/FRAME_0.png is images/frame_0.png)",
+                    "10 file names found in a different case (first: images/FRAME_0.png is images/frame_0.png)",
                 ],
             ),
         ),
@@ -240,8 +240,8 @@ pub(crate) fn cases() -> Vec<Case> {
                 "A#",
                 3,
                 &[
-                    "COLMAP: 3 photographs of sparse/0",
-                    "3 file names differ from their files in case (A0.JPG is images/A0.jpg)",
+                    "COLMAP: 3 photographs from sparse/0",
+                    "3 file names found in a different case (first: A0.JPG is images/A0.jpg)",
                 ],
             )),
         ),
@@ -251,9 +251,9 @@ pub(crate) fn cases() -> Vec<Case> {
             read(
                 "r_#",
                 &[
-                    r"10 file names are absolute paths, read without the first 2 parts (D:\set\Images\R_0 is images/r_0.Jpg)",
-                    r"10 file names differ from their files in the extension (D:\set\Images\R_0 is images/r_0.Jpg)",
-                    r"10 file names differ from their files in case (D:\set\Images\R_0 is images/r_0.Jpg)",
+                    r"10 file names found without the first 2 parts of absolute paths (first: D:\set\Images\R_0 is images/r_0.Jpg)",
+                    r"10 file names found with a different extension (first: D:\set\Images\R_0 is images/r_0.Jpg)",
+                    r"10 file names found in a different case (first: D:\set\Images\R_0 is images/r_0.Jpg)",
                 ],
             ),
         ),
@@ -268,7 +268,7 @@ pub(crate) fn cases() -> Vec<Case> {
         case(
             "COLMAP's names from the folder above",
             |folder| colmap(folder, "images/a#.png", "a#.png", 2),
-            Expected::Scene(held_out("a#", 2, &["COLMAP: 2 photographs of sparse/0"])),
+            Expected::Scene(held_out("a#", 2, &["COLMAP: 2 photographs from sparse/0"])),
         ),
         case(
             "Blender as usual",
@@ -279,15 +279,15 @@ pub(crate) fn cases() -> Vec<Case> {
             "Blender moved",
             |folder| blender(folder, "/data/lego/train/r_#", "train/r_#.jpg"),
             Expected::Scene(blender_scene(&[
-                "3 file names are absolute paths, read without the first 2 parts (/data/lego/train/r_0 is train/r_0.jpg)",
-                "3 file names differ from their files in the extension (/data/lego/train/r_0 is train/r_0.jpg)",
+                "3 file names found without the first 2 parts of absolute paths (first: /data/lego/train/r_0 is train/r_0.jpg)",
+                "3 file names found with a different extension (first: /data/lego/train/r_0 is train/r_0.jpg)",
             ])),
         ),
         case(
             "Blender without an image",
             |folder| blender(folder, "./train/r_#", "train/x_#.png"),
             Expected::Refused(
-                "dataset: DIR/transforms_train.json: frame 0 (./train/r_0): DIR/train/r_0.png is not there; remove the frame or restore the file",
+                "dataset: DIR/transforms_train.json: frame 0 (./train/r_0): DIR/train/r_0.png not found; remove the frame or restore the file",
             ),
         ),
     ]

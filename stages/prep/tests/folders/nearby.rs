@@ -56,7 +56,7 @@ fn model_cases() -> Vec<Case> {
         case(
             "nerfstudio's colmap/sparse/0",
             |folder| colmap(folder, "colmap/sparse/0", "images"),
-            Expected::Scene(held_out("a#", 3, &["COLMAP: 3 photographs of colmap/sparse/0"])),
+            Expected::Scene(held_out("a#", 3, &["COLMAP: 3 photographs from colmap/sparse/0"])),
         ),
         case(
             "3DGS#272: dense/0/sparse",
@@ -85,7 +85,7 @@ fn model_cases() -> Vec<Case> {
                 write_photographs(folder, "images/a#.png", 3);
             },
             Expected::Refused(
-                "dataset: DIR/sparse/0/cameras.txt: line 1: camera model \"HOLOGRAM\" is unknown (a newer COLMAP's?); undistort with colmap image_undistorter",
+                "dataset: DIR/sparse/0/cameras.txt: line 1: camera model \"HOLOGRAM\" is unknown (from a newer COLMAP?); undistort with colmap image_undistorter",
             ),
         ),
         case(
@@ -98,7 +98,7 @@ fn model_cases() -> Vec<Case> {
                 binary_images(folder);
             },
             Expected::Refused(
-                "dataset: DIR/sparse/0/cameras.bin: byte 32: camera 1 has model 99, which this program doesn't know (a newer COLMAP's?); undistort with colmap image_undistorter",
+                "dataset: DIR/sparse/0/cameras.bin: byte 32: camera 1 has unknown model 99 (from a newer COLMAP?); undistort with colmap image_undistorter",
             ),
         ),
     ]
@@ -110,7 +110,7 @@ fn llff_cases() -> Vec<Case> {
             "LLFF#69: fewer poses than photographs",
             llff,
             Expected::Refused(
-                "dataset: DIR/poses_bounds.npy: 8 poses for 10 images in images/; counts must match, or view_imgs.txt list the images with poses",
+                "dataset: DIR/poses_bounds.npy: 8 poses for 10 images in images/; counts must match, or view_imgs.txt must list the images that have poses",
             ),
         ),
         case(
@@ -120,7 +120,7 @@ fn llff_cases() -> Vec<Case> {
                 let names: String = EIGHT.iter().map(|i| format!("a{i}.png\r\n")).collect();
                 write(folder.join("view_imgs.txt"), names);
             },
-            paired("view_imgs.txt names the photographs with poses"),
+            paired("photographs with poses are listed by view_imgs.txt"),
         ),
         case(
             "nerf_pl#33: paired by COLMAP's model",
@@ -128,7 +128,7 @@ fn llff_cases() -> Vec<Case> {
                 llff(folder);
                 binary_images(folder);
             },
-            paired("sparse names the photographs with poses"),
+            paired("photographs with poses are listed by sparse"),
         ),
         case(
             "DSNeRF#101: bounds of other views",
@@ -137,7 +137,7 @@ fn llff_cases() -> Vec<Case> {
                 write_llff(folder, &[0, 1], [-12.3, 85.1]);
             },
             Expected::Refused(
-                "dataset: DIR/poses_bounds.npy: frame 0 (a0): bounds -12.3 and 85.1, expected 0 < near < far; LLFF's imgs2poses orders views otherwise than their names where COLMAP registered them in another order: run COLMAP again on images sorted by name, or give COLMAP's model without poses_bounds.npy",
+                "dataset: DIR/poses_bounds.npy: frame 0 (a0): bounds -12.3 and 85.1, expected 0 < near < far; LLFF's imgs2poses confuses views if COLMAP registered them in another order than that of their names: rerun COLMAP on images sorted by name, or use COLMAP's model without poses_bounds.npy",
             ),
         ),
     ]
@@ -174,7 +174,7 @@ fn name_cases() -> Vec<Case> {
                 "a#",
                 3,
                 &[
-                    "Blender's form: 3 views; none is said to be for testing",
+                    "Blender format: 3 views, no test views",
                     "warning: found transform_test.json, which is not read; did you mean transforms_test.json?",
                 ],
             )),
@@ -204,7 +204,7 @@ fn name_cases() -> Vec<Case> {
                 write(folder.join("keyframes/images/1.jpg"), "");
             },
             Expected::Refused(
-                "dataset: DIR: no data set; found Polycam's own export (DIR/keyframes/cameras), which is not read; convert: ns-process-data polycam --data 'DIR' --output-dir 'DIR-nerfstudio'",
+                "dataset: DIR: no data set; found a Polycam export (DIR/keyframes/cameras), which is not supported; convert: ns-process-data polycam --data 'DIR' --output-dir 'DIR-nerfstudio'",
             ),
         ),
         case(
@@ -214,7 +214,7 @@ fn name_cases() -> Vec<Case> {
                 write(folder.join("x/EXR_RGBD/rgb/0.jpg"), "");
             },
             Expected::Refused(
-                "dataset: DIR: no data set; found Record3D's own export (DIR/x/EXR_RGBD), which is not read; convert: ns-process-data record3d --data 'DIR/x/EXR_RGBD' --output-dir 'DIR/x/EXR_RGBD-nerfstudio'",
+                "dataset: DIR: no data set; found a Record3D export (DIR/x/EXR_RGBD), which is not supported; convert: ns-process-data record3d --data 'DIR/x/EXR_RGBD' --output-dir 'DIR/x/EXR_RGBD-nerfstudio'",
             ),
         ),
     ]
@@ -234,7 +234,7 @@ pub(crate) fn cases() -> Vec<Case> {
             3,
             &[
                 "transforms.json (instant-ngp, nerfstudio): 3 photographs",
-                "1 depth image (depth_file_path) does not exist, first depth/a1.png; only EXR depth is used",
+                "1 depth image (depth_file_path) not found (first: depth/a1.png); only EXR depth is used",
             ],
         )),
     )];

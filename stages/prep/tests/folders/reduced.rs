@@ -51,8 +51,8 @@ pub(crate) fn cases() -> Vec<Case> {
                 "a#",
                 3,
                 &[
-                    "COLMAP: 3 photographs of sparse/0",
-                    "3 file names are read from images_4, because images is missing or empty (a0.jpg is images_4/a0.png)",
+                    "COLMAP: 3 photographs from sparse/0",
+                    "3 file names found in images_4, because images is missing or empty (first: a0.jpg is images_4/a0.png)",
                 ],
             )))
         }),
@@ -62,7 +62,7 @@ pub(crate) fn cases() -> Vec<Case> {
                 3,
                 &[
                     "transforms.json (instant-ngp, nerfstudio): 3 photographs",
-                    "3 file names are read from images_2, because images is missing or empty (images/a0.jpg is images_2/a0.jpg)",
+                    "3 file names found in images_2, because images is missing or empty (first: images/a0.jpg is images_2/a0.jpg)",
                 ],
             ))
         }),

@@ -61,10 +61,10 @@ pub(crate) fn cases() -> Vec<Case> {
                 4..7,
                 [0],
                 &[
-                    r"1 file name contains backslashes, read as slashes (images\a_4.png is images/a_4.png)",
-                    "1 file name is an absolute path, read without the first part (/x/images/a_5.png is images/a_5.png)",
-                    "1 file name differs from its file in the extension (images/A_6 is images/a_6.png)",
-                    "1 file name differs from its file in case (images/A_6 is images/a_6.png)",
+                    r"1 file name found with slashes instead of backslashes (first: images\a_4.png is images/a_4.png)",
+                    "1 file name found without the first part of absolute paths (first: /x/images/a_5.png is images/a_5.png)",
+                    "1 file name found with a different extension (first: images/A_6 is images/a_6.png)",
+                    "1 file name found in a different case (first: images/A_6 is images/a_6.png)",
                 ],
             ),
         ),
@@ -74,7 +74,11 @@ pub(crate) fn cases() -> Vec<Case> {
                 let train = json!(["images/a_3.png", "images/b.png", "images/c.png"]);
                 listed(folder, train, Value::Null, names([0]));
             },
-            split([3], [0], &["2 of 3 names in train_filenames have no frame, first images/b.png"]),
+            split(
+                [3],
+                [0],
+                &["2 of 3 names in train_filenames have no frame (first: images/b.png)"],
+            ),
         ),
         case(
             "ns PR#3054: a list without frames",
@@ -98,16 +102,12 @@ pub(crate) fn cases() -> Vec<Case> {
         case(
             "test views alone",
             |folder| listed(folder, Value::Null, json!([]), names([3, 5])),
-            split(
-                [0, 1, 2, 4, 6, 7, 8, 9],
-                [3, 5],
-                &["8 training views: the frames that no list names"],
-            ),
+            split([0, 1, 2, 4, 6, 7, 8, 9], [3, 5], &["8 training views: the frames in no list"]),
         ),
         case(
             "training views alone",
             |folder| listed(folder, names(0..9), json!([]), Value::Null),
-            split(0..9, [9], &["1 test view: the frames that no list names"]),
+            split(0..9, [9], &["1 test view: the frames in no list"]),
         ),
         case(
             "all views for training",

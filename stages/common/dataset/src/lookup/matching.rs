@@ -4,18 +4,18 @@ use crate::lookup::listings::Listings;
 use crate::photograph::{IMAGE_EXTENSIONS, is_image_name};
 use crate::unread::is_unread_name;
 
-/// Differences between a written name and a file's name that a step of the lookup tolerates.
+/// Differences between a listed name and a file's name that a step of the lookup tolerates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Tolerance {
-    /// A missing, doubled or converted extension.
+    /// True for a missing, doubled or converted extension.
     pub(super) extension: bool,
-    /// Upper case for lower case, also in folders.
+    /// True for differing case, also in folders.
     pub(super) case: bool,
 }
 
 impl Tolerance {
     pub(super) const NONE: Self = Self { extension: false, case: false };
-    /// In the order in which they are tried.
+    /// All tolerances, in the order of the attempts.
     pub(super) const STEPS: [Self; 4] = [
         Self::NONE,
         Self { extension: true, case: false },
@@ -24,23 +24,22 @@ impl Tolerance {
     ];
 }
 
-/// Extensions that a file may have instead of the written one.
+/// Extensions that a file may have instead of the listed one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Extensions {
-    /// One more or one less, or that of a converted image.
-    Slips,
-    /// Any image's: reduced copies are often stored in another format.
+    /// One extension more or less, or that of a converted image.
+    Similar,
+    /// Any image extension: reduced copies often have another format.
     Any,
 }
 
-/// File name that stands for a written one: a stem that has to match, and an extension that may be
-/// in either case.
+/// File name to try for a listed name: the stem must match, the extension may be in any case.
 struct Variant {
     stem: String,
     extension: &'static str,
 }
 
-/// Returns the files that a path may mean, sorted.
+/// Returns the files that match a path, sorted.
 pub(super) fn candidates(
     listings: &mut Listings,
     path: &Path,
@@ -60,11 +59,11 @@ pub(super) fn candidates(
         vec![Variant { stem: name.to_owned(), extension: "" }]
     };
     let mut found = Vec::new();
-    for folder in folders(listings, parent, tolerance.case) {
+    for folder in matching_folders(listings, parent, tolerance.case) {
         for Variant { stem, extension } in &variants {
-            for same in listings.alike(&folder, &format!("{stem}{extension}")) {
-                let file = folder.join(&same);
-                if (tolerance.case || same.starts_with(stem.as_str())) && listings.is_file(&file) {
+            for name in listings.case_variants(&folder, &format!("{stem}{extension}")) {
+                let file = folder.join(&name);
+                if (tolerance.case || name.starts_with(stem.as_str())) && listings.is_file(&file) {
                     found.push(file);
                 }
             }
@@ -75,8 +74,8 @@ pub(super) fn candidates(
     found
 }
 
-/// Returns the folders that a path may mean.
-fn folders(listings: &mut Listings, path: &Path, any_case: bool) -> Vec<PathBuf> {
+/// Returns the folders that match a path.
+fn matching_folders(listings: &mut Listings, path: &Path, any_case: bool) -> Vec<PathBuf> {
     if !any_case {
         return vec![path.to_path_buf()];
     }
@@ -84,27 +83,43 @@ fn folders(listings: &mut Listings, path: &Path, any_case: bool) -> Vec<PathBuf>
     for part in path.iter().filter_map(|part| part.to_str()) {
         let mut below = Vec::new();
         for folder in &found {
-            below.extend(listings.alike(folder, part).iter().map(|same| folder.join(same)));
+            let names = listings.case_variants(folder, part);
+            below.extend(names.iter().map(|name| folder.join(name)));
         }
         found = below;
     }
     found
 }
 
+fn with_each_extension(stem: &str) -> Vec<Variant> {
+    IMAGE_EXTENSIONS.map(|extension| Variant { stem: stem.to_owned(), extension }).into()
+}
+
 fn variants(name: &str, extensions: Extensions) -> Vec<Variant> {
-    let with_each =
-        |stem: &str| IMAGE_EXTENSIONS.map(|extension| Variant { stem: stem.to_owned(), extension });
     let path = Path::new(name);
     let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or(name);
     if extensions == Extensions::Any && is_image_name(path) || is_unread_name(path) {
-        return with_each(stem).into();
+        return with_each_extension(stem);
     }
-    let mut found: Vec<Variant> = with_each(name).into();
-    // `a.png.png` for `a.png`: the file lacks what the name has twice.
+    let mut found = with_each_extension(name);
+    // Listed name `a.png.png` of the file `a.png`.
     if is_image_name(path) && is_image_name(Path::new(stem)) {
         found.push(Variant { stem: stem.to_owned(), extension: "" });
     }
     found
+}
+
+/// Splits an absolute path into folders and file name, as in `C:\Users\x\a.png` or
+/// `/home/x/a.png`; `None` for a relative path.
+pub(super) fn absolute_parts(text: &str) -> Option<Vec<&str>> {
+    let mut parts: Vec<&str> = text.split(['/', '\\']).filter(|part| !part.is_empty()).collect();
+    let is_absolute = text.starts_with(['/', '\\']) || parts.first().is_some_and(|p| is_drive(p));
+    parts.retain(|part| *part != ".");
+    (is_absolute && !parts.is_empty()).then_some(parts)
+}
+
+fn is_drive(part: &str) -> bool {
+    matches!(part.as_bytes(), [letter, b':'] if letter.is_ascii_alphabetic())
 }
 
 #[cfg(test)]
@@ -127,10 +142,27 @@ mod tests {
             ),
             ("a.HEIC", vec!["a.png", "a.jpg", "a.jpeg", "a.exr"]),
         ] {
-            assert_eq!(names_of(name, Extensions::Slips), expected);
+            assert_eq!(names_of(name, Extensions::Similar), expected);
         }
         let any = ["a.png", "a.jpg", "a.jpeg", "a.exr"];
         assert_eq!(names_of("a.JPG", Extensions::Any), any);
         assert_eq!(names_of("a", Extensions::Any), any);
+    }
+
+    #[test]
+    fn paths_of_other_computers_are_taken_apart() {
+        for (text, parts) in [
+            (r"C:\Users\x\a.png", Some(vec!["C:", "Users", "x", "a.png"])),
+            ("d:/x//a.png", Some(vec!["d:", "x", "a.png"])),
+            (r"\\server\share\a.png", Some(vec!["server", "share", "a.png"])),
+            ("/home/./x/a.png", Some(vec!["home", "x", "a.png"])),
+            ("images/a.png", None),
+            (r"images\a.png", None),
+            ("CC:/a.png", None),
+            ("", None),
+            ("/", None),
+        ] {
+            assert_eq!(absolute_parts(text), parts, "{text}");
+        }
     }
 }

@@ -3,58 +3,57 @@ use std::path::Path;
 
 use artifact::counted;
 
-use crate::misplaced::shown;
+use crate::file_status::path_text;
 
 /// Names that one step of the lookup found.
 #[derive(Default)]
 struct Step {
     names: BTreeSet<String>,
-    /// First of them, and its file.
+    /// First name, and its file.
     first: Option<(String, String)>,
 }
 
 impl Step {
     fn add(&mut self, name: &str, file: &Path) {
         self.names.insert(name.to_owned());
-        self.first.get_or_insert_with(|| (name.to_owned(), shown(file)));
+        self.first.get_or_insert_with(|| (name.to_owned(), path_text(file)));
     }
 
-    /// Returns a line with the number of names and the first of them, if any; `one` and `many`
-    /// describe one name and several.
-    fn note(&self, one: &str, many: &str) -> Option<String> {
+    /// Returns a note with the number of names and the first of them, if any; `how` describes the
+    /// step.
+    fn note(&self, how: &str) -> Option<String> {
         let (name, file) = self.first.as_ref()?;
-        let count = self.names.len();
-        let verb = if count == 1 { one } else { many };
-        Some(format!("{} {verb} ({name} is {file})", counted(count, "file name")))
+        let names = counted(self.names.len(), "file name");
+        Some(format!("{names} found {how} (first: {name} is {file})"))
     }
 }
 
-/// Steps by which a name led to its file.
+/// Steps that led from a name to its file.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Taken {
+pub(super) struct StepsTaken {
     pub(super) slashes: bool,
     pub(super) tail: bool,
-    pub(super) stand_in: bool,
+    pub(super) substitute: bool,
     pub(super) extension: bool,
     pub(super) case: bool,
 }
 
-/// Steps by which a data set's names led to files, for the log.
+/// Steps that led from a data set's names to files, for the log.
 #[derive(Default)]
 pub(super) struct Steps {
     slashes: Step,
     tail: Step,
-    stand_in: Step,
+    substitute: Step,
     extension: Step,
     case: Step,
 }
 
 impl Steps {
-    pub(super) fn record(&mut self, name: &str, file: &Path, taken: Taken) {
+    pub(super) fn record(&mut self, name: &str, file: &Path, taken: StepsTaken) {
         for (is_taken, step) in [
             (taken.slashes, &mut self.slashes),
             (taken.tail, &mut self.tail),
-            (taken.stand_in, &mut self.stand_in),
+            (taken.substitute, &mut self.substitute),
             (taken.extension, &mut self.extension),
             (taken.case, &mut self.case),
         ] {
@@ -64,33 +63,22 @@ impl Steps {
         }
     }
 
-    /// Returns a line for each step that found a name. `removed` is the number of leading parts
-    /// that absolute names lose, `stand_in` the folder that is read instead of `images`.
-    pub(super) fn notes(&self, removed: Option<usize>, stand_in: Option<&str>) -> Vec<String> {
-        let without = match removed.unwrap_or(0) {
-            0 => "read as relative".to_owned(),
-            1 => "read without the first part".to_owned(),
-            count => format!("read without the first {count} parts"),
+    /// Returns a note for each step that found a name. `removed` is the number of leading parts
+    /// removed from absolute names, `substitute` the folder that is read instead of `images`.
+    pub(super) fn notes(&self, removed: Option<usize>, substitute: Option<&str>) -> Vec<String> {
+        let tail = match removed.unwrap_or(0) {
+            0 => "by reading absolute paths as relative ones".to_owned(),
+            1 => "without the first part of absolute paths".to_owned(),
+            count => format!("without the first {count} parts of absolute paths"),
         };
-        let stand_in = stand_in.unwrap_or_default();
+        let substitute =
+            format!("in {}, because images is missing or empty", substitute.unwrap_or_default());
         [
-            self.slashes.note(
-                "contains backslashes, read as slashes",
-                "contain backslashes, read as slashes",
-            ),
-            self.tail.note(
-                &format!("is an absolute path, {without}"),
-                &format!("are absolute paths, {without}"),
-            ),
-            self.stand_in.note(
-                &format!("is read from {stand_in}, because images is missing or empty"),
-                &format!("are read from {stand_in}, because images is missing or empty"),
-            ),
-            self.extension.note(
-                "differs from its file in the extension",
-                "differ from their files in the extension",
-            ),
-            self.case.note("differs from its file in case", "differ from their files in case"),
+            self.slashes.note("with slashes instead of backslashes"),
+            self.tail.note(&tail),
+            self.substitute.note(&substitute),
+            self.extension.note("with a different extension"),
+            self.case.note("in a different case"),
         ]
         .into_iter()
         .flatten()

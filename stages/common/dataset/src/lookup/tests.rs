@@ -13,8 +13,8 @@ fn folder(files: &[&str]) -> tempfile::TempDir {
 
 fn found(lookup: &mut Lookup, name: &str) -> String {
     match lookup.find(name) {
-        Ok(Located::File(file)) => shown(&file.path),
-        Ok(Located::Nothing(found) | Located::Other(found)) => found.to_string(),
+        Ok(Located::File(file)) => path_text(&file.path),
+        Ok(Located::Missing(problem) | Located::Unusable(problem)) => problem.to_string(),
         Err(error) => error.to_string(),
     }
 }
@@ -61,12 +61,12 @@ fn steps_are_taken_in_order_and_combine() {
     for (name, words) in [
         ("images/f", r#"images/f.exr and images/f.png both match "images/f"; remove one"#),
         ("images/G.PNG", r#"images/G.png and images/g.png both match "images/G.PNG""#),
-        ("images/h.png", "images/h.png is not there"),
-        ("images/i.png", "images/i.png is not there"),
-        ("images/x", "images/x.png is not there"),
+        ("images/h.png", "images/h.png not found"),
+        ("images/i.png", "images/i.png not found"),
+        ("images/x", "images/x.png not found"),
         ("../images/a.png", "\"../images/a.png\" is not a path inside the folder"),
-        (r"..\images\a.png", r"..\images\a.png is not there"),
-        ("/home/x.png", "no file of the data set is at the end of the absolute path"),
+        (r"..\images\a.png", r"..\images\a.png not found"),
+        ("/home/x.png", "no file in the data set matches the end of the absolute path"),
         ("", "\"\" is not a path inside the folder"),
     ] {
         let message = found(&mut Lookup::in_folder(dir.path(), &[name], &[]), name);
@@ -75,8 +75,8 @@ fn steps_are_taken_in_order_and_combine() {
     // A name's own file is not another's: depth next to a photograph, one of two in another case.
     for (name, other, file) in [
         ("images/f", "images/f.exr", "images/f.png"),
-        ("images/i", "images/i.jpg", "images/i.png is not there"),
-        ("images/A.png", "images/a.png", "images/A.png is not there"),
+        ("images/i", "images/i.jpg", "images/i.png not found"),
+        ("images/A.png", "images/a.png", "images/A.png not found"),
     ] {
         let mut lookup = Lookup::in_folder(dir.path(), &[name, other], &[]);
         assert!(found(&mut lookup, name).ends_with(file), "{name}");
@@ -92,11 +92,11 @@ fn tails_are_the_same_for_all() {
     let mut lookup = Lookup::in_folder(dir.path(), &names, &[]);
     assert_eq!(found(&mut lookup, names[0]), "images/a.png");
     assert_eq!(found(&mut lookup, names[1]), "images/b.png");
-    assert!(found(&mut lookup, names[2]).contains("no file of the data set"));
+    assert!(found(&mut lookup, names[2]).contains("no file in the data set"));
     assert_eq!(
         lookup.notes(),
-        ["2 file names are absolute paths, read without the first 2 parts \
-            (/x/scene/images/a.png is images/a.png)"]
+        ["2 file names found without the first 2 parts of absolute paths (first: \
+            /x/scene/images/a.png is images/a.png)"]
     );
     let mut one = Lookup::in_folder(dir.path(), &names[..1], &[]);
     assert_eq!(found(&mut one, names[0]), "scene/images/a.png");
@@ -115,8 +115,8 @@ fn reduced_copies_stand_in_for_missing_images() {
         assert_eq!(found(&mut lookup, &format!("{base}a.jpg")), "images_4/a.PNG");
         assert_eq!(found(&mut lookup, &format!("{base}b.jpg")), "images_4/b.png");
         let note = format!(
-            "2 file names are read from images_4, because images is missing or empty ({base}a.jpg \
-            is images_4/a.PNG)"
+            "2 file names found in images_4, because images is missing or empty (first: \
+            {base}a.jpg is images_4/a.PNG)"
         );
         assert_eq!(lookup.notes(), [note]);
         assert_eq!(
@@ -132,7 +132,7 @@ fn reduced_copies_stand_in_for_missing_images() {
     assert_eq!(found(&mut lookup, "a.jpg"), "images_2/a.png");
     std::fs::write(dir.path().join("images/b.jpg"), "").unwrap();
     let mut lookup = Lookup::in_images(dir.path(), &["a.jpg"]);
-    assert!(found(&mut lookup, "a.jpg").contains("images/a.jpg is not there"));
+    assert!(found(&mut lookup, "a.jpg").contains("images/a.jpg not found"));
 }
 
 /// COLMAP's names may start from the data set's folder.

@@ -4,17 +4,17 @@ use scene::{Distortion, Intrinsics};
 
 use crate::file_reason::FileReason;
 
-/// A camera model.
-pub(crate) struct CameraModel {
-    /// Number in binary files.
+/// Camera model of COLMAP.
+pub(super) struct CameraModel {
+    /// Id in binary files.
     number: u32,
     /// Name in text files.
     name: &'static str,
     /// Number of parameters.
-    pub(crate) parameters: usize,
+    pub(super) parameters: usize,
 }
 
-/// Models by number. COLMAP 4 has more, which stay unknown here.
+/// Known models. COLMAP 4 has more, which are reported as unknown.
 const MODELS: [CameraModel; 13] = [
     CameraModel { number: 0, name: "SIMPLE_PINHOLE", parameters: 3 },
     CameraModel { number: 1, name: "PINHOLE", parameters: 4 },
@@ -33,39 +33,39 @@ const MODELS: [CameraModel; 13] = [
 
 impl CameraModel {
     /// Finds a model by its number.
-    pub(crate) fn of_number(number: u32) -> Option<&'static Self> {
+    pub(super) fn with_number(number: u32) -> Option<&'static Self> {
         MODELS.iter().find(|model| model.number == number)
     }
 
     /// Finds a model by its name.
-    pub(crate) fn of_name(name: &str) -> Option<&'static Self> {
+    pub(super) fn with_name(name: &str) -> Option<&'static Self> {
         MODELS.iter().find(|model| model.name == name)
     }
 
-    /// Returns a camera's intrinsics, or why they can't be.
-    pub(crate) fn intrinsics(
+    /// Returns a camera's intrinsics; fails if size or parameters are invalid.
+    pub(super) fn intrinsics(
         &self,
         width: u64,
         height: u64,
         parameters: &[f64],
     ) -> Result<Intrinsics, FileReason> {
-        let side = |value: u64| u32::try_from(value).ok().filter(|v| *v > 0);
-        let (Some(columns), Some(rows)) = (side(width), side(height)) else {
-            return Err(FileReason::Size { width, height });
+        let [columns, rows] =
+            [width, height].map(|side| u32::try_from(side).ok().filter(|side| *side > 0));
+        let (Some(columns), Some(rows)) = (columns, rows) else {
+            return Err(FileReason::InvalidSize { width, height });
         };
         if parameters.len() != self.parameters {
-            return Err(FileReason::Parameters {
+            return Err(FileReason::ParameterCount {
                 model: self.name.to_owned(),
                 expected: self.parameters,
                 found: parameters.len(),
             });
         }
-        let (pinhole, distortion) = self.lens(parameters)?;
-        let [fx, fy, cx, cy] = pinhole;
+        let ([fx, fy, cx, cy], distortion) = self.lens(parameters)?;
         Ok(Intrinsics { width: columns, height: rows, fx, fy, cx, cy, distortion })
     }
 
-    /// Returns focal lengths with principal point, and the distortion.
+    /// Returns [fx, fy, cx, cy] and the distortion; fails for a model that isn't supported.
     fn lens(&self, parameters: &[f64]) -> Result<([f64; 4], Distortion), FileReason> {
         let none = Distortion::default();
         let lens = match (self.name, parameters) {
@@ -81,8 +81,8 @@ impl CameraModel {
                 ([fx, fy, cx, cy], Distortion::brown([k1, k2, 0.0], [p1, p2]))
             }
             ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
-                let above = Distortion::brown([k1, k2, k3], [p1, p2]);
-                ([fx, fy, cx, cy], Distortion { denominator: [k4, k5, k6], ..above })
+                let numerator = Distortion::brown([k1, k2, k3], [p1, p2]);
+                ([fx, fy, cx, cy], Distortion { denominator: [k4, k5, k6], ..numerator })
             }
             ("SIMPLE_FISHEYE", &[f, cx, cy]) => ([f, f, cx, cy], Distortion::fisheye([0.0; 4])),
             ("FISHEYE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], Distortion::fisheye([0.0; 4])),
@@ -99,7 +99,7 @@ impl CameraModel {
                 let radial = Distortion::fisheye([k1, k2, k3, k4]);
                 ([fx, fy, cx, cy], Distortion { tangential: [p1, p2], ..radial })
             }
-            _ => return Err(FileReason::Model { model: self.name.to_owned() }),
+            _ => return Err(FileReason::UnsupportedModel { model: self.name.to_owned() }),
         };
         Ok(lens)
     }

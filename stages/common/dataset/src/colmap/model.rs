@@ -1,0 +1,288 @@
+//! Files of a COLMAP reconstruction (COLMAP's documentation, "Output format").
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DQuat, DVec3};
+use scene::Intrinsics;
+
+use super::bytes::Bytes;
+use super::camera::CameraModel;
+use super::points::{Reach, depth_range, removed_points_note};
+use crate::error::{DatasetError, FrameReason};
+use crate::file_reason::FileReason;
+use crate::file_status::is_file;
+use crate::frame::{Frame, pose_from_world_to_camera};
+use crate::photograph::{fit_camera, read_header};
+use crate::text::read_text;
+
+/// COLMAP reconstruction.
+#[derive(Debug, Default)]
+pub(super) struct Model {
+    pub(super) cameras: BTreeMap<u32, Intrinsics>,
+    pub(super) images: Vec<Image>,
+    points: BTreeMap<u64, DVec3>,
+}
+
+/// Registered image.
+#[derive(Debug)]
+pub(super) struct Image {
+    /// Rotation from world to camera; axes right, down, forward.
+    pub(super) rotation: DMat3,
+    pub(super) translation: DVec3,
+    camera: u32,
+    pub(super) name: String,
+    /// Ids of the observed points.
+    pub(super) points: Vec<u64>,
+}
+
+impl Image {
+    /// Returns the camera's centre in world space.
+    fn centre(&self) -> DVec3 {
+        -(self.rotation.transpose() * self.translation)
+    }
+}
+
+/// Reads a file of a folder; `None` if it doesn't exist.
+fn read_if_present(folder: &Path, name: &str) -> Result<Option<(PathBuf, Vec<u8>)>, DatasetError> {
+    let path = folder.join(name);
+    if !is_file(&path)? {
+        return Ok(None);
+    }
+    let bytes = std::fs::read(&path).map_err(|source| DatasetError::io(&path, source))?;
+    Ok(Some((path, bytes)))
+}
+
+impl Model {
+    /// Reads the model of a folder, binary files before text files. Points are optional.
+    pub(super) fn read(folder: &Path) -> Result<Self, DatasetError> {
+        let mut model = Self::default();
+        model.read_cameras(folder)?;
+        model.read_images(folder)?;
+        if let Some((path, points)) = read_if_present(folder, "points3D.bin")? {
+            model.read_binary_points(&mut Bytes::new(&path, &points))?;
+        } else if is_file(&folder.join("points3D.txt"))? {
+            model.read_text_points(&folder.join("points3D.txt"))?;
+        }
+        Ok(model)
+    }
+
+    pub(super) fn read_cameras(&mut self, folder: &Path) -> Result<(), DatasetError> {
+        match read_if_present(folder, "cameras.bin")? {
+            Some((path, cameras)) => self.read_binary_cameras(&mut Bytes::new(&path, &cameras)),
+            None => self.read_text_cameras(&folder.join("cameras.txt")),
+        }
+    }
+
+    pub(super) fn read_images(&mut self, folder: &Path) -> Result<(), DatasetError> {
+        match read_if_present(folder, "images.bin")? {
+            Some((path, images)) => self.read_binary_images(&mut Bytes::new(&path, &images)),
+            None => self.read_text_images(&folder.join("images.txt")),
+        }
+    }
+
+    fn read_binary_cameras(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+        for _ in 0..bytes.count(24, "cameras")? {
+            let id = bytes.u32("a camera")?;
+            let model = bytes.u32("a camera")?;
+            let (width, height) = (bytes.u64("a camera")?, bytes.u64("a camera")?);
+            let Some(model) = CameraModel::with_number(model) else {
+                return Err(bytes.error(FileReason::UnknownModelNumber { id, model }));
+            };
+            let parameters = (0..model.parameters)
+                .map(|_| bytes.f64("a camera"))
+                .collect::<Result<Vec<_>, _>>()?;
+            let intrinsics = model.intrinsics(width, height, &parameters).map_err(|reason| {
+                bytes.error(FileReason::Camera { id, reason: Box::new(reason) })
+            })?;
+            self.cameras.insert(id, intrinsics);
+        }
+        bytes.check_end("cameras")
+    }
+
+    fn read_binary_images(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+        for _ in 0..bytes.count(73, "images")? {
+            let id = bytes.u32("an image")?;
+            let quaternion = bytes.f64s::<4>("an image")?;
+            let translation = bytes.f64s::<3>("an image")?.into();
+            let camera = bytes.u32("an image")?;
+            let name = bytes.text("an image's name")?.to_owned();
+            let rotation = rotation_matrix(quaternion).map_err(|reason| {
+                let (name, reason) = (name.clone(), Box::new(reason));
+                bytes.error(FileReason::Image { id, name, reason })
+            })?;
+            let mut points = Vec::new();
+            for _ in 0..bytes.count(24, "points of an image")? {
+                bytes.take(16, "a point of an image")?;
+                points.push(bytes.u64("a point of an image")?);
+            }
+            self.images.push(Image { rotation, translation, camera, name, points });
+        }
+        bytes.check_end("images")
+    }
+
+    fn read_binary_points(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+        for _ in 0..bytes.count(51, "points")? {
+            let id = bytes.u64("a point")?;
+            self.points.insert(id, bytes.f64s::<3>("a point")?.into());
+            bytes.take(11, "a point")?;
+            let track = bytes.count(8, "images of a point")?;
+            bytes.take(8 * track, "a point's images")?;
+        }
+        bytes.check_end("points")
+    }
+
+    fn read_text_cameras(&mut self, path: &Path) -> Result<(), DatasetError> {
+        for line in TextLine::all(path, &read_text(path)?).filter(|l| !l.words.is_empty()) {
+            let id = line.number(0, "camera id")?;
+            let name = line.words.get(1).copied().unwrap_or_default();
+            let (width, height) = (line.number(2, "width")?, line.number(3, "height")?);
+            let parameters = (4..line.words.len())
+                .map(|i| line.number(i, "parameter"))
+                .collect::<Result<Vec<f64>, _>>()?;
+            let Some(model) = CameraModel::with_name(name) else {
+                return Err(line.error(FileReason::UnknownModelName { model: name.to_owned() }));
+            };
+            let intrinsics = model
+                .intrinsics(width, height, &parameters)
+                .map_err(|reason| line.error(reason))?;
+            self.cameras.insert(id, intrinsics);
+        }
+        Ok(())
+    }
+
+    fn read_text_images(&mut self, path: &Path) -> Result<(), DatasetError> {
+        let text = read_text(path)?;
+        // Two lines per image; the second one, its points, may be empty.
+        let mut lines = TextLine::all(path, &text);
+        while let Some(line) = lines.next() {
+            if line.words.is_empty() {
+                continue;
+            }
+            let [w, x, y, z] = [1, 2, 3, 4].map(|i| line.number(i, "rotation"));
+            let rotation =
+                rotation_matrix([w?, x?, y?, z?]).map_err(|reason| line.error(reason))?;
+            let [x, y, z] = [5, 6, 7].map(|i| line.number(i, "translation"));
+            let translation = DVec3::new(x?, y?, z?);
+            let camera = line.number(8, "camera id")?;
+            if line.words.len() < 10 {
+                return Err(line.error(FileReason::Missing { what: "an image's name" }));
+            }
+            let name = line.rest_after(9).to_owned();
+            let points = match lines.next() {
+                None => Vec::new(),
+                Some(second) => second.points().ok_or_else(|| {
+                    let image = line.words[0].to_owned();
+                    let reason = FileReason::PointsExpected { line: second.number, image };
+                    DatasetError::format(path, reason)
+                })?,
+            };
+            self.images.push(Image { rotation, translation, camera, name, points });
+        }
+        Ok(())
+    }
+
+    fn read_text_points(&mut self, path: &Path) -> Result<(), DatasetError> {
+        for line in TextLine::all(path, &read_text(path)?).filter(|l| !l.words.is_empty()) {
+            let id = line.number(0, "point id")?;
+            let [x, y, z] = [line.number(1, "x")?, line.number(2, "y")?, line.number(3, "z")?];
+            self.points.insert(id, DVec3::new(x, y, z));
+        }
+        Ok(())
+    }
+
+    /// Removes points outside the cameras' [`Reach`]; returns a note on them, if any.
+    pub(super) fn remove_far_points(&mut self) -> Option<String> {
+        let centres: Vec<DVec3> = self.images.iter().map(Image::centre).collect();
+        let focal = self.cameras.values().map(|k| k.fx.max(k.fy)).fold(0.0, f64::max);
+        let before = self.points.len();
+        let reach = Reach::new(&centres, focal)?;
+        self.points.retain(|_, point| reach.contains(*point));
+        let removed = before - self.points.len();
+        (removed > 0).then(|| removed_points_note(removed, before))
+    }
+
+    /// Creates the frame of an image, without its name; `file` is its photograph.
+    pub(super) fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, FrameReason> {
+        let id = image.camera;
+        let camera = self.cameras.get(&id).ok_or(FrameReason::CameraNotFound { id })?;
+        let fitted = fit_camera(*camera, read_header(&file)?)
+            .map_err(|reason| FrameReason::OfCamera { id, reason: Box::new(reason) })?;
+        let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
+        let mut frame = Frame::new(file, fitted, camera_to_world);
+        frame.depths = depth_range(image, camera, &self.points);
+        frame.check()?;
+        Ok(frame)
+    }
+}
+
+/// Returns the rotation matrix of a quaternion (w, x, y, z) of any positive length.
+fn rotation_matrix([w, x, y, z]: [f64; 4]) -> Result<DMat3, FileReason> {
+    let quaternion = DQuat::from_xyzw(x, y, z, w);
+    let length = quaternion.length();
+    if !(length.is_finite() && length > 1e-9) {
+        return Err(FileReason::Rotation([w, x, y, z]));
+    }
+    Ok(DMat3::from_quat(quaternion * (1.0 / length)))
+}
+
+/// Line of a text file.
+struct TextLine<'a> {
+    path: &'a Path,
+    /// Line number, counted from 1.
+    number: usize,
+    text: &'a str,
+    words: Vec<&'a str>,
+}
+
+impl<'a> TextLine<'a> {
+    /// Returns the lines of a text without comments.
+    fn all(path: &'a Path, text: &'a str) -> impl Iterator<Item = Self> {
+        let lines = text.lines().enumerate().filter(|(_, line)| !line.starts_with('#'));
+        lines.map(move |(i, line)| Self {
+            path,
+            number: i + 1,
+            text: line,
+            words: line.split_whitespace().collect(),
+        })
+    }
+
+    fn error(&self, reason: FileReason) -> DatasetError {
+        DatasetError::format(self.path, reason.on_line(self.number))
+    }
+
+    /// Returns the rest of the line after a number of words: a file name, which may have spaces.
+    fn rest_after(&self, words: usize) -> &'a str {
+        let mut rest = self.text.trim();
+        for word in &self.words[..words.min(self.words.len())] {
+            rest = rest[word.len()..].trim_start();
+        }
+        rest
+    }
+
+    /// Parses an image's points (x, y, id) and returns their ids, without -1, which means no point.
+    /// `None` if the line is something else.
+    fn points(&self) -> Option<Vec<u64>> {
+        let mut points = Vec::new();
+        for point in self.words.chunks(3) {
+            let [x, y, id] = point else { return None };
+            x.parse::<f64>().ok()?;
+            y.parse::<f64>().ok()?;
+            points.extend(u64::try_from(id.parse::<i64>().ok()?).ok());
+        }
+        Some(points)
+    }
+
+    /// Parses the word with an index; `what` describes it in errors.
+    fn number<T: std::str::FromStr>(
+        &self,
+        index: usize,
+        what: &'static str,
+    ) -> Result<T, DatasetError> {
+        let Some(word) = self.words.get(index) else {
+            return Err(self.error(FileReason::Missing { what }));
+        };
+        word.parse()
+            .map_err(|_| self.error(FileReason::InvalidNumber { what, word: (*word).to_owned() }))
+    }
+}

@@ -1,0 +1,189 @@
+//! Checks of paths that should be files.
+
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::path::{Path, PathBuf};
+
+use artifact::{file_kind, has_passed_over_name, printable, shortened};
+
+use crate::error::DatasetError;
+
+/// Result of checking a path.
+#[derive(Debug)]
+pub(crate) enum FileStatus {
+    File,
+    Missing(FileProblem),
+    /// Something that can't be read as a file.
+    Unusable(FileProblem),
+}
+
+/// Reason why a path isn't a readable file.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum FileProblem {
+    #[error("{} not found", path_text(path))]
+    NotFound { path: PathBuf },
+    /// Absolute path of another machine, no tail of which is a file of the data set.
+    #[error("no file in the data set matches the end of the absolute path {}", path_text(path))]
+    NoMatchingTail { path: PathBuf },
+    #[error("{} is {kind}, not {expected}", path_text(path))]
+    WrongKind { path: PathBuf, kind: &'static str, expected: &'static str },
+    /// Link to a missing target, at the path or above it.
+    #[error(
+        "{} is a symbolic link to {}, which does not exist",
+        path_text(link),
+        path_text(target)
+    )]
+    DanglingLink { link: PathBuf, target: PathBuf },
+    /// Link that can't be followed, at the path or above it.
+    #[error("{} is a symbolic link that cannot be followed: {error}", path_text(link))]
+    BrokenLink { link: PathBuf, error: io::Error },
+    #[error(
+        "{} is named like an editor or system file, which are skipped; rename it",
+        path_text(path)
+    )]
+    SkippedName { path: PathBuf },
+    #[error("{}: path is too long ({bytes} bytes)", shortened(&path_text(path)))]
+    TooLong { path: PathBuf, bytes: usize },
+    #[error("cannot access {}: {error}", path_text(path))]
+    Inaccessible { path: PathBuf, error: io::Error },
+}
+
+/// Returns a path for a message, on one line; bytes that aren't UTF-8 are escaped as `\xFF`.
+pub(crate) fn path_text(path: &Path) -> String {
+    match path.to_str() {
+        Some(text) => printable(text).into_owned(),
+        None => format!("{path:?}").trim_matches('"').to_owned(),
+    }
+}
+
+/// Maximum length of a path in bytes (Linux's `PATH_MAX`).
+const MAX_PATH_BYTES: usize = 4096;
+
+/// Checks a path; `expected` describes the expected file in messages ("an image").
+pub(crate) fn file_status(path: &Path, expected: &'static str) -> FileStatus {
+    let bytes = path.as_os_str().len();
+    let too_long = FileProblem::TooLong { path: path.to_path_buf(), bytes };
+    if bytes > MAX_PATH_BYTES {
+        return FileStatus::Unusable(too_long);
+    }
+    let path_buf = path.to_path_buf();
+    if path.file_name().is_some_and(has_passed_over_name) {
+        return FileStatus::Unusable(FileProblem::SkippedName { path: path_buf });
+    }
+    let error = match fs::metadata(path) {
+        Ok(found) if found.is_file() => return FileStatus::File,
+        Ok(found) => {
+            let kind = file_kind(found.file_type());
+            return FileStatus::Unusable(FileProblem::WrongKind { path: path_buf, kind, expected });
+        }
+        Err(error) => error,
+    };
+    FileStatus::Unusable(match (broken_link(path), error.kind()) {
+        (Some(link), ErrorKind::NotFound) => {
+            let target = fs::read_link(link).unwrap_or_default();
+            FileProblem::DanglingLink { link: link.to_path_buf(), target }
+        }
+        (Some(link), _) => FileProblem::BrokenLink { link: link.to_path_buf(), error },
+        (None, ErrorKind::InvalidFilename) => too_long,
+        (None, ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+            return FileStatus::Missing(FileProblem::NotFound { path: path_buf });
+        }
+        (None, _) => FileProblem::Inaccessible { path: path_buf, error },
+    })
+}
+
+/// Finds the first link along a path that can't be followed.
+fn broken_link(path: &Path) -> Option<&Path> {
+    let mut ancestors: Vec<&Path> =
+        path.ancestors().filter(|a| !a.as_os_str().is_empty()).collect();
+    ancestors.reverse();
+    ancestors.into_iter().find(|ancestor| {
+        fs::symlink_metadata(ancestor).is_ok_and(|m| m.is_symlink())
+            && fs::metadata(ancestor).is_err()
+    })
+}
+
+/// True if a file's name begins with a dot, such as `.DS_Store` and macOS's `._IMG_0000.png`, which
+/// are not photographs.
+pub(crate) fn is_hidden(path: &Path) -> bool {
+    path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
+}
+
+/// Fails if a path is, or leads through, a link that can't be followed.
+pub(crate) fn check_link(path: &Path) -> Result<(), DatasetError> {
+    match file_status(path, "a folder") {
+        FileStatus::Unusable(
+            problem @ (FileProblem::DanglingLink { .. } | FileProblem::BrokenLink { .. }),
+        ) => Err(problem.into()),
+        _ => Ok(()),
+    }
+}
+
+/// Returns whether a file exists; fails if something else is in its place.
+pub(crate) fn is_file(path: &Path) -> Result<bool, DatasetError> {
+    match file_status(path, "a file") {
+        FileStatus::File => Ok(true),
+        FileStatus::Missing(_) => Ok(false),
+        FileStatus::Unusable(problem) => Err(problem.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt as _;
+    use std::os::unix::fs::symlink;
+    use std::os::unix::net::UnixListener;
+
+    use super::*;
+
+    #[test]
+    fn what_is_no_file_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        fs::write(at("file"), "").unwrap();
+        fs::create_dir(at("folder")).unwrap();
+        let _listening = UnixListener::bind(at("socket")).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(at("pipe")).status().unwrap().success());
+        symlink("/dev/zero", at("device")).unwrap();
+        symlink("loop", at("loop")).unwrap();
+        symlink("gone", at("dangling")).unwrap();
+        symlink("file", at("link")).unwrap();
+        let found = |name: &str| file_status(&at(name), "an image");
+        assert!(matches!((found("file"), found("link")), (FileStatus::File, FileStatus::File)));
+        for (name, words) in [
+            ("folder", "folder is a folder, not an image"),
+            ("pipe", "pipe is a named pipe (FIFO), not an image"),
+            ("socket", "socket is a socket, not an image"),
+            ("device", "device is a device, not an image"),
+            ("loop", "loop is a symbolic link that cannot be followed"),
+            ("loop/x.png", "loop is a symbolic link that cannot be followed"),
+            ("dangling/x.png", "dangling is a symbolic link to gone, which does not exist"),
+            ("dangling", "dangling is a symbolic link to gone, which does not exist"),
+            ("._x.png", "._x.png is named like an editor or system file"),
+            (&"y".repeat(300), ": path is too long"),
+            (&"z/".repeat(1 << 20), ": path is too long"),
+        ] {
+            let FileStatus::Unusable(problem) = found(name) else {
+                panic!("{name}: {:?}", found(name))
+            };
+            let text = problem.to_string();
+            assert!(text.contains(words), "{text}");
+        }
+        for (name, words) in
+            [("nothing", "nothing not found"), ("file/x.png", "file/x.png not found")]
+        {
+            let FileStatus::Missing(problem) = found(name) else {
+                panic!("{name}: {:?}", found(name))
+            };
+            let text = problem.to_string();
+            assert!(text.contains(words), "{text}");
+        }
+    }
+
+    #[test]
+    fn paths_are_shown_on_one_line() {
+        assert_eq!(path_text(Path::new("a\u{1b}[31m/b\n.png")), "a\\u{1b}[31m/b\\n.png");
+        assert_eq!(path_text(Path::new(OsStr::from_bytes(b"a\xff\n.png"))), "a\\xFF\\n.png");
+    }
+}
