@@ -96,7 +96,7 @@ fn fill(name: &str, mask: &Mask, truth: &mut Image, found: &Image) -> anyhow::Re
             format!("view {name}: its mask leaves no pixel to score; remove the view or its mask");
         return Err(Failure::BadInput(message).into());
     }
-    Ok(mask.share())
+    Ok(mask.counted_fraction())
 }
 
 /// Refuses a render, or HR truth, of another size than the true camera's.

@@ -48,7 +48,10 @@ impl<'a> SceneWriter<'a> {
         let mut with_clipped = all.values().filter(|(_, clipping)| clipping.clipped > 0);
         let (first, _) = with_clipped.next()?;
         let count = 1 + with_clipped.count();
-        let sum: Clipping = all.values().map(|(_, clipping)| *clipping).sum();
+        let mut sum = Clipping::default();
+        for (_, clipping) in all.values() {
+            sum.add(*clipping);
+        }
         Some(format!(
             "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and clipped to 1, in {count} of {} \
             (first: frame {first})",

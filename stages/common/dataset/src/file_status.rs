@@ -109,6 +109,15 @@ pub(crate) fn is_hidden(path: &Path) -> bool {
     path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
 }
 
+/// Returns a folder's entries that aren't hidden, sorted; none if the folder can't be read.
+pub(crate) fn visible_entries(folder: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut paths: Vec<PathBuf> =
+        entries.map(|entry| entry.path()).filter(|path| !is_hidden(path)).collect();
+    paths.sort();
+    paths
+}
+
 /// Fails if a path is, or leads through, a link that can't be followed.
 pub(crate) fn check_link(path: &Path) -> Result<(), DatasetError> {
     match file_status(path, "a folder") {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use artifact::nearest;
 
-use crate::file_status::{is_hidden, path_text};
+use crate::file_status::{path_text, visible_entries};
 use crate::find_format;
 use crate::format::Format;
 
@@ -75,22 +75,13 @@ impl Nearby {
     }
 }
 
-/// Returns a folder's entries that aren't hidden, sorted.
-fn entries(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let mut paths: Vec<PathBuf> =
-        entries.map(|entry| entry.path()).filter(|path| !is_hidden(path)).collect();
-    paths.sort();
-    paths
-}
-
 fn parent_folder(path: &Path) -> PathBuf {
     let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     parent.unwrap_or(Path::new(".")).to_path_buf()
 }
 
 fn sub_folders(folder: &Path) -> Vec<PathBuf> {
-    entries(folder).into_iter().filter(|path| path.is_dir()).collect()
+    visible_entries(folder).into_iter().filter(|path| path.is_dir()).collect()
 }
 
 fn name_text(path: &Path) -> &str {
@@ -117,7 +108,8 @@ fn find_polycam(folder: &Path) -> Option<Nearby> {
         (folder.to_path_buf(), folder.join("keyframes"))
     };
     let mut cameras = ["corrected_cameras", "cameras"].map(|name| keyframes.join(name)).into_iter();
-    let sign = cameras.find(|path| entries(path).iter().any(|e| has_extension(e, "json")))?;
+    let sign =
+        cameras.find(|path| visible_entries(path).iter().any(|e| has_extension(e, "json")))?;
     let remedy = conversion("polycam", &data);
     Some(Nearby::Export { application: "Polycam", sign, remedy })
 }
@@ -133,7 +125,7 @@ fn find_record3d(folder: &Path) -> Option<Nearby> {
     } else if has_rgb && has_depth && (has_json || has_metadata) {
         folder.join("rgb")
     } else {
-        entries(folder).into_iter().find(|path| has_extension(path, "r3d"))?
+        visible_entries(folder).into_iter().find(|path| has_extension(path, "r3d"))?
     };
     let data = if has_exr { sign.clone() } else { folder.to_path_buf() };
     let command = conversion("record3d", &data);
@@ -163,11 +155,10 @@ fn shell_quoted(path: &Path) -> String {
 
 /// Recognises files and folders with almost the name of a data set's.
 fn find_misnamed(folder: &Path) -> Option<Nearby> {
-    let entries = entries(folder);
     if let Some(found) = PARTS.into_iter().find(|part| folder.join(part).is_file()) {
         return Some(Nearby::Incomplete { found });
     }
-    for path in &entries {
+    for path in &visible_entries(folder) {
         let name = name_text(path);
         let meant = if path.is_dir() {
             nearest(name, ["sparse"]).filter(|_| has_model(path))
@@ -226,7 +217,7 @@ fn sets_of(folders: &[PathBuf]) -> Vec<(PathBuf, Format)> {
 /// Finds a file with almost the name `transforms_test.json`.
 pub(crate) fn find_misspelt_test_file(folder: &Path) -> Option<String> {
     let known = ["transforms_train.json", "transforms_val.json", "transforms.json", PARTS[0]];
-    let names = entries(folder);
+    let names = visible_entries(folder);
     let mut names = names.iter().map(|path| name_text(path)).filter(|name| !known.contains(name));
     names.find(|name| nearest(name, known) == Some(PARTS[0])).map(str::to_owned)
 }

@@ -1,7 +1,5 @@
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, Cursor, Seek};
-use std::iter::Sum;
-use std::ops::Add;
 use std::path::Path;
 
 use image::metadata::Orientation;
@@ -185,12 +183,13 @@ fn read_exr_photograph(path: &Path) -> Result<(Rgba8, Clipping), PixelError> {
     });
     let (r, g, b, a) = (r?, g?, b?, image.channel("A"));
     let mut data = Vec::with_capacity(4 * r.len());
-    let mut clipping = Clipping::default();
+    let mut clipped = 0;
     for i in 0..r.len() {
         let (colour, alpha) = ([r[i], g[i], b[i]], a.map_or(1.0, |a| a[i]));
         data.extend(encode_pixel(colour, alpha));
-        clipping = clipping + Clipping::of_pixel(colour, alpha);
+        clipped += u64::from(is_clipped(colour, alpha));
     }
+    let clipping = Clipping { clipped, pixels: r.len() as u64 };
     Ok((Rgba8::new(image.width, image.height, data), clipping))
 }
 
@@ -220,26 +219,17 @@ pub struct Clipping {
 }
 
 impl Clipping {
-    /// Counts one pixel of a premultiplied colour.
-    fn of_pixel(colour: [f32; 3], alpha: f32) -> Self {
-        let limit = alpha * (1.0 + HALF_ROUNDING);
-        let is_clipped = alpha > 0.0 && colour.iter().any(|value| *value > limit);
-        Self { clipped: is_clipped.into(), pixels: 1 }
+    /// Adds the counts of another image.
+    pub fn add(&mut self, other: Self) {
+        self.clipped += other.clipped;
+        self.pixels += other.pixels;
     }
 }
 
-impl Add for Clipping {
-    type Output = Self;
-
-    fn add(self, other: Self) -> Self {
-        Self { clipped: self.clipped + other.clipped, pixels: self.pixels + other.pixels }
-    }
-}
-
-impl Sum for Clipping {
-    fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
-        all.fold(Self::default(), Self::add)
-    }
+/// True if a premultiplied colour is brighter than its alpha.
+fn is_clipped(colour: [f32; 3], alpha: f32) -> bool {
+    let limit = alpha * (1.0 + HALF_ROUNDING);
+    alpha > 0.0 && colour.iter().any(|value| *value > limit)
 }
 
 /// Bytes of an 8-bit RGBA pixel.

@@ -101,8 +101,10 @@ impl Image {
     #[must_use]
     pub fn over(&self, background: f32) -> Self {
         assert_eq!(self.channels, 4, "only an image with alpha can be composited");
-        let mut data = vec![0.0; self.data.len() / 4 * 3];
-        for (out, p) in data.as_chunks_mut::<3>().0.iter_mut().zip(self.data.as_chunks::<4>().0) {
+        let pixels = self.data.as_chunks::<4>().0;
+        let mut data = vec![0.0; 3 * pixels.len()];
+        for (i, out) in data.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            let p = &pixels[i];
             *out = [0, 1, 2].map(|c| p[c] + (1.0 - p[3]) * background);
         }
         Self::new(self.width, self.height, 3, data)

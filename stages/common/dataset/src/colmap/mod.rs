@@ -13,7 +13,7 @@ use scene::Intrinsics;
 use crate::dataset::Dataset;
 use crate::error::{DatasetError, FrameReason, Problem};
 use crate::file_reason::FileReason;
-use crate::file_status::{check_link, is_file, is_hidden};
+use crate::file_status::{check_link, is_file, visible_entries};
 use crate::format::Format;
 use crate::frame::assign_names;
 use crate::lookup::{Listings, Located, Lookup, reduced_copies};
@@ -34,15 +34,6 @@ pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, DatasetError> {
         models.extend(folders_with_list(path, "images")?);
     }
     Ok(models)
-}
-
-/// Returns a folder's entries that aren't hidden, sorted.
-fn visible_entries(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let mut paths: Vec<PathBuf> =
-        entries.map(|entry| entry.path()).filter(|path| !is_hidden(path)).collect();
-    paths.sort();
-    paths
 }
 
 /// True if a folder has COLMAP's usual folder of photographs, `images` or a reduced copy.
