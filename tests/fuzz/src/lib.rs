@@ -55,7 +55,10 @@ impl Folder {
                 frame.reading_bytes().ok();
                 frame.photograph().ok();
                 if let Ok(Some(mask)) = frame.mask() {
-                    let size = (frame.stored_intrinsics.width as usize, frame.stored_intrinsics.height as usize);
+                    let size = (
+                        frame.stored_intrinsics.width as usize,
+                        frame.stored_intrinsics.height as usize,
+                    );
                     assert_eq!((mask.width, mask.height), size, "a mask has its image's size");
                 }
                 frame.camera().check().ok();

@@ -103,8 +103,7 @@ impl Image {
         assert_eq!(self.channels, 4, "only an image with alpha can be composited");
         let pixels = self.data.as_chunks::<4>().0;
         let mut data = vec![0.0; 3 * pixels.len()];
-        for (i, out) in data.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-            let p = &pixels[i];
+        for (out, p) in data.as_chunks_mut::<3>().0.iter_mut().zip(pixels) {
             *out = [0, 1, 2].map(|c| p[c] + (1.0 - p[3]) * background);
         }
         Self::new(self.width, self.height, 3, data)

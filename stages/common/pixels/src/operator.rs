@@ -162,8 +162,11 @@ impl Resampling {
             let out = &mut narrow[j * width * channels..(j + 1) * width * channels];
             for (i, pixel) in out.chunks_exact_mut(channels).enumerate() {
                 let (first, weights) = self.x.run(i);
-                for (k, w) in weights.iter().enumerate() {
-                    add_scaled(pixel, *w, &row[(first + k) * channels..][..channels]);
+                let inputs = row[first * channels..].chunks_exact(channels);
+                for (k, input) in inputs.take(weights.len()).enumerate() {
+                    for c in 0..channels {
+                        pixel[c] += weights[k] * input[c];
+                    }
                 }
             }
         }
@@ -200,8 +203,11 @@ impl Resampling {
             let out = &mut data[j * width * channels..(j + 1) * width * channels];
             for (i, pixel) in row.chunks_exact(channels).enumerate() {
                 let (first, weights) = self.x.run(i);
-                for (k, w) in weights.iter().enumerate() {
-                    add_scaled(&mut out[(first + k) * channels..][..channels], *w, pixel);
+                let inputs = out[first * channels..].chunks_exact_mut(channels);
+                for (k, input) in inputs.take(weights.len()).enumerate() {
+                    for c in 0..channels {
+                        input[c] += weights[k] * pixel[c];
+                    }
                 }
             }
         }

@@ -133,10 +133,9 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
         for row in current.data.chunks_exact(image.width * 4) {
             for tap in &taps {
                 let mut sum = [1 << (PRECISION_BITS - 1); 4];
-                let pixels = &row.as_chunks::<4>().0[tap.first..][..tap.weights.len()];
-                for (k, &w) in tap.weights.iter().enumerate() {
+                for (pixel, &w) in row.as_chunks::<4>().0[tap.first..].iter().zip(&tap.weights) {
                     for c in 0..4 {
-                        sum[c] += i32::from(pixels[k][c]) * w;
+                        sum[c] += i32::from(pixel[c]) * w;
                     }
                 }
                 data.extend(sum.map(clip));
