@@ -9,7 +9,7 @@ use scene::Intrinsics;
 use super::model::Image;
 
 /// Ball within which photographs determine a point's depth: outside it, the two cameras farthest
-/// apart observe a point in directions that differ by less than a pixel (docs/design/005).
+/// apart observe a point in directions that differ by less than a pixel.
 ///
 /// COLMAP's own points are far inside: COLMAP keeps points whose rays meet at 1.5° or more
 /// (`Mapper.filter_min_tri_angle`), so within 38 times the distance between two cameras. At a focal
