@@ -213,7 +213,7 @@ fn files_that_are_no_part_of_the_data_are_passed_over() {
     symlink("gone", folder.join("train/link.png")).unwrap();
     project.ok(&["run"]);
     let said = project.ok(&["log", "prep"]);
-    assert!(said.contains("2 files skipped") && said.contains(".#transforms_train"), "{said}");
+    assert!(said.contains("2 files ignored") && said.contains(".#transforms_train"), "{said}");
     std::fs::remove_file(folder.join(".#transforms_train.json")).unwrap();
     for name in [".DS_Store", "train/._r_0.png", ".~lock.transforms_train.json#", ".x.swp"] {
         std::fs::write(folder.join(name), "").unwrap();

@@ -124,7 +124,7 @@ impl Stage for Prep {
 /// views if another split is requested.
 fn read_dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
     let folder = context.input("dataset")?.folder();
-    log_skipped_files(context, folder);
+    log_ignored_files(context, folder);
     let set = Dataset::read(folder).bad_input("dataset")?;
     let set = match params.lens {
         LensHandling::Follow => {
@@ -154,12 +154,12 @@ fn check_lenses(set: &Dataset) -> Result<(), Failure> {
 
 /// Logs the files of a data set that are neither hashed nor read. `scene.json` doesn't list them,
 /// since they don't change the data set's hash.
-fn log_skipped_files(context: &Context, folder: &Path) {
-    let Ok((_, skipped)) = list_source_files(folder) else { return };
-    if let Some(first) = skipped.first() {
+fn log_ignored_files(context: &Context, folder: &Path) {
+    let Ok((_, ignored)) = list_source_files(folder) else { return };
+    if let Some(first) = ignored.first() {
         context.say(format!(
-            "{} skipped: dangling links, editor and system files (first: {})",
-            counted(skipped.len(), "file"),
+            "{} ignored: dangling links, editor and system files (first: {})",
+            counted(ignored.len(), "file"),
             printable(&first.display().to_string())
         ));
     }

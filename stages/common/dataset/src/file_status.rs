@@ -4,7 +4,7 @@ use std::fs;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
-use artifact::{file_kind, has_passed_over_name, printable, shortened};
+use artifact::{file_kind, is_ignored_name, printable, shortened};
 
 use crate::error::DatasetError;
 
@@ -38,10 +38,10 @@ pub(crate) enum FileProblem {
     #[error("{} is a symbolic link that cannot be followed: {error}", path_text(link))]
     BrokenLink { link: PathBuf, error: io::Error },
     #[error(
-        "{} is named like an editor or system file, which are skipped; rename it",
+        "{} is named like an editor or system file, which are ignored; rename it",
         path_text(path)
     )]
-    SkippedName { path: PathBuf },
+    IgnoredName { path: PathBuf },
     #[error("{}: path is too long ({bytes} bytes)", shortened(&path_text(path)))]
     TooLong { path: PathBuf, bytes: usize },
     #[error("cannot access {}: {error}", path_text(path))]
@@ -67,8 +67,8 @@ pub(crate) fn file_status(path: &Path, expected: &'static str) -> FileStatus {
         return FileStatus::Unusable(too_long);
     }
     let path_buf = path.to_path_buf();
-    if path.file_name().is_some_and(has_passed_over_name) {
-        return FileStatus::Unusable(FileProblem::SkippedName { path: path_buf });
+    if path.file_name().is_some_and(is_ignored_name) {
+        return FileStatus::Unusable(FileProblem::IgnoredName { path: path_buf });
     }
     let error = match fs::metadata(path) {
         Ok(found) if found.is_file() => return FileStatus::File,
