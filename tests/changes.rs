@@ -227,9 +227,9 @@ fn checkpoints_of_inputs_that_were_written_to_are_not_trusted() {
     assert_eq!(last.code, 0, "{}", last.stderr);
     let said = "train-ss: an input was written to after the checkpoint; starting over";
     assert!(last.stderr.contains(said), "{}", last.stderr);
-    assert!(!last.stderr.contains("going on from step"), "{}", last.stderr);
+    assert!(!last.stderr.contains("resuming from step"), "{}", last.stderr);
     // Without that it goes on.
     assert_eq!(stopped(&["-p", "train-ss.seed=5"]).code, 130);
     let last = project.run(&[&arguments[..], &["-p", "train-ss.seed=5"]].concat());
-    assert!(last.stderr.contains("going on from step"), "{}", last.stderr);
+    assert!(last.stderr.contains("resuming from step"), "{}", last.stderr);
 }

@@ -133,7 +133,7 @@ fn a_stage_ends_with_its_runner_and_leaves_a_checkpoint() {
         signal(&child, "-INT");
         let finished = Finished::of(child.wait_with_output().unwrap());
         assert_eq!(finished.code, 130, "{what}: {}", finished.stderr);
-        assert!(finished.stderr.contains("going on from step"), "{what}: {}", finished.stderr);
+        assert!(finished.stderr.contains("resuming from step"), "{what}: {}", finished.stderr);
         assert!(finished.stderr.contains("interrupted"), "{what}: {}", finished.stderr);
         assert!(last_checkpoint(&partial) > before, "{what}: no checkpoint at the end");
     }

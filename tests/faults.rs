@@ -61,7 +61,7 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     let again = stage("train-ss", PARAMS, &inputs, &output, &more);
     assert_eq!(again.code, 0, "{}", again.stderr);
     assert!(
-        again.stderr.contains("checkpoint.safetensors: not a whole checkpoint; starting over"),
+        again.stderr.contains("checkpoint.safetensors: incomplete checkpoint; starting over"),
         "{}",
         again.stderr
     );
@@ -94,7 +94,7 @@ fn a_runner_killed_or_interrupted_goes_on() {
     assert!(status.contains("has a checkpoint to resume from"), "{status}{said}");
     let last = project.run(&["run"]);
     assert_eq!(last.code, 0, "{}", last.stderr);
-    assert!(last.stderr.contains("going on from step"), "{}", last.stderr);
+    assert!(last.stderr.contains("resuming from step"), "{}", last.stderr);
     assert!(project.ok(&["verify"]).contains("5 artifacts, 0 damaged"));
     let undisturbed =
         Project::new(&std::fs::read_to_string(project.path("pipeline.yaml")).unwrap());

@@ -412,7 +412,7 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
     assert!(project.ok(&["status"]).contains("has a checkpoint to resume from"));
     let again = project.run(&["run"]);
     assert!(
-        again.code == 0 && again.stderr.contains("train-ss: going on from step"),
+        again.code == 0 && again.stderr.contains("train-ss: resuming from step"),
         "{}",
         again.stderr
     );

@@ -336,7 +336,7 @@ fn poses_stay_where_refined_ones_are_no_better() {
     );
     let (kept, said, training, page) = trained_with(&project, "pose_refinement=true");
     let words =
-        "the given poses stay: photographs meet their neighbours no better with refined poses";
+        "given poses are used: photographs match their neighbours no better with refined poses";
     assert!(said.contains(&format!("warning: {words}")), "{said}");
     assert!(training["warnings"][0].as_str().unwrap().starts_with(words), "{training}");
     assert!(page.contains("id=\"warnings\"") && page.contains(words));

@@ -208,7 +208,7 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         ),
         (
             &["-p", "background=alpha", "-p", "pose_refinement=true"],
-            "parameter pose_refinement: photographs with an open background",
+            "parameter pose_refinement: renders cannot be compared with photographs",
         ),
         (&["--device", "gpu"], "--device gpu: no such device; expected cpu, cuda or cuda:N"),
         (&["--device", "cuda:"], "--device cuda:: no such device"),

@@ -90,7 +90,7 @@ const CASES: &[Case] = &[
         stage: "train-refine",
         params: r#"{"steps": 1000000000, "patch_size": 16, "features": 8, "blocks": 1}"#,
         inputs: &[("views", "views"), ("truth", "scene/train")],
-        goes_on: Some("going on from step"),
+        goes_on: Some("resuming from step"),
         ..CASE
     },
     Case {
@@ -104,7 +104,7 @@ const CASES: &[Case] = &[
         stage: "train-ss",
         params: r#"{"rays": 1000000000000, "log2_hashmap_size": 14, "max_resolution": 256}"#,
         inputs: &[("scene", "scene/train")],
-        goes_on: Some("going on from step"),
+        goes_on: Some("resuming from step"),
         ..CASE
     },
     Case {

@@ -1,10 +1,10 @@
-//! `make bench`: what the engine costs, and that cost over what the machine can do, measured side
-//! by side in one run.
+//! `make bench`: speeds of the engine, absolute and relative to the machine's limits, measured in
+//! one run.
 //!
 //! `SCENE=DIR` is a scene that `prep` made (×2, 100 px in the Makefile), `OUT=FILE` gets rows of
 //! JSON `{name, value, unit}`, `RAYS=N` sets the length of the measured training (default 3
-//! million), `SIMD=avx512|avx2|portable` the SIMD family. `AGAINST=FILE` is what an earlier run
-//! wrote: each of its values is compared with this run's.
+//! million), `SIMD=avx512|avx2|portable` the SIMD family. `AGAINST=FILE` is the output of an
+//! earlier run to compare with.
 
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
@@ -40,14 +40,14 @@ impl Rows {
         self.0.iter().find(|r| r.name == name).map_or(f64::NAN, |r| r.value)
     }
 
-    /// Measures sgemm once more. Other work slows a machine down by half at times, and never speeds
-    /// it up: the best of all is what it can do.
+    /// Measures sgemm once more. Other processes can halve the speed but never increase it, so the
+    /// best of all measurements is the machine's limit.
     fn sgemm(&mut self, when: &str) {
         self.add(format!("sgemm_gflops_{when}"), sgemm(), "GFLOP/s");
     }
 
-    /// What speeds come to over the best sgemm of all.
-    fn relate(&mut self) {
+    /// Adds speeds relative to the best sgemm.
+    fn add_relative_speeds(&mut self) {
         let best = self
             .0
             .iter()
@@ -114,7 +114,7 @@ fn main() -> anyhow::Result<()> {
     if let Some(name) = variable("SIMD") {
         choose_family(&name)?;
     }
-    // Read first: a run of minutes shouldn't end in a wrong name.
+    // Fail on a wrong name before a run of minutes, not after it.
     let earlier = variable("AGAINST").map(|file| read_rows(Path::new(&file))).transpose()?;
     let mut rows = Rows::default();
     let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
@@ -126,13 +126,13 @@ fn main() -> anyhow::Result<()> {
     passes(&mut rows);
     if let Some(scene) = variable("SCENE") {
         let rays = variable("RAYS").map_or(Ok(3_000_000), |r| r.parse())?;
-        // Young fields are slower: only runs of equal length compare.
+        // Fields are slower early in training: only runs of equal length are comparable.
         rows.add("rays", rays as f64, "rays");
         training(&mut rows, Path::new(&scene), rays)?;
     } else {
         println!("skipped: no SCENE, so nothing was trained or rendered");
     }
-    rows.relate();
+    rows.add_relative_speeds();
     if let Some(earlier) = &earlier {
         compare(&rows, earlier);
     }
@@ -144,7 +144,7 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The best of several runs: noise only ever adds time.
+/// Returns the shortest time of several runs: noise only adds time.
 fn best(runs: usize, mut run: impl FnMut()) -> f64 {
     let once = |_| {
         let start = Instant::now();
@@ -162,7 +162,7 @@ fn one_core<T: Send>(run: impl FnOnce() -> T + Send) -> T {
         .install(run)
 }
 
-/// f32 matrix products, one on each core at once.
+/// Measures f32 matrix products, one on each core in parallel.
 fn sgemm() -> f64 {
     const N: usize = 768;
     let threads = rayon::current_num_threads();
@@ -197,7 +197,7 @@ fn sgemm() -> f64 {
     (2 * N * N * N * threads) as f64 / seconds / 1e9
 }
 
-/// a = b + 3·c over arrays far larger than the caches.
+/// Measures a = b + 3·c over arrays far larger than the caches.
 fn bandwidth() -> f64 {
     use rayon::prelude::*;
     const N: usize = 1 << 25;
@@ -212,7 +212,7 @@ fn bandwidth() -> f64 {
     (3 * 4 * N) as f64 / seconds / 1e9
 }
 
-/// Rays of a camera that looks at the unit box.
+/// Returns rays of a camera towards the unit box.
 fn rays(count: usize) -> Vec<Ray> {
     let side = (count as f64).sqrt() as usize;
     let at = |i: usize| {
@@ -227,7 +227,7 @@ fn rays(count: usize) -> Vec<Ray> {
     (0..side * side).map(at).collect()
 }
 
-/// One core through a field of faint density: every sample gets a colour.
+/// Measures one core in a field of low density, where every sample gets a colour.
 fn passes(rows: &mut Rows) {
     let bounds =
         Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, ..Default::default() };
@@ -274,15 +274,15 @@ fn passes(rows: &mut Rows) {
     }
 }
 
-/// A scene to train on.
+/// Scene to train on.
 struct Scene {
     input: GivenInput,
     views: Views,
 }
 
 impl Scene {
-    /// Trains a field from its start to its end, and adds the speed to the rows. `name` ends the
-    /// rows' names.
+    /// Trains a field completely and adds the speed to the rows. `name` is the suffix of the rows'
+    /// names.
     fn train(&self, rows: &mut Rows, params: &Params, name: &str) -> anyhow::Result<Field> {
         let Self { input, views } = self;
         let params = params.resolve(&SceneFacts::of(views, true));
@@ -306,14 +306,12 @@ impl Scene {
     }
 }
 
-/// Whole trainings with their warm-up, at one and all threads, and what the first one's field
-/// renders.
+/// Measures complete trainings, with one and all threads, and renders of the first one's field.
 fn training(rows: &mut Rows, folder: &Path, rays: u64) -> anyhow::Result<()> {
     let input = GivenInput::open("scene", &folder.join("train"))?;
     let views = Views::read(&input)?;
     let scene = Scene { input, views };
-    // Rays drawn evenly over all pixels, so that the figure compares with others'; then as
-    // trainings really go.
+    // Uniform draws first, for comparison with other implementations; then the defaults.
     let grid = |rays, pixel_importance| {
         let field =
             FieldParams::Grid(GridParams { rays, pixel_importance, ..GridParams::default() });
@@ -335,7 +333,7 @@ fn training(rows: &mut Rows, folder: &Path, rays: u64) -> anyhow::Result<()> {
     rendering(rows, folder, &field)
 }
 
-/// Renders ten of a scene's views, at one and all threads and several sizes.
+/// Measures renders of ten of a scene's views, with one and all threads and at several sizes.
 fn rendering(rows: &mut Rows, folder: &Path, field: &Field) -> anyhow::Result<()> {
     let truth = Views::read(&GivenInput::open("cameras", &folder.join("cameras"))?)?;
     let cameras: Vec<Camera> = truth.views.iter().take(10).map(|v| v.camera.clone()).collect();
@@ -362,8 +360,8 @@ fn rendering(rows: &mut Rows, folder: &Path, field: &Field) -> anyhow::Result<()
     Ok(())
 }
 
-/// Some steps of the paper's field as published: 2,048 rays, 64 + 64 samples, two networks of eight
-/// 256-wide layers.
+/// Measures some steps of the paper's field: 2,048 rays, 64 + 64 samples, two networks of eight
+/// layers of width 256.
 #[cfg(feature = "torch")]
 fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()> {
     const STEPS: u64 = 3;

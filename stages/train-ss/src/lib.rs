@@ -1,51 +1,21 @@
 //! `train-ss`: supersampled training of a radiance field from LR images (NeRF-SR, section
 //! "Supersampling").
 //!
-//! * [`Params`]: the stage's parameters; `supersample: 1` is plain NeRF on the same images.
-//! * [`Resolved`]: the parameters with every default that the scene decides ([`Params::resolve`]).
-//! * [`Supersampling`]: what rays are cast and what their colours are compared with: the paper's
-//!   average (its eq. 4), or the kernel that made the LR images.
-//! * [`supervision`]: reads and checks all that a training is supervised by; `memory`: what that
-//!   needs.
-//! * `photographs`: LR images and references, packed (`packed`) into memory and, beyond a budget, a
-//!   file.
-//! * `pixel_sampler`: which pixel a bundle trains on; `residual`: how their
-//!   colours are judged.
-//! * `sub_pixel_rays`: how many rays are cast through a pixel.
-//! * `hr_cache`: the field's HR pixels as last rendered, by which the kernel is known without
-//!   casting its whole footprint.
-//! * `member`: one training; `field_trainer`: whatever it trains, our grid or the paper's networks.
-//! * `exposure`: how bright each photograph is, where that is asked for.
-//! * `moving_cameras`: where photographs were taken from, where that is asked for; `pose_choice`:
-//!   whether it was better to ask.
-//! * `learnt`: HR pixels, exposures and poses that a training has come to know.
-//! * `checkpoint`: what makes a killed run end in the same bytes.
+//! * `params`: parameters, and defaults that depend on the scene ([`Params::resolve`]).
+//!   `supersample: 1` is plain NeRF on the same images.
+//! * `supersample`: the number of sub-pixel rays of an LR pixel, from the parameter to the warm-up.
+//! * `photographs`: LR images and HR references, packed into memory and, beyond a budget, a file.
+//! * `state`: HR cache, exposures and poses, estimated in addition to the field.
+//! * `supervision`: drawn pixels, their rays and their loss: the paper's average (eq. 4), or the
+//!   kernel that made the LR images ([`Supersampling`]).
+//! * `training`: trainers of our grid and of the paper's MLPs, with checkpoints and a log.
 
-mod assembly;
-mod checkpoint;
-mod exposure;
-mod field_trainer;
-mod hr_cache;
-mod init_field;
-mod learnt;
-mod member;
-mod memory;
-mod moving_cameras;
-mod packed;
 mod params;
 mod photographs;
-mod pixel_sampler;
-mod pixel_set;
-mod pose_choice;
-mod reference_blocks;
-mod references;
-mod residual;
-mod resolve;
-mod setup;
-mod sub_pixel_rays;
-mod supersampling_options;
+mod state;
+mod supersample;
 mod supervision;
-mod training_log;
+mod training;
 
 use artifact::{Failure, WARNING, amount, with_warnings};
 use contract::{Input, Output, Rule};
@@ -55,18 +25,16 @@ use scene::Views;
 use serde_json::json;
 use stage::{Context, Stage};
 
-use init_field::InitField;
-use member::{Member, TrainingData};
-pub use params::{Combine, FieldParams, GridParams, MlpParams, Params, RateSchedule};
-pub use pixel_sampler::Order;
-pub use resolve::{ParamsError, Resolved, ResolvedField, ResolvedRegularisers, SceneFacts};
-use setup::open_background;
-pub use setup::supervision;
-pub use supervision::{Supersampling, Supervision};
-use training_log::TRAINING_FILE;
-pub use training_log::{CurvePoint, TrainingLog};
+pub use params::{
+    Combine, FieldParams, GridParams, MlpParams, Order, Params, ParamsError, RateSchedule,
+    Resolved, ResolvedField, ResolvedRegularisers, SceneFacts, Supervision,
+};
+use supervision::transparent_background;
+pub use supervision::{Supersampling, supervision};
+pub use training::{CurvePoint, TrainingLog};
+use training::{InitField, Member, TRAINING_FILE, TrainingData, train_with_best_poses};
 
-/// The stage.
+/// Stage `train-ss`.
 pub struct TrainSs;
 
 impl Stage for TrainSs {
@@ -83,7 +51,7 @@ impl Stage for TrainSs {
                 "references",
                 Input::optional(
                     &["scene/references"],
-                    "HR images of some views, to train on beside the LR images",
+                    "HR images of some views, to train on in addition to the LR images",
                 ),
             ),
             (
@@ -102,23 +70,23 @@ impl Stage for TrainSs {
     }
 
     fn rules() -> Vec<Rule> {
-        let closed = [
+        let conflicts = [
             ("supervision", json!("kernel")),
             ("pose_refinement", json!(true)),
             ("exposure", json!(true)),
         ];
-        let closed = closed.map(|(parameter, value)| {
-            let message = open_background(parameter);
+        let conflicts = conflicts.map(|(parameter, value)| {
+            let message = transparent_background(parameter);
             Rule::new(&message)
                 .when("scene.background", json!({"const": "alpha"}))
                 .must(parameter, json!({"not": {"const": value}}))
         });
-        let importance = "parameter pixel_importance: an epoch goes through all pixels evenly; \
+        let message = "parameter pixel_importance: epochs draw all pixels equally often; \
             choose order random";
-        let evenly = Rule::new(importance)
+        let importance = Rule::new(message)
             .when("order", json!({"const": "epochs"}))
             .must("pixel_importance", json!({"anyOf": [{"type": "null"}, {"maximum": 1}]}));
-        closed.into_iter().chain([evenly]).collect()
+        conflicts.into_iter().chain([importance]).collect()
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
@@ -143,52 +111,56 @@ impl Stage for TrainSs {
         };
         let init = init.map(|input| InitField::read(input, &mut file, anchor)).transpose()?;
         views.bounds = file.bounds;
-        let (model, combine) = (file.field, params.combine);
         let mut log = TrainingLog { resolved: params.record(), ..TrainingLog::default() };
         if context.from_checkpoint() {
-            let from = init.as_ref().map(|init| (init.member(0), combine));
-            let member = Member::new(context, params.member(0), (model, from), 0, 0)?;
-            log.add(member.latest_checkpoint(views.bounds)?);
+            let init = init.as_ref().map(|init| (init.member(0), params.combine));
+            let member = Member::new(context, params.member(0), (file.field, init), 0, 0)?;
+            log.append(member.write_latest_checkpoint(views.bounds)?);
             return publish(context, &file, &log);
         }
-        let first = match (&init, combine) {
-            (Some(init), Combine::Ensemble) => init.keep_beside(context, &mut file)?,
+        let first_index = match (&init, params.combine) {
+            (Some(init), Combine::Ensemble) => init.copy_members(context, &mut file)?,
             _ => 0,
         };
-        let members: Vec<Resolved> =
-            (0..params.ensemble).map(|index| params.member(index)).collect();
-        let compared = if params.pose_refinement { members[0].rays } else { 0 };
-        let progress = context.progress("training", compared + params.rays);
+        // The first member trains twice to choose between given and refined poses.
+        let comparison_rays = if params.pose_refinement { params.member(0).rays } else { 0 };
+        let progress = context.progress("training", comparison_rays + params.rays);
         let data = TrainingData { input, references, views: &views, progress: &progress };
-        let mut done = compared;
-        for (index, own) in members.into_iter().enumerate() {
-            // What the first member finds of poses holds for all.
-            let own = Resolved {
-                pose_refinement: own.pose_refinement && (index == 0 || log.moves_cameras(&views)),
-                ..own
+        let mut rays = comparison_rays;
+        for index in 0..params.ensemble {
+            let mut member_params = params.member(index);
+            if index > 0 {
+                // The choice of poses by the first member applies to all.
+                member_params.pose_refinement &= log.has_moved_cameras(&views);
+            }
+            let init = init.as_ref().map(|init| (init.member(index), params.combine));
+            let before = if index == 0 { 0 } else { rays };
+            let init = (file.field, init);
+            let member = Member::new(context, member_params, init, first_index + index, before)?;
+            let trained = if index == 0 {
+                train_with_best_poses(&member, &data)?
+            } else {
+                member.run(&data)?
             };
-            let from = init.as_ref().map(|init| (init.member(index as u32), combine));
-            let before = if index == 0 { 0 } else { done };
-            let member = Member::new(context, own, (model, from), first + index as u32, before)?;
-            let trained =
-                if index == 0 { pose_choice::train(&member, &data)? } else { member.run(&data)? };
-            trained.warnings.iter().for_each(|warning| context.say(format!("{WARNING}{warning}")));
-            done += trained.rays;
-            log.add(trained);
-            progress.set(done, "");
+            for warning in &trained.warnings {
+                context.say(format!("{WARNING}{warning}"));
+            }
+            rays += trained.rays;
+            log.append(trained);
+            progress.set(rays, "");
         }
         publish(context, &file, &log)
     }
 }
 
-/// Writes what lies beside the weights.
+/// Writes the field's description, the log and the summary.
 fn publish(context: &Context, file: &FieldFile, log: &TrainingLog) -> anyhow::Result<()> {
     context.write_json(FIELD_FILE, file)?;
     context.write_json(TRAINING_FILE, log)?;
     let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
     let (rays, steps, samples) = (amount(log.rays), log.steps, log.samples_per_ray);
     let summary = format!(
-        "{rays} rays in {steps} steps, {samples:.1} samples a ray, training PSNR {psnr:.2} dB"
+        "{rays} rays in {steps} steps, {samples:.1} samples per ray, training PSNR {psnr:.2} dB"
     );
     context.write_summary(&with_warnings(&summary, &log.warnings))
 }

@@ -6,53 +6,51 @@ use glam::DVec3;
 use radiance::{FieldFile, FieldModel};
 use stage::Context;
 
-/// A field to go on from.
+/// Input `init`: the field that a training is initialised from.
 pub(crate) struct InitField<'a> {
     input: &'a GivenInput,
     members: u32,
 }
 
 impl<'a> InitField<'a> {
-    /// Reads what it says of itself, which must be what is to be trained. An older field keeps its
-    /// frame: bounds that differ from those of `wanted` by rounding, as seen from `anchor`, and its
-    /// positions.
+    /// Reads the description of the field and fails if it differs from `file`, the field to train.
+    /// A field written before bounds were rounded and positions scaled keeps its frame: its bounds,
+    /// which equal those of `file` after rounding around `anchor`, and its positions replace those
+    /// of `file`.
     pub(crate) fn read(
         input: &'a GivenInput,
-        wanted: &mut FieldFile,
+        file: &mut FieldFile,
         anchor: DVec3,
     ) -> anyhow::Result<Self> {
-        let file = fields::read_field_file(input)?;
-        if file.bounds.rounded(anchor) == wanted.bounds {
-            wanted.bounds = file.bounds;
+        let init = fields::read_field_file(input)?;
+        if init.bounds.rounded(anchor) == file.bounds {
+            file.bounds = init.bounds;
         }
-        if let (FieldModel::Mlp(own), FieldModel::Mlp(wanted)) = (file.field, &mut wanted.field) {
-            wanted.scaled_positions = own.scaled_positions;
+        if let (FieldModel::Mlp(init), FieldModel::Mlp(mlp)) = (init.field, &mut file.field) {
+            mlp.scaled_positions = init.scaled_positions;
         }
-        let differs = [
-            ("lies elsewhere; train both from one prep", file.bounds != wanted.bounds),
-            (
-                "has another background; train both from one prep",
-                file.background != wanted.background,
-            ),
-            (
-                "is made of something else than the parameters ask for; give those it was trained \
-                with",
-                file.field != wanted.field,
-            ),
-        ];
-        match differs.iter().find(|(_, differs)| *differs) {
-            Some((what, _)) => Err(Failure::BadInput(format!("input init: it {what}")).into()),
-            None => Ok(Self { input, members: file.members }),
-        }
+        let problem = if init.bounds != file.bounds {
+            "the field's bounds differ from the scene's; train both from one run of prep"
+        } else if init.background != file.background {
+            "the field's background differs from the scene's; train both from one run of prep"
+        } else if init.field != file.field {
+            "the field's architecture differs from the parameters; give the parameters that the \
+            field was trained with"
+        } else {
+            return Ok(Self { input, members: init.members });
+        };
+        Err(Failure::BadInput(format!("input init: {problem}")).into())
     }
 
-    /// Weights of a member; where it has fewer of them, they are gone on from in turn.
+    /// Returns the path of the weights that a member is initialised from. An ensemble with more
+    /// members than the initial field uses its members in turn.
     pub(crate) fn member(&self, index: u32) -> PathBuf {
         self.input.path(&FieldFile::member_file(index % self.members))
     }
 
-    /// Writes all of its members before those of `file`, and returns how many they are.
-    pub(crate) fn keep_beside(
+    /// Copies the initial field's members to the output, before those to train, and returns their
+    /// number.
+    pub(crate) fn copy_members(
         &self,
         context: &Context,
         file: &mut FieldFile,
@@ -60,14 +58,14 @@ impl<'a> InitField<'a> {
         file.members += self.members;
         file.check().map_err(|reason| {
             let message = format!(
-                "parameter ensemble: {reason} with those of input init; lower it, or set \
-                    combine to average_weights"
+                "parameter ensemble: {reason} including those of input init; lower it, or set \
+                combine to average_weights"
             );
             Failure::Usage(message)
         })?;
         for index in 0..self.members {
             std::fs::copy(self.member(index), context.output_path(&FieldFile::member_file(index))?)
-                .context("cannot keep input init")?;
+                .context("cannot copy input init")?;
         }
         Ok(self.members)
     }
@@ -80,7 +78,7 @@ mod tests {
 
     use super::*;
 
-    /// Reads a field that is initialised from another; both by their bounds and positions.
+    /// Reads a field to initialise another from; both have the given bounds and positions.
     fn read(init: (Bounds, bool), wanted: (Bounds, bool)) -> Result<(Bounds, bool), String> {
         let file = |(bounds, scaled_positions)| FieldFile {
             format: FIELD_FORMAT,
@@ -97,7 +95,7 @@ mod tests {
         Ok((wanted.bounds, architecture.scaled_positions))
     }
 
-    /// A field from before bounds were rounded and positions scaled is trained on in its own frame.
+    /// A field from before bounds were rounded and positions scaled keeps its own frame.
     #[test]
     fn older_fields_keep_their_frame() {
         let bounds =
@@ -107,6 +105,6 @@ mod tests {
         assert_eq!(read((rounded, true), (rounded, true)), Ok((rounded, true)));
         let elsewhere = bounds.moved(DVec3::splat(1e-4));
         let refused = read((elsewhere, true), (rounded, true)).unwrap_err();
-        assert!(refused.contains("it lies elsewhere"), "{refused}");
+        assert!(refused.contains("bounds differ"), "{refused}");
     }
 }

@@ -5,53 +5,45 @@ use artifact::{Failure, FailureExt as _};
 use radiance::{Field, FieldModel, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
 use scene::Bounds;
 
-use crate::resolve::{Resolved, ResolvedField};
+use crate::params::{Resolved, ResolvedField};
 use crate::supervision::Supersampling;
 
-/// Whatever is trained: a step at a time, with checkpoints.
+/// Trainer of any kind of field, one step at a time, with checkpoints.
 pub(crate) trait FieldTrainer {
-    /// Takes a step; `None` once all rays are spent.
+    /// Takes a step; returns `None` after all rays have been cast.
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>>;
-    /// The field as it is now.
+    /// Returns the current field.
     fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>>;
-    /// Steps taken.
+    /// Returns the number of steps taken.
     fn steps(&self) -> u64;
-    /// Rays cast so far.
+    /// Returns the number of rays cast.
     fn rays_done(&self) -> u64;
-    /// The step that a checkpoint was written at, where it is whole.
+    /// Returns the step of a checkpoint; `None` if the checkpoint is incomplete.
     fn checkpoint_step(&self, path: &Path) -> Option<u64>;
-    /// Writes all that a resumed training needs.
+    /// Writes a checkpoint.
     fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()>;
-    /// Goes on from a checkpoint; whether it could. A trainer that can't is as it was, unless
-    /// libtorch failed.
+    /// Resumes from a checkpoint and returns whether that succeeded. On failure the trainer is
+    /// unchanged, unless libtorch failed.
     fn resume(&mut self, path: &Path) -> bool;
     /// Ends the training and writes the field's weights.
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()>;
 }
 
-/// A training that can't learn any more; another seed may do.
-#[derive(Debug)]
+/// Error of a training that can't make progress; another seed may succeed.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
 pub(crate) struct Collapsed(pub(crate) String);
 
-impl std::fmt::Display for Collapsed {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for Collapsed {}
-
-/// A training that hasn't begun, from semi-transparent space or from weights that another training
-/// wrote (`from`).
-pub(crate) fn start(
+/// Creates a trainer of a new field, or of one initialised from the weights `init`.
+pub(crate) fn new_trainer(
     params: &Resolved,
-    from: Option<&Path>,
+    init: Option<&Path>,
     bounds: Bounds,
     device: &str,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
     match &params.field {
         ResolvedField::Grid { architecture, regularisers, given } => {
-            let field = match from {
+            let field = match init {
                 Some(weights) => {
                     let mut field =
                         Field::read(weights, *architecture, bounds).bad_input("input init")?;
@@ -62,23 +54,21 @@ pub(crate) fn start(
             };
             let options = params.grid_training(given, regularisers);
             if device != "cpu" {
-                return start_grid_on(device, &field, options);
+                return new_grid_trainer_on(device, &field, options);
             }
             Ok(Box::new(Trainer::new(field, options)))
         }
         #[cfg(feature = "torch")]
         ResolvedField::Mlp { architecture, density_noise_std, given } => {
-            let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+            let device = nets::device(device).map_err(device_failure)?;
             nets::deterministic();
-            let field = match from {
+            let field = match init {
                 Some(weights) => torch_field::Mlp::read(weights, *architecture, bounds, device)
                     .bad_input("input init")?,
                 None => torch_field::Mlp::new(*architecture, bounds, params.seed, device)?,
             };
-            Ok(Box::new(torch_field::MlpTrainer::new(
-                field,
-                params.mlp_training(given, *density_noise_std),
-            )?))
+            let options = params.mlp_training(given, *density_noise_std);
+            Ok(Box::new(torch_field::MlpTrainer::new(field, options)?))
         }
         #[cfg(not(feature = "torch"))]
         ResolvedField::Mlp { .. } => {
@@ -89,8 +79,8 @@ pub(crate) fn start(
     }
 }
 
-/// A field from weights that a training wrote.
-pub(crate) fn read(
+/// Reads a trained field.
+pub(crate) fn read_field(
     model: FieldModel,
     bounds: Bounds,
     weights: &Path,
@@ -100,70 +90,73 @@ pub(crate) fn read(
         FieldModel::Grid(architecture) => Ok(Box::new(Field::read(weights, architecture, bounds)?)),
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
-            let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+            let device = nets::device(device).map_err(device_failure)?;
             Ok(Box::new(torch_field::Mlp::read(weights, architecture, bounds, device)?))
         }
         #[cfg(not(feature = "torch"))]
         FieldModel::Mlp(_) => {
-            anyhow::bail!("a field of networks can't be read for {device}: there is no libtorch")
+            anyhow::bail!("cannot read MLPs for {device}: train-ss was built without libtorch")
         }
     }
 }
 
-/// Makes trained weights the mean of those and of the ones that the training went on from: what
-/// either makes up evens out, as if both fields were rendered, and little is lost of what was known
-/// before.
-pub(crate) fn average(
+/// Replaces trained weights by their mean with the initial ones (design note 020).
+pub(crate) fn average_weights(
     model: FieldModel,
     bounds: Bounds,
-    from: &Path,
+    init: &Path,
     trained: &Path,
 ) -> anyhow::Result<()> {
     match model {
         FieldModel::Grid(architecture) => {
             let mut field = Field::read(trained, architecture, bounds)?;
-            field.average_with(&Field::read(from, architecture, bounds)?);
+            field.average_with(&Field::read(init, architecture, bounds)?);
             field.write(trained)?;
         }
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
             let device = nets::device("cpu")?;
-            let read = |path| torch_field::Mlp::read(path, architecture, bounds, device);
-            let field = read(trained)?;
-            field.average_with(&read(from)?)?;
+            let field = torch_field::Mlp::read(trained, architecture, bounds, device)?;
+            field.average_with(&torch_field::Mlp::read(init, architecture, bounds, device)?)?;
             field.write(trained)?;
         }
+        // `new_trainer` has refused to train MLPs.
         #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {} // Nor could it be trained.
+        FieldModel::Mlp(_) => {}
     }
     Ok(())
 }
 
-/// The same grid and the same training through libtorch.
 #[cfg(feature = "torch")]
-fn start_grid_on(
+fn device_failure(error: nets::DeviceError) -> Failure {
+    Failure::Usage(error.to_string())
+}
+
+/// Creates a trainer of a grid in libtorch.
+#[cfg(feature = "torch")]
+fn new_grid_trainer_on(
     device: &str,
     field: &Field,
     options: TrainingOptions,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+    let device = nets::device(device).map_err(device_failure)?;
     nets::deterministic();
     Ok(Box::new(torch_field::GridTrainer::new(field, options, device)?))
 }
 
 #[cfg(not(feature = "torch"))]
-fn start_grid_on(
+fn new_grid_trainer_on(
     device: &str,
     _: &Field,
     _: TrainingOptions,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
     let message = format!(
-        "--device {device}: it needs libtorch, and train-ss was built without it; run `make build`"
+        "--device {device} needs libtorch, and train-ss was built without it; run `make build`"
     );
     Err(Failure::Usage(message).into())
 }
 
-/// What all trainers have by the same names.
+/// Implements the methods of [`FieldTrainer`] that all trainers have under the same names.
 macro_rules! forwarded {
     () => {
         fn steps(&self) -> u64 {
@@ -207,10 +200,11 @@ impl FieldTrainer for Trainer {
     }
 }
 
+/// Writes a grid without its specks; fails if a parameter isn't finite.
 fn write_grid(mut field: Field, steps: u64, weights: &Path) -> anyhow::Result<()> {
     if !field.is_finite() {
         return Err(Failure::Numerical(format!(
-            "step {steps}: a parameter is not finite; lower the rate"
+            "step {steps}: a parameter is not finite; lower the learning rate"
         ))
         .into());
     }
@@ -221,7 +215,7 @@ fn write_grid(mut field: Field, steps: u64, weights: &Path) -> anyhow::Result<()
 #[cfg(feature = "torch")]
 impl FieldTrainer for torch_field::GridTrainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
-        Self::step(self, supervision).map_err(numerical)
+        Self::step(self, supervision).map_err(torch_failure)
     }
 
     fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>> {
@@ -235,9 +229,9 @@ impl FieldTrainer for torch_field::GridTrainer {
     }
 }
 
-/// What libtorch's trainings end with.
+/// Converts an error of a libtorch trainer.
 #[cfg(feature = "torch")]
-fn numerical(error: torch_field::TorchFieldError) -> anyhow::Error {
+fn torch_failure(error: torch_field::TorchFieldError) -> anyhow::Error {
     match error {
         torch_field::TorchFieldError::NotFinite { .. } => {
             Failure::Numerical(error.to_string()).into()
@@ -250,7 +244,7 @@ fn numerical(error: torch_field::TorchFieldError) -> anyhow::Error {
 #[cfg(feature = "torch")]
 impl FieldTrainer for torch_field::MlpTrainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
-        Self::step(self, supervision).map_err(numerical)
+        Self::step(self, supervision).map_err(torch_failure)
     }
 
     fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>> {

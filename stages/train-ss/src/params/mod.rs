@@ -1,35 +1,41 @@
+//! Parameters of `train-ss`, and the defaults that depend on the scene.
+
+mod resolve;
+mod resolved;
+mod scene_facts;
+
 use radiance::{Architecture, MlpArchitecture};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::pixel_sampler::Order;
-use crate::supervision::Supervision;
+pub use resolve::ParamsError;
+pub use resolved::{Resolved, ResolvedField, ResolvedRegularisers};
+pub use scene_facts::SceneFacts;
 
-/// Parameters of `train-ss`. Those that stay unset get a default from the scene
-/// ([`Params::resolve`]).
+/// Parameters of `train-ss`. [`Params::resolve`] replaces `None` with a default for the scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
     /// Kind of field: the hash grid, or the paper's MLPs, which take hours on a CPU.
     #[schemars(extend("x-group" = "field"))]
     pub field: FieldParams,
-    /// Sub-pixel rays along each side of an LR pixel, called s in the paper; 1 is plain NeRF. It
-    /// may differ from the scale of the views: fewer rays per pixel mean more pixels for the same
-    /// `rays`. With `supervision: kernel` it is the number of HR pixels along each side of an LR
-    /// pixel and may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
+    /// Sub-pixel rays along each side of an LR pixel, called s in the paper; 1 is plain NeRF. The
+    /// number may differ from the scale of the views: fewer rays per pixel mean more pixels for the
+    /// same `rays`. With `supervision: kernel`, the number of HR pixels along each side of an LR
+    /// pixel, which may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "sampling"))]
     pub supersample: f64,
-    /// How rays are compared with the LR pixel. Default: `kernel` for `grid` where `prep` made the
-    /// LR images or assumes their kernel and `background` isn't `alpha`, else `average`.
+    /// Comparison of an LR pixel with its rays. Default: `kernel` for `field: grid` if the scene
+    /// states the kernel of the LR images and `background` isn't `alpha`; otherwise `average`.
     #[schemars(extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub supervision: Option<Supervision>,
-    /// Finds one factor for red, green and blue of each photograph, for photographs with several
+    /// Estimates a gain for red, green and blue of each photograph, for photographs with several
     /// exposures or white balances. Rendered views have the mean exposure of the photographs.
     #[schemars(extend("x-group" = "data"))]
     pub exposure: bool,
     /// Optimises camera poses during training, for poses that aren't exact. Motion that all cameras
-    /// share is removed. Each field of an `ensemble` finds its own poses. `nerf-sr run registered`
-    /// then renders test views from registered cameras.
+    /// share is removed. Each field of an `ensemble` estimates its own poses.
+    /// `nerf-sr run registered` then renders test views from registered cameras.
     #[schemars(extend("x-group" = "data"))]
     pub pose_refinement: bool,
     /// Maximum number of HR references: the first ones of input `references` are used.
@@ -39,9 +45,9 @@ pub struct Params {
     /// images are averaged. Field m equals a single field trained with seed `seed` + m.
     #[schemars(range(min = 1, max = 16), extend("x-group" = "output"))]
     pub ensemble: u32,
-    /// How the initial field (input `init`) and the fine-tuned field are used. Default:
-    /// `average_weights` in NDC, where all cameras see the same side of the scene; `ensemble`
-    /// elsewhere, where a reference tells nothing about the other sides.
+    /// Combination of the initial field (input `init`) with the fine-tuned field. Default:
+    /// `average_weights` in NDC, where all cameras observe the same side of the scene; otherwise
+    /// `ensemble`, since a reference gives no information about the other sides.
     #[schemars(extend("x-group" = "output", "x-default" = BY_SCENE))]
     pub combine: Option<Combine>,
     /// Seed of all random numbers.
@@ -49,7 +55,7 @@ pub struct Params {
     pub seed: u64,
 }
 
-/// Stands for the default of a parameter that the scene decides.
+/// Text in place of a default that depends on the scene.
 const BY_SCENE: &str = "by scene";
 
 impl Default for Params {
@@ -68,7 +74,7 @@ impl Default for Params {
     }
 }
 
-/// The kinds of field, each with its own parameters.
+/// Kind of field, with the parameters of that kind.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FieldParams {
@@ -91,23 +97,23 @@ pub struct GridParams {
     /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
     pub rays: u64,
-    /// Maximum number of rays in a step. Below 256 it counts as 256.
+    /// Maximum number of rays in a step; values below 256 mean 256.
     #[schemars(range(min = 1, max = 1_048_576), extend("x-group" = "sampling"))]
     pub max_rays_per_step: u32,
-    /// Number of samples that the first steps aim at. The last steps aim at 8/3 times as many.
-    /// Steps have fewer rays while space is full of semi-transparent density.
+    /// Target number of samples in the first steps. The last steps have 8/3 times as many. Steps
+    /// have fewer rays while space is full of semi-transparent density.
     #[schemars(range(min = 1024, max = 16_777_216), extend("x-group" = "sampling"))]
     pub samples_per_step: u32,
     /// Order in which pixels are drawn.
     #[schemars(extend("x-group" = "sampling"))]
     pub order: Order,
-    /// How many times more often a pixel with detail around it is drawn than a flat one, with
-    /// `order: random`. The pixel's weight in the loss is divided by this factor, which keeps the
-    /// expected loss unchanged. Default: 10 with `order: random`, else 1.
+    /// Factor by which pixels with detail around them are drawn more often than flat pixels, with
+    /// `order: random`. A pixel's weight in the loss is divided by this factor, which keeps the
+    /// expected loss unchanged. Default: 10 with `order: random`, otherwise 1.
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling", "x-default" = "10"))]
     pub pixel_importance: Option<f64>,
-    /// Fraction of the rays that warms up with fewer sub-pixel rays per side: 1, 2, 4 and so on, up
-    /// to `supersample`.
+    /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
+    /// per side at first, then 2, 4 and so on, up to `supersample`.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "sampling"))]
     pub supersample_warmup: f64,
     /// Number of steps at the start that draw pixels only from the middle half of each image's
@@ -115,17 +121,17 @@ pub struct GridParams {
     #[schemars(extend("x-group" = "sampling"))]
     pub precrop_steps: u32,
     /// Samples along the diagonal of the unit cube. Default: 256 in NDC, where every ray crosses
-    /// the whole cube; else 512.
+    /// the whole cube; otherwise 512.
     #[schemars(range(min = 16, max = 8192), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub march_steps: Option<u32>,
     /// Weight of the distortion loss, which concentrates the sample weights along a ray. Default:
     /// with `background: opaque`, where empty space would otherwise fill with density, 0.004 in NDC
-    /// and 0.002 in a contraction; else 0, because the loss costs detail.
+    /// and 0.002 in a contraction; in all other cases 0, because the loss costs detail.
     #[schemars(range(min = 0.0, max = 10.0), extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub distortion: Option<f64>,
     /// Weight of the floater loss, which penalises semi-transparent density of the background's
-    /// colour. No image can tell such density from empty space. Default: 0.001 where the background
-    /// is white or black, else 0.
+    /// colour: images cannot distinguish such density from empty space. Default: 0.001 with a white
+    /// or black background, otherwise 0.
     #[schemars(range(min = 0.0, max = 10.0), extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub floater_loss: Option<f64>,
     /// Highest learning rate of the grid's coarsest level.
@@ -138,7 +144,7 @@ pub struct GridParams {
     /// Highest learning rate of the MLPs.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
     pub mlp_learning_rate: f64,
-    /// Learning rates at the end, as a share of the highest ones. They fall exponentially.
+    /// Final learning rates as a fraction of the highest ones. Learning rates fall exponentially.
     #[schemars(range(min = 1e-6, max = 1.0), extend("x-group" = "optimiser"))]
     pub learning_rate_decay: f64,
     /// Decay of the moving average of the weights, which starts late in training. 0 uses the final
@@ -155,11 +161,11 @@ pub struct GridParams {
     #[schemars(range(min = 2, max = 512), extend("x-group" = "field"))]
     pub base_resolution: u32,
     /// Cells along an axis of the finest level. Default: 2.56 cells for each LR pixel across the
-    /// unit cube as the cameras see it, at least `base_resolution`.
+    /// unit cube, at least `base_resolution`.
     #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub max_resolution: Option<u32>,
-    /// Maximum number of cells along z, of any level. Default: in NDC, where rays run along z, no
-    /// more than a ray has samples; elsewhere no limit.
+    /// Maximum number of cells along z, of any level. Default: in NDC, where rays run along z, the
+    /// number of samples along a ray; otherwise no limit.
     #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub finest_z: Option<u32>,
     /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at a
@@ -215,35 +221,35 @@ pub struct MlpParams {
     /// Order in which pixels are drawn.
     #[schemars(extend("x-group" = "sampling"))]
     pub order: Order,
-    /// How many times more often a pixel with detail around it is drawn than a flat one, with
-    /// `order: random`. The pixel's weight in the loss is divided by this factor, which keeps the
+    /// Factor by which pixels with detail around them are drawn more often than flat pixels, with
+    /// `order: random`. A pixel's weight in the loss is divided by this factor, which keeps the
     /// expected loss unchanged.
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
     pub pixel_importance: f64,
-    /// Fraction of the rays that warms up with fewer sub-pixel rays per side: 1, 2, 4 and so on, up
-    /// to `supersample`.
+    /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
+    /// per side at first, then 2, 4 and so on, up to `supersample`.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "sampling"))]
     pub supersample_warmup: f64,
     /// Number of steps at the start that draw pixels only from the middle half of each image's
-    /// width and height. Default: 0 in NDC, else 1000.
+    /// width and height. Default: 0 in NDC, otherwise 1000.
     #[schemars(extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub precrop_steps: Option<u32>,
     /// Samples of the coarse MLP along a ray.
     #[schemars(range(min = 4, max = 4096), extend("x-group" = "sampling"))]
     pub coarse_samples: u32,
-    /// Further samples along a ray, for the fine MLP.
+    /// Additional samples along a ray, for the fine MLP.
     #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
     pub fine_samples: u32,
-    /// Standard deviation of the noise on raw densities. Default: 1 in NDC, else 0.
+    /// Standard deviation of the noise on raw densities. Default: 1 in NDC, otherwise 0.
     #[schemars(range(min = 0.0, max = 100.0), extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub density_noise_std: Option<f64>,
     /// Highest learning rate.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
     pub learning_rate: f64,
-    /// Learning rate at the end, as a share of the highest one.
+    /// Final learning rate as a fraction of the highest one.
     #[schemars(range(min = 1e-6, max = 1.0), extend("x-group" = "optimiser"))]
     pub learning_rate_decay: f64,
-    /// How the learning rate falls. A training shorter than the paper's compresses the whole
+    /// Schedule of the learning rate. A training shorter than the paper's compresses the whole
     /// schedule into its steps.
     #[schemars(extend("x-group" = "optimiser"))]
     pub schedule: RateSchedule,
@@ -257,8 +263,8 @@ pub struct MlpParams {
     /// Octaves of the encoding of directions.
     #[schemars(range(min = 0, max = 16), extend("x-group" = "field"))]
     pub direction_frequencies: u32,
-    /// In NDC, colours depend on the ray's direction in NDC, as in the paper's code, and not on its
-    /// direction in the world.
+    /// In NDC, makes colours depend on the ray's direction in NDC, as in the paper's code, instead
+    /// of its direction in the world.
     #[schemars(extend("x-group" = "field"))]
     pub ndc_directions: bool,
     /// Number of layers that density and colour share.
@@ -295,23 +301,42 @@ impl Default for MlpParams {
     }
 }
 
-/// How the initial and the fine-tuned field are used.
+/// Comparison of an LR pixel with its rays.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Supervision {
+    /// Compares the mean of the rays, for LR images of any origin (the paper's eq. 4).
+    Average,
+    /// Renders HR pixels and shrinks them by the known degradation kernel.
+    Kernel,
+}
+
+/// Order of pixel draws.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Order {
+    /// Draws pixels independently.
+    Random,
+    /// Draws each pixel once in random order, then again in another order.
+    Epochs,
+}
+
+/// Combination of the initial with the fine-tuned field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Combine {
-    /// The mean of their weights is kept (Wortsman et al. 2022, "Robust fine-tuning"): one field to
-    /// render.
+    /// Averages the weights (Wortsman et al. 2022, "Robust fine-tuning"): one field to render.
     AverageWeights,
-    /// Their rendered images are averaged: better, and as slow as two fields.
+    /// Averages the rendered images: better, and as slow as two fields.
     Ensemble,
 }
 
-/// How the learning rate of the paper's MLPs falls.
+/// Schedule of the learning rate of the paper's MLPs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum RateSchedule {
-    /// As in the paper's code: by epochs, flat until the last ten.
+    /// The paper's code: constant until the last ten epochs, then a decay per epoch.
     Code,
-    /// As in the paper's text: exponentially throughout.
+    /// The paper's text: exponential decay throughout.
     Paper,
 }

@@ -1,27 +1,41 @@
+//! Photographs to train on, packed into memory and, beyond a budget, a file.
+
+mod packed;
+mod pixel_memory;
+mod pixel_set;
+mod references;
+
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput};
 use scene::{Background, View, Views};
 
-use crate::packed::{PackedPhotograph, PixelMemory};
+pub(crate) use packed::PackedPhotograph;
+pub(crate) use pixel_memory::{Bytes, PixelMemory};
+pub(crate) use pixel_set::PixelSet;
+pub(crate) use references::check_references;
+
+/// Message for a pixel file that can't be written.
+pub(crate) const NO_SPACE: &str =
+    "cannot store pixels in a file next to the output; free space on that disk";
 
 /// Photographs to train on, each with its view.
 #[derive(Debug)]
 pub(crate) struct Photographs {
-    /// Where they were taken from.
+    /// Views of the photographs.
     pub(crate) views: Views,
-    /// One for each view, of its camera's size.
+    /// One photograph per view, of its camera's size.
     pub(crate) images: Vec<PackedPhotograph>,
 }
 
 impl Photographs {
-    /// Reads the first photographs of an input, at most so many, and packs each at once.
+    /// Reads the first `max_count` photographs of an input and packs each before reading the next.
     pub(crate) fn read(
         input: &GivenInput,
-        most: usize,
+        max_count: usize,
         memory: &mut PixelMemory,
     ) -> anyhow::Result<Self> {
         let mut views = Views::read(input)?;
-        views.views.truncate(most);
+        views.views.truncate(max_count);
         let images = views
             .views
             .iter()
@@ -30,7 +44,12 @@ impl Photographs {
         Ok(Self { views, images })
     }
 
-    /// Over the background, but where that is open.
+    /// Returns each view with its photograph.
+    pub(crate) fn into_pairs(self) -> impl Iterator<Item = (View, PackedPhotograph)> {
+        self.views.views.into_iter().zip(self.images)
+    }
+
+    /// Composites the photographs over the scene's background unless that is transparent.
     pub(crate) fn over_background(self) -> Self {
         let background = self.views.background;
         if background == Background::Alpha {
@@ -44,7 +63,7 @@ impl Photographs {
 
 #[cfg(test)]
 impl Photographs {
-    /// An image that a camera took, RGB or premultiplied RGBA.
+    /// Returns the only photograph of a camera, RGB or premultiplied RGBA.
     pub(crate) fn taken_by(camera: scene::Camera, image: pixels::Image) -> Self {
         let views = Views::new(
             Background::White,
@@ -62,21 +81,17 @@ fn read(
     memory: &mut PixelMemory,
 ) -> anyhow::Result<PackedPhotograph> {
     let (name, k) = (&view.camera.name, view.camera.intrinsics);
-    let place = input.folder().display();
-    let photograph = view.read_photograph(input).bad_input(&place)?;
+    let folder = input.folder().display();
+    let photograph = view.read_photograph(input).bad_input(&folder)?;
     let photograph =
-        photograph.with_context(|| format!("view {name}: it has no image")).bad_input(&place)?;
+        photograph.with_context(|| format!("view {name} has no image")).bad_input(&folder)?;
     let (width, height) = (photograph.image.width, photograph.image.height);
     if (width, height) != (k.width as usize, k.height as usize) {
         let message = format!(
-            "{place}: view {name}: {width}×{height} pixels where its camera has {}×{}",
+            "{folder}: view {name}: the image has {width}×{height} pixels, its camera {}×{}",
             k.width, k.height
         );
         return Err(Failure::BadInput(message).into());
     }
-    PackedPhotograph::new(&photograph, memory).context(NO_PLACE)
+    PackedPhotograph::new(&photograph, memory).context(NO_SPACE)
 }
-
-/// What to say where pixels can't be written to their file.
-pub(crate) const NO_PLACE: &str =
-    "cannot keep pixels in a file beside the output; make place on that disk";

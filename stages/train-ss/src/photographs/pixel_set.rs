@@ -1,20 +1,21 @@
-/// A set of pixels among many: a bit each, and how many there are before every block of them, so
-/// that the n-th is found quickly.
+/// Number of 64-bit words of a block.
+const WORDS_PER_BLOCK: usize = 8;
+
+/// Subset of numbered pixels: one bit per pixel, and the rank of every block of words, so that the
+/// n-th element is found quickly.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PixelSet {
     words: Vec<u64>,
-    /// Pixels that it says something of.
+    /// Number of pixels appended, in the set or not.
     length: u64,
-    /// Pixels of the set before each block.
+    /// Number of elements before each block.
     before: Vec<u64>,
+    /// Number of elements.
     count: u64,
 }
 
-/// Words of a block.
-const WORDS_PER_BLOCK: usize = 8;
-
 impl PixelSet {
-    /// How many pixels are in it.
+    /// Returns the number of elements.
     pub(crate) fn len(&self) -> u64 {
         self.count
     }
@@ -23,29 +24,29 @@ impl PixelSet {
         self.words.get((pixel / 64) as usize).is_some_and(|word| word >> (pixel % 64) & 1 == 1)
     }
 
-    /// The n-th pixel of the set, of those that are in it counted from 0.
+    /// Returns the n-th element in ascending order, counted from 0.
     pub(crate) fn nth(&self, n: u64) -> Option<u64> {
         if n >= self.count {
             return None;
         }
         let block = self.before.partition_point(|&before| before <= n) - 1;
         let mut left = n - self.before[block];
-        for (at, word) in self.words.iter().enumerate().skip(block * WORDS_PER_BLOCK) {
-            let here = u64::from(word.count_ones());
-            if left < here {
+        for (i, word) in self.words.iter().enumerate().skip(block * WORDS_PER_BLOCK) {
+            let ones = u64::from(word.count_ones());
+            if left < ones {
                 let rest = (0..left).fold(*word, |word, _| word & (word - 1));
-                return Some(64 * at as u64 + u64::from(rest.trailing_zeros()));
+                return Some(64 * i as u64 + u64::from(rest.trailing_zeros()));
             }
-            left -= here;
+            left -= ones;
         }
         None
     }
 }
 
-/// By whether each of the next pixels is in it.
+/// Appends pixels; `true` puts the pixel into the set.
 impl Extend<bool> for PixelSet {
     fn extend<I: IntoIterator<Item = bool>>(&mut self, pixels: I) {
-        for is_in in pixels {
+        for is_element in pixels {
             let bit = self.length % 64;
             if bit == 0 {
                 if self.words.len().is_multiple_of(WORDS_PER_BLOCK) {
@@ -54,10 +55,10 @@ impl Extend<bool> for PixelSet {
                 self.words.push(0);
             }
             if let Some(word) = self.words.last_mut() {
-                *word |= u64::from(is_in) << bit;
+                *word |= u64::from(is_element) << bit;
             }
             self.length += 1;
-            self.count += u64::from(is_in);
+            self.count += u64::from(is_element);
         }
     }
 }

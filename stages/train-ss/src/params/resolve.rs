@@ -1,158 +1,30 @@
-//! Defaults that depend on the scene: decided here, once, and recorded in `training.json`.
+use radiance::{Architecture, MlpArchitecture};
+use scene::{Background, Space};
 
-use std::collections::BTreeMap;
+use super::{
+    Combine, FieldParams, GridParams, MlpParams, Order, Params, Resolved, ResolvedField,
+    ResolvedRegularisers, SceneFacts, Supervision,
+};
+use crate::supersample::whole_supersample;
 
-use radiance::{Architecture, FieldModel, MlpArchitecture, Regularisers, TrainingOptions};
-use scene::{Background, Intrinsics, Space, View, Views};
-use serde_json::{Value, json};
-
-use crate::params::{Combine, FieldParams, GridParams, MlpParams, Params};
-use crate::pixel_sampler::Order;
-use crate::sub_pixel_rays::{rays_per_side, warmup_stages};
-use crate::supervision::Supervision;
-
-/// Epochs of the published trainings: for Blender's scenes, and for photographs in NDC.
+/// Epochs of the published trainings of Blender scenes (NeRF-SR).
 const EPOCHS: u64 = 20;
+/// Epochs of the published trainings of photographs in NDC (NeRF-SR).
 const EPOCHS_IN_NDC: u64 = 30;
-/// Steps of precrop of the published training on Blender's scenes.
+/// Precrop steps of the published trainings of Blender scenes (design note 022).
 const PRECROP_STEPS: u32 = 1000;
-/// Weights of the distortion loss before an opaque background, in NDC and in a contraction.
+/// Weight of the distortion loss with an opaque background in NDC (design note 012).
 const DISTORTION_IN_NDC: f64 = 0.004;
+/// Weight of the distortion loss with an opaque background in a contraction (design note 012).
 const DISTORTION_IN_CONTRACTION: f64 = 0.002;
-/// Weight of the floater loss before a background that has one colour.
+/// Weight of the floater loss with a background of one colour (design note 013).
 const FLOATER_LOSS: f64 = 0.001;
-/// How much more often detail is drawn, in random order.
+/// Ratio of the draw rates of detailed and flat pixels with `order: random` (design note 010).
 const PIXEL_IMPORTANCE: f64 = 10.0;
-/// Steps in which the learning rates of a grid rise.
-const WARM_UP_STEPS: u64 = 100;
-/// Gradients shorter than so many times the mean are drawn at random.
-const ROULETTE: f32 = 0.25;
-/// Cells of the finest level for each LR pixel across the field.
+/// Cells of the finest level per LR pixel across the field (design note 006).
 const CELLS_PER_PIXEL: f64 = 2.56;
 
-/// All that defaults depend on.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SceneFacts {
-    /// What the field's cube holds.
-    pub space: Space,
-    /// What lies behind the scene.
-    pub background: Background,
-    /// LR pixels across the field's cube, as the finest view sees it.
-    pub pixels_across: f64,
-    /// LR pixels of all views.
-    pub lr_pixels: u64,
-    /// Whether the scene names the kernel that made its LR images.
-    pub has_kernel: bool,
-    /// Whether the training starts from a trained field.
-    pub is_fine_tuning: bool,
-}
-
-impl SceneFacts {
-    /// Those of a scene whose training begins with nothing.
-    pub fn of(views: &Views, has_kernel: bool) -> Self {
-        let pixels =
-            |v: &View| u64::from(v.camera.intrinsics.width) * u64::from(v.camera.intrinsics.height);
-        Self {
-            space: views.bounds.space,
-            background: views.background,
-            pixels_across: pixels_across(views),
-            lr_pixels: views.views.iter().map(pixels).sum(),
-            has_kernel,
-            is_fine_tuning: false,
-        }
-    }
-
-    fn is_ndc(&self) -> bool {
-        matches!(self.space, Space::Ndc(_))
-    }
-}
-
-fn pixels_across(views: &Views) -> f64 {
-    let across = |view: &View| across(view.camera.intrinsics, views.bounds.space);
-    views.views.iter().map(across).fold(0.0, f64::max)
-}
-
-/// LR pixels across the field's cube, as one view sees it.
-fn across(k: Intrinsics, space: Space) -> f64 {
-    match space {
-        // The cube is about what a view sees.
-        Space::Box => f64::from(k.width),
-        Space::Ndc(f) => (f.max[0] - f.min[0]).max(f.max[1] - f.min[1]) * k.fx,
-        // Half of it is, and the shell around it.
-        Space::Contraction => 2.0 * f64::from(k.width),
-    }
-}
-
-/// Parameters with every default decided.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Resolved {
-    /// The field and what its own training needs.
-    pub field: ResolvedField,
-    /// Sub-pixel rays along each side of an LR pixel.
-    pub supersample: f64,
-    /// Share of the rays with fewer sub-pixel rays.
-    pub supersample_warmup: f64,
-    /// What an LR pixel is compared with.
-    pub supervision: Supervision,
-    /// Whether exposures are found.
-    pub exposure: bool,
-    /// Whether cameras are moved.
-    pub pose_refinement: bool,
-    /// Order of the pixels.
-    pub order: Order,
-    /// How much more often detail is drawn.
-    pub pixel_importance: f64,
-    /// Steps that draw from the middle of the images alone.
-    pub precrop_steps: u32,
-    /// Fields to train apart.
-    pub ensemble: u32,
-    /// Rays over all fields of the ensemble.
-    pub rays: u64,
-    /// Most rays in a step.
-    pub max_rays_per_step: u32,
-    /// Rays through all sub-pixels of all views.
-    pub epoch: u64,
-    /// Most HR references that are used.
-    pub max_references: usize,
-    /// How the initial and the fine-tuned field are used.
-    pub combine: Combine,
-    /// Seed of all random numbers.
-    pub seed: u64,
-}
-
-/// A field with every default decided.
-#[derive(Clone, Debug, PartialEq)]
-pub enum ResolvedField {
-    /// A hash grid.
-    Grid {
-        /// Its shape.
-        architecture: Architecture,
-        /// What is asked of its rays beside their colours.
-        regularisers: ResolvedRegularisers,
-        /// Its parameters as given.
-        given: GridParams,
-    },
-    /// The paper's MLPs.
-    Mlp {
-        /// Their shape.
-        architecture: MlpArchitecture,
-        /// Standard deviation of the noise on raw densities.
-        density_noise_std: f64,
-        /// Their parameters as given.
-        given: MlpParams,
-    },
-}
-
-/// Weights of what is asked of a grid's rays, with every default decided.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ResolvedRegularisers {
-    /// Weight of the distortion loss.
-    pub distortion: f64,
-    /// Weight of the floater loss.
-    pub floater_loss: f64,
-}
-
-/// Parameters that can't be meant together.
+/// Error returned for parameters that contradict each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ParamsError {
     /// The coarsest level of a grid has more cells than the finest.
@@ -166,7 +38,7 @@ pub enum ParamsError {
 }
 
 impl Params {
-    /// Fails on parameters that can't be meant together.
+    /// Fails if parameters contradict each other.
     pub fn check(&self) -> Result<(), ParamsError> {
         match self.field {
             FieldParams::Grid(GridParams {
@@ -178,53 +50,46 @@ impl Params {
         }
     }
 
-    /// Sub-pixel rays along each side of an LR pixel, once all are cast.
-    fn side(&self) -> u64 {
-        rays_per_side(self.supersample)
-    }
-
-    /// Decides every default for a scene.
+    /// Sets every default for a scene.
     pub fn resolve(&self, scene: &SceneFacts) -> Resolved {
-        let epoch = scene.lr_pixels * self.side().pow(2);
-        let has_background = scene.background != Background::Alpha;
-        let (is_grid, sampling) = match &self.field {
-            FieldParams::Grid(grid) => (true, grid.sampling()),
-            FieldParams::Mlp(mlp) => (false, mlp.sampling(scene, epoch)),
+        let epoch = scene.lr_pixels * whole_supersample(self.supersample).pow(2);
+        let mut sampling = match &self.field {
+            FieldParams::Grid(grid) => grid.sampling(),
+            FieldParams::Mlp(mlp) => mlp.sampling(scene, epoch),
         };
-        let supervision = if is_grid && scene.has_kernel && has_background {
+        if scene.is_fine_tuning {
+            // The initial field already has the scene's rough shape.
+            (sampling.supersample_warmup, sampling.precrop_steps) = (0.0, 0);
+        }
+        let is_grid = matches!(self.field, FieldParams::Grid(_));
+        let supervision = if is_grid && scene.has_kernel && scene.background != Background::Alpha {
             Supervision::Kernel
         } else {
             Supervision::Average
         };
         let combine = if scene.is_ndc() { Combine::AverageWeights } else { Combine::Ensemble };
-        // The rough shape of a field that is fine-tuned is known.
-        let at_start = if scene.is_fine_tuning {
-            (0.0, 0)
-        } else {
-            (sampling.supersample_warmup, sampling.precrop_steps)
-        };
         Resolved {
             field: self.field.resolve(scene),
             supersample: self.supersample,
-            supersample_warmup: at_start.0,
+            supersample_warmup: sampling.supersample_warmup,
             supervision: self.supervision.unwrap_or(supervision),
             exposure: self.exposure,
             pose_refinement: self.pose_refinement,
             order: sampling.order,
             pixel_importance: sampling.pixel_importance,
-            precrop_steps: at_start.1,
+            precrop_steps: sampling.precrop_steps,
             ensemble: self.ensemble,
             rays: sampling.rays,
             max_rays_per_step: sampling.max_rays_per_step,
             epoch,
-            max_references: self.max_references.map_or(usize::MAX, |most| most as usize),
+            max_references: self.max_references.map_or(usize::MAX, |count| count as usize),
             combine: self.combine.unwrap_or(combine),
             seed: self.seed,
         }
     }
 }
 
-/// What both fields say of how rays are drawn.
+/// Parameters of ray sampling that both kinds of field have.
 struct Sampling {
     rays: u64,
     max_rays_per_step: u32,
@@ -248,16 +113,18 @@ impl GridParams {
     }
 
     fn architecture(&self, scene: &SceneFacts) -> Architecture {
+        // Both ranges are chosen by hand.
         let by_width = (CELLS_PER_PIXEL * scene.pixels_across).round().clamp(64.0, 2048.0) as u32;
         let finest = self.max_resolution.unwrap_or(by_width.max(self.base_resolution));
-        // Surfaces grow with the square of the resolution.
+        // The number of cells at surfaces grows with the square of the resolution.
         let by_finest =
             (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
         let steps = self.march_steps.unwrap_or(if scene.is_ndc() { 256 } else { 512 });
-        let unlimited = Architecture::default().finest_z;
-        // Rays run along z in NDC: cells needn't lie closer than their samples.
-        let by_steps = (f64::from(steps) / 3.0f64.sqrt()).round() as u32;
-        let finest_z = if scene.is_ndc() { by_steps.min(unlimited) } else { unlimited };
+        let mut finest_z = Architecture::default().finest_z;
+        if scene.is_ndc() {
+            // Samples along z across the cube: more cells would get none (design note 027).
+            finest_z = finest_z.min((f64::from(steps) / 3.0f64.sqrt()).round() as u32);
+        }
         Architecture {
             levels: self.n_levels,
             coarsest: self.base_resolution,
@@ -275,10 +142,13 @@ impl GridParams {
             (Background::Opaque, Space::Contraction) => DISTORTION_IN_CONTRACTION,
             (_, Space::Ndc(_) | Space::Contraction | Space::Box) => 0.0,
         };
-        let has_colour = matches!(scene.background, Background::White | Background::Black);
+        let floater_loss = match scene.background {
+            Background::White | Background::Black => FLOATER_LOSS,
+            Background::Opaque | Background::Alpha => 0.0,
+        };
         ResolvedRegularisers {
             distortion: self.distortion.unwrap_or(distortion),
-            floater_loss: self.floater_loss.unwrap_or(if has_colour { FLOATER_LOSS } else { 0.0 }),
+            floater_loss: self.floater_loss.unwrap_or(floater_loss),
         }
     }
 }
@@ -332,137 +202,10 @@ impl FieldParams {
     }
 }
 
-impl Resolved {
-    /// The parameters whose defaults the scene decides, by name, with the values in use: for
-    /// `training.json`.
-    pub fn record(&self) -> BTreeMap<String, Value> {
-        let common = json!({
-            "combine": self.combine,
-            "pixel_importance": self.pixel_importance,
-            "precrop_steps": self.precrop_steps,
-            "rays": self.rays,
-            "supersample_warmup": self.supersample_warmup,
-            "supervision": self.supervision,
-        });
-        let own = match &self.field {
-            ResolvedField::Grid { architecture, regularisers, .. } => json!({
-                "distortion": regularisers.distortion,
-                "finest_z": architecture.finest_z,
-                "floater_loss": regularisers.floater_loss,
-                "log2_hashmap_size": architecture.log2_entries,
-                "march_steps": architecture.steps,
-                "max_resolution": architecture.finest,
-            }),
-            ResolvedField::Mlp { density_noise_std, .. } => {
-                json!({ "density_noise_std": density_noise_std })
-            }
-        };
-        let entries = [common, own].into_iter().filter_map(|values| values.as_object().cloned());
-        entries.flatten().collect()
-    }
-
-    /// What is trained.
-    pub fn model(&self) -> FieldModel {
-        match &self.field {
-            ResolvedField::Grid { architecture, .. } => FieldModel::Grid(*architecture),
-            ResolvedField::Mlp { architecture, .. } => FieldModel::Mlp(*architecture),
-        }
-    }
-
-    /// How often a training may start over.
-    pub(crate) fn restarts(&self) -> u32 {
-        match &self.field {
-            ResolvedField::Grid { .. } => 0,
-            ResolvedField::Mlp { given, .. } => given.restarts,
-        }
-    }
-
-    /// Parameters by which a field of the ensemble is trained as if it were alone, with its share
-    /// of the rays.
-    #[must_use]
-    pub fn member(&self, index: u32) -> Self {
-        let members = u64::from(self.ensemble.max(1));
-        let own = self.rays / members + u64::from(u64::from(index) < self.rays % members);
-        Self {
-            ensemble: 1,
-            rays: own,
-            seed: self.seed.wrapping_add(u64::from(index)),
-            ..self.clone()
-        }
-    }
-
-    /// Bundles of rays that are drawn from the middle of the images: those of the first
-    /// `precrop_steps` steps.
-    pub fn precrop_bundles(&self) -> u64 {
-        let (batch, side) = (u64::from(self.max_rays_per_step), rays_per_side(self.supersample));
-        let doublings = warmup_stages(side);
-        let steps_of_stage = (self.supersample_warmup * self.rays as f64
-            / f64::from(doublings.max(1))) as u64
-            / batch;
-        let stages = (0..doublings).map(|i| (steps_of_stage, 1 << i)).chain([(u64::MAX, side)]);
-        let mut left = u64::from(self.precrop_steps);
-        let mut bundles = 0;
-        for (steps, side) in stages {
-            let steps = left.min(steps);
-            left -= steps;
-            bundles += steps * (batch / (side * side)).max(1);
-        }
-        bundles
-    }
-
-    /// How a grid is trained.
-    pub fn grid_training(
-        &self,
-        grid: &GridParams,
-        regularisers: &ResolvedRegularisers,
-    ) -> TrainingOptions {
-        TrainingOptions {
-            rays: self.rays,
-            max_rays_per_step: self.max_rays_per_step as usize,
-            samples_per_step: grid.samples_per_step as usize,
-            learning_rate: grid.learning_rate,
-            level_rate: grid.level_rate,
-            mlp_learning_rate: grid.mlp_learning_rate,
-            learning_rate_decay: grid.learning_rate_decay,
-            warm_up: WARM_UP_STEPS,
-            ema_decay: grid.ema_decay as f32,
-            regularisers: Regularisers {
-                distortion: regularisers.distortion as f32,
-                floater_loss: regularisers.floater_loss as f32,
-            },
-            network_decay: grid.network_decay as f32,
-            roulette: ROULETTE,
-            seed: self.seed,
-        }
-    }
-
-    /// How the paper's field is trained.
-    #[cfg(feature = "torch")]
-    pub fn mlp_training(
-        &self,
-        mlp: &MlpParams,
-        density_noise_std: f64,
-    ) -> torch_field::MlpTraining {
-        use crate::params::RateSchedule;
-        let epochs = self.rays.div_ceil(self.epoch.max(1));
-        torch_field::MlpTraining {
-            rays: self.rays,
-            max_rays_per_step: self.max_rays_per_step as usize,
-            learning_rate: mlp.learning_rate,
-            learning_rate_decay: mlp.learning_rate_decay,
-            schedule: match mlp.schedule {
-                RateSchedule::Code => torch_field::Schedule::Epochs { epochs },
-                RateSchedule::Paper => torch_field::Schedule::Exponential,
-            },
-            density_noise_std,
-            seed: self.seed,
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use scene::Frustum;
+    use serde_json::{Value, json};
     use stage::Stage as _;
 
     use super::*;
@@ -499,7 +242,7 @@ mod tests {
             Params::default(),
             Params { field: FieldParams::Mlp(MlpParams::default()), ..Params::default() },
         );
-        let said =
+        let with_grid =
             |field: GridParams| Params { field: FieldParams::Grid(field), ..Params::default() };
         let own = GridParams {
             distortion: Some(0.5),
@@ -536,10 +279,10 @@ mod tests {
             (&grid, open, "supervision", json!("average")),
             (&grid, SceneFacts { has_kernel: false, ..boxed }, "supervision", json!("average")),
             (&grid, SceneFacts { is_fine_tuning: true, ..boxed }, "supersample_warmup", json!(0.0)),
-            (&said(own.clone()), forward, "distortion", json!(0.5)),
-            (&said(own.clone()), forward, "march_steps", json!(999)),
-            (&said(own.clone()), forward, "finest_z", json!(60)),
-            (&said(own), forward, "pixel_importance", json!(1.0)),
+            (&with_grid(own.clone()), forward, "distortion", json!(0.5)),
+            (&with_grid(own.clone()), forward, "march_steps", json!(999)),
+            (&with_grid(own.clone()), forward, "finest_z", json!(60)),
+            (&with_grid(own), forward, "pixel_importance", json!(1.0)),
             (&mlp, forward, "rays", json!(3000)),
             (&mlp, forward, "precrop_steps", json!(0)),
             (&mlp, forward, "density_noise_std", json!(1.0)),
@@ -552,8 +295,8 @@ mod tests {
         ] {
             assert_eq!(value(params, &scene, name), expected, "{name} of {params:?} for {scene:?}");
         }
-        let many =
-            said(GridParams { march_steps: Some(8192), ..GridParams::default() }).resolve(&forward);
+        let many = with_grid(GridParams { march_steps: Some(8192), ..GridParams::default() })
+            .resolve(&forward);
         assert!(matches!(many.field, ResolvedField::Grid { architecture,
                 .. } if architecture.check().is_ok()));
     }

@@ -1,182 +1,188 @@
+//! Supervision of a training: the rays that are cast, and the loss between their colours and the
+//! photographs.
+
+mod assembly;
+mod memory;
+mod options;
+mod pixel_sampler;
+mod residual;
+mod setup;
+
 use std::io;
 
 use counter_rng::CounterRng;
 use poses::MeanMotion;
 use radiance::{Ray, RayField};
 use scene::{Background, Camera, CameraRays};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
-use crate::hr_cache::{HrCache, LrPixel};
-use crate::learnt::Learnt;
-use crate::moving_cameras::MovingCameras;
-use crate::packed::{PackedPhotograph, PixelMemory};
-use crate::pixel_sampler::PixelSampler;
-use crate::reference_blocks::block_start;
-use crate::residual::{Target, is_clipped};
-use crate::sub_pixel_rays::SubPixelRays;
+use crate::params::Supervision;
+use crate::photographs::{PackedPhotograph, PixelMemory};
+use crate::state::{Exposures, HrCache, LrPixel, MovingCameras, TrainingState};
+use crate::supersample::SupersampleSchedule;
 
-/// How rays are compared with the LR pixel.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum Supervision {
-    /// Their mean is compared, whatever made the LR images (the paper's eq. 4).
-    Average,
-    /// Rays render HR pixels, and the known degradation kernel makes an LR pixel of them.
-    Kernel,
-}
+use assembly::block_start;
+use pixel_sampler::PixelSampler;
+use residual::{Target, is_clipped};
+pub use setup::supervision;
+pub(crate) use setup::transparent_background;
 
-/// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-pixel
-/// rays are cast through it.
+/// Supersampling: draws a training pixel, more often where the image has detail, and casts
+/// sub-pixel rays through it.
 ///
-/// `average` compares their mean with the LR pixel (mean squared error over the three channels).
-/// `kernel` minimises the squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones
-/// that K makes the LR image y of: those of the drawn LR pixel are rendered, those around it cached
-/// ([`HrCache`]), so that the whole footprint costs no more rays than the average. Each sub-pixel
-/// ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine
-/// detail once more, learns slower.) Where K is the mean of whole pixels, both are alike, and
-/// nothing is cached.
+/// `average` compares the rays' mean with the LR pixel, by the mean squared error over the three
+/// channels. `kernel` minimises |K⁺·(K·c - y)|², the squared distance of the HR pixels c from the
+/// nearest ones whose degradation by K is the LR image y: the HR pixels of the drawn LR pixel are
+/// rendered and those around it cached ([`HrCache`]), so that the kernel's whole footprint costs no
+/// more rays than the average. Each sub-pixel ray gets its own component of K⁺·(K·c - y). The
+/// gradient of |K·c - y|² would have Kᵀ instead, which attenuates fine detail once more (design
+/// note 009). If K is the mean of whole pixels, both supervisions are equal and nothing is cached.
 ///
-/// Of an HR reference a block of pixels is drawn at a time, one for each sub-pixel ray to meet, and
-/// altogether four times as many blocks as an LR image has pixels.
+/// Draws from an HR reference are blocks of pixels, one for each sub-pixel ray (design note 019).
 pub struct Supersampling {
     /// LR photographs, then references.
     pub(crate) views: Vec<TrainingView>,
     pub(crate) sampler: PixelSampler,
     pub(crate) background: Background,
-    pub(crate) sub_pixel_rays: SubPixelRays,
+    pub(crate) schedule: SupersampleSchedule,
     pub(crate) supervision: Supervision,
     pub(crate) seed: u64,
-    /// What it has come to know in the training.
-    pub(crate) learnt: Learnt,
+    pub(crate) state: TrainingState,
     pub(crate) memory: PixelMemory,
 }
 
-/// What a bundle is drawn from and compared with.
+/// View whose pixels are drawn and compared.
 pub(crate) struct TrainingView {
-    /// What bundles are drawn from, a pixel each: of a reference, means over blocks of its pixels.
+    /// Pixels to draw: those of an LR photograph, or the means over blocks of a reference.
     pub(crate) image: PackedPhotograph,
-    /// A reference's own pixels; an LR photograph has none.
+    /// Pixels of a reference; `None` for an LR photograph.
     pub(crate) hr: Option<PackedPhotograph>,
     pub(crate) rays: CameraRays,
 }
 
-/// How colours of a bundle's rays are compared with what was photographed.
+/// Comparison of a bundle's colours with a photograph.
 enum Comparison<'a> {
-    /// The kernel makes LR pixels of them and of the cached HR pixels around.
+    /// Compares LR pixels, from rays and cached HR pixels through the kernel.
     Kernel(&'a HrCache),
-    /// Each ray meets a pixel of the reference and is compared with it.
+    /// Compares each ray with a pixel of the reference.
     Reference(&'a PackedPhotograph),
-    /// Rays are fewer than the pixels of the reference's block: means are compared.
+    /// Compares the rays' mean with that of the reference's block, which has more pixels than rays.
     ReferenceMean(&'a PackedPhotograph),
-    /// The rays' mean is compared with the LR pixel.
+    /// Compares the rays' mean with the LR pixel.
     Mean,
 }
 
-/// Purpose of a draw.
-const BACKGROUND: u64 = 101;
+/// RNG stream of background colours.
+const BACKGROUND_STREAM: u64 = 101;
 
 impl Supersampling {
-    /// Sub-pixel rays of an LR pixel along x and y, once all are cast.
-    pub fn full_side(&self) -> [usize; 2] {
-        self.sub_pixel_rays.full
+    /// Returns the number of sub-pixel rays along x and y after the warm-up.
+    pub fn supersample(&self) -> [usize; 2] {
+        self.schedule.supersample
     }
 
-    /// How many views are LR photographs.
+    /// Returns the number of LR photographs.
     fn lr_views(&self) -> usize {
         self.views.iter().filter(|view| view.hr.is_none()).count()
     }
 
-    /// How a view's bundles are compared by now.
+    /// Returns the current comparison for a view's bundles.
     fn comparison(&self, view: usize) -> Comparison<'_> {
-        let are_all_cast = self.sub_pixel_rays.are_all_cast();
-        match (&self.views[view].hr, &self.learnt.cache) {
-            (Some(hr), _) if are_all_cast => Comparison::Reference(hr),
+        let is_warmed_up = self.schedule.is_warmed_up();
+        match (&self.views[view].hr, &self.state.cache) {
+            (Some(hr), _) if is_warmed_up => Comparison::Reference(hr),
             (Some(hr), _) => Comparison::ReferenceMean(hr),
-            (None, Some(cache)) if are_all_cast => Comparison::Kernel(cache),
+            (None, Some(cache)) if is_warmed_up => Comparison::Kernel(cache),
             (None, _) => Comparison::Mean,
         }
     }
 
-    /// Column and row at which a block of a reference's pixels begins.
-    fn reference_block(&self, hr: &PackedPhotograph, [x, y]: [usize; 2]) -> [usize; 2] {
-        let [columns, rows] = self.sub_pixel_rays.full;
-        [block_start(x, columns, hr.width()), block_start(y, rows, hr.height())]
+    /// Returns the first column and row of a block of a reference's pixels.
+    fn reference_block(&self, hr: &PackedPhotograph, pixel: LrPixel) -> [usize; 2] {
+        let [columns, rows] = self.schedule.supersample;
+        [block_start(pixel.x, columns, hr.width), block_start(pixel.y, rows, hr.height)]
     }
 
-    /// Restores what [`Learnt::write`] wrote.
+    /// Restores the state that [`TrainingState::write`] wrote.
     pub(crate) fn restore(&mut self, from: &mut impl io::Read) -> io::Result<()> {
-        self.learnt.restore(from)?;
-        self.place_views();
+        self.state.restore(from)?;
+        self.update_rays();
         Ok(())
     }
 
-    /// What went wrong with pixels that are kept in a file, if anything did.
-    pub(crate) fn fault(&self) -> Option<&io::Error> {
-        self.memory.fault()
+    /// Returns the first I/O error of the pixel file, if any.
+    pub(crate) fn first_error(&self) -> Option<&io::Error> {
+        self.memory.first_error()
     }
 
-    /// Moves cameras, where that was asked for and it is time for it, to where the field's
-    /// renderings meet their photographs best. `field` is only made when it is.
+    /// Moves cameras towards the poses at which the field's renders fit the photographs, if pose
+    /// refinement is enabled and a round is due. `field` is only called then.
     pub(crate) fn refine_poses<'a>(
         &mut self,
-        done: f64,
+        progress: f64,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<()> {
-        let Learnt { moving, exposures, .. } = &mut self.learnt;
-        let Some(moving) = moving.as_mut().filter(|moving| moving.are_due(done)) else {
+        let TrainingState { cameras, exposures, .. } = &mut self.state;
+        let Some(cameras) = cameras.as_mut().filter(|cameras| cameras.are_due(progress)) else {
             return Ok(());
         };
-        let exposures = exposures.as_ref();
-        let exposure = |view: usize| exposures.map_or([1.0; 3], |e| e.of(view).map(f32::recip));
-        moving
-            .step(&*field()?, done, self.background.shown(), exposure)
+        cameras
+            .step(&*field()?, progress, self.background.shown(), |view| {
+                exposure_correction(exposures.as_ref(), view)
+            })
             .map_err(fields::rendering_failure)?;
-        self.place_views();
+        self.update_rays();
         Ok(())
     }
 
-    /// Has rays cast from where cameras have moved to.
-    fn place_views(&mut self) {
-        let cameras = self.learnt.moving.iter().flat_map(MovingCameras::cameras);
-        self.views.iter_mut().zip(cameras).for_each(|(view, camera)| view.rays = camera.rays());
+    /// Casts rays from the current cameras.
+    fn update_rays(&mut self) {
+        let cameras = self.state.cameras.as_ref().map_or(&[][..], MovingCameras::cameras);
+        for (i, camera) in cameras.iter().enumerate() {
+            self.views[i].rays = camera.rays();
+        }
     }
 
-    /// How far cameras of photographs have gone, where that was asked for. `field` is only made
-    /// then.
+    /// Measures the motion of the photographs' cameras, if pose refinement is enabled. `field` is
+    /// only called then.
     pub(crate) fn moved<'a>(
         &self,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<Option<MeanMotion>> {
-        let Some(moving) = &self.learnt.moving else { return Ok(None) };
-        let moved = moving
+        let Some(cameras) = &self.state.cameras else { return Ok(None) };
+        let moved = cameras
             .moved(&*field()?, self.lr_views(), self.background.shown())
             .map_err(fields::rendering_failure)?;
         Ok(Some(moved))
     }
 
-    /// Where the photographs were taken from, where that was asked for.
+    /// Returns the refined cameras of the photographs; empty without pose refinement.
     pub fn refined_cameras(&self) -> &[Camera] {
-        self.learnt.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.lr_views()])
+        self.state.cameras.as_ref().map_or(&[], |cameras| &cameras.cameras()[..self.lr_views()])
     }
 
-    /// What each photograph is so many times as bright as, red, green and blue, where that was
-    /// asked for.
+    /// Returns the RGB gain of each photograph relative to the field; empty if exposures aren't
+    /// estimated.
     pub fn exposures(&self) -> &[[f32; 3]] {
-        let exposures = self.learnt.exposures.as_ref();
-        exposures.map_or(&[], |exposures| &exposures.factors()[..self.lr_views()])
+        let exposures = self.state.exposures.as_ref();
+        exposures.map_or(&[], |exposures| &exposures.gains()[..self.lr_views()])
     }
 
-    /// The view and pixel that a bundle trains on.
-    fn pixel(&self, bundle: u64) -> (usize, usize) {
+    /// Returns the view and pixel that a bundle trains on.
+    fn drawn_pixel(&self, bundle: u64) -> (usize, usize) {
         self.sampler.draw(bundle, |view, pixel| self.views[view].image.counts(pixel))
     }
 
-    /// What lies behind a bundle's rays: with an open background, or none, another colour each
-    /// time, so that opacity is learnt.
-    fn behind(&self, bundle: u64) -> [f32; 3] {
+    /// Returns the column and row of a view's pixel.
+    fn position(&self, view: usize, pixel: usize) -> LrPixel {
+        let width = self.views[view].image.width;
+        LrPixel { view, x: pixel % width, y: pixel / width }
+    }
+
+    /// Returns the background colour of a bundle's rays: random for transparent and opaque scenes,
+    /// so that opacity is trained.
+    fn ray_background(&self, bundle: u64) -> [f32; 3] {
         if matches!(self.background, Background::Alpha | Background::Opaque) {
-            let mut rng = CounterRng::new(self.seed, BACKGROUND, bundle);
+            let mut rng = CounterRng::new(self.seed, BACKGROUND_STREAM, bundle);
             [0, 1, 2].map(|_| rng.uniform())
         } else {
             [self.background.shown(); 3]
@@ -184,41 +190,43 @@ impl Supersampling {
     }
 }
 
-/// Mean of a channel.
-fn mean(colours: &[[f32; 3]], c: usize) -> f32 {
-    colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
+/// Returns the factors from a view's photograph to the field's colours.
+fn exposure_correction(exposures: Option<&Exposures>, view: usize) -> [f32; 3] {
+    exposures.map_or([1.0; 3], |exposures| exposures.gains()[view].map(f32::recip))
 }
 
 impl radiance::Supervisor for Supersampling {
-    fn set_progress(&mut self, done: f64) {
-        self.learnt.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
-        self.sub_pixel_rays.set_progress(done);
+    fn set_progress(&mut self, progress: f64) {
+        if let Some(exposures) = &mut self.state.exposures {
+            exposures.update_gains(progress);
+        }
+        self.schedule.set_progress(progress);
     }
 
     fn rays_per_bundle(&self) -> usize {
-        self.sub_pixel_rays.count()
+        self.schedule.rays_per_pixel()
     }
 
     fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
-        let (index, pixel) = self.pixel(bundle);
-        let view = &self.views[index];
-        let background = self.behind(bundle);
-        let (x, y) = (pixel % view.image.width(), pixel / view.image.width());
-        let SubPixelRays { full, now, .. } = self.sub_pixel_rays;
-        // Where the sub-pixel rays begin, and how far apart they are, in pixels of its camera.
-        let (start, apart) = match self.comparison(index) {
-            Comparison::Kernel(cache) => cache.block_in_pixels(LrPixel { view: index, x, y }),
-            Comparison::Reference(hr) | Comparison::ReferenceMean(hr) => {
-                let start = self.reference_block(hr, [x, y]).map(|s| s as f64);
-                (start, [0, 1].map(|i| full[i] as f64 / now[i] as f64))
+        let (view, pixel) = self.drawn_pixel(bundle);
+        let pixel = self.position(view, pixel);
+        let background = self.ray_background(bundle);
+        let SupersampleSchedule { supersample, current_supersample, .. } = self.schedule;
+        // Start of the sub-pixel rays and distance between them, in pixels of the view's camera.
+        let (start, spacing) = match self.comparison(view) {
+            Comparison::Kernel(cache) => cache.block_in_lr_pixels(pixel),
+            Comparison::Reference(hr) | Comparison::ReferenceMean(hr) => (
+                self.reference_block(hr, pixel).map(|start| start as f64),
+                [0, 1].map(|i| supersample[i] as f64 / current_supersample[i] as f64),
+            ),
+            Comparison::Mean => {
+                ([pixel.x as f64, pixel.y as f64], current_supersample.map(|n| 1.0 / n as f64))
             }
-            Comparison::Mean => ([x as f64, y as f64], now.map(|n| 1.0 / n as f64)),
         };
         for (k, ray) in rays.iter_mut().enumerate() {
-            let (a, b) = (k % now[0], k / now[0]);
-            let place =
-                [start[0] + (a as f64 + 0.5) * apart[0], start[1] + (b as f64 + 0.5) * apart[1]];
-            *ray = Ray::new(&view.rays.ray(place[0], place[1]), background);
+            let x = start[0] + ((k % current_supersample[0]) as f64 + 0.5) * spacing[0];
+            let y = start[1] + ((k / current_supersample[0]) as f64 + 0.5) * spacing[1];
+            *ray = Ray::new(&self.views[view].rays.ray(x, y), background);
         }
     }
 
@@ -228,55 +236,57 @@ impl radiance::Supervisor for Supersampling {
         colours: &[[f32; 3]],
         gradients: &mut [[f32; 3]],
     ) -> f64 {
-        let (index, pixel) = self.pixel(bundle);
+        let (index, pixel) = self.drawn_pixel(bundle);
         let view = &self.views[index];
-        let exposures = self.learnt.exposures.as_ref();
-        let back = exposures.map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
         let target = Target {
-            back,
-            behind: self.behind(bundle),
+            exposure: exposure_correction(self.state.exposures.as_ref(), index),
+            background: self.ray_background(bundle),
             weight: self.sampler.weight(bundle, (index, pixel)),
             is_clipped: self.supervision == Supervision::Kernel && view.hr.is_none(),
         };
-        let (x, y) = (pixel % view.image.width(), pixel / view.image.width());
+        let position = self.position(index, pixel);
         match self.comparison(index) {
             Comparison::Kernel(cache) => {
-                let judge =
-                    |c: usize, prediction, sample| target.unclipped_residual(c, prediction, sample);
-                let pixel = LrPixel { view: index, x, y };
-                let own = cache.back_project(pixel, colours, &view.image, judge, gradients);
-                target.of_back_projected(own, gradients)
+                let residual = cache.back_project(
+                    position,
+                    colours,
+                    &view.image,
+                    |c, prediction, sample| target.unclipped_residual(c, prediction, sample),
+                    gradients,
+                );
+                target.back_projected_loss(residual, gradients)
             }
             Comparison::Reference(hr) => {
-                let columns = self.sub_pixel_rays.full[0];
-                let [left, top] = self.reference_block(hr, [x, y]);
-                let samples = (0..colours.len())
-                    .map(|k| hr.pixel((top + k / columns) * hr.width() + left + k % columns));
-                target.of_each(colours, samples, gradients)
+                let columns = self.schedule.supersample[0];
+                let [left, top] = self.reference_block(hr, position);
+                let sample_of =
+                    |k: usize| hr.pixel((top + k / columns) * hr.width + left + k % columns);
+                target.individual_loss(colours, sample_of, gradients)
             }
             Comparison::ReferenceMean(_) | Comparison::Mean => {
-                target.of_mean(colours, view.image.pixel(pixel), gradients)
+                target.mean_loss(colours, view.image.pixel(pixel), gradients)
             }
         }
     }
 
     fn remember(&mut self, bundle: u64, colours: &[[f32; 3]]) {
-        let Learnt { cache, exposures, .. } = &self.learnt;
-        if cache.is_none() && exposures.is_none() {
+        if self.state.cache.is_none() && self.state.exposures.is_none() {
             return;
         }
-        let (index, pixel) = self.pixel(bundle);
-        let image = &self.views[index].image;
-        if let Some(exposures) = &mut self.learnt.exposures {
-            let sample = image.pixel(pixel);
+        let (view, pixel) = self.drawn_pixel(bundle);
+        if let Some(exposures) = &mut self.state.exposures {
+            let sample = self.views[view].image.pixel(pixel);
             let photographed =
                 [0, 1, 2].map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] });
-            exposures.learn(index, photographed, [0, 1, 2].map(|c| mean(colours, c)));
+            let rendered = [0, 1, 2].map(|c| {
+                colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
+            });
+            exposures.add_pixel(view, photographed, rendered);
         }
-        let is_cached = matches!(self.comparison(index), Comparison::Kernel(_));
-        if let Some(cache) = self.learnt.cache.as_mut().filter(|_| is_cached) {
-            let (x, y) = (pixel % image.width(), pixel / image.width());
-            cache.remember(LrPixel { view: index, x, y }, colours);
+        let is_cached = matches!(self.comparison(view), Comparison::Kernel(_));
+        let pixel = self.position(view, pixel);
+        if let Some(cache) = self.state.cache.as_mut().filter(|_| is_cached) {
+            cache.store(pixel, colours);
         }
     }
 }
@@ -285,28 +295,28 @@ impl radiance::Supervisor for Supersampling {
 mod tests {
     use pixels::{Filter, Image, Resampling};
     use radiance::Supervisor as _;
-    use scene::{Distortion, Intrinsics, Photograph};
+    use scene::{Distortion, Intrinsics, Photograph, Space};
 
+    use super::assembly::{REFERENCE_DRAWS, block_means};
+    use super::options::SupersamplingOptions;
     use super::*;
-    use crate::assembly::REFERENCE_DRAWS;
+    use crate::params::{Order, Params, Resolved, SceneFacts};
     use crate::photographs::Photographs;
-    use crate::pixel_sampler::Order;
-    use crate::reference_blocks::block_means;
-    use crate::supersampling_options::SupersamplingOptions;
 
-    fn options(supervision: Supervision, scale: [f64; 2]) -> SupersamplingOptions {
-        SupersamplingOptions {
-            supervision,
-            scale,
-            filter: Filter::Lanczos,
-            supersample_warmup: 0.0,
-            order: Order::Random,
-            precrop_bundles: 0,
-            pixel_importance: 1.0,
-            exposure: false,
-            pose_refinement: false,
-            seed: 9,
-        }
+    fn options(supervision: Supervision, supersample: f64) -> SupersamplingOptions {
+        let scene = SceneFacts {
+            space: Space::Box,
+            background: Background::White,
+            pixels_across: 5.0,
+            lr_pixels: 20,
+            has_kernel: true,
+            is_fine_tuning: false,
+        };
+        let params =
+            Params { supersample, supervision: Some(supervision), seed: 9, ..Params::default() };
+        let params = params.resolve(&scene);
+        let params = Resolved { supersample_warmup: 0.0, pixel_importance: 1.0, ..params };
+        SupersamplingOptions { params, filter: Filter::Lanczos }
     }
 
     fn hr_image(width: usize, height: usize) -> Image {
@@ -316,7 +326,7 @@ mod tests {
 
     fn example(
         supervision: Supervision,
-        scale: [f64; 2],
+        supersample: f64,
         image: Option<Image>,
     ) -> (Supersampling, Camera) {
         let distortion = Distortion::brown([0.1, -0.02, 0.01], [0.005, -0.003]);
@@ -340,7 +350,7 @@ mod tests {
             supersampling(
                 Photographs::taken_by(camera.clone(), image),
                 None,
-                &options(supervision, scale),
+                &options(supervision, supersample),
             ),
             camera,
         )
@@ -362,14 +372,15 @@ mod tests {
     #[test]
     fn sub_pixel_rays_are_the_finer_cameras_pixel_rays() {
         let cases = [
-            (Supervision::Average, [3.0, 3.0]),
-            (Supervision::Kernel, [3.0, 3.0]),
-            (Supervision::Kernel, [2.8, 1.5]),
-            (Supervision::Kernel, [1.2, 1.25]),
+            (Supervision::Average, 3.0),
+            (Supervision::Kernel, 3.0),
+            (Supervision::Kernel, 2.8),
+            (Supervision::Kernel, 1.5),
+            (Supervision::Kernel, 1.2),
         ];
-        for (kind, scale) in cases {
-            let (supersampling, camera) = example(kind, scale, None);
-            let size = [(5.0 * scale[0]).round(), (4.0 * scale[1]).round()];
+        for (kind, supersample) in cases {
+            let (supersampling, camera) = example(kind, supersample, None);
+            let size = [(5.0 * supersample).round(), (4.0 * supersample).round()];
             let hr = camera.resized(size[0] as u32, size[1] as u32);
             let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
             let mut seen = vec![false; (size[0] * size[1]) as usize];
@@ -385,16 +396,16 @@ mod tests {
                         (0..3).all(|c| (ray.direction[c] - expected[c]).abs() < 1e-6)
                     });
                     seen[pixel.unwrap_or_else(|| {
-                        panic!("{kind:?} {scale:?}: {ray:?} is no pixel's ray")
+                        panic!("{kind:?} {supersample}: {ray:?} is no pixel's ray")
                     })] = true;
                 }
             }
-            assert!(seen.iter().all(|s| *s), "{kind:?} {scale:?}: every HR pixel is seen");
+            assert!(seen.iter().all(|s| *s), "{kind:?} {supersample}: every HR pixel is seen");
         }
     }
 
     fn backgrounds(background: Background) -> Vec<[f32; 3]> {
-        let (mut supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], None);
+        let (mut supersampling, _) = example(Supervision::Kernel, 2.0, None);
         supersampling.background = background;
         let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
         let bundles = (0..40).map(|bundle| {
@@ -420,7 +431,7 @@ mod tests {
 
     #[test]
     fn gradient_is_that_of_the_loss() {
-        let (supersampling, _) = example(Supervision::Average, [2.0, 2.0], None);
+        let (supersampling, _) = example(Supervision::Average, 2.0, None);
         let colours: Vec<[f32; 3]> = (0..4).map(|k| [0.1 * k as f32, 0.5, 0.9]).collect();
         let mut gradients = vec![[0.0; 3]; 4];
         supersampling.loss_and_gradient(7, &colours, &mut gradients);
@@ -437,10 +448,10 @@ mod tests {
 
     /// The largest loss and the largest gradient, once the cache is full of the truth.
     fn worst(truth: &Image, lr: &Image, kind: Supervision) -> (f64, f32) {
-        let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(lr.clone()));
+        let (mut supersampling, _) = example(kind, 2.0, Some(lr.clone()));
         let mut worst = (0.0f64, 0.0f32);
         for bundle in 0..800 {
-            let pixel = supersampling.pixel(bundle).1;
+            let pixel = supersampling.drawn_pixel(bundle).1;
             let (x, y) = (pixel % 5 * 2, pixel / 5 * 2);
             let colours: Vec<[f32; 3]> = (0..4)
                 .map(|k| {
@@ -476,7 +487,7 @@ mod tests {
     #[test]
     fn clipped_white_asks_for_white_or_more() {
         let white = Image::new(5, 4, 3, vec![1.0; 60]);
-        let (supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], Some(white));
+        let (supersampling, _) = example(Supervision::Kernel, 2.0, Some(white));
         let mut gradients = [[0.0; 3]; 4];
         assert!(
             supersampling.loss_and_gradient(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10,
@@ -490,14 +501,14 @@ mod tests {
     }
 
     fn drawn(supersampling: &Supersampling, range: std::ops::Range<u64>) -> Vec<usize> {
-        range.map(|g| supersampling.pixel(g).1).collect()
+        range.map(|g| supersampling.drawn_pixel(g).1).collect()
     }
 
     /// In epochs every pixel comes once before any comes again, each time in another order; the
     /// first come from the middle.
     #[test]
     fn epochs_draw_without_replacement() {
-        let (mut supersampling, _) = example(Supervision::Average, [1.0, 1.0], None);
+        let (mut supersampling, _) = example(Supervision::Average, 1.0, None);
         (supersampling.sampler.order, supersampling.sampler.precrop_bundles) = (Order::Epochs, 50);
         // 5 × 4 pixels.
         assert!(
@@ -515,7 +526,7 @@ mod tests {
     }
 
     fn judged(of: &Supersampling, pixel: usize) -> (f64, [[f32; 3]; 4]) {
-        let bundle = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
+        let bundle = (0..).find(|&g| of.drawn_pixel(g).1 == pixel).unwrap();
         let mut gradients = [[0.0; 3]; 4];
         let loss = of.loss_and_gradient(bundle, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
         (loss, gradients)
@@ -526,7 +537,7 @@ mod tests {
     #[test]
     fn masked_pixels_say_nothing() {
         for kind in [Supervision::Average, Supervision::Kernel] {
-            let (plain, camera) = example(kind, [2.0, 2.0], None);
+            let (plain, camera) = example(kind, 2.0, None);
             let mask =
                 pixels::Mask { width: 5, height: 4, counts: (0..20).map(|i| i % 5 < 3).collect() };
             let image = Image::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect());
@@ -534,9 +545,9 @@ mod tests {
             let mut masked = Photographs::taken_by(camera, image);
             masked.images =
                 vec![PackedPhotograph::new(&photograph, &mut PixelMemory::unlimited()).unwrap()];
-            let masked = supersampling(masked, None, &options(kind, [2.0, 2.0]));
+            let masked = supersampling(masked, None, &options(kind, 2.0));
             let mut drawn = [false; 20];
-            (0..800).for_each(|g| drawn[masked.pixel(g).1] = true);
+            (0..800).for_each(|g| drawn[masked.drawn_pixel(g).1] = true);
             assert!(drawn.iter().enumerate().all(|(i, d)| *d == (i % 5 < 3)), "{kind:?} {drawn:?}");
             // Far from the masked pixels all is as without them; beside them the kernel feels less.
             assert!(judged(&masked, 7).1.as_flattened().iter().all(|g| g.is_finite()));
@@ -562,7 +573,7 @@ mod tests {
     /// reference's pixel, and all are met by some.
     #[test]
     fn references_are_compared_with_themselves() {
-        let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
+        let (_, camera) = example(Supervision::Kernel, 2.0, None);
         // The last column of blocks overlaps the one before it.
         let (width, height) = (9, 8);
         let truth = hr_image(width, height);
@@ -571,13 +582,13 @@ mod tests {
             let mut joined = supersampling(
                 given(&camera, "a", 5, 4),
                 Some(given(&camera, "a", width, height)),
-                &options(kind, [2.0, 2.0]),
+                &options(kind, 2.0),
             );
-            assert_eq!(joined.sampler.numbers(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
+            assert_eq!(joined.sampler.count(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
             let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
             let mut seen = [false; 72];
             for bundle in 0..800 {
-                if joined.pixel(bundle).0 == 0 {
+                if joined.drawn_pixel(bundle).0 == 0 {
                     continue;
                 }
                 joined.sample_rays(bundle, &mut rays);
@@ -604,9 +615,9 @@ mod tests {
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-pixel rays they meet the block's mean together.
-            joined.sub_pixel_rays.warmup = 0.5;
+            joined.schedule.warmup = 0.5;
             joined.set_progress(0.0);
-            let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
+            let bundle = (0..).find(|&bundle| joined.drawn_pixel(bundle) == (1, 4)).unwrap();
             joined.sample_rays(bundle, &mut rays[..1]);
             assert!(
                 large.ray(8.0, 1.0).direction.distance(rays[0].direction.into()) < 1e-6,
@@ -617,8 +628,8 @@ mod tests {
             assert!(joined.loss_and_gradient(bundle, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
             joined.set_progress(1.0);
             // LR images have what they had.
-            let plain = supersampling(given(&camera, "a", 5, 4), None, &options(kind, [2.0, 2.0]));
-            let drawn = |of: &Supersampling| (0..).find(|&g| of.pixel(g) == (0, 7)).unwrap();
+            let plain = supersampling(given(&camera, "a", 5, 4), None, &options(kind, 2.0));
+            let drawn = |of: &Supersampling| (0..).find(|&g| of.drawn_pixel(g) == (0, 7)).unwrap();
             let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
             let mut gradients = [[[0.0; 3]; 4]; 2];
             joined.loss_and_gradient(drawn(&joined), &colours, &mut gradients[0]);
@@ -629,9 +640,9 @@ mod tests {
         let larger = supersampling(
             given(&camera, "a", 5, 4),
             Some(given(&camera, "a", 20, 16)),
-            &options(Supervision::Kernel, [2.0, 2.0]),
+            &options(Supervision::Kernel, 2.0),
         );
-        assert_eq!(larger.sampler.numbers(), 20 + 80);
+        assert_eq!(larger.sampler.count(), 20 + 80);
         let mut masked = truth;
         masked.data[..3].fill(f32::NAN);
         let means = block_means(&masked, [2, 2]);
@@ -644,12 +655,12 @@ mod tests {
     /// then the pixels of both are cached, and each is compared with its own.
     #[test]
     fn sizes_share_a_cache() {
-        let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
+        let (_, camera) = example(Supervision::Kernel, 2.0, None);
         let mut both = Photographs::taken_by(camera.resized(1, 1), hr_image(1, 1));
         let second = Photographs::taken_by(camera.resized(3, 2), hr_image(3, 2));
         both.views.views.extend(second.views.views);
         both.images.extend(second.images);
-        let mut options = options(Supervision::Kernel, [1.5, 1.5]);
+        let mut options = options(Supervision::Kernel, 1.5);
         options.filter = Filter::Box;
         let needs = |lr: (usize, usize)| options.needs_cache([lr].into_iter());
         assert!(!needs((1, 1)) && needs((3, 2)));
@@ -660,14 +671,14 @@ mod tests {
             assert!(joined.loss_and_gradient(bundle, &colours, &mut gradients).is_finite());
             joined.remember(bundle, &colours);
         }
-        assert_eq!(joined.learnt.written_len(), 3 * (2 * 2 + 5 * 3));
+        assert_eq!(joined.state.byte_length(), 3 * (2 * 2 + 5 * 3));
     }
 
     #[test]
     fn every_pixel_is_drawn() {
-        let (supersampling, _) = example(Supervision::Average, [1.0, 1.0], None);
+        let (supersampling, _) = example(Supervision::Average, 1.0, None);
         let mut seen = [false; 20];
-        (0..400).for_each(|g| seen[supersampling.pixel(g).1] = true);
+        (0..400).for_each(|g| seen[supersampling.drawn_pixel(g).1] = true);
         assert!(seen.iter().all(|s| *s));
     }
 }

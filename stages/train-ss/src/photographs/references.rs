@@ -2,29 +2,30 @@ use anyhow::Context as _;
 use pixels::{Exposure, Image, Kernel, Resampling, Rgba8, psnr_of, resize_pillow};
 use scene::Camera;
 
-use crate::packed::{PackedPhotograph, PixelMemory, straight};
-use crate::photographs::{NO_PLACE, Photographs};
+use super::packed::straight;
+use super::{NO_SPACE, PackedPhotograph, Photographs, PixelMemory};
 
-/// A reference that was shrunk is its own LR photograph, up to rounding, or shows something else
-/// where it differs by more than this, in dB.
-const LEAST_ALIKENESS: f64 = 25.0;
+/// Minimum PSNR between a shrunk reference and its own LR photograph, in dB; below it the reference
+/// counts as another image (design note 019).
+const MIN_REFERENCE_PSNR: f64 = 25.0;
 
-/// Alpha of an LR pixel that is made of opaque ones alone, up to rounding.
-const LEAST_OPAQUE_ALPHA: f32 = 1.0 - 1e-4;
+/// Minimum alpha of an LR pixel whose HR pixels are all opaque, up to rounding.
+const MIN_OPAQUE_ALPHA: f32 = 1.0 - 1e-4;
 
-/// References as they should join a training: of one with an LR photograph of its own the exposure
-/// is that photograph's, and it is left out where it shows something else. What was done is said.
-/// `kernel` made the LR photographs.
+/// Prepares references for a training: corrects the exposure of each to that of its own LR
+/// photograph, and drops references that differ from theirs. References without an LR photograph
+/// stay unchanged. `kernel` made the LR photographs; `log` reports corrections and dropped
+/// references.
 ///
-/// Images with alpha are compared as they are stored, colours premultiplied: over a background,
-/// what a kernel overshoots at the border of a thing would look like another exposure, since stored
-/// images have none of that.
-pub(crate) fn checked(
+/// Images with alpha are compared as stored, with premultiplied colours: over a background, the
+/// kernel's overshoot at the border of an object would look like another exposure, because stored
+/// images are clipped.
+pub(crate) fn check_references(
     mut references: Photographs,
     photographs: &Photographs,
     kernel: Kernel,
     memory: &mut PixelMemory,
-    say: &dyn Fn(String),
+    log: &dyn Fn(String),
 ) -> anyhow::Result<Photographs> {
     let (mut views, mut images) = (Vec::new(), Vec::new());
     for (view, mut packed) in references.views.views.into_iter().zip(references.images) {
@@ -33,29 +34,28 @@ pub(crate) fn checked(
             images.push(packed);
             continue;
         };
-        let mut photograph = packed.unpacked();
+        let mut photograph = packed.unpack();
         let (name, reference) = (&view.camera.name, &mut photograph.image);
-        let [mut shrunk, own] = compared(reference, &own, kernel);
+        let [mut shrunk, own] = comparable_images(reference, &own, kernel);
         if let Some(exposure) =
             Exposure::fit(&own, &shrunk, 1).filter(|exposure| !exposure.is_negligible())
         {
             let [r, g, b] = exposure.gain;
-            say(format!(
-                "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): \
-                taken back"
+            log(format!(
+                "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright); \
+                corrected"
             ));
             exposure.undo(reference);
             exposure.undo(&mut shrunk);
-            packed = PackedPhotograph::new(&photograph, memory).context(NO_PLACE)?;
+            packed = PackedPhotograph::new(&photograph, memory).context(NO_SPACE)?;
         }
-        let alike = alikeness(&shrunk, &own);
-        if alike < LEAST_ALIKENESS {
-            say(format!(
-                "reference {name} looks otherwise than its own LR photograph ({alike:.1} dB) and \
-                is left out: another view, or something that moved?"
+        let psnr = premultiplied_psnr(&shrunk, &own);
+        if psnr < MIN_REFERENCE_PSNR {
+            log(format!(
+                "reference {name} differs from its own LR photograph ({psnr:.1} dB) and is left \
+                out: another view, or did something move?"
             ));
-        }
-        if alike >= LEAST_ALIKENESS {
+        } else {
             views.push(view);
             images.push(packed);
         }
@@ -64,37 +64,39 @@ pub(crate) fn checked(
     Ok(references)
 }
 
-/// The LR photograph that a camera took, where there is one.
+/// Returns a camera's LR photograph, if any.
 fn own_photograph(photographs: &Photographs, camera: &Camera) -> Option<Image> {
     let view = photographs.views.taken_by(camera)?;
-    let place = photographs.views.views.iter().position(|other| std::ptr::eq(other, view))?;
-    Some(photographs.images[place].whole())
+    let index = photographs.views.views.iter().position(|other| std::ptr::eq(other, view))?;
+    Some(photographs.images[index].unmasked())
 }
 
-/// A reference as the kernel shrinks it, and its own LR photograph. With alpha it is shrunk as
-/// `prep` does it, from 8 bits to 8 bits.
-fn compared(reference: &Image, own: &Image, kernel: Kernel) -> [Image; 2] {
-    if is_transparent(reference) && kernel != Kernel::Average {
-        let shrunk = resize_pillow(&as_stored(reference), own.width, own.height, kernel.filter());
+/// Returns a reference shrunk by the kernel, and its own LR photograph. Images with alpha are
+/// shrunk from 8 bits to 8 bits, like those of `prep`.
+fn comparable_images(reference: &Image, own: &Image, kernel: Kernel) -> [Image; 2] {
+    let is_transparent = is_transparent(reference);
+    if is_transparent && kernel != Kernel::Average {
+        let shrunk = resize_pillow(&to_stored(reference), own.width, own.height, kernel.filter());
         return [Image::premultiplied(&shrunk), own.clone()];
     }
-    let sizes = [reference, own].map(|image| (image.width, image.height));
-    let mut pair =
-        [Resampling::new(kernel.filter(), sizes[0], sizes[1]).apply(reference), own.clone()];
-    if is_transparent(reference) {
-        // That kernel averages straight colours, those of what is transparent, too: only alpha is
-        // known there.
-        let hidden: Vec<usize> = (0..own.width * own.height)
-            .filter(|i| own.data[4 * i + 3] < LEAST_OPAQUE_ALPHA)
-            .collect();
-        pair.iter_mut()
-            .for_each(|image| hidden.iter().for_each(|i| image.data[4 * i..4 * i + 3].fill(0.0)));
+    let [from, to] = [reference, own].map(|image| (image.width, image.height));
+    let mut pair = [Resampling::new(kernel.filter(), from, to).apply(reference), own.clone()];
+    if is_transparent {
+        // `average` takes the mean of straight colours, those of transparent pixels included: only
+        // alpha is known where not all HR pixels are opaque.
+        for pixel in 0..own.width * own.height {
+            if own.data[4 * pixel + 3] < MIN_OPAQUE_ALPHA {
+                for image in &mut pair {
+                    image.data[4 * pixel..4 * pixel + 3].fill(0.0);
+                }
+            }
+        }
     }
     pair
 }
 
-/// An image with premultiplied alpha as its PNG has it: 8 bits, alpha straight.
-fn as_stored(image: &Image) -> Rgba8 {
+/// Converts an image with premultiplied alpha to its PNG's form: 8 bits, straight alpha.
+fn to_stored(image: &Image) -> Rgba8 {
     let pixels = image.data.as_chunks::<4>().0.iter().copied();
     Rgba8::new(image.width, image.height, pixels.flat_map(straight).collect())
 }
@@ -103,16 +105,16 @@ fn is_transparent(image: &Image) -> bool {
     image.channels == 4 && image.data.chunks_exact(4).any(|pixel| pixel[3] < 1.0)
 }
 
-/// How alike two images of one size are, in dB over their colours; what differs in alpha counts,
-/// too.
-fn alikeness(one: &Image, other: &Image) -> f64 {
+/// Returns the PSNR of two images of one size in dB. The squared error includes alpha, and is
+/// divided by the number of colour samples.
+fn premultiplied_psnr(one: &Image, other: &Image) -> f64 {
     let channels = if is_transparent(one) || is_transparent(other) { 4 } else { 3 };
     let pairs = samples(one, channels).zip(samples(other, channels));
     let colours = (3 * one.width * one.height) as f64;
     psnr_of(pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / colours)
 }
 
-/// Samples of the first channels.
+/// Returns the samples of an image's first channels.
 fn samples(image: &Image, channels: usize) -> impl Iterator<Item = &f32> {
     image.data.chunks_exact(image.channels).flat_map(move |pixel| &pixel[..channels])
 }
@@ -159,7 +161,7 @@ mod tests {
         let mut image = hr();
         image.data.iter_mut().for_each(|v| *v = change(*v));
         let say = |text: String| said.borrow_mut().push_str(&text);
-        let kept = checked(
+        let kept = check_references(
             photographs(name, image),
             &lr,
             Kernel::Lanczos,
@@ -168,7 +170,7 @@ mod tests {
         )
         .unwrap();
         (
-            kept.images.first().map(|packed| packed.whole().over(0.0)),
+            kept.images.first().map(|packed| packed.unmasked().over(0.0)),
             kept.views.views.len(),
             said.into_inner(),
         )
@@ -233,11 +235,12 @@ mod tests {
                 let say = |text: String| said.borrow_mut().push_str(&text);
                 let memory = &mut PixelMemory::unlimited();
                 let kept =
-                    checked(photographs("a", hr.clone()), &given, kernel, memory, &say).unwrap();
+                    check_references(photographs("a", hr.clone()), &given, kernel, memory, &say)
+                        .unwrap();
                 assert_eq!(said.into_inner(), "", "{size} {kernel:?}");
-                assert_eq!(kept.images[0].whole(), hr);
-                let [shrunk, own] = compared(&hr, &lr, kernel);
-                assert_eq!(alikeness(&shrunk, &own), 100.0, "{size} {kernel:?}");
+                assert_eq!(kept.images[0].unmasked(), hr);
+                let [shrunk, own] = comparable_images(&hr, &lr, kernel);
+                assert_eq!(premultiplied_psnr(&shrunk, &own), 100.0, "{size} {kernel:?}");
             }
         }
     }

@@ -1,0 +1,210 @@
+use std::collections::BTreeMap;
+
+use radiance::{Architecture, FieldModel, MlpArchitecture, Regularisers, TrainingOptions};
+use serde_json::{Value, json};
+
+use super::{Combine, GridParams, MlpParams, Order, Supervision};
+use crate::supersample::{warmup_stages, whole_supersample};
+
+/// Steps over which a grid's learning rates rise to their maximum; chosen by hand.
+const LEARNING_RATE_WARMUP_STEPS: u64 = 100;
+/// Gradient norm, relative to the mean, below which gradients go through Russian roulette (design
+/// note 037).
+const ROULETTE: f32 = 0.25;
+
+/// Parameters with every default set.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Resolved {
+    /// Field and the parameters of that kind of field.
+    pub field: ResolvedField,
+    /// Sub-pixel rays along each side of an LR pixel.
+    pub supersample: f64,
+    /// Fraction of the rays during which fewer sub-pixel rays are cast.
+    pub supersample_warmup: f64,
+    /// Comparison of an LR pixel with its rays.
+    pub supervision: Supervision,
+    /// True if exposures are estimated.
+    pub exposure: bool,
+    /// True if camera poses are optimised.
+    pub pose_refinement: bool,
+    /// Order of pixel draws.
+    pub order: Order,
+    /// Ratio of the draw rates of detailed and flat pixels.
+    pub pixel_importance: f64,
+    /// Number of steps that draw pixels only from the middle of the images.
+    pub precrop_steps: u32,
+    /// Number of independently trained fields.
+    pub ensemble: u32,
+    /// Number of rays over all fields of the ensemble.
+    pub rays: u64,
+    /// Maximum number of rays in a step.
+    pub max_rays_per_step: u32,
+    /// Number of rays in an epoch: one through every sub-pixel of every view.
+    pub epoch: u64,
+    /// Maximum number of HR references.
+    pub max_references: usize,
+    /// Combination of the initial with the fine-tuned field.
+    pub combine: Combine,
+    /// Seed of all random numbers.
+    pub seed: u64,
+}
+
+/// Field with every default set.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ResolvedField {
+    /// Hash grid.
+    Grid {
+        /// Shape of the grid and its MLPs.
+        architecture: Architecture,
+        /// Weights of the regularisers.
+        regularisers: ResolvedRegularisers,
+        /// Parameters as given.
+        given: GridParams,
+    },
+    /// The paper's MLPs.
+    Mlp {
+        /// Shape of the MLPs.
+        architecture: MlpArchitecture,
+        /// Standard deviation of the noise on raw densities.
+        density_noise_std: f64,
+        /// Parameters as given.
+        given: MlpParams,
+    },
+}
+
+/// Weights of a grid's regularisers with every default set.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ResolvedRegularisers {
+    /// Weight of the distortion loss.
+    pub distortion: f64,
+    /// Weight of the floater loss.
+    pub floater_loss: f64,
+}
+
+impl Resolved {
+    /// Returns the values in use of the parameters whose default depends on the scene, by name, for
+    /// `training.json`.
+    pub fn record(&self) -> BTreeMap<String, Value> {
+        let common = json!({
+            "combine": self.combine,
+            "pixel_importance": self.pixel_importance,
+            "precrop_steps": self.precrop_steps,
+            "rays": self.rays,
+            "supersample_warmup": self.supersample_warmup,
+            "supervision": self.supervision,
+        });
+        let own = match &self.field {
+            ResolvedField::Grid { architecture, regularisers, .. } => json!({
+                "distortion": regularisers.distortion,
+                "finest_z": architecture.finest_z,
+                "floater_loss": regularisers.floater_loss,
+                "log2_hashmap_size": architecture.log2_entries,
+                "march_steps": architecture.steps,
+                "max_resolution": architecture.finest,
+            }),
+            ResolvedField::Mlp { density_noise_std, .. } => {
+                json!({ "density_noise_std": density_noise_std })
+            }
+        };
+        let entries = [common, own].into_iter().filter_map(|values| values.as_object().cloned());
+        entries.flatten().collect()
+    }
+
+    /// Returns the kind of field with its architecture.
+    pub fn model(&self) -> FieldModel {
+        match &self.field {
+            ResolvedField::Grid { architecture, .. } => FieldModel::Grid(*architecture),
+            ResolvedField::Mlp { architecture, .. } => FieldModel::Mlp(*architecture),
+        }
+    }
+
+    /// Returns the maximum number of restarts of a collapsed training.
+    pub(crate) fn max_restarts(&self) -> u32 {
+        match &self.field {
+            ResolvedField::Grid { .. } => 0,
+            ResolvedField::Mlp { given, .. } => given.restarts,
+        }
+    }
+
+    /// Returns the parameters of one field of the ensemble: as if trained alone, with its part of
+    /// the rays.
+    #[must_use]
+    pub fn member(&self, index: u32) -> Self {
+        let members = u64::from(self.ensemble.max(1));
+        let has_extra_ray = u64::from(index) < self.rays % members;
+        Self {
+            ensemble: 1,
+            rays: self.rays / members + u64::from(has_extra_ray),
+            seed: self.seed.wrapping_add(u64::from(index)),
+            ..self.clone()
+        }
+    }
+
+    /// Returns the number of bundles in the first `precrop_steps` steps, which are drawn from the
+    /// middle of the images.
+    pub fn precrop_bundles(&self) -> u64 {
+        let batch = u64::from(self.max_rays_per_step);
+        let supersample = whole_supersample(self.supersample);
+        let doublings = warmup_stages(supersample);
+        let stage_steps = (self.supersample_warmup * self.rays as f64 / f64::from(doublings.max(1)))
+            as u64
+            / batch;
+        let warmup = (0..doublings).map(|doubling| (stage_steps, 1 << doubling));
+        let mut steps_left = u64::from(self.precrop_steps);
+        let mut bundles = 0;
+        for (steps, supersample) in warmup.chain([(u64::MAX, supersample)]) {
+            let steps = steps_left.min(steps);
+            steps_left -= steps;
+            bundles += steps * (batch / (supersample * supersample)).max(1);
+        }
+        bundles
+    }
+
+    /// Returns the training options of a grid.
+    pub fn grid_training(
+        &self,
+        grid: &GridParams,
+        regularisers: &ResolvedRegularisers,
+    ) -> TrainingOptions {
+        TrainingOptions {
+            rays: self.rays,
+            max_rays_per_step: self.max_rays_per_step as usize,
+            samples_per_step: grid.samples_per_step as usize,
+            learning_rate: grid.learning_rate,
+            level_rate: grid.level_rate,
+            mlp_learning_rate: grid.mlp_learning_rate,
+            learning_rate_decay: grid.learning_rate_decay,
+            warm_up: LEARNING_RATE_WARMUP_STEPS,
+            ema_decay: grid.ema_decay as f32,
+            regularisers: Regularisers {
+                distortion: regularisers.distortion as f32,
+                floater_loss: regularisers.floater_loss as f32,
+            },
+            network_decay: grid.network_decay as f32,
+            roulette: ROULETTE,
+            seed: self.seed,
+        }
+    }
+
+    /// Returns the training options of the paper's MLPs.
+    #[cfg(feature = "torch")]
+    pub fn mlp_training(
+        &self,
+        mlp: &MlpParams,
+        density_noise_std: f64,
+    ) -> torch_field::MlpTraining {
+        let epochs = self.rays.div_ceil(self.epoch.max(1));
+        torch_field::MlpTraining {
+            rays: self.rays,
+            max_rays_per_step: self.max_rays_per_step as usize,
+            learning_rate: mlp.learning_rate,
+            learning_rate_decay: mlp.learning_rate_decay,
+            schedule: match mlp.schedule {
+                super::RateSchedule::Code => torch_field::Schedule::Epochs { epochs },
+                super::RateSchedule::Paper => torch_field::Schedule::Exponential,
+            },
+            density_noise_std,
+            seed: self.seed,
+        }
+    }
+}

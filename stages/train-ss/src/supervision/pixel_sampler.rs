@@ -1,0 +1,255 @@
+use counter_rng::CounterRng;
+use pixels::Image;
+use rayon::prelude::*;
+
+use crate::params::Order;
+use crate::photographs::PixelSet;
+
+/// Sampler of the pixel that a bundle trains on. Pixels are numbered over all views in order; a
+/// pixel that is drawn more often has several numbers.
+pub(crate) struct PixelSampler {
+    views: Vec<PixelNumbers>,
+    /// Total number of pixel numbers.
+    count: u64,
+    importance: Importance,
+    pub(crate) order: Order,
+    /// Number of bundles at the start that come from the middle half of each image's width and
+    /// height.
+    pub(crate) precrop_bundles: u64,
+    seed: u64,
+}
+
+/// Range of a view's pixel numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct PixelNumbers {
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    /// Number of pixel numbers of the previous views.
+    pub(crate) start: u64,
+}
+
+/// RNG stream of pixel draws.
+const PIXEL_STREAM: u64 = 100;
+
+/// First of the four RNG streams of an epoch's permutation.
+const EPOCH_STREAM: u64 = 110;
+
+/// Maximum number of draws until a pixel counts; the last draw is used anyway and has no residual.
+const MAX_DRAWS: usize = 64;
+
+impl PixelSampler {
+    /// Creates a sampler of views with `count` pixel numbers in total.
+    pub(crate) fn new(
+        views: Vec<PixelNumbers>,
+        count: u64,
+        importance: Importance,
+        (order, precrop_bundles): (Order, u64),
+        seed: u64,
+    ) -> Self {
+        Self { views, count, importance, order, precrop_bundles, seed }
+    }
+
+    /// Returns the view and pixel that a bundle trains on. `counts` returns whether a view's pixel
+    /// counts.
+    pub(crate) fn draw(
+        &self,
+        bundle: u64,
+        counts: impl Fn(usize, usize) -> bool,
+    ) -> (usize, usize) {
+        let mut rng = CounterRng::new(self.seed, PIXEL_STREAM, bundle);
+        let is_precrop = bundle < self.precrop_bundles;
+        if self.order == Order::Epochs && !is_precrop {
+            let bundle = bundle - self.precrop_bundles;
+            let (epoch, index) = (bundle / self.count, bundle % self.count);
+            return self.pixel(permuted(self.seed, epoch, index, self.count));
+        }
+        let (mut view, mut pixel) = self.pixel(self.importance.draw(self.count, &mut rng));
+        for _ in 1..MAX_DRAWS {
+            if counts(view, pixel) {
+                break;
+            }
+            (view, pixel) = self.pixel(self.importance.draw(self.count, &mut rng));
+        }
+        if is_precrop {
+            let PixelNumbers { width, height, .. } = self.views[view];
+            let [x, y] = [width, height]
+                .map(|length| length / 4 + rng.below((length as u64 / 2).max(1)) as usize);
+            return (view, y * width + x);
+        }
+        (view, pixel)
+    }
+
+    /// Returns the view and pixel of a pixel number.
+    fn pixel(&self, number: u64) -> (usize, usize) {
+        let view = self.views.partition_point(|view| view.start <= number) - 1;
+        let PixelNumbers { width, height, start } = self.views[view];
+        (view, (number - start) as usize % (width * height))
+    }
+
+    /// Returns the weight of the loss of a bundle that trains on a pixel of a view.
+    pub(crate) fn weight(&self, bundle: u64, (view, pixel): (usize, usize)) -> f32 {
+        if bundle < self.precrop_bundles {
+            1.0
+        } else {
+            self.importance.weight(self.views[view].start + pixel as u64)
+        }
+    }
+
+    /// Returns the total number of pixel numbers.
+    #[cfg(test)]
+    pub(crate) fn count(&self) -> u64 {
+        self.count
+    }
+}
+
+/// Importance sampling: pixels with detail around them are drawn more often than flat ones, and
+/// each pixel's loss is weighted by the uniform over the actual draw rate, so that the expected
+/// loss and gradient are those of uniform draws (design note 010).
+pub(crate) struct Importance {
+    /// Numbers of the pixels with detail.
+    detailed: PixelSet,
+    /// Fraction of the draws that are uniform over all pixels; the others are uniform over detailed
+    /// pixels.
+    uniform_share: f32,
+    flat_weight: f32,
+    detailed_weight: f32,
+}
+
+impl Importance {
+    /// Creates a sampler that draws detailed pixels `ratio` times as often as flat ones.
+    pub(crate) fn new(ratio: f64, count: u64, detailed: PixelSet) -> Self {
+        let detailed_share = detailed.len() as f64 / count.max(1) as f64;
+        if ratio <= 1.0 || detailed_share <= 0.0 {
+            return Self { detailed, uniform_share: 1.0, flat_weight: 1.0, detailed_weight: 1.0 };
+        }
+        let uniform_share = 1.0 / (ratio - 1.0).mul_add(detailed_share, 1.0);
+        Self {
+            detailed,
+            uniform_share: uniform_share as f32,
+            flat_weight: (1.0 / uniform_share) as f32,
+            detailed_weight: (1.0 / (uniform_share * ratio)) as f32,
+        }
+    }
+
+    /// Draws a pixel number below `count`.
+    pub(crate) fn draw(&self, count: u64, rng: &mut CounterRng) -> u64 {
+        if self.uniform_share == 1.0 || rng.uniform() < self.uniform_share {
+            return rng.below(count);
+        }
+        self.detailed.nth(rng.below(self.detailed.len())).unwrap_or_default()
+    }
+
+    /// Returns the weight of a pixel's loss.
+    pub(crate) fn weight(&self, number: u64) -> f32 {
+        let is_uniform = self.uniform_share >= 1.0;
+        if !is_uniform && self.detailed.contains(number) {
+            self.detailed_weight
+        } else {
+            self.flat_weight
+        }
+    }
+}
+
+/// Maximum range of a channel over 3×3 pixels that count as flat (design note 010).
+const MAX_FLAT_RANGE: f32 = 8.0 / 255.0;
+
+/// Returns for every pixel whether a channel varies around it.
+pub(crate) fn detailed_pixels(image: &Image) -> Vec<bool> {
+    let (width, channels) = (image.width, image.channels);
+    let row = width * channels;
+    let mut detailed = vec![false; width * image.height];
+    detailed.par_chunks_mut(width.max(1)).enumerate().for_each_init(
+        // Minimum and maximum over three rows.
+        || (vec![0.0f32; row], vec![0.0f32; row]),
+        |(low, high), (y, detailed)| {
+            low.fill(f32::MAX);
+            high.fill(f32::MIN);
+            for j in adjacent(y, image.height) {
+                for (i, &v) in image.data[j * row..(j + 1) * row].iter().enumerate() {
+                    low[i] = low[i].min(v);
+                    high[i] = high[i].max(v);
+                }
+            }
+            for (x, detailed) in detailed.iter_mut().enumerate() {
+                *detailed = (0..channels).any(|c| {
+                    let samples = adjacent(x, width).map(|i| i * channels + c);
+                    let (min, max) = samples.fold((f32::MAX, f32::MIN), |(min, max), i| {
+                        (min.min(low[i]), max.max(high[i]))
+                    });
+                    max - min > MAX_FLAT_RANGE
+                });
+            }
+        },
+    );
+    detailed
+}
+
+/// Returns an index and its neighbours.
+fn adjacent(index: usize, length: usize) -> std::ops::Range<usize> {
+    index.saturating_sub(1)..(index + 2).min(length)
+}
+
+/// Returns the index-th of `count` numbers in an epoch's random order: a Feistel cipher over the
+/// next power of four, repeated while its result is not below `count`. The permutation needs no
+/// memory and can be evaluated anywhere by any thread.
+pub(crate) fn permuted(seed: u64, epoch: u64, index: u64, count: u64) -> u64 {
+    let bits = (64 - (count - 1).leading_zeros()).div_ceil(2).max(1);
+    let mask = (1u64 << bits) - 1;
+    let mut number = index;
+    loop {
+        let (mut left, mut right) = (number >> bits, number & mask);
+        for round in 0..4 {
+            let stream = EPOCH_STREAM + round;
+            let mixed = CounterRng::new(seed, stream, (epoch << 32) ^ right).below(mask + 1);
+            (left, right) = (right, left ^ mixed);
+        }
+        number = left << bits | right;
+        if number < count {
+            return number;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Pixels with detail are drawn at the given ratio, and the expected weighted loss is that of
+    /// uniform draws.
+    #[test]
+    fn focus_keeps_the_expectation() {
+        let mut flat = Image::new(20, 10, 3, vec![0.5; 600]);
+        flat.data[3 * (3 * 20 + 4)] = 0.9;
+        let around_dot =
+            |pixel: usize| (2..5).contains(&(pixel / 20)) && (3..6).contains(&(pixel % 20));
+        assert!(detailed_pixels(&flat).into_iter().eq((0..200).map(around_dot)));
+        let importance = Importance::new(7.0, 200, detailed_pixels(&flat).into_iter().collect());
+        let (mut counts, draws) = ([0u32; 200], 400_000);
+        (0..draws).for_each(|k| {
+            counts[importance.draw(200, &mut CounterRng::new(1, 2, k)) as usize] += 1
+        });
+        for (pixel, &count) in (0..200).zip(&counts) {
+            let mean =
+                f64::from(count) * 200.0 / draws as f64 * f64::from(importance.weight(pixel));
+            assert!((mean - 1.0).abs() < 0.12, "{pixel}: {mean}");
+        }
+        let (dot, elsewhere) = (counts[3 * 20 + 4], counts[6 * 20..].iter().sum::<u32>());
+        let often = f64::from(dot) / (f64::from(elsewhere) / 80.0);
+        assert!((often - 7.0).abs() < 0.6, "{often}");
+        let third = [false, false, false, true].into_iter().collect();
+        for even in
+            [Importance::new(1.0, 200, third), Importance::new(5.0, 200, PixelSet::default())]
+        {
+            assert!(even.weight(3) == 1.0 && even.uniform_share == 1.0);
+        }
+    }
+
+    #[test]
+    fn an_epoch_has_every_number_once() {
+        for n in [1, 2, 3, 17, 1000] {
+            let mut order: Vec<u64> = (0..n).map(|i| permuted(7, 3, i, n)).collect();
+            order.sort_unstable();
+            assert!(order.iter().copied().eq(0..n));
+        }
+    }
+}

@@ -1,0 +1,160 @@
+/// Minimum level of an LR sample that may have been clipped to white (254.5 in 8 bits); its
+/// complement is the maximum level of one that may have been clipped to black.
+const SATURATION: f32 = 254.5 / 255.0;
+
+/// True if the true value of an LR sample may lie beyond the sample.
+pub(crate) fn is_clipped(sample: f32) -> bool {
+    sample >= SATURATION || sample <= 1.0 - SATURATION
+}
+
+/// Returns prediction − target, or 0 if the target is NaN.
+fn residual(prediction: f32, target: f32) -> f32 {
+    if target.is_nan() { 0.0 } else { prediction - target }
+}
+
+/// Target of a bundle, except for the photograph's samples, and weight of the bundle's loss. Losses
+/// are means over the three channels.
+pub(crate) struct Target {
+    /// Factors from the photograph to the field's colours: reciprocals of its gains.
+    pub(crate) exposure: [f32; 3],
+    /// Background colour of the bundle's rays.
+    pub(crate) background: [f32; 3],
+    /// Weight of the bundle's loss.
+    pub(crate) weight: f32,
+    /// True if samples were clipped to black and white after the kernel or the exposure.
+    pub(crate) is_clipped: bool,
+}
+
+impl Target {
+    /// Returns the target colour of a photograph's sample: premultiplied RGBA over the background.
+    fn colour(&self, sample: [f32; 4]) -> [f32; 3] {
+        [0, 1, 2].map(|c| self.exposure[c] * (sample[c] + (1.0 - sample[3]) * self.background[c]))
+    }
+
+    /// Returns the residual of a prediction; 0 if the sample may have been clipped and the
+    /// prediction lies beyond it.
+    pub(crate) fn unclipped_residual(&self, channel: usize, prediction: f32, sample: f32) -> f32 {
+        let residual = residual(prediction, self.exposure[channel] * sample);
+        let is_beyond = (sample >= SATURATION && residual > 0.0)
+            || (sample <= 1.0 - SATURATION && residual < 0.0);
+        if is_beyond { 0.0 } else { residual }
+    }
+
+    /// Returns the loss of an LR pixel's residual, and scales back-projected residuals to the
+    /// loss's gradient.
+    pub(crate) fn back_projected_loss(
+        &self,
+        residual: [f32; 3],
+        gradients: &mut [[f32; 3]],
+    ) -> f64 {
+        for gradient in gradients.as_flattened_mut() {
+            *gradient *= self.weight * (2.0 / 3.0);
+        }
+        residual.iter().map(|&r| f64::from(self.weight) * f64::from(r) * f64::from(r) / 3.0).sum()
+    }
+
+    /// Returns the loss of colours with a sample each, and writes its gradient.
+    pub(crate) fn individual_loss(
+        &self,
+        colours: &[[f32; 3]],
+        sample_of: impl Fn(usize) -> [f32; 4],
+        gradients: &mut [[f32; 3]],
+    ) -> f64 {
+        let share = 1.0 / colours.len() as f32;
+        let mut loss = 0.0;
+        for (k, colour) in colours.iter().enumerate() {
+            let target = self.colour(sample_of(k));
+            for c in 0..3 {
+                let residual = residual(colour[c], target[c]);
+                loss += f64::from(self.weight * share) * f64::from(residual) * f64::from(residual)
+                    / 3.0;
+                gradients[k][c] = self.weight * residual * share * (2.0 / 3.0);
+            }
+        }
+        loss
+    }
+
+    /// Returns the loss of the colours' mean (the paper's eq. 4), and writes its gradient.
+    pub(crate) fn mean_loss(
+        &self,
+        colours: &[[f32; 3]],
+        sample: [f32; 4],
+        gradients: &mut [[f32; 3]],
+    ) -> f64 {
+        let share = 1.0 / colours.len() as f32;
+        let target = self.colour(sample);
+        let mut loss = 0.0;
+        for c in 0..3 {
+            let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
+            let residual = if self.is_clipped {
+                self.unclipped_residual(c, mean, sample[c])
+            } else {
+                residual(mean, target[c])
+            };
+            loss += f64::from(self.weight) * f64::from(residual) * f64::from(residual) / 3.0;
+            for gradient in gradients.iter_mut() {
+                gradient[c] = self.weight * residual * share * (2.0 / 3.0);
+            }
+        }
+        loss
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PLAIN: Target =
+        Target { exposure: [1.0; 3], background: [0.0; 3], weight: 1.0, is_clipped: false };
+
+    /// A clipped sample bounds the true value from one side only.
+    #[test]
+    fn clipped_samples_have_no_residual_beyond() {
+        let cases = [
+            (1.1, 1.0, 0.0),
+            (0.9, 1.0, -0.1),
+            (-0.1, 0.0, 0.0),
+            (0.1, 0.0, 0.1),
+            (1.1, 0.99, 0.11),
+            (-0.1, 0.01, -0.11),
+        ];
+        for (prediction, sample, expected) in cases {
+            assert!(
+                (PLAIN.unclipped_residual(1, prediction, sample) - expected).abs() < 1e-6,
+                "{prediction} {sample}"
+            );
+        }
+        assert!(is_clipped(1.0) && is_clipped(0.0) && !is_clipped(0.99));
+        // White in a photograph half as bright as the scene is a lower bound of the scene's colour.
+        let bright = Target { exposure: [0.5; 3], is_clipped: true, ..PLAIN };
+        let mut gradients = [[9.0; 3]; 2];
+        assert_eq!(bright.mean_loss(&[[0.9; 3]; 2], [1.0; 4], &mut gradients), 0.0);
+        assert_eq!(gradients, [[0.0; 3]; 2]);
+        let plain = Target { is_clipped: false, ..bright };
+        assert!(plain.mean_loss(&[[0.9; 3]; 2], [1.0; 4], &mut gradients) > 0.1);
+    }
+
+    /// Unknown samples have no residual.
+    #[test]
+    fn unknown_samples_have_no_residual() {
+        let unknown = [f32::NAN; 4];
+        assert_eq!(PLAIN.unclipped_residual(0, 0.2, f32::NAN), 0.0);
+        let mut gradients = [[9.0; 3]; 2];
+        assert_eq!(PLAIN.mean_loss(&[[0.2; 3]; 2], unknown, &mut gradients), 0.0);
+        assert_eq!(gradients, [[0.0; 3]; 2]);
+        gradients = [[9.0; 3]; 2];
+        assert_eq!(PLAIN.individual_loss(&[[0.2; 3]; 2], |_| unknown, &mut gradients), 0.0);
+        assert_eq!(gradients, [[0.0; 3]; 2]);
+    }
+
+    /// Exposure is corrected, and transparent samples show the background.
+    #[test]
+    fn samples_become_target_colours() {
+        let target = Target { exposure: [2.0, 1.0, 0.5], background: [0.4, 0.8, 1.0], ..PLAIN };
+        let colour = target.colour([0.1, 0.2, 0.3, 0.75]);
+        assert!(
+            colour.iter().zip([0.4, 0.4, 0.275]).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6),
+            "{colour:?}"
+        );
+    }
+}

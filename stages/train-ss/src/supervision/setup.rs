@@ -1,0 +1,105 @@
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::{Failure, GivenInput};
+use pixels::{DEGRADATION_FILE, Degradation, Kernel};
+use scene::{Background, Views};
+use stage::available_memory;
+
+use super::Supersampling;
+use super::memory::MemoryNeed;
+use super::options::SupersamplingOptions;
+use crate::params::{Resolved, Supervision};
+use crate::photographs::{NO_SPACE, PackedPhotograph, Photographs, check_references};
+
+/// Returns the error message for a parameter that conflicts with a transparent background.
+pub(crate) fn transparent_background(parameter: &str) -> String {
+    let problem = match parameter {
+        "supervision" => {
+            "kernel needs an opaque background; choose average, or prep.background white"
+        }
+        "exposure" => {
+            "exposure cannot be estimated over a transparent background; choose prep.background \
+            white or opaque"
+        }
+        _ => {
+            "renders cannot be compared with photographs over a transparent background; choose \
+            prep.background white or opaque"
+        }
+    };
+    format!("parameter {parameter}: {problem}")
+}
+
+/// Reads and checks photographs and references, and sets up the supervision of a training. Pixels
+/// beyond the memory budget go into a file in `folder`. `log` reports the memory need, and
+/// references that are corrected or dropped.
+pub fn supervision(
+    input: &GivenInput,
+    params: &Resolved,
+    references: Option<&GivenInput>,
+    folder: &Path,
+    has_checkpoints: bool,
+    log: &dyn Fn(String),
+) -> anyhow::Result<Supersampling> {
+    let views = Views::read(input)?;
+    let mut reference_views = Vec::new();
+    if let Some(references) = references.map(Views::read).transpose()? {
+        if references.background != views.background {
+            let message = "input references: the background differs from the scene's; create both \
+                in one run of prep";
+            return Err(Failure::BadInput(message.to_owned()).into());
+        }
+        reference_views = references.views;
+        reference_views.truncate(params.max_references);
+    }
+    let kernel = kernel(input, params, views.background)?;
+    let options = SupersamplingOptions { params: params.clone(), filter: kernel.filter() };
+    let need = MemoryNeed::of(&options, &views, &reference_views, has_checkpoints);
+    let mut memory = need.plan(available_memory()?, folder.to_path_buf())?;
+    log(need.describe(memory.left()));
+    let photographs = Photographs::read(input, usize::MAX, &mut memory)?;
+    if !photographs.images.iter().any(PackedPhotograph::is_known) {
+        let message = "scene: masks exclude every pixel of every photograph; white pixels count";
+        return Err(Failure::BadInput(message.to_owned()).into());
+    }
+    let references = match references {
+        Some(input) => {
+            let references = Photographs::read(input, params.max_references, &mut memory)?;
+            let checked = check_references(references, &photographs, kernel, &mut memory, log)?;
+            Some(checked.over_background())
+        }
+        None => None,
+    };
+    Supersampling::new(photographs.over_background(), references, &options, memory)
+        .context(NO_SPACE)
+}
+
+/// Returns the kernel of the LR images; Lanczos if the scene states none. Fails if parameters
+/// require a kernel or a background that the scene lacks.
+fn kernel(input: &GivenInput, params: &Resolved, background: Background) -> anyhow::Result<Kernel> {
+    let needs_kernel = params.supervision == Supervision::Kernel;
+    let is_known = input.path(DEGRADATION_FILE).exists();
+    if needs_kernel && !is_known {
+        let message = format!(
+            "parameter supervision: kernel needs {DEGRADATION_FILE} in the scene, which states \
+            the kernel of the LR images; choose average"
+        );
+        return Err(Failure::Usage(message).into());
+    }
+    let kernel = if is_known {
+        input.read_json::<Degradation>(DEGRADATION_FILE)?.kernel
+    } else {
+        Kernel::Lanczos
+    };
+    let enabled = [
+        ("supervision", needs_kernel),
+        ("pose_refinement", params.pose_refinement),
+        ("exposure", params.exposure),
+    ];
+    if background == Background::Alpha
+        && let Some((parameter, _)) = enabled.iter().find(|(_, is_enabled)| *is_enabled)
+    {
+        return Err(Failure::Usage(transparent_background(parameter)).into());
+    }
+    Ok(kernel)
+}

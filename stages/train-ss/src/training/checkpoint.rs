@@ -1,0 +1,178 @@
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use pixels::psnr_of;
+use radiance::StepReport;
+use serde::{Deserialize, Serialize};
+
+use super::field_trainer::FieldTrainer;
+use super::log::{CurvePoint, TrainingLog};
+use crate::supervision::Supersampling;
+
+/// File name of a trainer's checkpoint.
+const CHECKPOINT: &str = "checkpoint.safetensors";
+/// Minimum ratio of the time between two checkpoints to the time that one takes; chosen by hand.
+const MIN_INTERVAL_RATIO: u32 = 50;
+
+/// Training curve of an unfinished training. Checkpoints contain all of it, so that a resumed
+/// training writes the same curve.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub(crate) struct Curve {
+    points: Vec<CurvePoint>,
+    /// Sum of losses since the last point.
+    loss: f64,
+    /// Number of steps since the last point.
+    steps: u64,
+    samples: u64,
+}
+
+impl Curve {
+    /// Adds a step, and a point for each hundredth of the rays.
+    pub(crate) fn add(&mut self, report: &StepReport, rays: u64, total: u64) {
+        self.samples += report.samples as u64;
+        if !report.skipped {
+            self.loss += report.loss;
+            self.steps += 1;
+        }
+        let hundredths = rays * 100 / total;
+        let before = self.points.last().map_or(0, |p| p.rays * 100 / total);
+        if hundredths > before && self.steps > 0 {
+            self.points.push(CurvePoint { rays, psnr: psnr_of(self.loss / self.steps as f64) });
+            (self.loss, self.steps) = (0.0, 0);
+        }
+    }
+
+    /// Returns the last PSNR as text for the progress bar.
+    pub(crate) fn last_psnr(&self) -> String {
+        self.points.last().map(|p| format!("{:.2} dB", p.psnr)).unwrap_or_default()
+    }
+
+    pub(crate) fn finish(self, steps: u64, rays: u64) -> TrainingLog {
+        TrainingLog {
+            steps,
+            rays,
+            samples_per_ray: self.samples as f64 / rays.max(1) as f64,
+            curve: self.points,
+            ..TrainingLog::default()
+        }
+    }
+}
+
+/// Checkpoints in the work folder: `curve-STEP.json` and `kept-STEP.bin`, the supervision's state,
+/// then `checkpoint.safetensors`, whose step decides which of these files belong to it.
+pub(crate) struct Checkpoints {
+    folder: Option<PathBuf>,
+    last_written: Instant,
+    write_time: Duration,
+}
+
+impl Checkpoints {
+    pub(crate) fn new(folder: Option<&Path>) -> Self {
+        Self {
+            folder: folder.map(Path::to_path_buf),
+            last_written: Instant::now(),
+            write_time: Duration::from_millis(20),
+        }
+    }
+
+    /// Resumes from the checkpoint of an earlier run, if any. An incomplete checkpoint is logged
+    /// and skipped, and the training starts over. Fails if a complete one can't be read.
+    pub(crate) fn resume(
+        &self,
+        trainer: &mut dyn FieldTrainer,
+        supervision: &mut Supersampling,
+        log: impl Fn(&str),
+    ) -> anyhow::Result<Curve> {
+        let Some(folder) = &self.folder else { return Ok(Curve::default()) };
+        let path = folder.join(CHECKPOINT);
+        if !path.exists() {
+            return Ok(Curve::default());
+        }
+        let complete = read_curve(&path, trainer).and_then(|(step, curve)| {
+            let state = std::fs::File::open(folder.join(state_name(step))).ok()?;
+            let is_complete =
+                state.metadata().ok()?.len() == supervision.state.byte_length() as u64;
+            (is_complete && trainer.resume(&path)).then_some((state, curve))
+        });
+        let Some((mut state, curve)) = complete else {
+            log(&format!("{}: incomplete checkpoint; starting over", path.display()));
+            return Ok(Curve::default());
+        };
+        // The trainer has been restored: without its state the training would be neither the
+        // earlier one nor a new one.
+        supervision.restore(&mut state).with_context(|| {
+            let path = folder.join(state_name(trainer.steps()));
+            format!("cannot read {}; delete it to start the training over", path.display())
+        })?;
+        log(&format!("resuming from step {}", trainer.steps()));
+        Ok(curve)
+    }
+
+    /// Writes a checkpoint unless that would take more than a fiftieth of the time.
+    pub(crate) fn write_if_due(
+        &mut self,
+        trainer: &dyn FieldTrainer,
+        supervision: &Supersampling,
+        curve: &Curve,
+    ) -> anyhow::Result<()> {
+        if self.last_written.elapsed() > MIN_INTERVAL_RATIO * self.write_time {
+            self.write(trainer, supervision, curve)?;
+        }
+        Ok(())
+    }
+
+    /// Writes a checkpoint, if there is a work folder, and removes the previous one.
+    pub(crate) fn write(
+        &mut self,
+        trainer: &dyn FieldTrainer,
+        supervision: &Supersampling,
+        curve: &Curve,
+    ) -> anyhow::Result<()> {
+        let Some(folder) = &self.folder else { return Ok(()) };
+        let started = Instant::now();
+        let partial = folder.join("checkpoint.partial");
+        let step = trainer.steps();
+        let files = [curve_name(step), state_name(step)];
+        artifact::write_json(&folder.join(&files[0]), curve)?;
+        supervision.state.write(&mut std::fs::File::create(folder.join(&files[1]))?)?;
+        trainer.write_checkpoint(&partial)?;
+        std::fs::rename(&partial, folder.join(CHECKPOINT))?;
+        for entry in std::fs::read_dir(folder)? {
+            let entry = entry?;
+            let file = entry.file_name().to_string_lossy().into_owned();
+            if (file.starts_with("curve-") || file.starts_with("kept-")) && !files.contains(&file) {
+                std::fs::remove_file(entry.path())?;
+            }
+        }
+        self.last_written = Instant::now();
+        self.write_time = started.elapsed();
+        Ok(())
+    }
+}
+
+/// Restores a trainer from the latest checkpoint below a work folder and returns its curve; `None`
+/// if there is no complete checkpoint, for example while one replaces the other.
+pub(crate) fn read_latest(work: &Path, trainer: &mut dyn FieldTrainer) -> Option<Curve> {
+    let files = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
+    let latest = files
+        .filter(|entry| entry.file_name() == CHECKPOINT)
+        .max_by_key(|entry| entry.metadata().ok().and_then(|metadata| metadata.modified().ok()))?;
+    let (_, curve) = read_curve(latest.path(), trainer)?;
+    trainer.resume(latest.path()).then_some(curve)
+}
+
+fn curve_name(step: u64) -> String {
+    format!("curve-{step}.json")
+}
+
+fn state_name(step: u64) -> String {
+    format!("kept-{step}.bin")
+}
+
+/// Returns a checkpoint's step and curve.
+fn read_curve(checkpoint: &Path, trainer: &dyn FieldTrainer) -> Option<(u64, Curve)> {
+    let step = trainer.checkpoint_step(checkpoint)?;
+    let bytes = std::fs::read(checkpoint.with_file_name(curve_name(step))).ok()?;
+    Some((step, serde_json::from_slice(&bytes).ok()?))
+}

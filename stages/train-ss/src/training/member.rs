@@ -1,0 +1,258 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use artifact::{Failure, GivenInput};
+use poses::MeanMotion;
+use radiance::{FieldFile, FieldModel};
+use scene::{Bounds, Views};
+use stage::{Context, Progress};
+
+use super::checkpoint::{Checkpoints, Curve, read_latest};
+use super::field_trainer::{Collapsed, FieldTrainer, average_weights, new_trainer};
+use super::log::TrainingLog;
+use crate::params::{Combine, Resolved};
+use crate::supervision::{Supersampling, supervision};
+
+/// Inputs of a training, and its progress bar.
+#[derive(Clone, Copy)]
+pub(crate) struct TrainingData<'a> {
+    pub(crate) input: &'a GivenInput,
+    pub(crate) references: Option<&'a GivenInput>,
+    pub(crate) views: &'a Views,
+    pub(crate) progress: &'a Progress,
+}
+
+/// Training in progress.
+struct Training {
+    trainer: Box<dyn FieldTrainer>,
+    supervision: Supersampling,
+    checkpoints: Checkpoints,
+    curve: Curve,
+}
+
+/// Field of an ensemble, with checkpoints in a folder of its own.
+#[derive(Clone)]
+pub(crate) struct Member<'a> {
+    pub(super) context: &'a Context,
+    pub(super) params: Resolved,
+    pub(super) model: FieldModel,
+    /// Weights to initialise the field from, and their combination with the trained ones.
+    init: Option<(PathBuf, Combine)>,
+    /// Path of the field's weights.
+    pub(super) output: PathBuf,
+    work: Option<PathBuf>,
+    /// Number of rays of the previous members.
+    rays_before: u64,
+}
+
+/// File name of a trained member's weights in the member's work folder.
+const DONE_WEIGHTS: &str = "field.safetensors";
+/// File name of a trained member's log, which is written last.
+const DONE_LOG: &str = "training.json";
+
+impl<'a> Member<'a> {
+    pub(crate) fn new(
+        context: &'a Context,
+        params: Resolved,
+        (model, init): (FieldModel, Option<(PathBuf, Combine)>),
+        index: u32,
+        rays_before: u64,
+    ) -> anyhow::Result<Self> {
+        let output = context.output_path(&FieldFile::member_file(index))?;
+        let work = context.work().map(|w| w.join(format!("member-{index}")));
+        Ok(Self { context, params, model, init, output, work, rays_before })
+    }
+
+    /// Returns a copy with or without pose refinement, with its checkpoints in the subfolder
+    /// `name`, its weights at `output`, and `more_rays` additional rays before it.
+    pub(crate) fn variant(
+        &self,
+        pose_refinement: bool,
+        name: &str,
+        output: PathBuf,
+        more_rays: u64,
+    ) -> Self {
+        Self {
+            params: Resolved { pose_refinement, ..self.params.clone() },
+            output,
+            work: self.work.as_ref().map(|work| work.join(name)),
+            rays_before: self.rays_before + more_rays,
+            ..self.clone()
+        }
+    }
+
+    /// Trains the field unless an earlier run has. A collapsed training restarts with the next
+    /// seed, as often as the parameters allow.
+    pub(crate) fn run(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
+        if let Some(log) = self.copy_finished() {
+            self.context.say("using the field that an earlier run trained");
+            return Ok(log);
+        }
+        let mut collapse = String::new();
+        for restart in 0..=self.params.max_restarts() {
+            let params = Resolved {
+                seed: self.params.seed.wrapping_add(u64::from(restart)),
+                ..self.params.clone()
+            };
+            let mut work = self.work.clone();
+            if restart > 0 {
+                self.context.say(format!("{collapse}: starting over with seed {}", params.seed));
+                // A folder per restart: a checkpoint resumes with the seed it began with.
+                work = work.map(|work| work.join(format!("restart-{restart}")));
+            }
+            match self.train(&params, work.as_deref(), data) {
+                Err(error) => match error.downcast_ref() {
+                    Some(Collapsed(message)) => collapse.clone_from(message),
+                    None => return Err(error),
+                },
+                done => return done,
+            }
+        }
+        Err(Failure::Numerical(format!("{collapse}, or increase parameter restarts")).into())
+    }
+
+    /// Writes the weights of the latest checkpoint of any member, and returns its log.
+    pub(crate) fn write_latest_checkpoint(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
+        let work = self.context.work().context("--from-checkpoint needs --work")?;
+        let mut trainer = self.new_trainer(&self.params, bounds)?;
+        let curve = read_latest(work, &mut *trainer).ok_or_else(|| {
+            Failure::BadInput(format!("--work {}: no complete checkpoint yet", work.display()))
+        })?;
+        let log = curve.finish(trainer.steps(), trainer.rays_done());
+        self.write_weights(trainer, bounds)?;
+        Ok(log)
+    }
+
+    /// Copies the weights that an earlier run finished to the output, and returns their log.
+    fn copy_finished(&self) -> Option<TrainingLog> {
+        let work = self.work.as_ref()?;
+        let log = serde_json::from_slice(&std::fs::read(work.join(DONE_LOG)).ok()?).ok()?;
+        std::fs::copy(work.join(DONE_WEIGHTS), &self.output).ok()?;
+        Some(log)
+    }
+
+    /// Trains the field to the end, with checkpoints, progress and a curve.
+    fn train(
+        &self,
+        params: &Resolved,
+        work: Option<&Path>,
+        data: &TrainingData<'_>,
+    ) -> anyhow::Result<TrainingLog> {
+        let mut training = self.start(params, work, data)?;
+        self.take_steps(&mut training, params.rays, data.progress)?;
+        self.finish(training, data.views.bounds)
+    }
+
+    /// Starts a training, or resumes it from its last checkpoint in `work`.
+    fn start(
+        &self,
+        params: &Resolved,
+        work: Option<&Path>,
+        data: &TrainingData<'_>,
+    ) -> anyhow::Result<Training> {
+        let TrainingData { input, references, views, .. } = *data;
+        let folder = work.unwrap_or_else(|| self.output.parent().unwrap_or(Path::new(".")));
+        if let Some(work) = work {
+            std::fs::create_dir_all(work)
+                .with_context(|| format!("cannot create {}", work.display()))?;
+        }
+        let log = |text: String| self.context.say(text);
+        let mut supervision = supervision(input, params, references, folder, work.is_some(), &log)?;
+        let bundle: usize = supervision.supersample().iter().product();
+        if params.rays < bundle as u64 {
+            let message = format!(
+                "parameter rays: {} rays for a field, but one pixel needs {bundle}",
+                params.rays
+            );
+            return Err(Failure::Usage(message).into());
+        }
+        let mut trainer = self.new_trainer(params, views.bounds)?;
+        let checkpoints = Checkpoints::new(work);
+        let curve =
+            checkpoints.resume(&mut *trainer, &mut supervision, |text| self.context.say(text))?;
+        Ok(Training { trainer, supervision, checkpoints, curve })
+    }
+
+    /// Takes steps until `total` rays are cast, with checkpoints and progress.
+    fn take_steps(
+        &self,
+        training: &mut Training,
+        total: u64,
+        progress: &Progress,
+    ) -> anyhow::Result<()> {
+        let Training { trainer, supervision, checkpoints, curve } = training;
+        loop {
+            if self.context.is_interrupted() {
+                checkpoints
+                    .write(&**trainer, supervision, curve)
+                    .context("cannot write the checkpoint")?;
+                return Err(Failure::Interrupted.into());
+            }
+            let Some(report) = trainer.step(supervision)? else { return Ok(()) };
+            if let Some(error) = supervision.first_error() {
+                anyhow::bail!("cannot read or write the file of pixels: {error}");
+            }
+            if report.skipped {
+                self.context.say(format!(
+                    "step {}: a value was not finite; step discarded, learning rates halved",
+                    trainer.steps()
+                ));
+            }
+            let rays = trainer.rays_done();
+            supervision.refine_poses(rays as f64 / total as f64, || trainer.field())?;
+            curve.add(&report, rays, total);
+            progress.set(self.rays_before + rays, &curve.last_psnr());
+            checkpoints
+                .write_if_due(&**trainer, supervision, curve)
+                .context("cannot write the checkpoint")?;
+        }
+    }
+
+    /// Ends a training: writes the weights, and stores weights and log for a later run.
+    fn finish(&self, training: Training, bounds: Bounds) -> anyhow::Result<TrainingLog> {
+        let Training { trainer, supervision, curve, .. } = training;
+        let mut log = curve.finish(trainer.steps(), trainer.rays_done());
+        if let Some(moved) = supervision.moved(|| trainer.field())? {
+            self.context.say(format!("cameras have {moved}"));
+            if moved.is_far() {
+                log.warnings.push(far_warning(&moved));
+            }
+        }
+        log.exposures = supervision.exposures().to_vec();
+        log.poses =
+            supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
+        self.write_weights(trainer, bounds)?;
+        if let Some(work) = &self.work {
+            std::fs::copy(&self.output, work.join(DONE_WEIGHTS))
+                .context("cannot copy the field")?;
+            artifact::write_json(&work.join(DONE_LOG), &log)?;
+        }
+        Ok(log)
+    }
+
+    fn new_trainer(
+        &self,
+        params: &Resolved,
+        bounds: Bounds,
+    ) -> anyhow::Result<Box<dyn FieldTrainer>> {
+        let init = self.init.as_ref().map(|(weights, _)| weights.as_path());
+        new_trainer(params, init, bounds, &self.context.device)
+    }
+
+    /// Writes the weights of a training, averaged with the initial ones if requested.
+    fn write_weights(&self, trainer: Box<dyn FieldTrainer>, bounds: Bounds) -> anyhow::Result<()> {
+        trainer.finish(&self.output)?;
+        if let Some((init, Combine::AverageWeights)) = &self.init {
+            average_weights(self.model, bounds, init, &self.output)
+                .context("cannot average the weights")?;
+        }
+        Ok(())
+    }
+}
+
+fn far_warning(moved: &MeanMotion) -> String {
+    format!(
+        "pose refinement: cameras have {moved}; unless the given poses are that far off, train \
+        without pose_refinement"
+    )
+}
