@@ -1,4 +1,4 @@
-//! Figures over all views that another result is needed for.
+//! Figures over all views that compare them with another result or with references.
 
 use artifact::{Failure, GivenInput};
 use metrics::{METRICS_FILE, Metrics, NearReferences, ViewScores};
@@ -6,53 +6,56 @@ use scene::{Camera, Views};
 
 use crate::metric::value;
 
-/// Views count as near a reference within this angle between the optical axes, in degrees.
-const NEAR_DEGREES: f64 = 60.0;
+/// Maximum angle between the optical axes of a view and a reference near it, in degrees (design
+/// note 034).
+const MAX_NEAR_ANGLE_DEGREES: f64 = 60.0;
 
-/// What the view that fares worst gains over the same view of another result, in dB. Views without
-/// HR truth are left out.
+/// Returns the smallest gain in PSNR of a view over the same view of another result, in dB. Views
+/// without HR truth are skipped.
 pub(crate) fn least_gain(
     scored: &[ViewScores],
     baseline: &GivenInput,
 ) -> anyhow::Result<Option<f64>> {
-    let other: Metrics = baseline.read_json(METRICS_FILE)?;
+    let baseline: Metrics = baseline.read_json(METRICS_FILE)?;
     let mut least: Option<f64> = None;
     for view in scored {
-        let Some(before) = other.views.iter().find(|before| before.name == view.name) else {
-            let message = format!(
-                "input baseline: it has no view {}; score both on the same views",
-                view.name
-            );
+        let Some(before) = baseline.views.iter().find(|before| before.name == view.name) else {
+            let message =
+                format!("input baseline: no view {}; score both on the same views", view.name);
             return Err(Failure::BadInput(message).into());
         };
-        let both = [&view.scores, &before.scores].map(|scores| value(scores, "psnr"));
-        if let [Some(now), Some(before)] = both {
-            least = Some(least.map_or(now - before, |least| least.min(now - before)));
+        if let Some(psnr) = value(&view.scores, "psnr")
+            && let Some(psnr_before) = value(&before.scores, "psnr")
+        {
+            let gain = psnr - psnr_before;
+            least = Some(least.map_or(gain, |least| least.min(gain)));
         }
     }
     Ok(least)
 }
 
-/// The scores of views near a reference; none where no view is.
+/// Returns the scores of the views near a reference; `None` if there are none.
 pub(crate) fn near_references(
     scored: &[ViewScores],
     truth: &Views,
     references: &Views,
 ) -> Option<NearReferences> {
-    let least = NEAR_DEGREES.to_radians().cos();
-    let near: Vec<f64> = (scored.iter().zip(&truth.views))
-        .filter(|(_, view)| {
-            references.views.iter().any(|other| cosine(&view.camera, &other.camera) >= least)
-        })
-        .filter_map(|(scores, _)| value(&scores.scores, "psnr"))
-        .collect();
+    let min_cosine = MAX_NEAR_ANGLE_DEGREES.to_radians().cos();
+    let mut near = Vec::new();
+    for (i, view) in truth.views.iter().enumerate() {
+        let is_near = (references.views.iter())
+            .any(|reference| cosine(&view.camera, &reference.camera) >= min_cosine);
+        if is_near && let Some(psnr) = value(&scored[i].scores, "psnr") {
+            near.push(psnr);
+        }
+    }
     (!near.is_empty()).then(|| NearReferences {
         views: near.len(),
         psnr: near.iter().sum::<f64>() / near.len() as f64,
     })
 }
 
-/// The cosine between two cameras' optical axes.
+/// Returns the cosine of the angle between two cameras' optical axes.
 fn cosine(one: &Camera, other: &Camera) -> f64 {
     (0..3).map(|row| one.camera_to_world[row][2] * other.camera_to_world[row][2]).sum()
 }
@@ -90,7 +93,7 @@ mod tests {
         Camera { name: degrees.to_string(), intrinsics, camera_to_world: pose }
     }
 
-    /// Cameras that look along z, each turned about y by so many degrees.
+    /// Views along z, each turned about y by an angle in degrees.
     fn views(turns: &[f64]) -> Views {
         let view = |degrees: &f64| View::camera_only(camera(*degrees));
         Views::new(Background::White, Bounds::default(), turns.iter().map(view).collect())
@@ -135,6 +138,6 @@ mod tests {
         assert_eq!(least_gain(&now, &baseline).unwrap(), Some(-0.5));
         let problem =
             least_gain(&now, &baseline_of(folder.path(), &[("a", 30.0)])).unwrap_err().to_string();
-        assert!(problem.contains("input baseline: it has no view b"), "{problem}");
+        assert!(problem.contains("input baseline: no view b"), "{problem}");
     }
 }

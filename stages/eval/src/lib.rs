@@ -1,18 +1,19 @@
-//! `eval`: scores views against ground truth, and says by which conventions.
+//! `eval`: scores views against ground truth, and records the definitions of the scores.
 //!
-//! * `metric`: what a metric is; `scoring`: all of them. A new one changes `scoring/mod.rs` alone.
-//! * [`psnr`], [`ssim`], `lpips` (by SqueezeNet, AlexNet and VGG-16, each where its weights are
-//!   given and the build has libtorch): against HR truth.
-//! * `low_resolution`: PSNR and SSIM of the render shrunk to LR. Where photographs are all there
-//!   is, no HR truth exists, and this alone can be known.
-//! * [`depth_error`]: where the truth has depth. [`WarpScore`]: a view's neighbour, brought over by
-//!   the rendered depths, against the view.
-//! * `derived`: the scores near references and the least gain, over all views.
+//! * `metric`: the trait of a metric; `scoring`: all metrics. A new one changes `scoring/mod.rs`
+//!   alone.
+//! * [`psnr`], [`ssim`] and `lpips` compare with HR truth. LPIPS, by SqueezeNet, AlexNet and
+//!   VGG-16, needs each network's weights and libtorch.
+//! * `low_resolution`: PSNR and SSIM of the render shrunk to LR, the only scores of photographs
+//!   without HR truth.
+//! * [`depth_error`] compares with true depth. [`WarpScore`] compares a view with its neighbour,
+//!   warped by the rendered depths.
+//! * `derived`: scores near references, and the least gain over another result.
 //!
 //! The crate `metrics` has the types of `metrics.json`.
 //!
-//! Means over views are means of per-view values. Open backgrounds are scored on white. Where a
-//! view has a mask, what doesn't count is taken as right, and PSNR is that of the rest.
+//! Means over views are means of per-view values. Transparent backgrounds are scored on white.
+//! Pixels outside a view's mask count as correct, except in PSNR, which ignores them.
 
 mod derived;
 mod metric;
@@ -42,7 +43,7 @@ use scoring::{Perceptual, metrics};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Absolute error that error maps show in their brightest colour.
+    /// Absolute error of the brightest colour in error maps.
     #[schemars(range(min = 0.001, max = 1.0))]
     pub error_range: f64,
 }
@@ -53,7 +54,7 @@ impl Default for Params {
     }
 }
 
-/// The stage.
+/// Stage `eval`.
 pub struct Eval;
 
 impl Stage for Eval {
@@ -84,7 +85,7 @@ impl Stage for Eval {
                 Input::optional(
                     &["weights"],
                     "folder with networks and their heads, for LPIPS: squeezenet1_1.safetensors \
-                    and lpips_linear_squeeze_v0.1.safetensors, likewise alexnet and vgg16",
+                    and lpips_linear_squeeze_v0.1.safetensors, also alexnet and vgg16",
                 ),
             ),
         ]
@@ -95,13 +96,14 @@ impl Stage for Eval {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let (views_in, truth_in) = (context.input("views")?, context.input("truth")?);
-        let (views, truth) = (Views::read(views_in)?, Views::read(truth_in)?);
+        let (views_input, truth_input) = (context.input("views")?, context.input("truth")?);
+        let (views, truth) = (Views::read(views_input)?, Views::read(truth_input)?);
         let metrics = metrics(Perceptual::new(context.optional_input("weights"))?);
-        let is_known = truth_in.path(DEGRADATION_FILE).exists();
-        let made: Option<Degradation> =
-            if is_known { Some(truth_in.read_json(DEGRADATION_FILE)?) } else { None };
-        let scene = ScoredScene { views_in, views: &views, truth_in, truth: &truth, made };
+        let is_known = truth_input.path(DEGRADATION_FILE).exists();
+        let degradation: Option<Degradation> =
+            if is_known { Some(truth_input.read_json(DEGRADATION_FILE)?) } else { None };
+        let scene =
+            ScoredScene { views_input, views: &views, truth_input, truth: &truth, degradation };
         let progress = context.progress("scoring", truth.views.len() as u64);
         let scored = truth.views.par_iter().map(|true_view| {
             context.check_interrupt()?;
@@ -113,29 +115,36 @@ impl Stage for Eval {
         let baseline = context.optional_input("baseline");
         let least_gain = baseline.map(|baseline| least_gain(&scored, baseline)).transpose()?;
         let references = context.optional_input("references").map(Views::read).transpose()?;
-        let near = references.and_then(|near| near_references(&scored, &truth, &near));
-        let found = Metrics {
+        let near_references =
+            references.and_then(|references| near_references(&scored, &truth, &references));
+        let result = Metrics {
             conventions: conventions(params, &scene, &metrics),
             figures: metrics.iter().flat_map(|metric| metric.figures()).collect(),
             picture_titles: picture_titles(&metrics),
             mean: mean_of(scored.iter().map(|view| &view.scores)),
             least_gain: least_gain.flatten(),
-            near_references: near,
+            near_references,
             views: scored,
         };
-        context.write_json(METRICS_FILE, &found)?;
-        let words = metrics.iter().filter_map(|metric| metric.in_words(&found.mean));
-        let views = artifact::counted(found.views.len(), "view");
-        context.write_summary(&words.chain([views]).collect::<Vec<_>>().join(" · "))
+        context.write_json(METRICS_FILE, &result)?;
+        let mut summary: Vec<String> =
+            metrics.iter().filter_map(|metric| metric.summary(&result.mean)).collect();
+        summary.push(artifact::counted(result.views.len(), "view"));
+        context.write_summary(&summary.join(" · "))
     }
 }
 
 fn picture_titles(metrics: &[Box<dyn Metric>]) -> BTreeMap<String, String> {
-    let titled = metrics.iter().filter_map(|metric| Some((metric.name(), metric.picture_title()?)));
-    titled.map(|(name, title)| (name.to_owned(), title.to_owned())).collect()
+    let mut titles = BTreeMap::new();
+    for metric in metrics {
+        if let Some(title) = metric.picture_title() {
+            titles.insert(metric.name().to_owned(), title.to_owned());
+        }
+    }
+    titles
 }
 
-/// Scores a view by every metric, and writes its error map and what pictures they made.
+/// Scores a view by every metric, and writes its error map and the metrics' pictures.
 fn score(
     context: &Context,
     params: &Params,
@@ -144,11 +153,12 @@ fn score(
 ) -> anyhow::Result<ViewScores> {
     let name = &view.true_view.camera.name;
     let error_map = format!("errors/{name}.png");
-    if let Some((found, expected)) = view.shown() {
-        let drawn = draw_error(found, expected, params.error_range as f32);
-        write_png(&context.output_path(&error_map)?, &drawn)?;
+    if let Some((render, truth)) = view.compared_images() {
+        let map = draw_error_map(render, truth, params.error_range as f32);
+        write_png(&context.output_path(&error_map)?, &map)?;
     }
-    let (mut scores, mut pictures) = (Scores::new(), BTreeMap::new());
+    let mut scores = Scores::new();
+    let mut pictures = BTreeMap::new();
     for metric in metrics {
         let measured = metric.score(view)?;
         scores.extend(measured.scores);
@@ -161,15 +171,17 @@ fn score(
     Ok(ViewScores { name: name.clone(), scores, error_map, pictures })
 }
 
-/// Mean absolute error of the three channels as a colour.
-fn draw_error(found: &Image, expected: &Image, range: f32) -> Rgba8 {
-    let pairs = found.data.chunks_exact(3).zip(expected.data.chunks_exact(3));
-    let data = pairs.flat_map(|(a, b)| {
-        let error = a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0;
-        let [r, g, b] = heat(Palette::Error, error / range);
-        [r, g, b, 255]
-    });
-    Rgba8::new(found.width, found.height, data.collect())
+/// Draws the mean absolute error of the three channels as a colour.
+fn draw_error_map(render: &Image, truth: &Image, range: f32) -> Rgba8 {
+    let truth_pixels = truth.data.as_chunks::<3>().0;
+    let mut data = Vec::with_capacity(4 * truth_pixels.len());
+    for (i, [r, g, b]) in render.data.as_chunks::<3>().0.iter().enumerate() {
+        let truth = truth_pixels[i];
+        let error = ((r - truth[0]).abs() + (g - truth[1]).abs() + (b - truth[2]).abs()) / 3.0;
+        data.extend(heat(Palette::Error, error / range));
+        data.push(255);
+    }
+    Rgba8::new(render.width, render.height, data)
 }
 
 fn conventions(
@@ -177,17 +189,19 @@ fn conventions(
     scene: &ScoredScene<'_>,
     metrics: &[Box<dyn Metric>],
 ) -> BTreeMap<String, String> {
-    let on = match scene.truth.background {
+    let background = match scene.truth.background {
         Background::Black => "black",
         Background::White | Background::Alpha => "white",
         Background::Opaque => "none: the pictures are opaque",
     };
     let range = params.error_range;
     let error_maps = format!("mean absolute error of R, G, B; brightest at {range}");
-    let of_metrics = metrics.iter().map(|metric| (metric.name(), metric.convention(scene)));
-    [("background", on.to_owned()), ("error_maps", error_maps)]
-        .into_iter()
-        .chain(of_metrics)
-        .map(|(name, text)| (name.to_owned(), text))
-        .collect()
+    let mut conventions = BTreeMap::from([
+        ("background".to_owned(), background.to_owned()),
+        ("error_maps".to_owned(), error_maps),
+    ]);
+    for metric in metrics {
+        conventions.insert(metric.name().to_owned(), metric.convention(scene));
+    }
+    conventions
 }

@@ -5,67 +5,62 @@ use pixels::Rgba8;
 
 use crate::scored_view::{ScoredScene, ScoredView};
 
-/// Something that views are scored by. A new one is a type in `scoring/mod.rs`, and its line in the
-/// list there: `metrics.json`, the page and the summary follow from what it says of itself.
+/// Metric that scores views. A new metric is a type in `scoring/mod.rs` and a line in the list
+/// there; `metrics.json`, the page and the summary follow from its methods.
 pub(crate) trait Metric: Sync {
-    /// Its key among the conventions, and the name of its pictures.
+    /// Returns the key of the metric's convention, which is also the name of its pictures.
     fn name(&self) -> &'static str;
-    /// Its figures, the most important first.
+    /// Returns the metric's figures, the most important first.
     fn figures(&self) -> Vec<Figure>;
-    /// How its figures are made, in words.
+    /// Describes the definition of the figures.
     fn convention(&self, scene: &ScoredScene<'_>) -> String;
-    /// Scores a view; no scores where the view lacks what the metric needs. Pixels that don't count
-    /// are equal in both images, so their error is 0: divide a mean error over all pixels by
-    /// [`ScoredView::counted_share`], at LR by that of its `lr`.
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured>;
-    /// Title of its pictures on the page: a caption, and a note in brackets. Pictures without a
-    /// title aren't shown.
+    /// Scores a view; without scores if the view lacks an image that the metric needs. Pixels that
+    /// don't count are equal in both images, so a mean error over all pixels must be divided by the
+    /// `counted_share` of that resolution.
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement>;
+    /// Returns the title of the metric's pictures on the page: a caption, and a note in brackets.
+    /// Pictures without a title don't appear.
     fn picture_title(&self) -> Option<&'static str> {
         None
     }
-    /// What a line for people says of means over all views.
-    fn in_words(&self, _mean: &Scores) -> Option<String> {
+    /// Returns the summary's text for means over all views.
+    fn summary(&self, _mean: &Scores) -> Option<String> {
         None
     }
 }
 
-/// What a metric found of a view.
+/// Scores of a view by one metric.
 #[derive(Default)]
-pub(crate) struct Measured {
+pub(crate) struct Measurement {
     pub(crate) scores: Scores,
-    /// A picture of what was compared, where that is worth a look.
+    /// Picture of the comparison, if any.
     pub(crate) picture: Option<Rgba8>,
 }
 
-impl Measured {
+impl Measurement {
     pub(crate) fn one(name: &str, score: Score) -> Self {
         Self { scores: [(name.to_owned(), score)].into(), picture: None }
     }
 }
 
-/// The number at a figure's path, where there is one.
+/// Returns the value at a figure's path, if any.
 pub(crate) fn value(scores: &Scores, path: &str) -> Option<f64> {
-    match path.split_once('/') {
-        None => match scores.get(path)? {
-            Score::One(value) => Some(*value),
-            Score::Several(_) => None,
-        },
-        Some((name, part)) => match scores.get(name)? {
-            Score::One(_) => None,
-            Score::Several(parts) => parts.get(part).copied(),
-        },
+    let (name, part) = path.split_once('/').unwrap_or((path, ""));
+    match scores.get(name)? {
+        Score::One(value) => part.is_empty().then_some(*value),
+        Score::Several(parts) => parts.get(part).copied(),
     }
 }
 
-/// Means of the values of the views that have them.
+/// Returns the mean of each value over the views that have it.
 pub(crate) fn mean_of<'a>(views: impl Iterator<Item = &'a Scores>) -> Scores {
     let mut sums = Sums::new();
     for (name, score) in views.flatten() {
         match score {
-            Score::One(value) => add(&mut sums, (name.clone(), None), *value),
+            Score::One(value) => add(&mut sums, (name, None), *value),
             Score::Several(parts) => {
                 for (part, value) in parts {
-                    add(&mut sums, (name.clone(), Some(part.clone())), *value);
+                    add(&mut sums, (name, Some(part)), *value);
                 }
             }
         }
@@ -75,12 +70,12 @@ pub(crate) fn mean_of<'a>(views: impl Iterator<Item = &'a Scores>) -> Scores {
         let mean = sum / count as f64;
         match part {
             None => {
-                means.insert(name, Score::One(mean));
+                means.insert(name.to_owned(), Score::One(mean));
             }
             Some(part) => {
-                let several = means.entry(name).or_insert_with(|| Score::several([]));
+                let several = means.entry(name.to_owned()).or_insert_with(|| Score::several([]));
                 if let Score::Several(parts) = several {
-                    parts.insert(part, mean);
+                    parts.insert(part.to_owned(), mean);
                 }
             }
         }
@@ -88,10 +83,10 @@ pub(crate) fn mean_of<'a>(views: impl Iterator<Item = &'a Scores>) -> Scores {
     means
 }
 
-/// Sums of values and how many there are, by name and part.
-type Sums = BTreeMap<(String, Option<String>), (f64, usize)>;
+/// Sum and number of values, by name and part.
+type Sums<'a> = BTreeMap<(&'a str, Option<&'a str>), (f64, usize)>;
 
-fn add(sums: &mut Sums, key: (String, Option<String>), value: f64) {
+fn add<'a>(sums: &mut Sums<'a>, key: (&'a str, Option<&'a str>), value: f64) {
     let (sum, count) = sums.entry(key).or_default();
     *sum += value;
     *count += 1;

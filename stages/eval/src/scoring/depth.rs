@@ -1,35 +1,37 @@
 use pixels::{DepthMap, ExrImage};
 
-/// How far depth is off, in scene units.
+/// Errors of a view's z-depth, in scene units.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DepthError {
-    /// Mean absolute error; edges weigh in heavily.
+    /// Mean absolute error, dominated by edges.
     pub mean_absolute: f64,
-    /// Median absolute error: that of the surfaces.
+    /// Median absolute error, that of surfaces.
     pub median_absolute: f64,
-    /// Share of the pixels with a surface where the render's opacity is below one half.
+    /// Fraction of the pixels with a surface where the render's opacity is below one half.
     pub missed: f64,
 }
 
-/// Errors of z-depth where the truth has a [surface](DepthMap::has_surface). `None` where channels
-/// `Z` and `A` are missing or sizes differ; all 0 where nothing is seen.
-pub fn depth_error(found: &ExrImage, expected: &ExrImage) -> Option<DepthError> {
-    if (found.width, found.height) != (expected.width, expected.height) {
+/// Returns the errors of z-depth where the truth has a [surface](DepthMap::has_surface). `None` if
+/// channels `Z` and `A` are missing or sizes differ; all 0 if the truth has no surface.
+pub fn depth_error(render: &ExrImage, truth: &ExrImage) -> Option<DepthError> {
+    if (render.width, render.height) != (truth.width, truth.height) {
         return None;
     }
-    let (found, expected) = (DepthMap::of(found)?, DepthMap::of(expected)?);
-    let seen: Vec<usize> = (0..expected.depth.len()).filter(|&i| expected.has_surface(i)).collect();
-    if seen.is_empty() {
+    let (render, truth) = (DepthMap::of(render)?, DepthMap::of(truth)?);
+    let (mut errors, mut missed) = (Vec::new(), 0usize);
+    for i in (0..truth.depth.len()).filter(|&i| truth.has_surface(i)) {
+        errors.push((f64::from(render.depth[i]) - f64::from(truth.depth[i])).abs());
+        missed += usize::from(!render.has_surface(i));
+    }
+    if errors.is_empty() {
         return Some(DepthError::default());
     }
-    let error = |&i: &usize| (f64::from(found.depth[i]) - f64::from(expected.depth[i])).abs();
-    let mut errors: Vec<f64> = seen.iter().map(error).collect();
     errors.sort_by(f64::total_cmp);
-    let count = seen.len() as f64;
+    let count = errors.len() as f64;
     Some(DepthError {
         mean_absolute: errors.iter().sum::<f64>() / count,
         median_absolute: errors[errors.len() / 2],
-        missed: seen.iter().filter(|&&i| !found.has_surface(i)).count() as f64 / count,
+        missed: missed as f64 / count,
     })
 }
 

@@ -1,5 +1,5 @@
-//! LPIPS v0.1 (Zhang et al. 2018): distances of a network's normalised features after each of its
-//! stages, weighted by learned heads.
+//! LPIPS v0.1 (Zhang et al. 2018): distance of a network's normalised features after each stage of
+//! the network, weighted by learned heads.
 
 use std::path::Path;
 
@@ -10,37 +10,38 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::lpips_network::LpipsNetwork;
 
-/// A network and its heads.
+/// Network with its heads.
 pub struct Lpips {
     layers: Vec<LpipsLayer>,
     heads: Vec<Tensor>,
-    /// Pixels along a side that its poolings need.
-    least: usize,
+    /// Minimum width and height of images, in pixels, for the network's pooling layers.
+    min_size: usize,
 }
 
 enum LpipsLayer {
-    /// A convolution and a ReLU.
+    /// Convolution and ReLU.
     Conv { conv: Conv, stride: i64, padding: i64 },
-    /// SqueezeNet's: squeezed to few channels, expanded by 1×1 and 3×3 side by side; a ReLU after
-    /// each.
+    /// SqueezeNet's module: squeezes to few channels and expands by parallel 1×1 and 3×3
+    /// convolutions, with a ReLU after each.
     Fire { squeeze: Conv, expand1: Conv, expand3: Conv },
-    /// The largest of a square; at the border of what is left of one, or of whole ones alone.
-    Pool { size: i64, border: bool },
-    /// The end of a stage: features are compared here.
+    /// Maximum over a square with stride 2; `partial` includes incomplete squares at the border.
+    Pool { size: i64, partial: bool },
+    /// End of a stage, where features are compared.
     Stage,
 }
 
-/// Reads a network's layers in order, and knows how many channels the next one takes.
+/// Reader of a network's layers in order.
 struct LayerReader<'a> {
     weights: &'a Weights,
     layers: Vec<LpipsLayer>,
+    /// Channels of the next layer's input.
     channels: i64,
     /// Channels at the end of each stage.
     stages: Vec<i64>,
 }
 
 impl LayerReader<'_> {
-    /// A convolution with torchvision's index in `features`.
+    /// Reads a convolution by torchvision's index in `features`.
     fn conv(
         &mut self,
         index: usize,
@@ -60,19 +61,21 @@ impl LayerReader<'_> {
     }
 
     fn fire(&mut self, index: usize, squeezed: i64, expanded: i64) -> Result<(), WeightsError> {
-        let (weights, name) = (self.weights, format!("features.{index}"));
-        let conv = |part: &str, shape| Conv::read(weights, &format!("{name}.{part}"), shape);
-        self.layers.push(LpipsLayer::Fire {
-            squeeze: conv("squeeze", [squeezed, self.channels, 1, 1])?,
-            expand1: conv("expand1x1", [expanded, squeezed, 1, 1])?,
-            expand3: conv("expand3x3", [expanded, squeezed, 3, 3])?,
-        });
+        let read = |part: &str, shape| {
+            Conv::read(self.weights, &format!("features.{index}.{part}"), shape)
+        };
+        let layer = LpipsLayer::Fire {
+            squeeze: read("squeeze", [squeezed, self.channels, 1, 1])?,
+            expand1: read("expand1x1", [expanded, squeezed, 1, 1])?,
+            expand3: read("expand3x3", [expanded, squeezed, 3, 3])?,
+        };
+        self.layers.push(layer);
         self.channels = 2 * expanded;
         Ok(())
     }
 
-    fn pool(&mut self, size: i64, border: bool) {
-        self.layers.push(LpipsLayer::Pool { size, border });
+    fn pool(&mut self, size: i64, partial: bool) {
+        self.layers.push(LpipsLayer::Pool { size, partial });
     }
 
     fn stage(&mut self) {
@@ -80,13 +83,15 @@ impl LayerReader<'_> {
         self.stages.push(self.channels);
     }
 
-    /// SqueezeNet 1.1.
+    /// Reads SqueezeNet 1.1.
     fn squeeze(&mut self) -> Result<(), WeightsError> {
         self.conv(0, 64, 3, 2, 0)?;
         self.stage();
         for (fires, squeezed, expanded) in [([3, 4], 16, 64), ([6, 7], 32, 128)] {
             self.pool(3, true);
-            fires.into_iter().try_for_each(|index| self.fire(index, squeezed, expanded))?;
+            for index in fires {
+                self.fire(index, squeezed, expanded)?;
+            }
             self.stage();
         }
         self.pool(3, true);
@@ -99,7 +104,7 @@ impl LayerReader<'_> {
         Ok(())
     }
 
-    /// AlexNet, as torchvision has it.
+    /// Reads AlexNet in torchvision's form.
     fn alex(&mut self) -> Result<(), WeightsError> {
         self.conv(0, 64, 11, 4, 2)?;
         self.stage();
@@ -114,7 +119,7 @@ impl LayerReader<'_> {
         Ok(())
     }
 
-    /// VGG-16.
+    /// Reads VGG-16.
     fn vgg(&mut self) -> Result<(), WeightsError> {
         let blocks: [(i64, &[usize]); 5] = [
             (64, &[0, 2]),
@@ -127,7 +132,9 @@ impl LayerReader<'_> {
             if block > 0 {
                 self.pool(2, false);
             }
-            convs.iter().try_for_each(|&index| self.conv(index, outputs, 3, 1, 1))?;
+            for &index in convs {
+                self.conv(index, outputs, 3, 1, 1)?;
+            }
             self.stage();
         }
         Ok(())
@@ -149,8 +156,8 @@ impl LpipsLayer {
                     1,
                 )
             }
-            Self::Pool { size, border } => {
-                x.f_max_pool2d([*size; 2], [2, 2], [0, 0], [1, 1], *border)
+            Self::Pool { size, partial } => {
+                x.f_max_pool2d([*size; 2], [2, 2], [0, 0], [1, 1], *partial)
             }
             Self::Stage => Ok(x.shallow_clone()),
         }
@@ -158,32 +165,33 @@ impl LpipsLayer {
 }
 
 impl Lpips {
-    /// Reads a network and its heads from a folder; [`LpipsNetwork::files`] has their names.
+    /// Reads a network and its heads from the files [`LpipsNetwork::files`] in a folder.
     pub fn read(folder: &Path, network: LpipsNetwork) -> Result<Self, WeightsError> {
         nets::deterministic();
-        let [net, linear] = network.files();
-        let (net, linear) =
-            (Weights::read(&folder.join(net))?, Weights::read(&folder.join(linear))?);
+        let [weights_file, heads_file] = network.files();
+        let weights = Weights::read(&folder.join(weights_file))?;
+        let linear = Weights::read(&folder.join(heads_file))?;
         let mut reader =
-            LayerReader { weights: &net, layers: Vec::new(), channels: 3, stages: Vec::new() };
-        let least = match network {
+            LayerReader { weights: &weights, layers: Vec::new(), channels: 3, stages: Vec::new() };
+        let min_size = match network {
             LpipsNetwork::Squeeze => reader.squeeze().map(|()| 17),
             LpipsNetwork::Alex => reader.alex().map(|()| 31),
             LpipsNetwork::Vgg => reader.vgg().map(|()| 16),
         }?;
-        let heads = reader.stages.iter().enumerate().map(|(k, &channels)| {
-            linear.tensor(&format!("lin{k}.model.1.weight"), &[1, channels, 1, 1])
-        });
-        let heads = heads.collect::<Result<_, _>>()?;
-        Ok(Self { layers: reader.layers, heads, least })
+        let mut heads = Vec::with_capacity(reader.stages.len());
+        for (k, &channels) in reader.stages.iter().enumerate() {
+            let name = format!("lin{k}.model.1.weight");
+            heads.push(linear.tensor(&name, &[1, channels, 1, 1])?);
+        }
+        Ok(Self { layers: reader.layers, heads, min_size })
     }
 
-    /// Distance of two RGB images in [0, 1].
+    /// Returns the distance of two RGB images in 0..1.
     pub fn distance(&self, a: &Image, b: &Image) -> anyhow::Result<f64> {
-        let least = self.least;
+        let min_size = self.min_size;
         anyhow::ensure!(
-            a.width >= least && a.height >= least,
-            "LPIPS needs images of at least {least}×{least} pixels, not {}×{}",
+            a.width >= min_size && a.height >= min_size,
+            "LPIPS needs images of at least {min_size}×{min_size} pixels, found {}×{}",
             a.width,
             a.height
         );
@@ -191,7 +199,7 @@ impl Lpips {
     }
 
     fn sum_over_stages(&self, a: &Image, b: &Image) -> Result<f64, TchError> {
-        let (mut a, mut b, mut sum) = (input(a)?, input(b)?, 0.0);
+        let (mut a, mut b, mut sum) = (input_tensor(a)?, input_tensor(b)?, 0.0);
         let mut heads = self.heads.iter();
         for layer in &self.layers {
             (a, b) = (layer.forward(&a)?, layer.forward(&b)?);
@@ -208,14 +216,16 @@ impl Lpips {
     }
 }
 
-/// To [-1, 1], then by the method's own shift and scale; shape 1×3×H×W.
-fn input(image: &Image) -> Result<Tensor, TchError> {
-    let constant = |v: [f32; 3]| Tensor::f_from_slice(&v)?.f_reshape([1, 3, 1, 1]);
+/// Converts an image to the network's input, 1×3×H×W: scales it to [-1, 1] and normalises it with
+/// LPIPS's constants.
+fn input_tensor(image: &Image) -> Result<Tensor, TchError> {
+    let shift = Tensor::f_from_slice(&[-0.030f32, -0.088, -0.188])?.f_reshape([1, 3, 1, 1])?;
+    let scale = Tensor::f_from_slice(&[0.458f32, 0.448, 0.450])?.f_reshape([1, 3, 1, 1])?;
     let x = nets::tensor_of(image)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?;
-    x.f_sub(&constant([-0.030, -0.088, -0.188])?)?.f_div(&constant([0.458, 0.448, 0.450])?)
+    x.f_sub(&shift)?.f_div(&scale)
 }
 
-/// Unit length across channels.
+/// Normalises features to unit length across channels.
 fn normalised(x: &Tensor) -> Result<Tensor, TchError> {
     let length = x.f_square()?.f_sum_dim_intlist([1i64].as_slice(), true, Kind::Float)?.f_sqrt()?;
     x.f_div(&length.f_add_scalar(1e-10)?)

@@ -1,21 +1,20 @@
-/// Networks whose features LPIPS compares. Their distances differ: name the network beside the
-/// figure.
+/// Network whose features LPIPS compares. Distances of different networks aren't comparable.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LpipsNetwork {
     /// SqueezeNet 1.1.
     Squeeze,
-    /// AlexNet, as torchvision has it; what most papers mean by LPIPS.
+    /// AlexNet in torchvision's form, the network of LPIPS in most papers.
     Alex,
     /// VGG-16.
     Vgg,
 }
 
 impl LpipsNetwork {
-    /// All of them, in the order in which their distances are given.
+    /// All networks, in order of display.
     pub const ALL: [Self; 3] = [Self::Squeeze, Self::Alex, Self::Vgg];
 
-    /// Names of the files with its weights (torchvision's names of tensors) and with the learned
-    /// heads.
+    /// Returns the names of the files with the network's weights (torchvision's tensor names) and
+    /// with the learned heads.
     pub fn files(self) -> [&'static str; 2] {
         match self {
             Self::Squeeze => ["squeezenet1_1.safetensors", "lpips_linear_squeeze_v0.1.safetensors"],
@@ -24,39 +23,38 @@ impl LpipsNetwork {
         }
     }
 
-    /// Its score's name.
-    pub(super) fn key(self) -> &'static str {
+    pub(super) fn labels(self) -> Labels {
         match self {
-            Self::Squeeze => "lpips",
-            Self::Alex => "lpips_alex",
-            Self::Vgg => "lpips_vgg",
+            Self::Squeeze => Labels {
+                key: "lpips",
+                table: "LPIPS ↓",
+                summary: "LPIPS",
+                convention: "SqueezeNet 1.1 (lpips)",
+            },
+            Self::Alex => Labels {
+                key: "lpips_alex",
+                table: "LPIPS ↓ AlexNet",
+                summary: "LPIPS (AlexNet)",
+                convention: "AlexNet (lpips_alex)",
+            },
+            Self::Vgg => Labels {
+                key: "lpips_vgg",
+                table: "LPIPS ↓ VGG-16",
+                summary: "LPIPS (VGG-16)",
+                convention: "VGG-16 (lpips_vgg)",
+            },
         }
     }
+}
 
-    /// Its score's label in a table.
-    pub(super) fn label(self) -> &'static str {
-        match self {
-            Self::Squeeze => "LPIPS ↓",
-            Self::Alex => "LPIPS ↓ AlexNet",
-            Self::Vgg => "LPIPS ↓ VGG-16",
-        }
-    }
-
-    /// Its score in a sentence.
-    pub(super) fn short(self) -> &'static str {
-        match self {
-            Self::Squeeze => "LPIPS",
-            Self::Alex => "LPIPS (AlexNet)",
-            Self::Vgg => "LPIPS (VGG-16)",
-        }
-    }
-
-    /// What it is called, and its score.
-    pub(super) fn title(self) -> &'static str {
-        match self {
-            Self::Squeeze => "SqueezeNet 1.1 (lpips)",
-            Self::Alex => "AlexNet (lpips_alex)",
-            Self::Vgg => "VGG-16 (lpips_vgg)",
-        }
-    }
+/// Labels of a network's score.
+pub(super) struct Labels {
+    /// Name of the score in `metrics.json`.
+    pub(super) key: &'static str,
+    /// Label in a table.
+    pub(super) table: &'static str,
+    /// Label in the summary.
+    pub(super) summary: &'static str,
+    /// Names of the network and of its score in the convention.
+    pub(super) convention: &'static str,
 }

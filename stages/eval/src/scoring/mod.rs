@@ -1,24 +1,23 @@
-//! All metrics. A new one is a type in this file, and its line in [`metrics`]. Long formulas have
-//! files of their own. Only LPIPS, which holds networks, implements [`Metric`] elsewhere.
+//! All metrics. A new one is a type in this file and a line in [`metrics`]. Long formulas have
+//! files of their own; only LPIPS, which has networks, implements [`Metric`] elsewhere.
 
 mod depth;
 #[cfg(feature = "torch")]
 mod lpips;
 mod lpips_network;
 mod perceptual;
-mod psnr;
 mod ssim;
 mod warp;
 
-use std::path::PathBuf;
+use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::FailureExt as _;
 use metrics::{Figure, Score, Scores};
-use pixels::{DEPTH_CHANNELS, read_exr};
+use pixels::{DEPTH_CHANNELS, ExrImage, Image, psnr_of, read_exr};
 use scene::length;
 
-use crate::metric::{Measured, Metric, value};
+use crate::metric::{Measurement, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
 
 pub use depth::{DepthError, depth_error};
@@ -26,12 +25,11 @@ pub use depth::{DepthError, depth_error};
 pub use lpips::Lpips;
 pub use lpips_network::LpipsNetwork;
 pub(crate) use perceptual::Perceptual;
-pub use psnr::psnr;
 pub use ssim::{Ssim, ssim};
 pub use warp::WarpScore;
 
-/// All metrics, in the order in which they are shown. The page ranks results by the first figure,
-/// and its summary has the first four that have a value.
+/// Returns all metrics in order of display. The page ranks results by the first figure, and its
+/// summary has the first four figures with a value.
 pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
     vec![
         Box::new(PsnrMetric),
@@ -43,7 +41,20 @@ pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
     ]
 }
 
-/// [`psnr`], of the pixels that count.
+/// Returns the peak signal-to-noise ratio in dB, peak 1, of the mean squared error over all
+/// samples. Samples must lie in 0..1; equal images, whose PSNR is infinite, count as 100 dB.
+pub fn psnr(render: &Image, truth: &Image) -> f64 {
+    let pairs = render.data.iter().zip(&truth.data);
+    let sum: f64 = pairs.map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum();
+    psnr_of(sum / render.data.len() as f64)
+}
+
+/// Returns the [`psnr`] over the fraction of pixels that count; the other pixels must be equal.
+fn masked_psnr(render: &Image, truth: &Image, counted_share: f64) -> f64 {
+    psnr(render, truth) + 10.0 * counted_share.log10()
+}
+
+/// [`psnr`] of the pixels that count.
 struct PsnrMetric;
 
 impl Metric for PsnrMetric {
@@ -64,18 +75,18 @@ impl Metric for PsnrMetric {
         )
     }
 
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let Some(expected) = &view.expected else { return Ok(Measured::default()) };
-        let decibels = psnr::masked_psnr(&view.found, expected, view.counted_share);
-        Ok(Measured::one("psnr", Score::One(decibels)))
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
+        let Some(truth) = &view.truth else { return Ok(Measurement::default()) };
+        let psnr = masked_psnr(&view.render, truth, view.counted_share);
+        Ok(Measurement::one("psnr", Score::One(psnr)))
     }
 
-    fn in_words(&self, mean: &Scores) -> Option<String> {
+    fn summary(&self, mean: &Scores) -> Option<String> {
         Some(format!("PSNR {:.2} dB", value(mean, "psnr")?))
     }
 }
 
-/// [`ssim`], by what the window does at the border.
+/// [`ssim`] with both treatments of the border.
 struct SsimMetric;
 
 impl Metric for SsimMetric {
@@ -96,21 +107,21 @@ impl Metric for SsimMetric {
             .to_owned()
     }
 
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let Some(expected) = &view.expected else { return Ok(Measured::default()) };
-        let Ssim { reflected, valid } = ssim(&view.found, expected);
-        let mut measured = Measured::one("ssim", Score::One(reflected));
-        measured.scores.insert("ssim_valid".to_owned(), Score::One(valid));
-        Ok(measured)
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
+        let Some(truth) = &view.truth else { return Ok(Measurement::default()) };
+        let Ssim { reflected, valid } = ssim(&view.render, truth);
+        let mut measurement = Measurement::one("ssim", Score::One(reflected));
+        measurement.scores.insert("ssim_valid".to_owned(), Score::One(valid));
+        Ok(measurement)
     }
 
-    fn in_words(&self, mean: &Scores) -> Option<String> {
+    fn summary(&self, mean: &Scores) -> Option<String> {
         Some(format!("SSIM {:.4}", value(mean, "ssim")?))
     }
 }
 
-/// PSNR and SSIM of a render shrunk to LR, by the kernel that made the LR images or is taken to
-/// have made them, against the view's LR image.
+/// PSNR and SSIM between the view's LR image and the render, shrunk by the known or assumed kernel
+/// of the LR images.
 struct LowResolutionMetric;
 
 impl Metric for LowResolutionMetric {
@@ -126,24 +137,24 @@ impl Metric for LowResolutionMetric {
     }
 
     fn convention(&self, scene: &ScoredScene<'_>) -> String {
-        let kernel = scene.made.map_or_else(
+        let kernel = scene.degradation.map_or_else(
             || "a box, for want of a better guess".to_owned(),
-            |made| format!("{:?}", made.kernel).to_lowercase(),
+            |degradation| format!("{:?}", degradation.kernel).to_lowercase(),
         );
         format!("the render shrunk by {kernel}, against the view's LR picture")
     }
 
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let Some(lr) = &view.lr else { return Ok(Measured::default()) };
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
+        let Some(lr) = &view.lr else { return Ok(Measurement::default()) };
         let score = Score::several([
-            ("psnr", psnr::masked_psnr(&lr.shrunk, &lr.expected, lr.counted_share)),
-            ("ssim", ssim(&lr.shrunk, &lr.expected).reflected),
+            ("psnr", masked_psnr(&lr.render, &lr.truth, lr.counted_share)),
+            ("ssim", ssim(&lr.render, &lr.truth).reflected),
         ]);
-        Ok(Measured::one(self.name(), score))
+        Ok(Measurement::one(self.name(), score))
     }
 
-    fn in_words(&self, mean: &Scores) -> Option<String> {
-        // Where there is HR truth, its figures say more.
+    fn summary(&self, mean: &Scores) -> Option<String> {
+        // HR figures are more informative.
         if value(mean, "psnr").is_some() {
             return None;
         }
@@ -153,7 +164,7 @@ impl Metric for LowResolutionMetric {
     }
 }
 
-/// [`WarpScore`], where there is HR truth and rendered depth.
+/// [`WarpScore`], if there is HR truth and rendered depth.
 struct WarpMetric;
 
 impl Metric for WarpMetric {
@@ -179,14 +190,16 @@ impl Metric for WarpMetric {
         Some("Neighbours by depth (red: not seen)")
     }
 
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let Some((score, picture)) = warp::warped(view)? else { return Ok(Measured::default()) };
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
+        let Some((score, picture)) = warp::score_view(view)? else {
+            return Ok(Measurement::default());
+        };
         let score = Score::several([("psnr", score.psnr), ("seen", score.seen)]);
-        Ok(Measured { picture: Some(picture), ..Measured::one(self.name(), score) })
+        Ok(Measurement { picture: Some(picture), ..Measurement::one(self.name(), score) })
     }
 }
 
-/// [`depth_error`], where there is true depth.
+/// [`depth_error`], if there is true depth.
 struct DepthMetric;
 
 impl Metric for DepthMetric {
@@ -208,29 +221,36 @@ impl Metric for DepthMetric {
             .to_owned()
     }
 
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let (scene, place) = (view.scene, format!("view {}", view.view.camera.name));
-        let (Some(found), Some(expected)) = (&view.view.depth, &view.true_view.depth) else {
-            return Ok(Measured::default());
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
+        let (scene, name) = (view.scene, &view.view.camera.name);
+        let (Some(rendered), Some(truth)) = (&view.view.depth, &view.true_view.depth) else {
+            return Ok(Measurement::default());
         };
-        let read = |path: PathBuf| read_exr(&path)?.with_finite(&DEPTH_CHANNELS, &path);
-        let found = read(scene.views_in.path(found)).bad_input(&place)?;
-        let expected = read(scene.truth_in.path(expected)).bad_input(&place)?;
-        let error = depth_error(&found, &expected);
-        let error = error.context("depth needs channels Z and A of one size").bad_input(&place)?;
+        let rendered = read_depth(&scene.views_input.path(rendered), name)?;
+        let truth = read_depth(&scene.truth_input.path(truth), name)?;
+        let error = depth_error(&rendered, &truth)
+            .context("expected depth channels Z and A of the same size")
+            .bad_input(format!("view {name}"))?;
         let score = Score::several([
             ("mean_absolute", error.mean_absolute),
             ("median_absolute", error.median_absolute),
             ("missed", error.missed),
         ]);
-        Ok(Measured::one(self.name(), score))
+        Ok(Measurement::one(self.name(), score))
     }
 
-    fn in_words(&self, mean: &Scores) -> Option<String> {
+    fn summary(&self, mean: &Scores) -> Option<String> {
         let [mean, median] = ["mean_absolute", "median_absolute"]
             .map(|part| Some(length(value(mean, &format!("depth/{part}"))?, 4)));
         Some(format!("depth error {} mean, {} median", mean?, median?))
     }
+}
+
+/// Reads the depth channels of a view.
+fn read_depth(path: &Path, view: &str) -> Result<ExrImage, artifact::Failure> {
+    read_exr(path)
+        .and_then(|image| image.with_finite(&DEPTH_CHANNELS, path))
+        .bad_input(format!("view {view}"))
 }
 
 #[cfg(test)]

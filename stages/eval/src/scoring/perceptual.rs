@@ -5,18 +5,18 @@ use pixels::Image;
 #[cfg(feature = "torch")]
 use super::lpips::Lpips;
 use super::lpips_network::LpipsNetwork;
-use crate::metric::{Measured, Metric, value};
+use crate::metric::{Measurement, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
 
-/// LPIPS by every network whose weights are given.
+/// LPIPS of every network whose weights are given.
 pub(crate) struct Perceptual {
     given: Vec<LpipsNetwork>,
     #[cfg(feature = "torch")]
-    readers: Vec<LpipsPool>,
+    pools: Vec<LpipsPool>,
 }
 
-/// A network's files, and copies of it that are free; a thread that finds none reads another, since
-/// libtorch's tensors can't be shared.
+/// Pool of copies of a network, one per thread at a time, since libtorch's tensors can't be shared.
+/// A thread that finds the pool empty reads another copy.
 #[cfg(feature = "torch")]
 struct LpipsPool {
     folder: std::path::PathBuf,
@@ -27,59 +27,58 @@ struct LpipsPool {
 #[cfg(feature = "torch")]
 impl LpipsPool {
     fn new(folder: &std::path::Path, network: LpipsNetwork) -> anyhow::Result<Self> {
-        let reader =
+        let pool =
             Self { folder: folder.to_path_buf(), network, free: std::sync::Mutex::default() };
-        reader.keep(reader.take()?);
-        Ok(reader)
+        pool.give_back(pool.take()?);
+        Ok(pool)
     }
 
-    fn pool(&self) -> std::sync::MutexGuard<'_, Vec<Lpips>> {
+    fn free(&self) -> std::sync::MutexGuard<'_, Vec<Lpips>> {
         self.free.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
     fn take(&self) -> Result<Lpips, Failure> {
         use artifact::FailureExt as _;
-        let free = self.pool().pop();
+        let free = self.free().pop();
         free.map_or_else(|| Lpips::read(&self.folder, self.network).bad_input("weights"), Ok)
     }
 
-    fn keep(&self, lpips: Lpips) {
-        self.pool().push(lpips);
+    fn give_back(&self, lpips: Lpips) {
+        self.free().push(lpips);
     }
 }
 
 #[cfg(feature = "torch")]
 impl Perceptual {
-    /// Those of a folder. One that has no whole network is refused.
+    /// Reads all complete networks of a folder; fails if there is none.
     pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
         let Some(folder) = weights.map(GivenInput::folder) else {
-            return Ok(Self { given: Vec::new(), readers: Vec::new() });
+            return Ok(Self { given: Vec::new(), pools: Vec::new() });
         };
-        let is_there =
-            |network: &LpipsNetwork| network.files().iter().all(|file| folder.join(file).is_file());
-        let given: Vec<LpipsNetwork> = LpipsNetwork::ALL.into_iter().filter(is_there).collect();
+        let mut given = LpipsNetwork::ALL.to_vec();
+        given.retain(|network| network.files().iter().all(|file| folder.join(file).is_file()));
         if given.is_empty() {
             let message = format!(
-                "input weights: {}: no network is there; {}",
+                "input weights: {}: no network found; {}",
                 folder.display(),
-                wanted(&LpipsNetwork::ALL)
+                missing_files(&LpipsNetwork::ALL)
             );
             return Err(Failure::BadInput(message).into());
         }
-        let readers = given
-            .iter()
-            .map(|&network| LpipsPool::new(folder, network))
-            .collect::<anyhow::Result<_>>()?;
-        Ok(Self { given, readers })
+        let mut pools = Vec::with_capacity(given.len());
+        for &network in &given {
+            pools.push(LpipsPool::new(folder, network)?);
+        }
+        Ok(Self { given, pools })
     }
 
-    /// Distances by each network, in the order of [`LpipsNetwork::ALL`].
-    fn distances(&self, found: &Image, expected: &Image) -> anyhow::Result<[Option<f64>; 3]> {
+    /// Returns the distance by each network, in the order of [`LpipsNetwork::ALL`].
+    fn distances(&self, render: &Image, truth: &Image) -> anyhow::Result<[Option<f64>; 3]> {
         let mut distances = [None; 3];
-        for reader in &self.readers {
-            let lpips = reader.take()?;
-            distances[reader.network as usize] = Some(lpips.distance(found, expected)?);
-            reader.keep(lpips);
+        for pool in &self.pools {
+            let lpips = pool.take()?;
+            distances[pool.network as usize] = Some(lpips.distance(render, truth)?);
+            pool.give_back(lpips);
         }
         Ok(distances)
     }
@@ -89,7 +88,7 @@ impl Perceptual {
 #[allow(
     clippy::unused_self,
     clippy::unnecessary_wraps,
-    reason = "the same face with and without libtorch"
+    reason = "the same signatures with and without libtorch"
 )]
 impl Perceptual {
     pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
@@ -106,7 +105,7 @@ impl Perceptual {
     }
 }
 
-/// What stands where LPIPS would.
+/// Text in place of an unknown LPIPS.
 const MISSING: &str = "weights not given";
 
 impl Metric for Perceptual {
@@ -115,57 +114,62 @@ impl Metric for Perceptual {
     }
 
     fn figures(&self) -> Vec<Figure> {
-        let of = |network: LpipsNetwork| Figure::new(network.key(), network.label(), 4, false);
-        let mut figures = LpipsNetwork::ALL.map(of).to_vec();
+        let mut figures = LpipsNetwork::ALL
+            .map(LpipsNetwork::labels)
+            .map(|labels| Figure::new(labels.key, labels.table, 4, false))
+            .to_vec();
         figures[0].missing = Some(MISSING.to_owned());
         figures
     }
 
-    /// Which networks there are, and what is lacking for the others.
     fn convention(&self, _: &ScoredScene<'_>) -> String {
-        let lacking: Vec<LpipsNetwork> =
-            LpipsNetwork::ALL.into_iter().filter(|network| !self.given.contains(network)).collect();
+        let mut lacking = LpipsNetwork::ALL.to_vec();
+        lacking.retain(|network| !self.given.contains(network));
         if self.given.is_empty() {
-            return format!("{MISSING}: {}", wanted(&lacking));
+            return format!("{MISSING}: {}", missing_files(&lacking));
         }
-        let by: Vec<&str> = self.given.iter().map(|network| network.title()).collect();
+        let given: Vec<&str> =
+            self.given.iter().map(|network| network.labels().convention).collect();
         let missing = if lacking.is_empty() {
             String::new()
         } else {
-            format!("; {MISSING} for others: {}", wanted(&lacking))
+            format!("; {MISSING} for others: {}", missing_files(&lacking))
         };
-        format!("v0.1, inputs in [-1, 1], by {}{missing}", by.join(", "))
+        format!("v0.1, inputs in [-1, 1], by {}{missing}", given.join(", "))
     }
 
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let Some(expected) = &view.expected else { return Ok(Measured::default()) };
-        let distances = self.distances(&view.found, expected)?;
-        let known = LpipsNetwork::ALL.into_iter().zip(distances);
-        let known = known.filter_map(|(network, distance)| {
-            Some((network.key().to_owned(), Score::One(distance?)))
-        });
-        Ok(Measured { scores: known.collect(), picture: None })
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
+        let mut measurement = Measurement::default();
+        let Some(truth) = &view.truth else { return Ok(measurement) };
+        for (i, distance) in self.distances(&view.render, truth)?.into_iter().enumerate() {
+            if let Some(distance) = distance {
+                let key = LpipsNetwork::ALL[i].labels().key;
+                measurement.scores.insert(key.to_owned(), Score::One(distance));
+            }
+        }
+        Ok(measurement)
     }
 
-    fn in_words(&self, mean: &Scores) -> Option<String> {
+    fn summary(&self, mean: &Scores) -> Option<String> {
         value(mean, "psnr")?;
-        let known: Vec<String> = LpipsNetwork::ALL
-            .iter()
-            .filter_map(|network| {
-                Some(format!("{} {:.4}", network.short(), value(mean, network.key())?))
-            })
-            .collect();
+        let mut known = Vec::new();
+        for network in LpipsNetwork::ALL {
+            let labels = network.labels();
+            if let Some(distance) = value(mean, labels.key) {
+                known.push(format!("{} {distance:.4}", labels.summary));
+            }
+        }
         Some(if known.is_empty() { format!("LPIPS {MISSING}") } else { known.join(" · ") })
     }
 }
 
-/// The files that would be needed.
-fn wanted(networks: &[LpipsNetwork]) -> String {
-    let pairs = networks.iter().map(|network| {
-        let [net, heads] = network.files();
-        format!("{net} with {heads}")
-    });
-    let pairs: Vec<String> = pairs.collect();
+/// Describes the files that networks need.
+fn missing_files(networks: &[LpipsNetwork]) -> String {
+    let pairs: Vec<String> = networks
+        .iter()
+        .map(|network| network.files())
+        .map(|[weights, heads]| format!("{weights} with {heads}"))
+        .collect();
     format!(
         "-i eval.weights=FOLDER with {} (torchvision's and richzhang/PerceptualSimilarity's, as \
         safetensors)",

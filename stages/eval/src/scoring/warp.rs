@@ -1,83 +1,91 @@
-use artifact::{FailureExt as _, GivenInput};
-use pixels::{DEPTH_CHANNELS, DepthMap, ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
+use artifact::GivenInput;
+use pixels::{DepthMap, ExrImage, Image, Rgba8, psnr_of, to_u8};
 use scene::{Camera, Surface, View};
 
+use super::read_depth;
 use crate::scored_view::{ScoredView, read_image};
 
-/// A view's true image against its neighbour's, brought over by the rendered depths: depth is right
-/// where colours agree.
+/// Agreement of a view's true image with its neighbour's, warped by the rendered depths: a measure
+/// of depth.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct WarpScore {
-    /// Peak signal-to-noise ratio in dB over the pixels that the neighbour sees, too.
+    /// Peak signal-to-noise ratio in dB over the pixels that are visible from the neighbour.
     pub psnr: f64,
-    /// Their share.
+    /// Fraction of the pixels that are visible from the neighbour.
     pub seen: f64,
 }
 
-/// The view whose centre is nearest to a view's, itself left out.
-pub(crate) fn neighbour<'a>(of: &Camera, views: &'a [View]) -> Option<&'a View> {
-    let away = |v: &&View| (v.camera.centre() - of.centre()).length_squared();
-    views.iter().filter(|v| v.camera.name != of.name).min_by(|a, b| away(a).total_cmp(&away(b)))
+/// Returns the other view whose centre is nearest to a camera's.
+fn neighbour<'a>(camera: &Camera, views: &'a [View]) -> Option<&'a View> {
+    let others = views.iter().filter(|view| view.camera.name != camera.name);
+    others.min_by(|a, b| squared_distance(camera, a).total_cmp(&squared_distance(camera, b)))
 }
 
-/// A rendered view's depth and opacity.
-pub(crate) fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Option<ExrImage>> {
+fn squared_distance(camera: &Camera, view: &View) -> f64 {
+    (view.camera.centre() - camera.centre()).length_squared()
+}
+
+/// Reads depth and opacity of a rendered view; `None` if missing or of another size.
+fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Option<ExrImage>> {
     let Some(depth) = &view.depth else { return Ok(None) };
-    let path = input.path(depth);
-    let image = read_exr(&path)
-        .and_then(|image| image.with_finite(&DEPTH_CHANNELS, &path))
-        .bad_input(format!("view {}", view.camera.name))?;
+    let image = read_depth(&input.path(depth), &view.camera.name)?;
     let k = &view.camera.intrinsics;
-    let whole = (image.width, image.height) == (k.width as usize, k.height as usize);
-    Ok((whole && DepthMap::of(&image).is_some()).then_some(image))
+    let has_size = (image.width, image.height) == (k.width as usize, k.height as usize);
+    Ok((has_size && DepthMap::of(&image).is_some()).then_some(image))
 }
 
-/// Brings the neighbour's image over to a view and compares. The image shows what was brought over;
-/// what the neighbour doesn't see is red. Images have the sizes of the views. `None` where it sees
-/// nothing.
-pub(crate) fn warp(
-    view: (&Camera, &ExrImage, &Image),
-    other: (&Camera, &ExrImage, &Image),
+/// Warps the neighbour's image to a view by both depths, and scores the result. In the picture,
+/// pixels that aren't visible from the neighbour are red. Images must have the sizes of the views.
+/// `None` if nothing is visible.
+fn warp(
+    (camera, depth, truth): (&Camera, &ExrImage, &Image),
+    (other_camera, other_depth, other_truth): (&Camera, &ExrImage, &Image),
 ) -> Option<(WarpScore, Rgba8)> {
-    const UNSEEN: [u8; 4] = [120, 20, 30, 255];
-    let from = Surface { camera: view.0, map: DepthMap::of(view.1)? };
-    let places = from.positions_in(&Surface { camera: other.0, map: DepthMap::of(other.1)? });
-    let (mut sum, mut seen) = (0.0, 0usize);
-    let mut data = Vec::with_capacity(4 * places.len());
-    for (place, truth) in places.iter().zip(view.2.data.chunks_exact(3)) {
-        let Some(place) = place else {
-            data.extend(UNSEEN);
+    const INVISIBLE_COLOUR: [u8; 4] = [120, 20, 30, 255];
+    let surface = Surface { camera, map: DepthMap::of(depth)? };
+    let other = Surface { camera: other_camera, map: DepthMap::of(other_depth)? };
+    let positions = surface.positions_in(&other);
+    let (mut sum, mut visible) = (0.0, 0usize);
+    let mut data = Vec::with_capacity(4 * positions.len());
+    for (i, pixel) in truth.data.chunks_exact(3).enumerate() {
+        let Some(position) = positions[i] else {
+            data.extend(INVISIBLE_COLOUR);
             continue;
         };
-        let colour = other.2.colour_at(*place);
-        sum += colour.iter().zip(truth).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
-        seen += 1;
-        data.extend(colour.map(to_u8).into_iter().chain([255]));
+        let colour = other_truth.colour_at(position);
+        let mut error = 0.0;
+        for c in 0..3 {
+            error += f64::from(colour[c] - pixel[c]).powi(2);
+        }
+        sum += error;
+        visible += 1;
+        data.extend(colour.map(to_u8));
+        data.push(255);
     }
-    let share = seen as f64 / places.len().max(1) as f64;
-    let psnr = psnr_of(sum / (3 * seen) as f64);
-    (seen > 0)
-        .then(|| (WarpScore { psnr, seen: share }, Rgba8::new(view.2.width, view.2.height, data)))
+    if visible == 0 {
+        return None;
+    }
+    let psnr = psnr_of(sum / (3 * visible) as f64);
+    let seen = visible as f64 / positions.len() as f64;
+    Some((WarpScore { psnr, seen }, Rgba8::new(truth.width, truth.height, data)))
 }
 
-/// The true image of a view's nearest neighbour, seen from the view by the rendered depths.
-pub(super) fn warped(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
+/// Scores a view against its nearest neighbour's true image, warped by the rendered depths.
+pub(super) fn score_view(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
     let (scene, own_camera) = (view.scene, &view.view.camera);
-    let Some(expected) = &view.expected else { return Ok(None) };
+    let Some(truth) = &view.truth else { return Ok(None) };
     let Some(other) = neighbour(own_camera, &scene.views.views) else { return Ok(None) };
     let other_truth = scene.truth.views.iter().find(|v| v.camera.name == other.camera.name);
     let Some((other_view, file)) = other_truth.and_then(|v| Some((v, v.image.as_ref()?))) else {
         return Ok(None);
     };
-    let own = read_surface(scene.views_in, view.view)?;
-    let (Some(own), Some(theirs)) = (own, read_surface(scene.views_in, other)?) else {
-        return Ok(None);
-    };
-    let image = read_image(scene.truth_in, scene.truth, other_view, file)?;
-    if (image.width, image.height) != (theirs.width, theirs.height) {
+    let Some(depth) = read_surface(scene.views_input, view.view)? else { return Ok(None) };
+    let Some(other_depth) = read_surface(scene.views_input, other)? else { return Ok(None) };
+    let image = read_image(scene.truth_input, scene.truth, other_view, file)?;
+    if (image.width, image.height) != (other_depth.width, other_depth.height) {
         return Ok(None);
     }
-    Ok(warp((own_camera, &own, expected), (&other.camera, &theirs, &image)))
+    Ok(warp((own_camera, &depth, truth), (&other.camera, &other_depth, &image)))
 }
 
 #[cfg(test)]
@@ -116,13 +124,14 @@ mod tests {
         warp((&a, &image(depth), &wall(0)), (&b, &image(depth), &wall(2))).unwrap()
     }
 
-    /// A step of a tenth to the side before a wall at distance 2 moves its image by two pixels.
+    /// A step of a tenth to the side in front of a wall at distance 2 moves its image by two
+    /// pixels.
     #[test]
     fn right_depth_agrees_and_wrong_depth_does_not() {
-        let (right, shown) = walls_warped(2.0);
+        let (right, picture) = walls_warped(2.0);
         assert!(right.psnr > 60.0 && (right.seen - 0.95).abs() < 0.03, "{right:?}");
-        // What lies left of the neighbour's shown isn't seen.
-        assert_eq!(shown.data[..3], [120, 20, 30]);
+        // The view's left border lies outside the neighbour's image.
+        assert_eq!(picture.data[..3], [120, 20, 30]);
         let (wrong, _) = walls_warped(3.0);
         assert!(wrong.psnr < 25.0, "{wrong:?}");
     }
