@@ -1,11 +1,9 @@
-//! `register`: finds where photographs were taken from, by a field that knows the scene. Each
-//! camera moves until what the field renders meets its photograph ([`poses::refine`]), from coarse
-//! to fine.
+//! `register`: estimates the cameras of photographs from a trained field. Each camera moves, from
+//! coarse to fine, until the field's render fits its photograph ([`poses::refine`]).
 //!
-//! That is how test views are to be scored where poses aren't exact: the field lies where its own
-//! training views say, and a camera that is wrong by a pixel costs more decibels than anything a
-//! field gets wrong. Only LR photographs are looked at where there are any: HR ones are what views
-//! are scored by.
+//! Test views need registration if poses aren't exact: the field's frame follows its training
+//! views, and a camera that is off by a pixel costs more decibels than any error of the field
+//! (design note 025). LR photographs are preferred, because views are scored against the HR ones.
 
 use artifact::{FailureExt as _, GivenInput, WARNING, counted, with_warnings};
 use contract::{Input, Output};
@@ -21,10 +19,11 @@ use stage::{Context, Stage};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// How often a photograph is halved at the start. More finds cameras that are farther off.
+    /// Number of times that a photograph is halved at the start. More halvings register cameras
+    /// that are farther off.
     #[schemars(range(min = 0, max = 8))]
     pub smaller: u32,
-    /// Maximum number of renders for a photograph at each of its sizes.
+    /// Maximum number of renders of a photograph at each of its sizes.
     #[schemars(range(min = 2, max = 100))]
     pub renderings: u32,
 }
@@ -35,23 +34,20 @@ impl Default for Params {
     }
 }
 
-/// The stage.
+/// Stage `register`.
 pub struct Register;
 
 impl Stage for Register {
     type Params = Params;
     const NAME: &'static str = "register";
-    const SUMMARY: &'static str = "Finds where photographs were taken from, by a field.";
+    const SUMMARY: &'static str = "Estimates the cameras of photographs from a trained field.";
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         let photographs = ["scene/truth", "scene/train", "scene/references"];
         vec![
             ("field", Input::required(&["field"], "a trained field")),
-            (
-                "photographs",
-                Input::required(&photographs, "photographs with cameras that are about right"),
-            ),
+            ("photographs", Input::required(&photographs, "photographs with approximate cameras")),
         ]
     }
 
@@ -63,53 +59,54 @@ impl Stage for Register {
         let members = fields::Members::read(context.input("field")?, &context.device)?;
         let input = context.input("photographs")?;
         let given = Views::read(input)?;
-        let shown = members.file.background.shown();
+        let background = members.file.background.shown();
         let progress = context.progress("locating", given.views.len() as u64);
-        let mut found = Vec::with_capacity(given.views.len());
+        let mut registered = Vec::with_capacity(given.views.len());
         for view in &given.views {
             context.check_interrupt()?;
-            let place = || format!("view {}", view.camera.name);
-            let photograph = read(view, input).bad_input(place())?;
-            let registered = match photograph {
+            let name = format!("view {}", view.camera.name);
+            registered.push(match read_photograph(view, input).bad_input(&name)? {
                 Some(photograph) => {
-                    let image = photograph.over(shown).masked_image();
-                    Registered::by(&members, &view.camera, &image, params, shown)
-                        .map_err(|e| anyhow::anyhow!("{}: {e}", place()))?
+                    let image = photograph.over(background).masked_image();
+                    Registered::from_image(&members, &view.camera, &image, params, background)
+                        .map_err(|e| anyhow::anyhow!("{name}: {e}"))?
                 }
-                None => Registered::unknown(&view.camera),
-            };
-            found.push(registered);
+                None => Registered::unchanged(&view.camera),
+            });
             progress.add(1);
         }
-        let (summary, warning) = summary(&found);
-        warning.iter().for_each(|warning| context.say(format!("{WARNING}{warning}")));
-        let views = found.into_iter().map(|registered| View::camera_only(registered.to)).collect();
+        let (summary, warning) = summary(&registered);
+        if let Some(warning) = &warning {
+            context.say(format!("{WARNING}{warning}"));
+        }
+        let views = registered.into_iter().map(|view| View::camera_only(view.to)).collect();
         context.write_json(VIEWS_FILE, &Views::new(given.background, given.bounds, views))?;
         context.write_summary(&with_warnings(&summary, warning.as_slice()))
     }
 }
 
-/// Where a photograph was taken from.
+/// Registered camera of a photograph.
 struct Registered {
-    /// The given camera; its pixels are the photograph's.
+    /// Given camera, resized to the photograph.
     from: Camera,
-    /// The camera that was found.
+    /// Estimated camera.
     to: Camera,
-    /// Middle depth of what that sees.
+    /// Median depth of the render from the estimated camera.
     depth: Option<f64>,
-    /// How the photograph is met from either; none where there is no photograph.
+    /// Error of the render from the given and from the estimated camera; `None` without a
+    /// photograph.
     errors: Option<[f64; 2]>,
 }
 
 impl Registered {
-    /// Of a view without a photograph nothing is known.
-    fn unknown(camera: &Camera) -> Self {
+    /// Keeps the camera of a view without a photograph.
+    fn unchanged(camera: &Camera) -> Self {
         Self { from: camera.clone(), to: camera.clone(), depth: None, errors: None }
     }
 
-    /// By what a field renders, from coarse to fine. The given pose stays where the whole
-    /// photograph is met no better from the one found: smaller sizes may have led astray.
-    fn by(
+    /// Registers a camera from coarse to fine. Keeps the given pose unless the estimated one has a
+    /// smaller error at full size, since smaller sizes can mislead.
+    fn from_image(
         field: &dyn RayField,
         camera: &Camera,
         image: &Image,
@@ -123,46 +120,45 @@ impl Registered {
         for level in (1..=pyramid.smaller_levels()).rev() {
             to = refine(field, &to, &pyramid, level, &options)?.camera;
         }
-        let last = refine(field, &to, &pyramid, 0, &options)?;
-        let best = if last.after < given.before { last } else { given.clone() };
-        let from = camera.resized(image.width as u32, image.height as u32);
+        let estimated = refine(field, &to, &pyramid, 0, &options)?;
+        let before = given.before;
+        let best = if estimated.after < before { estimated } else { given };
         Ok(Self {
-            from,
+            from: camera.resized(image.width as u32, image.height as u32),
             to: best.camera,
             depth: best.depth,
-            errors: Some([given.before, best.after]),
+            errors: Some([before, best.after]),
         })
     }
 }
 
-/// The LR photograph of a view, or the only one there is.
-fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
+/// Reads the LR photograph of a view, or the HR one if there is no LR photograph.
+fn read_photograph(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
     Ok(match view.read_lr_photograph(input)? {
         Some(photograph) => Some(photograph),
         None => view.read_photograph(input)?,
     })
 }
 
-/// How far cameras went, and what it was good for; a warning, where they went far.
-fn summary(found: &[Registered]) -> (String, Option<String>) {
-    let moved = MeanMotion::of_cameras(
-        found.iter().map(|Registered { from, to, depth, .. }| CameraMotion {
-            from,
-            to,
-            depth: *depth,
-        }),
-    );
-    let errors: Vec<[f64; 2]> = found.iter().filter_map(|registered| registered.errors).collect();
-    let mean =
-        |i: usize| (errors.iter().map(|e| e[i]).sum::<f64>() / errors.len().max(1) as f64).sqrt();
-    let (count, all, before, after) =
-        (errors.len(), counted(found.len(), "camera"), mean(0), mean(1));
+/// Returns the summary, and a warning if cameras have moved far.
+fn summary(registered: &[Registered]) -> (String, Option<String>) {
+    let moves = registered.iter().map(|Registered { from, to, depth, .. }| CameraMotion {
+        from,
+        to,
+        depth: *depth,
+    });
+    let moved = MeanMotion::of_cameras(moves);
+    let errors: Vec<[f64; 2]> = registered.iter().filter_map(|view| view.errors).collect();
+    let [before, after] = [0, 1]
+        .map(|i| (errors.iter().map(|e| e[i]).sum::<f64>() / errors.len().max(1) as f64).sqrt());
     let summary = format!(
-        "{count} of {all} registered: {moved}; error (Huber's) {before:.4} before, {after:.4} after"
+        "{} of {} registered: {moved}; error (Huber) {before:.4} before, {after:.4} after",
+        errors.len(),
+        counted(registered.len(), "camera")
     );
     let warning = format!(
-        "cameras have {moved}, which is far: unless the given poses are that far off, the field \
-        or the photographs are of something else"
+        "cameras have {moved}; unless the given poses are that far off, the field and the \
+        photographs are of different scenes"
     );
     (summary, moved.is_far().then_some(warning))
 }

@@ -1,13 +1,13 @@
 //! `render-depth`: colour, opacity and depth of a field, for any list of cameras at any size.
 //!
-//! A field may have several members, trained apart or one on from another; what they render is
-//! averaged: each errs in its own way where the images leave it open.
+//! A field may have several members, trained independently or fine-tuned from another member. Their
+//! renders are averaged, since their errors are partly independent (design note 011).
 //!
-//! Where a view is smooth, a pixel shows one ray through its centre; elsewhere it shows the mean of
-//! several ([`Params::tolerance`]): adaptive sampling, as in Whitted 1980.
+//! Adaptive sampling (Whitted 1980): a pixel in a smooth part of a view has one ray through its
+//! centre, any other pixel several ([`Params::tolerance`]).
 //!
-//! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at.
-//! Rows are rendered and written sixteen at a time, so memory doesn't grow with the image.
+//! Every view becomes an EXR (R, G, B, A in half precision, `Z` in single) and a PNG preview. Rows
+//! are rendered and written in bands of sixteen, so memory doesn't grow with the image.
 
 use std::ops::Range;
 
@@ -29,20 +29,20 @@ use stage::{Context, Stage};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the views; heights follow the cameras' aspect. Default: the cameras' own size.
+    /// Width of the views; heights follow the cameras' aspect ratio. Default: the cameras' size.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by camera"))]
     pub size: Option<u32>,
-    /// Rays along each side of a pixel; 2 casts four. A pixel shows the mean of their colours and
+    /// Rays along each side of a pixel; 2 casts four. A pixel gets the mean of their colours and
     /// the depth of one of them.
     #[schemars(range(min = 1, max = 8))]
     pub samples_per_axis: u32,
-    /// Error of colour or opacity up to which one ray shows a pixel; others get all rays. The
-    /// estimate is made from the pixel's neighbours and bounds the error where the view is
-    /// quadratic. 0 casts all rays everywhere.
+    /// Maximum error of colour or opacity of a pixel with one ray; pixels above it get all rays.
+    /// The error is estimated from the pixel's neighbours, and bounded where the view is quadratic.
+    /// 0 casts all rays everywhere.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub tolerance: f64,
-    /// Depth that channel `Z` holds. The median lies on a surface; the mean lies between the
-    /// surface and floaters before it.
+    /// Kind of depth in channel `Z`. The median lies on a surface; the mean lies between the
+    /// surface and floaters in front of it.
     pub depth: Depth,
     /// Also writes the distance along the ray, as channel `distance`.
     pub ray_distance: bool,
@@ -60,17 +60,17 @@ impl Default for Params {
     }
 }
 
-/// Kinds of depth.
+/// Kind of depth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Depth {
-    /// Mean of where light is stopped, weighted by how much of it is.
+    /// Mean distance of the samples, weighted by their share of the pixel's colour.
     Expected,
-    /// Where half of the light is stopped; the far end where less ever is.
+    /// Distance at which half of the light is absorbed; the far end if less is.
     Median,
 }
 
-/// The stage.
+/// Stage `render-depth`.
 pub struct RenderDepth;
 
 impl Stage for RenderDepth {
@@ -85,7 +85,7 @@ impl Stage for RenderDepth {
             ["scene/cameras", "scene/truth", "scene/train", "scene/references", "cameras", "views"];
         vec![
             ("field", Input::required(&["field"], "a trained field")),
-            ("cameras", Input::required(&cameras, "folder with views.json: the cameras to render")),
+            ("cameras", Input::required(&cameras, "cameras to render (views.json)")),
         ]
     }
 
@@ -98,7 +98,12 @@ impl Stage for RenderDepth {
         let cameras = Views::read(context.input("cameras")?)?;
         let resized: Vec<Camera> =
             cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
-        let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();
+        let (mut rows, mut pixels) = (0, 0);
+        for camera in &resized {
+            let k = camera.intrinsics;
+            rows += u64::from(k.height);
+            pixels += u64::from(k.width) * u64::from(k.height);
+        }
         let progress = context.progress("rendering", rows);
         let (mut views, mut done) = (Vec::with_capacity(resized.len()), 0);
         for camera in resized {
@@ -120,31 +125,21 @@ impl Stage for RenderDepth {
                 ..View::camera_only(camera)
             });
         }
-        let count = views.len();
+        let summary = format!("{}, {} pixels", counted(views.len(), "view"), amount(pixels));
         context.write_json(VIEWS_FILE, &Views::new(file.background, cameras.bounds, views))?;
-        let pixels = amount(pixels_of(&cameras, params.size));
-        context.write_summary(&format!("{}, {pixels} pixels", counted(count, "view")))
+        context.write_summary(&summary)
     }
 }
 
+/// Resizes a camera to a width and keeps the aspect ratio.
 fn resize(camera: &Camera, width: Option<u32>) -> Camera {
     let k = camera.intrinsics;
-    match width {
-        Some(width) => {
-            let height =
-                (f64::from(k.height) * f64::from(width) / f64::from(k.width)).round().max(1.0);
-            camera.resized(width, height as u32)
-        }
-        None => camera.clone(),
-    }
+    let Some(width) = width else { return camera.clone() };
+    let height = (f64::from(k.height) * f64::from(width) / f64::from(k.width)).round().max(1.0);
+    camera.resized(width, height as u32)
 }
 
-fn pixels_of(cameras: &Views, width: Option<u32>) -> u64 {
-    let size = |v: &View| resize(&v.camera, width).intrinsics;
-    cameras.views.iter().map(|v| u64::from(size(v).width) * u64::from(size(v).height)).sum()
-}
-
-/// One view.
+/// View to render.
 struct RenderJob<'a> {
     params: &'a Params,
     members: &'a [Box<dyn RayField>],
@@ -165,12 +160,12 @@ impl RenderJob<'_> {
         let channels = &VIEW_CHANNELS[..if self.params.ray_distance { 6 } else { 5 }];
         let exr = context.output_path(image)?;
         let mut png = PngRows::create(&context.output_path(preview)?, width, height)?;
-        let mut centres = Centres::default();
+        let mut centres = CentreRows::default();
         write_view_image(&exr, (width, height), channels, |first, rows, samples| {
             context.check_interrupt()?;
-            let pixels = self.band(&mut centres, first..first + rows)?;
-            for (sample, pixel) in samples.chunks_exact_mut(channels.len()).zip(&pixels) {
-                sample.copy_from_slice(&pixel.channels[..channels.len()]);
+            let pixels = self.render_rows(&mut centres, first..first + rows)?;
+            for (i, sample) in samples.chunks_exact_mut(channels.len()).enumerate() {
+                sample.copy_from_slice(&pixels[i].channels[..channels.len()]);
             }
             png.write(&pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect::<Vec<_>>())?;
             progress.add(rows as u64);
@@ -179,76 +174,81 @@ impl RenderJob<'_> {
         png.finish().context("cannot write the preview")
     }
 
-    /// Renders some rows. `centres` is kept from one band to the next.
-    fn band(&self, centres: &mut Centres, rows: Range<usize>) -> anyhow::Result<Vec<ViewPixel>> {
+    /// Renders a band of rows. `centres` must be passed from each band to the next.
+    fn render_rows(
+        &self,
+        centres: &mut CentreRows,
+        rows: Range<usize>,
+    ) -> anyhow::Result<Vec<ViewPixel>> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         let n = self.params.samples_per_axis as usize;
         if n == 1 || self.params.tolerance == 0.0 {
-            return self.cast(&places(rows, width), n);
+            return self.cast(&pixel_positions(rows, width), n);
         }
-        // The row above is there already, the row below is the next band's first.
+        // Keep the row above the band, and add the rows up to the first one of the next band.
         let kept = rows.start.saturating_sub(1).max(centres.first);
         centres.pixels.drain(..(kept - centres.first) * width);
         centres.first = kept;
         let next = kept + centres.pixels.len() / width;
-        centres.pixels.extend(self.cast(&places(next..(rows.end + 1).min(height), width), 1)?);
+        let missing = pixel_positions(next..(rows.end + 1).min(height), width);
+        centres.pixels.extend(self.cast(&missing, 1)?);
 
         let tolerance = self.params.tolerance as f32;
-        let mut pixels = places(rows.clone(), width);
-        pixels.retain(|&pixel| centres.error(pixel, width) > tolerance);
-        let several = self.cast(&pixels, n)?;
+        let mut detailed = pixel_positions(rows.clone(), width);
+        detailed.retain(|&position| centres.error(position, width) > tolerance);
         let first = (rows.start - centres.first) * width;
-        let mut shown = centres.pixels[first..first + rows.len() * width].to_vec();
-        for ([x, y], several) in pixels.into_iter().zip(several) {
-            shown[(y - rows.start) * width + x] = several;
+        let mut pixels = centres.pixels[first..first + rows.len() * width].to_vec();
+        for (i, pixel) in self.cast(&detailed, n)?.into_iter().enumerate() {
+            let [x, y] = detailed[i];
+            pixels[(y - rows.start) * width + x] = pixel;
         }
-        Ok(shown)
+        Ok(pixels)
     }
 
-    /// Casts n × n rays through each pixel `[x, y]`.
-    fn cast(&self, pixels: &[[usize; 2]], n: usize) -> anyhow::Result<Vec<ViewPixel>> {
+    /// Renders the pixels at `[x, y]` with n × n rays each.
+    fn cast(&self, positions: &[[usize; 2]], n: usize) -> anyhow::Result<Vec<ViewPixel>> {
         let background = [self.background.shown(); 3];
-        let within = |k: usize| (k as f64 + 0.5) / n as f64;
         let camera_rays = self.camera.rays();
-        let (rays, to_z): (Vec<Ray>, Vec<f32>) = pixels
-            .iter()
-            .flat_map(|[x, y]| {
-                (0..n * n)
-                    .map(move |sub| (*x as f64 + within(sub % n), *y as f64 + within(sub / n)))
-            })
-            .map(|(u, v)| {
+        let mut rays = Vec::with_capacity(positions.len() * n * n);
+        let mut z_per_distance = Vec::with_capacity(rays.capacity());
+        for [x, y] in positions {
+            for sub in 0..n * n {
+                let u = *x as f64 + ((sub % n) as f64 + 0.5) / n as f64;
+                let v = *y as f64 + ((sub / n) as f64 + 0.5) / n as f64;
                 let ray = camera_rays.ray(u, v);
-                (Ray::new(&ray, background), self.camera.depth_per_distance(&ray) as f32)
-            })
-            .unzip();
+                rays.push(Ray::new(&ray, background));
+                z_per_distance.push(self.camera.depth_per_distance(&ray) as f32);
+            }
+        }
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
         let rendered = rendered.map_err(fields::rendering_failure)?;
-        let (mut shown, mut subs) = (Vec::with_capacity(pixels.len()), Vec::new());
-        for i in 0..pixels.len() {
+        let (mut pixels, mut samples) = (Vec::with_capacity(positions.len()), Vec::new());
+        for i in 0..positions.len() {
             let rays = i * n * n..(i + 1) * n * n;
-            subs.clear();
-            subs.extend(
-                rendered.iter().flat_map(|r| r[rays.clone()].iter().zip(&to_z[rays.clone()])),
-            );
-            shown.push(self.shown(&subs));
+            samples.clear();
+            for member in &rendered {
+                samples.extend(member[rays.clone()].iter().zip(&z_per_distance[rays.clone()]));
+            }
+            pixels.push(self.combine(&samples));
         }
-        Ok(shown)
+        Ok(pixels)
     }
 
-    /// What a pixel shows of its rays, each with its z-depth per distance.
-    fn shown(&self, subs: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
-        let [r, g, b] = std::array::from_fn(|c| mean(subs, |(p, _)| p.premultiplied[c]));
+    /// Combines the samples of a pixel's rays, each with its z-depth per distance: means of colour
+    /// and opacity, middle depth. A mean depth would lie between two surfaces.
+    fn combine(&self, samples: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
+        let [r, g, b] = std::array::from_fn(|c| mean(samples, |(p, _)| p.premultiplied[c]));
         let mut distances: Vec<(f32, f32)> =
-            subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect();
-        // A mean would invent a surface between two.
+            samples.iter().map(|(pixel, to_z)| (self.distance(pixel), **to_z)).collect();
         let (distance, to_z) = lower_median(&mut distances, |d| d.0).copied().unwrap_or_default();
         ViewPixel {
-            channels: [r, g, b, mean(subs, |(p, _)| p.opacity), distance * to_z, distance],
-            colour: std::array::from_fn(|c| mean(subs, |(p, _)| p.colour[c])),
+            channels: [r, g, b, mean(samples, |(p, _)| p.opacity), distance * to_z, distance],
+            colour: std::array::from_fn(|c| mean(samples, |(p, _)| p.colour[c])),
         }
     }
 
+    /// Returns the distance along the ray by the chosen kind of depth.
     fn distance(&self, pixel: &radiance::Pixel) -> f32 {
         match self.params.depth {
             Depth::Expected => pixel.depth,
@@ -257,46 +257,51 @@ impl RenderJob<'_> {
     }
 }
 
-/// The pixels `[x, y]` of some rows.
-fn places(rows: Range<usize>, width: usize) -> Vec<[usize; 2]> {
+/// Returns the positions `[x, y]` of the pixels of some rows.
+fn pixel_positions(rows: Range<usize>, width: usize) -> Vec<[usize; 2]> {
     rows.flat_map(|y| (0..width).map(move |x| [x, y])).collect()
 }
 
-/// What a pixel shows.
+/// Pixel of a rendered view.
 #[derive(Clone, Copy)]
 struct ViewPixel {
-    /// Premultiplied colour, opacity, z-depth and distance: channels of the EXR.
+    /// Channels of the EXR: premultiplied colour, opacity, z-depth and distance.
     channels: [f32; 6],
     /// Colour over the background, for the preview.
     colour: [f32; 3],
 }
 
-/// Rows of pixels by one ray through the centre of each.
+/// Rows of pixels with one ray through the centre of each.
 #[derive(Default)]
-struct Centres {
-    /// First row.
+struct CentreRows {
+    /// Index of the first row.
     first: usize,
     pixels: Vec<ViewPixel>,
 }
 
-impl Centres {
-    /// How far a pixel's mean colour and opacity may be from its centre's: the view's second
-    /// differences over 24, since the mean of a quadratic over a square of side 1 differs from its
-    /// centre by that part of its second derivatives. Unknown at the view's border.
+impl CentreRows {
+    /// Estimates the error of a pixel's centre ray against the pixel's mean colour and opacity: the
+    /// view's second differences over 24, by which the mean of a quadratic over a unit square
+    /// differs from the value at its centre. Infinite at the view's border.
     fn error(&self, [x, y]: [usize; 2], width: usize) -> f32 {
-        let at = (y - self.first) * width + x;
-        let inside = x > 0 && x + 1 < width && at >= width && at + width < self.pixels.len();
-        if !inside {
+        let index = (y - self.first) * width + x;
+        let is_inside =
+            x > 0 && x + 1 < width && index >= width && index + width < self.pixels.len();
+        if !is_inside {
             return f32::INFINITY;
         }
-        let bends = (0..4).map(|c| self.bend(at, c, 1) + self.bend(at, c, width));
-        bends.fold(0.0, f32::max) / 24.0
+        let mut largest = 0.0f32;
+        for channel in 0..4 {
+            let across = self.second_difference(index, channel, 1);
+            largest = largest.max(across + self.second_difference(index, channel, width));
+        }
+        largest / 24.0
     }
 
-    /// A channel's second difference at a pixel, along a step.
-    fn bend(&self, at: usize, channel: usize, step: usize) -> f32 {
+    /// Returns the absolute second difference of a channel at a pixel, along an index step.
+    fn second_difference(&self, index: usize, channel: usize, step: usize) -> f32 {
         let [before, own, after] =
-            [at - step, at, at + step].map(|i| self.pixels[i].channels[channel]);
+            [index - step, index, index + step].map(|i| self.pixels[i].channels[channel]);
         (before - 2.0 * own + after).abs()
     }
 }
@@ -313,7 +318,7 @@ mod tests {
     const SIZE: usize = 24;
     const CENTRE: f64 = SIZE as f64 / 2.0;
 
-    /// A picture on the plane z = -1, before a camera with a focal length of 1 pixel.
+    /// Picture on the plane z = -1, in front of a camera with a focal length of 1 pixel.
     struct Picture {
         colour: fn(f64, f64) -> f64,
         rays: Arc<AtomicUsize>,
@@ -340,7 +345,7 @@ mod tests {
         }
     }
 
-    /// With a focal length of 1 pixel, at the origin.
+    /// Camera at the origin with a focal length of 1 pixel.
     fn camera() -> Camera {
         let angle = 2.0 * CENTRE.atan();
         let intrinsics = Intrinsics::from_angle_x(SIZE as u32, SIZE as u32, angle);
@@ -361,20 +366,20 @@ mod tests {
             background: Background::White,
             camera: &camera,
         };
-        let mut centres = Centres::default();
+        let mut centres = CentreRows::default();
         let bands = (0..SIZE).step_by(band).map(|first| first..(first + band).min(SIZE));
         let shown: Vec<ViewPixel> =
-            bands.flat_map(|rows| job.band(&mut centres, rows).unwrap()).collect();
+            bands.flat_map(|rows| job.render_rows(&mut centres, rows).unwrap()).collect();
         (shown.iter().map(|pixel| pixel.channels[0]).collect(), count.load(Ordering::Relaxed))
     }
 
-    /// Bends more and more to the right.
+    /// Colour whose curvature grows to the right.
     fn bent(x: f64, y: f64) -> f64 {
         0.2 + 0.004 * x + 2e-5 * x.powi(3) - 0.001 * y * y + 0.002 * x * y
     }
 
     #[test]
-    fn one_ray_shows_what_is_smooth_within_the_tolerance() {
+    fn smooth_pixels_have_one_ray_within_the_tolerance() {
         let (all, most) = red(bent, 0.0, SIZE);
         assert_eq!(most, 4 * SIZE * SIZE);
         for tolerance in [1e-5, 1e-4, 1.5e-4, 2e-4, 1e-3] {
@@ -403,7 +408,7 @@ mod tests {
         }
     }
 
-    /// Sees a wall at this z-depth. Its expected depth is twice that. Opacity grows with the depth.
+    /// Wall at a z-depth; its expected depth is twice that, and its opacity grows with the depth.
     struct Wall(f32);
 
     impl Wall {
