@@ -154,14 +154,14 @@ fn views_are_consistent_with_their_own_photographs() {
     let project = project();
     let given = at_lr(&project, &[]);
     assert!(
-        given[1] < given[0] + 3.0 && !refine_summary(&project, &[]).contains("agree"),
+        given[1] < given[0] + 3.0 && !refine_summary(&project, &[]).contains("consistent"),
         "{given:?}"
     );
     let papers = at_lr(&project, &["-p", "split=paper"]);
     assert!(papers[1] > papers[0] + 6.0, "{papers:?}");
     assert!(
         refine_summary(&project, &["-p", "split=paper"])
-            .contains("agree with their own photographs")
+            .contains("consistent with their own photographs")
     );
     // The network has learnt on consistent views, too; what hasn't is said to be another task.
     assert!(is_agreeing(&project, &["-p", "split=paper"]) && !is_agreeing(&project, &[]));
@@ -203,7 +203,10 @@ fn views_are_means_with_their_enlarged_photographs() {
     project.ok(&[&["run"], &split[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &split);
     let summary = std::fs::read_to_string(folder("refine-sisr").join("summary.txt")).unwrap();
-    assert!(summary.contains("14 are means") && summary.contains("14 of them agree"), "{summary}");
+    assert!(
+        summary.contains("14 averaged with") && summary.contains("14 consistent with"),
+        "{summary}"
+    );
 
     let (views, refiner, enlarged) =
         (folder("render-depth"), folder("train-refine"), project.path("enlarged"));
@@ -449,14 +452,14 @@ fn bad_references_do_no_harm() {
         with_depths(&project, "d", &reference_views, |_, _| 2.5),
     );
     let said = scene.refined("shifted", &mine, &references, &theirs);
-    assert!(said.contains("looks otherwise than what is rendered"), "{said}");
+    assert!(said.contains("differs from the renders"), "{said}");
     let said = scene.refined(
         "hidden",
         &views,
         &references,
         &with_depths(&project, "e", &reference_views, |_, z| 0.01 * z),
     );
-    assert!(said.contains("sees nothing of these views"), "{said}");
+    assert!(said.contains("shows no part of these views"), "{said}");
     let said = scene.refined(
         "dark",
         &views,
@@ -470,7 +473,7 @@ fn bad_references_do_no_harm() {
         &with_colours(&project, &references, "g", |[r, g, b]| [g, b, 1.0 - r]),
         &reference_views,
     );
-    assert!(said.contains("looks otherwise than what is rendered"), "{said}");
+    assert!(said.contains("differs from the renders"), "{said}");
 }
 
 fn mean_psnr(project: &Project, arguments: &[&str], stage: &str) -> f64 {
@@ -596,7 +599,7 @@ fn other_fields_are_not_gone_on_from() {
         &scene,
         "{}",
         &field,
-        &["input init: it is made of something else than the parameters ask for"],
+        &["input init: the field's architecture differs from the parameters"],
     );
     let own = r#"{"rays": 8000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128}"#;
     cannot_go_on(
@@ -604,14 +607,14 @@ fn other_fields_are_not_gone_on_from() {
         &scene,
         own,
         &with_file(&project, &field, "black", &file.replace("\"white\"", "\"black\"")),
-        &["input init: it has another background"],
+        &["input init: the field's background differs from the scene's"],
     );
     cannot_go_on(
         &project,
         &scene,
         own,
         &with_file(&project, &field, "far", &file.replace("\"far\": ", "\"far\": 1")),
-        &["input init: it lies elsewhere"],
+        &["input init: the field's bounds differ from the scene's"],
     );
     let cut = with_file(&project, &field, "cut", &file);
     std::fs::write(cut.join("field-0.safetensors"), b"{").unwrap();
@@ -671,7 +674,7 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
     );
     let last = stage("train-refine", params, &inputs, &output, &more);
     assert_eq!(last.code, 0, "{}", last.stderr);
-    assert!(last.stderr.contains("going on from step"), "{}", last.stderr);
+    assert!(last.stderr.contains("resuming from step"), "{}", last.stderr);
     assert_eq!(manifest(&output), manifest(&whole));
     a_checkpoint_cut_short_is_left_out(&project, &inputs);
 }
@@ -817,7 +820,7 @@ fn wrong_views_are_refused_in_a_line() {
     train(&project, "{}", &views, &truth.with_file_name("downscaled"))
         .fails(3, &["24×24 pixels, but its image has 12×12"]);
     train(&project, "{}", &views, &truth.with_file_name("truth"))
-        .fails(3, &["none of them has an image, by name and pose, in input truth"]);
+        .fails(3, &["no view has an image in input truth with the same name and pose"]);
 }
 
 #[track_caller]

@@ -2,42 +2,44 @@ use artifact::{Failure, FailureExt as _, GivenInput};
 use pixels::Image;
 use scene::{Camera, Photograph, Views};
 
-/// Photographs enlarged by a method that looks at each alone.
-pub(crate) struct Enlarged<'a> {
+/// Photographs enlarged by single-image super-resolution.
+pub(crate) struct EnlargedPhotographs<'a> {
     input: &'a GivenInput,
     views: Views,
 }
 
-impl<'a> Enlarged<'a> {
+impl<'a> EnlargedPhotographs<'a> {
     pub(crate) fn read(input: &'a GivenInput) -> anyhow::Result<Self> {
         Ok(Self { input, views: Views::read(input)? })
     }
 
-    /// Whether there is one of a camera.
+    /// True if a camera has an enlarged photograph.
     pub(crate) fn has(&self, camera: &Camera) -> bool {
         self.views.taken_by(camera).is_some()
     }
 
-    /// The mean of an image and what was made of the same camera's photograph, where its mask
-    /// leaves it; the image where there is none.
-    pub(crate) fn mean(&self, mut image: Image, camera: &Camera) -> anyhow::Result<Image> {
+    /// Averages an image with the same camera's enlarged photograph, if any. Pixels that the mask
+    /// excludes stay unchanged.
+    pub(crate) fn average_with(&self, mut image: Image, camera: &Camera) -> anyhow::Result<Image> {
         let Some(view) = self.views.taken_by(camera) else { return Ok(image) };
-        let place = || format!("input enlarged: view {}", camera.name);
-        let Some(photograph) = view.read_photograph(self.input).bad_input(place())? else {
+        let name = format!("input enlarged: view {}", camera.name);
+        let Some(photograph) = view.read_photograph(self.input).bad_input(&name)? else {
             return Ok(image);
         };
         let Photograph { image: mut other, mask } = photograph.over(self.views.background.shown());
         if (other.width, other.height) != (image.width, image.height) {
-            let sizes = format!(
-                "{}×{} pixels where the view to refine has {}×{}",
+            let message = format!(
+                "{name}: {}×{} pixels, but the view to refine has {}×{}",
                 other.width, other.height, image.width, image.height
             );
-            return Err(Failure::BadInput(format!("{}: {sizes}", place())).into());
+            return Err(Failure::BadInput(message).into());
         }
         if let Some(mask) = mask {
             mask.fill(&mut other, &image);
         }
-        image.data.iter_mut().zip(&other.data).for_each(|(v, other)| *v = 0.5 * (*v + other));
+        for (i, sample) in image.data.iter_mut().enumerate() {
+            *sample = 0.5 * (*sample + other.data[i]);
+        }
         Ok(image)
     }
 }
@@ -58,8 +60,8 @@ mod tests {
         }
     }
 
-    /// Three views. `whole` shows a pixel with the level 0.2 and a transparent one on white.
-    /// `masked` shows the same, but its second pixel doesn't count. `empty` has no image.
+    /// Three views. `whole` has a pixel of level 0.2 and a transparent one on white. `masked` has
+    /// the same image, but its second pixel doesn't count. `empty` has no image.
     fn folder() -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         let image = Rgba8::new(2, 1, vec![51, 51, 51, 255, 0, 0, 0, 0]);
@@ -81,10 +83,10 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_is_taken_where_the_photograph_counts() {
+    fn pixels_that_count_are_averaged() {
         let folder = folder();
         let input = GivenInput::open("enlarged", folder.path()).unwrap();
-        let enlarged = Enlarged::read(&input).unwrap();
+        let enlarged = EnlargedPhotographs::read(&input).unwrap();
         let image = Image::new(2, 1, 3, vec![0.4, 0.4, 0.4, 0.5, 0.5, 0.5]);
         // The last two have another pose and another name.
         let cases: [(&str, f64, [f32; 2]); 5] = [
@@ -95,7 +97,7 @@ mod tests {
             ("other", 0.0, [0.4, 0.5]),
         ];
         for (name, x, [first, second]) in cases {
-            let mean = enlarged.mean(image.clone(), &camera(name, x)).unwrap();
+            let mean = enlarged.average_with(image.clone(), &camera(name, x)).unwrap();
             let expected = [first, first, first, second, second, second];
             let is_near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-6;
             assert!(mean.data.iter().zip(&expected).all(is_near), "{name}: {:?}", mean.data);
@@ -108,13 +110,13 @@ mod tests {
     fn another_size_is_refused() {
         let folder = folder();
         let input = GivenInput::open("enlarged", folder.path()).unwrap();
-        let enlarged = Enlarged::read(&input).unwrap();
+        let enlarged = EnlargedPhotographs::read(&input).unwrap();
         let image = Image::new(3, 1, 3, vec![0.5; 9]);
-        let error = enlarged.mean(image, &camera("whole", 0.0)).unwrap_err();
+        let error = enlarged.average_with(image, &camera("whole", 0.0)).unwrap_err();
         assert!(matches!(error.downcast_ref(), Some(Failure::BadInput(_))), "{error}");
         assert_eq!(
             error.to_string(),
-            "input enlarged: view whole: 2×1 pixels where the view to refine has 3×1"
+            "input enlarged: view whole: 2×1 pixels, but the view to refine has 3×1"
         );
     }
 }

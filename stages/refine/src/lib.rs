@@ -1,48 +1,79 @@
-//! `refine`: gives rendered views the detail they systematically lack, by a network that
-//! `train-refine` trained.
+//! `refine`: adds the detail that rendered views systematically lack, by a network of
+//! `train-refine`.
 //!
-//! A network that was trained with references takes them from the inputs `references` (true images
-//! at HR) and `reference-views` (the same views as rendered, for what the field sees where).
+//! A network trained with references takes them from the inputs `references` (true images at HR)
+//! and `reference-views` (renders of the same views, for depth).
 //!
-//! The paper's own network (`train-refine`'s `net: paper`) redraws patches from references' patches
-//! instead of adding to the view.
+//! The paper's network (`net: paper` of `train-refine`) redraws patches from references' patches
+//! instead of adding a residual.
 //!
-//! What a network that learnt from other images makes of a view's own photograph (input `enlarged`)
-//! errs in another way: the mean of both is taken.
+//! With input `enlarged`, the result is averaged with the view's photograph enlarged by a SISR
+//! network, whose errors are partly independent (design note 021).
 //!
-//! A view whose own LR photograph is known (input `photographs`; in the paper's split all are
-//! trained on and scored) is then moved as little as it takes to be consistent with that; before,
-//! too, where the network learnt on views that are.
+//! A view with an LR photograph of its own (input `photographs`; in the paper's split every view
+//! has one) is then projected to the nearest image that is consistent with the photograph (design
+//! note 016); also before refinement, if the network was trained on consistent views.
 //!
-//! Colours change; opacity, depth and cameras stay what the field made them.
+//! Colours change; opacity, depth and cameras stay unchanged.
 
 mod enlarged;
 mod network;
-mod params;
 mod references;
 mod summary;
 mod view;
 
 use contract::{Input, Output};
+use paper_refiner::OVERLAP;
 use refinement::{KnownView, LrObservations, REFINER_FILE, RefinerFile, Use};
 use scene::{VIEWS_FILE, Views, image_file, preview_file};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
 
-pub use params::Params;
-
-use enlarged::Enlarged;
+use enlarged::EnlargedPhotographs;
 use network::{AnyRefiner, Application};
-use references::{read_references, without_misleading};
+use references::{read_references, remove_misleading};
 use summary::Summary;
 use view::{RefineJob, RefinedView};
 
-/// The stage.
+/// Parameters of `refine`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Fraction of the predicted residual that is added. Default: the best fraction for views that
+    /// the refiner's training left out.
+    #[schemars(range(min = 0.0, max = 2.0), extend("x-default" = "by refiner"))]
+    pub residual_weight: Option<f64>,
+    /// Maximum number of HR references: the first ones of input `references` are used.
+    #[schemars(extend("x-default" = "all"))]
+    pub max_references: Option<u32>,
+    /// Rotated and mirrored versions of a view whose residuals are averaged (geometric
+    /// self-ensemble). Time is proportional to their number.
+    #[schemars(range(min = 1, max = 8))]
+    pub self_ensemble: u32,
+    /// For refiners of `net: paper`: pixels by which patches of 64 pixels overlap.
+    #[schemars(range(min = 0, max = 32))]
+    pub overlap: u32,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self {
+            residual_weight: None,
+            max_references: None,
+            self_ensemble: 4,
+            overlap: OVERLAP as u32,
+        }
+    }
+}
+
+/// Stage `refine`.
 pub struct Refine;
 
 impl Stage for Refine {
     type Params = Params;
     const NAME: &'static str = "refine";
-    const SUMMARY: &'static str = "Gives rendered views the detail they systematically lack.";
+    const SUMMARY: &'static str = "Adds the detail that rendered views systematically lack.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
@@ -55,7 +86,7 @@ impl Stage for Refine {
                     "true images of some other views, at HR",
                 ),
             ),
-            ("reference-views", Input::optional(&["views"], "those views as rendered")),
+            ("reference-views", Input::optional(&["views"], "renders of the references' views")),
             (
                 "photographs",
                 Input::optional(
@@ -94,19 +125,22 @@ impl Stage for Refine {
                 .optional_input("photographs")
                 .map(LrObservations::read)
                 .transpose()?,
-            enlarged: context.optional_input("enlarged").map(Enlarged::read).transpose()?,
-            takes_consistent: file.data_consistent,
+            enlarged: context
+                .optional_input("enlarged")
+                .map(EnlargedPhotographs::read)
+                .transpose()?,
+            expects_consistent: file.data_consistent,
         };
         let references = usable_references(&job, &views, params, file.confidence.unwrap_or(1.0))?;
         let refined = refine_all(&job, &mut views, &references)?;
         context.write_json(VIEWS_FILE, &views)?;
-        say_unseen(&job, &references, &refined.uses);
+        report_invisible_references(&job, &references, &refined.uses);
         context.write_summary(&refined.text())
     }
 }
 
-/// The references that views are refined by: the first ones given, consistent with their
-/// photographs if the network learnt by such, without misleading ones.
+/// Returns the references to refine by: the first `max_references` given, consistent with their LR
+/// photographs if the network was trained on such views, without misleading ones.
 fn usable_references(
     job: &RefineJob<'_>,
     views: &Views,
@@ -115,16 +149,16 @@ fn usable_references(
 ) -> anyhow::Result<Vec<KnownView>> {
     let mut references =
         read_references(job.context, job.network.takes_references(), views.background)?;
-    references.truncate(params.max_references.map_or(usize::MAX, |most| most as usize));
-    if let Some(own) = job.photographs.as_ref().filter(|_| job.takes_consistent) {
+    references.truncate(params.max_references.map_or(usize::MAX, |count| count as usize));
+    if let Some(photographs) = job.photographs.as_ref().filter(|_| job.expects_consistent) {
         for reference in &mut references {
-            reference.rendered = own.make_consistent(reference.rendered.clone())?;
+            reference.rendered = photographs.make_consistent(reference.rendered.clone())?;
         }
     }
-    without_misleading(job, references, views, confidence)
+    remove_misleading(job, references, views, confidence)
 }
 
-/// Refines all views and writes their files; an earlier run's are taken as they are.
+/// Refines all views and writes their files, except those that an earlier run has written.
 fn refine_all(
     job: &RefineJob<'_>,
     views: &mut Views,
@@ -149,27 +183,29 @@ fn refine_all(
         summary.consistent += usize::from(refined.is_consistent);
         summary.means +=
             usize::from(job.enlarged.as_ref().is_some_and(|enlarged| enlarged.has(&view.camera)));
-        summary.uses.iter_mut().zip(&refined.uses).for_each(|(sum, of_use)| sum.add(of_use));
+        network::add_uses(&mut summary.uses, &refined.uses);
         view.depth = view.depth.as_ref().map(|_| image.clone());
         view.image = Some(image);
         progress.add(1);
     }
-    if job.takes_consistent && summary.consistent < summary.views {
+    if job.expects_consistent && summary.consistent < summary.views {
         job.context.say(
-            "the network was trained on views consistent with LR photographs of their own, which \
-            some of these haven't: train one without",
+            "the network was trained on views consistent with LR photographs of their own, but \
+            some of these views have none; train a network without input photographs",
         );
     }
     Ok(summary)
 }
 
-/// Says which references were of no use.
-fn say_unseen(job: &RefineJob<'_>, references: &[KnownView], uses: &[Use]) {
+/// Logs the references that no view's points are visible from.
+fn report_invisible_references(job: &RefineJob<'_>, references: &[KnownView], uses: &[Use]) {
     if job.network.guidance().is_none() {
         return;
     }
-    for (reference, _) in references.iter().zip(uses).filter(|(_, of_use)| of_use.seen == 0) {
-        let name = &reference.rendered.camera.name;
-        job.context.say(format!("reference {name} sees nothing of these views"));
+    for (i, reference) in references.iter().enumerate() {
+        if uses[i].seen == 0 {
+            let name = &reference.rendered.camera.name;
+            job.context.say(format!("reference {name} shows no part of these views"));
+        }
     }
 }

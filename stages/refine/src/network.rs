@@ -6,28 +6,28 @@ use refinement::{
     with_references,
 };
 
-use crate::params::Params;
+use crate::Params;
 
-/// A trained network of either kind.
+/// Trained network of either kind.
 pub(crate) enum AnyRefiner {
-    /// Ours.
+    /// Our network.
     Compact(Refiner),
-    /// The paper's, and how many reference patches each patch gets.
+    /// The paper's network, and the number of reference patches per patch.
     Paper(PaperRefiner, usize),
 }
 
-/// How a network is applied to every view.
+/// Settings for applying a network to every view.
 pub(crate) struct Application {
-    /// Share of the predicted residual that is added.
+    /// Fraction of the predicted residual that is added.
     pub(crate) residual_weight: f32,
-    /// Turned and mirrored versions whose residuals are averaged.
+    /// Number of rotated and mirrored versions whose residuals are averaged.
     pub(crate) self_ensemble: u32,
     /// Pixels by which patches of the paper's network overlap.
     pub(crate) overlap: usize,
 }
 
 impl Application {
-    /// As asked for, else as the network's training found best.
+    /// Returns the parameters' settings; the default residual weight is the best one in training.
     pub(crate) fn new(params: &Params, file: &RefinerFile) -> Self {
         Self {
             residual_weight: params.residual_weight.unwrap_or(file.residual_weight) as f32,
@@ -49,7 +49,7 @@ impl AnyRefiner {
         .bad_input("input refiner")
     }
 
-    /// How it takes references, where it is ours and does.
+    /// Returns the guidance by references, if the network is ours and takes references.
     pub(crate) fn guidance(&self) -> Option<Guidance> {
         let Self::Compact(network) = self else { return None };
         network.architecture().guidance
@@ -59,9 +59,8 @@ impl AnyRefiner {
         self.guidance().is_some() || matches!(self, Self::Paper(..))
     }
 
-    /// What the network makes of a view: colours in 0..1. What each reference was of use for is
-    /// added to `uses`.
-    pub(crate) fn redraw(
+    /// Refines a view to colours in 0..1, and adds each reference's use to `uses`.
+    pub(crate) fn refine(
         &self,
         rendered: &Rendered,
         references: &[KnownView],
@@ -80,7 +79,7 @@ impl AnyRefiner {
                     )?);
                 };
                 let conditioned = with_references(rendered, &references, guidance);
-                uses.iter_mut().zip(&conditioned.uses).for_each(|(sum, of_use)| sum.add(of_use));
+                add_uses(uses, &conditioned.uses);
                 Ok(network.refine_weighted(&conditioned.view, residual_weight, self_ensemble)?)
             }
             Self::Paper(network, patches) => {
@@ -94,11 +93,21 @@ impl AnyRefiner {
     }
 }
 
-/// Moves redrawn colours towards the view's where the weight is below 1, and beyond where it is
-/// above; in 0..1. The view has four channels, the redrawn image three.
-fn blend(view: &Image, drawn: &mut Image, weight: f32) {
-    for (to, from) in drawn.data.chunks_exact_mut(3).zip(view.data.chunks_exact(4)) {
-        (0..3).for_each(|c| to[c] = (from[c] + weight * (to[c] - from[c])).clamp(0.0, 1.0));
+/// Adds each reference's use to its sum.
+pub(crate) fn add_uses(sums: &mut [Use], uses: &[Use]) {
+    for (i, sum) in sums.iter_mut().enumerate() {
+        sum.add(&uses[i]);
+    }
+}
+
+/// Blends from the view (weight 0) to the redrawn image (weight 1) and beyond, clamped to 0..1. The
+/// view has four channels, the redrawn image three.
+fn blend(view: &Image, redrawn: &mut Image, weight: f32) {
+    for (i, to) in redrawn.data.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+        for c in 0..3 {
+            let from = view.data[4 * i + c];
+            to[c] = (from + weight * (to[c] - from)).clamp(0.0, 1.0);
+        }
     }
 }
 
@@ -107,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_weight_goes_from_the_view_to_what_was_redrawn() {
+    fn the_weight_blends_from_the_view_to_the_redrawn_image() {
         let view = Image::new(1, 1, 4, vec![0.2, 0.4, 0.9, 1.0]);
         for (weight, expected) in [
             (0.0, [0.2, 0.4, 0.9]),

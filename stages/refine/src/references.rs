@@ -3,51 +3,53 @@ use refinement::{Guidance, KnownView, Rendered, Use, with_references};
 use scene::{Background, View, Views};
 use stage::Context;
 
+use crate::network::add_uses;
 use crate::view::{RefineJob, read_view};
 
-/// The references that a reference-based network asks for; what another is given is said and left
-/// out.
+/// Reads the references of a network that takes them; for other networks, logs that references are
+/// ignored.
 pub(crate) fn read_references(
     context: &Context,
-    wanted: bool,
+    takes_references: bool,
     background: Background,
 ) -> anyhow::Result<Vec<KnownView>> {
     let given = context.optional_input("references").zip(context.optional_input("reference-views"));
     let Some((images, rendered)) = given else {
-        if wanted {
+        if takes_references {
             context.say(
-                "the network knows how to use references, but there are none: give inputs \
-                    references and reference-views",
+                "the network can use references, but none are given; give inputs references and \
+                reference-views",
             );
         }
         return Ok(Vec::new());
     };
-    if !wanted {
+    if !takes_references {
         context.say(
-            "the network was trained without references: those given are left out; set \
-                train-refine's parameter references_per_view",
+            "references are ignored: the network was trained without references; set \
+            train-refine.references_per_view",
         );
         return Ok(Vec::new());
     }
-    let (images_list, rendered_list) = (Views::read(images)?, Views::read(rendered)?);
+    let rendered_views = Views::read(rendered)?;
     let mut references = Vec::new();
-    for image in &images_list.views {
-        let name = &image.camera.name;
-        let Some(truth) = image.read_photograph(images).bad_input(format!("reference {name}"))?
+    for true_view in &Views::read(images)?.views {
+        let name = &true_view.camera.name;
+        let Some(truth) =
+            true_view.read_photograph(images).bad_input(format!("reference {name}"))?
         else {
             continue;
         };
-        let Some(view) = rendered_list.taken_by(&image.camera) else {
+        let Some(view) = rendered_views.taken_by(&true_view.camera) else {
             let message = format!(
-                "input reference-views: no view {name} with that pose; \
-                render it for input references"
+                "input reference-views: no view {name} with the reference's pose; render the \
+                cameras of input references"
             );
             return Err(Failure::BadInput(message).into());
         };
         let view = read_view(rendered, view, background.shown())?.0;
         let known = KnownView::new(view, truth.over(background.shown()))
             .bad_input("input reference-views")?;
-        let (reference, note) = same_exposure(known);
+        let (reference, note) = correct_exposure(known);
         if let Some(note) = note {
             context.say(note);
         }
@@ -56,39 +58,39 @@ pub(crate) fn read_references(
     Ok(references)
 }
 
-/// A reference as it would look with the exposure of the images that the field learnt from, and
-/// what to say where it had another.
-fn same_exposure(reference: KnownView) -> (KnownView, Option<String>) {
+/// Corrects a reference's exposure to that of the field's training images. Returns a log line if
+/// the exposure differed.
+fn correct_exposure(reference: KnownView) -> (KnownView, Option<String>) {
     let Some(exposure) = reference.exposure().filter(|exposure| !exposure.is_negligible()) else {
         return (reference, None);
     };
     let [r, g, b] = exposure.gain;
     let name = &reference.rendered.camera.name;
     let note = format!(
-        "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): taken back"
+        "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright); corrected"
     );
     (reference.with_corrected_exposure(&exposure), Some(note))
 }
 
-/// A reference is doubted where the confidence in it is less than this share of that in those of
-/// the downscaled field.
-const DOUBTED_BELOW: f64 = 0.75;
+/// Minimum confidence in a reference, relative to that in the references of the network's training,
+/// below which the reference's depth is tested (design note 018).
+const MIN_RELATIVE_CONFIDENCE: f64 = 0.75;
 
-/// A doubted reference stays if the confidence in it is at least so many times as high as with all
-/// depths nearer or farther by the share [`DEPTH_SHIFT`].
-const SENSITIVE_FROM: f64 = 1.1;
+/// Minimum ratio of the confidence in a tested reference to that with all depths shifted by
+/// [`DEPTH_SHIFT`]; above it, depths count as correct (design note 018).
+const MIN_DEPTH_SENSITIVITY: f64 = 1.1;
+/// Relative shift of depths in the test (design note 018).
 const DEPTH_SHIFT: f32 = 0.1;
 
-/// Views, spread over all, by which references are judged.
-const JUDGING_VIEWS: usize = 8;
+/// Maximum number of views, spread over all, by which references are judged; chosen by hand.
+const MAX_JUDGING_VIEWS: usize = 8;
 
-/// The references that agree with what is rendered; others are left out, and each is said once it
-/// is judged. In those, confidence is less than a share of what they see, unless it would be
-/// clearly less still were all depths others. Then depths are right, and confidence is low for
-/// another reason: seen from far aside, surfaces look otherwise.
+/// Removes references that disagree with the renders, and logs each removal as soon as the
+/// reference is judged. A reference with low confidence stays if confidence is even lower with
+/// shifted depths: then its depths are correct, and its surfaces look different from another angle.
 ///
 /// `confidence` is that in the references of the network's training.
-pub(crate) fn without_misleading(
+pub(crate) fn remove_misleading(
     job: &RefineJob<'_>,
     references: Vec<KnownView>,
     views: &Views,
@@ -97,74 +99,79 @@ pub(crate) fn without_misleading(
     let Some(guidance) = job.network.guidance().filter(|_| !references.is_empty()) else {
         return Ok(references);
     };
-    let shown = |view: &View| job.shown(view).map(|(rendered, ..)| rendered);
-    let say = |note: String| job.context.say(note);
-    Judge { views: &views.views, guidance, shown: &shown, say: &say }
-        .sort_out(references, confidence)
+    ReferenceJudge {
+        views: &views.views,
+        guidance,
+        read: &|view| Ok(job.read(view)?.rendered),
+        log: &|note| job.context.say(note),
+    }
+    .retain_reliable(references, confidence)
 }
 
-/// Judges references by some views.
-struct Judge<'a> {
+/// Test of references against some of the views to refine.
+struct ReferenceJudge<'a> {
     views: &'a [View],
     guidance: Guidance,
-    /// A view as the network takes it.
-    shown: &'a dyn Fn(&View) -> Result<Rendered, Failure>,
-    /// Says what is wrong with a reference.
-    say: &'a dyn Fn(String),
+    /// Reads a view in the form that the network takes.
+    read: &'a dyn Fn(&View) -> Result<Rendered, Failure>,
+    /// Logs a removed reference.
+    log: &'a dyn Fn(String),
 }
 
-impl Judge<'_> {
-    /// The references that aren't misleading. Each of the others is said as soon as it is judged.
-    fn sort_out(
+impl ReferenceJudge<'_> {
+    /// Returns the references that aren't misleading, and logs the others.
+    fn retain_reliable(
         &self,
         references: Vec<KnownView>,
         confidence: f64,
     ) -> anyhow::Result<Vec<KnownView>> {
         let shares = self.confidence(&references, self.guidance, 1.0)?;
-        let mut kept = Vec::new();
-        for (reference, share) in references.into_iter().zip(shares) {
-            if share >= DOUBTED_BELOW * confidence || self.has_right_depth(&reference)? {
-                kept.push(reference);
+        let mut reliable = Vec::new();
+        for (i, reference) in references.into_iter().enumerate() {
+            let is_confident = shares[i] >= MIN_RELATIVE_CONFIDENCE * confidence;
+            if is_confident || self.has_correct_depth(&reference)? {
+                reliable.push(reference);
                 continue;
             }
             let name = &reference.rendered.camera.name;
-            (self.say)(format!(
-                "reference {name} looks otherwise than what is rendered (confidence {:.0} %) and \
-                is left out: wrong depth, a wrong pose, or something that moved?",
-                100.0 * share
+            (self.log)(format!(
+                "reference {name} differs from the renders (confidence {:.0} %) and is left out: \
+                wrong depth, a wrong pose, or did something move?",
+                100.0 * shares[i]
             ));
         }
-        Ok(kept)
+        Ok(reliable)
     }
 
-    /// Whether confidence in a reference is clearly lower with all depths nearer and farther.
-    fn has_right_depth(&self, reference: &KnownView) -> anyhow::Result<bool> {
-        // At another depth a reference sees nothing by its own.
-        let blind = Guidance { occlusion: false, ..self.guidance };
-        let mut shares = [0.0; 3];
-        for (share, factor) in shares.iter_mut().zip([1.0, 1.0 - DEPTH_SHIFT, 1.0 + DEPTH_SHIFT]) {
-            *share = self.confidence(std::slice::from_ref(reference), blind, factor)?[0];
-        }
-        let [as_rendered, nearer, farther] = shares;
-        Ok(as_rendered >= SENSITIVE_FROM * f64::max(nearer, farther))
+    /// True if confidence in a reference is clearly lower with all depths nearer and farther.
+    fn has_correct_depth(&self, reference: &KnownView) -> anyhow::Result<bool> {
+        // With shifted depths, the reference's own depth would hide every point.
+        let guidance = Guidance { occlusion: false, ..self.guidance };
+        let reference = std::slice::from_ref(reference);
+        let unshifted = self.confidence(reference, guidance, 1.0)?[0];
+        let nearer = self.confidence(reference, guidance, 1.0 - DEPTH_SHIFT)?[0];
+        let farther = self.confidence(reference, guidance, 1.0 + DEPTH_SHIFT)?[0];
+        Ok(unshifted >= MIN_DEPTH_SENSITIVITY * f64::max(nearer, farther))
     }
 
-    /// Confidence in each reference, as a share of what it sees of the views, were depths so many
-    /// times what they are.
+    /// Returns the confidence in each reference, relative to its visibility in the views, with all
+    /// depths multiplied by a factor.
     fn confidence(
         &self,
         references: &[KnownView],
         guidance: Guidance,
         depth_factor: f32,
     ) -> anyhow::Result<Vec<f64>> {
-        let every = self.views.len().div_ceil(JUDGING_VIEWS).max(1);
+        let stride = self.views.len().div_ceil(MAX_JUDGING_VIEWS).max(1);
         let mut uses = vec![Use::default(); references.len()];
         let references: Vec<&KnownView> = references.iter().collect();
-        for view in self.views.iter().step_by(every) {
-            let mut shown = (self.shown)(view)?;
-            shown.depth.iter_mut().for_each(|depth| *depth *= depth_factor);
-            let conditioned = with_references(&shown, &references, guidance);
-            uses.iter_mut().zip(&conditioned.uses).for_each(|(sum, of_use)| sum.add(of_use));
+        for view in self.views.iter().step_by(stride) {
+            let mut rendered = (self.read)(view)?;
+            for depth in &mut rendered.depth {
+                *depth *= depth_factor;
+            }
+            let conditioned = with_references(&rendered, &references, guidance);
+            add_uses(&mut uses, &conditioned.uses);
         }
         Ok(uses.iter().map(Use::confidence_share).collect())
     }
@@ -223,7 +230,7 @@ mod tests {
     }
 
     /// Names of the references that are kept of four.
-    fn sorted(judge: &Judge<'_>, confidence: f64) -> anyhow::Result<Vec<String>> {
+    fn sorted(judge: &ReferenceJudge<'_>, confidence: f64) -> anyhow::Result<Vec<String>> {
         let right = 100.0;
         let tinted: Vec<[f32; 3]> =
             colours(right).into_iter().map(|[r, g, b]| [r + 0.04, g + 0.04, b]).collect();
@@ -233,7 +240,7 @@ mod tests {
             known("farther", right, &colours(right / 1.1)),
             known("other", right, &[[0.9; 3]; WIDTH * HEIGHT]),
         ];
-        let kept = judge.sort_out(references, confidence)?;
+        let kept = judge.retain_reliable(references, confidence)?;
         Ok(kept.into_iter().map(|reference| reference.rendered.camera.name).collect())
     }
 
@@ -244,19 +251,19 @@ mod tests {
         let rendered = known("view", 0.0, &colours(0.0)).rendered;
         let views = vec![View::camera_only(rendered.camera.clone()); 9];
         let asked = Cell::new(0);
-        let shown = |_: &View| {
+        let read = |_: &View| {
             asked.set(asked.get() + 1);
             Ok::<_, Failure>(rendered.clone())
         };
         let said = RefCell::new(Vec::new());
-        let say = |note: String| said.borrow_mut().push(note);
+        let log = |note: String| said.borrow_mut().push(note);
         let guidance = Guidance::default();
-        let judge = Judge { views: &views, guidance, shown: &shown, say: &say };
+        let judge = ReferenceJudge { views: &views, guidance, read: &read, log: &log };
         assert_eq!(sorted(&judge, 1.0).unwrap(), ["same", "tinted"]);
         // Per channel the farther wall differs by 0.0318, and (1 + 100 · 3 · 0.0318²)⁻² is 0.59.
         let starts = [
-            "reference farther looks otherwise than what is rendered (confidence 59 %)",
-            "reference other looks otherwise than what is rendered",
+            "reference farther differs from the renders (confidence 59 %)",
+            "reference other differs from the renders",
         ];
         let notes = said.take();
         assert_eq!(notes.len(), 2, "{notes:?}");
@@ -272,12 +279,12 @@ mod tests {
         said.borrow_mut().clear();
         let failing = |view: &View| {
             if asked.get() < 5 * (1 + 2 * 3) {
-                shown(view)
+                read(view)
             } else {
                 Err(Failure::BadInput("no view".to_owned()))
             }
         };
-        assert!(sorted(&Judge { shown: &failing, ..judge }, 1.0).is_err());
+        assert!(sorted(&ReferenceJudge { read: &failing, ..judge }, 1.0).is_err());
         let notes = said.take();
         assert!(notes.len() == 1 && notes[0].starts_with(starts[0]), "{notes:?}");
     }
@@ -290,10 +297,10 @@ mod tests {
     }
 
     #[test]
-    fn another_exposure_is_taken_back() {
-        let (reference, note) = same_exposure(seen([0.6, 0.7, 1.0]));
+    fn another_exposure_is_corrected() {
+        let (reference, note) = correct_exposure(seen([0.6, 0.7, 1.0]));
         let expected =
-            "reference a has another exposure (0.60, 0.70, 1.00 times as bright): taken back";
+            "reference a has another exposure (0.60, 0.70, 1.00 times as bright); corrected";
         assert_eq!(note.as_deref(), Some(expected));
         let off = reference
             .truth
@@ -306,7 +313,7 @@ mod tests {
         // What a field may get wrong, and an image that says nothing, stay as they are.
         for same in [seen([1.05, 0.95, 1.0]), known("a", 0.0, &[[1.0; 3]; WIDTH * HEIGHT])] {
             let truth = same.truth.clone();
-            let (reference, note) = same_exposure(same);
+            let (reference, note) = correct_exposure(same);
             assert!(reference.truth == truth && note.is_none(), "{note:?}");
         }
     }

@@ -1,42 +1,41 @@
 use artifact::counted;
 use refinement::Use;
 
-/// How the views of a run were refined.
+/// Statistics of a run for its summary.
 pub(crate) struct Summary {
-    /// Views.
+    /// Number of views.
     pub(crate) views: usize,
-    /// Views that are consistent with their own LR photographs.
+    /// Number of views made consistent with their own LR photographs.
     pub(crate) consistent: usize,
-    /// Views that are means with their enlarged photographs.
+    /// Number of views averaged with their enlarged photographs.
     pub(crate) means: usize,
-    /// Share of the predicted residual that was added.
+    /// Fraction of the predicted residual that was added.
     pub(crate) residual_weight: f32,
-    /// Whether the network says of what use references were.
+    /// True if the network reports the use of references.
     pub(crate) is_reference_based: bool,
-    /// What each reference was of use for.
+    /// Use of each reference, summed over the views.
     pub(crate) uses: Vec<Use>,
 }
 
 impl Summary {
-    /// One sentence.
+    /// Returns the summary as one sentence.
     pub(crate) fn text(&self) -> String {
-        let means = match self.means {
-            0 => String::new(),
-            count => format!("; {count} are means with their enlarged photographs"),
-        };
-        let consistent = match self.consistent {
-            0 => String::new(),
-            count => format!("; {count} of them agree with their own photographs"),
-        };
-        format!(
-            "{}{}, with {:.2} of what the network adds{means}{consistent}",
+        let mut text = format!(
+            "{}{}, residual weight {:.2}",
             counted(self.views, "view"),
             self.references(),
             self.residual_weight
-        )
+        );
+        if self.means > 0 {
+            text += &format!("; {} averaged with their enlarged photographs", self.means);
+        }
+        if self.consistent > 0 {
+            text += &format!("; {} consistent with their own photographs", self.consistent);
+        }
+        text
     }
 
-    /// By how many references, and how far these were trusted.
+    /// Describes the number of references and the mean confidence in them.
     fn references(&self) -> String {
         if self.uses.is_empty() {
             return String::new();
@@ -46,11 +45,13 @@ impl Summary {
             return format!(" by {references}");
         }
         let mut all = Use::default();
-        self.uses.iter().for_each(|of_use| all.add(of_use));
-        if all.seen == 0 {
-            return format!(" by {references} that see nothing of them");
+        for reference in &self.uses {
+            all.add(reference);
         }
-        format!(" by {references}, trusted by {:.0} %", 100.0 * all.confidence_share())
+        if all.seen == 0 {
+            return format!(" by {references} that show no part of them");
+        }
+        format!(" by {references} (confidence {:.0} %)", 100.0 * all.confidence_share())
     }
 }
 
@@ -68,7 +69,7 @@ mod tests {
             is_reference_based: false,
             uses: Vec::new(),
         };
-        assert_eq!(plain.text(), "1 view, with 0.80 of what the network adds");
+        assert_eq!(plain.text(), "1 view, residual weight 0.80");
         let seen = Use { seen: 10, visibility: 8.0, confidence: 4.0 };
         let by_references = Summary {
             views: 3,
@@ -80,10 +81,10 @@ mod tests {
         };
         assert_eq!(
             by_references.text(),
-            "3 views by 2 references, trusted by 50 %, with 0.80 of what the network adds; 1 are \
-             means with their enlarged photographs; 2 of them agree with their own photographs"
+            "3 views by 2 references (confidence 50 %), residual weight 0.80; 1 averaged with \
+             their enlarged photographs; 2 consistent with their own photographs"
         );
         let unseen = Summary { uses: vec![Use::default()], ..by_references };
-        assert!(unseen.text().starts_with("3 views by 1 reference that see nothing of them, "));
+        assert!(unseen.text().starts_with("3 views by 1 reference that show no part of them, "));
     }
 }

@@ -1,41 +1,37 @@
 use std::path::Path;
 
 use artifact::{Failure, GivenInput};
-use pixels::{Channel, ExrImage, Image, write_png};
+use pixels::{ExrImage, Image, write_png};
 use refinement::{KnownView, LrObservations, Rendered, Use};
 use scene::{Photograph, VIEW_CHANNELS, View, write_view_image};
 use serde::{Deserialize, Serialize};
 use stage::Context;
 
-use crate::enlarged::Enlarged;
+use crate::enlarged::EnlargedPhotographs;
 use crate::network::{AnyRefiner, Application};
 
-/// A rendered view, and its file's channels.
+/// Reads a rendered view, and all channels of its file.
 pub(crate) fn read_view(
     input: &GivenInput,
     view: &View,
     background: f32,
 ) -> Result<(Rendered, ExrImage), Failure> {
     Rendered::read(input, view, background)?.ok_or_else(|| {
-        Failure::BadInput(format!(
-            "input {}: view {}: it has no image",
-            input.name(),
-            view.camera.name
-        ))
+        Failure::BadInput(format!("input {}: view {} has no image", input.name(), view.camera.name))
     })
 }
 
-/// How a view was refined.
+/// Result of refining a view, which is stored for a resumed run.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct RefinedView {
-    /// Whether it was made consistent with its own LR observation.
+    /// True if the view was made consistent with its own LR photograph.
     #[serde(rename = "agreed")]
     pub(crate) is_consistent: bool,
-    /// What each reference was of use for.
+    /// Use of each reference.
     pub(crate) uses: Vec<Use>,
 }
 
-/// What all views share.
+/// Settings and inputs of all views.
 pub(crate) struct RefineJob<'a> {
     pub(crate) context: &'a Context,
     pub(crate) input: &'a GivenInput,
@@ -43,9 +39,19 @@ pub(crate) struct RefineJob<'a> {
     pub(crate) network: AnyRefiner,
     pub(crate) application: Application,
     pub(crate) photographs: Option<LrObservations<'a>>,
-    pub(crate) enlarged: Option<Enlarged<'a>>,
-    /// Whether the network was trained on views that are consistent with their own LR observations.
-    pub(crate) takes_consistent: bool,
+    pub(crate) enlarged: Option<EnlargedPhotographs<'a>>,
+    /// True if the network was trained on views consistent with their own LR photographs.
+    pub(crate) expects_consistent: bool,
+}
+
+/// View to refine.
+pub(crate) struct ViewToRefine {
+    /// Render in the form that the network takes.
+    pub(crate) rendered: Rendered,
+    /// All channels of the view's file.
+    file: ExrImage,
+    /// LR photograph of the same camera.
+    photograph: Option<Photograph>,
 }
 
 impl RefineJob<'_> {
@@ -56,47 +62,45 @@ impl RefineJob<'_> {
         references: &[KnownView],
         [image, preview]: [&str; 2],
     ) -> anyhow::Result<RefinedView> {
-        let (rendered, file, own) = self.shown(view)?;
+        let ViewToRefine { rendered, file, photograph } = self.read(view)?;
         let mut uses = vec![Use::default(); references.len()];
-        let redrawn = self.network.redraw(&rendered, references, &self.application, &mut uses)?;
-        let mean = match &self.enlarged {
-            Some(enlarged) => enlarged.mean(redrawn, &view.camera)?,
-            None => redrawn,
-        };
-        let refined = self.make_consistent(mean, own.as_ref());
+        let mut refined =
+            self.network.refine(&rendered, references, &self.application, &mut uses)?;
+        if let Some(enlarged) = &self.enlarged {
+            refined = enlarged.average_with(refined, &view.camera)?;
+        }
+        let refined = self.make_consistent(refined, photograph.as_ref());
         let path = self.context.output_path(image)?;
         write_recoloured(&path, &file, &refined, &rendered.opacity, self.background)?;
         write_png(&self.context.output_path(preview)?, &refined.to_rgba8())?;
-        Ok(RefinedView { is_consistent: own.is_some(), uses })
+        Ok(RefinedView { is_consistent: photograph.is_some(), uses })
     }
 
-    /// A view as the network takes it, its file's channels, and its own photograph.
-    pub(crate) fn shown(
-        &self,
-        view: &View,
-    ) -> Result<(Rendered, ExrImage, Option<Photograph>), Failure> {
-        let (rendered, image) = read_view(self.input, view, self.background)?;
-        let own = match &self.photographs {
+    /// Reads a view.
+    pub(crate) fn read(&self, view: &View) -> Result<ViewToRefine, Failure> {
+        let (mut rendered, file) = read_view(self.input, view, self.background)?;
+        let photograph = match &self.photographs {
             Some(photographs) => photographs.photograph(&view.camera)?,
             None => None,
         };
-        if !self.takes_consistent {
-            return Ok((rendered, image, own));
+        if self.expects_consistent {
+            let colours = self.make_consistent(rendered.colours(), photograph.as_ref());
+            rendered = rendered.with_colours(&colours);
         }
-        let colours = self.make_consistent(rendered.colours(), own.as_ref());
-        Ok((rendered.with_colours(&colours), image, own))
+        Ok(ViewToRefine { rendered, file, photograph })
     }
 
-    /// An image of a view that is consistent with its own LR observation, where there is one.
-    fn make_consistent(&self, image: Image, own: Option<&Photograph>) -> Image {
-        match self.photographs.as_ref().zip(own) {
-            Some((photographs, own)) => photographs.project(&image, own),
-            None => image,
+    /// Makes an image of a view consistent with the view's LR photograph, if any.
+    fn make_consistent(&self, image: Image, photograph: Option<&Photograph>) -> Image {
+        match (&self.photographs, photograph) {
+            (Some(photographs), Some(photograph)) => photographs.project(&image, photograph),
+            _ => image,
         }
     }
 }
 
-/// Writes a view's file with other colours, composited on the background; its other channels stay.
+/// Writes a view's file with new colours, which are composited on the background. The other
+/// channels stay unchanged.
 fn write_recoloured(
     path: &Path,
     image: &ExrImage,
@@ -104,24 +108,24 @@ fn write_recoloured(
     opacity: &[f32],
     background: f32,
 ) -> anyhow::Result<()> {
-    // None where a channel is a colour.
-    let kept: Vec<(Channel, Option<&[f32]>)> = VIEW_CHANNELS
-        .into_iter()
-        .enumerate()
-        .filter_map(|(i, channel)| {
-            Some((channel, image.channel(channel.name).map(|s| (i >= 3).then_some(s))?))
-        })
-        .collect();
-    let channels: Vec<Channel> = kept.iter().map(|(c, _)| *c).collect();
+    let (mut channels, mut samples_of) = (Vec::new(), Vec::new());
+    for channel in VIEW_CHANNELS {
+        if let Some(samples) = image.channel(channel.name) {
+            channels.push(channel);
+            samples_of.push(samples);
+        }
+    }
     let size = (image.width, image.height);
-    write_view_image(path, size, &channels, |first, rows, samples| {
-        let pixels = first * image.width..(first + rows) * image.width;
-        for (i, sample) in pixels.zip(samples.chunks_exact_mut(kept.len())) {
-            for (c, (value, (_, same))) in sample.iter_mut().zip(&kept).enumerate() {
-                *value = same.map_or_else(
-                    || refined.data[i * 3 + c] - (1.0 - opacity[i]) * background,
-                    |s| s[i],
-                );
+    write_view_image(path, size, &channels, |first, _, samples| {
+        for (i, pixel) in samples.chunks_exact_mut(channels.len()).enumerate() {
+            let i = first * image.width + i;
+            for (c, value) in pixel.iter_mut().enumerate() {
+                // The first three channels are R, G and B.
+                *value = if c < 3 {
+                    refined.data[i * 3 + c] - (1.0 - opacity[i]) * background
+                } else {
+                    samples_of[c][i]
+                };
             }
         }
         Ok(())
@@ -134,7 +138,7 @@ mod tests {
 
     use super::*;
 
-    /// Two pixels, the second half transparent.
+    /// Writes and reads two pixels, the second half transparent.
     fn rendered(folder: &Path) -> ExrImage {
         let path = folder.join("rendered.exr");
         let pixels = [[0.5, 0.25, 0.125, 1.0, 2.0, 2.5], [0.25, 0.25, 0.25, 0.5, 3.0, 3.5]];

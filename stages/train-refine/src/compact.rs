@@ -6,25 +6,26 @@ use refinement::{
 };
 use stage::Context;
 
-use crate::examples::{Examples, lr_observations};
+use crate::examples::{Examples, lr_photographs};
 use crate::params::CompactParams;
-use crate::said::say;
+use crate::report_gain;
 use crate::steps::train;
 
 /// Trains our network by internal learning.
 pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::Result<()> {
     if net.patch_size % 2 == 1 {
         return Err(Failure::Usage(format!(
-            "parameter patch_size: {} is odd; an even number is expected",
+            "parameter patch_size: expected an even number, found {}",
             net.patch_size
         ))
         .into());
     }
-    let own = lr_observations(context)?;
-    let examples = Examples::read(context.input("views")?, context.input("truth")?, own.as_ref())?;
+    let photographs = lr_photographs(context)?;
+    let examples =
+        Examples::read(context.input("views")?, context.input("truth")?, photographs.as_ref())?;
     if net.references_per_view > 0 && examples.training.len() < 2 {
         return Err(Failure::BadInput(
-            "input views: one view has no others for references".to_owned(),
+            "input views: references_per_view needs at least two views".to_owned(),
         )
         .into());
     }
@@ -54,8 +55,8 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         rendered_psnr: scores.rendered_psnr,
         refined_psnr: scores.refined_psnr,
         confidence: scores.confidence,
-        data_consistent: own.is_some(),
+        data_consistent: photographs.is_some(),
     };
     context.write_json(REFINER_FILE, &file)?;
-    say(context, "views it hasn't seen", &file)
+    report_gain(context, "views left out of training", &file)
 }

@@ -3,20 +3,20 @@ use refinement::{KnownView, LrObservations, Rendered};
 use scene::{View, Views};
 use stage::Context;
 
-/// One view in so many is left out of training.
+/// Every n-th view is left out of training (design note 015).
 const HOLD_OUT_EVERY: usize = 8;
 
-/// Views whose truth is known.
+/// Views with ground truth.
 #[derive(Debug)]
 pub(crate) struct Examples<T = KnownView> {
-    /// Those to train on.
+    /// Views to train on.
     pub(crate) training: Vec<T>,
-    /// Those by which the network is judged.
+    /// Views to score the network on.
     pub(crate) left_out: Vec<T>,
 }
 
 impl<T: Clone> Examples<T> {
-    /// Every eighth is left out, the middle one of each eight; a single one is both.
+    /// Leaves out the middle one of each eight views; a single view is used for both.
     fn split(all: Vec<T>) -> Self {
         if all.len() == 1 {
             return Self { training: all.clone(), left_out: all };
@@ -32,23 +32,25 @@ impl<T: Clone> Examples<T> {
 }
 
 impl Examples {
-    /// Rendered views beside their truth; consistent with `own` photographs where these are given.
+    /// Reads rendered views and their truth, and makes the views consistent with LR `photographs`
+    /// if given.
     pub(crate) fn read(
         views: &GivenInput,
         truth: &GivenInput,
-        own: Option<&LrObservations<'_>>,
+        photographs: Option<&LrObservations<'_>>,
     ) -> Result<Self, Failure> {
-        let (rendered, known) = (Views::read(views)?, Views::read(truth)?);
+        let true_views = Views::read(truth)?;
+        let background = true_views.background.shown();
+        let sources = Sources { views, truth, photographs, background };
         let mut all = Vec::new();
-        for view in &rendered.views {
-            if let Some(true_view) = known.taken_by(&view.camera) {
-                let sources = Sources { views, truth, own, background: known.background.shown() };
+        for view in &Views::read(views)?.views {
+            if let Some(true_view) = true_views.taken_by(&view.camera) {
                 all.extend(sources.read(view, true_view)?);
             }
         }
         if all.is_empty() {
             return Err(Failure::BadInput(
-                "input views: none of them has an image, by name and pose, in input truth"
+                "input views: no view has an image in input truth with the same name and pose"
                     .to_owned(),
             ));
         }
@@ -56,49 +58,49 @@ impl Examples {
     }
 }
 
-/// Where an example comes from.
+/// Inputs of the examples.
 struct Sources<'a> {
     views: &'a GivenInput,
     truth: &'a GivenInput,
-    own: Option<&'a LrObservations<'a>>,
+    photographs: Option<&'a LrObservations<'a>>,
     background: f32,
 }
 
 impl Sources<'_> {
-    /// A view beside its truth; none where one of them has no image.
+    /// Reads a view and its truth; `None` if one of them has no image.
     fn read(&self, view: &View, true_view: &View) -> Result<Option<KnownView>, Failure> {
-        let place = || format!("view {}", view.camera.name);
-        let Some(photograph) = true_view.read_photograph(self.truth).bad_input(place())? else {
-            return Ok(None);
-        };
+        let truth = true_view
+            .read_photograph(self.truth)
+            .bad_input(format!("view {}", view.camera.name))?;
+        let Some(truth) = truth else { return Ok(None) };
         let Some((mut rendered, _)) = Rendered::read(self.views, view, self.background)? else {
             return Ok(None);
         };
-        if let Some(own) = self.own {
-            rendered = own.make_consistent(rendered)?;
+        if let Some(photographs) = self.photographs {
+            rendered = photographs.make_consistent(rendered)?;
         }
-        let truth = photograph.over(self.background);
-        Ok(Some(KnownView::new(rendered, truth).bad_input("input views")?))
+        let known = KnownView::new(rendered, truth.over(self.background));
+        Ok(Some(known.bad_input("input views")?))
     }
 }
 
-/// LR photographs of the downscaled field's views, where those of the views to be refined will be
-/// known, too: the task is to be the same.
-pub(crate) fn lr_observations(context: &Context) -> Result<Option<LrObservations<'_>>, Failure> {
+/// Reads the LR photographs of the downscaled field's views, if the views to be refined will have
+/// LR photographs, too: training and application must have the same task.
+pub(crate) fn lr_photographs(context: &Context) -> Result<Option<LrObservations<'_>>, Failure> {
     let Some((photographs, cameras)) =
         context.optional_input("photographs").zip(context.optional_input("cameras"))
     else {
         return Ok(None);
     };
-    let own = LrObservations::read(photographs)?;
-    if !own.cover(&Views::read(cameras)?) {
+    let photographs = LrObservations::read(photographs)?;
+    if !photographs.cover(&Views::read(cameras)?) {
         return Ok(None);
     }
     context.say(
-        "all views to be refined have LR photographs of their own: the network learns on views \
-        that are consistent with theirs",
+        "all views to be refined have LR photographs of their own: the network is trained on views \
+        consistent with theirs",
     );
-    Ok(Some(own))
+    Ok(Some(photographs))
 }
 
 #[cfg(test)]
@@ -114,7 +116,7 @@ mod tests {
 
     const SIDE: usize = 4;
 
-    /// A view from so far to the right; its image, if any, is the file of its name.
+    /// View at a distance to the right; its image, if any, is the file of its name.
     fn view(name: &str, right: f64, extension: Option<&str>) -> View {
         let camera = Camera {
             name: name.to_owned(),
@@ -125,7 +127,7 @@ mod tests {
         View { image, ..View::camera_only(camera) }
     }
 
-    /// An input with such views: half transparent ones are rendered, photographs are grey.
+    /// Writes an input: rendered views are half transparent, photographs are grey.
     fn input(dir: &Path, name: &str, views: Vec<View>) -> GivenInput {
         let folder = dir.join(name);
         std::fs::create_dir(&folder).unwrap();
@@ -156,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn views_stand_beside_their_truth() {
+    fn views_are_read_with_their_truth() {
         let dir = tempfile::tempdir().unwrap();
         let exr = Some("exr");
         let views = vec![
@@ -192,7 +194,7 @@ mod tests {
         let Err(Failure::BadInput(said)) = Examples::read(&views, &truth, None) else {
             panic!("they have none");
         };
-        assert!(said.starts_with("input views: none of them has an image"), "{said}");
+        assert!(said.starts_with("input views: no view has an image"), "{said}");
     }
 
     #[test]

@@ -1,42 +1,40 @@
-//! `train-refine`: trains the network that refines rendered views, from views whose truth is known.
+//! `train-refine`: trains the network that refines rendered views, from views with ground truth.
 //!
-//! This is internal learning; in the pipeline the views are of the downscaled field: a field
-//! trained from LR images that were shrunk once more, rendered at LR size, beside the LR images
-//! themselves. So it sees LR images alone, and the scene it is for.
+//! In the pipeline this is internal learning (design note 015): the views are LR-size renders of
+//! the downscaled field, which is trained from LR images shrunk once more, and their truth is the
+//! LR images. So the network is trained on LR images of its own scene alone.
 //!
-//! For views that will be refined by references, it sees references in training, too: other views
-//! of the downscaled field, of which every one has its true image.
+//! For refinement by references, training uses references, too: other views of the downscaled
+//! field, each with its true image.
 //!
-//! Where all views to be refined (input `cameras`) have LR photographs of their own, as in the
-//! paper's split, they are made consistent with those before the network sees them; so do the views
-//! that it learns from.
+//! If all views to be refined (input `cameras`) have LR photographs of their own, as in the paper's
+//! split, they will be consistent with these before refinement, and so are the training views.
 //!
-//! Every eighth view is left out of training; what the network brings there is measured and kept
-//! with it.
+//! Every eighth view is left out of training; the network's gain on these views is stored with it.
 //!
-//! `net: paper` trains the published network instead, on the rendered views of references beside
-//! the references (block `train-paper`): that is for comparison, and takes weeks on a CPU.
+//! `net: paper` trains the published network on renders of the references' views (block
+//! `train-paper`), for comparison; this takes weeks on a CPU.
 
 mod compact;
 mod examples;
 mod paper;
 mod params;
-mod said;
 mod steps;
 
 use contract::{Input, Output};
+use refinement::RefinerFile;
 use stage::{Context, Stage};
 
 pub use params::{CompactParams, Net, PaperParams, Params};
 
-/// The stage.
+/// Stage `train-refine`.
 pub struct TrainRefine;
 
 impl Stage for TrainRefine {
     type Params = Params;
     const NAME: &'static str = "train-refine";
     const SUMMARY: &'static str =
-        "Trains the network that refines rendered views, from views whose truth is known.";
+        "Trains the network that refines rendered views, from views with ground truth.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
         let cameras =
@@ -47,30 +45,29 @@ impl Stage for TrainRefine {
                 "truth",
                 Input::required(
                     &["scene/train", "scene/truth", "scene/references"],
-                    "what they should look like",
+                    "ground truth of the views",
                 ),
             ),
             (
                 "photographs",
                 Input::optional(
                     &["scene/train"],
-                    "net: compact: LR photographs that the field which rendered them was trained \
-                    on",
+                    "net: compact: LR photographs that the rendered field was trained on",
                 ),
             ),
             (
                 "cameras",
                 Input::optional(
                     &cameras,
-                    "net: compact: cameras of the views to be refined; where all have LR \
-                    photographs, so have examples",
+                    "net: compact: cameras of the views to be refined; if all have LR photographs, \
+                    training views are made consistent with theirs",
                 ),
             ),
             (
                 "weights",
                 Input::optional(
                     &["weights"],
-                    "net: paper: folder with VGG-19, for the perceptual loss; without it L1 alone",
+                    "net: paper: folder with VGG-19 for the perceptual loss; without it, L1 alone",
                 ),
             ),
         ]
@@ -87,4 +84,15 @@ impl Stage for TrainRefine {
             Net::Paper(net) => paper::run(context, net, params.seed),
         }
     }
+}
+
+/// Logs the network's gain on some views, and writes it as the stage's summary.
+fn report_gain(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
+    let RefinerFile { rendered_psnr, refined_psnr, residual_weight, .. } = file;
+    let summary = format!(
+        "{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight \
+        {residual_weight:.2})"
+    );
+    context.say(&summary);
+    context.write_summary(&summary)
 }

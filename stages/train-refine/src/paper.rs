@@ -6,14 +6,14 @@ use stage::Context;
 
 use crate::examples::Examples;
 use crate::params::PaperParams;
-use crate::said::say;
+use crate::report_gain;
 use crate::steps::train;
 
-/// Files with VGG-19's weights: all of them as torchvision names them, or the first blocks in
+/// File names of VGG-19's weights: all layers with torchvision's names, or the first blocks in
 /// Caffe's scaling.
-const VGG: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetensors"];
+const VGG_FILES: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetensors"];
 
-/// Trains the published network. It learns from all views there are, as published: from one.
+/// Trains the published network on all given views; the publication uses one.
 pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow::Result<()> {
     let Examples { training: mut known, left_out } =
         Examples::read(context.input("views")?, context.input("truth")?, None)?;
@@ -29,12 +29,12 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
         seed,
     };
     options.check(&known).bad_input("input truth")?;
-    let perceptual = context.optional_input("weights").map(perceptual).transpose()?;
+    let perceptual = context.optional_input("weights").map(read_perceptual_loss).transpose()?;
     context.say(match &perceptual {
         Some(loss) => {
-            format!("L1 and the perceptual loss of {} of VGG-19's 5 blocks", loss.blocks())
+            format!("loss: L1 and perceptual, by {} of VGG-19's 5 blocks", loss.blocks())
         }
-        None => "L1 alone: give input weights for the perceptual loss".to_owned(),
+        None => "loss: L1 alone; give input weights for the perceptual loss".to_owned(),
     });
     let width = params.features;
     let network = PaperRefiner::new(width, seed)?;
@@ -44,10 +44,10 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     let (mut rendered, mut refined) = (0.0, 0.0);
     let share = 1.0 / known.len() as f64;
     for view in &known {
-        let drawn =
+        let redrawn =
             trainer.network().refine(&view.rendered, &[view], options.references, OVERLAP)?;
         rendered += share * psnr(&view.rendered.colours(), &view.truth);
-        refined += share * psnr(&drawn, &view.truth);
+        refined += share * psnr(&redrawn, &view.truth);
     }
     let network = Network::Paper { width, patches: params.patches };
     let file = RefinerFile {
@@ -59,16 +59,17 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
         data_consistent: false,
     };
     context.write_json(REFINER_FILE, &file)?;
-    say(context, "the references that it learnt from", &file)
+    report_gain(context, "training references", &file)
 }
 
-fn perceptual(input: &GivenInput) -> Result<PerceptualLoss, Failure> {
-    let file = VGG.iter().map(|name| input.path(name)).find(|path| path.is_file());
-    let file = file.unwrap_or_else(|| input.path(VGG[0]));
+/// Reads the first existing file of VGG-19's weights.
+fn read_perceptual_loss(input: &GivenInput) -> Result<PerceptualLoss, Failure> {
+    let file = VGG_FILES.iter().map(|name| input.path(name)).find(|path| path.is_file());
+    let file = file.unwrap_or_else(|| input.path(VGG_FILES[0]));
     PerceptualLoss::read(&file).bad_input("input weights")
 }
 
-/// PSNR of two images of one size, in dB.
+/// Returns the PSNR of two images of one size in dB.
 fn psnr(image: &Image, truth: &Image) -> f64 {
     let squares = image.data.iter().zip(&truth.data).map(|(a, b)| f64::from(a - b).powi(2));
     psnr_of(squares.sum::<f64>() / truth.data.len() as f64)

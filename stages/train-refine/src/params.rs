@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Kind of network: ours, or the paper's, which takes weeks on a CPU.
+    /// Kind of network: ours, or the paper's, whose training takes weeks on a CPU.
     #[schemars(extend("x-group" = "network"))]
     pub net: Net,
     /// Seed of all random numbers.
@@ -13,7 +13,7 @@ pub struct Params {
     pub seed: u64,
 }
 
-/// The networks, each with its own parameters.
+/// Kind of network, with the parameters of that kind.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Net {
@@ -33,33 +33,33 @@ impl Default for Net {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct CompactParams {
-    /// Steps of training.
+    /// Number of training steps.
     #[schemars(range(min = 1), extend("x-group" = "optimiser"))]
     pub steps: u64,
-    /// Patches in a step.
+    /// Number of patches per step.
     #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
     pub batch: u32,
-    /// Pixels along a patch's side; an even number.
+    /// Pixels along each side of a patch, even.
     #[schemars(range(min = 8, max = 1024), extend("x-group" = "sampling"))]
     pub patch_size: u32,
     /// Highest learning rate.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
     pub rate: f64,
-    /// Features of the hidden layers.
+    /// Number of features of the hidden layers.
     #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
     pub features: u32,
-    /// Residual blocks, of two layers each.
+    /// Number of residual blocks, of two layers each.
     #[schemars(range(min = 0, max = 64), extend("x-group" = "network"))]
     pub blocks: u32,
-    /// References that each view gets while the network learns: as many as it will have when views
-    /// are refined. 0 trains a network without references.
+    /// Number of references per view during training, which should equal that during refinement. 0
+    /// trains a network without references.
     #[schemars(range(min = 0, max = 64), extend("x-group" = "data"))]
     pub references_per_view: u32,
-    /// A reference shows only points that it sees by its own depth. Without this, it also shows
-    /// points that something hides; for comparisons.
+    /// Uses only points of a view that are visible from the reference by the reference's own depth.
+    /// Without this, hidden points are used, too; for comparisons.
     #[schemars(extend("x-group" = "data"))]
     pub occlusion: bool,
-    /// Moves warped references by up to two pixels to fit the render; for comparisons.
+    /// Shifts warped references by up to two pixels to fit the render; for comparisons.
     #[schemars(extend("x-group" = "data"))]
     pub alignment: bool,
 }
@@ -84,22 +84,22 @@ impl Default for CompactParams {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PaperParams {
-    /// Steps of training.
+    /// Number of training steps.
     #[schemars(range(min = 1), extend("x-group" = "optimiser"))]
     pub steps: u64,
-    /// Patches in a step.
+    /// Number of patches per step.
     #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
     pub batch: u32,
-    /// Pixels along a patch's side; a multiple of 8.
+    /// Pixels along each side of a patch, a multiple of 8.
     #[schemars(range(min = 8, max = 1024), extend("x-group" = "sampling"))]
     pub patch_size: u32,
     /// Highest learning rate.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
     pub rate: f64,
-    /// Features of the first layer.
+    /// Number of features of the first layer.
     #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
     pub features: u32,
-    /// Reference patches that a patch gets.
+    /// Number of reference patches per patch.
     #[schemars(range(min = 1, max = 64), extend("x-group" = "data"))]
     pub patches: u32,
 }

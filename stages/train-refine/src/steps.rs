@@ -6,20 +6,21 @@ use artifact::Failure;
 use refinement::{KnownView, RefinementError, Training};
 use stage::Context;
 
-/// Steps between two notes of how the training goes.
-const STEPS_BETWEEN_NOTES: u64 = 50;
-/// Longest time without a note.
-const LONGEST_SILENCE: Duration = Duration::from_secs(10);
-/// Checkpoints take at most one part in so many of the time.
-const TIME_PER_CHECKPOINT: u32 = 50;
+/// Steps between two progress reports; chosen by hand.
+const STEPS_PER_REPORT: u64 = 50;
+/// Maximum time between two progress reports; chosen by hand.
+const MAX_REPORT_INTERVAL: Duration = Duration::from_secs(10);
+/// Minimum ratio of the time between two checkpoints to the time that one takes; chosen by hand.
+const MIN_CHECKPOINT_INTERVAL_RATIO: u32 = 50;
 
-/// Takes all steps that an earlier run hasn't; `note` says in words how large errors are.
+/// Trains to the end, from the checkpoint of an earlier run if there is one. `format_error` formats
+/// a mean error for the progress bar.
 pub(crate) fn train(
     context: &Context,
     steps: u64,
     trainer: &mut impl Training,
     examples: &[KnownView],
-    note: impl Fn(f64) -> String,
+    format_error: impl Fn(f64) -> String,
 ) -> anyhow::Result<()> {
     let checkpoint = context.work().map(|work| work.join("checkpoint.safetensors"));
     if let Some(path) = checkpoint.as_deref().filter(|p| p.exists()) {
@@ -31,38 +32,39 @@ pub(crate) fn train(
         examples,
         checkpoint.as_deref(),
         || context.is_interrupted(),
-        |done, mean| progress.set(done, &note(mean)),
+        |done, mean| progress.set(done, &format_error(mean)),
     )
 }
 
-/// Goes on from a checkpoint, or starts over where it can't be used; says which.
+/// Resumes from a checkpoint, or starts over if the checkpoint can't be used. Returns a log line.
 fn resume(trainer: &mut impl Training, checkpoint: &Path) -> String {
     match trainer.resume(checkpoint) {
-        Ok(()) => format!("going on from step {}", trainer.steps()),
+        Ok(()) => format!("resuming from step {}", trainer.steps()),
         Err(error) => format!("{error}; starting over"),
     }
 }
 
-/// Takes all steps that are left, and writes a checkpoint now and then. Fails once it is
-/// interrupted, after a last checkpoint. `tell` gets the steps taken and the mean error since it
-/// was last told.
+/// Takes the remaining steps and writes checkpoints. Writes a last checkpoint and fails if the run
+/// is interrupted. `report` gets the number of steps and the mean error since the last report.
 fn take_steps(
     trainer: &mut impl Training,
     examples: &[KnownView],
     checkpoint: Option<&Path>,
     interrupted: impl Fn() -> bool,
-    tell: impl Fn(u64, f64),
+    report: impl Fn(u64, f64),
 ) -> anyhow::Result<()> {
-    let (mut written, mut took) = (Instant::now(), Duration::from_millis(20));
-    let (mut sum, mut since, mut noted) = (0.0, 0u64, Instant::now());
+    let mut last_checkpoint = Instant::now();
+    let mut checkpoint_time = Duration::from_millis(20);
+    let mut last_report = Instant::now();
+    let (mut loss_sum, mut loss_count) = (0.0, 0u64);
     loop {
         let is_interrupted = interrupted();
-        if let Some(path) =
-            checkpoint.filter(|_| is_interrupted || written.elapsed() > TIME_PER_CHECKPOINT * took)
-        {
+        let is_due = last_checkpoint.elapsed() > MIN_CHECKPOINT_INTERVAL_RATIO * checkpoint_time;
+        if let Some(path) = checkpoint.filter(|_| is_interrupted || is_due) {
             let started = Instant::now();
             write_checkpoint(trainer, path).context("cannot write the checkpoint")?;
-            (written, took) = (Instant::now(), started.elapsed());
+            last_checkpoint = Instant::now();
+            checkpoint_time = started.elapsed();
         }
         if is_interrupted {
             return Err(Failure::Interrupted.into());
@@ -72,14 +74,17 @@ fn take_steps(
             error => anyhow::Error::from(error),
         })?;
         let Some(loss) = loss else { return Ok(()) };
-        (sum, since) = (sum + loss, since + 1);
-        if since == STEPS_BETWEEN_NOTES || noted.elapsed() > LONGEST_SILENCE {
-            tell(trainer.steps(), sum / since as f64);
-            (sum, since, noted) = (0.0, 0u64, Instant::now());
+        loss_sum += loss;
+        loss_count += 1;
+        if loss_count == STEPS_PER_REPORT || last_report.elapsed() > MAX_REPORT_INTERVAL {
+            report(trainer.steps(), loss_sum / loss_count as f64);
+            (loss_sum, loss_count) = (0.0, 0);
+            last_report = Instant::now();
         }
     }
 }
 
+/// Writes a checkpoint and replaces the previous one atomically.
 fn write_checkpoint(trainer: &impl Training, path: &Path) -> anyhow::Result<()> {
     let partial = path.with_extension("partial");
     trainer.write_checkpoint(&partial)?;
@@ -96,13 +101,13 @@ mod tests {
 
     const STEPS: u64 = 120;
 
-    /// A training whose errors are 1, 2, 3, …; its checkpoint is the number of steps as text.
+    /// Training whose errors are 1, 2, 3, …; its checkpoint is the number of steps as text.
     #[derive(Default)]
     struct Counting {
         steps: u64,
-        /// Steps that this run took.
+        /// Number of steps of this run.
         taken: u64,
-        /// What the step after so many ends with.
+        /// Error of the step after a number of steps.
         failure: Option<(u64, RefinementError)>,
     }
 
@@ -137,12 +142,12 @@ mod tests {
         RefinementError::View { name: "checkpoint".to_owned(), reason: reason.to_owned() }
     }
 
-    /// Takes steps without checkpoints; how it ended, and what was told.
-    fn told_by(trainer: &mut Counting) -> (anyhow::Result<()>, Vec<(u64, f64)>) {
-        let told = RefCell::new(Vec::new());
-        let tell = |done, mean| told.borrow_mut().push((done, mean));
-        let ended = take_steps(trainer, &[], None, || false, tell);
-        (ended, told.into_inner())
+    /// Takes steps without checkpoints; returns the result and the reports.
+    fn reports_of(trainer: &mut Counting) -> (anyhow::Result<()>, Vec<(u64, f64)>) {
+        let reports = RefCell::new(Vec::new());
+        let report = |done, mean| reports.borrow_mut().push((done, mean));
+        let ended = take_steps(trainer, &[], None, || false, report);
+        (ended, reports.into_inner())
     }
 
     #[test]
@@ -151,8 +156,8 @@ mod tests {
         let checkpoint = folder.path().join("checkpoint");
         std::fs::write(&checkpoint, "100").unwrap();
         let mut trainer = Counting::default();
-        assert_eq!(resume(&mut trainer, &checkpoint), "going on from step 100");
-        told_by(&mut trainer).0.unwrap();
+        assert_eq!(resume(&mut trainer, &checkpoint), "resuming from step 100");
+        reports_of(&mut trainer).0.unwrap();
         assert_eq!((trainer.steps, trainer.taken), (STEPS, 20));
     }
 
@@ -164,12 +169,12 @@ mod tests {
         let mut trainer = Counting::default();
         let said = resume(&mut trainer, &checkpoint);
         assert_eq!(said, "view checkpoint: no number; starting over");
-        told_by(&mut trainer).0.unwrap();
+        reports_of(&mut trainer).0.unwrap();
         assert_eq!((trainer.steps, trainer.taken), (STEPS, STEPS));
     }
 
     #[test]
-    fn an_interruption_leaves_a_checkpoint_to_go_on_from() {
+    fn an_interruption_leaves_a_checkpoint_to_resume_from() {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join("checkpoint");
         let mut trainer = Counting::default();
@@ -182,8 +187,8 @@ mod tests {
         assert_eq!(std::fs::read_to_string(&checkpoint).unwrap(), "3");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing partial is left");
         let mut trainer = Counting::default();
-        assert_eq!(resume(&mut trainer, &checkpoint), "going on from step 3");
-        told_by(&mut trainer).0.unwrap();
+        assert_eq!(resume(&mut trainer, &checkpoint), "resuming from step 3");
+        reports_of(&mut trainer).0.unwrap();
         assert_eq!(trainer.taken, STEPS - 3);
     }
 
@@ -207,17 +212,17 @@ mod tests {
             (refused("another size"), "view checkpoint: another size", 1),
         ] {
             let mut trainer = Counting { failure: Some((7, error)), ..Counting::default() };
-            let failure = told_by(&mut trainer).0.unwrap_err();
+            let failure = reports_of(&mut trainer).0.unwrap_err();
             assert_eq!((failure.to_string().as_str(), exit_code(&failure)), (words, code));
             assert_eq!(trainer.taken, 7);
         }
     }
 
     #[test]
-    fn a_note_is_the_mean_since_the_last_one() {
-        let (ended, told) = told_by(&mut Counting::default());
+    fn a_report_is_the_mean_since_the_last_one() {
+        let (ended, reports) = reports_of(&mut Counting::default());
         ended.unwrap();
-        // Of 1 to 50, and of 51 to 100; 20 more make no note.
-        assert_eq!(told, [(50, 25.5), (100, 75.5)]);
+        // Means of 1 to 50 and of 51 to 100; 20 more steps make no report.
+        assert_eq!(reports, [(50, 25.5), (100, 75.5)]);
     }
 }
