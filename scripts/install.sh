@@ -21,7 +21,7 @@ commands=(nerf-sr)
 programs=("${commands[@]}")
 for folder in stages/*/; do
   name=$(basename "$folder")
-  case $name in common | runner | remote) ;; *) programs+=("$name") ;; esac
+  case $name in common | runner) ;; *) programs+=("$name") ;; esac
 done
 for name in "${programs[@]}"; do
   [ -x "$built/$name" ] || die "$name isn't built; run \`make build\`"

@@ -4,8 +4,8 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use contract::{Description, ParameterSection, group_parameters};
 use serde_json::Value;
+use stage::{Description, ParameterSection, group_parameters};
 
 use crate::common::verbs_of;
 

@@ -9,9 +9,9 @@ use std::process::Command;
 use std::sync::LazyLock;
 use std::time::SystemTime;
 
-use contract::Description;
 use schemars::{JsonSchema, schema_for};
 use serde_json::Value;
+use stage::Description;
 
 fn of<T: JsonSchema>() -> Value {
     schema_for!(T).to_value()
@@ -66,7 +66,7 @@ fn modified(file: &Path) -> SystemTime {
 fn schemas() -> BTreeMap<String, Value> {
     let files = [
         ("pipeline", of::<planning::PipelineFile>()),
-        ("describe", of::<contract::Description>()),
+        ("describe", of::<stage::Description>()),
         ("artifact", of::<artifact::Manifest>()),
         ("action", of::<store::Record>()),
         ("run", of::<artifact::RunRecord>()),
@@ -161,7 +161,7 @@ fn help_leads_to_the_reference() {
             description.parameter_sections().iter().flat_map(|section| &section.parameters)
         {
             let known = parameter.group.is_empty()
-                || contract::PARAMETER_GROUPS.contains(&parameter.group.as_str());
+                || stage::PARAMETER_GROUPS.contains(&parameter.group.as_str());
             assert!(known && help.contains(&format!("  {}", parameter.name)), "{parameter:?}");
             let is_choice = parameter.choices.iter().any(|(word, _)| *word == parameter.default);
             assert!(

@@ -39,7 +39,7 @@ def pattern(width, height, channels, seed):
 
 
 def pillow():
-    folder = ROOT / "stages/common/pixels/tests/goldens/pillow"
+    folder = ROOT / "stages/common/imaging/pixels/tests/goldens/pillow"
     folder.mkdir(parents=True, exist_ok=True)
     filters = {"box": Image.BOX, "bicubic": Image.BICUBIC, "lanczos": Image.LANCZOS}
     sizes = [((64, 64), (32, 32)), ((64, 64), (16, 16)), ((37, 53), (17, 23)), ((53, 37), (53, 11)), ((31, 20), (9, 20)),

@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn import functional
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-TO = ROOT / "stages/common/paper-refiner/tests/goldens"
+TO = ROOT / "stages/common/refinement/paper-refiner/tests/goldens"
 torch.manual_seed(3)
 
 

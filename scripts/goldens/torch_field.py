@@ -140,7 +140,7 @@ for step in range(3):
     optimiser.step()
 out["parameters"] = torch.cat([p.reshape(-1) for p in parameters])
 
-path = ROOT / "stages/common/torch-field/tests/goldens/mlp.safetensors"
+path = ROOT / "stages/common/field/torch-field/tests/goldens/mlp.safetensors"
 path.parent.mkdir(parents=True, exist_ok=True)
 save_file({name: x.detach().contiguous() for name, x in out.items()}, path, {"torch": torch.__version__.split("+")[0]})
 print(path, path.stat().st_size)

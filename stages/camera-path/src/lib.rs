@@ -6,7 +6,6 @@
 use std::f64::consts::TAU;
 
 use artifact::Failure;
-use contract::{Input, Output};
 use glam::{DMat3, DQuat, DVec3};
 use pixels::{DEGRADATION_FILE, Degradation};
 use scene::{
@@ -15,6 +14,7 @@ use scene::{
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 /// Parameters of `camera-path`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

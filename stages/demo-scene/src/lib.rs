@@ -18,9 +18,9 @@ mod params;
 mod render;
 mod world;
 
-use contract::Output;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
+use stage::Output;
 use stage::{Context, Stage};
 
 use camera::ViewCamera;

@@ -22,7 +22,6 @@ mod scoring;
 
 use std::collections::BTreeMap;
 
-use contract::{Input, Output};
 use metrics::{METRICS_FILE, Metrics, Scores, ViewScores};
 use pixels::{DEGRADATION_FILE, Degradation, Image, Palette, Rgba8, heat, write_png};
 use rayon::prelude::*;
@@ -30,6 +29,7 @@ use scene::{Background, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 use derived::{least_gain, near_references};
 use metric::{Metric, mean_of};

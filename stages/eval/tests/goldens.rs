@@ -1,7 +1,7 @@
 //! SSIM against scikit-image and PyTorch, LPIPS against its published example.
 
 #![allow(missing_docs, reason = "a test")]
-#[path = "../../common/pixels/tests/pattern.rs"]
+#[path = "../../common/imaging/pixels/tests/pattern.rs"]
 #[allow(unreachable_pub, reason = "shared with pixels' tests")]
 mod pattern;
 

@@ -36,13 +36,13 @@ use std::io::{self, BufWriter, Write as _};
 
 use anyhow::Context as _;
 use artifact::{Failure, amount, counted};
-use contract::{Input, Output};
 use fields::Members;
 use glam::DVec3;
 use scene::{Bounds, Camera, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 use cameras::CameraFormat;
 use coordinates::Coordinates;

@@ -36,11 +36,11 @@ mod writer;
 use std::path::Path;
 
 use artifact::{Failure, FailureExt as _, counted, list_source_files, printable};
-use contract::{Input, Output, Rule};
 use dataset::{Dataset, Frame};
 use scene::Background;
 use serde_json::json;
 use stage::{Context, Stage};
+use stage::{Input, Output, Rule};
 
 use borders::Borders;
 pub use bounds::SpaceKind;

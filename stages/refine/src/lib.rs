@@ -22,13 +22,13 @@ mod references;
 mod summary;
 mod view;
 
-use contract::{Input, Output};
 use paper_refiner::OVERLAP;
 use refinement::{KnownView, LrObservations, REFINER_FILE, RefinerFile, Use};
 use scene::{VIEWS_FILE, Views, image_file, preview_file};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 use enlarged::EnlargedPhotographs;
 use network::{AnyRefiner, Application};

@@ -6,7 +6,6 @@
 //! (design note 025). LR photographs are preferred, because views are scored against the HR ones.
 
 use artifact::{FailureExt as _, GivenInput, WARNING, counted, with_warnings};
-use contract::{Input, Output};
 use pixels::{Image, PixelError};
 use poses::{CameraMotion, MeanMotion, Options, Pyramid, refine};
 use radiance::{RayField, RenderError};
@@ -14,6 +13,7 @@ use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 /// Parameters of `register`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -13,7 +13,6 @@ use std::ops::Range;
 
 use anyhow::Context as _;
 use artifact::{amount, counted};
-use contract::{Input, Output};
 use fields::{Members, lower_median, mean};
 use pixels::{PngRows, to_u8};
 use radiance::{Ray, RayField};
@@ -24,6 +23,7 @@ use scene::{
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 /// Parameters of `render-depth`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -36,8 +36,8 @@ mod tables;
 mod viewer;
 
 use artifact::{Failure, RunRecord, counted, sized};
-use contract::{Input, Output};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 pub use data::Params;
 pub use results::{ResultRow, StageResult};

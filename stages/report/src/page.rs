@@ -1,6 +1,5 @@
-use artifact::{RunRecord, counted};
+use artifact::{RunRecord, counted, format_utc};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
-use stage_call::utc;
 
 use crate::commands::{commands, file_name};
 use crate::data::Data;
@@ -112,7 +111,7 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
                     }
                 }
                 @if let Some(ended) = end_time(run) {
-                    div { dt { "Date" } dd { time { (utc(ended)) } } }
+                    div { dt { "Date" } dd { time { (format_utc(ended)) } } }
                 }
                 @if let Some(commit) = run.commit() {
                     div { dt { "Commit" } dd { code { (commit) } } }

@@ -1,11 +1,12 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use artifact::{RunInput, RunNode, RunRecord, UnfinishedNode, counted, sized};
-use contract::plain;
+use artifact::{
+    RunInput, RunNode, RunRecord, UnfinishedNode, counted, format_duration, format_utc, sized,
+};
 use maud::{Markup, html};
 use serde_json::Value;
-use stage_call::{seconds, utc};
+use stage::plain;
 
 use crate::commands::{file_name, stage_command};
 use crate::layout::{Drawing, HEIGHT, WIDTH, draw};
@@ -182,7 +183,7 @@ impl Block<'_> {
         if self.done.is_empty() {
             return String::new();
         }
-        let time = seconds(self.done.iter().map(|node| node.seconds).sum());
+        let time = format_duration(self.done.iter().map(|node| node.seconds).sum());
         let memory = self.done.iter().filter_map(|node| node.peak_memory).max();
         memory.map_or(time.clone(), |bytes| format!("{time} · {}", sized(bytes)))
     }
@@ -245,10 +246,10 @@ fn node_details(run: &RunRecord, node: &RunNode) -> Markup {
     };
     let mut facts: Vec<(&str, String)> = vec![
         ("State", state.to_owned()),
-        ("Started", utc(node.started_unix)),
-        ("Time", seconds(node.seconds)),
+        ("Started", format_utc(node.started_unix)),
+        ("Time", format_duration(node.seconds)),
     ];
-    facts.extend(node.processor_seconds.map(|time| ("Processor time", seconds(time))));
+    facts.extend(node.processor_seconds.map(|time| ("Processor time", format_duration(time))));
     facts.extend(node.peak_memory.map(|bytes| ("Peak memory", sized(bytes))));
     facts.push(("Threads", node.threads.to_string()));
     if !node.host.is_empty() {

@@ -1,6 +1,6 @@
+use artifact::format_duration;
 use maud::{Markup, html};
 use metrics::Figure;
-use stage_call::seconds;
 
 use crate::gather::{Report, Row, is_best, is_known};
 
@@ -27,7 +27,7 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
                     div { dt { (figure.label) } dd { (figure.format_value(mean)) } }
                 }
                 @if best.training > 0.0 {
-                    div { dt { "Training" } dd { (seconds(best.training)) } }
+                    div { dt { "Training" } dd { (format_duration(best.training)) } }
                 }
             }
         }
@@ -73,8 +73,8 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
                                 @if with_data_sets { td { (report.scenes[row.scene].data_set) } }
                                 @for figure in &known { (mean(figure, row, rows)) }
                                 td class="n" { (row.view_count()) }
-                                td class="n" { (seconds(row.training)) }
-                                td class="n" { (seconds(row.rendering)) }
+                                td class="n" { (format_duration(row.training)) }
+                                td class="n" { (format_duration(row.rendering)) }
                             }
                         }
                     }

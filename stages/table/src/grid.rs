@@ -1,7 +1,7 @@
 //! One table: a line for each combination of the rows' keys, with the best of each group marked.
 
-use contract::plain;
 use serde_json::Value;
+use stage::plain;
 
 use crate::figures::Figures;
 use crate::params::Params;

@@ -18,8 +18,8 @@ mod values;
 
 use anyhow::Context as _;
 use artifact::{Failure, RunRecord};
-use contract::{Input, Output, plain};
 use stage::{Context, Stage};
+use stage::{Input, Output, plain};
 
 use figures::Figures;
 pub use params::{Gain, Group, Params};

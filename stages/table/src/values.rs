@@ -1,7 +1,7 @@
 //! Values of rows by name: means, combinations, selections.
 
-use contract::plain;
 use serde_json::{Map, Value};
+use stage::plain;
 
 /// A result: keys (axes of the run, `method`) and values, by name.
 pub type Row = Map<String, Value>;

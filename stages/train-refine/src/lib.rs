@@ -21,9 +21,9 @@ mod paper;
 mod params;
 mod steps;
 
-use contract::{Input, Output};
 use refinement::RefinerFile;
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 pub use params::{CompactParams, Net, PaperParams, Params};
 

@@ -18,12 +18,12 @@ mod supervision;
 mod training;
 
 use artifact::{Failure, WARNING, amount, with_warnings};
-use contract::{Input, Output, Rule};
 use pixels::DEGRADATION_FILE;
 use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile};
 use scene::Views;
 use serde_json::json;
 use stage::{Context, Stage};
+use stage::{Input, Output, Rule};
 
 pub use params::{
     Combine, FieldParams, GridParams, MlpParams, Order, Params, ParamsError, RateSchedule,

@@ -21,7 +21,6 @@ mod swinir;
 
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput};
-use contract::{Input, Output, Rule};
 use nets::Weights;
 use pixels::{Filter, Image, Mask, resize_pillow, write_png};
 use rayon::prelude::*;
@@ -33,6 +32,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use stage::{Context, Stage};
+use stage::{Input, Output, Rule};
 use tch::no_grad;
 
 use network::Network;

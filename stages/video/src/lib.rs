@@ -10,13 +10,13 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use artifact::{Failure, RunNode, RunRecord, label, sink_folders};
-use contract::{Input, Output};
 use pixels::{DepthMap, Rgba8, common_range, read_exr, write_png};
 use rayon::prelude::*;
 use scene::{View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 /// Parameters of `video`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -28,13 +28,13 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput, RunNode, RunRecord, sink_folders};
 use base64::Engine as _;
-use contract::{Input, Output};
 use pixels::{Filter, Rgba8, encode_png, resize_pillow};
 use radiance::{Field, FieldFile, FieldModel};
 use scene::{Bounds, Camera, Intrinsics, Space, Views, undistort_image};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
+use stage::{Input, Output};
 
 use crate::atlas::Atlas;
 use crate::bake::{Baker, Shape, Volume};

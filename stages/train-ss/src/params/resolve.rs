@@ -304,7 +304,7 @@ mod tests {
     /// `training.json` says every default that `plan` leaves to the scene.
     #[test]
     fn what_is_by_scene_is_recorded() {
-        let schema = contract::Schema::new(&crate::TrainSs::describe("", "").parameters).unwrap();
+        let schema = stage::Schema::new(&crate::TrainSs::describe("", "").parameters).unwrap();
         let scene = facts(Space::Box, Background::White);
         for (name, field) in
             [("grid", FieldParams::default()), ("mlp", FieldParams::Mlp(MlpParams::default()))]

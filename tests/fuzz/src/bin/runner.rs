@@ -6,9 +6,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use contract::{Description, Schema};
 use libfuzzer_sys::fuzz_target;
 use planning::{Pipeline, Plan, Request};
+use stage::{Description, Schema};
 use store::Record;
 
 macro_rules! seed {

@@ -1,0 +1,132 @@
+//! Command-line arguments of a stage.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::contract::{Description, Schema};
+use anyhow::anyhow;
+use artifact::{Failure, FailureExt as _, known_names};
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+use crate::progress::ProgressMode;
+
+#[derive(clap::Parser)]
+#[command(subcommand_negates_reqs = true, args_conflicts_with_subcommands = true)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    pub(crate) command: Option<Command>,
+    /// JSON file with parameters; omitted ones have their defaults
+    #[arg(long, value_name = "FILE")]
+    pub(crate) params: Option<PathBuf>,
+    /// Input, e.g. --input scene=DIR; may be repeated
+    #[arg(long = "input", value_name = "NAME=DIR")]
+    pub(crate) inputs: Vec<String>,
+    /// Folder to create; must not exist, and appears only when complete
+    #[arg(long, value_name = "DIR", required = true)]
+    pub(crate) output: Option<PathBuf>,
+    /// Private folder for checkpoints, which survives an interruption
+    #[arg(long, value_name = "DIR")]
+    pub(crate) work: Option<PathBuf>,
+    /// Write the output from the latest checkpoint in --work, without further training
+    #[arg(long, requires = "work")]
+    pub(crate) from_checkpoint: bool,
+    /// Compute device: cpu or cuda:N
+    #[arg(long, default_value = "cpu")]
+    pub(crate) device: String,
+    /// Number of threads; doesn't affect the result [default: all cores]
+    #[arg(long, value_name = "N")]
+    pub(crate) threads: Option<usize>,
+    /// Format of progress reports
+    #[arg(long, value_enum, default_value = "plain")]
+    pub(crate) progress: ProgressMode,
+}
+
+#[derive(clap::Subcommand)]
+pub(crate) enum Command {
+    /// Print name, code fingerprint, parameters, inputs and output as JSON
+    Describe,
+}
+
+/// Parses the inputs' names and folders. Fails for an unknown input and for a missing one.
+pub(crate) fn input_folders<'a>(
+    given: &'a [String],
+    description: &Description,
+) -> anyhow::Result<Vec<(&'a str, &'a Path)>> {
+    let mut folders = Vec::new();
+    for text in given {
+        let (name, folder) = text
+            .split_once('=')
+            .ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
+        if !description.inputs.contains_key(name) {
+            let known = known_names(name, description.inputs.keys().map(String::as_str));
+            return Err(Failure::Usage(format!("--input {name}: no such input; {known}")).into());
+        }
+        folders.push((name, Path::new(folder)));
+    }
+    for (name, input) in &description.inputs {
+        if !input.optional && !folders.iter().any(|(given, _)| given == name) {
+            return Err(Failure::Usage(format!(
+                "input {name} is missing; give --input {name}=DIR ({})",
+                input.summary
+            ))
+            .into());
+        }
+    }
+    Ok(folders)
+}
+
+/// Reads the parameters, or takes the defaults without a file. Returns the checked values as JSON
+/// and as the stage's own type.
+pub(crate) fn read_params<P: DeserializeOwned>(
+    file: Option<&Path>,
+    description: &Description,
+) -> anyhow::Result<(Value, P)> {
+    let context = format!("--params {}", file.unwrap_or(Path::new("")).display());
+    let given = match file {
+        None => serde_json::Map::new(),
+        Some(path) => {
+            let bytes = fs::read(path).usage(&context)?;
+            serde_json::from_slice(&bytes).usage(format!("{context}: expected a JSON object"))?
+        }
+    };
+    let schema = Schema::new(&description.parameters)
+        .map_err(|e| anyhow!("the stage's own parameter schema: {e}"))?;
+    let resolved = schema.resolve(&given).map_err(|problems| {
+        let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        Failure::Usage(format!("{context}: {}", problems.join("; ")))
+    })?;
+    let params = serde_path_to_error::deserialize(schema.nested(&resolved)).usage(&context)?;
+    Ok((resolved, params))
+}
+
+/// Error returned for an invalid `--device`.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("--device {0}: no such device; expected cpu, cuda or cuda:N")]
+pub struct DeviceError(String);
+
+/// Checks that `--device` is `cpu`, `cuda` or `cuda:N`. The libraries that use a GPU check that it
+/// exists.
+pub fn check_device(name: &str) -> Result<(), DeviceError> {
+    let is_valid = match name.strip_prefix("cuda:") {
+        Some(index) => (1..=4).contains(&index.len()) && index.bytes().all(|b| b.is_ascii_digit()),
+        None => ["cpu", "cuda"].contains(&name),
+    };
+    if is_valid { Ok(()) } else { Err(DeviceError(name.to_owned())) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cpu_and_numbered_gpus_alone() {
+        for name in ["cpu", "cuda", "cuda:0", "cuda:12"] {
+            assert!(check_device(name).is_ok(), "{name}");
+        }
+        for name in ["", "gpu", "CPU", "cuda:", "cuda:x", "cuda:-1", "cuda:99999", "cuda0", "cpu:0"]
+        {
+            assert!(check_device(name).is_err(), "{name}");
+        }
+    }
+}

@@ -1,0 +1,163 @@
+//! Human-readable documentation of a stage's parameters: groups, allowed values and defaults.
+
+use serde_json::Value;
+
+use crate::contract::describe::Description;
+use crate::contract::parameters::DEFAULT_KEYWORD;
+use crate::contract::tagged::Tag;
+use crate::contract::values::Reader;
+
+/// Groups of parameters in their order of display; parameters without a group come first.
+pub const PARAMETER_GROUPS: [&str; 7] =
+    ["data", "sampling", "loss", "optimiser", "field", "network", "output"];
+/// Schema keyword for a parameter's group.
+const GROUP_KEYWORD: &str = "x-group";
+
+/// Documentation of a parameter.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ParameterDoc {
+    /// Name of the parameter.
+    pub name: String,
+    /// Group, one of [`PARAMETER_GROUPS`]; empty without a group.
+    pub group: String,
+    /// Description of the parameter.
+    pub text: String,
+    /// Allowed values, as text.
+    pub allowed: String,
+    /// Value if the parameter is omitted.
+    pub default: String,
+    /// Allowed values of a choice, each with its description.
+    pub choices: Vec<(String, String)>,
+}
+
+/// Group of parameters: those common to all variants of a stage, or those of one variant.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ParameterSection {
+    /// Variant that the parameters belong to, such as `field: grid`; `None` for common ones.
+    pub variant: Option<String>,
+    /// Parameters, sorted by group, then by name.
+    pub parameters: Vec<ParameterDoc>,
+}
+
+impl Description {
+    /// Documents the stage's parameters: the common ones, then those of each variant.
+    pub fn parameter_sections(&self) -> Vec<ParameterSection> {
+        let schema = &self.parameters;
+        // Two tags are an error of `Description::check`, which precedes every use.
+        let Some(tag) = Tag::find(schema).ok().flatten() else {
+            return vec![ParameterSection {
+                variant: None,
+                parameters: document(schema, |_| true),
+            }];
+        };
+        let common = &schema["properties"];
+        let schemas = tag.variant_schemas(schema);
+        let parameters = document(&schemas[0], |name| common.get(name).is_some());
+        let mut sections = vec![ParameterSection { variant: None, parameters }];
+        for (index, variant) in tag.variants().enumerate() {
+            let parameters = document(&schemas[index], |name| common.get(name).is_none());
+            let variant = Some(format!("{}: {variant}", tag.name()));
+            sections.push(ParameterSection { variant, parameters });
+        }
+        sections
+    }
+}
+
+/// Documents those of a schema's parameters whose names satisfy a condition.
+fn document(schema: &Value, condition: impl Fn(&str) -> bool) -> Vec<ParameterDoc> {
+    let mut found = Vec::new();
+    for (name, property) in
+        schema.get("properties").and_then(Value::as_object).into_iter().flatten()
+    {
+        if condition(name) {
+            found.push(ParameterDoc::new(schema, name, property));
+        }
+    }
+    found.sort_by(|a, b| (a.group_rank(), &a.name).cmp(&(b.group_rank(), &b.name)));
+    found
+}
+
+impl ParameterDoc {
+    fn new(schema: &Value, name: &str, property: &Value) -> Self {
+        let reader = Reader::new(schema);
+        let mut choices = Vec::new();
+        for (value, description) in reader.choices(property).into_iter().flatten() {
+            choices.push((plain(value), description.replace('\n', " ")));
+        }
+        let default = match (property.get("default"), keyword_text(property, DEFAULT_KEYWORD)) {
+            (None | Some(Value::Null), "") => "none".to_owned(),
+            (None | Some(Value::Null), description) => description.to_owned(),
+            (Some(default), _) => plain(default),
+        };
+        Self {
+            name: name.to_owned(),
+            group: keyword_text(property, GROUP_KEYWORD).to_owned(),
+            text: keyword_text(property, "description").replace('\n', " "),
+            allowed: allowed_text(property, reader.present(property), &choices),
+            default,
+            choices,
+        }
+    }
+
+    /// Returns the position of the group in the order of display.
+    fn group_rank(&self) -> usize {
+        PARAMETER_GROUPS.iter().position(|group| *group == self.group).map_or(0, |index| index + 1)
+    }
+}
+
+/// Returns the text of a schema's keyword; empty without the keyword.
+fn keyword_text<'a>(property: &'a Value, keyword: &str) -> &'a str {
+    property.get(keyword).and_then(Value::as_str).unwrap_or_default()
+}
+
+/// Formats a value as text, without quotes.
+pub fn plain(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+/// Describes the values that a parameter may have.
+fn allowed_text(property: &Value, present: &Value, choices: &[(String, String)]) -> String {
+    if !choices.is_empty() {
+        return choices.iter().map(|(value, _)| value.as_str()).collect::<Vec<_>>().join(", ");
+    }
+    let types: Vec<&str> = match present.get("type") {
+        Some(Value::String(one)) => vec![one],
+        Some(Value::Array(several)) => {
+            several.iter().filter_map(Value::as_str).filter(|one| *one != "null").collect()
+        }
+        _ => Vec::new(),
+    };
+    let noun = match types[..] {
+        ["boolean"] => return "true, false".to_owned(),
+        ["integer"] => "a whole number",
+        ["number"] => "a number",
+        ["string"] => "text",
+        ["array"] => "a list",
+        _ => "JSON",
+    };
+    let [min, max] = ["minimum", "maximum"]
+        .map(|keyword| property.get(keyword).or_else(|| present.get(keyword)).map(short_number));
+    match (min, max) {
+        (Some(min), Some(max)) => format!("{noun} from {min} to {max}"),
+        (Some(min), None) => format!("{noun} from {min}"),
+        (None, Some(max)) => format!("{noun} up to {max}"),
+        (None, None) => noun.to_owned(),
+    }
+}
+
+/// Formats a number without a redundant `.0`.
+fn short_number(value: &Value) -> String {
+    value.to_string().trim_end_matches(".0").to_owned()
+}
+
+/// Splits sorted parameters into groups: each group's name with its parameters.
+pub fn group_parameters(parameters: &[ParameterDoc]) -> Vec<(&str, Vec<&ParameterDoc>)> {
+    let mut groups: Vec<(&str, Vec<&ParameterDoc>)> = Vec::new();
+    for parameter in parameters {
+        match groups.last_mut() {
+            Some((group, members)) if *group == parameter.group => members.push(parameter),
+            _ => groups.push((&parameter.group, vec![parameter])),
+        }
+    }
+    groups
+}

@@ -1,0 +1,131 @@
+use std::collections::BTreeMap;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::contract::describe::Input;
+use crate::contract::error::KeywordError;
+use crate::contract::validator::Validator;
+
+/// Constraint between parameters and inputs, in addition to the checks of each alone. The runner
+/// checks rules when it plans, a stage when it starts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Rule {
+    /// Conditions: parameters with JSON Schemas. The rule applies if all values match.
+    /// `INPUT.PARAMETER` is a parameter of the stage that created the input; if that value is
+    /// unknown, the rule doesn't apply.
+    pub when: BTreeMap<String, Value>,
+    /// Inputs that are required if the rule applies.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub needs: Vec<String>,
+    /// Parameters with JSON Schemas that their values must match if the rule applies.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub must: BTreeMap<String, Value>,
+    /// Message if the rule is violated: the problem and the remedy.
+    pub message: String,
+}
+
+/// Given inputs by name, with the parameters of the stage that created each, if known.
+pub type GivenInputs = BTreeMap<String, Option<Value>>;
+
+/// Reason why a rule can't be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RuleError {
+    /// The rule refers to an input that the stage doesn't have.
+    #[error("no input {0:?}")]
+    UnknownInput(String),
+    /// The rule refers to a parameter that the stage doesn't have.
+    #[error("no parameter {0:?}")]
+    UnknownParameter(String),
+    /// A JSON Schema of the rule can't be used.
+    #[error("{name}: not a JSON Schema: {reason}")]
+    Schema {
+        /// Parameter that the schema belongs to.
+        name: String,
+        /// Reason why the schema can't be used.
+        reason: KeywordError,
+    },
+}
+
+impl Rule {
+    /// Creates a rule that always applies and has no requirement yet.
+    pub fn new(message: &str) -> Self {
+        Self {
+            when: BTreeMap::new(),
+            needs: Vec::new(),
+            must: BTreeMap::new(),
+            message: message.to_owned(),
+        }
+    }
+
+    /// Adds a condition: the rule applies only if a parameter matches a JSON Schema.
+    #[must_use]
+    pub fn when(mut self, parameter: &str, schema: Value) -> Self {
+        self.when.insert(parameter.to_owned(), schema);
+        self
+    }
+
+    /// Requires an input.
+    #[must_use]
+    pub fn needs(mut self, input: &str) -> Self {
+        self.needs.push(input.to_owned());
+        self
+    }
+
+    /// Requires that a parameter matches a JSON Schema.
+    #[must_use]
+    pub fn must(mut self, parameter: &str, schema: Value) -> Self {
+        self.must.insert(parameter.to_owned(), schema);
+        self
+    }
+
+    /// Checks that the rule refers to existing names and that its schemas can be used.
+    pub(crate) fn check(
+        &self,
+        parameters: &[&str],
+        inputs: &BTreeMap<String, Input>,
+    ) -> Result<(), RuleError> {
+        if let Some(input) = self.needs.iter().find(|input| !inputs.contains_key(*input)) {
+            return Err(RuleError::UnknownInput(input.clone()));
+        }
+        for (name, schema) in self.when.iter().chain(&self.must) {
+            let is_known = match name.split_once('.') {
+                Some((input, _)) => inputs.contains_key(input),
+                None => parameters.contains(&name.as_str()),
+            };
+            if !is_known {
+                return Err(RuleError::UnknownParameter(name.clone()));
+            }
+            Validator::new(schema)
+                .map_err(|reason| RuleError::Schema { name: name.clone(), reason })?;
+        }
+        Ok(())
+    }
+
+    /// Returns whether parameters and inputs satisfy the rule.
+    pub(crate) fn is_satisfied(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
+        let applies =
+            self.when.iter().all(|entry| value_matches(entry, parameters, inputs) == Some(true));
+        !applies
+            || (self.needs.iter().all(|input| inputs.contains_key(input))
+                && self
+                    .must
+                    .iter()
+                    .all(|entry| value_matches(entry, parameters, inputs) != Some(false)))
+    }
+}
+
+/// Returns whether a parameter's value matches a schema; `None` if the value is unknown.
+fn value_matches(
+    (name, schema): (&String, &Value),
+    parameters: &Value,
+    inputs: &GivenInputs,
+) -> Option<bool> {
+    let value = match name.split_once('.') {
+        Some((input, inner)) => inputs.get(input).and_then(|made_by| made_by.as_ref()?.get(inner)),
+        None => parameters.get(name.as_str()),
+    };
+    Some(Validator::new(schema).ok()?.is_valid(value?))
+}

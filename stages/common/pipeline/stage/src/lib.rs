@@ -1,0 +1,76 @@
+//! Command line of a stage: arguments, parameters, progress, exit codes, output.
+//!
+//! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked
+//!   parameters, `describe`, progress, exit codes, interruption and an atomic output for free.
+//! * [`Context`]: inputs, output and checkpoint folder of a running stage.
+//! * [`Description`], [`Schema`], [`Rule`]: a stage's description, and the checks of values against it.
+//! * [`Progress`], [`Event`]: progress reports for a terminal and for the runner.
+//! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic;
+//!   the runner uses them, too.
+//! * [`available_memory`], [`check_device`]: limits of memory, and the compute device.
+//!
+//! The crate knows neither images nor tensors nor the store. Artifacts and failures are in
+//! `artifact`.
+//!
+//! ```no_run
+//! use stage::{Context, Output, Stage, run_stage};
+//!
+//! #[derive(serde::Serialize, serde::Deserialize, schemars::JsonSchema, Default)]
+//! #[serde(default, deny_unknown_fields)]
+//! struct Params {
+//!     /// Whom to greet.
+//!     name: String,
+//! }
+//! struct Greet;
+//! impl Stage for Greet {
+//!     type Params = Params;
+//!     const NAME: &'static str = "greet";
+//!     const SUMMARY: &'static str = "Writes a greeting.";
+//!     fn output() -> Output { Output::kind("text") }
+//!     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+//!         std::fs::write(context.output_path("greeting.txt")?, &params.name)?;
+//!         Ok(())
+//!     }
+//! }
+//! fn main() -> std::process::ExitCode {
+//!     run_stage::<Greet>(env!("CARGO_PKG_VERSION"), "code-fingerprint")
+//! }
+//! ```
+
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+
+mod arguments;
+mod context;
+mod contract;
+mod help;
+mod hooks;
+mod memory;
+#[cfg(test)]
+mod panic_tests;
+mod panics;
+mod parts;
+mod progress;
+mod run;
+#[cfg(test)]
+mod signal_tests;
+mod signals;
+mod stage;
+mod staging;
+
+pub use arguments::{DeviceError, check_device};
+pub use context::{Context, SUMMARY_FILE};
+pub use contract::{
+    Description, DescriptionError, GivenInputs, Input, KeywordError, Output, PARAMETER_GROUPS,
+    ParameterDoc, ParameterProblem, ParameterSection, Rule, RuleError, Schema, SchemaError,
+    group_parameters, plain,
+};
+pub use hooks::{SLOW_VARIABLE, STOP_VARIABLE};
+pub use memory::{
+    MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory_message,
+    remaining_memory,
+};
+pub use panics::install_panic_hook;
+pub use progress::{Event, Pace, Progress, ProgressMode};
+pub use run::{RUNNER_VARIABLE, run_stage};
+pub use signals::{stop_on_signals, stop_signals};
+pub use stage::Stage;

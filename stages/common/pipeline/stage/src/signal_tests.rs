@@ -1,0 +1,89 @@
+//! Signals to stages in processes of their own.
+
+use std::io::{BufRead as _, BufReader, Read as _};
+use std::process::{Command, ExitCode, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::contract::Output;
+use rustix::process::{Pid, Signal, kill_process};
+
+use crate::run::run_stage_with;
+use crate::{Context, Stage};
+
+/// No parameters, as the object that the schema requires.
+#[derive(Default, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+struct Params {}
+
+/// A stage that never checks for signals, or checks often.
+struct Works;
+impl Stage for Works {
+    type Params = Params;
+    const NAME: &'static str = "work";
+    const SUMMARY: &'static str = "Works for an hour.";
+    fn output() -> Output {
+        Output::kind("text")
+    }
+    fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
+        std::fs::write(context.output_path("half")?, "half")?;
+        context.say("working");
+        let is_deaf = std::env::var(IS_DEAF).is_ok();
+        for _ in 0..360_000 {
+            std::thread::sleep(Duration::from_millis(10));
+            if !is_deaf {
+                context.check_interrupt()?;
+            }
+        }
+        Ok(())
+    }
+}
+
+const IS_DEAF: &str = "DEADLINE_IS_DEAF";
+const OUTPUT: &str = "DEADLINE_OUTPUT";
+
+#[test]
+#[ignore = "a process of its own, which the test below starts"]
+fn a_process_that_works() {
+    let output = std::env::var(OUTPUT).unwrap();
+    let arguments = ["work", "--output", &output, "--progress", "json"];
+    let code = run_stage_with::<Works>("", "", arguments.map(Into::into));
+    std::process::exit(if code == ExitCode::from(130) { 130 } else { 1 });
+}
+
+/// Exit code, stdout and stderr of a stage that gets a signal while it works, and the time from
+/// the signal to its end.
+fn signalled(signal: Signal, is_deaf: bool) -> (Option<i32>, String, String, Duration) {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    command.args(["signal_tests::a_process_that_works", "--exact", "--ignored", "--nocapture"]);
+    command.env(OUTPUT, folder.path().join("output"));
+    if is_deaf {
+        command.env(IS_DEAF, "1");
+    }
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut stderr = BufReader::new(child.stderr.take().unwrap());
+    let mut said = String::new();
+    stderr.read_line(&mut said).unwrap();
+    kill_process(Pid::from_child(&child), signal).unwrap();
+    let sent = Instant::now();
+    stderr.read_to_string(&mut said).unwrap();
+    let output = child.wait_with_output().unwrap();
+    let took = sent.elapsed();
+    assert_eq!(folder.path().read_dir().unwrap().count(), 0, "{said}");
+    (output.status.code(), String::from_utf8(output.stdout).unwrap(), said, took)
+}
+
+/// A stage ends within two seconds, whether it checks for signals or not, with one message, one
+/// event, and no output.
+#[test]
+fn a_signal_ends_any_stage_in_time() {
+    for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
+        for is_deaf in [false, true] {
+            let (code, stdout, stderr, took) = signalled(signal, is_deaf);
+            let words = "work: interrupted; run again to resume\n";
+            assert_eq!((code, stderr.as_str()), (Some(130), format!("working\n{words}").as_str()));
+            assert_eq!(stdout.matches(r#""event":"failed""#).count(), 1, "{stdout}");
+            assert!(took < Duration::from_secs(2), "{signal:?}, deaf: {is_deaf}: {took:?}");
+            assert!(!is_deaf || took > Duration::from_millis(900), "no time to end: {took:?}");
+        }
+    }
+}

@@ -1,0 +1,406 @@
+//! The command line.
+//!
+//! Structs that are flattened into a command, and values of options, have `//` comments: clap would
+//! print doc comments as the verb's help, or give every verb's help its long form.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use crate::garbage::Policy;
+use clap::{Args, CommandFactory as _, Parser, Subcommand};
+use planning::{Devices, Pipeline, PlanError, Request, Selection};
+use slurm::{Memory, Site};
+
+use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
+use crate::run_messages::FailureHint;
+use crate::session::Session;
+use crate::verbs::{self, GcOutput, GraphFormat};
+use crate::watch::Watch;
+
+const DEFAULT_PIPELINE: &str = "pipeline.yaml";
+const DEFAULT_DEVICE: &str = "cpu";
+const DEFAULT_EXECUTOR: &str = "local";
+
+/// Run the stages of pipeline.yaml, reuse cached results, and explain each decision
+#[derive(Parser)]
+#[command(name = "nerf-sr", version)]
+struct Cli {
+    #[command(subcommand)]
+    verb: Verb,
+    #[command(flatten)]
+    global: GlobalArgs,
+}
+
+// Options of every verb.
+#[derive(Args)]
+struct GlobalArgs {
+    /// Pipeline file
+    #[arg(long, global = true, default_value = DEFAULT_PIPELINE, value_name = "FILE")]
+    pipeline: PathBuf,
+    /// Folder of the artifacts [default: .nerf-sr next to the pipeline file]
+    #[arg(long, global = true, value_name = "DIR", env = "NERF_SR_STORE")]
+    store: Option<PathBuf>,
+    /// Compute device: cpu or cuda:N
+    #[arg(long, global = true, default_value = DEFAULT_DEVICE)]
+    device: String,
+    /// Run stages on this machine, or as jobs of a Slurm cluster; there, stages that request GPUs
+    /// (`resources`) compute on cuda:0
+    #[arg(long, global = true, value_enum, default_value = DEFAULT_EXECUTOR,
+        env = "NERF_SR_EXECUTOR")]
+    executor: ExecutorKind,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum ExecutorKind {
+    Local,
+    Slurm,
+}
+
+// Arguments from which a plan is created.
+#[derive(Args, Default)]
+struct PlanArgs {
+    /// Targets: stages of the pipeline, or files in pipelines/ or experiments/ next to it [default:
+    /// the pipeline's `default`]
+    targets: Vec<String>,
+    /// Set a parameter. Several values run all combinations; stages that don't depend on the
+    /// parameter run once. A value is JSON, such as a number, true or null, or plain text; an empty
+    /// value is null. If a parameter is given twice, the last value wins
+    #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
+    parameters: Vec<String>,
+    /// Read an input from a folder instead, e.g. -i dataset=scenes/lego
+    #[arg(short = 'i', long = "input", value_name = "[STAGE.]NAME=DIR[,DIR…]")]
+    inputs: Vec<String>,
+    #[command(flatten)]
+    experiment: ExperimentArgs,
+}
+
+// Selection from an experiment.
+#[derive(Args, Default)]
+struct ExperimentArgs {
+    /// Scenes of an experiment: folders in --data, or `demo` [default: those that its file names]
+    #[arg(long = "scene", value_name = "NAME[,NAME…]", value_delimiter = ',')]
+    scenes: Vec<String>,
+    /// Protocols of an experiment: presets of its file, or WIDTHxSCALE [default: those that its
+    /// file names]
+    #[arg(long = "protocol", value_name = "NAME[,NAME…]", value_delimiter = ',')]
+    protocols: Vec<String>,
+    /// Variant of an experiment; repeat for more [default: all]
+    #[arg(long = "variant", value_name = "NAME")]
+    variants: Vec<String>,
+    /// Use only the first N variants of an experiment
+    #[arg(long, value_name = "N")]
+    first_variants: Option<usize>,
+    /// Limit sinks to these of their inputs, or to these blocks [default: all]
+    #[arg(long = "show", value_name = "NAME[,NAME…]", value_delimiter = ',')]
+    show: Vec<String>,
+    /// Folder of an experiment's data sets [default: the one that its file names]
+    #[arg(long, value_name = "DIR", env = "NERF_SR_DATA")]
+    data: Option<PathBuf>,
+}
+
+// Options of `run`.
+#[derive(Args)]
+struct RunOptions {
+    /// Maximum number of stages that run at once [default: number of cores, at most 4]
+    #[arg(short, long, value_name = "N")]
+    jobs: Option<usize>,
+    /// Number of threads of each stage, and of cores for all stages together; results don't depend
+    /// on it [default: all cores]
+    #[arg(long, value_name = "N")]
+    threads: Option<usize>,
+    /// Memory limit for all stages together, such as 8G; each stage counts with the peak memory of
+    /// its last run [default: all memory]
+    #[arg(long, value_name = "AMOUNT")]
+    memory: Option<Memory>,
+    /// Continue with stages that don't depend on a failed one
+    #[arg(short, long)]
+    keep_going: bool,
+    /// Folder of pages and watched views [default: out next to the pipeline file]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Show a test view and its scores while a field trains, using about 2 % of the processor
+    /// time; needs a target that scores views, such as eval [default view: the first]
+    #[arg(long, value_name = "VIEW", num_args = 0..=1, require_equals = true,
+        default_missing_value = "")]
+    watch: Option<String>,
+    /// Site file of the cluster: partition, account, set-up lines [default:
+    /// ~/.config/nerf-sr/slurm.yaml if it exists]
+    #[arg(long, value_name = "FILE", env = "NERF_SR_SITE")]
+    site: Option<PathBuf>,
+}
+
+#[derive(Subcommand)]
+enum Verb {
+    /// Run the stages that the targets need; cached ones are skipped
+    Run {
+        #[command(flatten)]
+        plan: PlanArgs,
+        #[command(flatten)]
+        options: RunOptions,
+    },
+    /// Cancel submitted jobs of a cluster and the jobs that depend on them
+    Cancel {
+        /// Stage whose jobs are cancelled [default: all jobs of this store]
+        stage: Option<String>,
+    },
+    /// Run one task of a submission; called by its jobs' script
+    #[command(name = JOB_VERB, hide = true)]
+    Job {
+        /// Folder of the submission
+        submission: PathBuf,
+        /// Number of the task
+        number: usize,
+    },
+    /// Write a commented pipeline for a folder of posed photographs
+    Init {
+        /// Folder of the data set, whose format is detected
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+    },
+    /// Show what `run` would do, without running anything
+    Plan {
+        #[command(flatten)]
+        plan: PlanArgs,
+        /// Print JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Explain why a stage is cached, would run, or waits
+    Why {
+        /// Stage to explain
+        stage: String,
+        #[command(flatten)]
+        plan: PlanArgs,
+        /// Print JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Show every stage with its artifact, age and running time
+    Status {
+        #[command(flatten)]
+        plan: PlanArgs,
+        /// Print JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Print the path of a stage's artifact, or of a folder or file in it
+    Path {
+        /// Stage, e.g. eval, or a folder or file in its artifact, e.g. prep/train
+        #[arg(value_name = "STAGE[/FOLDER]")]
+        stage: String,
+        #[command(flatten)]
+        plan: PlanArgs,
+    },
+    /// Compare two results: parameters, defaults in use, metrics, images
+    Diff {
+        /// Stage with its arguments as one word ("eval -p kernel=box"), first characters of an
+        /// artifact's hash, ID of a recorded run, or name of a pin
+        before: String,
+        /// Result to compare with, in one of these forms
+        now: String,
+        /// Print JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Draw the stages and their inputs as a graph
+    Graph {
+        #[command(flatten)]
+        plan: PlanArgs,
+        /// Output format
+        #[arg(long, value_enum, default_value = "ascii")]
+        format: GraphFormat,
+    },
+    /// Print the log of a stage
+    Log {
+        /// Stage whose log is printed
+        stage: String,
+        #[command(flatten)]
+        plan: PlanArgs,
+    },
+    /// Read all artifacts and records, and compare their contents with their hashes
+    Verify {
+        /// Delete damaged artifacts and records, so that the next run creates them again
+        #[arg(long)]
+        remove: bool,
+    },
+    /// Protect the targets' artifacts from `gc`
+    Pin {
+        /// Name of the pin
+        name: String,
+        #[command(flatten)]
+        plan: PlanArgs,
+    },
+    /// Remove a pin
+    Unpin {
+        /// Name of the pin
+        name: String,
+    },
+    /// Delete artifacts that no pin, recent or running run, or target needs
+    Gc {
+        #[command(flatten)]
+        plan: PlanArgs,
+        /// Only print what would be deleted
+        #[arg(long)]
+        dry_run: bool,
+        /// Keep artifacts that were created or used in the last N days
+        #[arg(long, default_value_t = 7, value_name = "N")]
+        keep_days: u64,
+        /// Delete checkpoints of interrupted stages, too
+        #[arg(long)]
+        drop_unfinished: bool,
+        /// Delete artifacts of older versions of nerf-sr, too; no plan can use them any more
+        #[arg(long)]
+        drop_old: bool,
+        /// Print JSON
+        #[arg(long)]
+        json: bool,
+    },
+    /// Print the help of a stage's program: its output, inputs and parameters
+    Describe {
+        /// Stage to describe
+        stage: String,
+    },
+    /// Write man pages of all verbs into a folder; called by `make install`
+    #[command(hide = true)]
+    Man {
+        /// Folder of the man pages
+        folder: PathBuf,
+    },
+    /// Print shell completions
+    Completions {
+        /// Name of the shell
+        shell: clap_complete::Shell,
+    },
+}
+
+impl From<PlanArgs> for Request {
+    fn from(args: PlanArgs) -> Self {
+        let ExperimentArgs { scenes, protocols, variants, first_variants, show, data } =
+            args.experiment;
+        let selection =
+            Selection { data, scenes, protocols, variants, max_variants: first_variants, show };
+        Self { targets: args.targets, parameters: args.parameters, inputs: args.inputs, selection }
+    }
+}
+
+/// Parses the command line and carries out its verb.
+pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
+    let Cli { verb, global } = Cli::parse();
+    match verb {
+        Verb::Run { plan, options } => run(&global, plan, options),
+        Verb::Cancel { stage } => verbs::cancel(&global.open_session()?.store, stage.as_deref()),
+        Verb::Job { submission, number } => verbs::job(&submission, number),
+        Verb::Init { folder } => verbs::init(&folder, &global.pipeline),
+        Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json),
+        Verb::Why { stage, plan, json } => {
+            verbs::why(&global.open_session()?, &stage, &plan.into(), json)
+        }
+        Verb::Status { plan, json } => verbs::status(&global.open_session()?, &plan.into(), json),
+        Verb::Path { stage, plan } => verbs::path(&global.open_session()?, &stage, &plan.into()),
+        Verb::Diff { before, now, json } => {
+            verbs::diff(&global.open_session()?, &before, &now, json)
+        }
+        Verb::Graph { plan, format } => verbs::graph(&global.open_session()?, &plan.into(), format),
+        Verb::Log { stage, plan } => verbs::log(&global.open_session()?, &stage, &plan.into()),
+        Verb::Verify { remove } => verbs::verify(&global.open_session()?.store, remove),
+        Verb::Pin { name, plan } => verbs::pin(&global.open_session()?, &name, &plan.into()),
+        Verb::Unpin { name } => verbs::unpin(&global.open_session()?, &name),
+        Verb::Gc { plan, dry_run, keep_days, drop_unfinished, drop_old, json } => {
+            let policy = Policy { keep_days, drop_unfinished, drop_old };
+            verbs::gc(&global.open_session()?, &plan.into(), policy, GcOutput { dry_run, json })
+        }
+        Verb::Describe { stage } => {
+            verbs::describe(&Pipeline::read(&global.pipeline).map_err(PlanError::from)?, &stage)
+        }
+        Verb::Man { folder } => verbs::man(Cli::command(), &folder),
+        Verb::Completions { shell } => Ok(verbs::completions(shell, &mut Cli::command())),
+    }
+}
+
+fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Result<ExitCode> {
+    let session = global.open_session()?;
+    let out = options.out.clone().unwrap_or_else(|| session.pipeline.project_folder().join("out"));
+    let hint = FailureHint::new(global.arguments_of_log(&plan));
+    let executor = new_executor(global.executor, options, hint, &out)?;
+    verbs::run(&session, &plan.into(), &out, executor.as_ref())
+}
+
+impl GlobalArgs {
+    fn open_session(&self) -> anyhow::Result<Session> {
+        let by_resources = self.executor == ExecutorKind::Slurm;
+        let devices = Devices { given: self.device.clone(), by_resources };
+        Session::open(&self.pipeline, self.store.as_deref(), devices)
+    }
+
+    /// Returns the arguments with which `log` finds the stages of a run of this plan.
+    fn arguments_of_log(&self, plan: &PlanArgs) -> Vec<String> {
+        let mut arguments = plan.targets.clone();
+        for (option, values) in [("-p", &plan.parameters), ("-i", &plan.inputs)] {
+            arguments.extend(values.iter().flat_map(|value| [option.to_owned(), value.clone()]));
+        }
+        let experiment = &plan.experiment;
+        for (option, names) in [
+            ("--scene", &experiment.scenes),
+            ("--protocol", &experiment.protocols),
+            ("--show", &experiment.show),
+        ] {
+            if !names.is_empty() {
+                arguments.extend([option.to_owned(), names.join(",")]);
+            }
+        }
+        for name in &experiment.variants {
+            arguments.extend(["--variant".to_owned(), name.clone()]);
+        }
+        let pipeline = Some(&self.pipeline).filter(|file| *file != Path::new(DEFAULT_PIPELINE));
+        for (option, value) in [
+            ("--first-variants", experiment.first_variants.map(|count| count.to_string())),
+            ("--data", experiment.data.as_deref().map(path_text)),
+            ("--pipeline", pipeline.map(|file| path_text(file))),
+            ("--store", self.store.as_deref().map(path_text)),
+            ("--device", Some(self.device.clone()).filter(|device| device != DEFAULT_DEVICE)),
+        ] {
+            if let Some(value) = value {
+                arguments.extend([option.to_owned(), value]);
+            }
+        }
+        arguments
+    }
+}
+
+fn path_text(path: &Path) -> String {
+    path.to_string_lossy().into_owned()
+}
+
+/// Creates the executor of a run. `hint` is printed after a failure; pages are written to `out`.
+fn new_executor(
+    kind: ExecutorKind,
+    options: RunOptions,
+    hint: FailureHint,
+    out: &Path,
+) -> Result<Box<dyn Executor>, PlanError> {
+    let RunOptions { jobs, threads, memory, keep_going, site, watch, .. } = options;
+    if kind == ExecutorKind::Local {
+        let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
+        let budget = Budget::new(jobs, threads, memory.map(Memory::bytes))?;
+        return Ok(Box::new(Local { budget, keep_going, hint, watch }));
+    }
+    let problem = if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going {
+        "--jobs, --threads, --memory and --keep-going need --executor local; on a cluster, set \
+        `resources` in the pipeline"
+    } else if watch.is_some() {
+        "--watch needs --executor local: on a cluster, the runner exits before jobs run"
+    } else {
+        let site = Site::find(site.as_deref()).map_err(|e| PlanError::Usage(e.to_string()))?;
+        return Ok(Box::new(Cluster { site }));
+    };
+    Err(PlanError::Usage(problem.to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn the_command_line_is_sound() {
+        use clap::CommandFactory as _;
+        super::Cli::command().debug_assert();
+    }
+}

@@ -1,0 +1,304 @@
+//! The local executor: runs nodes whose parents are done, several at once, and then the sinks.
+
+use std::cell::OnceCell;
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::ExitCode;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc;
+
+use anyhow::{Context as _, anyhow};
+use artifact::{Failure, print_line, print_lines, report_line, report_text};
+use planning::stage_call::{Display, StageFailure};
+use planning::{Node, Sink};
+use stage::SUMMARY_FILE;
+use store::Record;
+
+use super::Executor;
+use super::budget::{Admission, Budget, Demand};
+use super::node::{Lookup, NodeJob, PendingAction, input_folder};
+use crate::failure;
+use crate::run_messages::{FailureHint, end_message};
+use crate::run_record::RunProgress;
+use crate::session::{Run, command_line};
+use crate::sink::{SinkResult, run_sink};
+use crate::watch::{Chain, Watch};
+
+/// This machine.
+pub(crate) struct Local {
+    /// Limits of the stages that run at the same time.
+    pub(crate) budget: Budget,
+    /// True if stages that don't depend on a failed one still run.
+    pub(crate) keep_going: bool,
+    /// Message after a failure.
+    pub(crate) hint: FailureHint,
+    /// Options of `--watch`.
+    pub(crate) watch: Option<Watch>,
+}
+
+impl Executor for Local {
+    fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
+        let plan = run.plan;
+        let outcome = run_nodes(run, self);
+        if run.stop.load(Ordering::Relaxed) {
+            return Err(Failure::Interrupted.into());
+        }
+        if let Some((index, failure)) = outcome.failures.first() {
+            // Without any result, pages are written only with --keep-going: a table then names the
+            // failed stages.
+            if self.keep_going || outcome.records.iter().any(Option::is_some) {
+                let partial = plan.sinks.iter().filter(|sink| sink.program.description.partial);
+                // A sink's failure doesn't replace the stage's exit code.
+                if let Err(error) = self.run_sinks(run, partial, &outcome) {
+                    report_line!("nerf-sr: {error:#}");
+                }
+            }
+            let node = &plan.nodes[*index];
+            let skipped = outcome.skipped;
+            report_text(&self.hint.message(&node.label(), &node.stage, skipped));
+            return Ok(ExitCode::from(failure.code));
+        }
+        print_summaries(run, &outcome)?;
+        let has_written = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
+        print_line!("{}", end_message(outcome.ran.len(), plan.nodes.len(), has_written));
+        Ok(ExitCode::SUCCESS)
+    }
+}
+
+impl Local {
+    /// Runs sinks and prints the paths of their pages. Returns whether a page was written.
+    fn run_sinks<'a>(
+        &self,
+        run: &Run<'_>,
+        sinks: impl Iterator<Item = &'a Sink>,
+        outcome: &Outcome,
+    ) -> anyhow::Result<bool> {
+        let progress = RunProgress {
+            records: &outcome.records,
+            ran: Some(&outcome.ran),
+            failures: &outcome.failures,
+            command: &command_line(),
+        };
+        let mut has_written = false;
+        for sink in sinks {
+            let result = run_sink(run, sink, self.budget.threads, &progress);
+            if run.stop.load(Ordering::Relaxed) {
+                return Err(Failure::Interrupted.into());
+            }
+            let result = result.map_err(|e| anyhow!("{}: {e}", sink.stage))?;
+            result.print(&sink.stage);
+            has_written |= matches!(result, SinkResult::Written { .. });
+        }
+        Ok(has_written)
+    }
+}
+
+/// Outcome of a run's nodes.
+struct Outcome {
+    /// Records by node index; `None` if the node isn't done.
+    records: Vec<Option<Record>>,
+    /// Nodes that ran.
+    ran: BTreeSet<usize>,
+    /// Nodes that failed.
+    failures: Vec<(usize, StageFailure)>,
+    /// Number of nodes that were skipped because of the failures.
+    skipped: usize,
+}
+
+/// Report of a worker: the node, its record, and whether the stage ran.
+type WorkerReport = (usize, Result<(Record, bool), StageFailure>);
+
+fn run_nodes(run: &Run<'_>, options: &Local) -> Outcome {
+    let display = Display::new();
+    let mut schedule = Schedule::new(run, options, &display);
+    let (sender, reports) = mpsc::channel::<WorkerReport>();
+    std::thread::scope(|scope| {
+        loop {
+            schedule.look_up_nodes();
+            for (index, job, action) in schedule.admit_nodes() {
+                let sender = sender.clone();
+                // The receiver lives as long as the scope. A panic ends the whole process.
+                scope.spawn(move || sender.send((index, job.carry_out(action))).ok());
+            }
+            if schedule.running.is_empty() {
+                break;
+            }
+            let Ok(report) = reports.recv() else { break };
+            schedule.finish(report);
+        }
+    });
+    let skipped = schedule.pending.len() + schedule.ready.len();
+    Outcome { skipped, ..schedule.outcome }
+}
+
+/// Progress of a run's nodes.
+struct Schedule<'a> {
+    run: &'a Run<'a>,
+    options: &'a Local,
+    display: &'a Display,
+    /// Nodes whose cache lookup is outstanding.
+    pending: BTreeSet<usize>,
+    /// Nodes that wait for admission, by node index.
+    ready: BTreeMap<usize, ReadyNode>,
+    /// Demands of the running nodes, by node index.
+    running: BTreeMap<usize, Demand>,
+    /// All records of the store, read when the first node isn't cached.
+    records: OnceCell<Vec<Record>>,
+    outcome: Outcome,
+}
+
+/// A node that isn't cached and whose parents are done.
+struct ReadyNode {
+    action: PendingAction,
+    demand: Demand,
+    /// True after a line was printed that the node waits for memory.
+    is_reported: bool,
+}
+
+impl<'a> Schedule<'a> {
+    fn new(run: &'a Run<'a>, options: &'a Local, display: &'a Display) -> Self {
+        let count = run.plan.nodes.len();
+        Self {
+            run,
+            options,
+            display,
+            pending: (0..count).collect(),
+            ready: BTreeMap::new(),
+            running: BTreeMap::new(),
+            records: OnceCell::new(),
+            outcome: Outcome {
+                records: vec![None; count],
+                ran: BTreeSet::new(),
+                failures: Vec::new(),
+                skipped: 0,
+            },
+        }
+    }
+
+    /// True if no further node may start.
+    fn is_stopping(&self) -> bool {
+        self.run.stop.load(Ordering::Relaxed)
+            || (!self.options.keep_going && !self.outcome.failures.is_empty())
+    }
+
+    fn report(&self, index: usize, text: &str) {
+        self.display.line(&format!("{}: {text}", self.run.plan.nodes[index].label()));
+    }
+
+    fn job(&self, index: usize) -> NodeJob<'a> {
+        let node = &self.run.plan.nodes[index];
+        let parents = node
+            .parents()
+            .filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?)))
+            .collect();
+        let threads = self.options.budget.threads;
+        NodeJob { run: self.run, node, parents, threads, display: self.display, watch: None }
+    }
+
+    /// Finds the stages that render and score a node's checkpoints, if `--watch` is given.
+    fn watch(&self, index: usize) -> Option<(&'a Watch, Chain)> {
+        let plan = self.run.plan;
+        let has_checkpoints = plan.nodes[index].program.description.from_checkpoint;
+        let watch = self.options.watch.as_ref().filter(|_| has_checkpoints)?;
+        let chain = Chain::find(plan, index, &|origin| {
+            input_folder(origin, self.run.store, &|index| {
+                self.outcome.records[index].as_ref().map(|record| record.output.clone())
+            })
+        });
+        if chain.is_none() {
+            let problem = "no stage of this run can score its views yet; add a target such as eval";
+            self.report(index, &format!("not watched: {problem}"));
+        }
+        Some((watch, chain?))
+    }
+
+    /// Looks up the pending nodes whose parents are done. Parents come first in the plan, so one
+    /// pass finds all cached nodes.
+    fn look_up_nodes(&mut self) {
+        for index in self.pending.clone() {
+            let node = &self.run.plan.nodes[index];
+            if self.is_stopping()
+                || node.parents().any(|parent| self.outcome.records[parent].is_none())
+            {
+                continue;
+            }
+            self.pending.remove(&index);
+            match self.job(index).look_up() {
+                Ok(Lookup::Cached(record)) => self.outcome.records[index] = Some(record),
+                Ok(Lookup::Pending(action)) => {
+                    // If records can't be read, every stage gets the default demand.
+                    let records =
+                        self.records.get_or_init(|| self.run.store.records().unwrap_or_default());
+                    let demand = Demand::estimate(&action.key_parts, &node.stage, records);
+                    self.ready.insert(index, ReadyNode { action, demand, is_reported: false });
+                }
+                Err(failure) => self.fail(index, failure),
+            }
+        }
+    }
+
+    /// Admits ready nodes in the plan's order and returns the new jobs.
+    fn admit_nodes(&mut self) -> Vec<(usize, NodeJob<'a>, PendingAction)> {
+        let mut admitted = Vec::new();
+        for (index, mut node) in std::mem::take(&mut self.ready) {
+            match self.options.budget.admission(&self.running, node.demand) {
+                Admission::Start if !self.is_stopping() => {
+                    self.running.insert(index, node.demand);
+                    let job = NodeJob { watch: self.watch(index), ..self.job(index) };
+                    admitted.push((index, job, node.action));
+                    continue;
+                }
+                Admission::TooLarge(message) if !self.is_stopping() => {
+                    self.fail(index, failure(message));
+                    continue;
+                }
+                Admission::WaitForMemory(reason) if !node.is_reported => {
+                    self.report(index, &format!("waiting: {reason}"));
+                    node.is_reported = true;
+                }
+                _ => {}
+            }
+            self.ready.insert(index, node);
+        }
+        admitted
+    }
+
+    /// Takes in a worker's report.
+    fn finish(&mut self, (index, result): WorkerReport) {
+        self.running.remove(&index);
+        match result {
+            Ok((record, ran)) => {
+                self.outcome.records[index] = Some(record);
+                if ran {
+                    self.outcome.ran.insert(index);
+                }
+            }
+            Err(failure) => self.fail(index, failure),
+        }
+    }
+
+    fn fail(&mut self, index: usize, failure: StageFailure) {
+        self.report(index, &format!("failed: {}", failure.message));
+        self.outcome.failures.push((index, failure));
+    }
+}
+
+/// Prints the summary of each node that is no other node's parent.
+fn print_summaries(run: &Run<'_>, outcome: &Outcome) -> anyhow::Result<()> {
+    let plan = run.plan;
+    let parents: BTreeSet<usize> = plan.nodes.iter().flat_map(Node::parents).collect();
+    for (index, node) in plan.nodes.iter().enumerate() {
+        if parents.contains(&index) {
+            continue;
+        }
+        let record = outcome.records[index]
+            .as_ref()
+            .with_context(|| format!("{} has no record", node.label()))?;
+        let file = run.store.object(&record.output).join(SUMMARY_FILE);
+        if let Some(summary) =
+            record.summary.clone().or_else(|| std::fs::read_to_string(&file).ok())
+        {
+            print_lines(&format!("{}: {summary}", node.label()));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,245 @@
+//! Runs one node under its key's lock.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use artifact::{format_duration, hash_json, unix_time};
+use planning::stage_call::{Call, Display, StageFailure, StageView, Usage, read_summary};
+use planning::{FoundInputs, Node, Origin, find_inputs};
+use serde_json::{Map, Value};
+use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
+
+use crate::failure;
+use crate::session::Run;
+use crate::unchanged::{ConfirmedProgram, Inputs, input_failure};
+use crate::waiting::{enter_store, holder_text, wait_for_lock};
+use crate::watch::{Chain, Watch, Watching};
+
+/// Action of a node that isn't cached.
+pub(crate) struct PendingAction {
+    pub(super) key_parts: Map<String, Value>,
+    inputs: FoundInputs,
+}
+
+/// Cache lookup result of a node whose parents are done.
+pub(crate) enum Lookup {
+    Cached(Record),
+    Pending(PendingAction),
+}
+
+/// A node to run, with everything that running it needs.
+pub(crate) struct NodeJob<'a> {
+    pub(crate) run: &'a Run<'a>,
+    pub(crate) node: &'a Node,
+    /// Records of the parents by node index.
+    pub(crate) parents: BTreeMap<usize, Record>,
+    pub(crate) threads: usize,
+    pub(crate) display: &'a Display,
+    /// Stages that render and score the node's checkpoints, if the node is watched.
+    pub(crate) watch: Option<(&'a Watch, Chain)>,
+}
+
+impl NodeJob<'_> {
+    /// Returns the node's record, after running the node if it isn't cached.
+    pub(crate) fn find_or_run(&self) -> Result<Record, StageFailure> {
+        match self.look_up()? {
+            Lookup::Cached(record) => Ok(record),
+            Lookup::Pending(action) => self.carry_out(action).map(|(record, _)| record),
+        }
+    }
+
+    /// Looks up the node's record. Either way, the run's file gets the node's key first, which
+    /// protects the artifact from garbage collection.
+    pub(crate) fn look_up(&self) -> Result<Lookup, StageFailure> {
+        let inputs = find_inputs(self.node, self.run.store, Some(self.run.stop), |index| {
+            self.output_of(index)
+        })
+        .map_err(|e| input_failure(&e))?;
+        let key_parts = planning::key_parts(self.node, &inputs.hashes, self.device());
+        let key = hash_json(&key_parts);
+        let entered = self.enter()?;
+        self.run.file.record_action(&entered, &self.node.stage, &key).map_err(failure)?;
+        Ok(match self.run.store.hit(&key).map_err(failure)? {
+            Some(record) => Lookup::Cached(record),
+            None => Lookup::Pending(PendingAction { key_parts, inputs }),
+        })
+    }
+
+    /// Runs the node unless another runner has done so meanwhile. Returns the record and whether
+    /// the stage ran.
+    pub(crate) fn carry_out(&self, action: PendingAction) -> Result<(Record, bool), StageFailure> {
+        let PendingAction { key_parts, inputs } = action;
+        let key = hash_json(&key_parts);
+        let lock = wait_for_lock(
+            self.run.stop,
+            &|holder, waited| self.report_waiting(holder, waited),
+            || self.run.store.try_lock(&key),
+        )?;
+        let action = Unfinished {
+            stage: self.node.stage.clone(),
+            point: self.node.point.clone(),
+            key_parts,
+            made_of: self.parents.values().map(Record::key).collect(),
+            started_unix: unix_time(),
+        };
+        let attempt = {
+            let entered = self.enter()?;
+            let kind = &self.node.program.description.output.kind;
+            let record = self.run.store.hit_or_repair(&entered, &key, kind).map_err(failure)?;
+            if let Some(record) = record {
+                return Ok((record, false));
+            }
+            self.run.store.begin(&entered, &action, &self.node.parameters).map_err(failure)?
+        };
+        let inputs = Inputs::new(self.node, self.run.store, inputs, |index| self.output_of(index))?;
+        self.run_and_publish(&lock, attempt, action, &inputs).map(|record| (record, true))
+    }
+
+    fn output_of(&self, index: usize) -> String {
+        self.parents[&index].output.clone()
+    }
+
+    fn device(&self) -> &str {
+        self.run.plan.device(&self.node.stage)
+    }
+
+    fn report(&self, text: &str) {
+        self.display.line(&format!("{}: {text}", self.node.label()));
+    }
+
+    fn enter(&self) -> Result<Entered, StageFailure> {
+        enter_store(self.run.store, self.run.stop, &|text| self.report(text))
+    }
+
+    fn report_waiting(&self, holder: Option<&Holder>, waited: Duration) {
+        let waited = format_duration(waited.as_secs_f64());
+        self.report(&format!("is being created{}; waiting ({waited} so far)", holder_text(holder)));
+    }
+
+    /// Calls the stage and publishes its artifact.
+    fn run_and_publish(
+        &self,
+        lock: &KeyLock,
+        attempt: Attempt,
+        action: Unfinished,
+        inputs: &Inputs<'_>,
+    ) -> Result<Record, StageFailure> {
+        let (usage, time) = self.call(lock, &attempt, inputs)?;
+        let record = Record {
+            stage: action.stage,
+            point: action.point,
+            key_parts: action.key_parts,
+            made_of: action.made_of,
+            output: String::new(),
+            started_unix: action.started_unix,
+            seconds: round_to_milliseconds(time.as_secs_f64()),
+            threads: self.threads,
+            peak_memory: Some(usage.peak_memory),
+            processor_seconds: Some(round_to_milliseconds(usage.processor_seconds)),
+            host: host_name(),
+            summary: read_summary(&attempt.output),
+        };
+        let kind = &self.node.program.description.output.kind;
+        let checked = self.run.store.check(attempt, kind).map_err(failure)?;
+        let record = self.run.store.publish(&self.enter()?, checked, record).map_err(failure)?;
+        self.report(&format!(
+            "done in {} → {}",
+            format_duration(record.seconds),
+            &record.output[..10]
+        ));
+        Ok(record)
+    }
+
+    /// Calls the stage and returns its usage and running time. Fails if the program or an input
+    /// differs from the key's at any time from start to end.
+    fn call(
+        &self,
+        lock: &KeyLock,
+        attempt: &Attempt,
+        inputs: &Inputs<'_>,
+    ) -> Result<(Usage, Duration), StageFailure> {
+        let label = self.node.label();
+        let program = ConfirmedProgram::new(&self.node.program, self.run.store, self.run.stop)?;
+        inputs.check(self.run.stop)?;
+        if inputs.drop_doubtful_checkpoints(attempt).map_err(failure)? {
+            self.report("an input was written to after the checkpoint; starting over");
+        }
+        let mut folders: Vec<(String, PathBuf)> = Vec::new();
+        for input in &self.node.inputs {
+            let folder =
+                input_folder(&input.from, self.run.store, &|index| Some(self.output_of(index)));
+            folders.extend(folder.map(|folder| (input.name.clone(), folder)));
+        }
+        let call = Call {
+            label: &label,
+            program: &self.node.program.path,
+            description: &self.node.program.description,
+            params: &attempt.params,
+            inputs: &folders,
+            hashes: &inputs.hashes,
+            output: &attempt.output,
+            work: Some(&attempt.work),
+            from_checkpoint: false,
+            device: self.device(),
+            threads: self.threads,
+            lock: Some(lock.file()),
+        };
+        let view = self.display.start(&label);
+        let started = Instant::now();
+        let result = self.run_watched(&call, attempt, &view);
+        let time = started.elapsed();
+        view.end();
+        let usage = result?;
+        program.confirm_again()?;
+        inputs.check(self.run.stop).inspect_err(|_| {
+            // Checkpoints may contain the changed input, even if it gets its old content back.
+            std::fs::remove_dir_all(&attempt.work).ok();
+        })?;
+        Ok((usage, time))
+    }
+
+    /// Runs the stage. If the node is watched, a second thread takes looks until the stage ends.
+    fn run_watched(
+        &self,
+        call: &Call<'_>,
+        attempt: &Attempt,
+        view: &StageView<'_>,
+    ) -> Result<Usage, StageFailure> {
+        let Some((watch, chain)) = &self.watch else {
+            return call.run(&attempt.log, view, self.run.stop);
+        };
+        let is_over = AtomicBool::new(false);
+        let scratch =
+            self.run.store.scratch(self.run.file.id()).join(format!("watch-{}", call.label));
+        let (label, display, is_over) = (call.label, self.display, &is_over);
+        let watching = Watching { watch, chain, label, scratch, display, is_over };
+        std::thread::scope(|scope| {
+            scope.spawn(|| watching.run(call));
+            let result = call.run(&attempt.log, view, self.run.stop);
+            is_over.store(true, Ordering::Relaxed);
+            result
+        })
+    }
+}
+
+/// Returns the folder of an input; `None` if its artifact doesn't exist yet. `output_of` returns
+/// the artifact of a node.
+pub(super) fn input_folder(
+    origin: &Origin,
+    store: &Store,
+    output_of: &dyn Fn(usize) -> Option<String>,
+) -> Option<PathBuf> {
+    match origin {
+        Origin::Node { index, subtree } => {
+            let object = store.object(&output_of(*index)?);
+            Some(subtree.as_ref().map_or(object.clone(), |s| object.join(s)))
+        }
+        Origin::Folder(folder) => Some(folder.clone()),
+    }
+}
+
+fn round_to_milliseconds(seconds: f64) -> f64 {
+    (seconds * 1e3).round() / 1e3
+}

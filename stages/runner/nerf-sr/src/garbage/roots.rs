@@ -1,0 +1,122 @@
+use std::collections::{BTreeMap, BTreeSet};
+
+use artifact::unix_time;
+use slurm::{Queue, Slurm};
+use store::{Run, Store, StoreError, Waiting};
+
+use crate::garbage::contents::Contents;
+
+/// Actions that are needed, and why.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Root {
+    /// Reason for keeping them, as a sentence fragment.
+    pub(crate) reason: String,
+    /// Keys of actions.
+    pub(crate) keys: BTreeSet<String>,
+    /// Nodes with unknown inputs: each keeps all records that may be the node's.
+    pub(crate) waiting: Vec<Waiting>,
+    /// True if the actions that produced their inputs are needed, too. Plans and runs list these
+    /// actions themselves.
+    pub(crate) with_inputs: bool,
+}
+
+/// Choices of the caller: ages and kinds of entries to keep.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Policy {
+    /// Age, in days since the last use, below which an entry is kept.
+    pub(crate) keep_days: u64,
+    /// True to delete checkpoints of actions that no process is working on.
+    pub(crate) drop_unfinished: bool,
+    /// True to delete artifacts whose keys have an older version.
+    pub(crate) drop_old: bool,
+}
+
+impl Policy {
+    /// Returns whether a time is less than `keep_days` ago. A time in the future is recent unless
+    /// `keep_days` is 0.
+    pub(crate) fn is_recent(self, unix: u64) -> bool {
+        unix_time().saturating_sub(unix) < self.keep_days.saturating_mul(86_400)
+    }
+}
+
+/// Returns all roots of a store. If several roots reach an entry, the first one gives the reason.
+pub(crate) fn find_roots(
+    store: &Store,
+    contents: &Contents,
+    plan: Root,
+    policy: Policy,
+    runs: &[Run],
+    submissions: &BTreeMap<String, String>,
+) -> Result<Vec<Root>, StoreError> {
+    let mut roots = vec![plan];
+    for pin in store.pins()? {
+        roots.push(run_root(format!("pinned as {}", pin.id), pin));
+    }
+    for run in runs.iter().cloned() {
+        if let Some(reason) = submissions.get(&run.id) {
+            roots.push(run_root(reason.clone(), run));
+        } else if run.in_progress {
+            let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
+            roots.push(run_root(format!("needed by the run of process {process}"), run));
+        } else if policy.is_recent(run.last_used_unix()) {
+            roots
+                .push(run_root(format!("used by a run {}", format_age(run.last_used_unix())), run));
+        }
+    }
+    for key in store.locked_keys()? {
+        roots.push(action_root("a stage is creating it".to_owned(), &key));
+    }
+    for (key, record) in &contents.records {
+        if policy.is_recent(record.started_unix) {
+            let reason = format!("created {}", format_age(record.started_unix));
+            roots.push(action_root(reason, key));
+        }
+        if !policy.drop_old && record.has_old_key() {
+            let reason = "created by an older version of nerf-sr (--drop-old)";
+            roots.push(action_root(reason.to_owned(), key));
+        }
+    }
+    if !policy.drop_unfinished {
+        for key in contents.unfinished.keys() {
+            if store.has_checkpoint(key)? {
+                let reason = "has a checkpoint (--drop-unfinished)";
+                roots.push(action_root(reason.to_owned(), key));
+            }
+        }
+    }
+    Ok(roots)
+}
+
+/// Returns the ids of submissions with unfinished jobs, each with the reason for keeping it; all
+/// submissions if Slurm doesn't answer.
+pub(crate) fn outstanding_submissions(
+    store: &Store,
+) -> Result<BTreeMap<String, String>, StoreError> {
+    let (reason, ids) = match Queue::read(&Slurm::default(), store.root()) {
+        Ok(queue) => (
+            "a submitted job needs it".to_owned(),
+            queue.submissions().into_iter().map(str::to_owned).collect::<Vec<_>>(),
+        ),
+        Err(error) => {
+            let path = store.root().join("slurm");
+            let submissions = slurm::list_submissions(store.root())
+                .map_err(|e| StoreError::Io { path, source: std::io::Error::other(e) })?;
+            let reason = format!("a submitted job may need it ({error})");
+            (reason, submissions.into_iter().map(|(id, _)| id).collect())
+        }
+    };
+    Ok(ids.into_iter().map(|id| (id, reason.clone())).collect())
+}
+
+fn action_root(reason: String, key: &str) -> Root {
+    Root { reason, keys: BTreeSet::from([key.to_owned()]), waiting: Vec::new(), with_inputs: true }
+}
+
+fn run_root(reason: String, run: Run) -> Root {
+    Root { reason, keys: run.keys, waiting: run.waiting, with_inputs: false }
+}
+
+fn format_age(unix: u64) -> String {
+    let hours = unix_time().saturating_sub(unix) / 3600;
+    if hours < 48 { format!("{hours} h ago") } else { format!("{} days ago", hours / 24) }
+}

@@ -1,0 +1,65 @@
+//! `nerf-sr`, the runner: pipeline.yaml → plan → run. The crate `planning` creates plans; this one
+//! carries them out. It knows stages by their `describe` alone and artifacts by their hashes.
+//!
+//! * `cli`, `session`, `verbs`: the command line, its pipeline and store, and one function a verb.
+//! * `execute`: carries out a plan on this machine or as a cluster's jobs, each node under its
+//!   key's lock. `unchanged` checks that programs and inputs stay the same while a stage runs.
+//! * `identities`: identities of nodes whose keys aren't known yet.
+//! * `node_report`: a plan's nodes as JSON. `state_text`: their states as text. `lineage`: two
+//!   results and their inputs, compared.
+//! * `watch`: shows one test view of a field while the field trains.
+//! * `sink`: gives the run's record (`run_record`) to stages that show it, such as the report, and
+//!   publishes their pages (`publish`, `page`, `archive`).
+
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+
+mod archive;
+mod cli;
+mod execute;
+mod garbage;
+mod identities;
+mod lineage;
+mod node_report;
+mod page;
+mod publish;
+mod run_messages;
+mod run_record;
+mod session;
+mod sink;
+mod starter;
+mod state_text;
+mod unchanged;
+mod verbs;
+mod waiting;
+mod watch;
+
+use std::process::ExitCode;
+
+use artifact::report_line;
+use planning::PlanError;
+use planning::stage_call::StageFailure;
+
+/// Runs the program. Exit codes: 0 for success, a failed stage's own code, 2 for an invalid file or
+/// command line, 70 for a panic. A closed stdout changes none of them.
+pub fn main() -> ExitCode {
+    stage::install_panic_hook("nerf-sr");
+    cli::run_command_line().unwrap_or_else(|error| {
+        report_line!("nerf-sr: {}", artifact::one_line(&error));
+        let plan_error = error.chain().find_map(|e| e.downcast_ref::<PlanError>());
+        ExitCode::from(plan_error.map_or_else(|| artifact::exit_code(&error), exit_code))
+    })
+}
+
+/// Returns a failure with exit code 1: neither invalid input nor a numerical failure.
+fn failure(error: impl std::fmt::Display) -> StageFailure {
+    StageFailure { code: 1, message: error.to_string() }
+}
+
+fn exit_code(error: &PlanError) -> u8 {
+    match error {
+        PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
+        PlanError::Store(_) => 1,
+        PlanError::Source { .. } | PlanError::Artifact(_) => 3,
+        PlanError::Interrupted => 130,
+    }
+}

@@ -1,0 +1,229 @@
+//! Publishing of a sink's page: the page is copied next to the old one, then exchanged for it
+//! atomically. A folder is replaced only if a sink wrote all of it and nobody has changed it
+//! ([`crate::page`]). A page of another data set, or a complete page that a partial one
+//! replaces, is archived ([`crate::archive`]).
+//!
+//! A kill may leave one of these next to a target `NAME`; the next publishing finishes the work:
+//!
+//! ```text
+//! .NAME.nerf-sr-scrap   a partial copy or a partially deleted folder, without value
+//! .NAME.nerf-sr-new     a complete page: the new one, or the old one after the exchange
+//! .NAME.nerf-sr-old     the old page, if the file system can't exchange two folders
+//! ```
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use artifact::{Manifest, list_files};
+use planning::stage_call::StageFailure;
+use rustix::fs::{CWD, RenameFlags, renameat_with};
+use store::{Locked, StoreError, is_lock_acquired};
+
+use crate::archive::archive_path;
+use crate::failure;
+use crate::page::{PageMark, check_ownership};
+use crate::waiting::wait_for_lock;
+
+/// True if the target is a page with this identity and all its files, and a killed publishing left
+/// nothing of value next to it.
+pub(crate) fn has_current_page(target: &Path, identity: &str) -> bool {
+    let mark = PageMark::read(target).ok().flatten();
+    mark.is_some_and(|mark| mark.identity == identity)
+        && has_all_files(target)
+        && ["new", "old"].iter().all(|suffix| matches!(exists(&hidden(target, suffix)), Ok(false)))
+}
+
+/// True if all files of a page's manifest exist with their sizes.
+fn has_all_files(page: &Path) -> bool {
+    Manifest::read(page).is_ok_and(|manifest| manifest.check_sizes(page).is_ok())
+}
+
+/// Publishes a sink's output, which contains its mark, as `target`. `kind` is the output's kind.
+/// Returns the new paths of earlier pages that were archived.
+pub(crate) fn publish(
+    output: &Path,
+    target: &Path,
+    kind: &str,
+    stop: &AtomicBool,
+) -> Result<Vec<PathBuf>, StageFailure> {
+    let out = target.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(out).map_err(|e| StageFailure::at(out, &e))?;
+    let _lock = lock_folder(out, stop)?;
+    let mark = PageMark::read(output).map_err(|e| StageFailure::at(output, &e))?;
+    let publishing = Publishing { target, kind, mark: mark.unwrap_or_default() };
+    let mut archived = publishing.finish_earlier()?;
+    let replaced = publishing.replace(output);
+    remove_folder(&publishing.hidden("scrap")).ok();
+    archived.extend(replaced?);
+    Ok(archived)
+}
+
+/// A publishing in progress; the target's parent folder is locked.
+struct Publishing<'a> {
+    target: &'a Path,
+    kind: &'a str,
+    /// Mark of the new page.
+    mark: PageMark,
+}
+
+impl Publishing<'_> {
+    fn hidden(&self, suffix: &str) -> PathBuf {
+        hidden(self.target, suffix)
+    }
+
+    fn failure(&self, error: &io::Error) -> StageFailure {
+        StageFailure::at(self.target, error)
+    }
+
+    /// Finishes a killed publishing. Returns the new paths of its pages that were archived.
+    fn finish_earlier(&self) -> Result<Vec<PathBuf>, StageFailure> {
+        let (old, new) = (self.hidden("old"), self.hidden("new"));
+        let is_target_missing = !exists(self.target).map_err(|e| self.failure(&e))?;
+        if is_target_missing && exists(&old).map_err(|e| self.failure(&e))? {
+            fs::rename(&old, self.target).map_err(|e| self.failure(&e))?;
+        }
+        let mut archived = Vec::new();
+        for leftover in [old, new] {
+            if exists(&leftover).map_err(|e| self.failure(&e))? {
+                self.check_ownership(&leftover)?;
+                archived.extend(
+                    self.archive_or_delete_leftover(&leftover).map_err(|e| self.failure(&e))?,
+                );
+            }
+        }
+        Ok(archived)
+    }
+
+    /// Archives or deletes a leftover, as its own publishing would have done: the leftover either
+    /// was replaced by the target's page, or was to replace it.
+    fn archive_or_delete_leftover(&self, leftover: &Path) -> io::Result<Option<PathBuf>> {
+        let mark = PageMark::read(leftover)?.unwrap_or_default();
+        if !has_all_files(leftover) || mark.identity == self.mark.identity {
+            return self.delete(leftover).map(|()| None);
+        }
+        let shown = PageMark::read(self.target)?;
+        self.archive_or_delete(leftover, shown.as_ref().unwrap_or(&self.mark))
+    }
+
+    /// Replaces the target's page by a copy of `output`. Returns the new path of the old page if
+    /// that was archived.
+    fn replace(&self, output: &Path) -> Result<Option<PathBuf>, StageFailure> {
+        let (scrap, page) = (self.hidden("scrap"), self.hidden("new"));
+        remove_folder(&scrap)
+            .and_then(|()| copy_folder(output, &scrap))
+            .and_then(|()| fs::rename(&scrap, &page))
+            .map_err(|e| StageFailure::at(&scrap, &e))?;
+        if let Err(refused) = self.exchange(&page) {
+            self.delete(&page).ok();
+            return Err(refused);
+        }
+        self.archive_or_delete(&page, &self.mark).map_err(|e| StageFailure::at(&page, &e))
+    }
+
+    /// Exchanges a page and the target's page. If the target doesn't exist, the page is moved.
+    fn exchange(&self, page: &Path) -> Result<(), StageFailure> {
+        if !exists(self.target).map_err(|e| self.failure(&e))? {
+            return fs::rename(page, self.target).map_err(|e| self.failure(&e));
+        }
+        self.check_ownership(self.target)?;
+        let flags = RenameFlags::EXCHANGE;
+        if renameat_with(CWD, page, CWD, self.target, flags).is_ok() {
+            return Ok(());
+        }
+        // Not every file system can exchange two folders. Without that, the target doesn't exist
+        // for a moment.
+        let old = self.hidden("old");
+        fs::rename(self.target, &old).map_err(|e| self.failure(&e))?;
+        let moved = fs::rename(page, self.target);
+        let destination = if moved.is_ok() { page } else { self.target };
+        fs::rename(&old, destination).and(moved).map_err(|e| self.failure(&e))
+    }
+
+    /// Archives a page that one with the mark `newer` replaces, or deletes it if it isn't worth
+    /// archiving. Returns the page's new path.
+    fn archive_or_delete(&self, page: &Path, newer: &PageMark) -> io::Result<Option<PathBuf>> {
+        if !exists(page)? {
+            return Ok(None);
+        }
+        let Some(archived) = archive_path(page, newer, self.target, self.kind)? else {
+            return self.delete(page).map(|()| None);
+        };
+        if exists(&archived)? {
+            self.delete(&archived)?;
+        }
+        fs::rename(page, &archived)?;
+        Ok(Some(archived))
+    }
+
+    /// Deletes a folder that a sink wrote. The folder is renamed first, so that a kill leaves no
+    /// partial page under a page's name.
+    fn delete(&self, folder: &Path) -> io::Result<()> {
+        let scrap = self.hidden("scrap");
+        remove_folder(&scrap)?;
+        fs::rename(folder, &scrap)?;
+        remove_folder(&scrap)
+    }
+
+    fn check_ownership(&self, folder: &Path) -> Result<(), StageFailure> {
+        check_ownership(folder, self.kind).map_err(|reason| {
+            failure(format!(
+                "{reason}; nothing was replaced: move this away, or choose another folder with \
+                --out"
+            ))
+        })
+    }
+}
+
+/// Returns the path of a hidden folder next to the target.
+fn hidden(target: &Path, suffix: &str) -> PathBuf {
+    let name = target.file_name().unwrap_or_default().to_string_lossy();
+    target.with_file_name(format!(".{name}.nerf-sr-{suffix}"))
+}
+
+/// Locks a folder of pages. Runs with different stores may publish into the same folder, so the
+/// store's locks aren't enough.
+fn lock_folder(folder: &Path, stop: &AtomicBool) -> Result<File, StageFailure> {
+    wait_for_lock(stop, &|_, _| {}, || {
+        let file = File::open(folder)
+            .map_err(|source| StoreError::Io { path: folder.to_path_buf(), source })?;
+        Ok(if is_lock_acquired(folder, file.try_lock())? {
+            Locked::Acquired(file)
+        } else {
+            Locked::HeldBy(None)
+        })
+    })
+}
+
+/// Copies a folder and syncs its files, so that a full disk is noticed before a page is replaced.
+fn copy_folder(from: &Path, to: &Path) -> io::Result<()> {
+    fs::create_dir_all(to)?;
+    for (relative, file) in list_files(from)? {
+        let target = to.join(relative);
+        if let Some(folder) = target.parent() {
+            fs::create_dir_all(folder)?;
+        }
+        fs::copy(file, &target)?;
+        File::open(&target)?.sync_all()?;
+    }
+    Ok(())
+}
+
+fn exists(path: &Path) -> io::Result<bool> {
+    match path.symlink_metadata() {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
+        found => found.map(|_| true),
+    }
+}
+
+fn remove_folder(path: &Path) -> io::Result<()> {
+    match fs::remove_dir_all(path) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
+        result => result,
+    }
+}
+
+#[cfg(test)]
+#[path = "publish_tests.rs"]
+mod tests;

@@ -1,0 +1,192 @@
+//! Record of a run, as a sink gets it.
+
+use std::collections::BTreeSet;
+
+use artifact::{FailedPoint, RunNode, RunRecord, UnfinishedNode};
+use planning::stage_call::StageFailure;
+use planning::{Node, Origin, Plan, Sink};
+use serde_json::Map;
+use store::{Record, Store};
+
+use crate::session::Run;
+
+/// Progress of a run.
+pub(crate) struct RunProgress<'a> {
+    /// Records by node index; `None` if the node isn't done.
+    pub(crate) records: &'a [Option<Record>],
+    /// Nodes that ran; `None` if unknown.
+    pub(crate) ran: Option<&'a BTreeSet<usize>>,
+    /// Nodes that failed.
+    pub(crate) failures: &'a [(usize, StageFailure)],
+    /// Command line of the run.
+    pub(crate) command: &'a [String],
+}
+
+impl<'a> RunProgress<'a> {
+    /// Returns the progress of a run before its first stage.
+    pub(crate) fn not_started(records: &'a [Option<Record>]) -> Self {
+        Self { records, ran: None, failures: &[], command: &[] }
+    }
+}
+
+/// Returns the record of the nodes that a sink shows and of their ancestors. `None` if one of them
+/// isn't done, unless the sink can show a part of a run. No artifact is read: values that the scene
+/// decides are missing, and so is everything that differs between two runs with equal results;
+/// [`add_details`] adds both.
+pub(crate) fn run_record(
+    run: &Run<'_>,
+    sink: &Sink,
+    progress: &RunProgress<'_>,
+) -> Option<RunRecord> {
+    let plan = run.plan;
+    let mut is_complete: Vec<bool> = Vec::with_capacity(plan.nodes.len());
+    for (index, node) in plan.nodes.iter().enumerate() {
+        let is_done = progress.records[index].is_some();
+        is_complete.push(is_done && node.parents().all(|parent| is_complete[parent]));
+    }
+    let (shown, missing): (Vec<usize>, Vec<usize>) =
+        sink.shows.iter().partition(|&&index| is_complete[index]);
+    let can_be_partial = sink.program.description.partial;
+    if !missing.is_empty() && !can_be_partial {
+        return None;
+    }
+    let (done, undone): (Vec<usize>, Vec<usize>) =
+        nodes_with_ancestors(plan, sink).into_iter().partition(|&index| is_complete[index]);
+    let mut nodes = Vec::with_capacity(done.len());
+    for &index in &done {
+        let record = progress.records[index].as_ref()?;
+        nodes.push(run_node(&plan.nodes[index], record, &done, shown.contains(&index), run.store));
+    }
+    let unfinished = undone
+        .iter()
+        .map(|&index| unfinished_node(plan, index, &done, &undone, progress))
+        .collect();
+    let mut failed = Vec::with_capacity(missing.len());
+    for node in missing.into_iter().map(|index| &plan.nodes[index]) {
+        failed.push(FailedPoint {
+            stage: node.stage.clone(),
+            point: node.point.clone(),
+            values: node.values.clone(),
+            reason: None,
+        });
+    }
+    // Sinks that show complete runs alone don't know of missing results.
+    if can_be_partial {
+        failed.extend_from_slice(&sink.left_out);
+    }
+    // JSON can't contain a path that isn't UTF-8. Without the path a table has no commit.
+    let home = std::path::absolute(run.out)
+        .ok()
+        .filter(|home| home.to_str().is_some())
+        .unwrap_or_default();
+    let data_sets = data_sets(plan, sink);
+    Some(RunRecord {
+        pages_folder: home,
+        command: Vec::new(),
+        data_sets,
+        nodes,
+        failed,
+        unfinished,
+    })
+}
+
+/// Returns the nodes that a sink shows and their ancestors, in the plan's order.
+fn nodes_with_ancestors(plan: &Plan, sink: &Sink) -> BTreeSet<usize> {
+    let mut found: BTreeSet<usize> = sink.shows.iter().copied().collect();
+    for index in (0..plan.nodes.len()).rev() {
+        if found.contains(&index) {
+            found.extend(plan.nodes[index].parents());
+        }
+    }
+    found
+}
+
+fn run_node(
+    node: &Node,
+    record: &Record,
+    done: &[usize],
+    is_shown: bool,
+    store: &Store,
+) -> RunNode {
+    RunNode {
+        stage: node.stage.clone(),
+        point: node.point.clone(),
+        values: node.values.clone(),
+        is_shown,
+        program: node.program.description.name.clone(),
+        is_cached: None,
+        kind: node.program.description.output.kind.clone(),
+        key: record.key(),
+        output: record.output.clone(),
+        resolved: Map::new(),
+        folder: store.object(&record.output),
+        parameters: node.parameters.as_object().cloned().unwrap_or_default(),
+        inputs: node.run_inputs(|parent| done.iter().position(|&index| index == parent)),
+        started_unix: record.started_unix,
+        seconds: record.seconds,
+        threads: record.threads,
+        peak_memory: record.peak_memory,
+        processor_seconds: record.processor_seconds,
+        host: record.host.clone(),
+    }
+}
+
+fn unfinished_node(
+    plan: &Plan,
+    index: usize,
+    done: &[usize],
+    undone: &[usize],
+    progress: &RunProgress<'_>,
+) -> UnfinishedNode {
+    let node = &plan.nodes[index];
+    // Numbers of a record's nodes: done ones first.
+    let numbers: Vec<usize> = done.iter().chain(undone).copied().collect();
+    let failure = progress.failures.iter().find(|(failed, _)| *failed == index);
+    UnfinishedNode {
+        stage: node.stage.clone(),
+        point: node.point.clone(),
+        kind: node.program.description.output.kind.clone(),
+        parameters: node.parameters.as_object().cloned().unwrap_or_default(),
+        needs: node
+            .parents()
+            .filter_map(|parent| numbers.iter().position(|&other| other == parent))
+            .collect(),
+        message: failure.map(|(_, failure)| failure.message.clone()),
+    }
+}
+
+/// Returns the data sets from which the shown nodes were computed: folders, and blocks that create
+/// data sets.
+fn data_sets(plan: &Plan, sink: &Sink) -> Vec<String> {
+    let mut found = BTreeSet::new();
+    for node in nodes_with_ancestors(plan, sink).into_iter().map(|index| &plan.nodes[index]) {
+        let folders: Vec<String> = node
+            .inputs
+            .iter()
+            .filter_map(|input| match &input.from {
+                Origin::Folder(folder) => Some(folder.display().to_string()),
+                Origin::Node { .. } => None,
+            })
+            .collect();
+        match node.program.description.output.kind.as_str() {
+            "dataset" if folders.is_empty() => _ = found.insert(node.stage.clone()),
+            "dataset" | "scene" => found.extend(folders),
+            _ => {}
+        }
+    }
+    found.into_iter().collect()
+}
+
+/// Adds the values that the scene decides, read from the artifacts, and this run's own data.
+pub(crate) fn add_details(record: &mut RunRecord, plan: &Plan, progress: &RunProgress<'_>) {
+    for node in &mut record.nodes {
+        let index = plan
+            .nodes
+            .iter()
+            .position(|planned| planned.stage == node.stage && planned.point == node.point);
+        let Some(index) = index else { continue };
+        node.resolved = plan.nodes[index].by_scene(&node.folder);
+        node.is_cached = progress.ran.map(|ran| !ran.contains(&index));
+    }
+    record.command = progress.command.to_vec();
+}

@@ -1,0 +1,143 @@
+//! Sinks show a run: each gets the run's record and writes a folder of its own. Sinks are never
+//! cached, but a sink whose page shows the same record already isn't called again.
+
+use std::path::{Path, PathBuf};
+
+use artifact::{
+    MANIFEST_FILE, Manifest, RunRecord, hash_json, list_output_files, print_line, write_json,
+};
+use planning::Sink;
+use planning::stage_call::{Call, Display, StageFailure};
+use serde_json::json;
+use store::Record;
+
+use crate::failure;
+use crate::page::PageMark;
+use crate::publish::{has_current_page, publish};
+use crate::run_record::{RunProgress, add_details, run_record};
+use crate::session::Run;
+use crate::unchanged::ConfirmedProgram;
+
+/// Returns the identity of a sink's page: a hash of the record, the sink's code and its parameters.
+/// Values that the scene decides follow from these, so they aren't hashed.
+fn page_identity(sink: &Sink, record: &RunRecord) -> String {
+    hash_json(&json!({"record": record, "code": sink.program.description.code,
+            "parameters": sink.parameters}))
+}
+
+/// True if a sink's page already shows these records.
+pub(crate) fn is_up_to_date(run: &Run<'_>, sink: &Sink, records: &[Option<Record>]) -> bool {
+    let record = run_record(run, sink, &RunProgress::not_started(records));
+    record.is_some_and(|record| {
+        has_current_page(&run.out.join(&sink.stage), &page_identity(sink, &record))
+    })
+}
+
+/// Result of [`run_sink`].
+pub(crate) enum SinkResult {
+    /// The sink wrote its folder. `archived` are the new paths of earlier pages.
+    Written { folder: PathBuf, archived: Vec<PathBuf> },
+    /// The folder already shows this record.
+    UpToDate(PathBuf),
+    /// A node that the sink shows has no record.
+    Incomplete,
+}
+
+impl SinkResult {
+    /// Prints the path of the sink's page, and the new paths of earlier pages.
+    pub(crate) fn print(&self, stage: &str) {
+        match self {
+            Self::Written { folder, archived } => {
+                for folder in archived {
+                    print_line!("{stage}: moved the earlier page to {}", page_path(folder));
+                }
+                print_line!("{stage}: {}", page_path(folder));
+            }
+            Self::UpToDate(folder) => print_line!("{stage}: {} (up to date)", page_path(folder)),
+            Self::Incomplete => print_line!("{stage}: nothing to show"),
+        }
+    }
+}
+
+/// Returns the path of the page in a sink's folder, or the folder if it has no page.
+fn page_path(folder: &Path) -> String {
+    let page = folder.join("index.html");
+    if page.exists() { page.display().to_string() } else { folder.display().to_string() }
+}
+
+/// Calls a sink and publishes its page as `out/STAGE`.
+pub(crate) fn run_sink(
+    run: &Run<'_>,
+    sink: &Sink,
+    threads: usize,
+    progress: &RunProgress<'_>,
+) -> Result<SinkResult, StageFailure> {
+    let Some(mut record) = run_record(run, sink, progress) else {
+        return Ok(SinkResult::Incomplete);
+    };
+    let target = run.out.join(&sink.stage);
+    let identity = page_identity(sink, &record);
+    if has_current_page(&target, &identity) {
+        return Ok(SinkResult::UpToDate(target));
+    }
+    add_details(&mut record, run.plan, progress);
+    let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
+    let output = scratch.join("output");
+    call(run, sink, threads, &record, &scratch, &output)?;
+    list_output_files(&output).map_err(failure)?;
+    let kind = &sink.program.description.output.kind;
+    let manifest = output.join(MANIFEST_FILE);
+    if !manifest.exists() {
+        let found =
+            Manifest::of_folder(kind, &output).map_err(|e| StageFailure::at(&output, &e))?;
+        write_json(&manifest, &found).map_err(|e| StageFailure::at(&manifest, &e))?;
+    }
+    let mark = PageMark {
+        identity,
+        is_complete: record.failed.iter().all(|point| point.reason.is_some()),
+        data_sets: record.data_sets,
+    };
+    mark.write(&output).map_err(|e| StageFailure::at(&output, &e))?;
+    let archived = publish(&output, &target, kind, run.stop)?;
+    // Leftovers of a sink have no value.
+    std::fs::remove_dir_all(&scratch).ok();
+    Ok(SinkResult::Written { folder: target, archived })
+}
+
+/// Calls a sink's program, which reads `run.json` and writes `output`.
+fn call(
+    run: &Run<'_>,
+    sink: &Sink,
+    threads: usize,
+    record: &RunRecord,
+    scratch: &Path,
+    output: &Path,
+) -> Result<(), StageFailure> {
+    let folder = scratch.join("run");
+    let params = scratch.join("params.json");
+    std::fs::create_dir_all(&folder)
+        .and_then(|()| write_json(&folder.join("run.json"), record))
+        .and_then(|()| write_json(&params, &sink.parameters))
+        .map_err(|e| StageFailure::at(scratch, &e))?;
+    let program = ConfirmedProgram::new(&sink.program, run.store, run.stop)?;
+    let display = Display::new();
+    let view = display.start(&sink.stage);
+    let call = Call {
+        label: &sink.stage,
+        program: &sink.program.path,
+        description: &sink.program.description,
+        params: &params,
+        inputs: &[("run".to_owned(), folder)],
+        hashes: &[],
+        output,
+        work: None,
+        from_checkpoint: false,
+        device: run.plan.device(&sink.stage),
+        threads,
+        lock: None,
+    };
+    let result = call.run(&scratch.join("log"), &view, run.stop);
+    view.end();
+    result?;
+    program.confirm_again()
+}

@@ -1,0 +1,231 @@
+//! First pipeline for a folder of posed photographs, as `nerf-sr init` writes it
+//! (docs/design/040).
+//!
+//! * [`Starter`]: summary of the folder, and a complete, commented pipeline file for it.
+//! * [`Starter::write`]: writes the pipeline file and, next to it, `pipelines/` with the shipped
+//!   targets. Existing files are never overwritten.
+//!
+//! Images up to [`MAX_WIDTH`] pixels wide keep their size. Larger ones are shrunk first: on a CPU,
+//! training on photographs of twelve million pixels takes hours.
+
+mod unposed;
+
+use std::fs;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+use artifact::counted;
+use dataset::{Dataset, DatasetError, Frame};
+
+use unposed::UnposedImages;
+
+/// Maximum width, in pixels, of images that keep their size. Chosen by hand: a CPU trains on larger
+/// ones for hours.
+pub(crate) const MAX_WIDTH: u32 = 800;
+/// HR width over LR width, chosen by hand.
+const SCALE: u32 = 2;
+/// Number of training rays: chosen by hand for a training of minutes on a CPU.
+const TRAINING_RAYS: u64 = 20_000_000;
+/// File names and texts of the shipped targets (`pipelines/` of the repository).
+const TARGETS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/targets.rs"));
+
+/// Pipeline for a data set, not written yet.
+#[derive(Clone, Debug)]
+pub(crate) struct Starter {
+    summary: String,
+    notes: Vec<String>,
+    text: String,
+    file: PathBuf,
+}
+
+/// Error returned when the pipeline can't be composed or written.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum StarterError {
+    /// The folder contains no data set.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+    /// The folder contains images, but no cameras.
+    #[error(
+        "{}: {found}, but no cameras; estimate them with COLMAP: {command}", folder.display()
+    )]
+    NoCameras {
+        /// Folder of the images.
+        folder: PathBuf,
+        /// Number and unread formats of the images, as text.
+        found: String,
+        /// Command that estimates the cameras.
+        command: String,
+    },
+    /// The pipeline file would be inside the data set.
+    #[error(
+        "{}: the pipeline and its results can't be inside the data set; change to another folder, \
+        such as the parent",
+        folder.display()
+    )]
+    Inside {
+        /// Folder of the data set.
+        folder: PathBuf,
+    },
+    /// The path can't be written to a pipeline file.
+    #[error("{}: path isn't UTF-8; rename the folder", folder.display())]
+    Name {
+        /// Folder of the data set.
+        folder: PathBuf,
+    },
+    /// A file to write exists already.
+    #[error(
+        "{} exists and was not changed; run `nerf-sr init` in a new folder",
+        file.display()
+    )]
+    Exists {
+        /// Existing file.
+        file: PathBuf,
+    },
+    /// A file or folder can't be found or written.
+    #[error("{}: {source}", file.display())]
+    Io {
+        /// Path of the file or folder.
+        file: PathBuf,
+        /// Error of the system.
+        source: io::Error,
+    },
+}
+
+impl Starter {
+    /// Reads a folder of posed photographs and composes the pipeline `file` for it.
+    pub(crate) fn new(folder: &Path, file: &Path) -> Result<Self, StarterError> {
+        let set = Dataset::read(folder).map_err(|error| read_error(folder, error))?;
+        let parent = file.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let dataset = data_path(folder, parent.unwrap_or(Path::new(".")))?;
+        let summary = summarize(&set);
+        let text = pipeline_text(&set, &summary, &dataset);
+        Ok(Self { summary, notes: set.notes, text, file: file.to_path_buf() })
+    }
+
+    /// Returns the format of the data set, and number and size of its photographs.
+    pub(crate) fn summary(&self) -> &str {
+        &self.summary
+    }
+
+    /// Returns the data set's notes, such as lens distortion, one line each.
+    pub(crate) fn notes(&self) -> &[String] {
+        &self.notes
+    }
+
+    /// Writes the pipeline file and, in `pipelines/` next to it, the shipped targets. Returns the
+    /// written files. Writes nothing if any of them exists.
+    pub(crate) fn write(&self) -> Result<Vec<PathBuf>, StarterError> {
+        let shelf = self.file.with_file_name("pipelines");
+        let name = self.file.file_name().unwrap_or_default().to_string_lossy();
+        let mut files = vec![(self.file.clone(), self.text.clone())];
+        for (target, text) in TARGETS {
+            let text = text.replace("../pipeline.yaml", &format!("../{name}"));
+            files.push((shelf.join(target), text));
+        }
+        if let Some((file, _)) = files.iter().find(|(file, _)| fs::symlink_metadata(file).is_ok()) {
+            return Err(StarterError::Exists { file: file.clone() });
+        }
+        fs::create_dir_all(&shelf).map_err(|e| io_error(&shelf, e))?;
+        for (file, text) in &files {
+            fs::File::create_new(file)
+                .and_then(|mut created| created.write_all(text.as_bytes()))
+                .map_err(|e| io_error(file, e))?;
+        }
+        Ok(files.into_iter().map(|(file, _)| file).collect())
+    }
+}
+
+fn io_error(file: &Path, source: io::Error) -> StarterError {
+    StarterError::Io { file: file.to_path_buf(), source }
+}
+
+/// Returns the YAML text for the data set's folder in a pipeline file of the folder `parent`: a
+/// relative path if the data set is inside `parent`, otherwise an absolute one.
+fn data_path(folder: &Path, parent: &Path) -> Result<String, StarterError> {
+    let data = folder.canonicalize().map_err(|e| io_error(folder, e))?;
+    let parent = parent.canonicalize().map_err(|e| io_error(parent, e))?;
+    if parent.starts_with(&data) {
+        return Err(StarterError::Inside { folder: folder.to_path_buf() });
+    }
+    let path = match data.strip_prefix(&parent) {
+        Ok(relative) => Path::new(".").join(relative),
+        Err(_) => data,
+    };
+    let text = path.to_str().ok_or_else(|| StarterError::Name { folder: folder.to_path_buf() })?;
+    if text.chars().all(|c| c.is_alphanumeric() || "./_-+".contains(c)) {
+        return Ok(text.to_owned());
+    }
+    // A JSON string is a YAML string, too.
+    Ok(serde_json::json!(text).to_string())
+}
+
+/// Returns the format of a data set, and number and size of its photographs, as text.
+fn summarize(set: &Dataset) -> String {
+    let mut sizes = set.frames.iter().map(Frame::intrinsics).map(|i| (i.width, i.height));
+    let size = match sizes.next() {
+        Some(first) if sizes.all(|size| size == first) => format!(" of {}×{}", first.0, first.1),
+        _ => " of several sizes".to_owned(),
+    };
+    format!("{}: {}{size}", set.format.title(), counted(set.frames.len(), "photograph"))
+}
+
+fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {
+    let is_irregular = set.frames.iter().any(|frame| frame.camera().check().is_err());
+    let lens = if is_irregular {
+        "\n      lens: undo # some lens distortion can't be modelled up to the border; photographs \
+        are undistorted and lose a border"
+    } else {
+        ""
+    };
+    let split = match &set.split {
+        Some(split) if !split.test.is_empty() => "the default uses the data set's own test views",
+        _ => "by default every eighth view is for testing only",
+    };
+    include_str!("pipeline.yaml")
+        .replace("{found}", summary)
+        .replace("{scale}", &SCALE.to_string())
+        .replace("{images}", &image_parameters(set))
+        .replace("{lens}", lens)
+        .replace("{split}", split)
+        .replace("{rays}", &TRAINING_RAYS.to_string())
+        // Last, since a folder's name may contain braces.
+        .replace("{dataset}", dataset)
+}
+
+/// Returns the YAML lines of the parameters that select the source of LR images.
+fn image_parameters(set: &Dataset) -> String {
+    let width = set.frames.iter().map(|frame| frame.intrinsics().width).min().unwrap_or(0);
+    if width > MAX_WIDTH {
+        let lr_width = MAX_WIDTH / SCALE;
+        format!(
+            "      lr_width: {lr_width} # photographs are shrunk to {MAX_WIDTH} pixels for scoring \
+            and to {lr_width} for training, which takes minutes on a CPU\n      \
+            # lr_source: photographs # instead of lr_width: trains on the unmodified photographs"
+        )
+    } else if set.format.is_benchmark() {
+        "      lr_source: downscaled # LR images are made from the data set's images; \
+        `photographs` trains on the unmodified images"
+            .to_owned()
+    } else {
+        "      lr_source: photographs # trains on the unmodified photographs; `downscaled` makes \
+        LR images from them first, so that views can be scored"
+            .to_owned()
+    }
+}
+
+/// Converts an error of the data set's reader: if the folder contains images, the new error names
+/// the command that estimates their cameras.
+fn read_error(folder: &Path, error: DatasetError) -> StarterError {
+    let images = UnposedImages::find(folder);
+    if !error.is_unrecognised() || images.files.is_empty() {
+        return StarterError::Dataset(error);
+    }
+    StarterError::NoCameras {
+        folder: folder.to_path_buf(),
+        found: images.summary(),
+        command: images.colmap_command(folder),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,108 @@
+//! States of nodes as text.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use artifact::{format_duration, hash_json, unix_time};
+use planning::{Node, Plan, Sink, State, short_hash};
+use serde_json::{Map, Value};
+
+use store::Record;
+
+use crate::session::Session;
+
+/// Finds the nodes that will run and on which a waiting node depends, directly or not.
+pub(crate) fn blocking_nodes(states: &[State], index: usize) -> BTreeSet<usize> {
+    let mut found = BTreeSet::new();
+    let mut open = vec![index];
+    while let Some(index) = open.pop() {
+        let State::Waits { on } = &states[index] else { continue };
+        open.extend(on);
+        found.extend(on.iter().filter(|&&parent| matches!(states[parent], State::WillRun { .. })));
+    }
+    found
+}
+
+/// Describes a node's state. With records, explains why the node will run.
+pub(crate) fn state_text(
+    session: &Session,
+    plan: &Plan,
+    index: usize,
+    state: &State,
+    records: Option<&[Record]>,
+) -> String {
+    match (state, records) {
+        (State::Cached(record), _) => {
+            format!("cached ({}, took {})", age_text(record), format_duration(record.seconds))
+        }
+        (State::Waits { on }, _) => {
+            let names: Vec<String> = on.iter().map(|&parent| plan.nodes[parent].label()).collect();
+            format!("waits for {}; stays cached if results don't change", names.join(", "))
+        }
+        (State::WillRun { .. }, None) => "will run".to_owned(),
+        (State::WillRun { key_parts }, Some(records)) => {
+            reason_to_run(session, key_parts, &plan.nodes[index].stage, records)
+        }
+    }
+}
+
+fn reason_to_run(
+    session: &Session,
+    key_parts: &Map<String, Value>,
+    stage: &str,
+    records: &[Record],
+) -> String {
+    match planning::explain(key_parts, stage, records) {
+        None => "will run: no earlier run of this stage".to_owned(),
+        Some(changes) if changes.is_empty() => match session.store.record(&hash_json(key_parts)) {
+            Ok(Some(record)) => {
+                let output = short_hash(&record.output);
+                format!("will run: its artifact {output} is missing or incomplete")
+            }
+            _ => "will run".to_owned(),
+        },
+        Some(changes) => format!("will run: {}", changes.join("; ")),
+    }
+}
+
+/// Lists the parameters that the scene decides, with their values if the node is cached.
+pub(crate) fn by_scene_text(session: &Session, node: &Node, state: &State) -> Option<String> {
+    let artifact = match state {
+        State::Cached(record) => session.store.object(&record.output),
+        _ => PathBuf::new(),
+    };
+    let mut entries = Vec::new();
+    for (name, value) in node.by_scene(&artifact) {
+        entries.push(match value {
+            Value::Null => name,
+            Value::String(text) => format!("{name}={text}"),
+            value => format!("{name}={value}"),
+        });
+    }
+    (!entries.is_empty()).then(|| format!("by scene: {}", entries.join(", ")))
+}
+
+/// Describes what a run does with a sink. Only `run` knows the folder of pages, so this doesn't
+/// depend on an existing page.
+pub(crate) fn sink_text(plan: &Plan, sink: &Sink, states: &[State]) -> String {
+    let mut names: Vec<&str> =
+        sink.shows.iter().map(|&index| plan.nodes[index].stage.as_str()).collect();
+    names.dedup();
+    let is_cached = sink.shows.iter().all(|&index| matches!(states[index], State::Cached(_)));
+    let when = if is_cached {
+        "all cached: a run writes the page only if it doesn't exist"
+    } else {
+        "a run writes the page again if results change"
+    };
+    format!("shows {}; {when}", names.join(", "))
+}
+
+/// Returns the time since an action started: `5 s ago`.
+pub(crate) fn age_text(record: &Record) -> String {
+    match unix_time().saturating_sub(record.started_unix) {
+        s if s < 120 => format!("{s} s ago"),
+        s if s < 7200 => format!("{} min ago", s / 60),
+        s if s < 172_800 => format!("{} h ago", s / 3600),
+        s => format!("{} days ago", s / 86_400),
+    }
+}

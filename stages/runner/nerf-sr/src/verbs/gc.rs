@@ -1,0 +1,99 @@
+use std::process::ExitCode;
+use std::time::Duration;
+
+use crate::garbage::{Collection, Policy, Root};
+use anyhow::Context as _;
+use artifact::{Failure, format_duration, print_line, report_line};
+use planning::{PlanError, Request};
+use serde_json::json;
+use stage::stop_on_signals;
+
+use super::print_json;
+use crate::session::Session;
+use crate::waiting::wait_for_lock;
+
+/// Deletes artifacts that nothing needs (docs/design/029).
+pub(crate) fn gc(
+    session: &Session,
+    request: &Request,
+    policy: Policy,
+    output: GcOutput,
+) -> anyhow::Result<ExitCode> {
+    let store = &session.store;
+    let root = plan_root(session, request)?;
+    if output.dry_run {
+        return output.print(&Collection::new(store, root, policy).context(UNREADABLE)?);
+    }
+    let stop = stop_on_signals()?;
+    let closed = match wait_for_lock(&stop, &|_, waited| report_wait(waited), || store.try_close())
+    {
+        Ok(closed) => closed,
+        Err(failure) if failure.code == 130 => return Err(Failure::Interrupted.into()),
+        Err(failure) => return Err(failure.into()),
+    };
+    let collection = Collection::new(store, root, policy).context(UNREADABLE)?;
+    collection.carry_out(store, &closed)?;
+    drop(closed);
+    store.empty_trash()?;
+    output.print(&collection)
+}
+
+/// Context of an error before anything is deleted.
+const UNREADABLE: &str = "nothing was deleted, because gc must read the whole store; make this \
+    file readable or move it away";
+
+fn report_wait(waited: Duration) {
+    report_line!(
+        "nerf-sr: waiting for runs that look up artifacts ({} so far)",
+        format_duration(waited.as_secs_f64())
+    );
+}
+
+/// Options of the output of `gc`.
+#[derive(Clone, Copy)]
+pub(crate) struct GcOutput {
+    /// True if nothing is deleted.
+    pub(crate) dry_run: bool,
+    /// True if JSON is printed.
+    pub(crate) json: bool,
+}
+
+impl GcOutput {
+    fn print(self, collection: &Collection) -> anyhow::Result<ExitCode> {
+        let (deleted, kept) = collection.bytes();
+        if self.json {
+            return print_json(&json!({"dry_run": self.dry_run, "bytes_gone": deleted,
+                "bytes_left": kept, "items": collection.decisions()}));
+        }
+        for decision in collection.decisions() {
+            print_line!("{decision}");
+        }
+        let deleted = deleted as f64 / 1e6;
+        let kept = kept as f64 / 1e6;
+        if self.dry_run {
+            print_line!("{deleted:.1} MB would be deleted, {kept:.1} MB would be kept");
+        } else {
+            print_line!("{deleted:.1} MB deleted, {kept:.1} MB kept");
+        }
+        Ok(ExitCode::SUCCESS)
+    }
+}
+
+/// Returns the root that keeps the plan's actions.
+fn plan_root(session: &Session, request: &Request) -> anyhow::Result<Root> {
+    let plan = session.plan(request)?;
+    let states = match plan.states(&session.store, None) {
+        Err(error @ PlanError::Store(_)) => {
+            return Err(anyhow::Error::from(error).context(UNREADABLE));
+        }
+        states => states?,
+    };
+    let mut root = Root { reason: "the pipeline needs it".to_owned(), ..Root::default() };
+    for (index, state) in states.iter().enumerate() {
+        match state.key() {
+            Some(key) => _ = root.keys.insert(key),
+            None => root.waiting.push(plan.nodes[index].waiting()),
+        }
+    }
+    Ok(root)
+}

@@ -1,0 +1,132 @@
+//! `cancel` cancels the jobs of a cluster; `job` is the command of one.
+
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context as _;
+use artifact::{counted, print_line, report_line, report_text};
+use planning::stage_call::{Display, StageFailure, stop_on_signals};
+use planning::{FrozenPlan, Plan, State};
+use signal_hook::consts::SIGUSR1;
+use slurm::{Queue, Slurm, Submission};
+use store::{Record, Store};
+
+use super::run::begin_run;
+use crate::execute::NodeJob;
+use crate::run_record::RunProgress;
+use crate::session::Run;
+use crate::sink::run_sink;
+use crate::unchanged::input_failure;
+
+/// Cancels the jobs of this store, or those of one stage. Slurm also cancels the jobs that depend
+/// on them.
+pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<ExitCode> {
+    let slurm = Slurm::default();
+    let mut jobs = Queue::read(&slurm, store.root())?.jobs;
+    jobs.retain(|job| stage.is_none_or(|stage| job.task.stage == stage));
+    slurm.cancel(&jobs.iter().map(|job| job.id.as_str()).collect::<Vec<_>>())?;
+    for job in &jobs {
+        print_line!("{}: {job}", job.task.label);
+    }
+    let of_stage = stage.map(|stage| format!(" of {stage}")).unwrap_or_default();
+    print_line!("cancelled {}{of_stage}", counted(jobs.len(), "job"));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Runs one task of a submission as a cluster's job: a node whose parents' jobs have ended, or a
+/// sink.
+pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
+    let stop = stop_on_signals()?;
+    // Slurm sends SIGUSR1 shortly before the time limit (`Site::notice`).
+    let is_time_up = Arc::new(AtomicBool::new(false));
+    for flag in [&stop, &is_time_up] {
+        signal_hook::flag::register(SIGUSR1, Arc::clone(flag))?;
+    }
+    let root =
+        folder.ancestors().nth(2).context("a submission must be a folder STORE/slurm/NAME")?;
+    let store = Store::open(root)?;
+    let frozen = FrozenPlan::read(&Submission::plan_path(folder))?;
+    let plan = frozen.task_plan(number)?;
+    let result = begin_run(&store, &plan, &stop).and_then(|file| {
+        let command = submission_command(&store, folder);
+        let (plan, store, out) = (&plan, &store, frozen.out.as_path());
+        let result = run_task(&Run { plan, store, file: &file, out, stop: &stop }, &command);
+        file.end().ok();
+        result
+    });
+    let Err(failure) = result else { return Ok(ExitCode::SUCCESS) };
+    report_text(&format!("nerf-sr: {}", failure.message));
+    if is_time_up.load(Ordering::Relaxed) && failure.code == 130 {
+        requeue(&plan, &store)?;
+    }
+    Ok(ExitCode::from(failure.code))
+}
+
+/// Returns the command line of the run that wrote a submission; empty if the run's file was
+/// deleted.
+fn submission_command(store: &Store, folder: &Path) -> Vec<String> {
+    let id = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    let run = store.run_or_pin(id).ok().flatten();
+    run.map(|run| run.command).unwrap_or_default()
+}
+
+/// Puts the job back into the queue if its stage has left a checkpoint. Without one, the job would
+/// start over for ever.
+fn requeue(plan: &Plan, store: &Store) -> anyhow::Result<()> {
+    let state = plan.states(store, None)?.pop();
+    let key = state.and_then(|state| state.key());
+    let has_checkpoint = key.map_or(Ok(false), |key| store.has_checkpoint(&key))?;
+    let Some(id) = slurm::current_job_id().filter(|_| has_checkpoint) else {
+        report_line!(
+            "nerf-sr: time limit reached without a checkpoint; raise the limit (resources: time)"
+        );
+        return Ok(());
+    };
+    report_line!("nerf-sr: time limit reached; job {id} will resume from the checkpoint");
+    Slurm::default().requeue(&id).context("cannot requeue the job; run again to resume")
+}
+
+/// Runs the task of a plan for one job. `command` is the command line of the run that submitted the
+/// task.
+fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
+    let states = run.plan.states(run.store, Some(run.stop)).map_err(|e| input_failure(&e))?;
+    let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
+    let threads = slurm::available_cores();
+    if let Some(sink) = run.plan.sinks.first() {
+        check_parents(run.plan, &sink.stage, sink.shows.iter().copied(), &records)?;
+        let progress = RunProgress { command, ..RunProgress::not_started(&records) };
+        run_sink(run, sink, threads, &progress)?.print(&sink.stage);
+        return Ok(());
+    }
+    let Some(node) = run.plan.nodes.last() else { return Ok(()) };
+    if records.last().is_some_and(Option::is_some) {
+        print_line!("{}: cached", node.label());
+        return Ok(());
+    }
+    check_parents(run.plan, &node.label(), node.parents(), &records)?;
+    let parents =
+        node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
+    let display = &Display::new();
+    NodeJob { run, node, parents, threads, display, watch: None }.find_or_run().map(drop)
+}
+
+/// Fails if a parent has no record. A job may start without its parents, because Slurm treats a
+/// forgotten job as successful.
+fn check_parents(
+    plan: &Plan,
+    label: &str,
+    mut parents: impl Iterator<Item = usize>,
+    records: &[Option<Record>],
+) -> Result<(), StageFailure> {
+    let Some(parent) = parents.find(|&parent| records[parent].is_none()) else {
+        return Ok(());
+    };
+    let parent = plan.nodes[parent].label();
+    let message = format!(
+        "{label} needs {parent}, which has no artifact: its job failed, was cancelled, or is \
+        unknown to Slurm; run again"
+    );
+    Err(StageFailure { code: 3, message })
+}

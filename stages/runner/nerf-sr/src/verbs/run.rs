@@ -1,0 +1,55 @@
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use artifact::{Failure, report_line};
+use planning::stage_call::{StageFailure, stop_on_signals};
+use planning::{Describing, Plan, Request, State};
+use store::{RunFile, Store};
+
+use crate::execute::Executor;
+use crate::failure;
+use crate::session::{Run, Session, check_not_in_input, command_line};
+use crate::waiting::enter_store;
+
+/// Runs the stages that the targets need, then the sinks.
+pub(crate) fn run(
+    session: &Session,
+    request: &Request,
+    out: &Path,
+    executor: &dyn Executor,
+) -> anyhow::Result<ExitCode> {
+    let stop = stop_on_signals()?;
+    let plan = session.new_plan(request, Describing::Needed(&stop))?;
+    check_not_in_input(&plan, "the folder of pages", out)?;
+    let file = match begin_run(&session.store, &plan, &stop) {
+        Ok(file) => file,
+        Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),
+        Err(error) => return Err(error.into()),
+    };
+    let store = &session.store;
+    let code = executor.carry_out(&Run { plan: &plan, store, file: &file, out, stop: &stop });
+    // Without its end, as on a full disk, a run's age counts from its beginning.
+    file.end().ok();
+    code
+}
+
+/// Creates the run's file and writes the actions that the run needs, as far as known.
+pub(super) fn begin_run(
+    store: &Store,
+    plan: &Plan,
+    stop: &AtomicBool,
+) -> Result<RunFile, StageFailure> {
+    let entered = enter_store(store, stop, &|text| report_line!("nerf-sr: {text}"))?;
+    let file = store.begin_run(&entered, command_line()).map_err(failure)?;
+    // An unreadable input folder is reported when its stage is due: other stages may not need it.
+    let states = plan.states(store, Some(stop)).unwrap_or_default();
+    for (index, node) in plan.nodes.iter().enumerate() {
+        match states.get(index).and_then(State::key) {
+            Some(key) => file.record_action(&entered, &node.stage, &key),
+            None => file.record_waiting(&entered, node.waiting()),
+        }
+        .map_err(failure)?;
+    }
+    Ok(file)
+}

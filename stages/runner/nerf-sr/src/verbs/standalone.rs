@@ -1,0 +1,68 @@
+//! Verbs that need no store: `init`, `describe`, `man` and `completions`.
+
+use std::io::Write as _;
+use std::path::Path;
+use std::process::{Command, ExitCode};
+
+use crate::starter::{Starter, StarterError};
+use anyhow::Context as _;
+use artifact::{Failure, print_line};
+use planning::{Pipeline, PlanError, executable};
+
+/// Writes a pipeline for a folder of posed photographs, and prints what was found.
+pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
+    let starter = Starter::new(folder, file).map_err(starter_failure)?;
+    print_line!("found: {}", starter.summary());
+    for note in starter.notes() {
+        print_line!("  {note}");
+    }
+    let written = starter.write().map_err(starter_failure)?;
+    let names: Vec<String> = written.iter().map(|file| file.display().to_string()).collect();
+    print_line!("wrote: {}", names.join(", "));
+    print_line!("`nerf-sr run` renders the views; `nerf-sr plan` shows the stages for this");
+    Ok(ExitCode::SUCCESS)
+}
+
+fn starter_failure(error: StarterError) -> anyhow::Error {
+    match error {
+        StarterError::Dataset(_) | StarterError::NoCameras { .. } => {
+            Failure::BadInput(error.to_string()).into()
+        }
+        StarterError::Io { .. } => error.into(),
+        StarterError::Inside { .. } | StarterError::Name { .. } | StarterError::Exists { .. } => {
+            Failure::Usage(error.to_string()).into()
+        }
+    }
+}
+
+/// Prints the help of a stage's program.
+pub(crate) fn describe(pipeline: &Pipeline, stage: &str) -> anyhow::Result<ExitCode> {
+    let (pipeline, _) = planning::find_targets(pipeline, &[stage.to_owned()])?;
+    if !pipeline.stages.contains_key(stage) {
+        let known = artifact::known_names(stage, pipeline.stages.keys().map(String::as_str));
+        return Err(PlanError::Usage(format!("no stage {stage:?}; {known}")).into());
+    }
+    let program = executable(&pipeline, stage);
+    let status = Command::new(&program)
+        .arg("--help")
+        .status()
+        .with_context(|| format!("cannot start {}; run `make build`", program.display()))?;
+    Ok(if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Writes man pages of the program and all its verbs into a folder.
+pub(crate) fn man(program: clap::Command, folder: &Path) -> anyhow::Result<ExitCode> {
+    std::fs::create_dir_all(folder)
+        .and_then(|()| clap_mangen::generate_to(program, folder))
+        .with_context(|| format!("cannot write man pages into {}", folder.display()))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Prints a shell's completions for the program.
+pub(crate) fn completions(shell: clap_complete::Shell, program: &mut clap::Command) -> ExitCode {
+    let mut script = Vec::new();
+    clap_complete::generate(shell, program, "nerf-sr", &mut script);
+    // A reader that closed the pipe early is no error.
+    std::io::stdout().write_all(&script).ok();
+    ExitCode::SUCCESS
+}

@@ -1,0 +1,122 @@
+//! Waits for locks, which end on signals and report the lock's holder.
+
+use artifact::format_duration;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use planning::stage_call::StageFailure;
+use store::{Entered, Holder, Locked, Store, StoreError, host_name};
+
+use crate::failure;
+
+/// Interval between two attempts to lock; chosen by hand.
+const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
+/// Delay before the first notice, since most waits are shorter; chosen by hand. The delay doubles
+/// with each notice.
+const NOTICE_DELAY: Duration = Duration::from_secs(1);
+
+/// Attempts to lock until this succeeds or `stop` is set. `report` gets the holder and the time
+/// waited so far.
+pub(crate) fn wait_for_lock<T>(
+    stop: &AtomicBool,
+    report: &dyn Fn(Option<&Holder>, Duration),
+    mut attempt: impl FnMut() -> Result<Locked<T>, StoreError>,
+) -> Result<T, StageFailure> {
+    let begin = Instant::now();
+    let mut next_notice = NOTICE_DELAY;
+    loop {
+        match attempt().map_err(failure)? {
+            Locked::Acquired(held) => return Ok(held),
+            Locked::HeldBy(holder) => {
+                if stop.load(Ordering::Relaxed) {
+                    let message = "interrupted while waiting for a lock".to_owned();
+                    return Err(StageFailure { code: 130, message });
+                }
+                if begin.elapsed() >= next_notice {
+                    report(holder.as_ref(), begin.elapsed());
+                    next_notice *= 2;
+                }
+                std::thread::sleep(ATTEMPT_INTERVAL);
+            }
+        }
+    }
+}
+
+/// Enters the store; waits while garbage collection runs.
+pub(crate) fn enter_store(
+    store: &Store,
+    stop: &AtomicBool,
+    report: &dyn Fn(&str),
+) -> Result<Entered, StageFailure> {
+    wait_for_lock(
+        stop,
+        &|holder, waited| {
+            report(&format!(
+                "waiting for garbage collection{} ({} so far)",
+                holder_text(holder),
+                format_duration(waited.as_secs_f64())
+            ));
+        },
+        || store.try_enter(),
+    )
+}
+
+/// Enters the store, or fails if garbage collection runs.
+pub(crate) fn try_enter_store(store: &Store) -> anyhow::Result<Entered> {
+    match store.try_enter()? {
+        Locked::Acquired(entered) => Ok(entered),
+        Locked::HeldBy(_) => Err(anyhow::anyhow!("garbage collection is running; try again later")),
+    }
+}
+
+/// Returns ` by process …` for a lock's holder; empty if the holder is unknown.
+pub(crate) fn holder_text(holder: Option<&Holder>) -> String {
+    let Some(Holder { pid, host, .. }) = holder else { return String::new() };
+    if *host != host_name() {
+        return format!(" by process {pid} on {host}");
+    }
+    let raw = i32::try_from(*pid).ok().and_then(rustix::process::Pid::from_raw);
+    let is_alive = raw
+        .is_some_and(|pid| rustix::process::test_kill_process(pid) != Err(rustix::io::Errno::SRCH));
+    if is_alive {
+        format!(" by process {pid}")
+    } else {
+        // A killed runner's stage inherited the lock.
+        format!(" by a stage of process {pid}, which has ended")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::cell::RefCell;
+
+    /// A wait reports the holder and ends with the signal, however long the lock is held.
+    #[test]
+    fn a_signal_ends_a_wait() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let Locked::Acquired(_lock) = store.try_lock("k").unwrap() else { panic!("held") };
+        let stop = AtomicBool::new(false);
+        let said = RefCell::new(Vec::new());
+        let say = |holder: Option<&Holder>, _: Duration| {
+            said.borrow_mut().push(holder_text(holder));
+            stop.store(true, Ordering::Relaxed);
+        };
+        let failure = wait_for_lock(&stop, &say, || store.try_lock("k")).unwrap_err();
+        assert_eq!(failure.code, 130);
+        assert_eq!(said.into_inner(), [format!(" by process {}", std::process::id())]);
+    }
+
+    #[test]
+    fn holders_are_named_by_machine_and_process() {
+        let holder = Holder::this_process();
+        assert_eq!(
+            holder_text(Some(&Holder { host: "far".into(), ..holder.clone() })),
+            format!(" by process {} on far", holder.pid)
+        );
+        let gone = holder_text(Some(&Holder { pid: 0x7fff_fff0, ..holder }));
+        assert!(gone.ends_with("which has ended"), "{gone}");
+        assert_eq!(holder_text(None), "");
+    }
+}

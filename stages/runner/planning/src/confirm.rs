@@ -1,0 +1,103 @@
+//! Checks before a stage's start and after its end that its program is the planned one: the key
+//! contains the hash of its code (docs/design/002).
+
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+
+use crate::stage_call::{DescribeError, Interrupted, describe_all};
+use store::Store;
+
+use crate::stages::{DescriptionCache, StageProgram, is_own};
+use crate::stamp::Stamp;
+
+/// Error returned when a program differs from the planned one, or can't be compared with it.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfirmError {
+    /// The program's file or its code differs.
+    #[error("{0} was changed or rebuilt after planning; run again")]
+    Changed(PathBuf),
+    /// The program's file can't be read.
+    #[error("{program}: {problem}")]
+    File {
+        /// Path of the file.
+        program: PathBuf,
+        /// Error of the system.
+        problem: std::io::Error,
+    },
+    /// The program no longer describes itself.
+    #[error(transparent)]
+    Describe(#[from] DescribeError),
+    /// A signal came while the program was described.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+impl From<Interrupted> for ConfirmError {
+    fn from(_: Interrupted) -> Self {
+        Self::Interrupted
+    }
+}
+
+impl StageProgram {
+    /// Returns whether the program is in the runner's folder. Others are the user's files.
+    pub fn is_own(&self) -> bool {
+        is_own(&self.path)
+    }
+
+    /// Checks before a stage's start that the program is the planned one. Returns the file's stamp.
+    pub fn confirm(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<Stamp, ConfirmError> {
+        let now = self.stamp_now()?;
+        if self.stamp == Some(now) {
+            return Ok(now);
+        }
+        if let Some(planned) = &self.stamp {
+            self.check_untouched(planned, &now)?;
+        }
+        self.check_code(store, stop)?;
+        Ok(now)
+    }
+
+    /// Checks after a stage's end that the program was the planned one since the `start`. Programs
+    /// outside the runner's folder are always described again: they may call other programs.
+    pub fn confirm_since(
+        &self,
+        start: &Stamp,
+        store: &Store,
+        stop: Option<&AtomicBool>,
+    ) -> Result<(), ConfirmError> {
+        let now = self.stamp_now()?;
+        if now == *start && self.is_own() {
+            return Ok(());
+        }
+        self.check_untouched(start, &now)?;
+        self.check_code(store, stop)
+    }
+
+    fn stamp_now(&self) -> Result<Stamp, ConfirmError> {
+        Stamp::of(&self.path)
+            .map_err(|problem| ConfirmError::File { program: self.path.clone(), problem })
+    }
+
+    /// Fails if a user's file was written to: an interpreter may read a script at any time. The
+    /// runner's own programs are in memory after their start, and a build may rewrite their files
+    /// without a change of code.
+    fn check_untouched(&self, before: &Stamp, now: &Stamp) -> Result<(), ConfirmError> {
+        if self.is_own() || now.is_untouched_since(before) {
+            return Ok(());
+        }
+        Err(ConfirmError::Changed(self.path.clone()))
+    }
+
+    /// Describes the program again. Fails if its code has changed.
+    fn check_code(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<(), ConfirmError> {
+        let path = &self.path;
+        let mut descriptions = describe_all(std::slice::from_ref(path), stop)?;
+        let description = descriptions.remove(path).ok_or(ConfirmError::Interrupted)?;
+        if description?.code == self.description.code {
+            return Ok(());
+        }
+        // The cache knows a wrapper script by its own file, which may be unchanged.
+        DescriptionCache::forget(store, path);
+        Err(ConfirmError::Changed(path.clone()))
+    }
+}

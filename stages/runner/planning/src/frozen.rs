@@ -1,0 +1,181 @@
+//! Plan as a file: queued jobs run the plan that was submitted, even if pipeline.yaml has changed
+//! (docs/design/032).
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use artifact::FailedPoint;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use slurm::Resources;
+use stage::Description;
+
+use crate::node::{Devices, Node, NodeInput, Origin, Plan, Sink};
+use crate::stages::{ProgramError, StageProgram};
+
+/// Serialisable plan.
+#[derive(Serialize, Deserialize)]
+pub struct FrozenPlan {
+    /// Folder of pages.
+    pub out: PathBuf,
+    devices: Devices,
+    resources: BTreeMap<String, Resources>,
+    programs: BTreeMap<PathBuf, Description>,
+    nodes: Vec<FrozenNode>,
+    sinks: Vec<FrozenSink>,
+}
+
+#[derive(Clone, Serialize, Deserialize)]
+struct FrozenNode {
+    stage: String,
+    point: String,
+    values: BTreeMap<String, String>,
+    parameters: Value,
+    inputs: Vec<NodeInput>,
+    program: PathBuf,
+}
+
+#[derive(Clone, Serialize, Deserialize)]
+struct FrozenSink {
+    stage: String,
+    parameters: Value,
+    shows: Vec<usize>,
+    left_out: Vec<FailedPoint>,
+    program: PathBuf,
+}
+
+/// Error returned when a frozen plan can't be used.
+#[derive(Debug, thiserror::Error)]
+pub enum FrozenError {
+    /// The file can't be read.
+    #[error("{path}: {source}")]
+    Read {
+        /// Path of the file.
+        path: PathBuf,
+        /// Error of the system.
+        source: std::io::Error,
+    },
+    /// The file has the format of another version.
+    #[error("{path}: written by another version of nerf-sr ({source}); submit again")]
+    Format {
+        /// Path of the file.
+        path: PathBuf,
+        /// Error of the parser.
+        source: serde_json::Error,
+    },
+    /// The plan has no such task.
+    #[error("the submission has no task {0}")]
+    Task(usize),
+    /// The description of a program is missing or invalid.
+    #[error(transparent)]
+    Program(#[from] ProgramError),
+}
+
+impl FrozenPlan {
+    /// Freezes a plan. `out` is the folder of pages.
+    pub fn new(plan: &Plan, out: &Path) -> Self {
+        let of_nodes = plan.nodes.iter().map(|node| &node.program);
+        let programs = of_nodes.chain(plan.sinks.iter().map(|sink| &sink.program));
+        let nodes = plan.nodes.iter().map(|node| FrozenNode {
+            stage: node.stage.clone(),
+            point: node.point.clone(),
+            values: node.values.clone(),
+            parameters: node.parameters.clone(),
+            inputs: node.inputs.clone(),
+            program: node.program.path.clone(),
+        });
+        let sinks = plan.sinks.iter().map(|sink| FrozenSink {
+            stage: sink.stage.clone(),
+            parameters: sink.parameters.clone(),
+            shows: sink.shows.clone(),
+            left_out: sink.left_out.clone(),
+            program: sink.program.path.clone(),
+        });
+        Self {
+            out: out.to_path_buf(),
+            devices: plan.devices.clone(),
+            resources: plan.resources.clone(),
+            programs: programs
+                .map(|program| (program.path.clone(), program.description.clone()))
+                .collect(),
+            nodes: nodes.collect(),
+            sinks: sinks.collect(),
+        }
+    }
+
+    /// Reads the plan of a submission.
+    pub fn read(path: &Path) -> Result<Self, FrozenError> {
+        let bytes = std::fs::read(path)
+            .map_err(|source| FrozenError::Read { path: path.to_path_buf(), source })?;
+        serde_json::from_slice(&bytes)
+            .map_err(|source| FrozenError::Format { path: path.to_path_buf(), source })
+    }
+
+    /// Returns the plan of one task: the node or sink of this number, with all nodes that it needs.
+    /// Sinks are numbered after the nodes.
+    pub fn task_plan(&self, number: usize) -> Result<Plan, FrozenError> {
+        let mut needed = BTreeSet::new();
+        let mut sink = None;
+        if number < self.nodes.len() {
+            needed.insert(number);
+        } else {
+            let found =
+                self.sinks.get(number - self.nodes.len()).ok_or(FrozenError::Task(number))?;
+            needed.extend(&found.shows);
+            sink = Some(found.clone());
+        }
+        for index in (0..self.nodes.len()).rev() {
+            if needed.contains(&index) {
+                needed.extend(self.nodes[index].inputs.iter().filter_map(NodeInput::node));
+            }
+        }
+        let mut new_index = BTreeMap::new();
+        let mut programs = BTreeMap::new();
+        let mut nodes = Vec::with_capacity(needed.len());
+        for old_index in needed {
+            let FrozenNode { stage, point, values, parameters, mut inputs, program } =
+                self.nodes[old_index].clone();
+            for input in &mut inputs {
+                if let Origin::Node { index, .. } = &mut input.from {
+                    *index = new_index[index];
+                }
+            }
+            let program = self.program(&program, &mut programs)?;
+            new_index.insert(old_index, nodes.len());
+            nodes.push(Node { stage, point, values, parameters, inputs, program });
+        }
+        let mut sinks = Vec::new();
+        if let Some(FrozenSink { stage, parameters, mut shows, left_out, program }) = sink {
+            for index in &mut shows {
+                *index = new_index[index];
+            }
+            let program = self.program(&program, &mut programs)?;
+            sinks.push(Sink { stage, parameters, shows, left_out, program });
+        }
+        Ok(Plan {
+            nodes,
+            sinks,
+            notes: Vec::new(),
+            devices: self.devices.clone(),
+            resources: self.resources.clone(),
+        })
+    }
+
+    /// Returns a program, the same one for all nodes of its path.
+    fn program(
+        &self,
+        path: &Path,
+        known: &mut BTreeMap<PathBuf, Arc<StageProgram>>,
+    ) -> Result<Arc<StageProgram>, FrozenError> {
+        if let Some(program) = known.get(path) {
+            return Ok(Arc::clone(program));
+        }
+        let Some(description) = self.programs.get(path) else {
+            return Err(ProgramError::Undescribed(path.to_path_buf()).into());
+        };
+        let program = Arc::new(StageProgram::new(path, description.clone())?);
+        known.insert(path.to_path_buf(), Arc::clone(&program));
+        Ok(program)
+    }
+}

@@ -1,0 +1,64 @@
+//! Plans from pipeline files, command lines and descriptions of stages. It runs no stage but for its description.
+//!
+//! * [`PipelineFile`]: content of one file. [`Pipeline`]: blocks of a file and of the files that it
+//!   extends. [`find_targets`] also searches the files in `pipelines/` and `experiments/`.
+//! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several
+//!   parameters and inputs.
+//! * [`Programs`]: description of each stage's program, cached in the store.
+//! * [`Plan`]: nodes (stages × swept values) in topological order, and their states: cached, to run
+//!   or waiting. `check` checks the whole pipeline, `arguments` and `axes` parse the command line,
+//!   `expand` creates the nodes.
+//! * [`Source`]: content hash of a folder outside the store, and changes since.
+//!   [`StageProgram::confirm`] checks that a program is still the planned one.
+//! * [`stage_call`]: the caller's half of the stage contract, for descriptions and for runs.
+//! * [`key_parts`]: parts of an action's key. The key is their hash, and [`changes`] explains
+//!   differences.
+//!
+//! ```no_run
+//! use planning::{Describing, Pipeline, Plan, Request};
+//! let pipeline = Pipeline::read("pipeline.yaml".as_ref())?;
+//! let store = store::Store::open(".nerf-sr".as_ref())?;
+//! let plan = Plan::new(&pipeline, &store, &Request::default(), Describing::Own)?;
+//! println!("{} nodes", plan.nodes.len());
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod arguments;
+mod axes;
+mod changes;
+mod check;
+mod confirm;
+mod expand;
+mod experiment;
+mod experiment_axes;
+mod extend;
+mod file;
+mod frozen;
+mod key;
+mod left_out;
+mod node;
+mod pipeline;
+mod plan;
+mod request;
+mod sources;
+pub mod stage_call;
+mod stages;
+mod stamp;
+mod targets;
+mod yaml_lines;
+
+pub use changes::{Change, changes, short_hash};
+pub use confirm::ConfirmError;
+pub use experiment::{Experiment, Selection, Variant};
+pub use extend::JoinError;
+pub use file::{Part, PipelineError, PipelineFile, StageBlock};
+pub use frozen::{FrozenError, FrozenPlan};
+pub use key::{explain, key_parts, nearest_changes, nearest_record};
+pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
+pub use pipeline::Pipeline;
+pub use plan::{FoundInputs, find_inputs, read_source};
+pub use request::{PlanError, Request};
+pub use sources::{Source, SourceError};
+pub use stages::{Describing, ProgramError, Programs, StageProgram, executable};
+pub use stamp::Stamp;
+pub use targets::find_targets;

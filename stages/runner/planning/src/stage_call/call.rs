@@ -1,0 +1,325 @@
+//! One call of a stage: starts the process, reads its output and waits for its end.
+
+use std::collections::VecDeque;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use artifact::{counted, format_duration, format_utc, printable, sized, unix_time};
+use stage::Description;
+use stage::{Event, SUMMARY_FILE};
+use wait4::ResUse;
+
+use crate::stage_call::failure::{Exit, StageFailure, is_noise, memory_kills};
+use crate::stage_call::group::{Group, Pipes};
+use crate::stage_call::log::{ProgressFilter, StageLog};
+
+/// Environment variables that every stage gets. A description declares the further variables that
+/// change the stage's result, since they are part of its key.
+const ENVIRONMENT: [&str; 12] = [
+    stage::MEMORY_VARIABLE,
+    "PATH",
+    "HOME",
+    "LANG",
+    "LC_ALL",
+    "TMPDIR",
+    "LD_LIBRARY_PATH",
+    "CUDA_VISIBLE_DEVICES",
+    "NO_COLOR",
+    "RUST_BACKTRACE",
+    stage::STOP_VARIABLE,
+    stage::SLOW_VARIABLE,
+];
+
+/// Maximum number of last stderr lines that are searched for the reason of a failure, chosen by
+/// hand.
+const MAX_TAIL_LINES: usize = 8;
+/// Interval between two checks of a running stage.
+const POLL_INTERVAL: Duration = Duration::from_millis(10);
+/// Time that a stopped stage has for its checkpoint after the end of the wrapper script that
+/// started it (docs/design/001).
+const MAX_CHECKPOINT_TIME: Duration = Duration::from_secs(10);
+
+/// Arguments of one call of a stage.
+pub struct Call<'a> {
+    /// Block and point, for the log and messages.
+    pub label: &'a str,
+    /// Path of the program.
+    pub program: &'a Path,
+    /// Description of the program.
+    pub description: &'a Description,
+    /// File of `--params`.
+    pub params: &'a Path,
+    /// Names and folders of `--input`.
+    pub inputs: &'a [(String, PathBuf)],
+    /// Content hashes of inputs by name, as far as known; for the log.
+    pub hashes: &'a [(String, String)],
+    /// Folder of `--output`.
+    pub output: &'a Path,
+    /// Folder of `--work`; `None` for a sink.
+    pub work: Option<&'a Path>,
+    /// True for `--from-checkpoint`: write the output from the latest checkpoint in `work`.
+    pub from_checkpoint: bool,
+    /// Value of `--device`.
+    pub device: &'a str,
+    /// Value of `--threads`.
+    pub threads: usize,
+    /// File of the key's lock. The stage inherits it as standard input, so that the key stays
+    /// locked until the stage ends.
+    pub lock: Option<&'a File>,
+}
+
+/// Memory and processor time of a call.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Usage {
+    /// Peak resident memory in bytes: the larger one of the stage and the programs that it called.
+    pub peak_memory: u64,
+    /// Processor time in seconds, of all threads and of the programs that the stage called.
+    pub processor_seconds: f64,
+}
+
+/// Receiver of a running stage's output. Control characters in the output are escaped.
+pub trait Watcher: Sync {
+    /// Takes a progress event.
+    fn progress(&self, event: &Event);
+    /// Takes a line of stderr.
+    fn stderr_line(&self, line: &str);
+    /// Runs every few milliseconds until the stage ends.
+    fn tick(&self) {}
+}
+
+impl Call<'_> {
+    /// Runs the stage, and appends its arguments, output and result to the file `log`. If `stop` is
+    /// set, the stage is asked to end, so that it can write a checkpoint.
+    pub fn run(
+        &self,
+        log: &Path,
+        watcher: &dyn Watcher,
+        stop: &AtomicBool,
+    ) -> Result<Usage, StageFailure> {
+        let log = StageLog::open(log).map_err(|e| StageFailure::at(log, &e))?;
+        self.log_arguments(&log);
+        let started = Instant::now();
+        let result = self.run_process(&log, watcher, stop);
+        let time = format_duration(started.elapsed().as_secs_f64());
+        match &result {
+            Ok(usage) => {
+                log.line(format_args!(
+                    "done in {time}; processor time {}, peak memory {}",
+                    format_duration(usage.processor_seconds),
+                    sized(usage.peak_memory)
+                ));
+                for line in read_summary(self.output).unwrap_or_default().lines() {
+                    log.line(format_args!("result: {line}"));
+                }
+            }
+            Err(StageFailure { code, message }) => {
+                log.line(format_args!("failed after {time} with exit code {code}: {message}"));
+            }
+        }
+        result
+    }
+
+    fn log_arguments(&self, log: &StageLog) {
+        log.line(format_args!("{}: started {}", self.label, format_utc(unix_time())));
+        log.line(format_args!(
+            "program: {} {}, {}",
+            self.program.display(),
+            self.description.version,
+            counted(self.threads, "thread")
+        ));
+        log.line(format_args!("device: {}", self.device));
+        let parameters = std::fs::read(self.params)
+            .ok()
+            .and_then(|b| serde_json::from_slice::<serde_json::Value>(&b).ok());
+        log.line(format_args!("parameters: {}", parameters.unwrap_or_default()));
+        for (name, folder) in self.inputs {
+            let hash = self.hashes.iter().find(|(hashed, _)| hashed == name);
+            let hash = hash.map(|(_, hash)| format!(" ({hash})")).unwrap_or_default();
+            log.line(format_args!("input {name}: {}{hash}", folder.display()));
+        }
+    }
+
+    fn run_process(
+        &self,
+        log: &StageLog,
+        watcher: &dyn Watcher,
+        stop: &AtomicBool,
+    ) -> Result<Usage, StageFailure> {
+        let kills_before = memory_kills();
+        let (group, (stdout, stderr)) =
+            self.start().map_err(|e| StageFailure::at(self.program, &e))?;
+        let output = OutputReader { log, watcher };
+        let (exit, stated_reason, tail) = std::thread::scope(|scope| {
+            let stdout = scope.spawn(|| output.read_stdout(stdout));
+            let stderr = scope.spawn(|| output.read_stderr(stderr));
+            let are_closed = || stdout.is_finished() && stderr.is_finished();
+            let exit = wait(group, stop, watcher, &are_closed);
+            (exit, stdout.join().ok().flatten(), stderr.join().unwrap_or_default())
+        });
+        let ResUse { status, rusage } = exit.map_err(|e| StageFailure::at(self.program, &e))?;
+        let last_line = tail.last().cloned();
+        let result = if status.success() {
+            let processor_seconds = (rusage.utime + rusage.stime).as_secs_f64();
+            Ok(Usage { peak_memory: rusage.maxrss, processor_seconds })
+        } else {
+            let exit = Exit {
+                status,
+                stated_reason,
+                tail,
+                was_stopped: stop.load(Ordering::Relaxed),
+                was_memory_exhausted: memory_kills() > kills_before,
+            };
+            Err(exit.failure(&self.description.name))
+        };
+        if let Some(line) = last_line {
+            // The caller prints the reason: the same line must not appear twice.
+            let is_reason = result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
+            if !is_reason {
+                watcher.stderr_line(&line);
+            }
+        }
+        result
+    }
+
+    fn start(&self) -> std::io::Result<(Group, Pipes)> {
+        let stdin = match self.lock {
+            Some(lock) => Stdio::from(lock.try_clone()?),
+            None => Stdio::null(),
+        };
+        Group::start(self.command().stdin(stdin))
+    }
+
+    fn command(&self) -> Command {
+        let mut command = Command::new(self.program);
+        command.arg("--params").arg(self.params).arg("--output").arg(self.output);
+        for (name, folder) in self.inputs {
+            let mut text = std::ffi::OsString::from(format!("{name}="));
+            text.push(folder);
+            command.arg("--input").arg(text);
+        }
+        if let Some(work) = self.work {
+            command.arg("--work").arg(work);
+        }
+        if self.from_checkpoint {
+            command.arg("--from-checkpoint");
+        }
+        command.args([
+            "--device",
+            self.device,
+            "--threads",
+            &self.threads.to_string(),
+            "--progress",
+            "json",
+        ]);
+        let declared = self.description.environment.iter().map(String::as_str);
+        let passed = ENVIRONMENT
+            .into_iter()
+            .chain(declared)
+            .filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
+        command
+            .env_clear()
+            .envs(passed)
+            .env(stage::RUNNER_VARIABLE, std::process::id().to_string());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+    }
+}
+
+/// Reader of a stage's output.
+struct OutputReader<'a> {
+    log: &'a StageLog,
+    watcher: &'a dyn Watcher,
+}
+
+impl OutputReader<'_> {
+    /// Reads stdout: progress events, and other lines, which are for the log alone. Returns the
+    /// reason of a failure if the stage states one.
+    fn read_stdout(&self, stdout: Option<impl Read>) -> Option<String> {
+        let mut reason = None;
+        let mut filter = ProgressFilter::default();
+        for line in read_lines(stdout) {
+            match serde_json::from_str(&line) {
+                Ok(Event::Failed { message }) => reason = Some(printable(&message).into_owned()),
+                Ok(Event::Progress { label, done, total, note }) => {
+                    let label = printable(&label).into_owned();
+                    let note = printable(&note).into_owned();
+                    if let Some(line) = filter.line(&label, done, total, &note) {
+                        self.log.line(line);
+                    }
+                    self.watcher.progress(&Event::Progress { label, done, total, note });
+                }
+                Err(_) => self.log.line(line),
+            }
+        }
+        reason
+    }
+
+    /// Reads stderr, and forwards all lines but the last, which may be the reason of a failure.
+    /// Returns the last lines.
+    fn read_stderr(&self, stderr: Option<impl Read>) -> Vec<String> {
+        let mut tail: VecDeque<String> = VecDeque::new();
+        for line in read_lines(stderr) {
+            self.log.line(&line);
+            if is_noise(&line) {
+                continue;
+            }
+            if let Some(last) = tail.back() {
+                self.watcher.stderr_line(last);
+            }
+            if tail.len() == MAX_TAIL_LINES {
+                tail.pop_front();
+            }
+            tail.push_back(line);
+        }
+        tail.into()
+    }
+}
+
+/// Waits for the end of a stage, then kills the processes that it has left running. `are_closed`
+/// returns whether all processes have closed the stage's pipes.
+fn wait(
+    group: Group,
+    stop: &AtomicBool,
+    watcher: &dyn Watcher,
+    are_closed: &dyn Fn() -> bool,
+) -> std::io::Result<ResUse> {
+    let mut is_stopped = false;
+    while !group.has_exited()? {
+        if stop.load(Ordering::Relaxed) && !is_stopped {
+            group.terminate();
+            is_stopped = true;
+        }
+        watcher.tick();
+        std::thread::sleep(POLL_INTERVAL);
+    }
+    let exited = Instant::now();
+    while is_stopped && !are_closed() && exited.elapsed() < MAX_CHECKPOINT_TIME {
+        watcher.tick();
+        std::thread::sleep(POLL_INTERVAL);
+    }
+    group.kill()
+}
+
+/// Returns the non-blank lines of a pipe. Bytes that aren't UTF-8 are replaced, control characters
+/// are escaped. Of a line that is overwritten by `\r`, as by a progress bar, only the last state
+/// is returned.
+fn read_lines(pipe: Option<impl Read>) -> impl Iterator<Item = String> {
+    let reader = pipe.map(BufReader::new);
+    reader.into_iter().flat_map(|r| r.split(b'\n').map_while(Result::ok)).filter_map(|bytes| {
+        let text = String::from_utf8_lossy(&bytes);
+        let line = text.trim_end().rsplit('\r').find(|state| !state.trim().is_empty())?;
+        Some(printable(line).into_owned())
+    })
+}
+
+/// Reads the summary in a stage's output; `None` if the stage wrote none.
+pub fn read_summary(output: &Path) -> Option<String> {
+    let file = output.join(SUMMARY_FILE);
+    // Reading a named pipe would never end.
+    file.metadata().ok().filter(std::fs::Metadata::is_file)?;
+    std::fs::read_to_string(file).ok()
+}

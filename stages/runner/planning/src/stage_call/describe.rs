@@ -1,0 +1,229 @@
+//! Descriptions of programs, from `STAGE describe`: several programs in parallel, each with a time
+//! limit.
+
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitStatus, Output, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
+
+use stage::Description;
+use stage::out_of_memory_message;
+
+use crate::stage_call::group::Group;
+
+/// Time limit of `describe`, chosen by hand. A program that exceeds it is killed.
+const MAX_DESCRIBE_TIME: Duration = Duration::from_secs(120);
+/// Time after which the wait for descriptions is reported, chosen by hand.
+const NOTICE_AFTER: Duration = Duration::from_secs(1);
+/// Maximum size of a program's output; descriptions have some kilobytes.
+const MAX_OUTPUT_BYTES: u64 = 1 << 24;
+/// Interval between two checks whether a program has ended.
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
+
+/// Error returned when `describe` was interrupted.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Interrupted;
+
+/// Error returned when a program can't be described.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DescribeError {
+    /// The program can't be started or waited for.
+    #[error("`{program} describe`: {problem}")]
+    Start {
+        /// Path of the program.
+        program: PathBuf,
+        /// Error of the system.
+        problem: String,
+    },
+    /// The program didn't end or close its output within the time limit.
+    #[error(
+        "`{program} describe` didn't finish within {limit:?}; check what it waits for, or set \
+        `run:` to another program"
+    )]
+    TimedOut {
+        /// Path of the program.
+        program: PathBuf,
+        /// Time limit.
+        limit: Duration,
+    },
+    /// The program failed.
+    #[error("`{program} describe` failed ({status}): {message}")]
+    Failed {
+        /// Path of the program.
+        program: PathBuf,
+        /// Exit status.
+        status: ExitStatus,
+        /// Last line of its stderr.
+        message: String,
+    },
+    /// The output isn't a description.
+    #[error("output of `{program} describe` isn't a description: {problem}")]
+    Invalid {
+        /// Path of the program.
+        program: PathBuf,
+        /// Error of the parser.
+        problem: String,
+    },
+}
+
+/// Descriptions, or the errors instead, by the program's path.
+pub type Descriptions = BTreeMap<PathBuf, Result<Description, DescribeError>>;
+
+/// Describes programs, as many in parallel as the machine has cores.
+pub fn describe_all(
+    paths: &[PathBuf],
+    stop: Option<&AtomicBool>,
+) -> Result<Descriptions, Interrupted> {
+    let threads =
+        std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(paths.len());
+    let next = &AtomicUsize::new(0);
+    let (sender, receiver) = mpsc::channel();
+    let mut descriptions = Descriptions::new();
+    std::thread::scope(|scope| {
+        for _ in 0..threads {
+            let sender = sender.clone();
+            scope.spawn(move || {
+                while let Some(path) = paths.get(next.fetch_add(1, Ordering::Relaxed))
+                    && !is_set(stop)
+                {
+                    // The receiver lives as long as the scope.
+                    sender.send((path.clone(), describe(path, MAX_DESCRIBE_TIME, stop))).ok();
+                }
+            });
+        }
+        drop(sender);
+        let mut timeout = NOTICE_AFTER;
+        loop {
+            match receiver.recv_timeout(timeout) {
+                Ok((path, description)) => _ = descriptions.insert(path, description),
+                Err(mpsc::RecvTimeoutError::Timeout) => {
+                    artifact::report_line!("reading the stages' descriptions (once per build)");
+                    timeout = Duration::MAX;
+                }
+                Err(mpsc::RecvTimeoutError::Disconnected) => break,
+            }
+        }
+    });
+    if is_set(stop) { Err(Interrupted) } else { Ok(descriptions) }
+}
+
+fn is_set(stop: Option<&AtomicBool>) -> bool {
+    stop.is_some_and(|stop| stop.load(Ordering::Relaxed))
+}
+
+/// Returns a program's description.
+fn describe(
+    path: &Path,
+    limit: Duration,
+    stop: Option<&AtomicBool>,
+) -> Result<Description, DescribeError> {
+    let program = path.to_path_buf();
+    let Some(Output { status, stdout, stderr }) = run_describe(path, limit, stop)
+        .map_err(|e| DescribeError::Start { program: program.clone(), problem: e.to_string() })?
+    else {
+        return Err(DescribeError::TimedOut { program, limit });
+    };
+    if !status.success() {
+        let stderr = String::from_utf8_lossy(&stderr);
+        let message = stderr.lines().rev().find_map(out_of_memory_message).unwrap_or_else(|| {
+            let last = stderr.trim_end().lines().last().unwrap_or_default();
+            last.replace(char::is_control, " ")
+        });
+        return Err(DescribeError::Failed { program, status, message });
+    }
+    serde_json::from_slice(&stdout)
+        .map_err(|e| DescribeError::Invalid { program, problem: e.to_string() })
+}
+
+/// Runs `describe`. Returns `None` if the time limit is exceeded or `stop` is set.
+fn run_describe(
+    path: &Path,
+    limit: Duration,
+    stop: Option<&AtomicBool>,
+) -> std::io::Result<Option<Output>> {
+    let mut command = Command::new(path);
+    command.arg("describe").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let (group, (stdout, stderr)) = Group::start(&mut command)?;
+    let (stdout, stderr) = (read_in_background(stdout), read_in_background(stderr));
+    let deadline = Instant::now() + limit;
+    while !group.has_exited()? {
+        if Instant::now() >= deadline || is_set(stop) {
+            return Ok(None);
+        }
+        std::thread::sleep(POLL_INTERVAL);
+    }
+    // A child process of the program may keep the pipes open.
+    let stdout = stdout.recv_timeout(deadline.saturating_duration_since(Instant::now()));
+    let stderr = stderr.recv_timeout(deadline.saturating_duration_since(Instant::now()));
+    let status = group.kill()?.status;
+    let (Ok(stdout), Ok(stderr)) = (stdout, stderr) else { return Ok(None) };
+    Ok(Some(Output { status, stdout, stderr }))
+}
+
+/// Reads a pipe to its end on another thread.
+fn read_in_background(pipe: Option<impl Read + Send + 'static>) -> mpsc::Receiver<Vec<u8>> {
+    let (sender, receiver) = mpsc::channel();
+    std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        if let Some(pipe) = pipe {
+            // After an error the bytes so far are no valid description, which is reported.
+            pipe.take(MAX_OUTPUT_BYTES).read_to_end(&mut bytes).ok();
+        }
+        sender.send(bytes).ok();
+    });
+    receiver
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A program, written by another process: while this one's threads start others, a file that it
+    /// has open itself can't be run.
+    fn program(folder: &Path, name: &str, text: &str) -> PathBuf {
+        let (source, target) = (folder.join(format!("{name}.sh")), folder.join(name));
+        std::fs::write(&source, text).unwrap();
+        assert!(
+            Command::new("install")
+                .args(["-m", "755"])
+                .args([&source, &target])
+                .status()
+                .unwrap()
+                .success()
+        );
+        target
+    }
+
+    #[test]
+    fn programs_that_give_no_description() {
+        let folder = tempfile::tempdir().unwrap();
+        for (text, limit, words) in [
+            ("#!/bin/sh\nsleep 1000\n", Duration::from_millis(50), "didn't finish within 50ms"),
+            ("#!/bin/sh\nsleep 1000 &\n", Duration::from_millis(200), "didn't finish within 200ms"),
+            (
+                "#!/bin/sh\necho one >&2\nprintf 'two\\033[31m\\n' >&2\nexit 3\n",
+                MAX_DESCRIBE_TIME,
+                "failed (exit status: 3): two [31m",
+            ),
+            (
+                "#!/bin/sh\necho '  what():  std::bad_alloc' >&2\nkill -ABRT $$\n",
+                MAX_DESCRIBE_TIME,
+                "failed (signal: 6 (SIGABRT)): out of memory",
+            ),
+            ("#!/bin/sh\necho '{}'\n", MAX_DESCRIBE_TIME, "isn't a description: missing field"),
+            ("#!/nowhere/at/all\n", MAX_DESCRIBE_TIME, "describe`: No such file"),
+        ] {
+            let path = program(folder.path(), "stage", text);
+            let problem = describe(&path, limit, None).unwrap_err().to_string();
+            assert!(problem.contains(words), "{problem}");
+        }
+        let path = program(folder.path(), "waits", "#!/bin/sh\nsleep 1000\n");
+        let stop = AtomicBool::new(true);
+        assert!(matches!(describe_all(std::slice::from_ref(&path), Some(&stop)), Err(Interrupted)));
+        // Stopped while the program runs.
+        assert!(describe(&path, MAX_DESCRIBE_TIME, Some(&stop)).is_err());
+    }
+}

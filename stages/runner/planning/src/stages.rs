@@ -1,0 +1,367 @@
+//! Stages' programs with their descriptions, which are cached in the store.
+//!
+//! Programs in the runner's folder are its own. Any other is a user's file that a pipeline file
+//! names: only `run` starts it, and only for a needed stage. Other verbs know it by its cached
+//! description while its bytes are unchanged (docs/design/030).
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use crate::stage_call::{DescribeError, Interrupted, describe_all};
+use artifact::{nearest, write_atomically};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use stage::{Description, DescriptionError, Schema, SchemaError};
+use store::Store;
+
+use crate::file::{Part, PipelineError, StageBlock};
+use crate::pipeline::Pipeline;
+use crate::stamp::Stamp;
+
+/// Program of a stage, with its description.
+#[derive(Debug)]
+pub struct StageProgram {
+    /// Path of the executable.
+    pub path: PathBuf,
+    /// Description from `STAGE describe`.
+    pub description: Description,
+    /// Schema of the parameters.
+    pub schema: Schema,
+    /// Stamp of the executable from before it was described; `None` in a plan that was read from a
+    /// file.
+    pub(crate) stamp: Option<Stamp>,
+}
+
+/// Error returned when a stage's program can't be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ProgramError {
+    /// The program's file can't be used.
+    #[error("{path}: {problem}")]
+    File {
+        /// Path of the file.
+        path: PathBuf,
+        /// Problem and remedy.
+        problem: String,
+    },
+    /// The program isn't built.
+    #[error("{path} isn't built; {remedy}")]
+    Unbuilt {
+        /// Path of the missing file.
+        path: PathBuf,
+        /// Command that builds the program, or an alternative.
+        remedy: String,
+    },
+    /// The program is a user's file, which only `run` may start.
+    #[error("{0} isn't part of nerf-sr; read it first, then start it with `nerf-sr run`")]
+    Foreign(PathBuf),
+    /// The program can't be described.
+    #[error(transparent)]
+    Describe(#[from] DescribeError),
+    /// The program's file changed while the program was described.
+    #[error("{0} changed while it was described; run again")]
+    Changed(PathBuf),
+    /// The given descriptions lack the program.
+    #[error("no description of {0}")]
+    Undescribed(PathBuf),
+    /// The description is invalid.
+    #[error("description of {path} is invalid: {problem}")]
+    Description {
+        /// Path of the program.
+        path: PathBuf,
+        /// Problem of the description.
+        problem: DescriptionError,
+    },
+    /// The schema of the parameters can't be compiled.
+    #[error(transparent)]
+    Schema(#[from] SchemaError),
+}
+
+impl StageProgram {
+    /// Creates a program from its description. Fails if the description is invalid.
+    pub fn new(path: &Path, description: Description) -> Result<Self, ProgramError> {
+        description
+            .check()
+            .map_err(|problem| ProgramError::Description { path: path.to_path_buf(), problem })?;
+        let schema = Schema::new(&description.parameters)?;
+        Ok(Self { path: path.to_path_buf(), description, schema, stamp: None })
+    }
+
+    /// Returns whether a block of this program gives a parameter itself.
+    pub fn is_given(&self, block: &StageBlock, parameter: &str) -> bool {
+        block.parameter_layers().any(|layer| self.schema.flattened(layer).contains_key(parameter))
+    }
+
+    /// Overrides the `given` parameters with those of a block.
+    pub fn lay_over(&self, given: &mut Map<String, Value>, block: &StageBlock) {
+        for layer in block.parameter_layers() {
+            self.schema.override_with(given, layer);
+        }
+    }
+}
+
+/// Programs that may be started to describe themselves.
+#[derive(Clone, Copy)]
+pub enum Describing<'a> {
+    /// The runner's own programs, and users' files that are needed; setting the flag interrupts.
+    Needed(&'a AtomicBool),
+    /// The runner's own programs only.
+    Own,
+}
+
+/// Program of each stage, or the error that makes it unusable.
+pub struct Programs(BTreeMap<String, Result<Arc<StageProgram>, PipelineError>>);
+
+impl Programs {
+    /// Returns a stage's program, if it can be used.
+    pub fn get(&self, stage: &str) -> Option<&StageProgram> {
+        self.0.get(stage)?.as_deref().ok()
+    }
+
+    /// Returns a stage's program. Fails if it can't be used.
+    pub fn require(&self, stage: &str) -> Result<&Arc<StageProgram>, PipelineError> {
+        self.0[stage].as_ref().map_err(Clone::clone)
+    }
+
+    /// Returns the stages whose programs can't be used.
+    pub fn unusable(&self) -> impl Iterator<Item = &str> {
+        self.0.iter().filter(|(_, program)| program.is_err()).map(|(stage, _)| stage.as_str())
+    }
+
+    /// Creates the programs from given descriptions, by the name or path in the pipeline file.
+    /// Starts no program.
+    pub fn from_descriptions(
+        pipeline: &Pipeline,
+        descriptions: &BTreeMap<String, Description>,
+    ) -> Self {
+        Self::new(pipeline, |stage| {
+            let path = Path::new(program_name(pipeline, stage));
+            match descriptions.get(program_name(pipeline, stage)) {
+                Some(description) => StageProgram::new(path, description.clone()),
+                None => Err(ProgramError::Undescribed(path.to_path_buf())),
+            }
+        })
+    }
+
+    /// Finds the programs of all stages. Describes those that aren't in the store's cache. `needed`
+    /// are the targets and their transitive dependencies.
+    pub fn find(
+        pipeline: &Pipeline,
+        store: &Store,
+        needed: &BTreeSet<String>,
+        describing: Describing,
+    ) -> Result<Self, Interrupted> {
+        let mut cache = DescriptionCache::read(store);
+        let mut answers: BTreeMap<PathBuf, Result<Answer, ProgramError>> = BTreeMap::new();
+        let mut unknown = BTreeMap::new();
+        let paths: BTreeMap<&str, PathBuf> =
+            pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
+        for (stage, path) in &paths {
+            let is_needed =
+                paths.iter().any(|(stage, other)| other == path && needed.contains(*stage));
+            let answer = match identify(path, program_name(pipeline, stage)) {
+                Err(problem) => Err(problem),
+                Ok(identity) => match cache.description(path, &identity) {
+                    Some(description) => Ok(Answer { identity, description }),
+                    None if identity.may_be_started(describing, is_needed) => {
+                        unknown.insert(path.clone(), identity);
+                        continue;
+                    }
+                    None => Err(ProgramError::Foreign(path.clone())),
+                },
+            };
+            answers.insert(path.clone(), answer);
+        }
+        let stop = match describing {
+            Describing::Needed(stop) => Some(stop),
+            Describing::Own => None,
+        };
+        let unknown_paths: Vec<PathBuf> = unknown.keys().cloned().collect();
+        for (path, description) in describe_all(&unknown_paths, stop)? {
+            let answer = check_answer(&path, unknown[&path].clone(), description);
+            if let Ok(answer) = &answer {
+                cache.0.insert(cache_key(&path), answer.clone());
+            }
+            answers.insert(path, answer);
+        }
+        if !unknown.is_empty() {
+            cache.write(store);
+        }
+        Ok(Self::new(pipeline, |stage| {
+            let Answer { identity, description } = answers[&paths[stage]].clone()?;
+            let program = StageProgram::new(&paths[stage], description)?;
+            Ok(StageProgram { stamp: Some(identity.stamp), ..program })
+        }))
+    }
+
+    /// Finds each stage's program. Errors get the location of the stage's block.
+    fn new(pipeline: &Pipeline, find: impl Fn(&str) -> Result<StageProgram, ProgramError>) -> Self {
+        let programs = pipeline.stages.keys().map(|stage| {
+            let program = find(stage)
+                .map(Arc::new)
+                .map_err(|e| pipeline.error(stage, Part::Field("run"), e.to_string()));
+            (stage.clone(), program)
+        });
+        Self(programs.collect())
+    }
+}
+
+/// Fails if a program's file has changed since it was identified.
+fn check_answer(
+    path: &Path,
+    identity: Identity,
+    description: Result<Description, DescribeError>,
+) -> Result<Answer, ProgramError> {
+    let description = description?;
+    if Stamp::of(path).is_ok_and(|now| now.is_untouched_since(&identity.stamp)) {
+        Ok(Answer { identity, description })
+    } else {
+        Err(ProgramError::Changed(path.to_path_buf()))
+    }
+}
+
+/// Cached descriptions by the program's path.
+#[derive(Default, Serialize, Deserialize)]
+pub(crate) struct DescriptionCache(BTreeMap<String, Answer>);
+
+/// Description of a program, with the identity of its file.
+#[derive(Clone, Serialize, Deserialize)]
+struct Answer {
+    #[serde(flatten)]
+    identity: Identity,
+    description: Description,
+}
+
+/// Identity of a program's file.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Identity {
+    #[serde(flatten)]
+    stamp: Stamp,
+    /// Hash of the bytes of a user's file; `None` for the runner's own programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    blake3: Option<String>,
+}
+
+impl DescriptionCache {
+    /// Reads the cache of a store. An unreadable cache counts as empty.
+    fn read(store: &Store) -> Self {
+        let bytes = std::fs::read(Self::file(store)).unwrap_or_default();
+        serde_json::from_slice(&bytes).unwrap_or_default()
+    }
+
+    fn file(store: &Store) -> PathBuf {
+        store.root().join("cache/describe.json")
+    }
+
+    fn write(&self, store: &Store) {
+        if let Ok(bytes) = serde_json::to_vec(self) {
+            // Without a cache, the next start is only slower.
+            write_atomically(&Self::file(store), &bytes).ok();
+        }
+    }
+
+    /// Removes the description of a program, so that the next run describes it again.
+    pub(crate) fn forget(store: &Store, program: &Path) {
+        let mut cache = Self::read(store);
+        if cache.0.remove(&cache_key(program)).is_some() {
+            cache.write(store);
+        }
+    }
+
+    fn description(&self, path: &Path, identity: &Identity) -> Option<Description> {
+        let answer = self.0.get(&cache_key(path))?;
+        answer.identity.is_same(identity).then(|| answer.description.clone())
+    }
+}
+
+impl Identity {
+    /// Returns whether two identities are equal. A user's file is identified by its bytes alone: a
+    /// copy of a project has other times.
+    fn is_same(&self, other: &Self) -> bool {
+        self.blake3 == other.blake3 && (self.blake3.is_some() || self.stamp == other.stamp)
+    }
+
+    fn may_be_started(&self, describing: Describing, is_needed: bool) -> bool {
+        self.blake3.is_none() || (is_needed && matches!(describing, Describing::Needed(_)))
+    }
+}
+
+fn cache_key(path: &Path) -> String {
+    path.display().to_string()
+}
+
+/// Returns a stage's program as its block names it: a path, or the name of a program in the
+/// runner's folder.
+fn program_name<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
+    let block = program_block(pipeline, stage);
+    pipeline.stages[block].run.as_deref().unwrap_or(block)
+}
+
+/// Returns the name of the block that names a stage's program.
+fn program_block<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
+    pipeline.stages[stage].extends.as_deref().unwrap_or(stage)
+}
+
+/// Returns the path of a stage's executable.
+pub fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
+    let name = program_name(pipeline, stage);
+    if name.contains('/') {
+        let block = program_block(pipeline, stage);
+        let path = pipeline.resolve_path(block, Part::Field("run"), name);
+        return path.canonicalize().unwrap_or(path);
+    }
+    runner_folder().join(name)
+}
+
+/// Returns whether a program is one of the runner's own.
+pub(crate) fn is_own(path: &Path) -> bool {
+    path.parent() == Some(&runner_folder())
+}
+
+/// Returns the folder of the running program.
+fn runner_folder() -> PathBuf {
+    let exe = std::env::current_exe().and_then(|exe| exe.canonicalize());
+    exe.ok().and_then(|exe| exe.parent().map(Path::to_path_buf)).unwrap_or_default()
+}
+
+/// Returns the identity of a program's file.
+fn identify(path: &Path, name: &str) -> Result<Identity, ProgramError> {
+    let stamp =
+        if path.is_dir() { Err(std::io::ErrorKind::IsADirectory.into()) } else { Stamp::of(path) };
+    let error = match stamp {
+        Ok(stamp) if is_own(path) => return Ok(Identity { stamp, blake3: None }),
+        Ok(stamp) => match hash_file(path) {
+            Ok(hash) => return Ok(Identity { stamp, blake3: Some(hash) }),
+            Err(error) => error.to_string(),
+        },
+        Err(error) if name.contains('/') => {
+            format!("{error}; set `run:` to the stage's executable")
+        }
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+            let suggestion = nearest_program(name)
+                .map(|other| format!("did you mean {other}? "))
+                .unwrap_or_default();
+            let remedy = format!("{suggestion}run `make build`, or set `run:` to another program");
+            return Err(ProgramError::Unbuilt { path: path.to_path_buf(), remedy });
+        }
+        Err(error) => error.to_string(),
+    };
+    Err(ProgramError::File { path: path.to_path_buf(), problem: error })
+}
+
+/// Returns the program in the runner's folder whose name is most similar to an unknown name.
+fn nearest_program(name: &str) -> Option<String> {
+    let mut programs = Vec::new();
+    for entry in std::fs::read_dir(runner_folder()).ok()?.flatten() {
+        programs.extend(entry.file_name().into_string().ok().filter(|name| !name.contains('.')));
+    }
+    programs.sort_unstable();
+    nearest(name, programs.iter().map(String::as_str)).map(str::to_owned)
+}
+
+fn hash_file(path: &Path) -> std::io::Result<String> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update_reader(std::fs::File::open(path)?)?;
+    Ok(hasher.finalize().to_hex().to_string())
+}

@@ -1,0 +1,291 @@
+//! Encodings, merge keys and key lines of hand-written YAML files.
+//!
+//! * [`decode`]: converts a file's bytes to text, or fails with a [`DecodeError`].
+//! * [`expand_merge_keys`]: replaces merge keys. [`find_non_finite`]: finds a number that JSON
+//!   can't represent.
+//! * [`line_of`]: line number of a key. [`line_of_duplicate`]: line number of a repeated key.
+//!
+//! serde_yaml reads the values; this module finds line numbers for error messages.
+
+use std::collections::BTreeSet;
+use std::fmt;
+
+use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde_yaml::Value;
+
+/// Error returned when a file isn't UTF-8 text.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{problem}")]
+pub(crate) struct DecodeError {
+    /// Line number of the first invalid byte; `None` if the whole file has another encoding.
+    pub(crate) line: Option<usize>,
+    /// Problem and remedy.
+    pub(crate) problem: &'static str,
+}
+
+/// Returns the text of a UTF-8 file without its byte order mark.
+pub(crate) fn decode(bytes: &[u8]) -> Result<&str, DecodeError> {
+    let is_utf16 = bytes.starts_with(&[0xff, 0xfe])
+        || bytes.starts_with(&[0xfe, 0xff])
+        || bytes.iter().take(2).any(|b| *b == 0);
+    if is_utf16 {
+        let problem = "encoding is UTF-16; save the file as UTF-8 (iconv -f UTF-16 -t UTF-8)";
+        return Err(DecodeError { line: None, problem });
+    }
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    std::str::from_utf8(bytes).map_err(|e| {
+        let line = 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count();
+        let problem = "encoding isn't UTF-8; save the file as UTF-8";
+        DecodeError { line: Some(line), problem }
+    })
+}
+
+/// Replaces merge keys (`<<: *anchor`) by the entries of their anchors. Returns whether the
+/// document has merge keys.
+pub(crate) fn expand_merge_keys(document: &mut Value) -> Result<bool, serde_yaml::Error> {
+    let mut merged = false;
+    // A merged mapping may contain merge keys of its own.
+    while has_merge_key(document) {
+        document.apply_merge()?;
+        merged = true;
+    }
+    Ok(merged)
+}
+
+fn has_merge_key(value: &Value) -> bool {
+    match value {
+        Value::Mapping(entries) => {
+            entries.iter().any(|(key, value)| key.as_str() == Some("<<") || has_merge_key(value))
+        }
+        Value::Sequence(items) => items.iter().any(has_merge_key),
+        Value::Tagged(tagged) => has_merge_key(&tagged.value),
+        _ => false,
+    }
+}
+
+/// Returns the keys that lead to the first number that JSON can't represent (`.nan` or `.inf`).
+pub(crate) fn find_non_finite(value: &Value) -> Option<Vec<String>> {
+    match value {
+        Value::Number(number) if !number.as_f64().is_none_or(f64::is_finite) => Some(Vec::new()),
+        Value::Mapping(entries) => entries.iter().find_map(|(key, value)| {
+            let mut path = find_non_finite(value)?;
+            path.insert(0, key.as_str().unwrap_or_default().to_owned());
+            Some(path)
+        }),
+        Value::Sequence(items) => items.iter().find_map(find_non_finite),
+        Value::Tagged(tagged) => find_non_finite(&tagged.value),
+        _ => None,
+    }
+}
+
+/// Message of the error with which a visitor ends a search: serde_yaml knows lines only for errors,
+/// so a visitor reports the wanted key as one.
+const FOUND: &str = "key found";
+
+/// Returns the line at which a search reported its key.
+fn found_line(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
+    let error = searched.err()?;
+    error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
+}
+
+/// Returns the line number of a key, given as a path through nested mappings. If the key is
+/// missing, returns the line of the last existing key of the path.
+pub(crate) fn line_of(text: &str, path: &[&str]) -> Option<usize> {
+    (1..=path.len()).rev().find_map(|length| {
+        let search = Search(&path[..length]);
+        found_line(search.deserialize(serde_yaml::Deserializer::from_str(text)))
+    })
+}
+
+/// Returns the line number of the first key that repeats an earlier key of its mapping.
+pub(crate) fn line_of_duplicate(text: &str) -> Option<usize> {
+    found_line(DuplicateSearch.deserialize(serde_yaml::Deserializer::from_str(text)))
+}
+
+/// Search for a key, given as a path through nested mappings.
+struct Search<'a>(&'a [&'a str]);
+
+impl<'de> DeserializeSeed<'de> for Search<'_> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_map(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Search<'_> {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a mapping")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+        let Some((first, rest)) = self.0.split_first() else { return Ok(()) };
+        while let Some(is_match) = map.next_key_seed(KeyCheck(|key: &str| {
+            if key == *first && rest.is_empty() { None } else { Some(key == *first) }
+        }))? {
+            if is_match {
+                map.next_value_seed(Search(rest))?;
+            } else {
+                map.next_value::<IgnoredAny>()?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Check of a mapping's key: `None` ends the search at this key, `Some` continues it and returns
+/// whether the key's value is searched.
+struct KeyCheck<F>(F);
+
+impl<'de, F: FnOnce(&str) -> Option<bool>> DeserializeSeed<'de> for KeyCheck<F> {
+    type Value = bool;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<bool, D::Error> {
+        deserializer.deserialize_str(self)
+    }
+}
+
+impl<F: FnOnce(&str) -> Option<bool>> Visitor<'_> for KeyCheck<F> {
+    type Value = bool;
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a key")
+    }
+
+    fn visit_str<E: Error>(self, key: &str) -> Result<bool, E> {
+        (self.0)(key).ok_or_else(|| E::custom(FOUND))
+    }
+}
+
+/// Search for a repeated key in nested mappings and lists.
+struct DuplicateSearch;
+
+impl<'de> DeserializeSeed<'de> for DuplicateSearch {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for DuplicateSearch {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("anything")
+    }
+
+    fn visit_bool<E>(self, _: bool) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_i64<E>(self, _: i64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_u64<E>(self, _: u64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_f64<E>(self, _: f64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_str<E>(self, _: &str) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_unit<E>(self) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
+        while items.next_element_seed(DuplicateSearch)?.is_some() {}
+        Ok(())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+        let mut seen: BTreeSet<String> = BTreeSet::new();
+        while map
+            .next_key_seed(KeyCheck(|key: &str| seen.insert(key.to_owned()).then_some(false)))?
+            .is_some()
+        {
+            map.next_value_seed(DuplicateSearch)?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_are_found_on_their_lines() {
+        let text = "default: [a]\nstages:\n  a:\n    inputs: {x: b, y: c}\n    # b: a \
+            comment\n    parameters:\n      'x': 1\n      z:\n        - 2\n  b: \
+            {parameters: {\n    x: 2}}\n  inputs:\n    run: &r ./x\n  c:\n    run: *r\n";
+        for (path, line) in [
+            (&["default"][..], Some(1)),
+            (&["stages", "a"], Some(3)),
+            (&["stages", "b"], Some(10)),
+            (&["stages", "inputs"], Some(12)),
+            (&["stages", "a", "inputs", "x"], Some(4)),
+            (&["stages", "a", "parameters", "x"], Some(7)),
+            (&["stages", "b", "parameters", "x"], Some(11)),
+            (&["stages", "a", "parameters", "nothing"], Some(6)),
+            (&["stages", "a", "parameters", "z", "deeper"], Some(8)),
+            (&["stages", "c", "run"], Some(15)),
+            (&["nothing"], None),
+            (&[], None),
+        ] {
+            assert_eq!(line_of(text, path), line, "{path:?}");
+        }
+        assert_eq!(line_of("a: [", &["a", "b"]), Some(1));
+        for (text, line) in [
+            ("a: 1\nb: {x: 1.5, y: [true, null, {z: 2,\n  z: -3}]}\n", Some(3)),
+            ("a: 1\nb: 2\na: text\n", Some(3)),
+            ("a: {x: 1}\nb: {x: 1}\n", None),
+        ] {
+            assert_eq!(line_of_duplicate(text), line, "{text}");
+        }
+    }
+
+    #[test]
+    fn encodings() {
+        assert_eq!(decode(b"\xef\xbb\xbfa: 1"), Ok("a: 1"));
+        assert_eq!(decode("ä: 1\r\n".as_bytes()), Ok("ä: 1\r\n"));
+        let utf16 = |bytes: &[u8]| {
+            decode(bytes).unwrap_err().problem.contains("UTF-16; save the file as UTF-8")
+        };
+        assert!(
+            utf16(b"\xff\xfea\0:\0")
+                && utf16(b"\xfe\xff\0a\0:")
+                && utf16(b"a\0:\0")
+                && utf16(b"\0a\0:")
+        );
+        let DecodeError { line, problem } = decode(b"a: 1\nb: \xe4\n").unwrap_err();
+        assert!(line == Some(2) && problem.contains("save the file as UTF-8"), "{problem}");
+    }
+
+    #[test]
+    fn merge_keys_are_followed() {
+        for (text, expected) in [
+            ("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}", "a: {x: 1, y: 2}\nb: {y: 3, x: 1}"),
+            ("a: &a {x: 1}\nb: &b {<<: *a}\nc: {<<: *b}", "a: {x: 1}\nb: {x: 1}\nc: {x: 1}"),
+            (
+                "a: &a {x: 1}\nb: &b {y: 1}\nc: {<<: [*a, *b]}",
+                "a: {x: 1}\nb: {y: 1}\nc: {x: 1, y: 1}",
+            ),
+        ] {
+            let [mut found, expected] =
+                [text, expected].map(|t| serde_yaml::from_str::<Value>(t).unwrap());
+            assert!(expand_merge_keys(&mut found).unwrap());
+            assert_eq!(found, expected, "{text}");
+        }
+        let mut scalar = serde_yaml::from_str("a: {<<: 1}").unwrap();
+        assert!(expand_merge_keys(&mut scalar).is_err());
+    }
+}
