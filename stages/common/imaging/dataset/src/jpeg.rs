@@ -33,13 +33,19 @@ const MAX_SCANS: usize = 100;
 /// Minimum number of zeros at the end of a file that can't be image data; chosen by hand.
 const MIN_PADDING_BYTES: usize = 16;
 
+/// Returns whether the decoder knows a marker.
+fn is_known_marker(marker: u8) -> bool {
+    matches!(marker, 0xc0..=0xc2 | DHT | 0xcc | 0xd0..=0xdd | 0xe0..=0xe2 | 0xed | 0xee | 0xfe)
+}
+
 /// Completeness of a JPEG's image data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Extent {
     /// Complete data, or a file that the decoder refuses.
     Whole,
-    /// Complete rows without the end marker.
-    Unterminated,
+    /// Complete rows without an end marker that the decoder reaches. The image data end at offset
+    /// `end`.
+    Unterminated { end: usize },
     /// Incomplete rows, of the image's height in rows.
     Missing { rows: u32, height: u32 },
     /// Progressive JPEG without all detail; `scan` is the first incomplete or the last scan, counted
@@ -103,6 +109,8 @@ struct Walk<'a> {
     scans: usize,
     /// First incomplete scan, counted from 1.
     damaged_scan: Option<usize>,
+    /// Offset of the marker after the last scan, or length of the file.
+    end: usize,
 }
 
 impl<'a> Walk<'a> {
@@ -125,7 +133,10 @@ impl<'a> Walk<'a> {
                 }
                 SOF_BASELINE | SOF_EXTENDED | SOF_PROGRESSIVE => return None,
                 SOS if self.scans == MAX_SCANS => return None,
-                SOS => self.read_scan(segment)?,
+                SOS => {
+                    self.read_scan(segment)?;
+                    self.end_scan()?;
+                }
                 _ => {}
             }
         }
@@ -198,6 +209,16 @@ impl<'a> Walk<'a> {
         Some(())
     }
 
+    /// Finds the end of a scan. `None` if the decoder doesn't know the next marker: it would drop the
+    /// image data that it has read ahead.
+    fn end_scan(&mut self) -> Option<()> {
+        let offset = self.offset;
+        let marker = self.next_marker();
+        self.end = if marker.is_some() { self.offset - 2 } else { self.bytes.len() };
+        self.offset = offset;
+        marker.is_none_or(is_known_marker).then_some(())
+    }
+
     /// Returns the completeness of a file that ends here; `None` without a frame.
     fn extent(&self, is_terminated: bool) -> Option<Extent> {
         let Frame { is_progressive, height, components, .. } = self.frame.as_ref()?;
@@ -207,7 +228,7 @@ impl<'a> Walk<'a> {
             _ if *is_progressive => {
                 Extent::Coarse { scan: self.damaged_scan.unwrap_or(self.scans), height: *height }
             }
-            (0, false) => Extent::Unterminated,
+            (0, false) => Extent::Unterminated { end: self.end },
             (rows, _) => Extent::Missing { rows, height: *height },
         })
     }

@@ -61,7 +61,7 @@ fn missing_rows_are_counted() {
                 let ended = [cut, &END_MARKER].concat();
                 let (found, rows) = match extent(cut) {
                     it @ Extent::Missing { rows, height: ROWS } => (it, rows),
-                    Extent::Unterminated => (Extent::Whole, 0),
+                    Extent::Unterminated { end: found } if found == end => (Extent::Whole, 0),
                     other => panic!("{case}: {other:?} at {end}"),
                 };
                 assert!(rows <= most, "{case}: {rows} rows missing at {end}, {most} before");
@@ -80,9 +80,32 @@ fn missing_rows_are_counted() {
                 }
             }
             assert!(most < 20, "{case}: {most} rows missing near the end");
-            let extent = extent(&bytes[..bytes.len() - 2]);
-            assert_eq!(extent, Extent::Unterminated, "{case}");
+            let end = bytes.len() - END_MARKER.len();
+            assert_eq!(extent(&bytes[..end]), Extent::Unterminated { end }, "{case}");
         }
+    }
+}
+
+/// At a marker that the decoder doesn't know, it would give up the last blocks.
+#[test]
+fn unknown_markers_end_the_image_data() {
+    for sampling in SAMPLINGS {
+        let bytes = jpeg(SIZE, sampling, false, 0);
+        let whole = decoded(&bytes).unwrap();
+        let end = bytes.len() - END_MARKER.len();
+        for (marker, filling) in [(&b"\xff\x46"[..], 0), (b"\xff\xe5", 0), (b"\xff\xff\xff\xf3", 2)]
+        {
+            let tail = [marker, &b"\x00\x04ab"[..], &END_MARKER].concat();
+            let mut followed = [&bytes[..end], &tail].concat();
+            let found = extent(&followed);
+            assert_eq!(found, Extent::Unterminated { end: end + filling }, "{sampling:?}");
+            followed.truncate(end + filling);
+            followed.extend(END_MARKER);
+            assert!(decoded(&followed).unwrap() == whole, "{sampling:?} {marker:?}");
+        }
+        let known = [&bytes[..end], b"\xff\xe1\x00\x04ab", &END_MARKER].concat();
+        assert_eq!(extent(&known), Extent::Whole);
+        assert!(decoded(&known).unwrap() == whole, "{sampling:?}");
     }
 }
 

@@ -161,7 +161,8 @@ fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelE
 fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<(), String> {
     match extent(jpeg) {
         Extent::Whole => Ok(()),
-        Extent::Unterminated => {
+        Extent::Unterminated { end } => {
+            jpeg.truncate(end);
             jpeg.extend(END_MARKER);
             Ok(())
         }

@@ -234,11 +234,23 @@ pub fn exr_reading_bytes(path: &Path) -> Result<u64, PixelError> {
     Ok(8 * samples.sum::<u64>())
 }
 
+/// Bytes of a chunk's entry in the offset table.
+const OFFSET_BYTES: u64 = 8;
+
 fn read_header(path: &Path) -> Result<MetaData, PixelError> {
-    let meta = MetaData::read_from_buffered(open(path)?, false).map_err(|e| exr_error(path, e))?;
+    let file = open(path)?;
+    let length = file.get_ref().metadata().map(|metadata| metadata.len());
+    let length = length.map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+    let meta = MetaData::read_from_buffered(file, false).map_err(|e| exr_error(path, e))?;
     if let Some(header) = meta.headers.iter().find(|h| h.layer_size.area() > MAX_PIXELS) {
         let (width, height) = (header.layer_size.width(), header.layer_size.height());
         return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
+    }
+    // Decoding would first allocate memory for the whole table, and for all pixels.
+    let chunks: u64 = meta.headers.iter().map(|header| header.chunk_count as u64).sum();
+    if OFFSET_BYTES * chunks > length {
+        let reason = "incomplete or damaged EXR (shorter than its offset table)";
+        return Err(format_error(path, reason));
     }
     Ok(meta)
 }
@@ -337,6 +349,26 @@ mod tests {
                     );
                 }
             }
+        }
+    }
+
+    /// A header of a few bytes doesn't make the reader allocate gigabytes.
+    #[test]
+    fn a_file_without_its_offset_table_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.exr");
+        write(&path, 4, 3);
+        let mut bytes = std::fs::read(&path).unwrap();
+        for window in [&b"dataWindow\0box2i\0"[..], b"displayWindow\0box2i\0"] {
+            let start = bytes.windows(window.len()).position(|w| w == window).unwrap();
+            // After the length (4 bytes): left, top, right, bottom.
+            let bottom = start + window.len() + 4 + 12;
+            bytes[bottom..bottom + 4].copy_from_slice(&59_999_999i32.to_le_bytes());
+        }
+        std::fs::write(&path, bytes).unwrap();
+        for error in [exr_size(&path).unwrap_err(), read_exr(&path).unwrap_err()] {
+            let message = error.to_string();
+            assert!(message.contains("(shorter than its offset table); export"), "{message}");
         }
     }
 
