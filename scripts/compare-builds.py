@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """Compares what two builds make of the same experiments, file by file: after a change that mustn't change behaviour.
 
-compare-builds.py OLD NEW [--data DIR] [--only NAME ...] [--before-renames] [--added FILE:KEY ...]
+compare-builds.py OLD NEW [--data DIR] [--only NAME ...] [--ignored FILE:KEY ...]
 
 OLD and NEW are work trees, each built by `make build`. The experiments are small: the demo scene, lego 100x2 by both kinds of supervision,
-fern 252x2, and a refined run. Tensors, EXR, PNG and text files are compared byte by byte, JSON by value. --before-renames says that OLD
-is older than the glossary: its names are translated. --added names JSON keys that OLD hasn't.
+fern 252x2, and a refined run. Tensors, EXR, PNG and text files are compared byte by byte, JSON by value and by today's names. --ignored
+lists JSON keys that are left out, such as field.json:format.
 """
 
 import argparse
@@ -25,79 +25,53 @@ EXPERIMENTS = {
     "fern": "-i dataset=DATA/nerf_llff_data/fern -p lr_width=252 -p prep.test_views=1 -p train-ss.rays=300000 -p render-depth.samples_per_axis=1",
     "refined": "refined -p demo-scene.size=64 -p demo-scene.train=12 -p demo-scene.test=2 -p train-ss.rays=300000 -p downscaled-field.rays=200000 -p train-refine.steps=40",
 }
-# What folders and JSON keys were before the glossary.
-KEYS = {"downscaled": "rehearsal"}
-# What stages and parameters were.
-RENAMES = KEYS | {
-    "downscaled-field": "rehearsal-field",
-    "downscaled-views": "rehearsal-views",
-    "lr_width": "lr",
-    "precrop_steps": "crop_steps",
-    "ensemble": "members",
-    "hidden_dim": "hidden",
-    "max_rays_per_step": "batch",
-    "samples_per_axis": "sub_rays",
+# JSON keys of files in earlier builds, with their names today.
+NAMES = {
+    "field.json": {
+        "levels": "n_levels",
+        "coarsest": "base_resolution",
+        "finest": "max_resolution",
+        "log2_entries": "log2_hashmap_size",
+        "hidden": "hidden_dim",
+        "steps": "march_steps",
+        "position_octaves": "position_frequencies",
+        "direction_octaves": "direction_frequencies",
+        "depth": "layers",
+        "width": "hidden_dim",
+    },
+    "refiner.json": {"strength": "residual_weight", "trusted": "confidence", "agreeing": "data_consistent"},
 }
-
-
-def older(word: str) -> str:
-    """A word of a command line as it was before the glossary: targets, stages and parameters."""
-    name, equals, value = word.partition("=")
-    return ".".join(RENAMES.get(part, part) for part in name.split(".")) + equals + value
-
-
-def newer(name: str, renames: dict[str, str]) -> str:
-    return next((new for new, old in renames.items() if old == name), name)
 
 
 def printed(command: list) -> str:
     return subprocess.run(command, check=True, text=True, stdout=subprocess.PIPE).stdout
 
 
-def has_json(runner: pathlib.Path) -> bool:
-    """Whether a runner has `status --json`: builds before 5fe62be, such as those before the glossary, have words alone."""
-    return "--json" in printed([runner, "status", "--help"])
-
-
-def artifacts(tree: pathlib.Path, folder: pathlib.Path, words: list[str], has_old_names: bool) -> dict[str, pathlib.Path]:
-    """The artifacts of a run, by stage and point; with today's names."""
-    words = [older(word) for word in words] if has_old_names else words
+def artifacts(tree: pathlib.Path, folder: pathlib.Path, words: list[str]) -> dict[str, pathlib.Path]:
+    """Artifacts of a run, by stage and point."""
     runner = [tree / "target/release/nerf-sr", "--pipeline", tree / "pipeline.yaml", "--store", folder / "store"]
     subprocess.run([*runner, "run", "--out", folder / "out", *words], check=True, stdout=subprocess.DEVNULL)
-    if has_json(runner[0]):
-        made = [node for node in json.loads(printed([*runner, "status", "--json", *words]))["nodes"] if node["state"] == "cached"]
-        return {f"{node['stage']} [{node['point']}]".removesuffix(" []"): pathlib.Path(node["folder"]) for node in made}
-    found = {}
-    for line in printed([*runner, "status", *words]).splitlines():
-        label, cached, rest = line.partition(" cached ")
-        if cached:
-            stage, _, point = label.strip().partition(" ")
-            label = f"{newer(stage, RENAMES) if has_old_names else stage} {point}".strip()
-            found[label] = next((folder / "store/objects").glob(f"{rest.split()[0]}*"))
-    return found
+    made = [node for node in json.loads(printed([*runner, "status", "--json", *words]))["nodes"] if node["state"] == "cached"]
+    return {f"{node['stage']} [{node['point']}]".removesuffix(" []"): pathlib.Path(node["folder"]) for node in made}
 
 
-def renamed(value):
-    """A JSON value with its keys as they are called now."""
+def renamed(value, names: dict[str, str]):
+    """Returns a JSON value with today's keys."""
     if isinstance(value, dict):
-        return {newer(key, KEYS): renamed(entry) for key, entry in value.items()}
-    return [renamed(entry) for entry in value] if isinstance(value, list) else value
+        return {names.get(key, key): renamed(entry, names) for key, entry in value.items()}
+    return [renamed(entry, names) for entry in value] if isinstance(value, list) else value
 
 
-def files(artifact: pathlib.Path, options: argparse.Namespace, has_old_names: bool) -> dict:
-    """Contents by path, the manifest left out: it follows from them."""
-    has_renames, added = options.before_renames, options.added
+def files(artifact: pathlib.Path, options: argparse.Namespace) -> dict:
+    """Contents by path, without the manifest, which follows from them, and the summary, whose words change."""
     found = {}
-    for file in sorted(p for p in artifact.rglob("*") if p.is_file() and p.name != "artifact.json"):
-        parts = file.relative_to(artifact).parts
-        name = "/".join(newer(part, KEYS) if has_old_names else part for part in parts)
-        if has_renames and name == "summary.txt":
-            continue  # Words for people, with the names in them.
+    for file in sorted(p for p in artifact.rglob("*") if p.is_file() and p.name not in ("artifact.json", "summary.txt")):
+        name = file.relative_to(artifact).as_posix()
         if file.suffix == ".json":
-            value = json.loads(file.read_text())
+            value = renamed(json.loads(file.read_text()), NAMES.get(file.name, {}))
             if isinstance(value, dict):
-                value = {key: entry for key, entry in value.items() if f"{name}:{key}" not in added}
-            found[name] = renamed(value) if has_old_names else value
+                value = {key: entry for key, entry in value.items() if f"{name}:{key}" not in options.ignored}
+            found[name] = value
         else:
             found[name] = file.read_bytes()
     return found
@@ -126,11 +100,11 @@ def compare(name: str, options: argparse.Namespace) -> bool:
     """Whether both builds make the same of an experiment; says what differs."""
     words = EXPERIMENTS[name].replace("DATA", str(options.data.resolve())).split()
     with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
-        old = artifacts(options.old, pathlib.Path(one), words, options.before_renames)
-        new = artifacts(options.new, pathlib.Path(other), words, False)
+        old = artifacts(options.old, pathlib.Path(one), words)
+        new = artifacts(options.new, pathlib.Path(other), words)
         differences, compared = sorted(old.keys() ^ new.keys()), 0
         for label in sorted(old.keys() & new.keys()):
-            before, after = files(old[label], options, options.before_renames), files(new[label], options, False)
+            before, after = files(old[label], options), files(new[label], options)
             compared += len(after)
             differences += unequal(before, after, f"{label}:")
     what = f"{len(differences)} differences" if differences else "equal"
@@ -144,8 +118,7 @@ def main() -> int:
     parser.add_argument("new", type=pathlib.Path)
     parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
     parser.add_argument("--only", nargs="+", choices=EXPERIMENTS, default=list(EXPERIMENTS))
-    parser.add_argument("--before-renames", action="store_true")
-    parser.add_argument("--added", nargs="*", default=[], metavar="FILE:KEY")
+    parser.add_argument("--ignored", nargs="*", default=[], metavar="FILE:KEY")
     options = parser.parse_args()
     return 0 if all([compare(name, options) for name in options.only]) else 1
 

@@ -37,13 +37,13 @@ def sizes(path: pathlib.Path, state: dict) -> dict:
     except (KeyError, ValueError) as error:
         sys.exit(f"{path}: tensor {error} is missing; is it a VanillaMLP?")
     depth = sum(name.startswith("xyz_encoding_") and name.endswith(".0.weight") for name in state)
-    return {"position_octaves": octaves(path, position), "direction_octaves": octaves(path, direction), "depth": depth, "width": width}
+    return {"position_frequencies": octaves(path, position), "direction_frequencies": octaves(path, direction), "layers": depth, "hidden_dim": width}
 
 
 def shapes(network: dict) -> dict:
     """Names and shapes of a network's tensors."""
-    position, direction = (3 + 6 * network[f"{of}_octaves"] for of in ("position", "direction"))
-    width, depth = network["width"], network["depth"]
+    position, direction = (3 + 6 * network[f"{of}_frequencies"] for of in ("position", "direction"))
+    width, depth = network["hidden_dim"], network["layers"]
     # The position joins in again at the fifth layer.
     layers = {f"xyz_encoding_{i + 1}.0": (position if i == 0 else position + width if i == 4 else width, width) for i in range(depth)}
     layers |= {"sigma": (width, 1), "xyz_encoding_final": (width, width)}

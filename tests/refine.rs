@@ -142,7 +142,7 @@ fn refine_summary(project: &Project, more: &[&str]) -> String {
 }
 
 fn is_agreeing(project: &Project, more: &[&str]) -> bool {
-    project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["agreeing"]
+    project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["data_consistent"]
         .as_bool()
         .unwrap()
 }

@@ -25,7 +25,7 @@ pub(crate) fn read_view(
 #[derive(Serialize, Deserialize)]
 pub(crate) struct RefinedView {
     /// True if the view was made consistent with its own LR photograph.
-    #[serde(rename = "agreed")]
+    #[serde(alias = "agreed")]
     pub(crate) is_consistent: bool,
     /// Use of each reference.
     pub(crate) uses: Vec<Use>,

@@ -233,12 +233,24 @@ fn passes(rows: &mut Rows) {
         Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, ..Default::default() };
     let default = Architecture::default();
     let variants = [
-        ("", Architecture { levels: 8, log2_entries: 17, hidden: 32, ..default }),
-        ("_64_wide", Architecture { levels: 8, log2_entries: 17, hidden: 64, ..default }),
-        ("_2_19_entries", Architecture { levels: 8, log2_entries: 19, hidden: 32, ..default }),
+        ("", Architecture { n_levels: 8, log2_hashmap_size: 17, hidden_dim: 32, ..default }),
+        (
+            "_64_wide",
+            Architecture { n_levels: 8, log2_hashmap_size: 17, hidden_dim: 64, ..default },
+        ),
+        (
+            "_2_19_entries",
+            Architecture { n_levels: 8, log2_hashmap_size: 19, hidden_dim: 32, ..default },
+        ),
         (
             "_256_steps",
-            Architecture { levels: 8, log2_entries: 17, hidden: 32, steps: 256, ..default },
+            Architecture {
+                n_levels: 8,
+                log2_hashmap_size: 17,
+                hidden_dim: 32,
+                march_steps: 256,
+                ..default
+            },
         ),
     ];
     for (name, architecture) in variants {
@@ -268,7 +280,7 @@ fn passes(rows: &mut Rows) {
                 "%",
             );
             // Eight corners of four floats a level: read forward, read and written backward.
-            let bytes = (architecture.levels * 8 * 16 * 3) as f64;
+            let bytes = (architecture.n_levels * 8 * 16 * 3) as f64;
             rows.add("grid_traffic_of_forward_backward", bytes / both, "GB/s");
         }
     }

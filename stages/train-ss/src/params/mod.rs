@@ -197,12 +197,12 @@ impl Default for GridParams {
             learning_rate_decay: 0.16,
             ema_decay: 0.97,
             network_decay: 1e-6,
-            n_levels: grid.levels,
-            base_resolution: grid.coarsest,
+            n_levels: grid.n_levels,
+            base_resolution: grid.base_resolution,
             max_resolution: None,
             finest_z: None,
             log2_hashmap_size: None,
-            hidden_dim: grid.hidden,
+            hidden_dim: grid.hidden_dim,
         }
     }
 }
@@ -292,11 +292,11 @@ impl Default for MlpParams {
             learning_rate_decay: 0.01,
             schedule: RateSchedule::Code,
             restarts: 0,
-            position_frequencies: mlp.position_octaves,
-            direction_frequencies: mlp.direction_octaves,
+            position_frequencies: mlp.position_frequencies,
+            direction_frequencies: mlp.direction_frequencies,
             ndc_directions: mlp.ndc_directions,
-            layers: mlp.depth,
-            hidden_dim: mlp.width,
+            layers: mlp.layers,
+            hidden_dim: mlp.hidden_dim,
         }
     }
 }

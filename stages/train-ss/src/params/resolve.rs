@@ -126,13 +126,13 @@ impl GridParams {
             finest_z = finest_z.min((f64::from(steps) / 3.0f64.sqrt()).round() as u32);
         }
         Architecture {
-            levels: self.n_levels,
-            coarsest: self.base_resolution,
-            finest,
+            n_levels: self.n_levels,
+            base_resolution: self.base_resolution,
+            max_resolution: finest,
             finest_z: self.finest_z.unwrap_or(finest_z),
-            log2_entries: self.log2_hashmap_size.unwrap_or(by_finest),
-            hidden: self.hidden_dim,
-            steps,
+            log2_hashmap_size: self.log2_hashmap_size.unwrap_or(by_finest),
+            hidden_dim: self.hidden_dim,
+            march_steps: steps,
         }
     }
 
@@ -169,12 +169,12 @@ impl MlpParams {
 
     fn architecture(&self) -> MlpArchitecture {
         MlpArchitecture {
-            position_octaves: self.position_frequencies,
-            direction_octaves: self.direction_frequencies,
+            position_frequencies: self.position_frequencies,
+            direction_frequencies: self.direction_frequencies,
             ndc_directions: self.ndc_directions,
             scaled_positions: true,
-            depth: self.layers,
-            width: self.hidden_dim,
+            layers: self.layers,
+            hidden_dim: self.hidden_dim,
             coarse_samples: self.coarse_samples,
             fine_samples: self.fine_samples,
         }

@@ -98,9 +98,9 @@ impl Resolved {
                 "distortion": regularisers.distortion,
                 "finest_z": architecture.finest_z,
                 "floater_loss": regularisers.floater_loss,
-                "log2_hashmap_size": architecture.log2_entries,
-                "march_steps": architecture.steps,
-                "max_resolution": architecture.finest,
+                "log2_hashmap_size": architecture.log2_hashmap_size,
+                "march_steps": architecture.march_steps,
+                "max_resolution": architecture.max_resolution,
             }),
             ResolvedField::Mlp { density_noise_std, .. } => {
                 json!({ "density_noise_std": density_noise_std })

@@ -138,7 +138,12 @@ mod tests {
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
         let field = Field::new(
-            Architecture { finest: 32, levels: 4, log2_entries: 10, ..Architecture::default() },
+            Architecture {
+                max_resolution: 32,
+                n_levels: 4,
+                log2_hashmap_size: 10,
+                ..Architecture::default()
+            },
             bounds,
             3,
         );

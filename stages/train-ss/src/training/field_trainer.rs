@@ -266,7 +266,8 @@ mod tests {
 
     /// A small field with two thin cells, one of them beside an opaque cell.
     fn field() -> Field {
-        let architecture = Architecture { levels: 2, log2_entries: 8, ..Architecture::default() };
+        let architecture =
+            Architecture { n_levels: 2, log2_hashmap_size: 8, ..Architecture::default() };
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
         let mut field = Field::new(architecture, bounds, 1);

@@ -247,10 +247,10 @@ mod tests {
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
         let architecture = Architecture {
-            finest: 32,
-            levels: 4,
-            log2_entries: 10,
-            steps: 64,
+            max_resolution: 32,
+            n_levels: 4,
+            log2_hashmap_size: 10,
+            march_steps: 64,
             ..Architecture::default()
         };
         let folder = tempfile::tempdir().unwrap();

@@ -79,7 +79,7 @@ fn a_grid_of_the_first_format_is_refused() {
     let line = format!("{error:#}");
     assert!(
         line.ends_with(
-            "field has format 1 of another build; this build reads format 2: train the field again"
+            "field has format 1 of another build; this build reads formats 2 to 3: train the field again"
         ),
         "{line}"
     );

@@ -1,25 +1,31 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Sizes of a grid field.
+/// Sizes of a grid field. Aliases are the names in `field.json` of format 2.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Architecture {
     /// Number of grid levels.
-    pub levels: u32,
+    #[serde(alias = "levels")]
+    pub n_levels: u32,
     /// Cells along an axis of the coarsest level.
-    pub coarsest: u32,
+    #[serde(alias = "coarsest")]
+    pub base_resolution: u32,
     /// Cells along an axis of the finest level.
-    pub finest: u32,
+    #[serde(alias = "finest")]
+    pub max_resolution: u32,
     /// Maximum number of cells along z, of any level: in NDC rays run along z, and cells thinner
     /// than the distance between samples train poorly.
     pub finest_z: u32,
     /// Base-2 logarithm of the maximum number of entries per level; finer levels are hashed.
-    pub log2_entries: u32,
+    #[serde(alias = "log2_entries")]
+    pub log2_hashmap_size: u32,
     /// Width of the hidden layers.
-    pub hidden: u32,
+    #[serde(alias = "hidden")]
+    pub hidden_dim: u32,
     /// Number of samples along the diagonal of the unit cube.
-    pub steps: u32,
+    #[serde(alias = "steps")]
+    pub march_steps: u32,
 }
 
 /// Maximum number of cells along an axis.
@@ -28,13 +34,13 @@ const MAX_RESOLUTION: u32 = 4096;
 impl Default for Architecture {
     fn default() -> Self {
         Self {
-            levels: 8,
-            coarsest: 16,
-            finest: 256,
+            n_levels: 8,
+            base_resolution: 16,
+            max_resolution: 256,
             finest_z: MAX_RESOLUTION,
-            log2_entries: 17,
-            hidden: 64,
-            steps: 512,
+            log2_hashmap_size: 17,
+            hidden_dim: 64,
+            march_steps: 512,
         }
     }
 }
@@ -42,19 +48,19 @@ impl Default for Architecture {
 impl Architecture {
     /// Returns the distance between samples, in cube sides.
     pub fn step(&self) -> f32 {
-        3.0f32.sqrt() / self.steps as f32
+        3.0f32.sqrt() / self.march_steps as f32
     }
 
     /// Fails with the first number that is out of range.
     pub fn check(&self) -> Result<(), OutOfRange> {
         check_ranges(&[
-            ("levels", self.levels, 1, 16),
-            ("coarsest", self.coarsest, 2, 512),
-            ("finest", self.finest, self.coarsest, MAX_RESOLUTION),
+            ("n_levels", self.n_levels, 1, 16),
+            ("base_resolution", self.base_resolution, 2, 512),
+            ("max_resolution", self.max_resolution, self.base_resolution, MAX_RESOLUTION),
             ("finest_z", self.finest_z, 2, MAX_RESOLUTION),
-            ("log2_entries", self.log2_entries, 8, 22),
-            ("hidden", self.hidden, 16, 128),
-            ("steps", self.steps, 16, 8192),
+            ("log2_hashmap_size", self.log2_hashmap_size, 8, 22),
+            ("hidden_dim", self.hidden_dim, 16, 128),
+            ("march_steps", self.march_steps, 16, 8192),
         ])
     }
 
@@ -62,7 +68,7 @@ impl Architecture {
     /// estimate before its first step.
     pub fn samples_per_full_ray(&self) -> f64 {
         // About 1/√3: the cube's side over its diagonal.
-        f64::from(self.steps) * 0.6
+        f64::from(self.march_steps) * 0.6
     }
 }
 

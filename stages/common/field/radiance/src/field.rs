@@ -49,7 +49,7 @@ impl Field {
 
     fn empty(architecture: Architecture, bounds: Bounds) -> Self {
         let levels = levels(&architecture);
-        let layers = Layers::new(levels.len() * FEATURES, architecture.hidden as usize);
+        let layers = Layers::new(levels.len() * FEATURES, architecture.hidden_dim as usize);
         let grid = Aligned::zeros(architecture.grid_len());
         // The optimiser takes whole vectors.
         let network = Aligned::zeros(layers.len().next_multiple_of(LANES));
@@ -174,10 +174,10 @@ mod tests {
     #[test]
     fn fields_are_averaged() {
         let architecture = Architecture {
-            finest: 32,
-            levels: 4,
-            log2_entries: 10,
-            steps: 64,
+            max_resolution: 32,
+            n_levels: 4,
+            log2_hashmap_size: 10,
+            march_steps: 64,
             ..Architecture::default()
         };
         let [mut mean, own, other] =

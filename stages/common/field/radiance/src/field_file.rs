@@ -11,8 +11,12 @@ use crate::architecture::{OutOfRange, check_ranges};
 pub const FIELD_FILE: &str = "field.json";
 
 /// Format of the weights that this build reads and writes. Formats of grid fields differ in their
-/// networks and the order of their entries; the paper's field has a single format.
-pub const FIELD_FORMAT: u32 = 2;
+/// networks, the order of their entries and the names in [`FIELD_FILE`]; the paper's field has a
+/// single format.
+pub const FIELD_FORMAT: u32 = 3;
+
+/// Oldest format of a grid field that this build reads: only its names differ.
+const OLDEST_FORMAT: u32 = 2;
 
 /// Description of a field artifact, `field.json`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -46,8 +50,8 @@ pub enum FieldFileError {
     OutOfRange(#[from] OutOfRange),
     /// The file has another format.
     #[error(
-        "field has format {0} of another build; this build reads format {FIELD_FORMAT}: train the \
-        field again"
+        "field has format {0} of another build; this build reads formats {OLDEST_FORMAT} to \
+        {FIELD_FORMAT}: train the field again"
     )]
     Format(u32),
 }
@@ -62,7 +66,7 @@ impl FieldFile {
     pub fn check(&self) -> Result<(), FieldFileError> {
         check_ranges(&[("members", self.members, 1, 16)])?;
         match self.field {
-            FieldModel::Grid(_) if self.format != FIELD_FORMAT => {
+            FieldModel::Grid(_) if !(OLDEST_FORMAT..=FIELD_FORMAT).contains(&self.format) => {
                 Err(FieldFileError::Format(self.format))
             }
             FieldModel::Grid(architecture) => Ok(architecture.check()?),
@@ -81,18 +85,22 @@ pub enum FieldModel {
     Mlp(MlpArchitecture),
 }
 
-/// Sizes of the paper's field; defaults are the published ones.
+/// Sizes of the paper's field; defaults are the published ones. Aliases are the names of format 2.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MlpArchitecture {
     /// Octaves of the positional encoding of positions.
-    pub position_octaves: u32,
+    #[serde(alias = "position_octaves")]
+    pub position_frequencies: u32,
     /// Octaves of the positional encoding of directions.
-    pub direction_octaves: u32,
+    #[serde(alias = "direction_octaves")]
+    pub direction_frequencies: u32,
     /// Number of layers before density and colour branch; the fifth has a skip connection.
-    pub depth: u32,
+    #[serde(alias = "depth")]
+    pub layers: u32,
     /// Width of the layers before the branch.
-    pub width: u32,
+    #[serde(alias = "width")]
+    pub hidden_dim: u32,
     /// Number of samples per ray of the coarse network.
     pub coarse_samples: u32,
     /// Number of additional samples per ray of the fine network.
@@ -109,10 +117,10 @@ pub struct MlpArchitecture {
 impl Default for MlpArchitecture {
     fn default() -> Self {
         Self {
-            position_octaves: 10,
-            direction_octaves: 4,
-            depth: 8,
-            width: 256,
+            position_frequencies: 10,
+            direction_frequencies: 4,
+            layers: 8,
+            hidden_dim: 256,
             coarse_samples: 64,
             fine_samples: 64,
             ndc_directions: false,
@@ -125,10 +133,10 @@ impl MlpArchitecture {
     /// Fails with the first number that is out of range.
     pub fn check(&self) -> Result<(), OutOfRange> {
         check_ranges(&[
-            ("position_octaves", self.position_octaves, 0, 16),
-            ("direction_octaves", self.direction_octaves, 0, 16),
-            ("depth", self.depth, 1, 32),
-            ("width", self.width, 2, 4096),
+            ("position_frequencies", self.position_frequencies, 0, 16),
+            ("direction_frequencies", self.direction_frequencies, 0, 16),
+            ("layers", self.layers, 1, 32),
+            ("hidden_dim", self.hidden_dim, 2, 4096),
             ("coarse_samples", self.coarse_samples, 4, 4096),
             ("fine_samples", self.fine_samples, 1, 4096),
         ])

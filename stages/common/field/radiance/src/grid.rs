@@ -47,22 +47,22 @@ impl Level {
     }
 }
 
-/// Returns the shapes of levels from `coarsest` to `finest` cells in equal ratios, with at most
-/// `finest_z` cells along z and 2^`log2_entries` entries each.
+/// Returns the shapes of levels from `base_resolution` to `max_resolution` cells in equal ratios, with
+/// at most `finest_z` cells along z and 2^`log2_hashmap_size` entries each.
 pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
-    let Architecture { levels: count, coarsest, finest, finest_z, log2_entries, .. } =
-        *architecture;
-    let steps = f64::from(count.max(2) - 1);
-    let ratio = libm::pow(f64::from(finest) / f64::from(coarsest), 1.0 / steps);
+    let Architecture { n_levels, base_resolution, max_resolution, finest_z, .. } = *architecture;
+    let max_entries = 1 << architecture.log2_hashmap_size;
+    let steps = f64::from(n_levels.max(2) - 1);
+    let ratio = libm::pow(f64::from(max_resolution) / f64::from(base_resolution), 1.0 / steps);
     let mut offset = 0;
-    (0..count)
+    (0..n_levels)
         .map(|i| {
-            let cells = (f64::from(coarsest) * ratio.powi(i as i32)).round() as u32;
+            let cells = (f64::from(base_resolution) * ratio.powi(i as i32)).round() as u32;
             let resolution = [cells, cells, cells.min(finest_z)];
             let bricks = resolution.map(|n| (n + 1).div_ceil(2));
             let vertices = bricks.iter().map(|n| u64::from(*n)).product::<u64>() * BRICK as u64;
-            let hashed = vertices > 1 << log2_entries;
-            let entries = if hashed { 1usize << log2_entries } else { vertices as usize };
+            let hashed = vertices > max_entries;
+            let entries = if hashed { max_entries } else { vertices } as usize;
             let level =
                 Level { resolution, entries, bricks: [bricks[0], bricks[1]], hashed, offset };
             offset += entries * FEATURES;
@@ -200,9 +200,12 @@ mod tests {
 
     #[test]
     fn a_linear_function_is_interpolated_exactly() {
-        let level =
-            levels(&Architecture { levels: 1, finest: 16, finest_z: 8, ..Architecture::default() })
-                [0];
+        let level = levels(&Architecture {
+            n_levels: 1,
+            max_resolution: 16,
+            finest_z: 8,
+            ..Architecture::default()
+        })[0];
         let mut table = vec![0.0; level.entries * FEATURES];
         for z in 0..9 {
             for y in 0..17 {
@@ -226,10 +229,10 @@ mod tests {
     #[test]
     fn scatter_is_the_adjoint_of_encode() {
         let small = Architecture {
-            levels: 4,
-            coarsest: 8,
-            finest: 128,
-            log2_entries: 10,
+            n_levels: 4,
+            base_resolution: 8,
+            max_resolution: 128,
+            log2_hashmap_size: 10,
             ..Architecture::default()
         };
         for level in

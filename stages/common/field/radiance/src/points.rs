@@ -99,10 +99,10 @@ mod tests {
     #[test]
     fn places_hold_what_rays_see() {
         let architecture = Architecture {
-            finest: 32,
-            levels: 4,
-            log2_entries: 10,
-            steps: 64,
+            max_resolution: 32,
+            n_levels: 4,
+            log2_hashmap_size: 10,
+            march_steps: 64,
             ..Default::default()
         };
         let bounds =

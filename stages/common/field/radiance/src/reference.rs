@@ -189,13 +189,13 @@ fn fused_gradients(
 
 fn example() -> (Field, Vec<Ray>) {
     let architecture = Architecture {
-        levels: 5,
-        coarsest: 4,
-        finest: 48,
+        n_levels: 5,
+        base_resolution: 4,
+        max_resolution: 48,
         finest_z: 20,
-        log2_entries: 9,
-        hidden: 16,
-        steps: 24,
+        log2_hashmap_size: 9,
+        hidden_dim: 16,
+        march_steps: 24,
     };
     let mut field = Field::new(
         architecture,
@@ -433,12 +433,12 @@ fn extremes_stay_finite() {
     for raw in [-1e30f32, -50.0, 0.0, 50.0, 1e30] {
         for scale in [1e-6f64, 1.0, 1e6] {
             let architecture = Architecture {
-                levels: 2,
-                coarsest: 2,
-                finest: 4,
-                log2_entries: 8,
-                hidden: 16,
-                steps: 64,
+                n_levels: 2,
+                base_resolution: 2,
+                max_resolution: 4,
+                log2_hashmap_size: 8,
+                hidden_dim: 16,
+                march_steps: 64,
                 ..Architecture::default()
             };
             let mut field = Field::new(

@@ -421,13 +421,13 @@ mod tests {
     }
 
     const SMALL: Architecture = Architecture {
-        levels: 4,
-        coarsest: 4,
-        finest: 32,
+        n_levels: 4,
+        base_resolution: 4,
+        max_resolution: 32,
         finest_z: 32,
-        log2_entries: 10,
-        hidden: 16,
-        steps: 64,
+        log2_hashmap_size: 10,
+        hidden_dim: 16,
+        march_steps: 64,
     };
 
     fn cube(space: Space) -> Bounds {
@@ -447,7 +447,7 @@ mod tests {
         let options = TrainingOptions { ema_decay: 0.9, ..options(30) };
         let new =
             |architecture| Trainer::new(Field::new(architecture, cube(Space::Box), 5), options);
-        let larger = Architecture { log2_entries: 11, ..SMALL };
+        let larger = Architecture { log2_hashmap_size: 11, ..SMALL };
         for (name, architecture) in [("size", larger), ("cells", SMALL)] {
             let path = folder.path().join(name);
             let mut other = new(architecture);

@@ -73,10 +73,10 @@ fn published_size_forward_in_f32() {
 /// The small field, its rays and draws.
 fn small() -> (Mlp, Batch, SampleDraws) {
     let architecture = MlpArchitecture {
-        position_octaves: 4,
-        direction_octaves: 2,
-        depth: 6,
-        width: 16,
+        position_frequencies: 4,
+        direction_frequencies: 2,
+        layers: 6,
+        hidden_dim: 16,
         coarse_samples: 8,
         fine_samples: 8,
         ndc_directions: false,

@@ -145,17 +145,18 @@ fn met_cells(weight: &Tensor, positions: &Tensor, raw: &Tensor) -> Result<Vec<Ce
 
 /// Returns the levels, from the coarsest to the finest.
 fn build_levels(architecture: &Architecture) -> Vec<TorchLevel> {
-    let (coarsest, finest) = (f64::from(architecture.coarsest), f64::from(architecture.finest));
-    let ratio = libm::pow(finest / coarsest, 1.0 / f64::from(architecture.levels.max(2) - 1));
-    let mut levels = Vec::with_capacity(architecture.levels as usize);
+    let (coarsest, finest) =
+        (f64::from(architecture.base_resolution), f64::from(architecture.max_resolution));
+    let ratio = libm::pow(finest / coarsest, 1.0 / f64::from(architecture.n_levels.max(2) - 1));
+    let mut levels = Vec::with_capacity(architecture.n_levels as usize);
     let mut first = 0;
-    for i in 0..architecture.levels {
+    for i in 0..architecture.n_levels {
         let cells = (coarsest * ratio.powi(i as i32)).round() as i64;
         let resolution = [cells, cells, cells.min(i64::from(architecture.finest_z))];
         let bricks = resolution.map(|n| n / 2 + 1);
         let vertices = bricks.iter().product::<i64>() * BRICK as i64;
-        let is_hashed = vertices > 1 << architecture.log2_entries;
-        let entries = if is_hashed { 1 << architecture.log2_entries } else { vertices };
+        let is_hashed = vertices > 1 << architecture.log2_hashmap_size;
+        let entries = if is_hashed { 1 << architecture.log2_hashmap_size } else { vertices };
         levels.push(TorchLevel { resolution, bricks, first, entries, is_hashed });
         first += entries;
     }
@@ -167,8 +168,8 @@ const OUTPUTS: i64 = DENSITY_OUTPUTS as i64;
 
 /// Returns inputs and outputs of the five layers.
 fn layer_shapes(architecture: &Architecture) -> [(i64, i64); 5] {
-    let features = FEATURES as i64 * i64::from(architecture.levels);
-    let hidden = i64::from(architecture.hidden);
+    let features = FEATURES as i64 * i64::from(architecture.n_levels);
+    let hidden = i64::from(architecture.hidden_dim);
     [
         (features, hidden),
         (hidden, OUTPUTS),
@@ -554,13 +555,14 @@ mod tests {
         };
         let mut devices = vec![Device::Cpu];
         devices.extend(nets::device("cuda").ok());
-        for (spread, log2_entries, hidden) in [(0.0, 12, 16), (0.3, 12, 32), (3.0, 14, 64)] {
+        for (spread, log2_hashmap_size, hidden_dim) in [(0.0, 12, 16), (0.3, 12, 32), (3.0, 14, 64)]
+        {
             let architecture = Architecture {
-                finest: 96,
+                max_resolution: 96,
                 finest_z: 40,
-                log2_entries,
-                hidden,
-                steps: 256,
+                log2_hashmap_size,
+                hidden_dim,
+                march_steps: 256,
                 ..Architecture::default()
             };
             let field = example(architecture, bounds, spread);
@@ -620,10 +622,10 @@ mod tests {
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e6, ..Default::default() };
         let architecture = Architecture {
-            finest: 64,
-            log2_entries: 12,
-            hidden: 16,
-            steps: 64,
+            max_resolution: 64,
+            log2_hashmap_size: 12,
+            hidden_dim: 16,
+            march_steps: 64,
             ..Architecture::default()
         };
         let field = example(architecture, bounds, 1.0);

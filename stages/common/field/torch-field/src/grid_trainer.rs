@@ -443,11 +443,11 @@ mod tests {
 
     fn new_field(space: Space) -> Field {
         let architecture = Architecture {
-            finest: 32,
-            levels: 4,
-            log2_entries: 10,
-            hidden: 16,
-            steps: 64,
+            max_resolution: 32,
+            n_levels: 4,
+            log2_hashmap_size: 10,
+            hidden_dim: 16,
+            march_steps: 64,
             ..Architecture::default()
         };
         Field::new(architecture, bounds(space), 5)

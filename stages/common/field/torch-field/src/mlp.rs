@@ -248,7 +248,7 @@ impl Mlp {
             Some(maps) => (maps.enter.shallow_clone(), maps.leave.shallow_clone()),
         };
         let count = i64::from(self.architecture.coarse_samples);
-        let direction = encode(&batch.direction, self.architecture.direction_octaves)?;
+        let direction = encode(&batch.direction, self.architecture.direction_frequencies)?;
         let noise = draws.and_then(|d| d.noise.as_ref());
 
         let t = stratified(&near, &far, count, draws.map(|d| &d.coarse))?;
@@ -289,7 +289,7 @@ impl Mlp {
             Some(maps) => maps.positions(t)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?,
         };
         let positions = positions.f_reshape([n * m, 3])?;
-        let code = encode(&positions, self.architecture.position_octaves)?;
+        let code = encode(&positions, self.architecture.position_frequencies)?;
         let width = direction.size()[1];
         let directions =
             direction.f_unsqueeze(1)?.f_expand([n, m, width], false)?.f_reshape([n * m, width])?;
@@ -409,8 +409,8 @@ mod tests {
         let frustum =
             Frustum { camera_to_world: pose, min: [-0.5; 2], max: [0.5; 2], near: 2.0, far: 90.0 };
         let architecture = MlpArchitecture {
-            depth: 5,
-            width: 16,
+            layers: 5,
+            hidden_dim: 16,
             coarse_samples: 16,
             fine_samples: 8,
             ..MlpArchitecture::default()
@@ -465,8 +465,8 @@ mod tests {
         let rendered = |scaled_positions, shift: DVec3, scale: f64| {
             let architecture = MlpArchitecture {
                 scaled_positions,
-                depth: 5,
-                width: 16,
+                layers: 5,
+                hidden_dim: 16,
                 ..MlpArchitecture::default()
             };
             let bounds = Bounds {
@@ -497,7 +497,8 @@ mod tests {
     /// Every number of both networks is the mean of both fields'.
     #[test]
     fn fields_are_averaged() {
-        let architecture = MlpArchitecture { depth: 5, width: 16, ..MlpArchitecture::default() };
+        let architecture =
+            MlpArchitecture { layers: 5, hidden_dim: 16, ..MlpArchitecture::default() };
         let [a, b, mean] = [3, 4, 3]
             .map(|seed| Mlp::new(architecture, Bounds::default(), seed, Device::Cpu).unwrap());
         mean.average_with(&b).unwrap();

@@ -379,8 +379,8 @@ mod tests {
     /// How a training ends of which one network's raw densities are shifted, if not well.
     fn collapse(network: fn(&Mlp) -> &MlpNetwork, shift: f64) -> Option<String> {
         let architecture = MlpArchitecture {
-            depth: 5,
-            width: 16,
+            layers: 5,
+            hidden_dim: 16,
             coarse_samples: 16,
             fine_samples: 8,
             ..MlpArchitecture::default()

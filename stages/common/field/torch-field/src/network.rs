@@ -43,10 +43,10 @@ pub(crate) fn encode(x: &Tensor, octaves: u32) -> Result<Tensor, TchError> {
 impl MlpNetwork {
     /// Returns the layers from input to output.
     pub(crate) fn layers(architecture: &MlpArchitecture) -> Vec<Layer> {
-        let width = i64::from(architecture.width);
-        let position = encoded_dims(3, architecture.position_octaves);
-        let direction = encoded_dims(3, architecture.direction_octaves);
-        let trunk = (0..architecture.depth).map(|i| {
+        let width = i64::from(architecture.hidden_dim);
+        let position = encoded_dims(3, architecture.position_frequencies);
+        let direction = encoded_dims(3, architecture.direction_frequencies);
+        let trunk = (0..architecture.layers).map(|i| {
             let inputs = match i {
                 0 => position,
                 SKIP_LAYER => position + width,
@@ -128,7 +128,7 @@ impl MlpNetwork {
         position: &Tensor,
         direction: &Tensor,
     ) -> Result<(Tensor, Tensor), TchError> {
-        let depth = self.architecture.depth as usize;
+        let depth = self.architecture.layers as usize;
         let mut x = position.shallow_clone();
         for i in 0..depth {
             if i == SKIP_LAYER as usize {

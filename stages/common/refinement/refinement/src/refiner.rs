@@ -52,7 +52,7 @@ pub const REFINER_FILE: &str = "refiner.json";
 /// columns × inputs.
 pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 
-/// Content of `refiner.json`.
+/// Content of `refiner.json`. Aliases are names of an earlier format.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RefinerFile {
@@ -60,7 +60,7 @@ pub struct RefinerFile {
     pub network: Network,
     /// Fraction of the predicted residual that is added, from 0 to 1: the best one for the
     /// validation views.
-    #[serde(rename = "strength")]
+    #[serde(alias = "strength")]
     pub residual_weight: f64,
     /// Mean PSNR of the rendered validation views, in dB.
     pub rendered_psnr: f64,
@@ -68,10 +68,10 @@ pub struct RefinerFile {
     pub refined_psnr: f64,
     /// Confidence in references as a fraction of their visibility in the validation views; absent
     /// if the network takes no references.
-    #[serde(rename = "trusted", default)]
+    #[serde(alias = "trusted", default)]
     pub confidence: Option<f64>,
     /// True if the network's input views are made consistent with their own LR photographs.
-    #[serde(rename = "agreeing", default)]
+    #[serde(alias = "agreeing", default)]
     pub data_consistent: bool,
 }
 

@@ -51,7 +51,7 @@ pub struct Use {
     /// Number of the view's pixels that are visible in the reference.
     pub seen: usize,
     /// Sum over them of their visibility, by angle and size.
-    #[serde(rename = "sight")]
+    #[serde(alias = "sight")]
     pub visibility: f64,
     /// Sum over them of the confidence: visibility, reduced where the reference disagrees with the
     /// rendered view.
