@@ -226,7 +226,7 @@ fn pipelines_that_cannot_be_used() {
             "prep/train}",
             "prep/test}",
             10,
-            "no folder \"test\"; known: cameras, downscaled, references, train, train-cameras, \
+            "no subtree \"test\"; known: cameras, downscaled, references, train, train-cameras, \
             truth",
         ),
         ("prep/train}", "prep/truth}", 10, "takes scene/train, but prep/truth is scene/truth"),

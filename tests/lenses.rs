@@ -227,7 +227,8 @@ fn what_a_fisheye_cannot_see_is_masked() {
     let undone = project.path("undone");
     let made = stage("prep", r#"{"lens": "undo"}"#, &[("dataset", &data)], &undone, &[]);
     assert_eq!(made.code, 0, "{}", made.stderr);
-    let said = "8 fisheye photographs are resampled for pinhole cameras that see 100.0°×100.0°";
+    let said = "8 fisheye photographs are resampled to pinhole cameras with a field of view of \
+        100.0°×100.0°";
     assert!(notes(&undone).iter().any(|note| note.starts_with(said)), "{:?}", notes(&undone));
     let views = Views::read_folder(&undone.join("train")).unwrap();
     assert!(

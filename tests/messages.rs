@@ -88,7 +88,10 @@ fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
         // The log ends with the same reason.
         let log = project.ok(&["log", "talk"]);
         let reason = said.strip_prefix("talk: failed: ").unwrap();
-        assert!(log.lines().last().unwrap().contains(&format!("with {code}: {reason}")), "{log}");
+        assert!(
+            log.lines().last().unwrap().contains(&format!("with exit code {code}: {reason}")),
+            "{log}"
+        );
     }
 }
 
@@ -317,7 +320,7 @@ fn describe_prints_a_stages_help() {
     let help = project.ok(&["describe", "eval"]);
     assert!(
         help.contains("Usage: eval ")
-            && help.contains("\nParameters: ")
+            && help.contains("\nParameters, ")
             && help.contains("\nInputs, "),
         "{help}"
     );

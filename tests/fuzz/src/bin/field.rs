@@ -13,11 +13,11 @@ static FOLDER: LazyLock<Folder> = LazyLock::new(Folder::new);
 fuzz_target!(|data: &[u8]| {
     FOLDER.write("field.safetensors", data);
     let architecture = Architecture {
-        levels: 1,
-        coarsest: 2,
-        finest: 2,
-        log2_entries: 8,
-        hidden: 16,
+        n_levels: 1,
+        base_resolution: 2,
+        max_resolution: 2,
+        log2_hashmap_size: 8,
+        hidden_dim: 16,
         ..Architecture::default()
     };
     let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 5.0, ..Bounds::default() };

@@ -6,8 +6,9 @@
 //! missing. A progressive JPEG needs its end marker, since nothing else determines the number of
 //! scans.
 //!
-//! An invalid header before the first scan is left to the decoder, which reports it. After the first
-//! scan the decoder ignores an invalid header, so that it counts as damage here.
+//! An invalid segment before the first scan is left to the decoder, which reports it. The decoder
+//! ignores an invalid scan header, and any invalid segment after the first scan: here these are
+//! damage.
 
 use std::ops::{Range, RangeInclusive};
 
@@ -57,7 +58,7 @@ pub(crate) enum Extent {
 pub(crate) fn extent(bytes: &[u8]) -> Extent {
     let mut walk = Walk { bytes: without_padding(bytes), ..Walk::default() };
     let is_terminated = walk.read_to_end();
-    if is_terminated.is_none() && walk.scans == 0 {
+    if is_terminated.is_none() && walk.scans == 0 && walk.damaged_scan.is_none() {
         return Extent::Whole;
     }
     walk.extent(is_terminated == Some(true)).unwrap_or(Extent::Whole)
@@ -175,8 +176,11 @@ impl<'a> Walk<'a> {
     /// Skips a scan, and counts its incomplete rows.
     fn read_scan(&mut self, segment: &[u8]) -> Option<()> {
         let frame = self.frame.as_mut()?;
-        let (parts, rest) = parse_parts(segment, frame)?;
-        let band = if frame.is_progressive { Band::read(rest)? } else { Band::ALL };
+        let Some((parts, band)) = parse_scan(segment, frame) else {
+            // The decoder renders something even so.
+            self.damaged_scan.get_or_insert(self.scans + 1);
+            return None;
+        };
         let single = if let [part] = &parts[..] { Some(part.component) } else { None };
         let grid = Grid::new(frame, single);
         let mut bits = Bits::new(self.bytes, self.offset);
@@ -341,8 +345,8 @@ fn parse_frame(segment: &[u8], is_progressive: bool) -> Option<Frame> {
     is_valid.then_some(Frame { is_progressive, width, height, components })
 }
 
-/// Parses the components of a scan; returns them and the rest of its header.
-fn parse_parts<'a>(segment: &'a [u8], frame: &Frame) -> Option<(Vec<Part>, &'a [u8])> {
+/// Parses a scan header (SOS): components and coefficients.
+fn parse_scan(segment: &[u8], frame: &Frame) -> Option<(Vec<Part>, Band)> {
     let (count, rest) = segment.split_first()?;
     let (listed, rest) = rest.split_at_checked(2 * usize::from(*count))?;
     let mut parts = Vec::with_capacity(usize::from(*count));
@@ -350,7 +354,8 @@ fn parse_parts<'a>(segment: &'a [u8], frame: &Frame) -> Option<(Vec<Part>, &'a [
         let component = frame.components.iter().position(|component| component.id == *id)?;
         parts.push(Part { component, tables: [tables >> 4, tables & 15].map(usize::from) });
     }
-    (!parts.is_empty()).then_some((parts, rest))
+    let band = if frame.is_progressive { Band::read(rest)? } else { Band::ALL };
+    (!parts.is_empty()).then_some((parts, band))
 }
 
 fn u16_at(bytes: &[u8], offset: usize) -> Option<u16> {

@@ -123,6 +123,29 @@ fn a_progressive_jpeg_needs_its_end() {
     }
 }
 
+#[test]
+fn an_invalid_scan_header_is_damage() {
+    for is_progressive in [false, true] {
+        let bytes = jpeg(SIZE, Some(SamplingFactor::R_4_2_0), is_progressive, 0);
+        let scan = bytes.windows(2).position(|w| w == [0xff, SOS]).unwrap();
+        // After marker, length and the number of components: the first component's number.
+        let mut unknown = bytes.clone();
+        unknown[scan + 5] = 9;
+        let expected = if is_progressive {
+            Extent::Coarse { scan: 1, height: ROWS }
+        } else {
+            Extent::Missing { rows: ROWS, height: ROWS }
+        };
+        assert_eq!(extent(&unknown), expected);
+        if is_progressive {
+            let mut band = bytes;
+            let components = usize::from(band[scan + 4]);
+            band[scan + 5 + 2 * components] = 34;
+            assert_eq!(extent(&band), expected);
+        }
+    }
+}
+
 /// A lost piece is found even if restart markers let the decoder resume after it.
 #[test]
 fn a_lost_piece_is_missing() {

@@ -52,7 +52,7 @@ pub fn device(name: &str) -> Result<Device, DeviceError> {
 /// Returns the GPU with this index, or the reason why it can't be used.
 fn usable_cuda_device(index: Option<usize>) -> Result<Device, String> {
     let Some(index) = index else {
-        return Err("no such device; cpu, cuda or cuda:N is expected".to_owned());
+        return Err("no such device; expected cpu, cuda or cuda:N".to_owned());
     };
     load_cuda();
     let count = Cuda::device_count();
