@@ -16,7 +16,7 @@ const REFINED: &str = "
   downscaled-field:
     parameters: {rays: 40000}
   train-refine:
-    parameters: {steps: 60, batch: 4, patch_size: 16, features: 8, blocks: 1}
+    parameters: {steps: 60, batch_size: 4, patch_size: 16, features: 8, blocks: 1}
   upsample:
     parameters: {method: bicubic}
   finetuned-field:
@@ -24,7 +24,7 @@ const REFINED: &str = "
   train-reference:
     parameters: {references_per_view: 2}
   train-paper:
-    parameters: {steps: 3, batch: 2, patch_size: 16, features: 4}
+    parameters: {steps: 3, batch_size: 2, patch_size: 16, features: 4}
 ";
 
 fn project() -> Project {
@@ -644,7 +644,7 @@ fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'sta
     (
         folder("downscaled-views"),
         folder("prep").join("train"),
-        r#"{"steps": 600, "batch": 8, "patch_size": 24, "features": 32, "blocks": 2}"#,
+        r#"{"steps": 600, "batch_size": 8, "patch_size": 24, "features": 32, "blocks": 2}"#,
     )
 }
 
@@ -681,7 +681,7 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
 
 /// It is said and not trusted: the training starts over.
 fn a_checkpoint_cut_short_is_left_out(project: &Project, inputs: &[(&str, &Path)]) {
-    let params = r#"{"steps": 100, "batch": 2, "patch_size": 16, "features": 8, "blocks": 1}"#;
+    let params = r#"{"steps": 100, "batch_size": 2, "patch_size": 16, "features": 8, "blocks": 1}"#;
     let [whole, output, work] = ["short", "cut", "cut-work"].map(|name| project.path(name));
     assert_eq!(stage("train-refine", params, inputs, &whole, &[]).code, 0);
     let more = ["--work", work.to_str().unwrap(), "--progress", "plain"];

@@ -73,7 +73,7 @@ const CASES: &[Case] = &[
     },
     Case {
         stage: "register",
-        params: r#"{"smaller": 0, "renderings": 100}"#,
+        params: r#"{"pyramid_levels": 0, "max_renders": 100}"#,
         inputs: &[("field", "field"), ("photographs", "photographs")],
         ..CASE
     },
@@ -96,7 +96,7 @@ const CASES: &[Case] = &[
     Case {
         label: "a large batch",
         stage: "train-refine",
-        params: r#"{"batch": 32, "patch_size": 24, "features": 128, "blocks": 32}"#,
+        params: r#"{"batch_size": 32, "patch_size": 24, "features": 128, "blocks": 32}"#,
         inputs: &[("views", "views"), ("truth", "scene/train")],
         ..CASE
     },

@@ -70,7 +70,7 @@ impl Stage for Eval {
                 "baseline",
                 Input::optional(
                     &["metrics"],
-                    "scores of the same views to compare with, for the least gain of a view",
+                    "scores of the same views by another method, for the smallest gain of a view over them",
                 ),
             ),
             (

@@ -9,8 +9,9 @@ use crate::mesh::Mesh;
 use crate::surface_view::{PointState, SurfaceView};
 
 /// Returns the colours of a mesh's vertices, display-encoded sRGB: the mean over the views that
-/// observe the vertex, weighted by the angle of view, or else the field's own colour along the
-/// normal. `offset` is the world point of the mesh's origin.
+/// observe the vertex, weighted by the squared cosine between the vertex normal and the direction
+/// to the camera, or otherwise the field's own colour along the
+/// normal. `offset` is the origin of the mesh's frame, in the world.
 pub(crate) fn vertex_colours(
     field: &Members,
     views: &[SurfaceView],
@@ -41,7 +42,7 @@ pub(crate) fn vertex_colours(
     Ok(colours)
 }
 
-/// Returns the truncation distance at a world point.
+/// Returns the truncation distance at a point in the mesh's frame.
 fn truncation_at(lattice: &Lattice, position: Vec3) -> f32 {
     truncation_distance(lattice, lattice.to_lattice(position.as_dvec3()))
 }

@@ -9,8 +9,8 @@ const MAX_DISTANCE_PIXELS: f64 = 2.0;
 /// note 043). Thin objects have another side close by.
 const MIN_SAME_SIDE_COSINE: f64 = 0.7;
 
-/// Moves every pixel's point to the mean of the surfaces that all views observe there, and removes
-/// points that too many views see through: floaters and fringes of edges.
+/// Moves every pixel's point to the mean of the surfaces that all views observe there. Removes
+/// points where too many views observe empty space, such as floaters and false points along edges.
 pub(crate) fn apply_consensus(views: &mut [SurfaceView], progress: &Progress) {
     let shifts: Vec<Vec<(usize, Option<f32>)>> = views
         .par_iter()

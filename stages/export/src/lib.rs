@@ -169,7 +169,7 @@ impl Stage for Export {
             cameras: job.cameras.len(),
             ..ExportSummary::default()
         };
-        job.write_surfels(&mut summary)?;
+        job.write_points_splats_and_cameras(&mut summary)?;
         if let Some(lattice) = &lattice {
             context.check_interrupt()?;
             job.write_mesh(lattice, &mut summary)?;
@@ -272,7 +272,7 @@ struct ExportJob<'a> {
 
 impl ExportJob<'_> {
     /// Writes points, splats and cameras.
-    fn write_surfels(&self, summary: &mut ExportSummary) -> anyhow::Result<()> {
+    fn write_points_splats_and_cameras(&self, summary: &mut ExportSummary) -> anyhow::Result<()> {
         let max_surfels = self.params.max_points as usize;
         let surfels = surfel::merge(&self.views, &self.bounds, max_surfels);
         if surfels.is_empty() {
@@ -350,7 +350,7 @@ impl ExportJob<'_> {
         let ([x, y, z], files) = (offset.offset, offset.files.join(", "));
         self.context.say(format!(
             "the scene is far from the origin: coordinates of {files} lack the offset ({x}, {y}, \
-            {z}), which is in {OFFSET_FILE}"
+            {z}); add the offset, also in {OFFSET_FILE}, to get the input's coordinates"
         ));
         self.context.write_json(OFFSET_FILE, &offset)
     }

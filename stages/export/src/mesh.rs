@@ -29,7 +29,8 @@ impl Mesh {
         self.normals = sums.iter().map(|sum| sum.normalize_or(DVec3::Z).as_vec3()).collect();
     }
 
-    /// Returns the edges of a single triangle, sorted, each with its vertices in ascending order.
+    /// Returns the edges that belong to exactly one triangle, sorted, each with its vertices in
+    /// ascending order.
     pub(crate) fn boundary_edges(&self) -> Vec<[u32; 2]> {
         let mut edges: Vec<[u32; 2]> = self
             .triangles

@@ -12,8 +12,8 @@ const MIN_OPACITY: f32 = 0.5;
 /// Maximum depth difference, in pixel widths, of neighbouring pixels of one surface: slants of up
 /// to 80°.
 const MAX_DEPTH_STEP_PIXELS: f32 = 6.0;
-/// Maximum number of pixels to each side from which a normal is computed: more than noise, less
-/// than thin objects (design note 043).
+/// Maximum number of pixels to each side from which a normal is computed: enough to average out
+/// noise, but fewer than thin objects are wide (design note 043).
 const MAX_BASELINE_PIXELS: usize = 4;
 
 /// Surface points and normals of a view, rendered by a pinhole camera.
@@ -170,8 +170,9 @@ impl SurfaceView {
         (before != after).then_some((tangent, margin as u8))
     }
 
-    /// Returns the farthest pixel of the same surface in one direction, at most `available` pixels,
-    /// to the image's border, and [`MAX_BASELINE_PIXELS`] away.
+    /// Returns the farthest pixel of the same surface in one direction: at most
+    /// [`MAX_BASELINE_PIXELS`] away, and at most `available` pixels, the distance to the image's
+    /// border.
     fn last_of_surface(&self, index: usize, available: usize, stride: isize) -> usize {
         let mut last = index;
         for _ in 0..available.min(MAX_BASELINE_PIXELS) {

@@ -40,23 +40,20 @@ pub(crate) enum SpaceError {
     NotForward,
 }
 
-/// Minimum distance from the box's centre, in half sides of the box, at which points call for the
-/// contraction (docs/design/004).
-const MIN_CONTRACTION_HALVES: f64 = 2.5;
+/// Minimum distance of points from the box's centre, relative to half the box's side, above which
+/// the space becomes the contraction (design note 004).
+const MIN_CONTRACTION_DISTANCE: f64 = 2.5;
 
 /// Camera with its depth range [nearest, farthest], if known.
 pub(crate) type CameraDepths = (Camera, Option<[f64; 2]>);
 
 /// Returns the scene's bounds, around the training views; `others` are test views, which the space
-/// must suit, too.
-///
-/// Without a requested `kind` the space is NDC if all cameras face one direction and their depths
-/// are known, the contraction if known depths reach far outside the box, otherwise the box. In an
-/// unbounded scene (opaque background) with unknown depths no box can be trusted to contain it:
-/// depths are guessed if the cameras face one direction, otherwise the space is the contraction.
-///
-/// All is computed relative to a point near the cameras: sums of large coordinates would lose the
-/// digits in which cameras differ.
+/// must suit, too.  Without a requested `kind` the space is NDC if all cameras face one direction
+/// and their depths are known, the contraction if known depths reach far outside the box, otherwise
+/// the box. If the scene is unbounded (opaque background) and depths are unknown, a box might not
+/// contain the scene. Then depths are guessed if the cameras face one direction; otherwise the
+/// space is the contraction.  All is computed relative to a point near the cameras: sums of large
+/// coordinates would lose the digits in which cameras differ.
 pub(crate) fn scene_bounds(
     training: &[CameraDepths],
     others: &[CameraDepths],
@@ -69,7 +66,8 @@ pub(crate) fn scene_bounds(
     }
     let (training, others) = (moved(training, -origin), moved(others, -origin));
     let bounds = bounds_near_origin(&training, &others, is_unbounded, kind)?;
-    // Rounded as `train-ss` does, before the shift uses up the digits.
+    // Rounded as in `train-ss`, and before the shift: large coordinates have fewer digits after the
+    // point.
     let anchor = training.first().map_or(DVec3::ZERO, |(camera, _)| camera.centre());
     Ok(bounds.rounded(anchor).moved(origin))
 }
@@ -196,7 +194,7 @@ fn mean(views: &[CameraDepths], vector: fn(&Camera) -> DVec3) -> DVec3 {
 /// True if most views have known depths far outside the box.
 fn reaches_beyond(bounds: &Bounds, views: &[CameraDepths]) -> bool {
     let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
-    let reach = MIN_CONTRACTION_HALVES * 0.5 * bounds.longest_side();
+    let reach = MIN_CONTRACTION_DISTANCE * 0.5 * bounds.longest_side();
     let far = views.iter().filter(|(camera, depths)| {
         depths.is_some_and(|[_, farthest]| farthest > (camera.centre() - centre).length() + reach)
     });
@@ -627,7 +625,7 @@ mod tests {
         )
     }
 
-    /// Without any depth: where images say that the scene goes on, cameras say how.
+    /// If depths are unknown and the scene is unbounded, the cameras determine the space.
     #[test]
     fn an_unbounded_scene_is_not_in_a_box() {
         for scale in [1e-3, 1.0, 1e3] {

@@ -19,7 +19,7 @@ pub(crate) enum ParameterError {
         omit lr_width"
     )]
     LrWidthOfPhotographs,
-    #[error("parameter kernel: average cannot be assumed for photographs; choose box")]
+    #[error("parameter kernel: photographs cannot have kernel average; choose box")]
     AssumedAverage,
     /// Kernel `average` with a fractional scale: it averages whole pixels only.
     #[error(

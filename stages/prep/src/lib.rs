@@ -129,13 +129,13 @@ fn read_dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
     let set = match params.lens {
         LensHandling::Follow => {
             check_lenses(&set)?;
-            set.followed()
+            set.with_lens_mask_note()
         }
         LensHandling::Undo => set.undistorted().bad_input("dataset")?,
         LensHandling::Ignore => set.without_distortion(),
     };
     let needs_merge = matches!(params.split, Some(SplitKind::Holdout | SplitKind::Paper));
-    Ok(if needs_merge { set.merged() } else { set })
+    Ok(if needs_merge { set.without_split() } else { set })
 }
 
 /// Fails at the first frame whose distorted lens has no ray for some pixels.

@@ -43,10 +43,10 @@ pub struct Params {
     /// Distance along rays at which the scene ends. Default: derived from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub far: Option<f64>,
-    /// Space of the field's unit cube. Default: `ndc` if all cameras face one direction and their
-    /// depths are known or the background is `opaque`; otherwise `contraction` if the background is
-    /// `opaque` and depths are unknown, or known points are far outside the region that the cameras
-    /// face; otherwise `box`.
+    /// Space of the field's unit cube. Default: `ndc` if all cameras face one direction, and either
+    /// depths are known or the background is `opaque`. Otherwise `contraction` if the background is
+    /// `opaque` and depths are unknown, and also if known points are far outside the region that
+    /// the cameras face. Otherwise `box`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub space: Option<SpaceKind>,
     /// Split into training and test views. Default: the data set's own split, or `holdout` if it has

@@ -91,15 +91,14 @@ impl Stage for Refine {
                 "photographs",
                 Input::optional(
                     &["scene/train"],
-                    "LR photographs; a view of the same camera is made consistent with its own",
+                    "LR photographs; a view with the camera of a photograph is made consistent with that one",
                 ),
             ),
             (
                 "enlarged",
                 Input::optional(
                     &["views"],
-                    "photographs enlarged to the views' size; a view of the same camera becomes \
-                    the mean of both",
+                    "photographs enlarged to the views' size; a view with the camera of a photograph becomes the mean of view and photograph",
                 ),
             ),
         ]

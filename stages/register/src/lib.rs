@@ -19,18 +19,18 @@ use stage::{Input, Output};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Number of times that a photograph is halved at the start. More halvings register cameras
-    /// that are farther off.
+    /// Number of times that a photograph is halved at the start. With more halvings, cameras with
+    /// larger errors can be registered.
     #[schemars(range(min = 0, max = 8))]
-    pub smaller: u32,
-    /// Maximum number of renders of a photograph at each of its sizes.
+    pub pyramid_levels: u32,
+    /// Maximum number of times that the field is rendered for a photograph, at each of its sizes.
     #[schemars(range(min = 2, max = 100))]
-    pub renderings: u32,
+    pub max_renders: u32,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { smaller: 3, renderings: 8 }
+        Self { pyramid_levels: 3, max_renders: 8 }
     }
 }
 
@@ -113,8 +113,8 @@ impl Registered {
         params: &Params,
         background: f32,
     ) -> Result<Self, RenderError> {
-        let pyramid = Pyramid::new(image, params.smaller);
-        let options = Options { max_renders: params.renderings, background, ..Options::default() };
+        let pyramid = Pyramid::new(image, params.pyramid_levels);
+        let options = Options { max_renders: params.max_renders, background, ..Options::default() };
         let given = refine(field, camera, &pyramid, 0, &Options { max_renders: 1, ..options })?;
         let mut to = camera.clone();
         for level in (1..=pyramid.smaller_levels()).rev() {

@@ -36,9 +36,9 @@ pub struct Params {
     /// the depth of one of them.
     #[schemars(range(min = 1, max = 8))]
     pub samples_per_axis: u32,
-    /// Maximum error of colour or opacity of a pixel with one ray; pixels above it get all rays.
-    /// The error is estimated from the pixel's neighbours, and bounded where the view is quadratic.
-    /// 0 casts all rays everywhere.
+    /// Maximum error of colour or opacity of a pixel with one ray; pixels with a larger error get
+    /// all rays. The error is estimated from the pixel's neighbours; the estimate is an upper bound
+    /// where the image is locally quadratic. 0 casts all rays everywhere.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub tolerance: f64,
     /// Kind of depth in channel `Z`. The median lies on a surface; the mean lies between the

@@ -27,7 +27,7 @@ impl Layout<'_> {
         let params = self.params;
         let columns = distinct(rows, &params.columns);
         let further =
-            params.further.iter().filter(|row| !is_part || row.contains_key(&params.each));
+            params.extra_rows.iter().filter(|row| !is_part || row.contains_key(&params.split_by));
         let further: Vec<Row> = further.filter(|row| self.matches(row, rows)).cloned().collect();
         let all = [rows, &further[..]].concat();
         let values: Vec<&String> = params
@@ -105,7 +105,7 @@ impl Layout<'_> {
 
     /// Returns the rows with values in the same group.
     fn rivals(&self, rows: &[Row], mine: &[Row]) -> Vec<Row> {
-        let by = &self.params.grouped_by;
+        let by = &self.params.group_by;
         let group = mine.first().and_then(|row| row.get(by));
         rows.iter()
             .filter(|row| row.get(by) == group && !row.contains_key(MISSING))
@@ -149,7 +149,7 @@ impl Layout<'_> {
 
     /// True if an entry of a row is a key that results may share.
     fn is_key(&self, name: &str, value: &Value) -> bool {
-        value.is_string() && name != "method" && name != self.params.grouped_by
+        value.is_string() && name != "method" && name != self.params.group_by
     }
 }
 

@@ -1,4 +1,5 @@
-//! The Markdown document: a table of all rows, one per scene, gains, spreads, and failed points.
+//! The Markdown document: a table of all rows, a table for each value of the key `split_by`, gains,
+//! spreads, and failed points.
 
 use artifact::{FailedPoint, Failure, label};
 
@@ -17,8 +18,9 @@ pub(crate) fn markdown(
 ) -> Result<String, Failure> {
     let keys = row_keys(params, rows)?;
     let layout = Layout { params, figures, keys, reference: reference(params, rows)? };
-    let each = std::slice::from_ref(&params.each);
-    let mut parts = if params.each.is_empty() { Vec::new() } else { distinct(rows, each).concat() };
+    let each = std::slice::from_ref(&params.split_by);
+    let mut parts =
+        if params.split_by.is_empty() { Vec::new() } else { distinct(rows, each).concat() };
     if parts.len() < 2 {
         parts.clear();
     }
@@ -62,8 +64,8 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, Failure> {
     }
     check_keys("rows", &params.rows, rows, &known)?;
     check_keys("columns", &params.columns, rows, &known)?;
-    if !params.each.is_empty() {
-        check_keys("each", std::slice::from_ref(&params.each), rows, &known)?;
+    if !params.split_by.is_empty() {
+        check_keys("split_by", std::slice::from_ref(&params.split_by), rows, &known)?;
     }
     let mut keys = params.rows.clone();
     if keys.is_empty() {
@@ -75,10 +77,10 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, Failure> {
         }
     }
     if !params.groups.is_empty()
-        && !keys.contains(&params.grouped_by)
-        && !params.columns.contains(&params.grouped_by)
+        && !keys.contains(&params.group_by)
+        && !params.columns.contains(&params.group_by)
     {
-        keys.push(params.grouped_by.clone());
+        keys.push(params.group_by.clone());
     }
     Ok(keys)
 }
@@ -118,7 +120,7 @@ fn reference(params: &Params, rows: &[Row]) -> Result<Option<f64>, Failure> {
 /// Returns the table of differences between methods in each column; empty if there are none.
 fn gains(params: &Params, rows: &[Row]) -> String {
     let columns = distinct(rows, &params.columns);
-    let all = [rows, &params.further[..]].concat();
+    let all = [rows, &params.extra_rows[..]].concat();
     let mut head = vec!["gain".to_owned()];
     for column in &columns {
         head.push(if column.is_empty() { "all".to_owned() } else { column.join(", ") });

@@ -181,9 +181,9 @@ fn groups_further_rows_and_gains() {
         ],
         ..params(json!({
             "rows": ["method"], "columns": ["protocol"], "values": ["psnr"],
-            "grouped_by": "has seen", "each": "scene",
+            "group_by": "has seen", "split_by": "scene",
             "notes": ["One."],
-            "further": [
+            "extra_rows": [
                 {"method": "paper: NeRF", "protocol": "100x2", "psnr": 27.5},
                 {"method": "paper: SS", "protocol": "100x2", "psnr": 29.75},
                 {"method": "paper: SS", "protocol": "200x2", "psnr": 40},
@@ -233,10 +233,11 @@ Means over lego, chair:
 * One.
 ";
     assert_eq!(markdown(&params, &methods(), &figures(), &[]).unwrap(), expected);
-    let unknown = Params { each: "scena".to_owned(), ..Params::default() };
+    let unknown = Params { split_by: "scena".to_owned(), ..Params::default() };
     let problem = markdown(&unknown, &methods(), &figures(), &[]).unwrap_err().to_string();
     assert!(
-        problem.starts_with("parameter each: no result has a key \"scena\"; did you mean scene?"),
+        problem
+            .starts_with("parameter split_by: no result has a key \"scena\"; did you mean scene?"),
         "{problem}"
     );
 }
@@ -256,7 +257,7 @@ fn rows_follow_the_groups() {
     let failed = json!({"stage": "eval-nerf", "point": ""});
     let nodes = ["eval", "eval-hr", "eval-ss"].map(node);
     let run = json!({"nodes": nodes, "failed": [failed, left_out]});
-    let params = params(json!({"methods": {"eval-ss": "ours"}, "grouped_by": "seen",
+    let params = params(json!({"methods": {"eval-ss": "ours"}, "group_by": "seen",
         "groups": [{"name": "LR", "methods": ["eval-ss", "eval-liif"]},
         {"name": "HR", "methods": ["eval-hr"]}]}));
     let rows =

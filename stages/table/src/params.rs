@@ -43,19 +43,20 @@ pub struct Params {
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
     /// Heading and key of the groups' column.
-    pub grouped_by: String,
+    pub group_by: String,
     /// Rows from other sources, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:
-    /// 29.77}]`. Such a row is in tables whose results have its keys, and is never the best.
+    /// 29.77}]`. Such a row appears in tables whose results have the values of its keys, and is
+    /// never marked as the best.
     #[schemars(extend("x-default" = "none"))]
-    pub further: Vec<Row>,
+    pub extra_rows: Vec<Row>,
     /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over:
-    /// eval-nerf}]`. Methods are blocks, or methods of `further`.
+    /// eval-nerf}]`. Methods are blocks, or methods of `extra_rows`.
     #[schemars(extend("x-default" = "none"))]
     pub gains: Vec<Gain>,
-    /// Key with an additional table for each of its values, if it has several. These tables have
-    /// the rows of `further` with this key.
+    /// Key that splits the results: each of its values gets an additional table, if there are
+    /// several. Of `extra_rows`, these tables contain only rows with this key.
     #[schemars(extend("x-default" = "one table of all"))]
-    pub each: String,
+    pub split_by: String,
     /// Remarks below the table.
     #[schemars(extend("x-default" = "none"))]
     pub notes: Vec<String>,
@@ -103,10 +104,10 @@ impl Default for Params {
             methods: BTreeMap::new(),
             fields: BTreeMap::new(),
             groups: Vec::new(),
-            grouped_by: "group".to_owned(),
-            further: Vec::new(),
+            group_by: "group".to_owned(),
+            extra_rows: Vec::new(),
             gains: Vec::new(),
-            each: String::new(),
+            split_by: String::new(),
             notes: Vec::new(),
         }
     }

@@ -57,7 +57,7 @@ fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> R
     row.insert("method".to_owned(), json!(params.methods.get(stage).unwrap_or(stage)));
     if !params.groups.is_empty() {
         let group = params.groups.iter().find(|group| group.methods.contains(stage));
-        row.insert(params.grouped_by.clone(), json!(group.map_or("", |group| group.name.as_str())));
+        row.insert(params.group_by.clone(), json!(group.map_or("", |group| group.name.as_str())));
     }
     for (name, value) in params.fields.get(stage).into_iter().flatten() {
         let value = substituted(&row, value);

@@ -37,10 +37,10 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     };
     let options = RefinerTraining {
         steps: net.steps,
-        batch_size: net.batch as usize,
+        batch_size: net.batch_size as usize,
         patch_size: net.patch_size as usize,
         references: net.references_per_view as usize,
-        learning_rate: net.rate,
+        learning_rate: net.learning_rate,
         seed,
     };
     let mut trainer = RefinerTrainer::new(Refiner::new(architecture, seed)?, options)?;

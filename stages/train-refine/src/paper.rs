@@ -22,10 +22,10 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     }
     let options = PaperTraining {
         steps: params.steps,
-        batch_size: params.batch as usize,
+        batch_size: params.batch_size as usize,
         patch_size: params.patch_size as usize,
         references: params.patches as usize,
-        learning_rate: params.rate,
+        learning_rate: params.learning_rate,
         seed,
     };
     options.check(&known).bad_input("input truth")?;

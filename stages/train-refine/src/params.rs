@@ -38,13 +38,13 @@ pub struct CompactParams {
     pub steps: u64,
     /// Number of patches per step.
     #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
-    pub batch: u32,
+    pub batch_size: u32,
     /// Pixels along each side of a patch, even.
     #[schemars(range(min = 8, max = 1024), extend("x-group" = "sampling"))]
     pub patch_size: u32,
     /// Highest learning rate.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
-    pub rate: f64,
+    pub learning_rate: f64,
     /// Number of features of the hidden layers.
     #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
     pub features: u32,
@@ -55,8 +55,8 @@ pub struct CompactParams {
     /// trains a network without references.
     #[schemars(range(min = 0, max = 64), extend("x-group" = "data"))]
     pub references_per_view: u32,
-    /// Uses only points of a view that are visible from the reference by the reference's own depth.
-    /// Without this, hidden points are used, too; for comparisons.
+    /// Uses only those points of a view that are visible in the reference, according to the
+    /// reference's depth map. `false` also uses hidden points, and is meant for comparisons.
     #[schemars(extend("x-group" = "data"))]
     pub occlusion: bool,
     /// Shifts warped references by up to two pixels to fit the render; for comparisons.
@@ -68,9 +68,9 @@ impl Default for CompactParams {
     fn default() -> Self {
         Self {
             steps: 4_000,
-            batch: 8,
+            batch_size: 8,
             patch_size: 64,
-            rate: 1e-3,
+            learning_rate: 1e-3,
             features: 32,
             blocks: 4,
             references_per_view: 0,
@@ -89,13 +89,13 @@ pub struct PaperParams {
     pub steps: u64,
     /// Number of patches per step.
     #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
-    pub batch: u32,
+    pub batch_size: u32,
     /// Pixels along each side of a patch, a multiple of 8.
     #[schemars(range(min = 8, max = 1024), extend("x-group" = "sampling"))]
     pub patch_size: u32,
     /// Highest learning rate.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
-    pub rate: f64,
+    pub learning_rate: f64,
     /// Number of features of the first layer.
     #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
     pub features: u32,
@@ -106,6 +106,13 @@ pub struct PaperParams {
 
 impl Default for PaperParams {
     fn default() -> Self {
-        Self { steps: 46_875, batch: 32, patch_size: 64, rate: 5e-4, features: 128, patches: 8 }
+        Self {
+            steps: 46_875,
+            batch_size: 32,
+            patch_size: 64,
+            learning_rate: 5e-4,
+            features: 128,
+            patches: 8,
+        }
     }
 }

@@ -71,7 +71,7 @@ impl Rows {
     }
 }
 
-/// Runs the kernels of a family, which the machine must support.
+/// Selects the SIMD family whose kernels are measured. Fails if the machine doesn't support it.
 fn choose_family(name: &str) -> anyhow::Result<()> {
     let family = match name {
         "avx512" => Family::Avx512,

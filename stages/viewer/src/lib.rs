@@ -51,7 +51,7 @@ pub struct Params {
     /// Maximum number of LR photographs in the page, spread evenly over the training views.
     #[schemars(range(min = 0, max = 1000))]
     pub photographs: u32,
-    /// Maximum width of these photographs in pixels; wider ones are shrunk.
+    /// Maximum width in pixels of the LR photographs in the page; wider ones are shrunk.
     #[schemars(range(min = 16, max = 4096))]
     pub photograph_width: u32,
 }

@@ -41,7 +41,7 @@ impl Folder {
     pub fn read(&self) {
         if let Ok(set) = Dataset::read(self.0.path()) {
             // Lenses as `prep` treats them.
-            drop(set.clone().followed());
+            drop(set.clone().with_lens_mask_note());
             if let Ok(undone) = set.clone().undistorted() {
                 undone.frames.iter().take(2).for_each(|frame| drop(frame.photograph()));
             }

@@ -43,8 +43,8 @@ struct GlobalArgs {
     /// Compute device: cpu or cuda:N
     #[arg(long, global = true, default_value = DEFAULT_DEVICE)]
     device: String,
-    /// Run stages on this machine, or as jobs of a Slurm cluster; there, stages that request GPUs
-    /// (`resources`) compute on cuda:0
+    /// Where stages run: on this machine, or as jobs of a Slurm cluster. With slurm, stages whose
+    /// `resources` request GPUs compute on cuda:0
     #[arg(long, global = true, value_enum, default_value = DEFAULT_EXECUTOR,
         env = "NERF_SR_EXECUTOR")]
     executor: ExecutorKind,
@@ -67,7 +67,8 @@ struct PlanArgs {
     /// value is null. If a parameter is given twice, the last value wins
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
-    /// Read an input from a folder instead, e.g. -i dataset=scenes/lego
+    /// Read an input from this folder, not from what the pipeline names, e.g. -i
+    /// dataset=scenes/lego
     #[arg(short = 'i', long = "input", value_name = "[STAGE.]NAME=DIR[,DIR…]")]
     inputs: Vec<String>,
     #[command(flatten)]
@@ -90,7 +91,8 @@ struct ExperimentArgs {
     /// Use only the first N variants of an experiment
     #[arg(long, value_name = "N")]
     first_variants: Option<usize>,
-    /// Limit sinks to these of their inputs, or to these blocks [default: all]
+    /// Show only these results on pages and in tables: names of a sink's inputs, or of blocks
+    /// [default: all]
     #[arg(long = "show", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     show: Vec<String>,
     /// Folder of an experiment's data sets [default: the one that its file names]
@@ -104,8 +106,8 @@ struct RunOptions {
     /// Maximum number of stages that run at once [default: number of cores, at most 4]
     #[arg(short, long, value_name = "N")]
     jobs: Option<usize>,
-    /// Number of threads of each stage, and of cores for all stages together; results don't depend
-    /// on it [default: all cores]
+    /// Threads of each stage, and cores that all stages share; results don't depend on the number
+    /// [default: all cores]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
     /// Memory limit for all stages together, such as 8G; each stage counts with the peak memory of
@@ -235,7 +237,7 @@ enum Verb {
         /// Name of the pin
         name: String,
     },
-    /// Delete artifacts that no pin, recent or running run, or target needs
+    /// Delete artifacts that are not needed by a pin, a recent or running run, or a target
     Gc {
         #[command(flatten)]
         plan: PlanArgs,

@@ -9,7 +9,7 @@ use std::sync::atomic::AtomicBool;
 use artifact::{Damage, MANIFEST_FILE, Manifest};
 use planning::stage_call::StageFailure;
 use planning::{
-    ConfirmError, FoundInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp,
+    ConfirmError, HashedInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp,
     read_source,
 };
 use store::{Attempt, Store};
@@ -70,7 +70,7 @@ impl<'a> Inputs<'a> {
     pub(crate) fn new(
         node: &'a Node,
         store: &'a Store,
-        found: FoundInputs,
+        found: HashedInputs,
         output_of: impl Fn(usize) -> String,
     ) -> Result<Self, StageFailure> {
         let mut artifacts = Vec::new();
@@ -80,7 +80,7 @@ impl<'a> Inputs<'a> {
                 artifacts.push(stored.map_err(|e| damage_failure(&e))?);
             }
         }
-        let FoundInputs { hashes, sources } = found;
+        let HashedInputs { hashes, sources } = found;
         let inputs = Self { node, store, hashes, sources, artifacts };
         if !node.program.is_own() {
             // The runner's own programs compare files with manifests themselves.

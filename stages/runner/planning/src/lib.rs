@@ -1,4 +1,5 @@
-//! Plans from pipeline files, command lines and descriptions of stages. It runs no stage but for its description.
+//! Plans from pipeline files, command lines and descriptions of stages. No stage runs, except to
+//! print its description.
 //!
 //! * [`PipelineFile`]: content of one file. [`Pipeline`]: blocks of a file and of the files that it
 //!   extends. [`find_targets`] also searches the files in `pipelines/` and `experiments/`.
@@ -56,7 +57,7 @@ pub use frozen::{FrozenError, FrozenPlan};
 pub use key::{explain, key_parts, nearest_changes, nearest_record};
 pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
 pub use pipeline::Pipeline;
-pub use plan::{FoundInputs, find_inputs, read_source};
+pub use plan::{HashedInputs, hash_inputs, read_source};
 pub use request::{PlanError, Request};
 pub use sources::{Source, SourceError};
 pub use stages::{Describing, ProgramError, Programs, StageProgram, executable};

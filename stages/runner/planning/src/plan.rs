@@ -31,7 +31,8 @@ impl Plan {
         goal.plan(pipeline, &programs, request)
     }
 
-    /// Creates a plan from given descriptions, by the program's name or the path in `run`. Starts
+    /// Creates a plan from given descriptions, keyed by the program's name or its path in `run`.
+    /// Starts
     /// no program and reads no file.
     pub fn from_descriptions(
         pipeline: &Pipeline,
@@ -51,7 +52,8 @@ impl Plan {
         if self.devices.by_resources && has_gpu { "cuda:0" } else { &self.devices.given }
     }
 
-    /// Returns the state of each node before a run. Ends soon after `stop` is set.
+    /// Returns the state of each node before a run. Fails with [`PlanError::Interrupted`] soon
+    /// after `stop` is set.
     pub fn states(
         &self,
         store: &Store,
@@ -65,7 +67,7 @@ impl Plan {
                 states.push(State::Waits { on: on.into_iter().collect() });
                 continue;
             }
-            let inputs = find_inputs(node, store, stop, |index| cached_output(&states[index]))?;
+            let inputs = hash_inputs(node, store, stop, |index| cached_output(&states[index]))?;
             let key_parts = key_parts(node, &inputs.hashes, self.device(&node.stage));
             states.push(match store.hit(&hash_json(&key_parts))? {
                 Some(record) => State::Cached(Box::new(record)),
@@ -123,23 +125,23 @@ impl<'a> Goal<'a> {
     }
 }
 
-/// Inputs of a node, as far as the key and later checks need them.
-pub struct FoundInputs {
+/// Content hashes of a node's inputs, and those inputs that are folders outside the store.
+pub struct HashedInputs {
     /// Content hashes by input name.
     pub hashes: Vec<(String, String)>,
     /// Folders outside the store by input name.
     pub sources: BTreeMap<String, Source>,
 }
 
-/// Reads a node's inputs. `output_of` returns the identity of a parent's artifact. Ends soon after
-/// `stop` is set.
-pub fn find_inputs(
+/// Hashes a node's inputs. `output_of` returns the identity of a parent's artifact. Fails with
+/// [`PlanError::Interrupted`] soon after `stop` is set.
+pub fn hash_inputs(
     node: &Node,
     store: &Store,
     stop: Option<&AtomicBool>,
     output_of: impl Fn(usize) -> String,
-) -> Result<FoundInputs, PlanError> {
-    let mut found = FoundInputs { hashes: Vec::new(), sources: BTreeMap::new() };
+) -> Result<HashedInputs, PlanError> {
+    let mut found = HashedInputs { hashes: Vec::new(), sources: BTreeMap::new() };
     for NodeInput { name, from } in &node.inputs {
         let hash = match from {
             Origin::Node { index, subtree: None } => output_of(*index),
@@ -159,7 +161,8 @@ pub fn find_inputs(
     Ok(found)
 }
 
-/// Reads the folder of a node's input. Ends soon after `stop` is set.
+/// Reads the folder of a node's input. Fails with [`PlanError::Interrupted`] soon after `stop` is
+/// set.
 pub fn read_source(
     store: &Store,
     node: &Node,

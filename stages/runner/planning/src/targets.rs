@@ -1,4 +1,5 @@
-//! Targets by name: blocks of pipeline.yaml, or else of the files in `pipelines/` next to it.
+//! Finds targets by name in pipeline.yaml, then in the files of `pipelines/` and `experiments/`
+//! next to it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -9,9 +10,10 @@ use crate::file::Part;
 use crate::pipeline::{Pipeline, TARGET_FOLDERS};
 use crate::request::PlanError;
 
-/// Returns a pipeline that contains all targets, and the targets' blocks. The target NAME is a
-/// block of pipeline.yaml; or the block NAME, or else the default, of `pipelines/NAME.yaml`; or a
-/// block of another file there.
+/// Returns a pipeline that contains all targets, and the targets' blocks. A target NAME is searched
+/// in this order: the block NAME of pipeline.yaml; the file NAME.yaml in [`TARGET_FOLDERS`], which
+/// stands for its block NAME or, without one, for its default blocks; the block NAME of any other
+/// file there.
 pub fn find_targets(
     pipeline: &Pipeline,
     targets: &[String],

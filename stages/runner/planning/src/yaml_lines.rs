@@ -5,7 +5,8 @@
 //!   can't represent.
 //! * [`line_of`]: line number of a key. [`line_of_duplicate`]: line number of a repeated key.
 //!
-//! serde_yaml reads the values; this module finds line numbers for error messages.
+//! serde_yaml parses the values but keeps no line numbers: [`line_of`] and [`line_of_duplicate`]
+//! find them for error messages.
 
 use std::collections::BTreeSet;
 use std::fmt;

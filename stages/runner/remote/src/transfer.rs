@@ -125,9 +125,9 @@ impl Transfer {
 
 /// Remedy for a damaged artifact of the store.
 pub(crate) const STORE_REMEDY: &str =
-    "the artifact is damaged: `nerf-sr verify --remove`, then run again";
+    "the artifact is damaged; remove it by `nerf-sr verify --remove`, then run again";
 const REMOTE_REMEDY: &str = "the artifact was not pulled; delete this file and the action's record \
-    on the remote, and push again from a complete store";
+    on the remote, and push again from a store that has the artifact";
 
 /// Comparison of a file's content with its manifest, piece by piece.
 pub(crate) struct ContentCheck<'a> {

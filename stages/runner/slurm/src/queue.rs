@@ -20,7 +20,7 @@ pub struct Job {
     pub id: String,
     /// Slurm's state: `PENDING`, `RUNNING`.
     pub state: String,
-    /// Slurm's reason for waiting; `None` if the job doesn't wait.
+    /// Slurm's reason for waiting; the text "None" if the job doesn't wait.
     pub reason: String,
     /// ID of the job's submission.
     pub submission: String,

@@ -27,7 +27,7 @@ pub struct Resources {
 }
 
 impl Resources {
-    /// Returns these resources with each one that `other` states taken from `other`.
+    /// Returns these resources; a value that `other` has replaces this one.
     #[must_use]
     pub fn overridden_by(&self, other: &Self) -> Self {
         Self {

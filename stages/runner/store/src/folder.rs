@@ -16,7 +16,8 @@ use crate::error::{StoreError, if_found, with_path};
 /// locks/KEY             one OS lock per key, which the kernel releases when the process ends
 /// runs/ID.jsonl         actions that a run needs, written during the run
 /// pins/NAME.jsonl       actions that are kept until unpinned
-/// gate                  reader-writer lock: entered briefly by runs, closed by garbage collection
+/// gate                  reader-writer lock: runs hold it briefly as readers, garbage collection as
+/// the writer
 /// format                version of this layout
 /// ```
 ///

@@ -20,9 +20,9 @@ pub struct Params {
     #[schemars(extend("x-group" = "field"))]
     pub field: FieldParams,
     /// Sub-pixel rays along each side of an LR pixel, called s in the paper; 1 is plain NeRF. The
-    /// number may differ from the scale of the views: fewer rays per pixel mean more pixels for the
-    /// same `rays`. With `supervision: kernel`, the number of HR pixels along each side of an LR
-    /// pixel, which may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
+    /// number may differ from the scale of the views: with fewer rays per pixel, the same `rays`
+    /// cover more pixels. With `supervision: kernel`, it is the number of HR pixels along each side
+    /// of an LR pixel, and may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "sampling"))]
     pub supersample: f64,
     /// Comparison of an LR pixel with its rays. Default: `kernel` for `field: grid` if the scene

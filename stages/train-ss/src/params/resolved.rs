@@ -19,7 +19,7 @@ pub struct Resolved {
     pub field: ResolvedField,
     /// Sub-pixel rays along each side of an LR pixel.
     pub supersample: f64,
-    /// Fraction of the rays during which fewer sub-pixel rays are cast.
+    /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays.
     pub supersample_warmup: f64,
     /// Comparison of an LR pixel with its rays.
     pub supervision: Supervision,
@@ -82,8 +82,8 @@ pub struct ResolvedRegularisers {
 }
 
 impl Resolved {
-    /// Returns the values in use of the parameters whose default depends on the scene, by name, for
-    /// `training.json`.
+    /// Returns the resolved values of the parameters whose defaults depend on the scene, by name,
+    /// for `training.json`.
     pub fn record(&self) -> BTreeMap<String, Value> {
         let common = json!({
             "combine": self.combine,
@@ -140,7 +140,8 @@ impl Resolved {
         }
     }
 
-    /// Returns the number of bundles in the first `precrop_steps` steps, which are drawn from the
+    /// Returns the number of bundles (the rays of one LR pixel) in the first `precrop_steps` steps,
+    /// which are drawn from the
     /// middle of the images.
     pub fn precrop_bundles(&self) -> u64 {
         let batch = u64::from(self.max_rays_per_step);

@@ -91,7 +91,7 @@ impl MemoryNeed {
     pub(crate) fn describe(&self, budget: u64) -> String {
         let in_memory = self.pixels.min(budget);
         let mut text = format!(
-            "memory: about {} ({} for the field, {} for pixels)",
+            "memory: about {}, of which {} for the field and {} for pixels",
             sized(self.minimum() + in_memory),
             sized(self.field),
             sized(in_memory)

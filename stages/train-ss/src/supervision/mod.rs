@@ -22,7 +22,7 @@ use crate::supersample::SupersampleSchedule;
 
 use assembly::block_start;
 use pixel_sampler::PixelSampler;
-use residual::{Target, is_clipped};
+use residual::{LossContext, is_clipped};
 pub use setup::supervision;
 pub(crate) use setup::transparent_background;
 
@@ -238,11 +238,11 @@ impl radiance::Supervisor for Supersampling {
     ) -> f64 {
         let (index, pixel) = self.drawn_pixel(bundle);
         let view = &self.views[index];
-        let target = Target {
+        let target = LossContext {
             exposure: exposure_correction(self.state.exposures.as_ref(), index),
             background: self.ray_background(bundle),
             weight: self.sampler.weight(bundle, (index, pixel)),
-            is_clipped: self.supervision == Supervision::Kernel && view.hr.is_none(),
+            may_be_clipped: self.supervision == Supervision::Kernel && view.hr.is_none(),
         };
         let position = self.position(index, pixel);
         match self.comparison(index) {
@@ -261,10 +261,10 @@ impl radiance::Supervisor for Supersampling {
                 let [left, top] = self.reference_block(hr, position);
                 let sample_of =
                     |k: usize| hr.pixel((top + k / columns) * hr.width + left + k % columns);
-                target.individual_loss(colours, sample_of, gradients)
+                target.mean_of_losses(colours, sample_of, gradients)
             }
             Comparison::ReferenceMean(_) | Comparison::Mean => {
-                target.mean_loss(colours, view.image.pixel(pixel), gradients)
+                target.loss_of_mean(colours, view.image.pixel(pixel), gradients)
             }
         }
     }

@@ -12,20 +12,21 @@ fn residual(prediction: f32, target: f32) -> f32 {
     if target.is_nan() { 0.0 } else { prediction - target }
 }
 
-/// Target of a bundle, except for the photograph's samples, and weight of the bundle's loss. Losses
-/// are means over the three channels.
-pub(crate) struct Target {
+/// Context of a bundle's loss, besides the photograph's samples. A bundle is the sub-pixel rays of
+/// one LR pixel. Losses are means over the three channels.
+pub(crate) struct LossContext {
     /// Factors from the photograph to the field's colours: reciprocals of its gains.
     pub(crate) exposure: [f32; 3],
     /// Background colour of the bundle's rays.
     pub(crate) background: [f32; 3],
     /// Weight of the bundle's loss.
     pub(crate) weight: f32,
-    /// True if samples were clipped to black and white after the kernel or the exposure.
-    pub(crate) is_clipped: bool,
+    /// True if samples at 0 or 1 may have been clipped, and so bound the true value from one side
+    /// only.
+    pub(crate) may_be_clipped: bool,
 }
 
-impl Target {
+impl LossContext {
     /// Returns the target colour of a photograph's sample: premultiplied RGBA over the background.
     fn colour(&self, sample: [f32; 4]) -> [f32; 3] {
         [0, 1, 2].map(|c| self.exposure[c] * (sample[c] + (1.0 - sample[3]) * self.background[c]))
@@ -54,7 +55,7 @@ impl Target {
     }
 
     /// Returns the loss of colours with a sample each, and writes its gradient.
-    pub(crate) fn individual_loss(
+    pub(crate) fn mean_of_losses(
         &self,
         colours: &[[f32; 3]],
         sample_of: impl Fn(usize) -> [f32; 4],
@@ -75,7 +76,7 @@ impl Target {
     }
 
     /// Returns the loss of the colours' mean (the paper's eq. 4), and writes its gradient.
-    pub(crate) fn mean_loss(
+    pub(crate) fn loss_of_mean(
         &self,
         colours: &[[f32; 3]],
         sample: [f32; 4],
@@ -86,7 +87,7 @@ impl Target {
         let mut loss = 0.0;
         for c in 0..3 {
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
-            let residual = if self.is_clipped {
+            let residual = if self.may_be_clipped {
                 self.unclipped_residual(c, mean, sample[c])
             } else {
                 residual(mean, target[c])
@@ -104,8 +105,12 @@ impl Target {
 mod tests {
     use super::*;
 
-    const PLAIN: Target =
-        Target { exposure: [1.0; 3], background: [0.0; 3], weight: 1.0, is_clipped: false };
+    const PLAIN: LossContext = LossContext {
+        exposure: [1.0; 3],
+        background: [0.0; 3],
+        weight: 1.0,
+        may_be_clipped: false,
+    };
 
     /// A clipped sample bounds the true value from one side only.
     #[test]
@@ -126,12 +131,12 @@ mod tests {
         }
         assert!(is_clipped(1.0) && is_clipped(0.0) && !is_clipped(0.99));
         // White in a photograph half as bright as the scene is a lower bound of the scene's colour.
-        let bright = Target { exposure: [0.5; 3], is_clipped: true, ..PLAIN };
+        let bright = LossContext { exposure: [0.5; 3], may_be_clipped: true, ..PLAIN };
         let mut gradients = [[9.0; 3]; 2];
-        assert_eq!(bright.mean_loss(&[[0.9; 3]; 2], [1.0; 4], &mut gradients), 0.0);
+        assert_eq!(bright.loss_of_mean(&[[0.9; 3]; 2], [1.0; 4], &mut gradients), 0.0);
         assert_eq!(gradients, [[0.0; 3]; 2]);
-        let plain = Target { is_clipped: false, ..bright };
-        assert!(plain.mean_loss(&[[0.9; 3]; 2], [1.0; 4], &mut gradients) > 0.1);
+        let plain = LossContext { may_be_clipped: false, ..bright };
+        assert!(plain.loss_of_mean(&[[0.9; 3]; 2], [1.0; 4], &mut gradients) > 0.1);
     }
 
     /// Unknown samples have no residual.
@@ -140,17 +145,18 @@ mod tests {
         let unknown = [f32::NAN; 4];
         assert_eq!(PLAIN.unclipped_residual(0, 0.2, f32::NAN), 0.0);
         let mut gradients = [[9.0; 3]; 2];
-        assert_eq!(PLAIN.mean_loss(&[[0.2; 3]; 2], unknown, &mut gradients), 0.0);
+        assert_eq!(PLAIN.loss_of_mean(&[[0.2; 3]; 2], unknown, &mut gradients), 0.0);
         assert_eq!(gradients, [[0.0; 3]; 2]);
         gradients = [[9.0; 3]; 2];
-        assert_eq!(PLAIN.individual_loss(&[[0.2; 3]; 2], |_| unknown, &mut gradients), 0.0);
+        assert_eq!(PLAIN.mean_of_losses(&[[0.2; 3]; 2], |_| unknown, &mut gradients), 0.0);
         assert_eq!(gradients, [[0.0; 3]; 2]);
     }
 
     /// Exposure is corrected, and transparent samples show the background.
     #[test]
     fn samples_become_target_colours() {
-        let target = Target { exposure: [2.0, 1.0, 0.5], background: [0.4, 0.8, 1.0], ..PLAIN };
+        let target =
+            LossContext { exposure: [2.0, 1.0, 0.5], background: [0.4, 0.8, 1.0], ..PLAIN };
         let colour = target.colour([0.1, 0.2, 0.3, 0.75]);
         assert!(
             colour.iter().zip([0.4, 0.4, 0.275]).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6),

@@ -2,11 +2,11 @@
 
 use glam::{DMat3, DVec3};
 
-/// Colour error above which Huber's loss is linear: an outlier, such as a moved object or a part of
-/// the scene that no image covers. Chosen by hand.
+/// Threshold of the Huber loss. Larger colour errors count linearly, since they come from outliers:
+/// moved objects, or parts of the scene that no image covers. Chosen by hand.
 pub(crate) const HUBER_THRESHOLD: f64 = 0.1;
 
-/// Returns Huber's robust error.
+/// Returns twice the Huber loss of an error: its square up to the threshold.
 pub(crate) fn huber(error: f64) -> f64 {
     let size = error.abs();
     if size > HUBER_THRESHOLD {

@@ -34,14 +34,15 @@ impl Passes {
         }
     }
 
-    /// Renders rays in this thread; if `backward`, also propagates a gradient of 1 by every colour
-    /// to the grid's features. Returns the numbers of samples marched and of samples with a colour.
+    /// Renders rays in this thread; if `backward`, also backpropagates a gradient of 1 for every
+    /// colour channel to the grid's features. Returns the numbers of samples marched and of samples
+    /// with a colour.
     pub fn run(&mut self, field: &Field, rays: &[Ray], backward: bool) -> [usize; 2] {
         let mut samples = [0; 2];
         self.features.clear();
         for rays in rays.chunks(CHUNK_RAYS) {
             let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
-            self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
+            self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Single);
             samples[0] += self.chunk.samples();
             samples[1] += self.chunk.coloured_samples();
             if backward {

@@ -34,7 +34,8 @@ impl Ray {
     }
 }
 
-/// Ray in the unit cube with a parameter t of even speed; in a box t is the distance in cube sides.
+/// Ray in the unit cube with a parameter t: in a box and in NDC the distance along the ray in cube
+/// sides, in a contraction see [`RayMap::Contracted`].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NormalizedRay {
     /// Position at t = 0.
@@ -244,8 +245,8 @@ fn clip_to_frustum(
     if !length.is_finite() || length <= 0.0 {
         return None;
     }
-    // x = distance - enter is a projective function of t: t = c·x / (Z + x·dZ), with c from the far
-    // end.
+    // With x = distance - enter, t is a projective function of x: t = c·x / (Z + x·dZ). c follows
+    // from t = length at the far end.
     let c = length * to.z / (leave - enter);
     Some(NormalizedRay {
         origin: start.as_vec3().to_array(),

@@ -89,8 +89,8 @@ impl Judge<'_> {
         self.layer(third, &self.layer(second, &self.layer(first, &input, true), true), false)
     }
 
-    /// Weight and colour of a ray's samples that count, and the light that comes through. Without
-    /// those that don't count, it is what the fused pass sees.
+    /// Returns weight and colour of each sample that counts, and the ray's transmittance. Other
+    /// samples attenuate light but have no colour, as in the fused pass.
     fn shaded(&self, ray: &Ray, samples: &[Sample]) -> (Vec<(f64, [f64; 3])>, f64) {
         let step = f64::from(self.field.step());
         let (mut depth, mut counted) = (0.0f64, Vec::new());
@@ -252,9 +252,9 @@ fn fused_passes_equal_the_plain_ones() {
         }
     }
 
-    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and the floater
-    // loss, where neither background_likeness to the background nor what comes through to it is
-    // learnt from.
+    // The loss is Σ g·C with random g, so that its gradient with respect to the colours is g, plus
+    // the floater loss. The floater loss has no gradient with respect to sample colours and
+    // transmittance: likenesses are computed once and stay constant.
     let regularisers = Regularisers { floater_loss: 0.3, ..Regularisers::default() };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {
@@ -385,10 +385,10 @@ fn stopping_early_loses_no_more_than_the_light_that_was_left() {
     field.network[second.range()].iter_mut().step_by(second.outputs).for_each(|w| *w = 6.0);
     let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
     let mut chunk = Chunk::default();
-    chunk.forward(&field, &clipped, &[0.5; 20], Strides::Even);
+    chunk.forward(&field, &clipped, &[0.5; 20], Strides::Single);
     let wide = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
     let judge = Judge { field: &field, grid: wide(&field.grid), network: wide(&field.network) };
-    let samples = samples(&field, &clipped, &[0.5; 20], Strides::Even);
+    let samples = samples(&field, &clipped, &[0.5; 20], Strides::Single);
     let mut stopped = 0;
     for (r, sum) in chunk.sums.iter().enumerate() {
         stopped += usize::from(sum.transmittance < 1e-4);

@@ -35,9 +35,9 @@ pub(crate) struct ShadedRay<'a> {
 /// Gradients of a ray's loss.
 #[derive(Debug)]
 pub(crate) struct LossGradients<'a> {
-    /// Gradient by each sample's weight.
+    /// Gradient with respect to each sample's weight.
     pub(crate) by_weight: &'a mut [f32],
-    /// Gradient by the ray's transmittance T, times T.
+    /// T times the gradient with respect to the ray's transmittance T.
     pub(crate) behind: f32,
 }
 

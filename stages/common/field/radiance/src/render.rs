@@ -79,7 +79,7 @@ impl Field {
     fn render_chunk(&self, rays: &[Ray]) -> Vec<Pixel> {
         let mut chunk = CHUNK.take();
         let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
-        chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
+        chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Single);
         let far = self.bounds.far as f32;
         let pixels =
             (0..rays.len()).map(|i| pixel(&rays[i], &clipped[i], &chunk.sums[i], far)).collect();

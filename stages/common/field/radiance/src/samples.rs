@@ -12,7 +12,7 @@ use crate::simd::LANES;
 use crate::spec::Strides;
 use crate::spec::{
     DENSITY_OUTPUTS, FEATURES, MAX_OPTICAL_DEPTH, MAX_RAW_DENSITY, MIN_HIT_WEIGHT,
-    MIN_TRANSMITTANCE, MIN_WEIGHT, TRAINING_ROUNDS,
+    MIN_TRANSMITTANCE, MIN_WEIGHT, TRAINING_ROUND_SAMPLES,
 };
 
 /// Sums over one ray's samples.
@@ -178,9 +178,9 @@ impl Samples {
     /// rows. Before this round `counted` samples count.
     fn take_samples(&mut self, rays: &March<'_>, counted: usize) -> Round {
         let max_samples = match rays.strides {
-            Strides::Even => RENDERING_ROUND,
+            Strides::Single => RENDERING_ROUND,
             Strides::ByCell | Strides::Double => {
-                TRAINING_ROUNDS[self.rounds.len().min(TRAINING_ROUNDS.len() - 1)]
+                TRAINING_ROUND_SAMPLES[self.rounds.len().min(TRAINING_ROUND_SAMPLES.len() - 1)]
             }
         };
         let start = self.marched.t.len();

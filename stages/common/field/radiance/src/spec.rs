@@ -22,7 +22,7 @@ pub const VIEW_INPUTS: usize = VIEW_FEATURES + BASIS;
 /// Maximum raw density, to which larger values are clamped: a step is opaque long before e^15.
 pub const MAX_RAW_DENSITY: f32 = 15.0;
 
-/// Minimum transmittance at which rays are sampled and samples have colour and gradient. A larger
+/// Transmittance below which a ray ends: samples beyond have neither colour nor gradient. A larger
 /// threshold costs PSNR (docs/design/006).
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Minimum weight of a sample that has colour and gradient. A larger threshold costs PSNR
@@ -32,9 +32,10 @@ pub const MIN_WEIGHT: f32 = 1e-4;
 pub const MIN_TOTAL_WEIGHT: f32 = 1e-4;
 /// Optical depth at which a ray ends: -ln([`MIN_TRANSMITTANCE`]).
 pub const MAX_OPTICAL_DEPTH: f32 = 9.210_34;
-/// Samples per ray in the first rounds of a training; later rounds have the last number
-/// (docs/design/006). Samples behind a surface that an early round finds are never evaluated.
-pub const TRAINING_ROUNDS: [usize; 4] = [8, 8, 16, 32];
+/// Maximum samples per ray in each marching round of a training step's forward pass; further rounds
+/// use the last number (docs/design/006). Once a round finds a surface, the samples behind it are
+/// never evaluated.
+pub const TRAINING_ROUND_SAMPLES: [usize; 4] = [8, 8, 16, 32];
 
 /// Maximum distance of a floater's colour from the background's (docs/design/013).
 pub const MAX_FLOATER_COLOUR_DISTANCE: f32 = 0.1;
@@ -44,8 +45,8 @@ pub const OCCUPANCY_CELLS: usize = 128;
 /// Maximum optical depth of a step in a thin cell (docs/design/037), where training rays take a
 /// sample of double length at every other step.
 pub const MAX_THIN_OPTICAL_DEPTH: f32 = 0.05;
-/// Maximum optical depth of a step in an empty cell. A tenth of it fills the background with faint
-/// density (docs/design/045).
+/// Maximum optical depth of a step in an empty cell. At a tenth of this threshold, the background
+/// fills with faint density (docs/design/045).
 pub const MAX_EMPTY_OPTICAL_DEPTH: f32 = 0.01;
 
 /// Minimum weight of a training sample that raises its cell's density to the sample's own
@@ -62,7 +63,7 @@ pub const ADAM_EPSILON: f64 = 1e-15;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Strides {
     /// A sample at every step: for rendering.
-    Even,
+    Single,
     /// Double strides in thin cells: for training, where other rays have samples in between.
     ByCell,
     /// Double strides everywhere: for a training's first steps, while density is smooth.
@@ -74,7 +75,7 @@ impl Strides {
     #[inline]
     pub(crate) fn are_double_in(self, thin: bool) -> bool {
         match self {
-            Self::Even => false,
+            Self::Single => false,
             Self::ByCell => thin,
             Self::Double => true,
         }

@@ -1,7 +1,7 @@
 use radiance::spec::{
     BASIS, BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, MAX_OPTICAL_DEPTH, MAX_RAW_DENSITY,
     MIN_HIT_WEIGHT, MIN_TOTAL_WEIGHT, MIN_TRANSMITTANCE, MIN_WEIGHT, OCCUPANCY_CELLS, RAW_COLOUR,
-    TRAINING_ROUNDS, VIEW_FEATURE, VIEW_FEATURES,
+    TRAINING_ROUND_SAMPLES, VIEW_FEATURE, VIEW_FEATURES,
 };
 use radiance::{
     Architecture, CellHit, Field, Occupancy, Pixel, Ray, RayField, RenderError, Strides,
@@ -13,8 +13,8 @@ use crate::error::TorchFieldError;
 use crate::ray_maps::{RayMaps, matrix, multiply_add, to_host};
 use crate::step::run_in_pieces;
 
-/// The hash-grid field, [`radiance::Field`], in libtorch: an independent implementation on the same
-/// parameters that checks the hand-written one, and its way to CUDA (design note 023).
+/// The hash-grid field, [`radiance::Field`], in libtorch: an independent implementation with the
+/// same parameters. It checks the hand-written field, and computes on CUDA (design note 023).
 #[derive(Debug)]
 pub struct TorchGrid {
     pub(crate) architecture: Architecture,
@@ -121,23 +121,23 @@ pub(crate) struct GridForward {
     pub(crate) shaded_colour: Tensor,
     pub(crate) shaded_weight: Tensor,
     pub(crate) shaded_ray: Tensor,
-    /// Densities of cells in which samples stop light; only in training.
-    pub(crate) met: Vec<CellHit>,
+    /// Cells in which samples absorb light; only in training.
+    pub(crate) hits: Vec<CellHit>,
     /// Number of samples in occupied cells; only in training.
     pub(crate) samples: usize,
     maps: RayMaps,
 }
 
-/// Returns the densities of cells in which samples stop light, from the samples' weights (s × 1),
-/// positions (s × 3) and raw densities (s).
-fn met_cells(weight: &Tensor, positions: &Tensor, raw: &Tensor) -> Result<Vec<CellHit>, TchError> {
-    let met = weight
+/// Returns the cells in which samples absorb light, from the samples' weights (s × 1), positions (s
+/// × 3) and raw densities (s).
+fn find_hits(weight: &Tensor, positions: &Tensor, raw: &Tensor) -> Result<Vec<CellHit>, TchError> {
+    let hits = weight
         .f_squeeze_dim(-1)?
         .f_gt(f64::from(MIN_HIT_WEIGHT))?
         .f_nonzero()?
         .f_squeeze_dim(-1)?;
-    let density = raw.f_index_select(0, &met)?.f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?;
-    let positions = to_host(&positions.f_index_select(0, &met)?)?;
+    let density = raw.f_index_select(0, &hits)?.f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?;
+    let positions = to_host(&positions.f_index_select(0, &hits)?)?;
     let positions = positions.as_chunks::<3>().0;
     let densities = to_host(&density)?;
     Ok(positions.iter().zip(densities).map(|(&p, density)| CellHit::at(p, density)).collect())
@@ -224,13 +224,14 @@ fn optical_depths(
     Ok([through, transmittance, weights])
 }
 
-/// Counts the samples that a training step evaluates: on each ray, those of `kept` up to the end of
-/// the round in which the ray becomes dark. `through` is the optical depth up to each step's end.
+/// Counts the samples that a training step evaluates. A ray's samples in `kept` are evaluated in
+/// rounds ([`TRAINING_ROUND_SAMPLES`]), until its optical depth reaches [`MAX_OPTICAL_DEPTH`]. `through`
+/// is the optical depth up to each step's end.
 fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
     let exists = through.f_zeros_like()?.f_reshape([-1])?.f_index_fill(0, kept, 1.0)?;
     let exists = exists.f_reshape_as(through)?;
     let ordinal = exists.f_cumsum(1, None::<Kind>)?;
-    let [first @ .., later] = TRAINING_ROUNDS.map(|samples| samples as i64);
+    let [first @ .., later] = TRAINING_ROUND_SAMPLES.map(|samples| samples as i64);
     let mut end = 0;
     let mut is_end = exists.f_lt(0.0)?;
     for samples in first {
@@ -239,9 +240,9 @@ fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
     }
     let is_later = ordinal.f_sub_scalar(end)?.f_remainder(later)?.f_eq(0)?;
     is_end = is_end.f_logical_or(&is_later.f_logical_and(&ordinal.f_gt(end)?)?)?;
-    let is_dark =
+    let is_opaque =
         through.f_ge(f64::from(MAX_OPTICAL_DEPTH))?.f_logical_and(&is_end)?.f_mul(&exists)?;
-    let is_over = is_dark.f_cumsum(1, None::<Kind>)?.f_sub(&is_dark)?.f_gt(0.0)?;
+    let is_over = is_opaque.f_cumsum(1, None::<Kind>)?.f_sub(&is_opaque)?.f_gt(0.0)?;
     let marched = exists.f_logical_and(&is_over.f_logical_not()?)?;
     Ok(marched.f_sum(Kind::Int64)?.f_int64_value(&[])? as usize)
 }
@@ -355,13 +356,13 @@ impl TorchGrid {
         let ray = step.f_div_scalar_mode(count, "floor")?;
         let weight = weights.f_reshape([-1])?.f_index_select(0, &step)?.f_unsqueeze(-1)?;
         let outputs = outputs.f_index_select(0, &shaded)?;
-        let (met, samples) = match strides {
+        let (hits, samples) = match strides {
             // Rendering needs neither.
-            Strides::Even => (Vec::new(), 0),
+            Strides::Single => (Vec::new(), 0),
             Strides::ByCell | Strides::Double => no_grad(|| -> Result<_, TchError> {
                 let positions = positions.f_index_select(0, &shaded)?;
-                let met = met_cells(&weight, &positions, &outputs.i((.., 0)))?;
-                Ok((met, count_marched(&through, &kept)?))
+                let hits = find_hits(&weight, &positions, &outputs.i((.., 0)))?;
+                Ok((hits, count_marched(&through, &kept)?))
             })?,
         };
         let colour = self.shade(&maps, &outputs, &weight, &ray, n)?;
@@ -374,7 +375,7 @@ impl TorchGrid {
             shaded_colour: colour,
             shaded_weight: weight,
             shaded_ray: ray,
-            met,
+            hits,
             samples,
             maps,
         })
@@ -399,7 +400,7 @@ impl TorchGrid {
         // With double strides every other step is one sample, in the middle of two steps.
         let is_double = match strides {
             // False everywhere.
-            Strides::Even => states.f_lt(0.0)?,
+            Strides::Single => states.f_lt(0.0)?,
             Strides::ByCell => states.f_eq(1.0)?,
             Strides::Double => states.f_gt(0.0)?,
         };
@@ -456,7 +457,7 @@ impl TorchGrid {
 
     fn render_piece(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
         let offsets = Tensor::f_full([rays.len() as i64], 0.5, (Kind::Float, self.device))?;
-        let forward = self.forward(rays, &offsets, Strides::Even)?;
+        let forward = self.forward(rays, &offsets, Strides::Single)?;
         let maps = &forward.maps;
         let weights = forward.weights.f_mul(&forward.counted)?;
         let distances = maps
@@ -576,7 +577,11 @@ mod tests {
             for &device in &devices {
                 let judge = TorchGrid::new(&field, device).unwrap();
                 let seen = judge
-                    .forward(&rays, &Tensor::full([300], 0.5, (Kind::Float, device)), Strides::Even)
+                    .forward(
+                        &rays,
+                        &Tensor::full([300], 0.5, (Kind::Float, device)),
+                        Strides::Single,
+                    )
                     .unwrap();
                 let background = seen.transmittance.unsqueeze(-1);
                 let gradients = Tensor::run_backward(

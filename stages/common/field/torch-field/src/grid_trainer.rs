@@ -38,7 +38,7 @@ struct GridPiece {
     /// Sum of the bundles' losses.
     loss: f64,
     samples: usize,
-    met: Vec<CellHit>,
+    hits: Vec<CellHit>,
 }
 
 impl GridTrainer {
@@ -103,11 +103,11 @@ impl GridTrainer {
         let pieces = step.run_in_pieces(|range| self.run(&*supervision, step, range))?;
         self.tally.count(bundles, rays_per_bundle);
         let (mut samples, mut loss) = (0, 0.0);
-        let (mut met, mut colours, mut sum) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut hits, mut colours, mut sum) = (Vec::new(), Vec::new(), Vec::new());
         for piece in pieces {
             samples += piece.samples;
             loss += piece.loss;
-            met.extend(piece.met);
+            hits.extend(piece.hits);
             colours.push(piece.colours);
             if sum.is_empty() {
                 sum = piece.gradients;
@@ -124,7 +124,7 @@ impl GridTrainer {
             }
         } else {
             no_grad(|| self.apply_gradients(&sum))?;
-            self.occupancy.raise_densities(&met);
+            self.occupancy.raise_densities(&hits);
             step.remember(supervision, &colours);
         }
         self.tally.steps += 1;
@@ -171,7 +171,7 @@ impl GridTrainer {
             colours: loss.colours,
             loss: loss.sum,
             samples: forward.samples,
-            met: forward.met,
+            hits: forward.hits,
         })
     }
 

@@ -82,7 +82,7 @@ mod tests {
         assert_eq!(frame.camera_to_world[2], [0., 0., 1., 4.]);
         assert_eq!(frame.stored_intrinsics, scene::Intrinsics::from_angle_x(10, 6, 0.7));
         // Both sides have an r_0.
-        let merged = set.merged();
+        let merged = set.without_split();
         assert_eq!([&merged.frames[0].name, &merged.frames[1].name], ["r_0", "test_r_0"]);
         assert_eq!(merged.split, None);
     }
@@ -99,7 +99,7 @@ mod tests {
         assert_eq!((missing.frames.len(), &missing.split), (1, &None));
         assert_eq!(missing, empty);
         assert_eq!(missing.notes, ["Blender format: 1 view, no test views"]);
-        assert_eq!(missing.clone().merged(), missing);
+        assert_eq!(missing.clone().without_split(), missing);
         std::fs::create_dir(&test).unwrap();
         let message = Dataset::read(dir.path()).unwrap_err().to_string();
         assert!(message.contains("transforms_test.json is a folder, not a file"), "{message}");

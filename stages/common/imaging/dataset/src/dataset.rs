@@ -27,7 +27,7 @@ impl Dataset {
     /// Removes the folder's own split. A test view with the name of a training view, as in Blender
     /// scenes, is renamed `test_NAME`.
     #[must_use]
-    pub fn merged(mut self) -> Self {
+    pub fn without_split(mut self) -> Self {
         let split = self.split.take().unwrap_or_default();
         let mut taken: BTreeSet<String> =
             split.train.iter().map(|&i| self.frames[i].name.clone()).collect();
@@ -43,7 +43,7 @@ impl Dataset {
     /// Keeps the lenses' distortion; adds a note on the pixels that are masked because their lens
     /// has no ray for them.
     #[must_use]
-    pub fn followed(mut self) -> Self {
+    pub fn with_lens_mask_note(mut self) -> Self {
         let mut known: Vec<(Intrinsics, usize)> = Vec::new();
         let (mut pixels, mut photographs) = (0, 0);
         for frame in &self.frames {
@@ -235,7 +235,7 @@ mod tests {
     #[test]
     fn masks_of_lenses_join_those_of_the_data() {
         let dir = tempfile::tempdir().unwrap();
-        let set = fisheye_set(dir.path()).followed();
+        let set = fisheye_set(dir.path()).with_lens_mask_note();
         let is_cut = |i: usize| {
             let (x, y) = ((i % 40) as f64 - 19.5, (i / 40) as f64 - 14.5);
             x.hypot(y) / 40.0 * 200.0 >= 89.0

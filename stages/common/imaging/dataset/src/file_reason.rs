@@ -77,7 +77,8 @@ pub(crate) enum FileReason {
     NoFrames,
     #[error("the model has no images; at least one is required")]
     NoImages,
-    /// None of the named images exists; `folder` contains all of them, if known.
+    /// None of the named images exists; `folder` is the folder in which all were expected, if there
+    /// is a single one.
     #[error(
         "none of the {count} images exists{} (first missing: {})",
         folder.as_ref().map(|folder| format!(" in {}", path_text(folder))).unwrap_or_default(),

@@ -22,7 +22,7 @@ pub(crate) enum FileStatus {
 pub(crate) enum FileProblem {
     #[error("{} not found", path_text(path))]
     NotFound { path: PathBuf },
-    /// Absolute path of another machine, no tail of which is a file of the data set.
+    /// Absolute path from another machine. No file in the data set matches the end of the path.
     #[error("no file in the data set matches the end of the absolute path {}", path_text(path))]
     NoMatchingTail { path: PathBuf },
     #[error("{} is {kind}, not {expected}", path_text(path))]
@@ -147,7 +147,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_no_file_is_named() {
+    fn messages_name_the_kind_of_non_file() {
         let dir = tempfile::tempdir().unwrap();
         let at = |name: &str| dir.path().join(name);
         fs::write(at("file"), "").unwrap();

@@ -196,11 +196,11 @@ mod tests {
         for version in [0, 4, 255] {
             assert_refused(&file(version, &good, &data), "magic string or version is wrong");
         }
-        // One that claims to reach beyond the file: by a byte, and as far as can be.
+        // A header whose stated length exceeds the file: by one byte, and by the maximum.
         let all = (good.len() + data.len()) as u32;
         assert_refused(&claiming(all + 1, &good, &data), "magic string or version is wrong");
         assert_refused(&claiming(u32::MAX, &good, &data), "magic string or version is wrong");
-        // One without length, and one that reaches into the data, which aren't text.
+        // A header of length 0, and one that includes a byte of the data, which isn't text.
         assert_refused(&claiming(0, &good, &data), "no descr");
         let numbers = [0xff; 48];
         let mut reaching = file(1, &good, &numbers);
@@ -216,14 +216,14 @@ mod tests {
         }
     }
 
-    /// Rows, columns and how many numbers there are, read of six.
+    /// Returns rows, columns and number of values read from a file with six numbers.
     fn sizes(order: &str, shape: &str) -> Option<[usize; 3]> {
         let header = format!("{{'descr': '<f8', 'fortran_order': {order}, 'shape': {shape}}}");
         let matrix = read_matrix(&file(1, &header, &[0; 48])).ok()?;
         Some([matrix.rows, matrix.columns, matrix.numbers.len()])
     }
 
-    /// What a shape claims is held against what is there before anything is allocated.
+    /// The size in the header is compared with the data before memory is allocated.
     #[test]
     fn a_matrix_has_the_numbers_that_its_shape_claims() {
         let most = usize::MAX;
@@ -231,14 +231,15 @@ mod tests {
             for (shape, expected) in [
                 ("(6, 1)".to_owned(), Some([6, 1, 6])),
                 ("(1, 6)".to_owned(), Some([1, 6, 6])),
-                // What lies behind isn't looked at.
+                // Data after the matrix are ignored.
                 ("(2, 1)".to_owned(), Some([2, 1, 2])),
                 ("(7, 1)".to_owned(), None),
-                // Of no rows or no columns there is nothing, whatever the other is.
+                // A matrix without rows or columns has no numbers, whatever the other length is.
                 ("(0, 17)".to_owned(), Some([0, 17, 0])),
                 (format!("({most}, 0)"), Some([most, 0, 0])),
                 (format!("(0, {most})"), Some([0, most, 0])),
-                // The most that a count can be; more than that; and a length that is none.
+                // The largest possible count, a count that overflows, and a length that isn't a
+                // usize.
                 (format!("({}, 17)", most / 17), None),
                 (format!("({}, 17)", most / 17 + 1), None),
                 (format!("({most}0, 17)"), None),
@@ -248,7 +249,7 @@ mod tests {
         }
     }
 
-    /// Which numbers make sense is for who knows what they mean: `llff` refuses NaN.
+    /// Every number is accepted here. Callers check values: `llff` refuses NaN, for example.
     #[test]
     fn every_number_is_read_as_it_is() {
         let odd = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -0.0, 5e-324, f64::MAX];

@@ -14,7 +14,8 @@ pub enum Kernel {
     Bicubic,
     /// Pillow's box: the mean of whole pixels, premultiplied.
     Box,
-    /// The average of the paper's code: colour and alpha apart, never rounded. Requires an integer
+    /// Averages as the paper's code does: colour and alpha separately, without rounding. Requires
+    /// an integer
     /// scale.
     Average,
 }
@@ -43,7 +44,8 @@ pub struct Degradation {
     pub hr: [u32; 2],
 }
 
-/// Computes the mean of `sx`×`sy` blocks, colour and alpha apart and unrounded, as `--ds_method avg`
+/// Computes the mean of `sx`×`sy` blocks, colour and alpha separately and without rounding, as
+/// `--ds_method avg`
 /// of the paper's code does. `None` if the image size isn't a multiple of (sx, sy).
 ///
 /// Like the paper's code it pools *straight* colour, so that colours of transparent pixels bleed

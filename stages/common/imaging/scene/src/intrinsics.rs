@@ -36,9 +36,9 @@ const BORDER_SAMPLES: u32 = 64;
 /// is checked; chosen by hand.
 const ORDER_SAMPLES: u32 = 16;
 
-/// Maximum of half a side over the focal length for a pinhole camera that replaces a fisheye: tan
-/// 50°. At 100° across, the border has 2.4 times as many pixels per degree as the middle; wider
-/// views would spend ever more of the image on their borders.
+/// Maximum tangent of the half field of view of a pinhole camera that replaces a fisheye: tan 50°.
+/// At 100° across, the border has 2.4 times as many pixels per degree as the middle; wider views
+/// would spend ever more of the image on their borders.
 const MAX_PINHOLE_SLOPE: f64 = 1.191_753_592_594_21;
 
 impl Intrinsics {
@@ -146,8 +146,8 @@ impl Intrinsics {
         )
     }
 
-    /// Returns the mask of pixels whose ray isn't cut (see [`Intrinsics::is_cut`]); `None` if no
-    /// ray is.
+    /// Returns the mask of pixels with valid rays; `None` if all are valid. A cut ray (see
+    /// [`Intrinsics::is_cut`]) is not valid.
     pub fn lens_mask(&self) -> Option<Mask> {
         if !self.has_cut_rays() {
             return None;
@@ -164,7 +164,8 @@ impl Intrinsics {
         self.border().any(|position| self.is_cut(position))
     }
 
-    /// True if a fisheye's ray at a position, in pixels, is cut to 89° from the axis.
+    /// True if the fisheye ray at a position, in pixels, is more than 89° from the axis and is
+    /// clamped.
     pub fn is_cut(&self, position: [f64; 2]) -> bool {
         self.distortion.is_cut(self.to_plane(position))
     }

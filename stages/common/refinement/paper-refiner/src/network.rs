@@ -65,7 +65,7 @@ const MAX_WIDTH: u32 = 1024;
 const WEIGHTS: u64 = 320;
 
 impl PaperRefiner {
-    /// Creates an untrained network, initialised like the reference (He et al. 2015; scales of
+    /// Creates an untrained network, initialised as in the authors' code (He et al. 2015; scales of
     /// batch normalisation around 1). The published width is 128.
     pub fn new(width: u32, seed: u64) -> Result<Self, RefinementError> {
         let mut number = 0;

@@ -21,9 +21,9 @@ type Corner = (usize, usize);
 
 impl PaperRefiner {
     /// Redraws a view in patches of 64×64 pixels that overlap by `overlap` pixels, at most by half,
-    /// and are blended. Each patch gets at most `count` reference patches, at the positions at
-    /// which its own pixels are visible in references; a patch without any gets itself, as in the
-    /// reference's code. Returns an image of three channels in 0..1.
+    /// and are blended. Each patch gets at most `count` reference patches, at the positions where
+    /// the patch's pixels are visible in the references. A patch without reference patches is its
+    /// own reference, as in the paper's code. Returns an image of three channels in 0..1.
     pub fn refine(
         &self,
         rendered: &Rendered,

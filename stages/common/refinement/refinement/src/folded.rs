@@ -5,24 +5,25 @@ use tch::{TchError, Tensor};
 /// channels (space-to-depth), which widens its receptive field at equal cost (design note 015).
 pub(crate) const FOLD: usize = 2;
 
-/// Rectangle of an image in pixels; beyond the image's border, the border pixels are repeated.
+/// Rectangle of an image, in pixels. It may extend beyond the image, where the nearest border
+/// pixels are repeated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Square {
+pub(crate) struct Window {
     pub(crate) x: isize,
     pub(crate) y: isize,
     /// Width and height, multiples of [`FOLD`].
     pub(crate) size: (usize, usize),
 }
 
-impl Square {
-    /// Returns the square grown by `folds` folds on each side.
+impl Window {
+    /// Returns the window grown by `folds` folds on each side.
     pub(crate) fn grown(self, folds: usize) -> Self {
         let margin = folds * FOLD;
         let (x, y) = (self.x - margin as isize, self.y - margin as isize);
         Self { x, y, size: (self.size.0 + 2 * margin, self.size.1 + 2 * margin) }
     }
 
-    /// Calls `pixel` with the column and row of each pixel of the square, in the network's order:
+    /// Calls `pixel` with the column and row of each pixel of the window, in the network's order:
     /// rows of folds, the pixels of a fold together.
     pub(crate) fn fold(self, mut pixel: impl FnMut(usize, usize)) {
         for fold_y in 0..self.size.1 / FOLD {
@@ -95,20 +96,20 @@ impl Orientation {
     };
 
     /// Returns the square with the size that it has in this orientation.
-    pub(crate) fn oriented(self, square: Square) -> Square {
+    pub(crate) fn oriented(self, square: Window) -> Window {
         let (width, height) = square.size;
-        Square { size: if self.swap { (height, width) } else { (width, height) }, ..square }
+        Window { size: if self.swap { (height, width) } else { (width, height) }, ..square }
     }
 
     /// Maps a column and row of the oriented square to those of the original square.
-    pub(crate) fn source(self, square: Square, x: usize, y: usize) -> (usize, usize) {
+    pub(crate) fn source(self, square: Window, x: usize, y: usize) -> (usize, usize) {
         let (x, y) = if self.swap { (y, x) } else { (x, y) };
         let (width, height) = square.size;
         (if self.flip_x { width - 1 - x } else { x }, if self.flip_y { height - 1 - y } else { y })
     }
 }
 
-/// Returns a tensor's folded samples, as [`Square::unfold`] takes them.
+/// Returns a tensor's folded samples, as [`Window::unfold`] takes them.
 pub(crate) fn folded_samples(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     let flat = tensor.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
     Vec::<f32>::try_from(&flat)
@@ -121,7 +122,7 @@ mod tests {
     #[test]
     fn what_is_folded_unfolds() {
         let image = Image::new(7, 5, 3, (0..105).map(|v| v as f32).collect());
-        let square = Square { x: -2, y: 1, size: (6, 4) };
+        let square = Window { x: -2, y: 1, size: (6, 4) };
         let mut folded = Vec::new();
         square.fold(|x, y| folded.extend_from_slice(square.pixel(&image, x, y)));
         let again = folded_samples(&square.tensor(&folded, 3).unwrap()).unwrap();
@@ -137,7 +138,7 @@ mod tests {
 
     #[test]
     fn turns_are_eight_and_lose_nothing() {
-        let square = Square { x: 3, y: 4, size: (6, 2) };
+        let square = Window { x: 3, y: 4, size: (6, 2) };
         let mut seen = std::collections::BTreeSet::new();
         for orientation in Orientation::ALL {
             let mut places = Vec::new();

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use tch::{TchError, Tensor, no_grad};
 
 use crate::error::RefinementError;
-use crate::folded::{FOLD, Orientation, Square, folded_samples};
+use crate::folded::{FOLD, Orientation, Window, folded_samples};
 use crate::view::{INPUTS, OUTPUTS, REFERENCE_INPUTS};
 use crate::warped_reference::Guidance;
 
@@ -209,12 +209,12 @@ impl Refiner {
             .flat_map(|y| (0..width).step_by(TILE_SIDE).map(move |x| (x, y)))
             .map(|(x, y)| (x, y, self.shallow_clone()))
             .collect();
-        let residuals: Vec<(Square, Vec<f32>)> = tiles
+        let residuals: Vec<(Window, Vec<f32>)> = tiles
             .into_par_iter()
             .map(|(x, y, refiner)| -> Result<_, TchError> {
                 let size = [width - x, height - y]
                     .map(|remaining| remaining.min(TILE_SIDE).next_multiple_of(FOLD));
-                let square = Square { x: x as isize, y: y as isize, size: size.into() };
+                let square = Window { x: x as isize, y: y as isize, size: size.into() };
                 Ok((square, refiner.residual(view, square, orientations)?))
             })
             .collect::<Result<_, _>>()?;
@@ -240,7 +240,7 @@ impl Refiner {
     fn residual(
         &self,
         view: &Image,
-        square: Square,
+        square: Window,
         orientations: &[Orientation],
     ) -> Result<Vec<f32>, TchError> {
         let around = square.grown(self.receptive_radius());
@@ -337,7 +337,7 @@ mod tests {
         let refiner = random(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
             let view = image(width, height);
-            let square = Square {
+            let square = Window {
                 x: 0,
                 y: 0,
                 size: (width.next_multiple_of(FOLD), height.next_multiple_of(FOLD)),
@@ -367,7 +367,7 @@ mod tests {
     }
 
     fn added_to(refiner: &Refiner, view: &Image) -> Vec<f32> {
-        refiner.residual(view, Square { x: 4, y: 4, size: (8, 8) }, &Orientation::ALL[..1]).unwrap()
+        refiner.residual(view, Window { x: 4, y: 4, size: (8, 8) }, &Orientation::ALL[..1]).unwrap()
     }
 
     /// Internal learning from little pushes features below 0 everywhere. What the network adds must

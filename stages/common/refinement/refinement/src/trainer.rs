@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use tch::{Kind, TchError, Tensor};
 
 use crate::error::RefinementError;
-use crate::folded::{FOLD, Orientation, Square};
+use crate::folded::{FOLD, Orientation, Window};
 use crate::refiner::Refiner;
 use crate::view::{KnownView, OUTPUTS, REFERENCE_INPUTS};
 use crate::warped_reference::{Guidance, Use, with_references};
@@ -298,7 +298,7 @@ fn run_shard(
     views: &[TrainingView<'_>],
 ) -> Result<(f64, Vec<Tensor>), TchError> {
     let (mut inputs, mut residuals) = (Vec::new(), Vec::new());
-    let square = Square { x: 0, y: 0, size: (options.patch_size, options.patch_size) };
+    let square = Window { x: 0, y: 0, size: (options.patch_size, options.patch_size) };
     let around = square.grown(refiner.receptive_radius());
     for i in range {
         let number = step * options.batch_size as u64 + i as u64;
@@ -328,7 +328,7 @@ struct TrainingView<'a> {
 /// Augmented patch of a view.
 struct TrainingPatch<'a> {
     view: TrainingView<'a>,
-    square: Square,
+    square: Window,
     orientation: Orientation,
     /// Permutation of the colour channels.
     order: [usize; OUTPUTS],
@@ -395,11 +395,11 @@ fn draw_square<'a>(
     views: &[TrainingView<'a>],
     side: usize,
     rng: &mut CounterRng,
-) -> (TrainingView<'a>, Square) {
+) -> (TrainingView<'a>, Window) {
     let view = views[rng.below(views.len() as u64) as usize];
     let x = draw_start(view.view.width, side, rng);
     let y = draw_start(view.view.height, side, rng);
-    (view, Square { x, y, size: (side, side) })
+    (view, Window { x, y, size: (side, side) })
 }
 
 /// Draws the start of a square along an axis: an even pixel, aligned with the folds of whole views.
@@ -408,7 +408,7 @@ fn draw_start(size: usize, side: usize, rng: &mut CounterRng) -> isize {
 }
 
 /// Returns the range of the green channel in a square of the ground truth.
-fn contrast(truth: &Image, square: Square) -> f32 {
+fn contrast(truth: &Image, square: Window) -> f32 {
     let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
     square.fold(|x, y| {
         let green = square.pixel(truth, x, y)[1];

@@ -114,7 +114,8 @@ pub struct KnownView {
 
 impl KnownView {
     /// Combines a rendered view with its photograph, composited on the same background. Masked
-    /// pixels of the photograph get the rendered colour, so that they differ nowhere.
+    /// pixels of the photograph get the rendered colour, so that view and photograph are equal
+    /// there.
     pub fn new(rendered: Rendered, photograph: Photograph) -> Result<Self, RefinementError> {
         let view = &rendered.view;
         let Photograph { image: mut truth, mask } = photograph;
@@ -207,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_exposure_is_none() {
+    fn no_exposure_is_fitted_to_flat_or_inverted_images() {
         let mut flat = view(1.0, 0.0);
         flat.truth.data.fill(1.0);
         assert_eq!(flat.exposure(), None);

@@ -8,7 +8,8 @@ use serde_json::{Map, Value};
 use stage::machine_memory;
 use store::Record;
 
-/// Maximum number of threads or stages per core. More cost only memory and time; chosen by hand.
+/// Maximum number of threads or stages per core. A larger number would only cost memory and time;
+/// chosen by hand.
 const MAX_THREADS_PER_CORE: usize = 4;
 /// Maximum number of stages at once without `--jobs`; chosen by hand.
 const DEFAULT_MAX_STAGES: usize = 4;
@@ -138,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_no_machine_could_use_is_lowered() {
+    fn only_excessive_numbers_are_capped() {
         assert_eq!([8, 1000].map(|threads| capped("--threads", threads, 2)), [8, 8]);
         assert_eq!(capped("--jobs", 3, 2), 3);
     }

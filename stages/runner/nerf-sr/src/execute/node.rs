@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use artifact::{format_duration, hash_json, unix_time};
 use planning::stage_call::{Call, Display, StageFailure, StageView, Usage, read_summary};
-use planning::{FoundInputs, Node, Origin, find_inputs};
+use planning::{HashedInputs, Node, Origin, hash_inputs};
 use serde_json::{Map, Value};
 use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
 
@@ -20,7 +20,7 @@ use crate::watch::{Chain, Watch, Watching};
 /// Action of a node that isn't cached.
 pub(crate) struct PendingAction {
     pub(super) key_parts: Map<String, Value>,
-    inputs: FoundInputs,
+    inputs: HashedInputs,
 }
 
 /// Cache lookup result of a node whose parents are done.
@@ -53,7 +53,7 @@ impl NodeJob<'_> {
     /// Looks up the node's record. Either way, the run's file gets the node's key first, which
     /// protects the artifact from garbage collection.
     pub(crate) fn look_up(&self) -> Result<Lookup, StageFailure> {
-        let inputs = find_inputs(self.node, self.run.store, Some(self.run.stop), |index| {
+        let inputs = hash_inputs(self.node, self.run.store, Some(self.run.stop), |index| {
             self.output_of(index)
         })
         .map_err(|e| input_failure(&e))?;

@@ -18,8 +18,8 @@ pub(crate) struct Contents {
 }
 
 impl Contents {
-    /// Reads a store. Fails if an entry can't be read or a record is damaged: artifacts that it
-    /// needs are unknown then.
+    /// Reads a store. Fails if an entry can't be read or a record is damaged: the artifacts that
+    /// such a record needs would be unknown, and deleted.
     pub(crate) fn read(store: &Store) -> Result<Self, StoreError> {
         let action_files = store.action_files()?;
         let mut records = BTreeMap::new();

@@ -29,7 +29,7 @@ pub(crate) fn run(
     };
     let store = &session.store;
     let code = executor.carry_out(&Run { plan: &plan, store, file: &file, out, stop: &stop });
-    // Without its end, as on a full disk, a run's age counts from its beginning.
+    // If the end can't be recorded, as on a full disk, the run's age is counted from its start.
     file.end().ok();
     code
 }

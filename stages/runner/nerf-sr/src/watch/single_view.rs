@@ -27,6 +27,9 @@ impl WatchedView {
         }
         let found = views.iter().find(|view| name.is_empty() || name_of(view) == Some(name));
         let Some(view) = found else {
+            if name.is_empty() {
+                anyhow::bail!("no view to watch: the inputs list none");
+            }
             let known: Vec<&str> = views.iter().filter_map(name_of).collect();
             anyhow::bail!("no view {name}; {}", artifact::known_names(name, known));
         };

@@ -26,7 +26,7 @@ fn sample(march: &March<'_>, k: u32) -> Option<(f32, f32)> {
     }
 }
 
-const STRIDES: [Strides; 3] = [Strides::Even, Strides::ByCell, Strides::Double];
+const STRIDES: [Strides; 3] = [Strides::Single, Strides::ByCell, Strides::Double];
 
 /// All samples of a ray without leaps, and those found by marching in parts, as the renderer
 /// does.
@@ -100,8 +100,8 @@ fn nothing_gives_no_sample() {
     let mut occupancy = Occupancy::full();
     occupancy.set(|_| Cell::Empty);
     for seed in 0..100 {
-        assert_eq!(both(&occupancy, straight_ray(seed), Strides::Even), [vec![], vec![]]);
-        assert_eq!(both(&occupancy, bent_ray(seed, 1.5), Strides::Even), [vec![], vec![]]);
+        assert_eq!(both(&occupancy, straight_ray(seed), Strides::Single), [vec![], vec![]]);
+        assert_eq!(both(&occupancy, bent_ray(seed, 1.5), Strides::Single), [vec![], vec![]]);
     }
 }
 
