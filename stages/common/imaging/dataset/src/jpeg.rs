@@ -6,9 +6,9 @@
 //! missing. A progressive JPEG needs its end marker, since nothing else determines the number of
 //! scans.
 //!
-//! An invalid segment before the first scan is left to the decoder, which reports it. The decoder
-//! ignores an invalid scan header, and any invalid segment after the first scan: here these are
-//! damage.
+//! An invalid segment before the first scan is left to the decoder, which reports it; if it doesn't,
+//! the file is refused. The decoder ignores an invalid scan header, and any invalid segment after the
+//! first scan: here these are damage.
 
 use std::ops::{Range, RangeInclusive};
 
@@ -42,8 +42,10 @@ fn is_known_marker(marker: u8) -> bool {
 /// Completeness of a JPEG's image data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Extent {
-    /// Complete data, or a file that the decoder refuses.
+    /// Complete data.
     Whole,
+    /// No scan is found: the decoder should refuse the file.
+    Unknown,
     /// Complete rows without an end marker that the decoder reaches. The image data end at offset
     /// `end`.
     Unterminated { end: usize },
@@ -59,9 +61,9 @@ pub(crate) fn extent(bytes: &[u8]) -> Extent {
     let mut walk = Walk { bytes: without_padding(bytes), ..Walk::default() };
     let is_terminated = walk.read_to_end();
     if is_terminated.is_none() && walk.scans == 0 && walk.damaged_scan.is_none() {
-        return Extent::Whole;
+        return Extent::Unknown;
     }
-    walk.extent(is_terminated == Some(true)).unwrap_or(Extent::Whole)
+    walk.extent(is_terminated == Some(true)).unwrap_or(Extent::Unknown)
 }
 
 /// Removes zeros at the end, left by an interrupted copy: they would be valid codes.

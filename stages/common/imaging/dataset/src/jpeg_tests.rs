@@ -27,6 +27,14 @@ pub(crate) fn jpeg(
     bytes
 }
 
+/// Returns a JPEG that only the decoder reads: it takes a restart marker for a segment.
+pub(crate) fn hidden_jpeg() -> Vec<u8> {
+    let bytes = jpeg(SIZE, None, false, 0);
+    let hidden = [&bytes[..2], b"\xff\xd7\0\x08\xff\xe0\xff\xff\0\0", &bytes[2..]].concat();
+    assert!(decoded(&hidden).is_some());
+    hidden
+}
+
 const SAMPLINGS: [Option<SamplingFactor>; 6] = [
     None,
     Some(SamplingFactor::R_4_4_4),
@@ -169,5 +177,6 @@ fn any_bytes_have_an_extent() {
             extent(&bytes[at..]);
         }
     }
-    assert_eq!(extent(b""), Extent::Whole);
+    assert_eq!(extent(b""), Extent::Unknown);
+    assert_eq!(extent(&hidden_jpeg()), Extent::Unknown);
 }

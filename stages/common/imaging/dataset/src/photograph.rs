@@ -143,13 +143,17 @@ fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelE
         return read_exr_photograph(path);
     }
     let mut bytes = fs::read(path).map_err(|source| io_error(path, source))?;
+    let mut is_checked = true;
     if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
-        complete_jpeg(&mut bytes).map_err(|reason| format_error(path, reason))?;
+        is_checked = complete_jpeg(&mut bytes).map_err(|reason| format_error(path, reason))?;
     }
     let mut decoder = decoder(Cursor::new(bytes), path)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
         .map_err(|e| format_error(path, format!("incomplete or damaged image ({e})")))?;
+    if !is_checked {
+        return Err(format_error(path, "damaged JPEG: headers and image data don't match".into()));
+    }
     if is_upright {
         image.apply_orientation(orientation);
     }
@@ -157,14 +161,15 @@ fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelE
 }
 
 /// Fails if a JPEG lacks image data, which its decoder would replace by grey. Adds a missing end
-/// marker, without which the decoder omits the last rows.
-fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<(), String> {
+/// marker, without which the decoder omits the last rows. Returns whether image data were found.
+fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<bool, String> {
     match extent(jpeg) {
-        Extent::Whole => Ok(()),
+        Extent::Whole => Ok(true),
+        Extent::Unknown => Ok(false),
         Extent::Unterminated { end } => {
             jpeg.truncate(end);
             jpeg.extend(END_MARKER);
-            Ok(())
+            Ok(true)
         }
         Extent::Missing { rows, height } => {
             Err(format!("cut short or damaged: {rows} of {height} rows are missing"))
@@ -318,7 +323,7 @@ fn resize_nearest(image: &Rgba8, (width, height): (usize, usize)) -> Rgba8 {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::jpeg::tests::jpeg;
+    use crate::jpeg::tests::{hidden_jpeg, jpeg};
     use jpeg_encoder::SamplingFactor;
     use scene::Distortion;
 
@@ -455,6 +460,7 @@ pub(crate) mod tests {
             (&bytes[..100], "a.jpg: cut short or damaged: 64 of 64 rows are missing; export"),
             (&bytes[..20], "a.jpg: cannot read its header (Format error"),
             (&progressive[..progressive.len() - 1], "detail of all 64 rows is missing; export"),
+            (&hidden_jpeg(), "a.jpg: damaged JPEG: headers and image data don't match; export"),
         ] {
             let message = read(bytes).unwrap_err();
             assert!(message.contains(words), "{message}");
