@@ -435,7 +435,7 @@ fn contradictions_are_refused() {
         &folder,
         &out,
         r#"{"lr_source": "photographs", "lr_width": 16}"#,
-        &["parameter lr_width", "leave lr_width out"],
+        &["parameter lr_width", "omit lr_width"],
     );
     refused(
         &folder,

@@ -37,7 +37,7 @@ fn every_verb_finds_a_target_of_its_own_file() {
         (&["plan", "viewer"], &["train-ss", "viewer"]),
         (&["log", "camera-path", "video"], &["has not run yet"]),
         (&["gc", "refined", "--dry-run"], &["would be kept"]),
-        (&["describe", "train-refine"], &["Usage: train-refine ", "\nParameters: "]),
+        (&["describe", "train-refine"], &["Usage: train-refine ", "\nParameters, "]),
     ] {
         let said = project.ok(arguments);
         assert!(words.iter().all(|word| said.contains(word)), "{arguments:?}: {said}");

@@ -200,7 +200,7 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         ),
         (
             &["-p", "background=alpha", "-p", "supervision=kernel"],
-            "stage train-ss: parameter supervision: kernel needs a background",
+            "stage train-ss: parameter supervision: kernel needs an opaque background",
         ),
         (
             &["-p", "background=white,alpha", "-p", "exposure=true"],
