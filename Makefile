@@ -1,10 +1,11 @@
-# make demo    builds what the demo needs, and makes its page
-# make test    every test · make faults · make lint · make bench · make sweep · make clean
-# make help    all targets
+# make demo    builds the default pipeline's programs and runs the demo scene
+# make test    runs all tests · make faults · make lint · make bench · make sweep · make clean
+# make help    lists all targets
 
 SHELL := /bin/bash
 export PATH := $(HOME)/.cargo/bin:$(PATH)
-# The libtorch that scripts/setup-libtorch.sh makes, or your own; tests and doctests find it by this.
+# libtorch of scripts/setup-libtorch.sh, or of LIBTORCH. LD_LIBRARY_PATH is for doctests and other folders than .libtorch, which no
+# rpath covers.
 LIBTORCH_DIR := $(if $(LIBTORCH),$(LIBTORCH),$(CURDIR)/.libtorch)
 ifdef LIBTORCH_USE_PYTORCH
 LIBTORCH_DIR := $(shell python3 -c 'import pathlib, torch; print(pathlib.Path(torch.__file__).parent)')
@@ -12,56 +13,56 @@ endif
 export LD_LIBRARY_PATH := $(LIBTORCH_DIR)/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 
 NERF_SR := target/release/nerf-sr
-# Real scenes and network weights, for the targets that measure.
+# Folder with real scenes and network weights, read by the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
 .PHONY: help demo build-demo build remote install setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean reference goldens
 
-help: ## Show the targets
+help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
 
-# Says every eight seconds that a silent command still runs.
+# Reports every eight seconds that a silent command is still running.
 ALIVE := scripts/alive.sh
 
-setup: ## Put libtorch into .libtorch (once)
+setup: ## Download libtorch into .libtorch (once)
 	@$(ALIVE) scripts/setup-libtorch.sh
 
-# The one program with a network in it is built apart: in one build, what it asks of shared crates would have all others built again.
+# Built separately: in one build, its features of shared crates would be unified with all other programs', which would be rebuilt.
 REMOTE := nerf-sr-remote
-build: setup ## Build everything but nerf-sr-remote in the release profile
+build: setup ## Build all programs except nerf-sr-remote in the release profile
 	@$(ALIVE) cargo build --release --workspace --exclude $(REMOTE)
 
 remote: ## Build nerf-sr-remote, which shares stores between machines
 	@$(ALIVE) cargo build --release -p $(REMOTE)
 
-# The programs of the default pipeline do without libtorch. Once everything is built, the demo takes that: keys are the same.
-# tests/first_run.rs compares copies of these programs with the whole build.
+# The default pipeline's programs build without libtorch. If all programs are built already, the demo uses them: keys are equal.
+# tests/first_run.rs compares the copies in target/without-libtorch with the full build.
 DEMO_PROGRAMS := nerf-sr demo-scene prep train-ss render-depth eval report
 build-demo:
 	@command -v cargo >/dev/null || { echo "cargo is missing; install Rust 1.95 or newer (rustup)" >&2; exit 1; }
 	@$(ALIVE) cargo build --release --no-default-features $(DEMO_PROGRAMS:%=-p %)
 	@mkdir -p target/without-libtorch && cp -f $(DEMO_PROGRAMS:%=target/release/%) target/without-libtorch
 
-demo: $(if $(wildcard target/release/train-refine),build,build-demo) ## Build what the demo needs, the demo scene at ×2, and its page
+demo: $(if $(wildcard target/release/train-refine),build,build-demo) ## Build the default pipeline's programs and run the demo scene at ×2
 	@$(NERF_SR) run
 
 PREFIX ?= /usr/local
-# With sudo there may be no cargo: then what is built is installed.
+# Under sudo cargo may not be on the PATH; then the existing build is installed.
 install: $(if $(wildcard $(HOME)/.cargo/bin/cargo)$(shell command -v cargo),build remote) ## Install programs, completions and man pages: make install PREFIX=/usr/local DESTDIR=
 	@DESTDIR=$(DESTDIR) scripts/install.sh $(PREFIX) $(LIBTORCH_DIR)
 
-test: build remote ## Every test, the skipped and the slowest named; FILTER=WORDS for some of them
+test: build remote ## Run all tests and doctests, list skipped and slowest tests; FILTER=TEXT selects tests by name
 	@python3 scripts/run-tests.py $(FILTER)
 	cargo test --release --workspace --exclude $(REMOTE) --doc --quiet
 
 KILLS ?= 200
 RUNNERS ?= 10
 ROUNDS ?= 100
-faults: build remote ## Kills at random moments and at every call that changes a folder, files changed during runs, runners at once: make faults KILLS=200 ROUNDS=100 SEED=1
+faults: build remote ## Inject faults: kills at random moments and at every call that changes a folder, files changed during runs, concurrent runners: make faults KILLS=200 ROUNDS=100 SEED=1
 	NERF_SR_KILLS=$(KILLS) NERF_SR_ROUNDS=$(ROUNDS) NERF_SR_REPEAT=$(RUNNERS) NERF_SR_CALL_STEP=1 $(if $(SEED),NERF_SR_SEED=$(SEED)) \
 	  cargo test --release -p end-to-end --test kills --test random_changes --test sharing --test every_call -- --nocapture random_moments eight_runners every_call
 
-lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets; cargo-deny and typos where installed
+lint: setup ## Run rustfmt, clippy (with and without libtorch, fuzz targets included), and cargo-deny and typos if installed
 	cargo fmt --all --check
 	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
@@ -71,13 +72,13 @@ lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
 	@if command -v typos >/dev/null; then typos; else echo "typos is not installed: skipped"; fi
 
-# libFuzzer's coverage on a stable compiler; for the target alone, since build scripts have no libFuzzer to link with.
+# Flags of libFuzzer's coverage on a stable compiler. With --target they don't apply to build scripts, which have no libFuzzer to link.
 FUZZ_FLAGS := -Cpasses=sancov-module $(addprefix -Cllvm-args=-sanitizer-coverage-,level=4 inline-8bit-counters pc-table trace-compares)
 FUZZ_HOST = $(shell rustc -vV | sed -n 's/^host: //p')
 FUZZ_TARGETS ?= $(basename $(notdir $(wildcard tests/fuzz/src/bin/*.rs)))
 FUZZ_SECONDS ?= 60
 IN_FUZZ = cd tests/fuzz && FUZZ_SEEDS=$(CURDIR)/out/fuzz/seeds CARGO_TARGET_DIR=$(CURDIR)/target/fuzz
-fuzz: ## Broken files for every reader: make fuzz FUZZ_SECONDS=3600 FUZZ_TARGETS="colmap llff"
+fuzz: ## Fuzz every reader with damaged files: make fuzz FUZZ_SECONDS=3600 FUZZ_TARGETS="colmap llff"
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
 	@$(IN_FUZZ) RUSTFLAGS="$(FUZZ_FLAGS)" cargo build --release --quiet --target $(FUZZ_HOST)
 	@for target in $(FUZZ_TARGETS); do mkdir -p out/fuzz/corpus/$$target out/fuzz/seeds/$$target; \
@@ -85,7 +86,7 @@ fuzz: ## Broken files for every reader: make fuzz FUZZ_SECONDS=3600 FUZZ_TARGETS
 	    -artifact_prefix=out/fuzz/$$target- out/fuzz/corpus/$$target out/fuzz/seeds/$$target 2>&1 | tee out/fuzz/$$target.log | tail -3; \
 	  test $${PIPESTATUS[0]} = 0 || exit 1; done
 
-lego: build ## Real lego 100→200, plain NeRF beside supersampling
+lego: build ## Run lego 100→200 with plain NeRF and with supersampling
 	@$(NERF_SR) run -j 1 --out out/lego -i dataset=$(DATA)/nerf_synthetic/lego -i weights=$(DATA)/weights \
 	  -p rays=40000000 -p supersample=1,2
 
@@ -94,76 +95,76 @@ SCALE ?= 2
 LR ?= 100
 comma := ,
 list = $(subst $() $(),$(comma),$(strip $(1)))
-# The demo scene is made as large as the sweep needs.
+# Size of the demo scene: the sweep's largest HR width.
 DEMO_SIZE = $(shell python3 -c 'print(round(max(map(float, "$(LR)".split())) * max(map(float, "$(SCALE)".split()))))')
-sweep: build ## All combinations, e.g. make sweep KERNEL="lanczos average" SCALE="2 4" LR="100 200" DATASET=DIR (default: the demo scene)
+sweep: build ## Run all combinations: make sweep KERNEL="lanczos average" SCALE="2 4" LR="100 200" DATASET=DIR (default: the demo scene)
 	@$(NERF_SR) run --out out/sweep $(if $(DATASET),-i dataset=$(DATASET),-p demo-scene.size=$(DEMO_SIZE)) \
 	  -p kernel=$(call list,$(KERNEL)) -p prep.scale=$(call list,$(SCALE)) -p lr_width=$(call list,$(LR))
 
-# Experiments are files of experiments/; a variable that is given takes the place of what the file names.
+# Experiments are the files of experiments/. A variable that is set overrides the file's list.
 SCENES ?=
 PROTOCOLS ?=
 SUPERVISION ?=
-# Words of an option for each value: $(call each,-p ,$(SET)) is -p A=1 -p B=2.
+# Repeats an option for each value: $(call each,-p ,$(SET)) is -p A=1 -p B=2.
 each = $(foreach value,$(2),$(1)$(value))
 chosen = $(if $(SCENES),--scene $(call list,$(SCENES))) $(if $(PROTOCOLS),--protocol $(call list,$(PROTOCOLS))) --data $(or $(HELD_OUT),$(DATA)) \
   $(if $(SPLIT),-p split=$(SPLIT)) $(if $(RAYS),-p train-ss.rays=$(RAYS)) $(call each,-p ,$(SET))
-# Runs an experiment alone, so that times mean something, and copies its rows to OUT (JSON): $(call experiment,NAME,TABLE,more words)
+# Runs an experiment one stage at a time, so that times are comparable, and copies its rows to OUT (JSON): $(call experiment,NAME,ARGUMENTS)
 experiment = $(NERF_SR) run $(1) -j 1 --out out/$(1) $(chosen) $(2) && mkdir -p $(dir $(or $(OUT),out/$(1).json)) && \
   cp out/$(1)/$(1)/rows.json $(or $(OUT),out/$(1).json)
 QUALITY := quality$(if $(ENLARGED),-enlarged,$(if $(REFINED),-refined))
-quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" REFINED=1 SET="seed=1" OUT=FILE
+quality: build ## Score the protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" REFINED=1 SET="seed=1" OUT=FILE
 	@$(call experiment,$(QUALITY),$(if $(SUPERVISION),-p train-ss.supervision=$(call list,$(SUPERVISION))))
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr
 TABLES := paper-table paper-metrics paper-times
 TABLE = $(or $(OUT),out/table.md)
-# A quarter where a pixel has one ray instead of four, and where an image has a quarter of the pixels.
+# A quarter of the rays for fields with one ray per pixel instead of four, or with a quarter of the pixels per image.
 fewer_rays = -p train-ss.rays=$(1) $(foreach field,field-nerf-epochs downscaled-field,-p $(field).rays=$$(($(1) / 4)))
-table: build ## The paper's tables with every method: make table SCENES="lego" PROTOCOLS="100x2" METHODS="nerf bicubic imdn ss" OUT=FILE.md
+table: build ## Write the paper's tables with all methods: make table SCENES="lego" PROTOCOLS="100x2" METHODS="nerf bicubic imdn ss" OUT=FILE.md
 	@$(NERF_SR) run $(TABLES) -j 1 --data $(DATA) $(if $(SCENES),--scene $(call list,$(SCENES))) $(if $(PROTOCOLS),--protocol $(call list,$(PROTOCOLS))) \
 	  --show $(call list,$(METHODS)) $(if $(SPLIT),-p prep.split=$(SPLIT)) $(if $(RAYS),$(call fewer_rays,$(RAYS))) \
 	  $(if $(filter file,$(origin KERNEL)),,-p prep.kernel=$(firstword $(KERNEL))) $(call each,-p ,$(SET))
 	@mkdir -p $(dir $(TABLE)) && cat $(TABLES:%=out/%/table.md) > $(TABLE)
 	@for kind in json csv; do cp out/paper-table/rows.$$kind $(basename $(TABLE)).$$kind; done
 
-results: ## Put tables that experiments made in out/ into docs/results, whose comments name the commands
+results: ## Update the tables in docs/results from out/; the comment above each table is the command that writes it
 	UPDATE=1 cargo test --release -p end-to-end --test results --quiet -- --nocapture what_was_measured
 
 REFERENCES ?= 1
 MOST_REFERENCES = $(shell printf '%s\n' $(REFERENCES) | sort -n | tail -1)
-refine-table: build ## Rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE
+refine-table: build ## Compare rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE
 	@$(call experiment,refine-table,$(call each,--variant ,$(REFERENCES)) -p prep.hr_references=$(MOST_REFERENCES))
 
 PAPER_STEPS ?= 400
-refine-ablation: build ## What each part of refinement brings, on downscaled views that its training leaves out
+refine-ablation: build ## Measure the PSNR gain of each part of refinement, on downscaled views left out of the training
 	@$(call experiment,refine-ablation,$(if $(VARIANTS),--first-variants $(VARIANTS)))
 ifneq ($(PAPER_STEPS),0)
 	@$(NERF_SR) run paper-ablation -j 1 --out out/paper-ablation $(chosen) -p train-paper.steps=$(PAPER_STEPS)
 endif
 
-# Training views withheld from scenes, on which choices are made.
+# Data sets whose test views are withheld training views; settings are chosen on them.
 held-out:
 	@for scene in $(or $(SCENES),lego chair); do for folder in nerf_synthetic nerf_llff_data .; do \
 	  if [ -d $(DATA)/$$folder/$$scene ]; then python3 scripts/hold-out.py $(DATA)/$$folder/$$scene out/held-out/$$scene; break; fi; done; done >/dev/null
 
 ablation tradeoff: HELD_OUT = out/held-out
-ablation: build held-out ## What each part brings and costs, on withheld training views
+ablation: build held-out ## Measure PSNR and time of each part of the training, on withheld training views
 	@$(call experiment,ablation,$(if $(VARIANTS),--first-variants $(VARIANTS)))
 
-tradeoff: build held-out ## PSNR against training time, on withheld training views
+tradeoff: build held-out ## Measure PSNR against training time, on withheld training views
 	@$(call experiment,tradeoff)
 
-seeds: build ## Ten seeds on the demo scene: the spread of the PSNR
+seeds: build ## Measure the spread of the PSNR over ten seeds of the demo scene
 	@$(call experiment,seeds)
 
-bench-runner: build ## What the runner costs beside DVC and Snakemake, which this installs: out/bench-runner/table.md
+bench-runner: build ## Measure the runner's overhead against DVC and Snakemake (installed by pip): out/bench-runner/table.md
 	@python3 scripts/bench-runner.py
 
 BENCH_SCENE := out/bench/scene
-# Said to both builds: what an older one takes by itself differs.
+# Passed to both builds, because the default differs in older ones.
 BENCH_RAYS := $(or $(RAYS),3000000)
-bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene); SIMD=avx2|portable; AGAINST=FILE of an earlier run or the folder of another checkout
+bench: build ## Measure the engine's speed: rows of JSON in OUT=FILE (lego from DATA, otherwise the demo scene); SIMD=avx2|portable; AGAINST=FILE of an earlier run, or the folder of another checkout
 	@rm -rf out/bench && mkdir -p out/bench
 	@if [ -d $(DATA)/nerf_synthetic/lego ]; then ln -s $(abspath $(DATA))/nerf_synthetic/lego out/bench/data; \
 	  else target/release/demo-scene --output out/bench/data; fi
@@ -172,14 +173,14 @@ bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA,
 	@against="$(abspath $(AGAINST))"; if [ -d "$$against" ]; then $(MAKE) -C "$$against" bench AGAINST= RAYS=$(BENCH_RAYS) DATA=$(abspath $(DATA)) OUT=$(abspath out/bench-against.json) && against=$(abspath out/bench-against.json) || exit; fi; \
 	  SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) SIMD=$(SIMD) RAYS=$(BENCH_RAYS) AGAINST="$$against" cargo bench --quiet -p train-ss --bench bench
 
-compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout; RAYS="FACTOR …" or BUDGETS=1, SCENES="lego 100x2" PICTURE=FILE.svg
+compare-engines: build ## Compare training and rendering of this build and of AGAINST=DIR, another built checkout; RAYS="FACTOR …" or BUDGETS=1, SCENES="lego 100x2" PICTURE=FILE.svg
 	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS)) $(if $(BUDGETS),--budgets) $(if $(SCENES),--only "$(SCENES)") $(if $(PICTURE),--picture $(PICTURE))
 
-reference: build ## Make schemas/ and docs/reference/ anew, from the types and the built programs
+reference: build ## Regenerate schemas/ and docs/reference/ from the types and the built programs
 	UPDATE=1 cargo test --release --workspace --exclude $(REMOTE) --test schemas
 
-goldens: ## Make the golden files anew, with pinned versions of Pillow, scikit-image and PyTorch
+goldens: ## Regenerate the golden files with pinned versions of Pillow, scikit-image and PyTorch
 	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens/requirements.txt && .venv/bin/python scripts/goldens
 
-clean: ## Remove what was built and run (not .libtorch)
+clean: ## Remove target, .nerf-sr and out (not .libtorch)
 	rm -rf target .nerf-sr out
