@@ -1,7 +1,7 @@
-"""Makes the golden files that other implementations give: python scripts/goldens
+"""Generates the golden files from other implementations: python scripts/goldens
 
-They lie in `tests/goldens/` of their crate. Checkpoints for tests/checkpoint.rs lie in `tests/data/`. `make goldens` installs the packages
-that requirements.txt pins.
+Golden files are written to `tests/goldens/` of each crate, checkpoints for tests/checkpoint.rs to `tests/data/`. `make goldens` first
+installs the packages that requirements.txt pins.
 """
 
 import pathlib

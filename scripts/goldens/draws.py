@@ -1,4 +1,4 @@
-"""The draws of `counter_rng::uniform`, repeated, so that golden files needn't keep drawn weights. Not a program."""
+"""Module that repeats the draws of `counter_rng::uniform`, so that golden files needn't contain random weights."""
 
 import numpy
 
@@ -11,7 +11,7 @@ def scramble(x):
 
 
 def uniform(seed: int, purpose: int, count: int) -> numpy.ndarray:
-    """Numbers in [0, 1) with 24 bits, in f64: counters 0, 1, ..."""
+    """Returns numbers in [0, 1) with 24 bits, as f64, for the counters 0, 1, ..."""
     with numpy.errstate(over="ignore"):
         start = scramble(numpy.uint64(seed) ^ (numpy.uint64(purpose) * numpy.uint64(0xD1B54A32D192ED03)))
         state = scramble(start ^ numpy.arange(count, dtype=numpy.uint64)) + numpy.uint64(0x9E3779B97F4A7C15)

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Makes the golden files of `pixels` and `eval`, from Pillow, scikit-image and PyTorch: run by `make goldens`.
+"""Generates the golden files of `pixels` and `eval` with Pillow, scikit-image and PyTorch: run by `make goldens`.
 
-Inputs come from an integer formula that the tests repeat (`pattern`), so only outputs are kept.
+Inputs are computed by an integer formula that the tests repeat (`pattern`), so golden files contain only outputs.
 """
 
 import json
@@ -18,7 +18,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 
 def pattern(width, height, channels, seed):
-    """Bytes with flat areas, edges, noise, and alpha of every kind. Repeated in Rust by the tests."""
+    """Returns an image with gradients, edges, noise, and opaque, transparent and partial alpha. The Rust tests repeat this formula."""
     out = numpy.zeros((height, width, channels), numpy.uint8)
     state = seed
     for y in range(height):
@@ -55,7 +55,7 @@ def pillow():
 
 
 def ssim():
-    """`valid` from scikit-image, `reflect` from PyTorch's padding, both in f64."""
+    """Writes SSIM values in f64: `valid` by scikit-image, `reflect` with PyTorch's reflection padding."""
     import skimage
     import torch
     from skimage.metrics import structural_similarity
@@ -92,12 +92,13 @@ def ssim():
 
 
 def lpips():
-    """LPIPS by PyTorch's layers, with weights that are drawn: every network, one pair of images."""
+    """Writes LPIPS distances of one pair of images for each network, computed by PyTorch's layers with random weights."""
     import torch
     from torch.nn import functional
 
     fire = lambda i, inputs, squeezed, expanded: (i, inputs, squeezed, expanded)
-    # A number: a stage's end; P: a pooling (size, with the border); (index, inputs, outputs, size, stride, padding); or a fire.
+    # Layers: a number ends a stage of that many channels; ("P", size, ceil_mode) is a max pooling; a tuple of six is a convolution (index,
+    # inputs, outputs, size, stride, padding); a tuple of four is a fire module.
     networks = {
         "squeeze": [(0, 3, 64, 3, 2, 0), 64, ("P", 3, True), fire(3, 64, 16, 64), fire(4, 128, 16, 64), 128, ("P", 3, True),
                     fire(6, 128, 32, 128), fire(7, 256, 32, 128), 256, ("P", 3, True), fire(9, 256, 48, 192), 384,

@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
-"""Makes the golden files of `paper-refiner`, from PyTorch's own layers in f64: run by `make goldens`.
+"""Generates the golden files of `paper-refiner` with PyTorch's own layers in f64: run by `make goldens`.
 
-The network and VGG-19's blocks are built here from their published description, with narrow layers and fixed random weights: features after
-each block, the network's output with running and with batch statistics, the loss with and without its perceptual part, and all gradients.
+The network and VGG-19's blocks are built here from their published descriptions, with narrow layers and fixed random weights. Golden files
+contain features after each block, the network's output with running and with batch statistics, the loss with and without its perceptual
+part, and all gradients.
 """
 
 import pathlib
@@ -68,7 +69,7 @@ WIDTHS = [4, 4, 6, 6, 6]
 
 
 def vgg(kind):
-    """Random weights of the blocks, by name, and the features that are compared."""
+    """Writes random weights of the blocks and returns the perceptual distance that uses them."""
     weights, inputs, index, convs = {}, 3, 0, []
     for block in range(3 if kind == "caffe" else 5):
         for i in range(BLOCKS[block]):

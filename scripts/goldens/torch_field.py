@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Makes the golden file of the paper's field (`torch-field`), from PyTorch's own layers and optimiser: run by `make goldens`.
+"""Generates the golden file of the paper's field (`torch-field`) with PyTorch's own layers and optimiser: run by `make goldens`.
 
-The networks, the sampling and the compositing are built here from their published description. Inputs and weights come from the
-counter-based draws of `counter_rng::uniform`, which are repeated here, so only outputs are kept: one safetensors file. Besides, two
-small checkpoints for tests/checkpoint.rs.
+Networks, sampling and compositing are built here from their published descriptions. Inputs and weights are draws of
+`counter_rng::uniform`, which draws.py repeats, so the safetensors file contains only outputs. The script also writes two small
+checkpoints for tests/checkpoint.rs.
 """
 
 import collections
@@ -20,7 +20,7 @@ SEED = 11
 
 
 def draw(purpose, *shape):
-    """Numbers in [0, 1), as `counter_rng::uniform(SEED, purpose, 0..)` gives them."""
+    """Returns the numbers in [0, 1) of `counter_rng::uniform(SEED, purpose, 0..)`."""
     return torch.from_numpy(draws.uniform(SEED, purpose, math.prod(shape))).reshape(shape)
 
 
@@ -32,7 +32,7 @@ def encode(x, octaves):
 
 
 class Network(torch.nn.Module):
-    """Eight layers (here: depth) with the position joining in again at the fifth; density and a feature; colour by direction."""
+    """NeRF's network: `depth` layers with a skip connection of the position to the fifth; heads for density, feature and colour."""
 
     def __init__(self, octaves, depth, width, purpose):
         super().__init__()
@@ -101,13 +101,13 @@ def look(network, origin, direction, t, background, noise):
 
 out = {}
 
-# The published size, forward, in single precision.
+# Forward pass at the published size, in single precision.
 full = Network((10, 4), 8, 256, 1000).float()
 position, direction = (4 * draw(1, 8, 3) - 2).float(), (2 * draw(2, 8, 3) - 1).float()
 out["encoding"] = encode(position, 10)
 out["full.colour"], out["full.density"] = (x.detach() for x in full(position, direction))
 
-# A small one through a whole step, in double precision.
+# Three training steps of small networks, in double precision.
 n, m = 8, 8
 coarse, fine = Network((4, 2), 6, 16, 2000), Network((4, 2), 6, 16, 3000)
 origin = 0.5 * draw(3, n, 3) + torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
@@ -134,7 +134,7 @@ for step in range(3):
         out |= {"stratified": t, "importance": more, "coarse.weights": coarse_weights, "fine.weights": fine_weights}
         out |= {"coarse.colour": coarse_colour, "fine.colour": fine_colour, "loss": loss.reshape(1)}
         out["gradient"] = torch.cat([p.grad.reshape(-1) for p in parameters])
-        # The same rays without draws: where samples lie when a view is rendered.
+        # Sample positions of the same rays in rendering, without random draws.
         edges = (even[:, 1:] + even[:, :-1]) / 2
         out["importance.even"] = importance(edges, coarse_weights[:, 1:-1], torch.linspace(0, 1, m, dtype=torch.float64).expand(n, m))
     optimiser.step()
@@ -145,8 +145,8 @@ path.parent.mkdir(parents=True, exist_ok=True)
 save_file({name: x.detach().contiguous() for name, x in out.items()}, path, {"torch": torch.__version__.split("+")[0]})
 print(path, path.stat().st_size)
 
-# Checkpoints of the reference's shape, in miniature, for scripts/convert-checkpoint.py: tensor k holds k, k + 1/8, k + 2/8 …
-# The coarse one comes from several GPUs, the fine one has half precision and a transposed tensor.
+# Small checkpoints in the reference implementation's layout, for scripts/convert-checkpoint.py: tensor k contains k, k + 1/8, k + 2/8 …
+# The coarse one has names of a multi-GPU checkpoint, the fine one has half precision and a transposed tensor.
 names = [f"xyz_encoding_{i + 1}.0" for i in range(6)] + ["sigma", "xyz_encoding_final", "dir_encoding.0", "rgb.0"]
 position, direction, width = 15, 9, 8
 inputs = [position, width, width, width, position + width, width, width, width, width + direction, width // 2]

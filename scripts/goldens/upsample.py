@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Makes the golden files of `upsample`, from PyTorch's own layers: run by `make goldens`.
+"""Generates the golden files of `upsample` with PyTorch's own layers: run by `make goldens`.
 
-The networks are built here from their papers' descriptions, small and with fixed random weights, and run in f64. A file has a network's
-weights, inputs (golden.input.N) and outputs (golden.output.N). Some weights are saved as their projects release them, too, for
-tests/checkpoint.rs.
+The networks are built here from their papers' descriptions, small and with fixed random weights, and run in f64. A file contains a
+network's weights, inputs (golden.input.N) and outputs (golden.output.N). Some weights are also saved in the format of their project's
+releases, for tests/checkpoint.rs.
 
-With NERF_SR_DATA (or ../shared/data) there, IMDN's released weights are run on ten test views, too, and the scores are kept.
+If NERF_SR_DATA (or ../shared/data) exists, the scores of IMDN's released weights on ten test views are also written.
 """
 
 import json
@@ -30,7 +30,7 @@ def conv(inputs, outputs, size=3):
 
 
 class Distillation(nn.Module):
-    """IMDN's block: a quarter of the channels is kept after each layer; channels are weighed by contrast."""
+    """IMDN's block: each layer passes a quarter of the channels to the output; contrast-aware attention weights channels."""
 
     def __init__(self, width):
         super().__init__()
@@ -75,7 +75,7 @@ class Imdn(nn.Module):
 
 
 class Liif(nn.Module):
-    """EDSR's baseline encoder and LIIF's function: features unfolded, local ensemble, cells decoded."""
+    """EDSR's baseline encoder with LIIF's decoder: feature unfolding, local ensemble, cell decoding."""
 
     def __init__(self, width, blocks, hidden):
         super().__init__()
@@ -226,7 +226,7 @@ class SwinIr(nn.Module):
 
 
 def golden(name, network, cases):
-    """`cases`: (rows, columns of the input, further arguments)."""
+    """Writes a network's golden file and returns its weights; `cases` are tuples (rows, columns of the input, further arguments)."""
     tensors = {key: value.detach().float().clone() for key, value in network.state_dict().items()}
     network.double()
     for i, (rows, columns, *more) in enumerate(cases):
@@ -258,7 +258,7 @@ first = "layers.0.residual_group.blocks"
 extra = {f"{first}.0.attn.relative_position_index": torch.zeros(16, 16, dtype=torch.long), f"{first}.1.attn_mask": torch.zeros(4, 16, 16)}
 released("swinir", {"params": light | extra})
 
-# IMDN as released, on ten test views at 200 px over white, LR by Pillow's bicubic filter.
+# Scores of IMDN's released weights on ten test views at 200 px over white; LR images by Pillow's bicubic filter.
 data = pathlib.Path(os.environ.get("NERF_SR_DATA", ROOT.parent / "shared/data"))
 if (data / "weights/imdn_x2.safetensors").is_file():
     scores = {}
