@@ -1,5 +1,5 @@
-"""Reads PyTorch's checkpoints and writes safetensors, with nothing but Python: a checkpoint is a ZIP file of a pickle and raw numbers, of
-which no code is run. Not a program."""
+"""Module that reads PyTorch checkpoints and writes safetensors, with the standard library only. A checkpoint is a ZIP file of a pickle and
+raw numbers; no code in the pickle is executed."""
 
 import array
 import collections
@@ -11,15 +11,15 @@ import struct
 import sys
 import zipfile
 
-# Kinds of numbers, as `struct` calls them.
+# Format characters of `struct` for PyTorch's storage types.
 KINDS = {"FloatStorage": "f", "HalfStorage": "e", "DoubleStorage": "d", "LongStorage": "q", "IntStorage": "i", "BoolStorage": "?"}
 
-# A tensor: its shape, and its numbers row by row.
+# Tensor with its shape and its numbers in row-major order.
 Tensor = collections.namedtuple("Tensor", ["shape", "numbers"])
 
 
 class Unpickler(pickle.Unpickler):
-    """Reads dictionaries of tensors, lists, texts and numbers; anything else in the pickle is refused."""
+    """Unpickler of dictionaries, lists, tensors, strings and numbers; all other objects are refused."""
 
     def __init__(self, archive: zipfile.ZipFile, name: str):
         super().__init__(archive.open(name))
@@ -33,7 +33,7 @@ class Unpickler(pickle.Unpickler):
             **{("torch", kind): kind for kind in KINDS},
         }
         if (module, name) not in allowed:
-            raise ValueError(f"it holds a {module}.{name}; weights alone are expected")
+            raise ValueError(f"the pickle contains {module}.{name}; only tensors are expected")
         return allowed[module, name]
 
     def persistent_load(self, identity):
@@ -52,7 +52,7 @@ class Unpickler(pickle.Unpickler):
 
 
 def read(path: pathlib.Path) -> dict:
-    """What a checkpoint holds."""
+    """Returns the content of a checkpoint; exits with one line if the file can't be read."""
     try:
         with zipfile.ZipFile(path) as archive:
             (name,) = [name for name in archive.namelist() if name.endswith("data.pkl")]
@@ -66,14 +66,14 @@ def read(path: pathlib.Path) -> dict:
 
 
 def tensors(path: pathlib.Path, state: dict) -> dict:
-    """A dictionary that has nothing but tensors; without the prefix that checkpoints of several GPUs have before each name."""
+    """Checks that a dictionary contains only tensors; returns them without `module.`, the name prefix of multi-GPU checkpoints."""
     if not isinstance(state, dict) or not all(isinstance(tensor, Tensor) for tensor in state.values()):
         sys.exit(f"{path}: not a dictionary of tensors")
     return {name.removeprefix("module."): tensor for name, tensor in state.items()}
 
 
 def check(path: pathlib.Path, state: dict, expected: dict, network: str) -> dict:
-    """The tensors, once their names, shapes and numbers are those of the network."""
+    """Returns the tensors if names and shapes are those of the network and all numbers are finite; exits otherwise."""
     for name in sorted(expected.keys() | state.keys()):
         if name not in state:
             sys.exit(f"{path}: tensor {name} is missing; is it {network}?")
@@ -81,14 +81,14 @@ def check(path: pathlib.Path, state: dict, expected: dict, network: str) -> dict
             sys.exit(f"{path}: tensor {name} doesn't belong to {network}")
         shape, numbers = state[name]
         if shape != expected[name]:
-            sys.exit(f"{path}: tensor {name} is {shape} where {expected[name]} is expected")
+            sys.exit(f"{path}: tensor {name}: expected shape {expected[name]}, found {shape}")
         if not all(map(math.isfinite, numbers)):
-            sys.exit(f"{path}: tensor {name} is not finite")
+            sys.exit(f"{path}: tensor {name} has numbers that are not finite")
     return state
 
 
 def write(path: pathlib.Path, state: dict) -> None:
-    """Writes tensors as safetensors of f32, so that bytes repeat."""
+    """Writes tensors as f32 safetensors, sorted by name so that equal tensors give equal bytes."""
     header, data = {}, bytearray()
     for name, (shape, numbers) in sorted(state.items()):
         numbers = array.array("f", numbers)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Turns checkpoints of the reference implementation into a field that `render-depth` renders.
+"""Converts checkpoints of the reference implementation to a field that `render-depth` renders.
 
     scripts/convert-checkpoint.py 20_net_Coarse.pth 20_net_Fine.pth converted/
     nerf-sr run render-depth ...      # with `inputs: {field: ./converted, cameras: prep/cameras}` in pipeline.yaml
 
-Needs nothing but Python (scripts/checkpoints.py). Sizes of the networks are read from their layers; every key and shape is checked.
+Needs only Python's standard library. Sizes of the networks are read from their layers; all names and shapes are checked.
 """
 
 import argparse
@@ -17,20 +17,20 @@ import checkpoints
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("coarse", type=pathlib.Path, help="EPOCH_net_Coarse.pth")
 parser.add_argument("fine", type=pathlib.Path, help="EPOCH_net_Fine.pth")
-parser.add_argument("out", type=pathlib.Path, help="folder to make")
-parser.add_argument("--near", type=float, default=2.0, help="where rays begin (Blender scenes: 2)")
-parser.add_argument("--far", type=float, default=6.0, help="where rays end (Blender scenes: 6)")
+parser.add_argument("out", type=pathlib.Path, help="folder to create")
+parser.add_argument("--near", type=float, default=2.0, help="distance at which rays begin (default 2, for Blender scenes)")
+parser.add_argument("--far", type=float, default=6.0, help="distance at which rays end (default 6, for Blender scenes)")
 parser.add_argument("--background", choices=["white", "black"], default="white")
 options = parser.parse_args()
 
 def octaves(path: pathlib.Path, inputs: int) -> int:
     if inputs < 3 or inputs % 6 != 3:
-        sys.exit(f"{path}: {inputs} inputs are no encoded position or direction (3 and 6 for every octave)")
+        sys.exit(f"{path}: {inputs} inputs, which is not the size of an encoded position or direction (3 and 6 per octave)")
     return (inputs - 3) // 6
 
 
 def sizes(path: pathlib.Path, state: dict) -> dict:
-    """What the layers say of the network."""
+    """Returns the network's sizes, read from its layers."""
     try:
         width, position = state["xyz_encoding_1.0.weight"][0]
         direction = state["dir_encoding.0.weight"][0][1] - width
@@ -41,10 +41,10 @@ def sizes(path: pathlib.Path, state: dict) -> dict:
 
 
 def shapes(network: dict) -> dict:
-    """Names and shapes of a network's tensors."""
+    """Returns the shapes of a network's tensors by name."""
     position, direction = (3 + 6 * network[f"{of}_frequencies"] for of in ("position", "direction"))
     width, depth = network["hidden_dim"], network["layers"]
-    # The position joins in again at the fifth layer.
+    # Skip connection: the fifth layer also reads the encoded position.
     layers = {f"xyz_encoding_{i + 1}.0": (position if i == 0 else position + width if i == 4 else width, width) for i in range(depth)}
     layers |= {"sigma": (width, 1), "xyz_encoding_final": (width, width)}
     layers |= {"dir_encoding.0": (width + direction, width // 2), "rgb.0": (width // 2, 3)}
@@ -58,7 +58,7 @@ for prefix, path in (("coarse", options.coarse), ("fine", options.fine)):
     checked = checkpoints.check(path, state, shapes(networks[-1]), "a VanillaMLP")
     tensors |= {f"{prefix}.{name}": tensor for name, tensor in checked.items()}
 if networks[0] != networks[1]:
-    sys.exit(f"{options.fine}: its network is {networks[1]}, that of {options.coarse} {networks[0]}")
+    sys.exit(f"{options.fine}: network sizes {networks[1]} differ from {networks[0]} in {options.coarse}")
 
 checkpoints.write(options.out / "field-0.safetensors", tensors)
 reach = options.far

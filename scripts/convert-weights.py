@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Turns released weights of super-resolution networks into the safetensors files that `upsample` reads.
+"""Converts released weights of super-resolution networks to the safetensors files that `upsample` reads.
 
     scripts/convert-weights.py imdn IMDN_x2.pth weights/imdn_x2.safetensors
     scripts/convert-weights.py liif edsr-baseline-liif.pth weights/liif.safetensors
     scripts/convert-weights.py swinir 001_classicalSR_DF2K_s64w8_SwinIR-M_x2.pth weights/swinir_x2.safetensors
 
-Needs nothing but Python (scripts/checkpoints.py). Sizes are read from the layers; every key and shape is checked. What a network
-can make anew (LIIF's unused colour shifts, SwinIR's masks and indices) is left out.
+Needs only Python's standard library. Sizes are read from the layers; all names and shapes are checked. Tensors that `upsample` doesn't
+use or computes itself (LIIF's colour shifts, SwinIR's masks and indices) are left out.
 """
 
 import argparse
@@ -19,8 +19,8 @@ import checkpoints
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("network", choices=["imdn", "liif", "swinir"])
-parser.add_argument("checkpoint", type=pathlib.Path, help="FILE.pth as released")
-parser.add_argument("out", type=pathlib.Path, help="FILE.safetensors to make")
+parser.add_argument("checkpoint", type=pathlib.Path, help="released FILE.pth")
+parser.add_argument("out", type=pathlib.Path, help="FILE.safetensors to write")
 options = parser.parse_args()
 
 
@@ -33,7 +33,7 @@ def conv(name: str, outputs: int, inputs: int, size: int = 3) -> dict:
 
 
 def count(state: dict, pattern: str) -> int:
-    """How many numbered things there are."""
+    """Returns the number of distinct numbers that the pattern's group matches in the tensors' names."""
     return len({match[1] for name in state if (match := re.match(pattern, name))})
 
 
@@ -84,7 +84,7 @@ def swinir(state: dict) -> dict:
             hidden = state[f"{block}.mlp.fc1.weight"].shape[0]
             table, heads = state[f"{block}.attn.relative_position_bias_table"].shape
             if (math.isqrt(table) % 2, math.isqrt(table) ** 2) != (1, table):
-                sys.exit(f"{options.checkpoint}: a table of {table} biases is no square window's")
+                sys.exit(f"{options.checkpoint}: a table of {table} biases doesn't fit a square window")
             expected |= norm(f"{block}.norm1") | norm(f"{block}.norm2")
             expected |= {f"{block}.attn.relative_position_bias_table": (table, heads)}
             expected |= layer(f"{block}.attn.qkv", 3 * width, width) | layer(f"{block}.attn.proj", width, width)
@@ -103,7 +103,7 @@ def swinir(state: dict) -> dict:
 
 
 whole = checkpoints.read(options.checkpoint)
-# Where projects keep the weights in what they save.
+# Keys under which the projects save the weights.
 for key in ("params_ema", "params", "model", "sd"):
     if isinstance(whole, dict) and isinstance(whole.get(key), dict):
         whole = whole[key]
@@ -114,6 +114,6 @@ try:
 except KeyError as error:
     sys.exit(f"{options.checkpoint}: tensor {error.args[0]} is missing; is it {options.network}?")
 except (IndexError, ValueError):
-    sys.exit(f"{options.checkpoint}: its tensors' shapes aren't those of {options.network}")
+    sys.exit(f"{options.checkpoint}: the tensors' shapes are not those of {options.network}")
 checkpoints.write(options.out, checkpoints.check(options.checkpoint, state, expected, options.network))
 print(f"{options.out}: {len(state)} tensors")
