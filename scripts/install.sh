@@ -1,21 +1,21 @@
 #!/usr/bin/env bash
-# Installs what `make build` and `make remote` made: install.sh PREFIX [LIBTORCH]; `make install PREFIX=…` calls this.
+# Installs the programs of `make build` and `make remote`: install.sh PREFIX [LIBTORCH]; `make install PREFIX=…` calls this script.
 #
-# PREFIX/lib/nerf-sr has the programs and, beside them, where their rpath looks first, the libraries of LIBTORCH that they need.
-# PREFIX/bin has links. DESTDIR goes before PREFIX, for whoever makes packages.
+# PREFIX/lib/nerf-sr gets the programs and the libraries of LIBTORCH that they need; the programs' rpath searches this folder first.
+# PREFIX/bin gets links. DESTDIR is prepended to PREFIX, for package builds.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 die() { echo "install: $*" >&2; exit 1; }
-[ $# -ge 1 ] || die "name a folder: scripts/install.sh PREFIX [LIBTORCH]"
-case $1 in /*) ;; *) die "PREFIX=$1: give an absolute path, such as PREFIX=$PWD/$1" ;; esac
+[ $# -ge 1 ] || die "PREFIX is missing; usage: scripts/install.sh PREFIX [LIBTORCH]"
+case $1 in /*) ;; *) die "PREFIX=$1 is not absolute; give an absolute path, such as PREFIX=$PWD/$1" ;; esac
 built=${BUILT:-target/release}
 libtorch=$(realpath "${2:-.libtorch}")/lib
 root=${DESTDIR:-}$1
 home=$root/lib/nerf-sr
-if [ -e "$home" ] && [ ! -e "$home/nerf-sr" ]; then die "$home is there and isn't nerf-sr's; choose another PREFIX"; fi
+if [ -e "$home" ] && [ ! -e "$home/nerf-sr" ]; then die "$home exists and has no nerf-sr; choose another PREFIX"; fi
 
-# A stage's folder, crate and binary have one name. nerf-sr-remote is built apart; without it the rest is whole.
+# A stage's folder, crate and binary have one name. nerf-sr-remote is optional, because it is built separately.
 commands=(nerf-sr)
 [ ! -x "$built/nerf-sr-remote" ] || commands+=(nerf-sr-remote)
 programs=("${commands[@]}")
@@ -24,10 +24,10 @@ for folder in stages/*/; do
   case $name in common | runner) ;; *) programs+=("$name") ;; esac
 done
 for name in "${programs[@]}"; do
-  [ -x "$built/$name" ] || die "$name isn't built; run \`make build\`"
+  [ -x "$built/$name" ] || die "$built/$name not found; run \`make build\`"
 done
 
-# Libraries that programs need and that come from libtorch, not from the system.
+# Libraries that the programs need from libtorch; others are the system's.
 libraries=$(cd "$built" && LD_LIBRARY_PATH=$libtorch ldd "${programs[@]/#/./}" | awk '/=> \// {print $3}' | sort -u | xargs realpath | sort -u |
   while read -r file; do case $file in "$libtorch"/*) echo "$file" ;; esac; done)
 [ -n "$libraries" ] || die "$libtorch has no library that these programs need; run \`make build\`"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Puts the npm packages of tests/browser into target/browser, as their lock file's hashes say. The browser is Debian's chromium.
+# Installs the npm packages of tests/browser into target/browser, with the hashes of their lock file. The browser is Debian's chromium.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 home=target/browser

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Puts a CPU libtorch that tch 0.26 links against into .libtorch/ (425 MB; no GPU needed to link or run).
+# Installs a CPU libtorch for tch 0.26 into .libtorch/ (425 MB; linking and running need no GPU).
 #
-# The parts come from Python wheels, fetched by pip into .libtorch/wheels and checked against the sizes and hashes below.
-# Safe to call again: what is there and right is kept, an interrupted download starts over, a finished set-up returns at once.
-# An existing LIBTORCH, or LIBTORCH_USE_PYTORCH=1, is honoured: then this does nothing.
+# The files come from Python wheels, which pip downloads into .libtorch/wheels and which are checked against the sizes and hashes below.
+# Safe to run again: intact wheels are kept, an interrupted download starts over, and a finished installation returns at once.
+# If LIBTORCH or LIBTORCH_USE_PYTORCH=1 is set, nothing is installed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -11,11 +11,11 @@ say() { echo "setup-libtorch: $*" >&2; }
 die() { say "$*"; exit 1; }
 
 if [ -n "${LIBTORCH_USE_PYTORCH:-}" ]; then
-  python3 -c 'import torch' 2>/dev/null || die "LIBTORCH_USE_PYTORCH is set, but python3 has no torch; pip install torch==2.13.0 or unset it"
+  python3 -c 'import torch' 2>/dev/null || die "LIBTORCH_USE_PYTORCH is set, but python3 has no torch; run pip install torch==2.13.0, or unset LIBTORCH_USE_PYTORCH"
   say "using the libtorch of the installed PyTorch (LIBTORCH_USE_PYTORCH)"; exit 0
 fi
 if [ -n "${LIBTORCH:-}" ]; then
-  [ -e "$LIBTORCH/lib/libtorch.so" ] || die "LIBTORCH=$LIBTORCH has no lib/libtorch.so; point it at an unpacked libtorch 2.13 or unset it"
+  [ -e "$LIBTORCH/lib/libtorch.so" ] || die "LIBTORCH=$LIBTORCH has no lib/libtorch.so; set LIBTORCH to an unpacked libtorch 2.13, or unset LIBTORCH"
   say "using LIBTORCH=$LIBTORCH"; exit 0
 fi
 
@@ -28,7 +28,7 @@ command -v g++ >/dev/null || die "g++ is missing; apt-get install g++"
 command -v python3 >/dev/null || die "python3 is missing; apt-get install python3 python3-pip"
 python3 -m pip --version >/dev/null 2>&1 || die "pip is missing; apt-get install python3-pip"
 free_kb=$(df -Pk . | awk 'NR==2 {print $4}')
-[ "$free_kb" -gt 2000000 ] || die "2 GB of disk are needed here, $((free_kb / 1024)) MB are free"
+[ "$free_kb" -gt 2000000 ] || die "2 GB of free disk space are required in $PWD, $((free_kb / 1024)) MB are free"
 
 # requirement | file | bytes | sha256
 wheels="
@@ -40,13 +40,13 @@ mkdir -p "$home/wheels" "$home/lib"
 intact() { [ -f "$1" ] && [ "$(stat -c %s "$1")" = "$2" ] && [ "$(sha256sum "$1" | cut -d' ' -f1)" = "$3" ]; }
 for line in $wheels; do
   IFS='|' read -r requirement file bytes sha <<<"$line"
-  if intact "$home/wheels/$file" "$bytes" "$sha"; then say "$requirement: already here"; continue; fi
+  if intact "$home/wheels/$file" "$bytes" "$sha"; then say "$requirement: already downloaded"; continue; fi
   rm -f "$home/wheels/$file"
-  say "$requirement: fetching $((bytes / 1000000)) MB"
-  # The wheel is named by Python version; only its C++ libraries are used, so any Python 3 may fetch this one.
+  say "$requirement: downloading $((bytes / 1000000)) MB"
+  # Only the wheel's C++ libraries are used, so the wheel's Python version need not be that of python3.
   python3 -m pip download --quiet --no-deps --only-binary=:all: --dest "$home/wheels" --implementation cp --python-version 3.11 \
     --abi cp311 --abi none --platform manylinux_2_28_x86_64 --platform manylinux_2_25_x86_64 --platform manylinux2014_x86_64 \
-    "$requirement" || die "$requirement could not be fetched; check the network and run make again"
+    "$requirement" || die "cannot download $requirement; check the network and run make again"
   intact "$home/wheels/$file" "$bytes" "$sha" || die "$file differs from the recorded size or hash; delete $home and run make again"
 done
 
@@ -76,10 +76,10 @@ for prefix, members in wanted.items():
                 with archive.open(info) as source, open(target, "wb") as out:
                     shutil.copyfileobj(source, out, 1 << 20)
 PY
-# tch links -ltorch; the wheel's own libtorch.so pulls in CUDA.
+# tch links -ltorch, but the wheel's libtorch.so depends on CUDA; this linker script replaces that library.
 echo "INPUT(-ltorch_cpu)" >"$home/lib/libtorch.so"
 for file in libtorch_cpu.so libc10.so libgomp.so.1 libcudart.so.13 libcupti.so.13; do
-  [ -s "$home/lib/$file" ] || die "$file was not in the wheels; delete $home and run make again"
+  [ -s "$home/lib/$file" ] || die "$file not found in the wheels; delete $home and run make again"
 done
 rm -rf "$home/wheels"
 touch "$done_mark"
