@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# A one-node Slurm in a private, short-named folder, for tests: no systemd, no cgroups, no database, loopback only, no root.
+# Starts or stops a one-node Slurm in a private folder for tests: no systemd, cgroups, database or root, loopback only.
 # usage: MINI_SLURM_PORT=17000 mini-slurm.sh start|stop DIR; then SLURM_CONF=DIR/slurm.conf sbatch …
-# It takes that port and the next. The node claims four cores, whatever the machine has.
+# Slurm uses that port and the next. The node is configured with four cores on any machine. DIR must be short: it contains a socket.
 set -euo pipefail
 verb=${1:?start|stop}; dir=$(realpath -m "${2:?a folder}"); port=${MINI_SLURM_PORT:-16817}
-# Debian puts the daemons where an ordinary user's PATH doesn't look.
+# Debian installs the daemons in /usr/sbin, which is not on an ordinary user's PATH.
 PATH=$PATH:/usr/sbin
 host=$(hostname -s); me=$(id -un)
 
@@ -20,7 +20,7 @@ configure() {
   : > "$dir/cgroup.conf"
   if [ "$gpus" -gt 0 ]; then
     gres="Gres=gpu:$gpus"
-    # Slurm wants a character device for each, and takes its number from the end of the path.
+    # Slurm requires a character device per GPU and reads the GPU's number from the end of the path.
     for i in $(seq 0 $((gpus - 1))); do
       ln -sfn /dev/null "$dir/gpu$i"
       echo "Name=gpu File=$dir/gpu$i" >> "$dir/gres.conf"
@@ -74,7 +74,7 @@ start() {
   export SLURM_CONF=$dir/slurm.conf
   local pid=$dir/slurmctld.pid
   while [ "$SECONDS" -lt 60 ]; do
-    # Where its port is taken it is gone at once, and asking it would take seconds each time.
+    # slurmctld exits at once if its port is in use; then each sinfo would block for seconds.
     if [ -s "$pid" ] && ! kill -0 "$(cat "$pid")" 2>/dev/null; then break; fi
     if [ "$(timeout 5 sinfo -h -o %T 2>/dev/null)" = idle ]; then exit 0; fi
     sleep 0.25

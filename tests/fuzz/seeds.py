@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writes a few whole files for each fuzz target to start from: seeds.py FOLDER."""
+"""Writes the seeds of each fuzz target, mostly valid files: seeds.py FOLDER."""
 
 import base64
 import io
@@ -42,7 +42,7 @@ def npy(numbers: list, kind: str = "<f8", order: str = "False", shape: str = "(2
     return b"\x93NUMPY" + bytes([version, 0]) + length + header.encode() + data
 
 
-# Every branch of the reader, and shapes at the edges of what a count can be.
+# Seeds for every branch of the reader, and shapes whose counts overflow or almost do.
 row = [0, 1, 0, 0, 3, -1, 0, 0, 0, 4, 0, 0, 1, 4, 5, 1, 9]
 seed("llff", "two", npy(row + row))
 for version in (2, 3):
@@ -80,7 +80,7 @@ for name, lens in {
 }.items():
     seed("transforms", name, f'{{{lens}, "frames": [{{"file_path": "images/a.png", "transform_matrix": {pose}}}]}}'.encode())
 for which in range(4):
-    # Radial, tangential and rational terms, focal lengths, principal point; whole numbers are shares of the largest.
+    # Radial, tangential and rational terms, focal lengths, principal point; integers are scaled to 1 at the largest i64.
     terms = [-0.02, 0.006, -0.003, 0.0005, 0.1, 0.2, 0, 0, 0, -0.1, -0.1, 0.1, 0.1]
     numbers = struct.pack("<13q", *(int(k * (2**63 - 1)) for k in terms)) if which & 2 == 0 else struct.pack("<13d", *terms)
     seed("lens", str(which), bytes([which]) + numbers)
@@ -114,8 +114,8 @@ exr += struct.pack("<3Q", *(first + 40 * y for y in range(3)))
 exr += b"".join(struct.pack("<iI", y, 32) + struct.pack("<e", 0.5) * 16 for y in range(3))
 seed("picture", "exr", b"\x02" + exr)
 
-# What Pillow makes of 20×20 pixels with subsampled chroma, restart markers and progressive scans, and of 20×12 grey ones. The byte
-# before each says where it is cut.
+# Pillow's JPEGs of 20×20 pixels with subsampled chroma, restart markers and progressive scans, and of 20×12 grey pixels. The byte before
+# each is the length at which the target cuts the file, in 256ths.
 jpegs = {
     "baseline": """
 /9j/4AAQSkZJRgABAQAAAQABAAD/2wBDABQODxIPDRQSEBIXFRQYHjIhHhwcHj0sLiQySUBMS0dARkVQWnNiUFVtVkVGZIhlbXd7gYKBTmCNl4x9lnN+gXz/2wBD
