@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Runs a command that may be silent for long, such as cargo: alive.sh COMMAND [ARGUMENT…]
+# Runs a command that may print nothing for minutes, such as cargo: alive.sh COMMAND [ARGUMENT…]
 #
-# On a terminal cargo shows a bar by itself. Elsewhere a line says every eight seconds of silence that the command still runs.
+# On a terminal cargo prints its own progress bar. Otherwise a line after every eight seconds of silence reports that the command is
+# still running.
 set -euo pipefail
 if [ -t 2 ]; then exec "$@"; fi
 "$@" 2>&1 | while true; do
@@ -9,7 +10,7 @@ if [ -t 2 ]; then exec "$@"; fi
   IFS= read -r -t 8 line || status=$?
   if [ "$status" = 0 ]; then
     printf '%s\n' "$line"
-  elif [ -n "$line" ]; then # a line whose end hasn't come yet, or never will
+  elif [ -n "$line" ]; then # an incomplete line: `read` timed out or reached the end
     printf '%s' "$line"
   elif [ "$status" -gt 128 ]; then
     printf '    … still running after %d s\n' "$SECONDS"

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""What the runner costs beside DVC and Snakemake, on equal DAGs in one run: `make bench-runner`.
+"""Measures the runner's overhead against DVC and Snakemake, on equal DAGs in one run: `make bench-runner`.
 
-Two questions are asked of each program, by turns, and the medians are compared:
+Two commands of each program are measured, the programs taking turns, and medians are compared:
 
-* A run with nothing to do, of the default pipeline's graph with 1 GB in 500 files: `nerf-sr run`, `dvc repro`, `snakemake -n`.
-* The plan of a sweep: a stage at each of 1,000 points below two stages that are made (DVC plans nothing below what isn't):
-  `nerf-sr plan`, `dvc repro --dry`, `snakemake -n`.
+* A run with nothing to do: the default pipeline's graph with 1 GB in 500 files, by `nerf-sr run`, `dvc repro`, `snakemake -n`.
+* The plan of a sweep: one stage with 1,000 points after two finished stages (DVC plans no stage whose dependencies are missing),
+  by `nerf-sr plan`, `dvc repro --dry`, `snakemake -n`.
 
-Stages are one script that writes files, so that only runners differ. The table goes to out/bench-runner/table.md.
+All stages are one script that writes files, so that only the runners differ. The table is written to out/bench-runner/table.md.
 """
 
 import argparse
@@ -20,17 +20,17 @@ import sys
 import time
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-# The default pipeline: each stage with what it needs. The last is a sink.
+# Graph of the default pipeline: the stages and their inputs. The last stage is a sink.
 DEFAULT = {
     "dataset": [], "prep": ["dataset"], "train": ["prep"], "render": ["train", "prep"], "eval": ["render", "prep"], "report": ["eval"]
 }
-# The sweep: its last stage has many points, which share the others.
+# Graph of the sweep: the last stage has many points, which share the other stages.
 SWEEP = {"dataset": [], "prep": ["dataset"], "train": ["prep"]}
 FILES, BYTES = 100, 2_000_000
-# What is asked of nerf-sr: seconds, and how many times as fast as others.
+# Requirements for nerf-sr: maximum seconds of each verb, and minimum speed-up over the other programs.
 MOST, LEAST = {"run": 0.025, "plan": 1.0}, 20
 
-# Writes files; for nerf-sr it keeps the stage contract. A sink writes one small page.
+# Stage that writes files, by nerf-sr's stage contract. A sink writes one small page.
 STAGE = """#!/usr/bin/env python3
 import json, pathlib, sys
 arguments = sys.argv[1:]
@@ -50,7 +50,7 @@ for number in range(1 if is_sink else %d):
 
 
 def pipeline(graph, points=None):
-    """nerf-sr's. The points are given on the command line."""
+    """Returns pipeline.yaml of a graph; nerf-sr gets the points on the command line, so `points` is ignored."""
     lines = [f"default: [{list(graph)[-1]}]", "stages:"]
     for name, needs in graph.items():
         is_sink = name == "report"
@@ -60,7 +60,7 @@ def pipeline(graph, points=None):
 
 
 def dvc_file(graph, points=None):
-    """DVC's; with points the last stage has so many."""
+    """Returns dvc.yaml of a graph; `points` is the number of points of the last stage."""
     lines = ["stages:"]
     for name, needs in graph.items():
         swept = points is not None and name == list(graph)[-1]
@@ -74,7 +74,7 @@ def dvc_file(graph, points=None):
 
 
 def snakefile(graph, points=None):
-    """Snakemake's; likewise."""
+    """Returns the Snakefile of a graph; `points` is the number of points of the last stage."""
     last = list(graph)[-1]
     wanted = f"expand('data/{last}-{{seed}}', seed=range(1, {points + 1}))" if points else f"'data/{last}'"
     lines = [f"rule all:\n    input: {wanted}\n"]
@@ -96,19 +96,19 @@ def prepare(folder, text, file):
 
 
 def call(command, folder, environment, says=""):
-    """Seconds of a command, which must go well and say something so many times."""
+    """Runs a command and returns its seconds. Exits if the command fails or doesn't print the text of `says` (text, count) `count` times."""
     begun = time.perf_counter()
     result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     taken = time.perf_counter() - begun
     said = result.stdout + result.stderr
     words, count = says if says else ("", 0)
     if result.returncode != 0 or (says and said.count(words) != count):
-        sys.exit(f"bench-runner: {' '.join(map(str, command))}: not {count} times {words!r}: {said[-2000:]}")
+        sys.exit(f"bench-runner: {' '.join(map(str, command))}: expected {words!r} {count} times, found: {said[-2000:]}")
     return taken
 
 
 def by_turns(commands, rounds, environment):
-    """Median seconds of each command; (name, command, folder, what it says) are called by turns, once before it counts."""
+    """Returns the median seconds of each command. Commands (name, command, folder, `says` of `call`) take turns; the first round is a warm-up."""
     seconds = {name: [] for name, *_ in commands}
     for number in range(rounds + 1):
         for name, command, folder, says in commands:
@@ -119,11 +119,11 @@ def by_turns(commands, rounds, environment):
 
 
 def missed(verb, seconds):
-    """What was asked for and isn't reached, in words."""
+    """Yields a message for each requirement that nerf-sr misses."""
     ours, *others = seconds.values()
     if ours > MOST[verb]:
-        yield f"nerf-sr {verb} takes {1000 * ours:.0f} ms, not {1000 * MOST[verb]:.0f}"
-    yield from (f"nerf-sr {verb} is {other / ours:.0f} times as fast, not {LEAST}" for other in others if other < LEAST * ours)
+        yield f"nerf-sr {verb} takes {1000 * ours:.0f} ms; at most {1000 * MOST[verb]:.0f} ms are required"
+    yield from (f"nerf-sr {verb} is {other / ours:.0f} times as fast; at least {LEAST} times is required" for other in others if other < LEAST * ours)
 
 
 def rows(title, seconds):
@@ -137,10 +137,10 @@ def version(command, environment):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--nerf-sr", type=pathlib.Path, default=ROOT / "target/release/nerf-sr", help="the runner")
-    parser.add_argument("--out", type=pathlib.Path, default=ROOT / "out/bench-runner", help="where to work")
-    parser.add_argument("--rounds", type=int, default=5, help="calls of each that count (default 5)")
-    parser.add_argument("--points", type=int, default=1000, help="points of the sweep (default 1000)")
+    parser.add_argument("--nerf-sr", type=pathlib.Path, default=ROOT / "target/release/nerf-sr", help="runner (default target/release/nerf-sr)")
+    parser.add_argument("--out", type=pathlib.Path, default=ROOT / "out/bench-runner", help="working folder (default out/bench-runner)")
+    parser.add_argument("--rounds", type=int, default=5, help="measured calls of each command (default 5)")
+    parser.add_argument("--points", type=int, default=1000, help="number of points of the sweep (default 1000)")
     options = parser.parse_args()
     venv = options.out / "venv"
     subprocess.run([sys.executable, "-m", "venv", venv], check=True)
@@ -177,7 +177,7 @@ def main():
         ("dvc repro --dry", [dvc, "repro", "--dry"], places["plan/dvc"], ("Running stage 'train@", options.points)),
         ("snakemake -n", dry, places["plan/snakemake"], ("rule train:", options.points)),
     ]
-    # DVC plans nothing below what isn't made.
+    # `prep` must exist: DVC plans no stage whose dependencies are missing.
     for command, place in [([options.nerf_sr, "run", "prep"], "nerf-sr"), ([dvc, "repro", "prep"], "dvc"), ([snakemake, "--cores", "1", "data/prep"], "snakemake")]:
         call(command, places[f"plan/{place}"], environment)
     sweep = by_turns(plan, options.rounds, environment)

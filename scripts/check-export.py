@@ -3,9 +3,9 @@
 
     check-export.py EXPORT TRUTH.ply SEEN.ply
 
-TRUTH.ply has points of the true surface with their normals, SEEN.ply those that cameras see. Prints JSON: mean distances to
-the former and from the latter over the scene's size, its longest side, and shares of normals that point the same way as the
-nearest true one. Cameras are left out without pycolmap.
+TRUTH.ply has points of the true surface with their normals; SEEN.ply has the points that are visible from the cameras. Prints JSON:
+mean distances to TRUTH.ply and from SEEN.ply over the scene's longest side, and shares of normals that point to the same side as the
+nearest true normal. Without pycolmap, cameras are omitted.
 """
 
 import json
@@ -50,7 +50,7 @@ def main():
     found = {}
     (mesh,) = trimesh.load(export / "mesh.glb", process=False).geometry.values()
     samples, faces = trimesh.sample.sample_surface(mesh, 200_000, seed=1)
-    # The sampled surface is dense enough to stand for all of it.
+    # 200,000 samples are dense enough to represent the surface.
     found["mesh"] = figures(samples, mesh.face_normals[faces], cKDTree(samples).query(seen)[0])
     found["mesh"]["triangles"] = len(mesh.faces)
     found["mesh"]["vertices_outward"] = outward(mesh.vertices, mesh.vertex_normals, tree, truth_normals)

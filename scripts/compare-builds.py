@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Compares what two builds make of the same experiments, file by file: after a change that mustn't change behaviour.
+"""Compares the artifacts of two builds for the same experiments, file by file; for changes that must not affect results.
 
 compare-builds.py OLD NEW [--data DIR] [--only NAME ...] [--ignored FILE:KEY ...]
 
-OLD and NEW are work trees, each built by `make build`. The experiments are small: the demo scene, lego 100x2 by both kinds of supervision,
-fern 252x2, and a refined run. Tensors, EXR, PNG and text files are compared byte by byte, JSON by value and by today's names. --ignored
-lists JSON keys that are left out, such as field.json:format.
+OLD and NEW are work trees, each built by `make build`. The experiments are small: the demo scene, an ensemble, the paper's field, lego 100x2
+with both kinds of supervision, fern 252x2, and a refined run. Tensors, EXR, PNG and text files are compared byte by byte, JSON files by value
+after keys are renamed to today's names. --ignored lists JSON keys that are not compared, such as field.json:format.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 
-# Targets and arguments, by today's names. Budgets are small: bytes are compared, not images.
+# Targets and arguments, with today's names. Budgets are small because bytes are compared, not quality.
 SMALL = "-p lr_width=100 -p prep.test_views=2 -p train-ss.rays=400000 -p train-ss.precrop_steps=20"
 EXPERIMENTS = {
     "demo": "-p demo-scene.size=64 -p demo-scene.train=12 -p demo-scene.test=2 -p train-ss.rays=300000",
@@ -25,7 +25,7 @@ EXPERIMENTS = {
     "fern": "-i dataset=DATA/nerf_llff_data/fern -p lr_width=252 -p prep.test_views=1 -p train-ss.rays=300000 -p render-depth.samples_per_axis=1",
     "refined": "refined -p demo-scene.size=64 -p demo-scene.train=12 -p demo-scene.test=2 -p train-ss.rays=300000 -p downscaled-field.rays=200000 -p train-refine.steps=40",
 }
-# JSON keys of files in earlier builds, with their names today.
+# Today's names of JSON keys that earlier builds named differently, by file.
 NAMES = {
     "field.json": {
         "levels": "n_levels",
@@ -48,7 +48,7 @@ def printed(command: list) -> str:
 
 
 def artifacts(tree: pathlib.Path, folder: pathlib.Path, words: list[str]) -> dict[str, pathlib.Path]:
-    """Artifacts of a run, by stage and point."""
+    """Runs an experiment and returns the artifacts' folders by stage and point."""
     runner = [tree / "target/release/nerf-sr", "--pipeline", tree / "pipeline.yaml", "--store", folder / "store"]
     subprocess.run([*runner, "run", "--out", folder / "out", *words], check=True, stdout=subprocess.DEVNULL)
     made = [node for node in json.loads(printed([*runner, "status", "--json", *words]))["nodes"] if node["state"] == "cached"]
@@ -63,7 +63,7 @@ def renamed(value, names: dict[str, str]):
 
 
 def files(artifact: pathlib.Path, options: argparse.Namespace) -> dict:
-    """Contents by path, without the manifest, which follows from them, and the summary, whose words change."""
+    """Returns an artifact's file contents by path, without the manifest (derived from the files) and the summary (its text may change)."""
     found = {}
     for file in sorted(p for p in artifact.rglob("*") if p.is_file() and p.name not in ("artifact.json", "summary.txt")):
         name = file.relative_to(artifact).as_posix()
@@ -81,7 +81,7 @@ MISSING = object()
 
 
 def unequal(before, after, path: str) -> list[str]:
-    """Where two values differ, by path; of JSON with what they are."""
+    """Returns the paths at which two values differ; for JSON also both values."""
     if before is MISSING or after is MISSING:
         return [f"{path}: only {'now' if before is MISSING else 'before'}"]
     if isinstance(before, dict) and isinstance(after, dict):
@@ -97,7 +97,7 @@ def unequal(before, after, path: str) -> list[str]:
 
 
 def compare(name: str, options: argparse.Namespace) -> bool:
-    """Whether both builds make the same of an experiment; says what differs."""
+    """Returns whether both builds give equal artifacts for an experiment; prints the differences."""
     words = EXPERIMENTS[name].replace("DATA", str(options.data.resolve())).split()
     with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
         old = artifacts(options.old, pathlib.Path(one), words)

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Compares what two builds' engines cost and bring, on withheld training views, one after the other in one run.
+"""Compares time and quality of two builds' engines on withheld training views, one after the other in one run.
 
 compare-engines.py OLD NEW [--data DIR] [--only NAME ...] [--rays FACTOR ... | --budgets] [--seeds N] [--picture FILE.svg]
 
-OLD and NEW are work trees, each built by `make build`. OLD prepares each scene, NEW scores the views of both; which of them trains
-first changes from seed to seed and from factor to factor. With several factors of the rays, --picture draws PSNR against training
-time. --budgets takes rays and other parameters from each build's own protocols (experiments/common.yaml). Times are by the clock;
-processor time, which a busy machine changes less, stands beside them and in the picture. Depth error is the mean of the views'
-median errors in scene units, where true depth is known; seen is the share of pixels whose depth agrees with a neighbouring view's.
+OLD and NEW are work trees, each built by `make build`. OLD prepares each scene, NEW scores the views of both; the build that trains
+first alternates between seeds and between factors. With several factors of the rays, --picture draws PSNR against training time.
+--budgets reads rays and other parameters from each build's own protocols (experiments/common.yaml). Times are wall-clock times;
+processor time, which depends less on other load, follows in brackets and is the picture's axis. Depth error is the mean of the views'
+median errors in scene units, if true depth is known; seen is the share of pixels whose depth agrees with a neighbouring view's.
 LPIPS needs DATA/weights.
 """
 
@@ -24,7 +24,7 @@ import tempfile
 import time
 from typing import NamedTuple
 
-# Data set (None is the demo scene with a backdrop), LR width, scale, rays of one field.
+# Data set (None: the demo scene with a backdrop), LR width, scale, and rays of one field.
 SCENES = {
     "lego 100x2": ("nerf_synthetic/lego", 100, 2, 2_000_000),
     "lego 200x4": ("nerf_synthetic/lego", 200, 4, 2_000_000),
@@ -34,14 +34,14 @@ SCENES = {
     "lego 200x2": ("nerf_synthetic/lego", 200, 2, 2_000_000),
     "fern 252x2": ("nerf_llff_data/fern", 252, 2, 2_000_000),
 }
-# Compared by default, with few rays.
+# Default scenes, except with --budgets.
 SHORT = ["lego 100x2", "lego 200x4", "fern 252x4", "demo with backdrop"]
-# Scenes of the protocols in experiments/common.yaml, which end their names.
+# Default scenes with --budgets; the last word of a name is its protocol in experiments/common.yaml.
 PROTOCOLS = [name for name, (dataset, *_) in SCENES.items() if dataset]
 
 
 class Cost(NamedTuple):
-    """What a stage took: seconds by the clock, of processor time, and its peak memory in MiB."""
+    """Cost of a stage: wall-clock seconds, processor seconds, and peak memory in MiB."""
 
     seconds: float
     processor: float
@@ -52,7 +52,7 @@ class Cost(NamedTuple):
 
 
 def run(tree: pathlib.Path, stage: str, folder: pathlib.Path, output: str, inputs: dict[str, str], params: dict) -> Cost:
-    """Runs a stage of a build."""
+    """Runs a stage of a build and returns its cost; exits if the stage fails."""
     (folder / "params.json").write_text(json.dumps(params))
     words = [f"--input={name}={folder / path}" for name, path in inputs.items()]
     begin = time.monotonic()
@@ -79,7 +79,7 @@ def prepare(options: argparse.Namespace, folder: pathlib.Path, name: str) -> Non
 
 
 class Result(NamedTuple):
-    """What a training of a build brought and cost."""
+    """Scores and costs of one training by a build."""
 
     scene: str
     build: str
@@ -101,7 +101,7 @@ class Result(NamedTuple):
 
 
 def protocol(tree: pathlib.Path, name: str) -> dict[str, dict[str, int]]:
-    """Each stage's parameters in a build's protocol of a scene."""
+    """Returns each stage's parameters in the build's protocol for a scene."""
     width_and_scale = name.split()[-1]
     preset = re.search(rf"^    {width_and_scale}:(.*?)^    \S", (tree / "experiments/common.yaml").read_text(), re.DOTALL | re.MULTILINE)
     params = {}
@@ -134,7 +134,7 @@ COLOURS = {"old": "#8a8a8a", "new": "#c2410c"}
 
 
 def picture(results: list[Result]) -> str:
-    """PSNR against training time as SVG: a panel a scene, a curve a build, seeds averaged."""
+    """Returns an SVG of PSNR against training time: one panel per scene, one curve per build, seeds averaged."""
     scenes = list(dict.fromkeys(result.scene for result in results))
     panels = "".join(panel(scene, [r for r in results if r.scene == scene], i * (WIDTH + BETWEEN)) for i, scene in enumerate(scenes))
     width = len(scenes) * (WIDTH + BETWEEN) - BETWEEN
@@ -143,7 +143,7 @@ def picture(results: list[Result]) -> str:
 
 
 def panel(scene: str, results: list[Result], left: int) -> str:
-    """One scene's curves, `left` units from the left."""
+    """Returns one scene's curves as SVG, `left` units from the left edge."""
     curves = {build: [] for build in COLOURS}
     for build, rays in dict.fromkeys((r.build, r.rays) for r in results):
         seeds = [r for r in results if (r.build, r.rays) == (build, rays)]
@@ -178,17 +178,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("old", type=pathlib.Path)
     parser.add_argument("new", type=pathlib.Path)
-    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"), help="scenes (default ../shared/data)")
-    parser.add_argument("--only", nargs="*", choices=SCENES, help=f"which scenes (default {', '.join(SHORT)}; with --budgets all but the demo scene)")
+    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"), help="folder with the scenes (default ../shared/data)")
+    parser.add_argument("--only", nargs="*", choices=SCENES, help=f"scenes to compare (default {', '.join(SHORT)}; with --budgets all except the demo scene)")
     rays = parser.add_mutually_exclusive_group()
-    rays.add_argument("--rays", type=float, nargs="+", default=[1.0], help="factors of the rays")
-    rays.add_argument("--budgets", action="store_true", help="the rays of each build's own protocol, and its other parameters")
-    parser.add_argument("--picture", type=pathlib.Path, help="an SVG of PSNR against training time")
-    parser.add_argument("--seeds", type=int, default=1, help="seeds of each training")
+    rays.add_argument("--rays", type=float, nargs="+", default=[1.0], help="factors by which the number of rays is multiplied (default 1)")
+    rays.add_argument("--budgets", action="store_true", help="use the rays and other parameters of each build's own protocols")
+    parser.add_argument("--picture", type=pathlib.Path, help="write an SVG of PSNR against training time")
+    parser.add_argument("--seeds", type=int, default=1, help="number of seeds (default 1)")
     options = parser.parse_args()
     names = options.only or (PROTOCOLS if options.budgets else SHORT)
     if options.budgets:
-        # What is missing is said before hours of training.
+        # A missing protocol must fail before hours of training.
         for tree, name in itertools.product((options.old, options.new), names):
             protocol(tree, name)
     print("| scene | build | seed | rays | PSNR | SSIM | LPIPS | depth error | seen | training (processor) | rendering (processor) | peak memory | load |\n" + "| --- " * 13 + "|")

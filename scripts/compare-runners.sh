@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# What docs/comparison.md says was tried: five runners and ours on a stage that writes half of a file, waits, and writes the rest.
+# Runs the trials of docs/comparison.md: five runners and nerf-sr on a stage that writes half of a file, waits, and writes the rest.
 #
-#   scripts/compare-runners.sh        after `make bench-runner`, whose environment has DVC and Snakemake; ninja and just come from PyPI, too
+#   scripts/compare-runners.sh        after `make bench-runner`, which installs DVC and Snakemake; this script installs ninja and just
 set -u
 root=$(cd "$(dirname "$0")/.." && pwd)
 work=$root/out/compare-runners
@@ -48,14 +48,14 @@ for tool in $tools; do
   cd "$work/$tool" || exit 1
   echo 0 > nap; run "$tool" > log 2>&1; sleep 1.1
   touch data/in; run "$tool" > log 2>&1
-  echo "$tool: after a touch without a change it has run $(runs) times"
+  echo "$tool: stage runs after a touch without a change: $(runs)"
 
   echo y > data/in; echo 5 > nap; before=$(runs)
   export -f run; setsid bash -c "run $tool" > log 2>&1 & leader=$!
   for _ in $(seq 100); do [ "$(runs)" -gt "$before" ] && break; sleep 0.1; done; sleep 0.3
   ps -eo pid,sid | awk -v s="$leader" '$2 == s { print $1 }' | xargs -r kill -9 2> /dev/null; pkill -9 -f "$work/$tool/step.sh"; sleep 0.5
   echo 0 > nap; before=$(runs); run "$tool" > log 2>&1
-  echo "$tool: after kill -9 halfway: exit code $?, ran again $(($(runs) - before)) times, result: $(tr '\n' ' ' < "$(result "$tool")")"
+  echo "$tool: after kill -9 halfway: exit code $?, stage runs: $(($(runs) - before)), result: $(tr '\n' ' ' < "$(result "$tool")")"
   if [ "$tool" = snakemake ]; then
     snakemake --unlock > log 2>&1; snakemake -q all --cores 1 --rerun-incomplete out > log 2>&1
   fi
@@ -63,10 +63,10 @@ for tool in $tools; do
   echo z > data/in; echo 3 > nap; before=$(runs)
   run "$tool" > first 2>&1 & sleep 2
   run "$tool" > second 2>&1; second=$?; wait $!
-  echo "$tool: of two at once the second ended with $second; both ran it $(($(runs) - before)) times"
+  echo "$tool: two concurrent runs: exit code of the second $second, stage runs of both: $(($(runs) - before))"
 
   echo 0 > nap; run "$tool" > log 2>&1; file=$(result "$tool"); time=$(stat -c %y "$file"); before=$(runs)
   printf Q | dd of="$file" bs=1 conv=notrunc 2> /dev/null; touch -d "$time" "$file"; run "$tool" > log 2>&1
-  echo "$tool: after a flipped byte, its time kept, it ran again $(($(runs) - before)) times"
+  echo "$tool: stage runs after a changed byte with an unchanged time: $(($(runs) - before))"
 done 2>&1 | grep -v Killed
 cd "$work/nerf-sr" && nerf-sr verify | tail -1

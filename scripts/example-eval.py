@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""A stage in another language: mean squared error, in eval's place. Needs Python 3 alone.
+"""Example of a stage in another language: replaces eval by the mean squared error. Needs only Python 3.
 
     stages:
       eval:
         run: ./scripts/example-eval.py
 
-It keeps the stage contract: `describe` prints JSON; a run reads --params and --input NAME=DIR, makes --output DIR, says what is
-wrong in one line on stderr, and ends with 0 done, 1 failed, 2 wrong usage, 3 bad input. The runner writes artifact.json.
+The script follows the stage contract: `describe` prints JSON; a run reads --params and --input NAME=DIR, creates --output DIR, reports
+an error as one line on stderr, and exits with 0 (done), 1 (failed), 2 (wrong usage) or 3 (bad input). The runner writes artifact.json.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def describe():
 
 
 def read_png(path):
-    """Width, height and RGB rows over white of an 8-bit RGB or RGBA PNG."""
+    """Reads an 8-bit RGB or RGBA PNG; returns its RGB values over white, row by row."""
     data = path.read_bytes()
     position, compressed = 8, b""
     while position < len(data):
@@ -95,7 +95,7 @@ def main():
         name = view["camera"]["name"]
         preview = inputs["views"] / "previews" / f"{name}.png"
         if not preview.is_file():
-            print(f"example-eval: {preview}: not there; render the same cameras", file=sys.stderr)
+            print(f"example-eval: {preview} not found; render the cameras of the ground truth", file=sys.stderr)
             return 3
         found, expected = read_png(preview), read_png(inputs["truth"] / view["image"])
         scores[name] = sum((a - b) ** 2 for a, b in zip(found, expected)) / len(found) / params["peak"] ** 2

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Measures `make demo` from nothing, for some commits, one after the other: first-runs.py COMMIT… [--rounds N] [--work DIR] [--out FILE]
+"""Measures `make demo` in clean clones of commits, one after the other: first-runs.py COMMIT… [--rounds N] [--work DIR] [--out FILE]
 
-Each run has a clean clone without `target` and `.libtorch`; what cargo and pip have cached in the home folder stays. A row of JSON
-says how long it took to the page, the processor time of all its processes, the longest silence, whether libtorch was fetched, the
-demo's scores, and sgemm's rate before and after (with NumPy).
+Clones have no `target` and no `.libtorch`; the caches of cargo and pip in the home folder are kept. A row of JSON has the seconds until
+the page is written, the processor time of all processes, the longest silence, whether libtorch was downloaded, the demo's scores, and
+sgemm's rate before and after the run (with NumPy).
 """
 
 import argparse
@@ -19,7 +19,7 @@ import time
 
 
 def sgemm() -> float | None:
-    """GFLOP/s of a product of matrices of 1024 columns, the best of ten; None without NumPy."""
+    """Measures a product of 1024×1024 matrices; returns the best GFLOP/s of ten, or None without NumPy."""
     try:
         import numpy
     except ImportError:
@@ -34,7 +34,7 @@ def sgemm() -> float | None:
 
 
 def listen(process: subprocess.Popen) -> tuple[str, float]:
-    """Reads what a process says until it ends; its words, and the longest time in which it said nothing."""
+    """Reads a process's output until the process ends; returns the output and the longest silence in seconds."""
     words, silence, last = b"", 0.0, time.monotonic()
     while True:
         select.select([process.stdout], [], [])
@@ -47,7 +47,7 @@ def listen(process: subprocess.Popen) -> tuple[str, float]:
 
 
 def measure(repository: pathlib.Path, commit: str, work: pathlib.Path) -> dict:
-    """Runs `make demo` in a clean clone of a commit."""
+    """Runs `make demo` in a clean clone of a commit and returns its row of measurements."""
     clone = work / "clone"
     shutil.rmtree(clone, ignore_errors=True)
     subprocess.run(["git", "clone", "--quiet", repository, clone], check=True)
@@ -61,7 +61,7 @@ def measure(repository: pathlib.Path, commit: str, work: pathlib.Path) -> dict:
     (work / f"{commit}.log").write_text(words)
     page = clone / "out/report/index.html"
     if status or not page.exists():
-        sys.exit(f"{commit}: make demo failed; {work / f'{commit}.log'} has what it said")
+        sys.exit(f"{commit}: make demo failed; its output is in {work / f'{commit}.log'}")
     scores = re.search(r"^eval: (PSNR.*)$", words, re.MULTILINE)
     return {
         "commit": commit, "seconds": round(seconds), "processor_seconds": round(usage.ru_utime + usage.ru_stime),

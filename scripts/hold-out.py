@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Makes a Blender data set whose test views are training views withheld from training.
+"""Creates a Blender data set whose test views are training views withheld from training.
 
-Choices (defaults, regularisers, schedules) are made on these, so that test views stay for reporting:
+Settings (defaults, regularisers, schedules) are chosen on withheld views, so that test views are only for reporting:
 
     scripts/hold-out.py ../shared/data/nerf_synthetic/lego out/held-out/lego
     nerf-sr run -i dataset=out/held-out/lego
 
-Every EVERY-th training frame, from the middle of the first EVERY on, becomes a test view. Images are linked, not copied.
+Every EVERY-th training frame, beginning with frame EVERY / 2, becomes a test view. Images are linked, not copied.
 """
 
 import argparse
@@ -15,8 +15,8 @@ import pathlib
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("dataset", type=pathlib.Path, help="a data set in Blender's format")
-parser.add_argument("out", type=pathlib.Path, help="folder to make")
-parser.add_argument("--every", type=int, default=8, help="withhold one training view in so many (default 8)")
+parser.add_argument("out", type=pathlib.Path, help="folder to create")
+parser.add_argument("--every", type=int, default=8, help="withhold every EVERY-th training view (default 8)")
 options = parser.parse_args()
 
 transforms = json.loads((options.dataset / "transforms_train.json").read_text())

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""PSNR of true LR views, ideally up-sampled: the HR test views with all removed that lies above the LR images' Nyquist frequency.
+"""Prints the PSNR of ideal up-sampling: HR test views without frequencies above the LR images' Nyquist frequency.
 
-What a method without any prior or second view could reach at best; a yardstick for the tables. Needs numpy and Pillow
-(`.venv/bin/python` after `make goldens`). HR views are made as `prep` makes them: Lanczos in 8 bits, then white behind.
+Upper bound for methods without a prior or a second view; a yardstick for the tables. Needs numpy and Pillow (`.venv/bin/python`
+after `make goldens`). HR views are computed as in `prep`: Lanczos in 8 bits, then a white background.
 
     .venv/bin/python scripts/ideal-upsampling.py --data ../shared/data --scenes lego chair
 """

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Projects points by COLMAP's own library: reads cameras with points from stdin, writes image positions to stdout, as JSON.
+"""Projects points with pycolmap: reads cameras and points as JSON from stdin, writes image positions as JSON to stdout.
 
-A test's other side: lens models must agree with pycolmap's. Needs `pip install pycolmap`.
+tests/lenses.rs compares the lens models with pycolmap's. Needs `pip install pycolmap`.
 """
 
 import json

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Makes docs/demo.png, the picture on top of the README, from the last `make demo`. Needs Pillow (make goldens installs it).
+"""Draws docs/demo.png, the first picture of the README, from the last `make demo`; called by scripts/readme-pictures.sh.
 
-    scripts/readme-pictures.sh calls it.
+Needs Pillow (`make goldens` installs it).
 """
 
 import pathlib
@@ -14,7 +14,7 @@ SIDE = 300
 
 
 def artifact(stage: str) -> pathlib.Path:
-    """A folder that the last run made."""
+    """Returns the folder of a stage's current artifact."""
     return pathlib.Path(subprocess.run([ROOT / "target/release/nerf-sr", "path", stage], cwd=ROOT, check=True, text=True, stdout=subprocess.PIPE).stdout.strip())
 
 

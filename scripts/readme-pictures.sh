@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes the README's pictures from the demo scene: docs/demo.png, docs/page.png and docs/viewer.png.
+# Writes the README's pictures of the demo scene: docs/demo.png, docs/page.png and docs/viewer.png.
 # Needs `make build`, Pillow (`make goldens` installs it), and Chromium with scripts/setup-browser.sh.
 set -euo pipefail
 cd "$(dirname "$0")/.."

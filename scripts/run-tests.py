@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Runs all tests, a binary for each core at a time, and says which were skipped and which took longest.
+"""Runs all tests, one test binary per core at a time, and lists skipped and slowest tests.
 
-run-tests.py [FILTER]: only tests whose names contain FILTER. Build the stages first: end-to-end tests run them.
+run-tests.py [FILTER] runs only tests whose names contain FILTER. End-to-end tests run the built stages, so build these first.
 """
 
 import concurrent.futures
@@ -13,14 +13,14 @@ import sys
 import time
 
 SLOWEST = 3
-# As `make build` and `make remote` select them, so that nothing is built twice.
+# Package selections of `make build` and `make remote`: others would select other features and rebuild dependencies.
 SELECTIONS = [["--workspace", "--exclude", "nerf-sr-remote"], ["-p", "nerf-sr-remote"]]
-# Seconds that each binary took last time: what takes long begins early.
+# Seconds of each binary in the last run; slow binaries start first.
 TIMES = pathlib.Path("target/test-times.json")
 
 
 def build() -> list[tuple[str, str, str]]:
-    """Builds all test binaries; (package and target, path, folder to run in) of each, fast ones first."""
+    """Builds all test binaries; returns (package and target, path, working folder) of each: unit tests, then end-to-end tests, slow ones first."""
     command = ["cargo", "test", "--release", "--lib", "--bins", "--tests", "--no-run", "--message-format=json-render-diagnostics"]
     messages = []
     for packages in SELECTIONS:
@@ -42,7 +42,7 @@ def build() -> list[tuple[str, str, str]]:
 
 
 class Outcome:
-    """What the tests of one binary came to."""
+    """Results of one binary's tests."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -51,7 +51,7 @@ class Outcome:
 
 
 def run(name: str, path: str, folder: str, test_filter: list[str]) -> Outcome:
-    """Runs a binary's tests one after the other, so that each has its time."""
+    """Runs a binary's tests one after the other, so that each test is timed; returns the results."""
     outcome = Outcome(name)
     environment = dict(os.environ, CARGO_MANIFEST_DIR=folder)
     command = [path, "--test-threads=1", "--show-output", *test_filter]
@@ -75,7 +75,7 @@ def run(name: str, path: str, folder: str, test_filter: list[str]) -> Outcome:
             elif text.startswith("skipped: ") and said_by:
                 outcome.skipped.append(f"{name}::{said_by}: {text.strip()}")
     if process.wait() and not outcome.failed:
-        outcome.failed.append(f"{name} ended with {process.returncode}" + (f" in {test}" if test else ""))
+        outcome.failed.append(f"{name} exited with {process.returncode}" + (f" in {test}" if test else ""))
     return outcome
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Writes transforms.json's cameras as a COLMAP model, by COLMAP's own library: write-colmap.py FOLDER sparse/0.
+"""Writes transforms.json's cameras as a COLMAP model with pycolmap: write-colmap.py FOLDER sparse/0.
 
-A test's other side: what pycolmap writes, `prep` must read. Needs `pip install pycolmap`.
+tests/photographs.rs checks that `prep` reads pycolmap's models. Needs `pip install pycolmap`.
 """
 
 import json
@@ -19,7 +19,7 @@ parameters = [focal, focal, width / 2, height / 2]
 camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=width, height=height, params=parameters)
 reconstruction.add_camera_with_trivial_rig(camera)
 for number, frame in enumerate(transforms["frames"], 1):
-    # World to camera, with axes right, down, forward.
+    # COLMAP's poses are world to camera, with axes right, down, forward.
     pose = numpy.array(frame["transform_matrix"]) @ numpy.diag([1, -1, -1, 1])
     inverse = pycolmap.Rigid3d(numpy.linalg.inv(pose)[:3])
     image = pycolmap.Image(name=pathlib.Path(frame["file_path"]).name, camera_id=1, image_id=number)
