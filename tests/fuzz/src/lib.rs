@@ -1,18 +1,19 @@
-//! What the targets share: a folder of one data set, in which one file is the fuzzer's.
+//! Shared code of the fuzz targets: a data set in a folder, one file of which is the fuzzer's input.
 
 use std::path::{Path, PathBuf};
 
 use dataset::Dataset;
 use scene::{Camera, Distortion, Intrinsics, Projection};
 
-/// A 4×3 image, as PNG.
+/// Width and height of the images, in pixels.
 const SIZE: (usize, usize) = (4, 3);
 
-/// A folder in memory where there is one, with `images/a.png` and `images/b.png`.
+/// Folder of a data set with `images/a.png` and `images/b.png`; in `/dev/shm` if that exists, since
+/// a target writes files in every run.
 pub struct Folder(tempfile::TempDir);
 
 impl Folder {
-    /// An empty one, with images.
+    /// Creates a folder with only the images.
     pub fn new() -> Self {
         let memory = Path::new("/dev/shm");
         let dir = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
@@ -24,20 +25,20 @@ impl Folder {
         folder
     }
 
-    /// Where a file of it lies.
+    /// Returns the path of a file in the folder.
     pub fn path(&self, file: &str) -> PathBuf {
         self.0.path().join(file)
     }
 
-    /// Writes one file.
+    /// Writes a file in the folder.
     pub fn write(&self, file: &str, bytes: &[u8]) {
         let path = self.path(file);
         std::fs::create_dir_all(path.parent().expect("inside the folder")).expect("a folder");
         std::fs::write(path, bytes).expect("a file");
     }
 
-    /// Reads the data set and its first images. Errors are what is expected; a panic, a hang or
-    /// much memory isn't.
+    /// Reads the data set and its first images. Errors are ignored: only a panic, a hang or
+    /// excessive memory is a finding.
     pub fn read(&self) {
         if let Ok(set) = Dataset::read(self.0.path()) {
             // Lenses as `prep` treats them.
@@ -66,7 +67,7 @@ impl Folder {
         }
     }
 
-    /// Nothing that a file names may lie outside the folder.
+    /// Fails if a file that the data set names is outside the folder.
     fn check_inside(&self, file: &Path) {
         let found = file.canonicalize().expect("a file that was looked at");
         let folder = self.0.path().canonicalize().expect("the folder");
@@ -80,8 +81,8 @@ impl Default for Folder {
     }
 }
 
-/// A camera at the origin with a lens of any numbers: with one bit of `which` a fisheye's, with
-/// another as large as f64 has them.
+/// Returns a camera at the origin whose lens parameters are read from `bytes`. Bit 0 of `which`
+/// selects a fisheye lens; bit 1 selects arbitrary f64 values instead of numbers from -1 to 1.
 pub fn lens_camera(which: u8, bytes: &[u8]) -> Camera {
     let mut numbers = bytes.chunks(8).map(|chunk| {
         let mut word = [0; 8];
@@ -104,8 +105,8 @@ pub fn lens_camera(which: u8, bytes: &[u8]) -> Camera {
     Camera { name: "a".to_owned(), intrinsics, camera_to_world }
 }
 
-/// A COLMAP model's three files, binary, of two views: the seeds that `seeds.py` writes, less their
-/// first byte, which says which file they are.
+/// Returns the three files of a binary COLMAP model with two views: the seeds of `seeds.py` without
+/// their first byte, which selects the file.
 pub fn colmap_model() -> [(&'static str, &'static [u8]); 3] {
     macro_rules! seed {
         ($which:literal) => {
@@ -115,7 +116,7 @@ pub fn colmap_model() -> [(&'static str, &'static [u8]); 3] {
     [("cameras.bin", seed!("0")), ("images.bin", seed!("1")), ("points3D.bin", seed!("2"))]
 }
 
-/// An array of LLFF of two views: the seed that `seeds.py` writes.
+/// Returns a `poses_bounds.npy` with two views: the seed of `seeds.py`.
 pub fn poses_of_llff() -> &'static [u8] {
     include_bytes!(concat!(env!("FUZZ_SEEDS"), "/llff/two"))
 }

@@ -1,4 +1,4 @@
-//! One of a COLMAP model's files, binary or text: the first byte says which.
+//! Fuzzes one file of a COLMAP model, binary or text; the first byte selects the file.
 #![no_main]
 
 use std::sync::LazyLock;

@@ -1,4 +1,4 @@
-//! A field's weights: safetensors.
+//! Fuzzes the weights of a field, a safetensors file.
 #![no_main]
 
 use std::sync::LazyLock;

@@ -1,5 +1,5 @@
-//! A JPEG photograph, whole and cut short: the first byte says where. A cut file is refused, or has
-//! the pixels of the whole one.
+//! Fuzzes a JPEG photograph, complete and truncated; the first byte is the truncated length in
+//! 256ths. A truncated file must be refused or have the pixels of the complete one.
 #![no_main]
 
 use std::sync::LazyLock;

@@ -1,4 +1,4 @@
-//! `poses_bounds.npy`: NumPy's format, and what LLFF keeps in it.
+//! Fuzzes `poses_bounds.npy`: the NumPy format and LLFF's array in it.
 #![no_main]
 
 use std::sync::LazyLock;

@@ -1,4 +1,4 @@
-//! A photograph's mask as PNG, JPEG or EXR: the first byte says which.
+//! Fuzzes a photograph's mask as PNG, JPEG or EXR; the first byte selects the format.
 #![no_main]
 
 use std::sync::LazyLock;
@@ -24,7 +24,7 @@ fuzz_target!(|data: &[u8]| {
     let file = format!("images/m.{end}");
     folder.write(&file, rest);
     folder.read();
-    // What stages read of one another.
+    // Stages read masks of other stages by this function.
     if *end == "png"
         && let Ok(mask) = pixels::Mask::read(&folder.path(&file), (4, 3))
     {

@@ -1,5 +1,5 @@
-//! Names of files in a data set: lines that a `transforms.json`, COLMAP's list of images, or LLFF's
-//! list of views has. The first byte says which.
+//! Fuzzes file names in a data set: the lines of the input are names in a `transforms.json`, in
+//! COLMAP's list of images, or in LLFF's list of views. The first byte selects the list.
 #![no_main]
 
 use std::sync::LazyLock;
@@ -8,7 +8,7 @@ use fuzz::{Folder, poses_of_llff};
 use libfuzzer_sys::fuzz_target;
 use serde_json::json;
 
-/// A folder of each form, in which names may go wrong in every way.
+/// One folder per data set format, with files whose names are easily confused.
 static FOLDERS: LazyLock<[Folder; 3]> = LazyLock::new(|| {
     let folders = [Folder::new(), Folder::new(), Folder::new()];
     for folder in &folders {
@@ -38,8 +38,8 @@ static FOLDERS: LazyLock<[Folder; 3]> = LazyLock::new(|| {
     folders
 });
 
-/// Frames of the first lines, which may name a mask after a tab and a depth image after another, and
-/// lists of the last lines.
+/// Returns a `transforms.json`. Lines before the first empty line are frames: image, mask and depth
+/// image, separated by tabs. The next three paragraphs are the lists of file names by split.
 fn transforms(text: &str) -> String {
     let pose = json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]);
     let mut lists = text.split("\n\n");

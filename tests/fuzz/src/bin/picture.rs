@@ -1,4 +1,4 @@
-//! A photograph as PNG, JPEG or EXR: the first byte says which.
+//! Fuzzes a photograph as PNG, JPEG or EXR; the first byte selects the format.
 #![no_main]
 
 use std::sync::LazyLock;
@@ -24,7 +24,7 @@ fuzz_target!(|data: &[u8]| {
     let file = format!("images/c.{end}");
     folder.write(&file, rest);
     folder.read();
-    // What stages read of one another.
+    // Stages read images of other stages by these functions.
     if *end == "exr" {
         pixels::read_exr(&folder.path(&file)).ok();
     }

@@ -1,6 +1,7 @@
-//! What `nerf-sr-remote` reads from elsewhere: archives, with their index, manifests and records.
-//! The first byte says which of them the rest is. Everything else of the archive then fits, so that
-//! no hash stops the rest from being looked at. Manifests and records are read alike by `pull`.
+//! Fuzzes archives as `nerf-sr-remote` imports them: index, manifests and records. The first byte
+//! selects the part that the input replaces. The other parts match the input, so that no hash check
+//! refuses the archive before the input is parsed. `pull` reads manifests and records by the same
+//! code.
 #![no_main]
 
 use std::cell::RefCell;
@@ -17,16 +18,16 @@ use store::{Record, Store};
 const BLOCK: usize = 512;
 const FILE_BYTES: &[u8] = b"{\"psnr\": 31.25}";
 
-/// An archive in the making.
+/// Builder of an archive.
 #[derive(Default)]
 struct Archive {
     bytes: Vec<u8>,
-    /// Where headers begin.
+    /// Byte offsets of the entries' headers.
     headers: Vec<usize>,
 }
 
 impl Archive {
-    /// Adds an entry, whatever its path is.
+    /// Adds an entry without checking its path.
     fn add(&mut self, path: &[u8], content: &[u8]) {
         if path.len() > 100 {
             self.add_raw(b"long", &[path, b"\0"].concat(), tar::EntryType::GNULongName);
@@ -47,7 +48,8 @@ impl Archive {
         self.bytes.resize(self.bytes.len().next_multiple_of(BLOCK), 0);
     }
 
-    /// Changes bytes, three of `edits` at a time, and makes the headers' checksums right again.
+    /// Changes bytes and updates the headers' checksums. Each edit has three bytes: a little-endian
+    /// offset of two, and the bits to flip.
     fn edit(&mut self, edits: &[u8]) {
         for edit in edits.chunks_exact(3) {
             let place = usize::from(u16::from_le_bytes([edit[0], edit[1]])) % self.bytes.len();
@@ -67,7 +69,7 @@ fn text(value: &impl serde::Serialize) -> Vec<u8> {
     serde_json::to_vec(value).expect("JSON")
 }
 
-/// An artifact of one file and its record.
+/// Returns the manifest of an artifact with one file, and the record of the action.
 fn sample() -> (Manifest, Record) {
     let path = "metrics.json".to_owned();
     let blake3 = blake3::hash(FILE_BYTES).to_hex().to_string();
@@ -78,8 +80,8 @@ fn sample() -> (Manifest, Record) {
     (manifest, Record { stage: "eval".to_owned(), key_parts, output, ..Record::default() })
 }
 
-/// An archive of one artifact, given its manifest, and of records. `index` takes the place of the
-/// right one.
+/// Returns an archive of one artifact, given its manifest, and of records. `index` replaces the
+/// valid index.
 fn archive(manifest: &Manifest, mut records: Vec<Record>, index: Option<&[u8]>) -> Archive {
     let identity = manifest.identity();
     records.sort_by_key(Record::key);
@@ -104,7 +106,7 @@ fn archive(manifest: &Manifest, mut records: Vec<Record>, index: Option<&[u8]>) 
 
 const ZEROS: [u8; 8] = [0; 8];
 
-/// The fuzzer's manifest, but its files hold a few zeros.
+/// Returns an archive with the fuzzer's manifest, whose files are replaced by short files of zeros.
 fn with_manifest(data: &[u8]) -> Option<Archive> {
     let mut manifest: Manifest = serde_json::from_slice(data).ok()?;
     manifest.files.sort();
@@ -126,7 +128,7 @@ fn with_record(data: &[u8]) -> Option<Archive> {
     Some(archive(&manifest, vec![record, serde_json::from_slice(data).ok()?], None))
 }
 
-/// A folder in memory with a store and an archive.
+/// Folder with a store and an archive, in memory.
 struct World {
     dir: tempfile::TempDir,
     imports: usize,
@@ -145,7 +147,8 @@ impl World {
         self.dir.path().join(name)
     }
 
-    /// Imports bytes: all is whole, or nothing has come in; and nothing lies anywhere else.
+    /// Imports an archive. The store must have intact objects, or after an error no content at all;
+    /// no file may be written outside the store.
     fn import(&mut self, bytes: &[u8]) {
         let file = self.path("archive");
         fs::write(&file, bytes).expect("a file");

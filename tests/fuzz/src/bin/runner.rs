@@ -1,5 +1,5 @@
-//! What the runner reads: pipeline.yaml, a stage's description, the command line, records. The
-//! first byte says which of them the rest is; the others are the seeds that `seeds.py` writes.
+//! Fuzzes the inputs of the runner: pipeline.yaml, a stage's description, the command line, and
+//! records. The first byte selects one; the others are the seeds of `seeds.py`.
 #![no_main]
 
 use std::collections::BTreeMap;
@@ -17,7 +17,8 @@ macro_rules! seed {
     };
 }
 
-/// Targets, parameters and inputs, a line each after a letter that says which.
+/// Parses a request: each line is a letter and a parameter (`p`), an input (`i`) or a target (any
+/// other letter).
 fn request(data: &[u8]) -> Request {
     let mut request = Request::default();
     for line in String::from_utf8_lossy(data)
@@ -34,12 +35,12 @@ fn request(data: &[u8]) -> Request {
     request
 }
 
-/// The description of one seed, or of these bytes.
+/// Parses a stage's description.
 fn description(data: &[u8]) -> Option<Description> {
     serde_json::from_slice(data).ok()
 }
 
-/// Nodes of the plan.
+/// Plans a pipeline and returns the number of nodes; `None` if an input is refused.
 fn plan(pipeline: &[u8], train: &[u8], arguments: &[u8]) -> Option<usize> {
     let pipeline = Pipeline::parse(pipeline, Path::new("pipeline.yaml")).ok()?;
     let stages =
@@ -55,14 +56,14 @@ fn plan(pipeline: &[u8], train: &[u8], arguments: &[u8]) -> Option<usize> {
     Some(plan.nodes.len())
 }
 
-/// The seeds are a whole that can be planned; else little would be tried.
+/// Checks once that the seeds can be planned; otherwise most inputs would be refused early.
 static SEEDS: LazyLock<()> = LazyLock::new(|| {
     assert_eq!(plan(seed!("pipeline"), seed!("describe-train"), b""), Some(3));
     assert!(plan(seed!("pipeline"), seed!("describe-train"), seed!("arguments")).is_some());
 });
 
-/// A description's parameters: what they are resolved to is resolved to itself, so a key doesn't
-/// change by being read again.
+/// Checks that resolved parameters resolve to themselves, so that reading parameters again doesn't
+/// change a key.
 fn resolve(data: &[u8]) {
     let Some(description) = description(data).filter(|d| d.check().is_ok()) else { return };
     let schema = Schema::new(&description.parameters).expect("the description was checked");
@@ -71,7 +72,7 @@ fn resolve(data: &[u8]) {
     assert_eq!(again.ok(), Some(resolved));
 }
 
-/// A record as `why` reads it.
+/// Reads a record as the verb `why` does.
 fn record(data: &[u8]) {
     let Ok(record) = serde_json::from_slice::<Record>(data) else { return };
     assert_eq!(record.key().len(), 64);

@@ -1,4 +1,4 @@
-//! `transforms.json`.
+//! Fuzzes `transforms.json`.
 #![no_main]
 
 use std::sync::LazyLock;
