@@ -1,12 +1,12 @@
-//! A real browser for pages that stages write: scripts of `tests/browser`, run by node in Debian's
-//! Chromium.
+//! Runs pages that stages write in a real browser: node runs the scripts of `tests/browser`, which
+//! control Debian's Chromium.
 
 use std::ffi::OsStr;
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
-/// Runs `tests/browser/SCRIPT` and returns the JSON that it prints. None, with a word, where the
-/// browser isn't installed.
+/// Runs `tests/browser/SCRIPT` and returns the JSON that the script prints. Without an installed
+/// browser, prints that the test is skipped and returns `None`.
 #[track_caller]
 pub fn run_in_browser<A: AsRef<OsStr>>(
     script: &str,
@@ -15,7 +15,7 @@ pub fn run_in_browser<A: AsRef<OsStr>>(
     let root = super::root();
     let packages = root.join("target/browser");
     let chromium = chromium();
-    // A copy of the lock file that the packages were installed by.
+    // `complete` is a copy of the lock file with which the packages were installed.
     let [installed, wanted] =
         [packages.join("complete"), root.join("tests/browser/package-lock.json")]
             .map(|file| std::fs::read(file).ok());

@@ -1,4 +1,4 @@
-//! The demo scene's training views as photographs of one's own, in each form that folders have.
+//! The demo scene's training views as a user's photographs, in each supported data set format.
 
 #![allow(dead_code, reason = "every test file uses a part of it")]
 #![allow(unreachable_pub, reason = "shared by several test binaries")]
@@ -13,19 +13,19 @@ use super::common::{Project, stage};
 pub const WIDTH: u32 = 32;
 pub const ANGLE: f64 = 0.691_111_2;
 
-/// A form of folders.
+/// Data set format.
 pub struct Form {
-    /// The folder's name.
+    /// Name of the folder.
     pub name: &'static str,
     /// Writes the folder.
     pub write: fn(&Project) -> PathBuf,
-    /// What `nerf-sr init` calls it.
+    /// Name of the format in the output of `nerf-sr init`.
     pub found: &'static str,
-    /// Where `nerf-sr init` has LR images come from.
+    /// Value of `lr_source` that `nerf-sr init` chooses.
     pub lr_source: &'static str,
 }
 
-/// All but the demo scene's own.
+/// All formats except the demo scene's own.
 pub const FORMS: &[Form] = &[
     Form {
         name: "transforms",
@@ -48,8 +48,8 @@ fn column(frame: &Value, column: usize) -> DVec3 {
     )
 }
 
-/// Names, poses (right, up, back and centre as columns) and opaque images of a demo scene's
-/// training views, in `folder/images`.
+/// Writes opaque images of a demo scene's training views to `folder/images`; returns each view's
+/// name, rotation (right, up, back as columns) and centre.
 pub fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {
     let data = project.path("data");
     if !data.exists() {
@@ -82,7 +82,7 @@ pub fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3
             )
         })
         .collect();
-    // By name, as LLFF has them and as COLMAP's are put.
+    // LLFF's poses are in the order of the image names.
     views.sort_by(|a, b| a.0.cmp(&b.0));
     views
 }
@@ -119,7 +119,7 @@ pub fn as_colmap(project: &Project) -> PathBuf {
     .unwrap();
     let mut images = "# as COLMAP registers them: in no order\n".to_owned();
     for (id, (name, axes, centre)) in views.iter().enumerate().rev() {
-        // World to camera, with axes right, down, forward.
+        // COLMAP's poses are world to camera, with axes right, down, forward.
         let rotation = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis).transpose();
         let (q, t) = (DQuat::from_mat3(&rotation), -(rotation * *centre));
         images += &format!(

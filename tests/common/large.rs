@@ -1,4 +1,4 @@
-//! Inputs of stages that take seconds to make, and settings at which the stages work for long.
+//! Stage inputs that are generated in seconds, and parameters with which the stages run for long.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use super::{Project, stage};
 
-/// A small field and what belongs to it, all of it stages' own work.
+/// Project with a small scene, field, LR views and refiner, all written by the stages.
 pub struct Small {
     pub project: Project,
 }
@@ -34,7 +34,7 @@ impl Small {
         self.project.path(name)
     }
 
-    /// Runs a stage; inputs and output are names in the project's folder.
+    /// Runs a stage; inputs and output are paths in the project's folder.
     pub fn make(&self, name: &str, params: &str, inputs: &[(&str, &str)], output: &str) {
         let folders: Vec<PathBuf> = inputs.iter().map(|(_, folder)| self.path(folder)).collect();
         let mut given: Vec<(&str, &Path)> = Vec::new();
@@ -45,7 +45,7 @@ impl Small {
         assert_eq!(done.code, 0, "{name}: {}", done.stderr);
     }
 
-    /// Cameras of the training views, of these widths.
+    /// Writes cameras of the training views, resized to the given widths.
     pub fn cameras(&self, output: &str, widths: &[u32]) {
         let given = Views::read_folder(&self.path("scene/train-cameras")).unwrap();
         let mut views = Vec::new();
@@ -59,7 +59,7 @@ impl Small {
         publish(&folder, "cameras");
     }
 
-    /// The demo scene's data set with one large photograph for every view.
+    /// Writes a copy of the demo scene's data set in which all images are one large photograph.
     pub fn large_photographs(&self, output: &str, width: usize) {
         let (from, to) = (self.path("data"), self.path(output));
         let image = Rgba8::new(width, width, vec![200; 4 * width * width]);
@@ -77,13 +77,13 @@ impl Small {
         }
     }
 
-    /// A run's record of these nodes, as a sink's input.
+    /// Writes a run's record with these nodes, as the input of a sink.
     pub fn record(&self, output: &str, nodes: &[Value]) {
         let record = json!({"home": self.path("out"), "nodes": nodes}).to_string();
         self.project.write(&format!("{output}/run.json"), &record);
     }
 
-    /// A node of a record whose artifact lies in a folder of the project.
+    /// Returns a node of a run's record; its artifact is a folder of the project.
     pub fn node(&self, stage: &str, kind: &str, folder: &str, inputs: &Value) -> Value {
         json!({"stage": stage, "point": "", "is_shown": true, "kind": kind, "key": "k",
             "output": "o", "folder": self.path(folder), "parameters": {}, "inputs": inputs,
@@ -91,7 +91,7 @@ impl Small {
     }
 }
 
-/// Writes a folder's manifest.
+/// Writes the manifest of a folder.
 fn publish(folder: &Path, kind: &str) {
     let manifest = artifact::Manifest::of_folder(kind, folder).unwrap();
     artifact::write_json(&folder.join(artifact::MANIFEST_FILE), &manifest).unwrap();

@@ -1,14 +1,14 @@
-//! Files of a project: which ones last, and which ones only an unfinished command has.
+//! Files of a project: lasting ones, and leftovers of unfinished commands.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde_json::Value;
 
-/// Content of files by their paths.
+/// Contents of files by path.
 pub type Files = BTreeMap<String, Vec<u8>>;
 
-/// Every file below a folder.
+/// Reads all files below a folder.
 pub fn files_below(folder: &Path) -> Files {
     let mut files = Files::new();
     for entry in walkdir::WalkDir::new(folder) {
@@ -22,10 +22,10 @@ pub fn files_below(folder: &Path) -> Files {
 }
 
 const STORES: [&str; 2] = [".nerf-sr", "other"];
-/// Folders of a store that are empty after all runs have ended and garbage was collected.
+/// Folders of a store that are empty after garbage collection if no run is in progress.
 const EMPTY_FOLDERS: [&str; 3] = ["trash", "sinks", "partial"];
 
-/// Returns whether only an unfinished command has such a file.
+/// Returns whether a file exists only during a command or after an interrupted one.
 pub fn is_leftover(path: &str) -> bool {
     let parts: Vec<&str> = path.split('/').collect();
     let is_temporary = |name: &&str| {
@@ -41,8 +41,8 @@ pub fn is_leftover(path: &str) -> bool {
         || parts.iter().any(|name| name.starts_with(".nerf-sr-"))
 }
 
-/// Returns the part of a file's content that is equal in equal runs, if the file has one: times and
-/// processes differ.
+/// Returns the part of a file's content that is equal in equal runs, without times and process
+/// numbers; `None` if the file has no such part.
 pub fn lasting(path: &str, content: &[u8]) -> Option<Vec<u8>> {
     let parts: Vec<&str> = path.split('/').collect();
     let (name, folder) = (parts[parts.len() - 1], parts.iter().rev().nth(1).copied());
@@ -62,7 +62,7 @@ pub fn lasting(path: &str, content: &[u8]) -> Option<Vec<u8>> {
     }
 }
 
-/// The lasting files of a project.
+/// Reads the lasting files of a project.
 pub fn lasting_files(folder: &Path) -> Files {
     let mut files = Files::new();
     for (path, content) in files_below(folder) {

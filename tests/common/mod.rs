@@ -1,5 +1,5 @@
-//! One builder for end-to-end tests: a folder with a pipeline of its own, the real runner and the
-//! real stages.
+//! Fixture of the end-to-end tests: a project folder with its own pipeline, on which the built
+//! runner and stages are run.
 
 #![allow(dead_code, reason = "every test file uses a part of it")]
 #![allow(unreachable_pub, reason = "shared by several test binaries")]
@@ -15,21 +15,21 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
-/// The repository.
+/// Returns the root folder of the repository.
 pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_path_buf()
 }
 
-/// A program that `make build` made.
+/// Returns the path of a program that `make build` built.
 pub fn bin(name: &str) -> PathBuf {
-    // Test binaries lie one folder deeper.
+    // Test binaries are one folder deeper than programs.
     let test = std::env::current_exe().unwrap();
     let path = test.ancestors().nth(2).unwrap().join(name);
     assert!(path.exists(), "{} is not built; run `make build` first", path.display());
     path
 }
 
-/// All stages, sorted: a stage's folder, crate and program have one name.
+/// Returns the names of all stages, sorted: a stage's folder, crate and program have one name.
 pub fn stage_names() -> Vec<String> {
     let folders = std::fs::read_dir(root().join("stages")).unwrap();
     let mut names: Vec<String> = folders
@@ -42,13 +42,13 @@ pub fn stage_names() -> Vec<String> {
     names
 }
 
-/// The runner's verbs.
+/// Returns the runner's verbs.
 pub fn verbs() -> Vec<String> {
     let help = Finished::of(Command::new(bin("nerf-sr")).arg("--help").output().unwrap()).stdout;
     verbs_of(&help).into_iter().map(str::to_owned).collect()
 }
 
-/// The verbs that the runner's help lists.
+/// Returns the verbs that a help text of the runner lists.
 pub fn verbs_of(help: &str) -> Vec<&str> {
     let lines = help.lines().skip_while(|line| *line != "Commands:").skip(1);
     lines
@@ -58,8 +58,8 @@ pub fn verbs_of(help: &str) -> Vec<&str> {
         .collect()
 }
 
-/// A verb with what it can't do without, where `prep` is made. A new verb that needs arguments has
-/// them here.
+/// Returns a verb with its required arguments, for a project that has `prep`'s artifact. A new verb
+/// with required arguments is added here.
 pub fn call_of(verb: &str) -> Vec<&str> {
     let arguments: &[&str] = match verb {
         "init" => &["data"],
@@ -73,7 +73,7 @@ pub fn call_of(verb: &str) -> Vec<&str> {
     [&[verb][..], arguments].concat()
 }
 
-/// A pipeline that runs in seconds: 12 views of 24 pixels, a small field.
+/// Pipeline that runs in seconds: 12 views of 24 pixels, a small field.
 pub const TINY: &str = "
 default: [eval]
 stages:
@@ -91,7 +91,7 @@ stages:
     inputs: {views: render-depth, truth: prep/truth}
 ";
 
-/// A pipeline of stages that take a tenth of a second each, with its page.
+/// Pipeline with a page, whose stages take a tenth of a second each.
 pub const FAST: &str = "
 default: [report]
 stages:
@@ -112,7 +112,7 @@ stages:
     inputs: {run: eval}
 ";
 
-/// A folder with a pipeline.
+/// Temporary folder with a pipeline.
 pub struct Project {
     dir: tempfile::TempDir,
 }
@@ -132,8 +132,8 @@ impl Project {
         Self::new(FAST)
     }
 
-    /// The tiny pipeline with shipped targets; `blocks` are changes of their blocks, and further
-    /// ones.
+    /// Creates a project with the tiny pipeline and shipped targets; `blocks` are stage blocks that
+    /// change theirs or are added.
     pub fn shipped(targets: &[&str], blocks: &str) -> Self {
         let project = Self { dir: tempfile::tempdir().unwrap() };
         project.write("base/pipeline.yaml", TINY);
@@ -148,7 +148,7 @@ impl Project {
         project
     }
 
-    /// The tiny pipeline with the shipped `pipelines/` and `experiments/`.
+    /// Creates a project with the tiny pipeline and the shipped `pipelines/` and `experiments/`.
     pub fn experiments() -> Self {
         let project = Self::tiny();
         ["pipelines", "experiments"]
@@ -157,7 +157,7 @@ impl Project {
         project
     }
 
-    /// Copies a shipped folder of pipeline files into a folder.
+    /// Copies a shipped folder of pipeline files into a folder of the project.
     pub fn copy_folder(&self, shipped: &str, folder: &str) {
         for entry in std::fs::read_dir(root().join(shipped)).unwrap() {
             let path = entry.unwrap().path();
@@ -179,7 +179,8 @@ impl Project {
         std::fs::write(path, text).unwrap();
     }
 
-    /// Writes a program. Another process does: what this one has open for writing can't be started.
+    /// Writes an executable file, by another process: a child that another test forks meanwhile
+    /// would inherit this process's open file, and a file open for writing can't be executed.
     pub fn program(&self, file: &str, text: &str) {
         self.write(".source", text);
         let to = self.path(file);
@@ -195,7 +196,7 @@ impl Project {
         );
     }
 
-    /// Changes the text of the pipeline, and of the tiny one that it extends.
+    /// Replaces text in the pipeline and in the tiny pipeline that it extends.
     #[track_caller]
     pub fn replace(&self, from: &str, to: &str) {
         let files = ["pipeline.yaml", "base/pipeline.yaml"];
@@ -211,18 +212,18 @@ impl Project {
         self.command_of(&bin("nerf-sr"), arguments)
     }
 
-    /// The command of any program in the project's folder.
+    /// Returns the command of a program, in the project's folder.
     pub fn command_of(&self, program: &Path, arguments: &[&str]) -> Command {
         let mut command = Command::new(program);
         command.args(arguments).current_dir(self.dir.path());
-        // Defaults of whoever runs the tests.
+        // The environment of the user who runs the tests must not change the runner's defaults.
         for name in ["STORE", "EXECUTOR", "SITE", "DATA"] {
             command.env_remove(format!("NERF_SR_{name}"));
         }
         command
     }
 
-    /// Starts the runner, its output kept.
+    /// Starts the runner with captured output.
     pub fn spawn(&self, arguments: &[&str]) -> Child {
         self.command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
     }
@@ -231,7 +232,7 @@ impl Project {
         Finished::of(self.command(arguments).output().unwrap())
     }
 
-    /// Runs and expects success.
+    /// Runs the runner, which must succeed, and returns its stdout.
     #[track_caller]
     pub fn ok(&self, arguments: &[&str]) -> String {
         let finished = self.run(arguments);
@@ -239,7 +240,7 @@ impl Project {
         finished.stdout
     }
 
-    /// What `status` knows of each node, as the runner tells programs.
+    /// Returns the nodes that `status --json` reports.
     #[track_caller]
     pub fn nodes(&self, arguments: &[&str]) -> Vec<serde_json::Value> {
         let status = self.ok(&[&["status", "--json"], arguments].concat());
@@ -247,23 +248,23 @@ impl Project {
         report["nodes"].as_array().unwrap().clone()
     }
 
-    /// Identity of the artifact that a stage has now, in the order of the sweep's points.
+    /// Returns identities of a stage's current artifacts, in the order of the sweep's points.
     #[track_caller]
     pub fn output_of(&self, stage: &str, arguments: &[&str]) -> Vec<String> {
         let nodes = self.nodes(arguments);
         let outputs = nodes.iter().filter(|node| node["stage"] == stage).map(|node| {
-            node["output"].as_str().unwrap_or_else(|| panic!("it isn't cached: {node}")).to_owned()
+            node["output"].as_str().unwrap_or_else(|| panic!("not cached: {node}")).to_owned()
         });
         outputs.collect()
     }
 
-    /// Folder of the artifact that a stage has now, the first of a sweep's.
+    /// Returns the folder of a stage's current artifact, the first one of a sweep.
     #[track_caller]
     pub fn artifact(&self, stage: &str, arguments: &[&str]) -> PathBuf {
         self.object(&self.output_of(stage, arguments)[0])
     }
 
-    /// A JSON file of that.
+    /// Reads a JSON file of a stage's current artifact.
     #[track_caller]
     pub fn json(&self, stage: &str, file: &str, arguments: &[&str]) -> serde_json::Value {
         let path = self.artifact(stage, arguments).join(file);
@@ -271,7 +272,7 @@ impl Project {
             .unwrap_or_else(|e| panic!("{}: {e}", path.display()))
     }
 
-    /// Folder of an artifact, by the beginning of its identity.
+    /// Returns the folder of an artifact, given the beginning of its identity.
     #[track_caller]
     pub fn object(&self, start: &str) -> PathBuf {
         let objects = std::fs::read_dir(self.path(".nerf-sr/objects")).unwrap();
@@ -281,7 +282,7 @@ impl Project {
         found.unwrap_or_else(|| panic!("no object {start}"))
     }
 
-    /// The pipeline's own demo scene as `data/NAME`, for whoever is told a data folder.
+    /// Links the pipeline's demo scene as `data/NAME`, so that `data` can be given as a data folder.
     pub fn demo_data(&self, name: &str) {
         self.ok(&["run", "demo-scene"]);
         let dataset = self.object(&self.output_of("demo-scene", &[])[0]);
@@ -289,7 +290,7 @@ impl Project {
         std::os::unix::fs::symlink(&dataset, self.path("data").join(name)).unwrap();
     }
 
-    /// Every object and record of the store, sorted.
+    /// Returns the paths of all objects and records of the store, sorted.
     pub fn store_listing(&self) -> Vec<String> {
         let mut names: Vec<String> = ["objects", "actions"]
             .into_iter()
@@ -303,7 +304,7 @@ impl Project {
     }
 }
 
-/// What a command left.
+/// Exit code and output of a finished command.
 pub struct Finished {
     pub code: i32,
     pub stdout: String,
@@ -319,7 +320,7 @@ impl Finished {
         }
     }
 
-    /// Expects an exit code and, on stderr, a line that has all the words.
+    /// Asserts an exit code and that one line of stderr contains all texts of `words`.
     #[track_caller]
     pub fn fails(&self, code: i32, words: &[&str]) {
         assert_eq!(self.code, code, "{}\n{}", self.stdout, self.stderr);
@@ -329,7 +330,7 @@ impl Finished {
     }
 }
 
-/// Runs a stage by the contract.
+/// Runs a stage by the stage contract.
 pub fn stage(
     name: &str,
     params: &str,
@@ -340,8 +341,8 @@ pub fn stage(
     Finished::of(stage_command(name, params, inputs, output, more).output().unwrap())
 }
 
-/// The command of a stage by the contract; its parameters lie beside the output. It says nothing
-/// unless `more` has `--progress`.
+/// Returns the command of a stage by the stage contract, after writing its parameters next to the
+/// output. The stage prints no progress unless `more` has `--progress`.
 pub fn stage_command(
     name: &str,
     params: &str,
@@ -362,7 +363,7 @@ pub fn stage_command(
     command
 }
 
-/// LR images of a small demo scene at half the size.
+/// Prepares a small demo scene at half its size and returns the folder of the LR images.
 pub fn demo_train(project: &Project, views: u32) -> PathBuf {
     let (data, scene) = (project.path("data"), project.path("scene"));
     let params = format!(r#"{{"size": 48, "train": {views}, "test": 1, "samples_per_axis": 1}}"#);
@@ -371,22 +372,22 @@ pub fn demo_train(project: &Project, views: u32) -> PathBuf {
     scene.join("train")
 }
 
-/// What stands in an artifact's manifest: its whole content.
+/// Returns the text of an artifact's manifest, which identifies its content.
 pub fn manifest(folder: &Path) -> String {
     std::fs::read_to_string(folder.join("artifact.json")).unwrap()
 }
 
-/// Sends a running stage a signal: "-TERM", "-KILL".
+/// Sends a signal to a running stage: "-TERM", "-KILL".
 pub fn signal(child: &Child, name: &str) {
     Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
 }
 
-/// When the last of a work folder's checkpoints was written.
+/// Returns the time of a work folder's latest checkpoint.
 pub fn last_checkpoint(work: &Path) -> Option<SystemTime> {
     checkpoints(work).iter().filter_map(|file| file.metadata().ok()?.modified().ok()).max()
 }
 
-/// A work folder's checkpoints.
+/// Returns the paths of a work folder's checkpoints.
 pub fn checkpoints(work: &Path) -> Vec<PathBuf> {
     let files = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
     files
@@ -395,17 +396,18 @@ pub fn checkpoints(work: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// What comes at all comes within this time, however slow the machine is just now. Slurm alone
-/// takes a minute before it ends a job whose time is up.
+/// Timeout of [`wait_until`], long enough for a busy machine. Slurm takes a minute to end a job
+/// whose time limit has passed.
 const PATIENCE: Duration = Duration::from_secs(300);
 
-/// Waits for what comes sooner or later, and fails where it doesn't.
+/// Waits until a condition is true; panics after [`PATIENCE`].
 #[track_caller]
 pub fn wait_until(happened: impl FnMut() -> bool) {
     assert!(happens(happened), "what the test waits for hasn't happened in {PATIENCE:?}");
 }
 
-/// Waits likewise; whether it has come, for who can say more of it.
+/// Waits until a condition is true; returns `false` after [`PATIENCE`], for callers that report the
+/// failure in more detail.
 pub fn happens(mut happened: impl FnMut() -> bool) -> bool {
     let begun = Instant::now();
     while !happened() {
@@ -417,19 +419,19 @@ pub fn happens(mut happened: impl FnMut() -> bool) -> bool {
     true
 }
 
-/// Whether a process hasn't ended. One that nobody has waited for yet is still listed.
+/// Returns whether a process is running. A zombie, which `/proc` still lists, is not.
 pub fn is_running(process: &str) -> bool {
     let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
-    // The state stands behind the name, which is in brackets and may hold anything.
+    // The state follows the process name in brackets, which may contain any characters.
     stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with(['Z', 'X']))
 }
 
-/// Kills a stage so many milliseconds after its start, and then each time so long after another
-/// checkpoint was written. There is one to go on from in the end.
+/// Runs and kills a stage once per entry of `milliseconds`: the given time after its start, and in
+/// later rounds the given time after the next checkpoint. A checkpoint remains at the end.
 ///
-/// Which moment a kill meets is left to chance: any may come. From the count `slow_from` of its
-/// progress on the stage takes its time, so that no machine ends it before the last kill. Tests
-/// that need a certain step set `NERF_SR_STOP_AFTER`.
+/// Kills happen at arbitrary moments. From the progress count `slow_from` on, the stage slows down,
+/// so that no machine finishes the stage before the last kill. Tests that need a certain step set
+/// `NERF_SR_STOP_AFTER`.
 pub fn kill_again_and_again(
     name: &str,
     params: &str,
@@ -454,12 +456,13 @@ pub fn kill_again_and_again(
         std::thread::sleep(Duration::from_millis(*pause));
         child.kill().unwrap();
         let killed = Finished::of(child.wait_with_output().unwrap());
-        assert_eq!(killed.code, -1, "it ended before kill {round}: {}", killed.stderr);
+        assert_eq!(killed.code, -1, "{name} ended before kill {round}: {}", killed.stderr);
     }
     assert!(last_checkpoint(work).is_some() && !output.exists());
 }
 
-/// The data folder with real scenes and weights; without it a test says so and ends.
+/// Returns the data folder with real scenes and weights; without one, prints that the test is
+/// skipped and returns `None`.
 pub fn data() -> Option<PathBuf> {
     let path =
         std::env::var("NERF_SR_DATA").map_or_else(|_| root().join("../shared/data"), PathBuf::from);

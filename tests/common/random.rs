@@ -1,6 +1,6 @@
-//! Random choices that a seed repeats.
+//! Seeded random choices.
 
-/// Random numbers that a seed repeats (xorshift).
+/// Seeded random number generator (xorshift).
 pub struct Random(u64);
 
 impl Random {
@@ -15,13 +15,13 @@ impl Random {
         self.0 % bound
     }
 
-    /// One of some things.
+    /// Returns a random element.
     pub fn choose<'a, T>(&mut self, things: &'a [T]) -> &'a T {
         &things[self.below(things.len() as u64) as usize]
     }
 }
 
-/// The number that an environment variable gives.
+/// Returns the number in an environment variable, if set.
 pub fn number(variable: &str) -> Option<u64> {
     std::env::var(variable)
         .ok()

@@ -1,4 +1,4 @@
-//! Binary PLY as other programs write and read it, and a reference renderer of 3D Gaussians.
+//! Independent reader of binary PLY files, and a reference renderer of 3D Gaussians.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,7 +7,7 @@ use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use pixels::Image;
 use scene::Camera;
 
-/// The columns of a binary little-endian PLY file's first element, by their names.
+/// Reads the columns of the first element of a binary little-endian PLY file, by name.
 pub fn read_ply(path: &Path) -> BTreeMap<String, Vec<f64>> {
     let bytes = std::fs::read(path).unwrap();
     let end = b"end_header\n";
@@ -36,7 +36,7 @@ pub fn read_ply(path: &Path) -> BTreeMap<String, Vec<f64>> {
     columns
 }
 
-/// Three columns as vectors.
+/// Returns three columns as vectors.
 pub fn vectors(columns: &BTreeMap<String, Vec<f64>>, names: [&str; 3]) -> Vec<DVec3> {
     (0..columns[names[0]].len()).map(|i| vector(columns, names, i)).collect()
 }
@@ -45,7 +45,7 @@ fn vector(columns: &BTreeMap<String, Vec<f64>>, names: [&str; 3], i: usize) -> D
     DVec3::from_array(names.map(|name| columns[name][i]))
 }
 
-/// A 3D Gaussian.
+/// 3D Gaussian.
 pub struct Splat {
     position: DVec3,
     covariance: DMat3,
@@ -58,7 +58,7 @@ fn rotation(columns: &BTreeMap<String, Vec<f64>>, i: usize) -> DMat3 {
     DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
 }
 
-/// Reads a splat file by its layout alone.
+/// Reads a splat file by the published layout of its columns.
 pub fn read_splats(path: &Path) -> Vec<Splat> {
     let columns = read_ply(path);
     (0..columns["x"].len()).map(|i| splat(&columns, i)).collect()
@@ -75,7 +75,7 @@ fn splat(columns: &BTreeMap<String, Vec<f64>>, i: usize) -> Splat {
     }
 }
 
-/// A splat in an image.
+/// Splat projected into an image.
 struct Drawn<'a> {
     splat: &'a Splat,
     depth: f64,
@@ -89,8 +89,8 @@ fn covered(radius: f64, middle: f64, size: usize) -> std::ops::Range<usize> {
     end(middle - radius)..end(middle + radius + 1.0)
 }
 
-/// Renders splats over a grey background as Kerbl et al. 2023 do: linearised projection, a blur of
-/// 0.3 square pixels, front to back.
+/// Renders splats over a grey background by the method of Kerbl et al. 2023: linearised projection,
+/// 0.3 square pixels added to the variance, compositing from front to back.
 pub fn render_splats(splats: &[Splat], camera: &Camera, background: f64) -> Image {
     let k = camera.intrinsics;
     let mut drawn: Vec<Drawn<'_>> = splats.iter().filter_map(|s| projected(s, camera)).collect();
@@ -123,7 +123,7 @@ fn projected<'a>(splat: &'a Splat, camera: &Camera) -> Option<Drawn<'a>> {
     if depth < 0.2 {
         return None;
     }
-    // Camera axes right, down, forward.
+    // Camera axes: right, down, forward.
     let axes = camera.rotation();
     let turn = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis).transpose();
     let place = turn * (splat.position - camera.centre());

@@ -1,4 +1,4 @@
-//! How near an exported surface is to the demo scene's own, which is known exactly.
+//! Comparison of an exported surface with the demo scene's exact surface.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,17 +8,17 @@ use glam::DVec3;
 use scene::Camera;
 use serde_json::Value;
 
-/// A binary glTF file with one mesh.
+/// Content of a binary glTF file with one mesh.
 pub struct Glb {
-    /// The JSON chunk.
+    /// JSON chunk.
     pub description: Value,
-    /// Vertices.
+    /// Vertex positions.
     pub positions: Vec<DVec3>,
-    /// Their normals.
+    /// Vertex normals.
     pub normals: Vec<DVec3>,
-    /// Their linear colours.
+    /// Vertex colours, linear RGB.
     pub colours: Vec<DVec3>,
-    /// Vertices of each triangle.
+    /// Vertex indices of each triangle.
     pub triangles: Vec<[usize; 3]>,
 }
 
@@ -38,7 +38,7 @@ fn vectors(description: &Value, binary: &[u8], accessor: &Value) -> Vec<DVec3> {
 }
 
 impl Glb {
-    /// Reads a file.
+    /// Reads a binary glTF file.
     pub fn read(path: &Path) -> Self {
         let bytes = std::fs::read(path).unwrap();
         let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
@@ -62,7 +62,8 @@ impl Glb {
     }
 }
 
-/// Points of the true surface that cameras see, and its normals, one for each cell of a grid.
+/// Returns points of the true surface that are visible from the cameras, with normals; one point
+/// per cell of a grid.
 pub fn true_surface(world: &World, cameras: &[Camera], cell: f64) -> Vec<(DVec3, DVec3)> {
     let mut points = BTreeMap::new();
     for camera in cameras {
@@ -81,14 +82,14 @@ fn key(point: DVec3, cell: f64) -> [i32; 3] {
     (point / cell).to_array().map(|x| x.floor() as i32)
 }
 
-/// Longest side of the box around points.
+/// Returns the longest side of the points' bounding box.
 pub fn size(points: &[(DVec3, DVec3)]) -> f64 {
     let all = || points.iter().map(|(point, _)| *point);
     let (min, max) = (all().reduce(DVec3::min).unwrap(), all().reduce(DVec3::max).unwrap());
     (max - min).max_element()
 }
 
-/// How an exported surface compares with the true one.
+/// Errors of an exported surface.
 #[derive(Clone, Copy, Debug)]
 pub struct Compared {
     /// Mean distance from exported vertices or points to the true surface, over the scene's size.
@@ -99,7 +100,7 @@ pub struct Compared {
     pub outward: f64,
 }
 
-/// Compares vertices and normals with the true surface and points of it.
+/// Compares vertices and normals with the true surface, of which `truth` are sample points.
 pub fn compare(
     world: &World,
     truth: &[(DVec3, DVec3)],
@@ -122,7 +123,7 @@ pub fn compare(
     }
 }
 
-/// Finds the nearest of many points.
+/// Index of points for nearest-neighbour distances.
 struct Nearest {
     cell: f64,
     points: BTreeMap<[i32; 3], Vec<DVec3>>,
@@ -139,7 +140,7 @@ impl Nearest {
         let middle = key(from, self.cell);
         let mut best = f64::INFINITY;
         for ring in 0..64 {
-            // What lies in farther rings is at least so far away.
+            // Points in this ring and farther ones can't be nearer than `ring - 1` cells.
             if best <= f64::from(ring - 1) * self.cell {
                 break;
             }
@@ -153,7 +154,7 @@ impl Nearest {
     }
 }
 
-/// The cells at a distance, in cells, from one, by their largest coordinate difference.
+/// Returns the cells at Chebyshev distance `ring` from a cell.
 fn cells_of_ring(middle: [i32; 3], ring: i32) -> impl Iterator<Item = [i32; 3]> {
     let side = 2 * ring + 1;
     (0..side.pow(3)).filter_map(move |i| {
