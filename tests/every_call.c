@@ -23,11 +23,11 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-/* A program that takes longer hangs. */
+/* Timeout; a program that runs longer is assumed to hang. */
 #define MAX_SECONDS 300
 
 static const struct { int number; const char *name; } CALLS[] = {
-/* Newer architectures have the *at variants alone. */
+/* Newer architectures have only the *at variants. */
 #ifdef SYS_rename
     {SYS_rename, "rename"}, {SYS_link, "link"}, {SYS_unlink, "unlink"}, {SYS_rmdir, "rmdir"},
 #endif
@@ -44,7 +44,7 @@ static void fail(const char *what) {
     exit(70);
 }
 
-/* Stops this process and its children at CALLS; the number of a call's entry goes with the stop. */
+/* Stops this process and its children at CALLS; the stop's event message is the call's index in CALLS. */
 static void install_filter(void) {
     struct sock_filter code[2 * CALL_COUNT + 2];
     struct sock_fprog filter = {0, code};
@@ -57,7 +57,7 @@ static void install_filter(void) {
     if (prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) || prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &filter)) fail("seccomp");
 }
 
-/* Starts the program, traced with all that it starts. */
+/* Starts the program and traces it with all its children. */
 static pid_t start(char **command) {
     int ready[2];
     char byte;
@@ -81,7 +81,7 @@ static pid_t start(char **command) {
     return program;
 }
 
-/* Process that a thread belongs to; 0 if the thread has ended. */
+/* Returns the process that a thread belongs to; 0 if the thread has ended. */
 static pid_t process_of(pid_t thread) {
     char path[64], line[256];
     int process = 0;
@@ -113,7 +113,7 @@ int main(int count, char **words) {
             else kill(program, SIGKILL);
         }
         if (signal == (SIGTRAP | 0x80)) kill(program, SIGKILL);
-        /* Stops of ptrace's own are no signals to deliver; a thread that was killed meanwhile is gone. */
+        /* Stops by ptrace itself deliver no signal. An error of ptrace is ignored: the thread may have been killed. */
         int is_signal = event == 0 && signal != (SIGTRAP | 0x80);
         ptrace(resume, thread, 0, is_signal ? signal : 0);
     }
