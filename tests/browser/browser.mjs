@@ -1,7 +1,7 @@
-// Opens a page from disk in headless Chromium, as tests/common/browser.rs calls it.
+// Opens pages from disk in headless Chromium; called by the scripts that tests/common/browser.rs runs.
 //
-// Packages lie in target/browser, where scripts/setup-browser.sh puts them. No console error and no request but for
-// files is allowed: `finish` says what was found.
+// scripts/setup-browser.sh installs the npm packages in target/browser. Console errors and network requests are
+// collected as `problems`.
 import { createRequire } from "node:module";
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
@@ -13,7 +13,7 @@ const QUIET = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-ba
   "--disable-component-update", "--disable-sync"];
 const SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"];
 
-/** Starts Chromium; `webgl` brings WebGL2 in software. */
+/** Starts Chromium; `webgl` enables WebGL2 by a software renderer. */
 export async function start({ webgl = false } = {}) {
   return chromium.launch({
     executablePath: process.env.NERF_SR_CHROMIUM,
@@ -29,7 +29,7 @@ export async function open(browser, path, { width = 1440, height = 900, dark = f
     reducedMotion: "reduce",
     hasTouch: width < 600,
   });
-  // Pages of megabytes take long to open on a busy machine.
+  // Pages of several megabytes load slowly on a busy machine.
   context.setDefaultTimeout(180_000);
   const page = await context.newPage();
   const problems = [];
@@ -44,7 +44,7 @@ export async function open(browser, path, { width = 1440, height = 900, dark = f
   return { page, problems };
 }
 
-/** Serious and critical findings of axe-core, one line each. */
+/** Returns the serious and critical findings of axe-core, one line each. */
 export async function accessibilityFindings(page) {
   await page.evaluate(readFileSync(packages.resolve("axe-core/axe.min.js"), "utf8"));
   const { violations } = await page.evaluate(() => window.axe.run());
@@ -53,7 +53,7 @@ export async function accessibilityFindings(page) {
     .map(({ id, help, nodes }) => `${id}: ${help}: ${nodes.slice(0, 3).map(({ target }) => target.join(" ")).join(", ")}`);
 }
 
-/** Runs `check`, prints the object that it returns as JSON, and ends the browser whatever happens. */
+/** Runs `check`, prints its result as JSON, and closes the browser, also after an error. */
 export async function report(options, check) {
   const browser = await start(options);
   try {

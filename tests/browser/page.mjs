@@ -1,7 +1,7 @@
-// Uses a report page as a reader would, on a phone and a desktop, light and dark: page.mjs PAGE
+// Operates a report page like a user, in phone and desktop size, light and dark: page.mjs PAGE
 //
-// Prints for each of the four what was wrong (`problems`) and what the page said (`numbers`: by view, result and
-// figure; `summary`).
+// Prints for each of the four combinations the `problems` and the page's content (`summary`, and `numbers` by view,
+// result and metric).
 import { accessibilityFindings, open, report } from "./browser.mjs";
 
 const PAGE = process.argv[2];
@@ -34,7 +34,7 @@ async function look(browser, size) {
   return found;
 }
 
-/** The numbers under the pictures, as a table's rows. */
+/** Returns the numbers below the images, by row and column of their table. */
 const readNumbers = (page) =>
   page.locator("#numbers").evaluate((table) => {
     const figures = [...table.querySelectorAll("thead th")].slice(1).map((cell) => cell.textContent);
@@ -46,7 +46,7 @@ const readNumbers = (page) =>
   });
 
 const options = (page, id) => page.locator(`#${id} option`).evaluateAll((all) => all.map((option) => option.value));
-/** Of a hundred methods the first and the last. */
+/** Returns the first six and last six values, because a page can have a hundred methods. */
 const ends = (all) => [...all.slice(0, 6), ...all.slice(-6)].filter((value, i, some) => some.indexOf(value) === i);
 const sources = (page) => page.locator("#stage img").evaluateAll((all) => all.map((image) => image.src));
 const division = (page) =>
@@ -55,7 +55,7 @@ const division = (page) =>
     .nth(1)
     .evaluate((half) => half.style.clipPath);
 
-/** Moves the division, and goes through all views and methods. */
+/** Moves the slider, and selects all views and methods. */
 async function compare(page, expect) {
   const before = await division(page);
   await page.locator("#split").press("Home");
@@ -87,7 +87,7 @@ async function compare(page, expect) {
   return numbers;
 }
 
-/** Zoom and pan stay when the view changes. */
+/** Checks that zoom and pan are kept when the view changes. */
 async function zoom(page, expect) {
   const transform = () =>
     page
@@ -111,7 +111,7 @@ async function arrange(page, expect) {
   expect((await page.locator("#stage .pane").count()) === 1, "the slider doesn't come back");
 }
 
-/** A click on a plot of all views shows the view. */
+/** Checks that selecting a point in a plot of all views selects its view. */
 async function pick(page, expect) {
   const plot = page.locator(".plot").first();
   if (!(await page.locator(".chart figcaption", { hasText: "of every view" }).count())) return;
@@ -128,7 +128,7 @@ async function pick(page, expect) {
   );
 }
 
-/** A box of the graph opens what is known of its stage. */
+/** Checks that a box of the graph opens the details of its stage. */
 async function followGraph(page, expect) {
   const boxes = page.locator(".graph a");
   if (!(await boxes.count())) return expect(false, "there is no graph");

@@ -1,7 +1,7 @@
-// Loads a splat file in the GaussianSplats3D viewer and draws it from given cameras: splats.mjs SPLATS.ply VIEWS.json FOLDER.
+// Renders a splat file in the GaussianSplats3D viewer from given cameras: splats.mjs SPLATS.ply VIEWS.json FOLDER.
 //
-// Each view becomes FOLDER/NAME.png, of the camera's size. Prints how many splats the viewer's loader found and what kept
-// it from drawing.
+// Writes each view to FOLDER/NAME.png, in the camera's size. Prints the number of splats that the viewer loaded, and the
+// problems.
 import { createRequire } from "node:module";
 import { readFileSync, writeFileSync } from "node:fs";
 import { dirname, join } from "node:path";
@@ -13,7 +13,7 @@ const packages = createRequire(`${process.env.NERF_SR_BROWSER}/`);
 const three = dirname(packages.resolve("three"));
 const viewer = dirname(packages.resolve("@mkkellogg/gaussian-splats-3d"));
 
-// Modules can't be loaded from disk; this host is never asked: every request is answered here.
+// Browsers don't load modules from disk. No request reaches this host: `answer` serves all of them.
 const ORIGIN = "http://viewer.invalid/";
 const FILES = {
   "/three.module.js": join(three, "three.module.js"),
@@ -32,7 +32,7 @@ async function answer(route) {
   return route.fulfill({ contentType, body: readFileSync(FILES[path]) });
 }
 
-// In the page: shows the file in a viewer of its own size and camera, on white as the demo scene's images are.
+// In the page: loads the file in a viewer of the given size, over white like the demo scene's images.
 async function load({ width, height }) {
   const THREE = await import("three");
   const { SceneFormat, SceneRevealMode, Viewer } = await import("viewer");
@@ -48,7 +48,7 @@ async function load({ width, height }) {
   return viewer.getSplatMesh().getSplatCount();
 }
 
-// In the page: draws a view, as a PNG's data URL.
+// In the page: renders a view and returns a PNG as data URL.
 async function draw({ intrinsics, camera_to_world: pose }) {
   const { THREE, renderer, camera, viewer } = window.shown;
   camera.fov = (360 / Math.PI) * Math.atan((0.5 * intrinsics.height) / intrinsics.fy);
@@ -57,7 +57,7 @@ async function draw({ intrinsics, camera_to_world: pose }) {
   camera.updateProjectionMatrix();
   new THREE.Matrix4().set(...pose.flat(), 0, 0, 0, 1).decompose(camera.position, camera.quaternion, camera.scale);
   camera.updateMatrixWorld(true);
-  // The viewer sorts beside, when a camera has moved far, and at first the nearest splats alone: here all are sorted.
+  // The viewer sorts splats asynchronously, and only the nearest ones first; this waits and then sorts all splats.
   viewer.update();
   do {
     await new Promise((resolve) => setTimeout(resolve, 20));

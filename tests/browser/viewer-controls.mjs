@@ -1,10 +1,10 @@
-// Uses a viewer's page as people do, and prints what it shows: viewer-controls.mjs PAGE [PNG FOLDER]
+// Operates a viewer's page like a user, and prints its states: viewer-controls.mjs PAGE [PNG FOLDER]
 import { mkdirSync } from "node:fs";
 import { accessibilityFindings, open, report } from "./browser.mjs";
 
 const [file, written] = process.argv.slice(2);
 
-/** In the page: waits until all is drawn; then what it looks like and where it is seen from. */
+/** In the page: waits until rendering ends; returns a hash of the pixels, the camera and the visible parts. */
 async function state() {
   const viewer = await window.viewer;
   const pause = () => new Promise((resolve) => setTimeout(resolve, 30));
@@ -50,7 +50,7 @@ const onDesktop = (page) => [
   ["reset", async () => { await page.check("[value=colour]"); await page.uncheck("#with-frusta"); await page.click("#reset"); }],
 ];
 
-/** Touches move from one list of places to another. */
+/** Moves touch points from one list of positions to another. */
 async function touched(page, from, to) {
   const session = await page.context().newCDPSession(page);
   const send = (type, places) =>

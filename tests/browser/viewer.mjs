@@ -1,13 +1,13 @@
 // Compares a viewer's page with rendered views: viewer.mjs PAGE VIEWS [PNG FOLDER]
 //
-// VIEWS is an artifact of render-depth. For each of its views, prints the PSNR of the page's view from the same camera in
-// dB, that of its mirror image, texture reads a pixel and milliseconds. With a folder, writes the page's views there.
+// VIEWS is an artifact of render-depth. For each view, prints the PSNR of the page's view from the same camera in dB, the
+// PSNR of the mirrored view, texture reads per pixel, and milliseconds. With a folder, also writes the page's views there.
 import { mkdirSync, readFileSync, writeFileSync } from "node:fs";
 import { accessibilityFindings, open, report } from "./browser.mjs";
 
 const [file, folder, written] = process.argv.slice(2);
 
-/** In the page: draws a camera's view and compares it with a PNG. */
+/** In the page: renders a camera's view and compares the pixels with a PNG. */
 async function compared({ camera, expected }) {
   const viewer = await window.viewer;
   const pixelsOf = async (url, isMirrored = false) => {

@@ -1,4 +1,4 @@
-// Prints a pixel that WebGL2 cleared to orange.
+// Clears a WebGL2 canvas to orange and prints a pixel.
 import { report } from "./browser.mjs";
 
 await report({ webgl: true }, async (browser) => {
