@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Starts or stops a one-node Slurm in a private folder for tests: no systemd, cgroups, database or root, loopback only.
 # usage: MINI_SLURM_PORT=17000 mini-slurm.sh start|stop DIR; then SLURM_CONF=DIR/slurm.conf sbatch …
-# Slurm uses that port and the next. The node is configured with four cores on any machine. DIR must be short: it contains a socket.
+# Slurm uses that port and the next. The node has four configured cores on any machine. DIR must be short, because it contains a socket.
 set -euo pipefail
 verb=${1:?start|stop}; dir=$(realpath -m "${2:?a folder}"); port=${MINI_SLURM_PORT:-16817}
 # Debian installs the daemons in /usr/sbin, which is not on an ordinary user's PATH.

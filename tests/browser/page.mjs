@@ -106,9 +106,9 @@ async function zoom(page, expect) {
 
 async function arrange(page, expect) {
   await page.locator("#grid-mode").click();
-  expect((await page.locator("#stage .pane").count()) > 1, "nothing stands side by side");
+  expect((await page.locator("#stage .pane").count()) > 1, "the grid has fewer than two panes");
   await page.locator("#slider-mode").click();
-  expect((await page.locator("#stage .pane").count()) === 1, "the slider doesn't come back");
+  expect((await page.locator("#stage .pane").count()) === 1, "the slider has more than one pane");
 }
 
 /** Checks that selecting a point in a plot of all views selects its view. */
