@@ -28,6 +28,7 @@ def read_points(path):
 
 
 def outward(points, normals, tree, truth_normals):
+    """Returns the share of normals that point to the same side as the nearest true normal."""
     _, nearest = tree.query(points)
     return float(np.mean(np.sum(normals * truth_normals[nearest], axis=1) > 0))
 

@@ -58,7 +58,7 @@ def read(path: pathlib.Path) -> dict:
             (name,) = [name for name in archive.namelist() if name.endswith("data.pkl")]
             return Unpickler(archive, name).load()
     except zipfile.BadZipFile:
-        sys.exit(f"{path}: not a checkpoint of PyTorch 1.6 or newer; load it there and save it again")
+        sys.exit(f"{path}: not a checkpoint of PyTorch 1.6 or newer; load the file in a newer PyTorch and save it again")
     except OSError as error:
         sys.exit(f"{path}: {error.strerror}")
     except Exception as error:
@@ -76,7 +76,7 @@ def check(path: pathlib.Path, state: dict, expected: dict, network: str) -> dict
     """Returns the tensors if names and shapes are those of the network and all numbers are finite; exits otherwise."""
     for name in sorted(expected.keys() | state.keys()):
         if name not in state:
-            sys.exit(f"{path}: tensor {name} is missing; is it {network}?")
+            sys.exit(f"{path}: tensor {name} is missing; expected the weights of {network}")
         if name not in expected:
             sys.exit(f"{path}: tensor {name} doesn't belong to {network}")
         shape, numbers = state[name]

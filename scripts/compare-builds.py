@@ -114,11 +114,11 @@ def compare(name: str, options: argparse.Namespace) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("old", type=pathlib.Path)
-    parser.add_argument("new", type=pathlib.Path)
-    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
-    parser.add_argument("--only", nargs="+", choices=EXPERIMENTS, default=list(EXPERIMENTS))
-    parser.add_argument("--ignored", nargs="*", default=[], metavar="FILE:KEY")
+    parser.add_argument("old", type=pathlib.Path, help="work tree of the old build")
+    parser.add_argument("new", type=pathlib.Path, help="work tree of the new build")
+    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"), help="folder with the scenes (default ../shared/data)")
+    parser.add_argument("--only", nargs="+", choices=EXPERIMENTS, default=list(EXPERIMENTS), help="experiments to compare (default all)")
+    parser.add_argument("--ignored", nargs="*", default=[], metavar="FILE:KEY", help="JSON keys that are not compared")
     options = parser.parse_args()
     return 0 if all([compare(name, options) for name in options.only]) else 1
 

@@ -67,6 +67,7 @@ def run(tree: pathlib.Path, stage: str, folder: pathlib.Path, output: str, input
 
 
 def prepare(options: argparse.Namespace, folder: pathlib.Path, name: str) -> None:
+    """Prepares a scene with the old build, in `folder/scene`."""
     dataset, width, scale, _ = SCENES[name]
     source = folder / "dataset"
     if dataset is None:
@@ -113,6 +114,7 @@ def protocol(tree: pathlib.Path, name: str) -> dict[str, dict[str, int]]:
 
 
 def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build: str, seed: int, factor: float) -> Result:
+    """Trains and renders a scene with one build and scores the views with the new build."""
     _, _, scale, rays = SCENES[name]
     tree = getattr(options, build)
     own = protocol(tree, name) if options.budgets else {"train-ss": {"rays": int(rays * factor)}}
@@ -176,8 +178,8 @@ def panel(scene: str, results: list[Result], left: int) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("old", type=pathlib.Path)
-    parser.add_argument("new", type=pathlib.Path)
+    parser.add_argument("old", type=pathlib.Path, help="work tree of the old build")
+    parser.add_argument("new", type=pathlib.Path, help="work tree of the new build")
     parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"), help="folder with the scenes (default ../shared/data)")
     parser.add_argument("--only", nargs="*", choices=SCENES, help=f"scenes to compare (default {', '.join(SHORT)}; with --budgets all except the demo scene)")
     rays = parser.add_mutually_exclusive_group()

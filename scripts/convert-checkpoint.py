@@ -24,6 +24,7 @@ parser.add_argument("--background", choices=["white", "black"], default="white")
 options = parser.parse_args()
 
 def octaves(path: pathlib.Path, inputs: int) -> int:
+    """Returns the octaves of an encoding with this many values; exits if no number of octaves fits."""
     if inputs < 3 or inputs % 6 != 3:
         sys.exit(f"{path}: {inputs} inputs, which is not the size of an encoded position or direction (3 and 6 per octave)")
     return (inputs - 3) // 6
@@ -35,7 +36,7 @@ def sizes(path: pathlib.Path, state: dict) -> dict:
         width, position = state["xyz_encoding_1.0.weight"][0]
         direction = state["dir_encoding.0.weight"][0][1] - width
     except (KeyError, ValueError) as error:
-        sys.exit(f"{path}: tensor {error} is missing; is it a VanillaMLP?")
+        sys.exit(f"{path}: tensor {error} is missing; expected the weights of a VanillaMLP")
     depth = sum(name.startswith("xyz_encoding_") and name.endswith(".0.weight") for name in state)
     return {"position_frequencies": octaves(path, position), "direction_frequencies": octaves(path, direction), "layers": depth, "hidden_dim": width}
 

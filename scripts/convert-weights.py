@@ -38,6 +38,7 @@ def count(state: dict, pattern: str) -> int:
 
 
 def imdn(state: dict) -> dict:
+    """Returns the expected shapes of IMDN's tensors by name; sizes are read from `state`."""
     width = state["fea_conv.weight"].shape[0]
     blocks, kept = count(state, r"IMDB(\d+)\."), width // 4
     rest, narrow = width - kept, state["IMDB1.cca.conv_du.0.weight"].shape[0]
@@ -51,6 +52,7 @@ def imdn(state: dict) -> dict:
 
 
 def liif(state: dict) -> dict:
+    """Returns the expected shapes of LIIF's tensors by name; sizes are read from `state`."""
     width = state["encoder.head.0.weight"].shape[0]
     blocks = count(state, r"encoder\.body\.(\d+)\.body\.")
     expected = conv("encoder.head.0", width, 3) | conv(f"encoder.body.{blocks}", width, width)
@@ -65,6 +67,7 @@ def liif(state: dict) -> dict:
 
 
 def swinir(state: dict) -> dict:
+    """Returns the expected shapes of SwinIR's tensors by name; sizes and variant are read from `state`."""
     width = state["conv_first.weight"].shape[0]
 
     def convs(name: str) -> dict:
@@ -112,7 +115,7 @@ state = {name: tensor for name, tensor in checkpoints.tensors(options.checkpoint
 try:
     expected = {"imdn": imdn, "liif": liif, "swinir": swinir}[options.network](state)
 except KeyError as error:
-    sys.exit(f"{options.checkpoint}: tensor {error.args[0]} is missing; is it {options.network}?")
+    sys.exit(f"{options.checkpoint}: tensor {error.args[0]} is missing; expected the weights of {options.network}")
 except (IndexError, ValueError):
     sys.exit(f"{options.checkpoint}: the tensors' shapes are not those of {options.network}")
 checkpoints.write(options.out, checkpoints.check(options.checkpoint, state, expected, options.network))

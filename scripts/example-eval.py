@@ -19,6 +19,7 @@ import zlib
 
 
 def describe():
+    """Returns the description that the runner reads: parameters, inputs and output of the stage."""
     return {
         "name": "example-eval",
         "version": "1",

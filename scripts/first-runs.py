@@ -72,10 +72,10 @@ def measure(repository: pathlib.Path, commit: str, work: pathlib.Path) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("commits", nargs="+")
-    parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--work", type=pathlib.Path, default=pathlib.Path("out/first-runs"))
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/first-runs.json"))
+    parser.add_argument("commits", nargs="+", help="commits to measure")
+    parser.add_argument("--rounds", type=int, default=1, help="runs of each commit (default 1)")
+    parser.add_argument("--work", type=pathlib.Path, default=pathlib.Path("out/first-runs"), help="folder for clones and logs (default out/first-runs)")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/first-runs.json"), help="JSON file to write (default out/first-runs.json)")
     arguments = parser.parse_args()
     repository = pathlib.Path(__file__).resolve().parent.parent
     arguments.work.mkdir(parents=True, exist_ok=True)

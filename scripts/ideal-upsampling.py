@@ -17,7 +17,7 @@ from PIL import Image
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", type=pathlib.Path, required=True)
 parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
-parser.add_argument("--protocols", nargs="+", default=["100x2", "100x4", "200x2", "200x4"], help="LR width x scale")
+parser.add_argument("--protocols", nargs="+", default=["100x2", "100x4", "200x2", "200x4"], help="protocols as LR width x scale (default 100x2 100x4 200x2 200x4)")
 options = parser.parse_args()
 
 
@@ -26,6 +26,7 @@ def psnr(a: numpy.ndarray, b: numpy.ndarray) -> float:
 
 
 def ideal(view: pathlib.Path, lr: int, scale: float) -> float:
+    """Returns the PSNR of a test view after removing all frequencies above the LR image's Nyquist frequency."""
     hr = round(lr * scale)
     image = Image.open(view).convert("RGBA")
     if image.width != hr:

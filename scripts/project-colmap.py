@@ -12,6 +12,7 @@ import pycolmap
 
 
 def projected(entry: dict) -> list:
+    """Projects the points of one camera and returns the image positions."""
     size = {"width": entry["width"], "height": entry["height"]}
     camera = pycolmap.Camera(model=entry["model"], params=entry["parameters"], **size)
     return camera.img_from_cam(numpy.array(entry["points"])).tolist()
