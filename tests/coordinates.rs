@@ -169,8 +169,8 @@ fn weights(made: &Made) -> Vec<u8> {
     std::fs::read(made.field.join(FieldFile::member_file(0))).unwrap()
 }
 
-/// Shifts that are exact in f64, and powers of two as units, change no bit of a field; shifts change
-/// no bit of its views, either.
+/// Shifts that are exact in f64, and powers of two as units, change no bit of a field; shifts
+/// change no bit of its views, either.
 #[test]
 fn exact_shifts_and_units_give_equal_bytes() {
     let project = Project::tiny();

@@ -71,8 +71,8 @@ fn plain(line: &str) -> String {
     }
 }
 
-/// Changes the parts of a stage's key as another version would have written them; under the key that
-/// these come to, the next run finds the record no more.
+/// Changes the parts of a stage's key as another version would have written them; under the key
+/// that these come to, the next run finds the record no more.
 fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
     let actions = std::fs::read_dir(project.path(".nerf-sr/actions"))
         .unwrap()

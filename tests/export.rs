@@ -25,7 +25,8 @@ const ENLARGED: u32 = 4;
 /// Decibels of the splats after a short training, in the mean; 043 has figures.
 const LEAST_SPLATS: f64 = 24.0;
 
-/// What a measuring needs: the exported files, the cameras they were made from, and the test images.
+/// What a measuring needs: the exported files, the cameras they were made from, and the test
+/// images.
 struct Exported {
     files: PathBuf,
     cameras: PathBuf,

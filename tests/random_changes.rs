@@ -1,6 +1,6 @@
 //! Files of the data set, of programs and of the store that change at random moments of a run: the
-//! run fails, or its results are those of a fresh store, and no later run takes a wrong result for a
-//! cached one.
+//! run fails, or its results are those of a fresh store, and no later run takes a wrong result for
+//! a cached one.
 //!
 //! NERF_SR_ROUNDS says how many changes (`make faults`: 100), NERF_SR_SEED which.
 

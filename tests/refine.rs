@@ -414,8 +414,8 @@ impl Refining<'_> {
         let summary = std::fs::read_to_string(output.join("summary.txt")).unwrap();
         let (psnr, rendered) = (first_psnr(self.prep, &output), self.rendered);
         println!("{name}: {psnr:.2} dB, rendered {rendered:.2}; {summary}; {}", finished.stderr);
-        // Not of every field: in e423529 the shifted depth cost 0.1 to 0.35 dB, or wasn't told, with
-        // seeds 1, 3, 4, 5 and 6 (docs/design/018).
+        // Not of every field: in e423529 the shifted depth cost 0.1 to 0.35 dB, or wasn't told,
+        // with seeds 1, 3, 4, 5 and 6 (docs/design/018).
         assert!(psnr > rendered - 0.15, "{name}: {psnr} of {rendered}");
         finished.stderr
     }

@@ -1,5 +1,5 @@
-//! `schemas/` and `docs/reference/` are made from the types and from what the built stages say; this
-//! test keeps them current. `make reference` writes them anew.
+//! `schemas/` and `docs/reference/` are made from the types and from what the built stages say;
+//! this test keeps them current. `make reference` writes them anew.
 
 #![allow(missing_docs, reason = "a test")]
 

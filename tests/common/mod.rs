@@ -282,7 +282,8 @@ impl Project {
         found.unwrap_or_else(|| panic!("no object {start}"))
     }
 
-    /// Links the pipeline's demo scene as `data/NAME`, so that `data` can be given as a data folder.
+    /// Links the pipeline's demo scene as `data/NAME`, so that `data` can be given as a data
+    /// folder.
     pub fn demo_data(&self, name: &str) {
         self.ok(&["run", "demo-scene"]);
         let dataset = self.object(&self.output_of("demo-scene", &[])[0]);

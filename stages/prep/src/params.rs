@@ -21,12 +21,12 @@ pub struct Params {
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "output", "x-default" = "2"))]
     pub scale: Option<f64>,
     /// Source of the LR images: the `photographs` themselves, without HR ground truth, or images
-    /// `downscaled` from HR images by `kernel`. Default: `downscaled` for benchmark formats (Blender,
-    /// LLFF) and with `lr_width`, otherwise `photographs`.
+    /// `downscaled` from HR images by `kernel`. Default: `downscaled` for benchmark formats
+    /// (Blender, LLFF) and with `lr_width`, otherwise `photographs`.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub lr_source: Option<LrSource>,
-    /// Degradation kernel from HR to LR images. With `lr_source: photographs`, the assumed kernel of
-    /// the photographs. Default: `lanczos` for downscaled images, `box` for photographs.
+    /// Degradation kernel from HR to LR images. With `lr_source: photographs`, the assumed kernel
+    /// of the photographs. Default: `lanczos` for downscaled images, `box` for photographs.
     #[schemars(extend("x-group" = "data", "x-default" = "by `lr_source`"))]
     pub kernel: Option<Kernel>,
     /// Treatment of lens distortion and of fisheye lenses that the data set describes.
@@ -49,8 +49,8 @@ pub struct Params {
     /// the cameras face. Otherwise `box`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub space: Option<SpaceKind>,
-    /// Split into training and test views. Default: the data set's own split, or `holdout` if it has
-    /// none.
+    /// Split into training and test views. Default: the data set's own split, or `holdout` if it
+    /// has none.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub split: Option<SplitKind>,
     /// Maximum number of test views, chosen at even intervals.

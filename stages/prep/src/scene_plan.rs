@@ -238,7 +238,8 @@ mod tests {
         }
     }
 
-    /// A box that is a point for f64 is refused, without a word of parameters that nobody has given.
+    /// A box that is a point for f64 is refused, without a word of parameters that nobody has
+    /// given.
     #[test]
     fn boxes_without_an_inside_are_refused() {
         let mut set = ring(Format::Blender, 8);

@@ -61,8 +61,8 @@ impl Strips {
         (!(is_frame && is_wide)).then_some(Self { widths, colour })
     }
 
-    /// Returns the strips that nine in ten views have on the same sides, with median widths, and the
-    /// number of views that have them.
+    /// Returns the strips that nine in ten views have on the same sides, with median widths, and
+    /// the number of views that have them.
     pub(crate) fn common(views: &[Option<Self>]) -> Option<(Self, usize)> {
         let found: Vec<Self> = views.iter().flatten().copied().collect();
         let widths = median_widths(&found);

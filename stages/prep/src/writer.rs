@@ -182,8 +182,8 @@ impl<'a> SceneWriter<'a> {
         })
     }
 
-    /// Writes the images of a training frame: LR image, downscaled LR image, HR reference, and their
-    /// masks.
+    /// Writes the images of a training frame: LR image, downscaled LR image, HR reference, and
+    /// their masks.
     fn write_training_image(&self, frame: &Frame, is_reference: bool) -> anyhow::Result<()> {
         let (hr, lr) = self.images(frame)?;
         let name = &frame.name;
@@ -258,8 +258,8 @@ impl<'a> SceneWriter<'a> {
         Ok(write_png(&path, &mask.to_rgba8())?)
     }
 
-    /// Returns the mask of an LR image: all HR pixels under an LR pixel must count. Photographs that
-    /// are the LR images keep their masks.
+    /// Returns the mask of an LR image: all HR pixels under an LR pixel must count. Photographs
+    /// that are the LR images keep their masks.
     fn lr_mask(&self, mask: &Mask, image: &LrImage) -> Mask {
         let is_same_size = image.size() == (mask.width, mask.height);
         let kernel = self.plan.images.kernel;

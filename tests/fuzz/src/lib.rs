@@ -1,4 +1,5 @@
-//! Shared code of the fuzz targets: a data set in a folder, one file of which is the fuzzer's input.
+//! Shared code of the fuzz targets: a data set in a folder, one file of which is the fuzzer's
+//! input.
 
 use std::path::{Path, PathBuf};
 

@@ -47,8 +47,8 @@ impl Level {
     }
 }
 
-/// Returns the shapes of levels from `base_resolution` to `max_resolution` cells in equal ratios, with
-/// at most `finest_z` cells along z and 2^`log2_hashmap_size` entries each.
+/// Returns the shapes of levels from `base_resolution` to `max_resolution` cells in equal ratios,
+/// with at most `finest_z` cells along z and 2^`log2_hashmap_size` entries each.
 pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
     let Architecture { n_levels, base_resolution, max_resolution, finest_z, .. } = *architecture;
     let max_entries = 1 << architecture.log2_hashmap_size;

@@ -225,8 +225,8 @@ fn optical_depths(
 }
 
 /// Counts the samples that a training step evaluates. A ray's samples in `kept` are evaluated in
-/// rounds ([`TRAINING_ROUND_SAMPLES`]), until its optical depth reaches [`MAX_OPTICAL_DEPTH`]. `through`
-/// is the optical depth up to each step's end.
+/// rounds ([`TRAINING_ROUND_SAMPLES`]), until its optical depth reaches [`MAX_OPTICAL_DEPTH`].
+/// `through` is the optical depth up to each step's end.
 fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
     let exists = through.f_zeros_like()?.f_reshape([-1])?.f_index_fill(0, kept, 1.0)?;
     let exists = exists.f_reshape_as(through)?;

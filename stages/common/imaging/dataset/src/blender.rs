@@ -11,8 +11,9 @@ use crate::frame_file::{FrameFile, MissingImages, lookup_of};
 use crate::nearby::find_misspelt_test_file;
 use crate::split::Split;
 
-/// Reads `transforms_train.json` and, if it exists, `transforms_test.json`: NeRF's synthetic scenes.
-/// A missing image is an error; names may omit `.png`. Without test views the data set has no split.
+/// Reads `transforms_train.json` and, if it exists, `transforms_test.json`: NeRF's synthetic
+/// scenes. A missing image is an error; names may omit `.png`. Without test views the data set has
+/// no split.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let train_file = FrameFile::read(&folder.join("transforms_train.json"))?;
     let test_path = folder.join("transforms_test.json");

@@ -6,8 +6,8 @@ pub enum Format {
     /// NeRF's synthetic scenes: `transforms_train.json`, `transforms_test.json` if there are test
     /// views, one angle of view for all frames, PNG.
     Blender,
-    /// instant-ngp and nerfstudio: `transforms.json` with intrinsics for all frames or for each, lens
-    /// distortion, masks.
+    /// instant-ngp and nerfstudio: `transforms.json` with intrinsics for all frames or for each,
+    /// lens distortion, masks.
     Transforms,
     /// LLFF: `poses_bounds.npy` next to `images` (or `images_4`, `images_8`, …).
     Llff,

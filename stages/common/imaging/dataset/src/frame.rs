@@ -39,8 +39,8 @@ pub struct Frame {
     pub stored_intrinsics: Intrinsics,
     /// Pinhole camera to which the image is resampled, if distortion is removed.
     pub pinhole: Option<Intrinsics>,
-    /// Pose `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world
-    /// space.
+    /// Pose `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in
+    /// world space.
     pub camera_to_world: Pose,
     /// Smallest and largest known depth of observed points along the axis; through a fisheye lens
     /// their distances.
@@ -118,8 +118,8 @@ pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> 
 /// Separators between the parts of a name with folders; the second one tells `a/b` from `a_b`.
 const SEPARATORS: [&str; 2] = ["_", "__"];
 
-/// Names frames by the paths of their images inside the data set: by file names if those are unique,
-/// otherwise with their folders. `list` is the file that lists the frames.
+/// Names frames by the paths of their images inside the data set: by file names if those are
+/// unique, otherwise with their folders. `list` is the file that lists the frames.
 pub(crate) fn assign_names(
     frames: &mut [Frame],
     list: &Path,

@@ -158,8 +158,8 @@ impl<'a> Bits<'a> {
         Some(())
     }
 
-    /// Skips a block of a progressive scan without DC (G.1.2.2 and G.1.2.3). `known` has the bits of
-    /// non-zero coefficients; those of new ones are added.
+    /// Skips a block of a progressive scan without DC (G.1.2.2 and G.1.2.3). `known` has the bits
+    /// of non-zero coefficients; those of new ones are added.
     pub(crate) fn skip_band(&mut self, band: Band, table: &Table, known: &mut u64) -> Option<()> {
         let mut coefficient = band.first;
         while self.empty_blocks == 0 && coefficient <= band.last {

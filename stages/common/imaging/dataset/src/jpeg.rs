@@ -1,14 +1,14 @@
-//! Finds rows without data in a JPEG (ITU-T T.81). The decoder fills such rows with grey, or decodes
-//! them more coarsely, without an error.
+//! Finds rows without data in a JPEG (ITU-T T.81). The decoder fills such rows with grey, or
+//! decodes them more coarsely, without an error.
 //!
-//! Huffman codes are skipped scan by scan. Like libjpeg, this accepts any bytes after the end marker
-//! (EOI). Unlike Pillow, it accepts a sequential JPEG that lacks only the end marker: no pixel is
-//! missing. A progressive JPEG needs its end marker, since nothing else determines the number of
-//! scans.
+//! Huffman codes are skipped scan by scan. Like libjpeg, this accepts any bytes after the end
+//! marker (EOI). Unlike Pillow, it accepts a sequential JPEG that lacks only the end marker: no
+//! pixel is missing. A progressive JPEG needs its end marker, since nothing else determines the
+//! number of scans.
 //!
-//! An invalid segment before the first scan is left to the decoder, which reports it; if it doesn't,
-//! the file is refused. The decoder ignores an invalid scan header, and any invalid segment after the
-//! first scan: here these are damage.
+//! An invalid segment before the first scan is left to the decoder, which reports it; if it
+//! doesn't, the file is refused. The decoder ignores an invalid scan header, and any invalid
+//! segment after the first scan: here these are damage.
 
 use std::ops::{Range, RangeInclusive};
 
@@ -51,8 +51,8 @@ pub(crate) enum Extent {
     Unterminated { end: usize },
     /// Incomplete rows, of the image's height in rows.
     Missing { rows: u32, height: u32 },
-    /// Progressive JPEG without all detail; `scan` is the first incomplete or the last scan, counted
-    /// from 1.
+    /// Progressive JPEG without all detail; `scan` is the first incomplete or the last scan,
+    /// counted from 1.
     Coarse { scan: usize, height: u32 },
 }
 
@@ -117,7 +117,8 @@ struct Walk<'a> {
 }
 
 impl<'a> Walk<'a> {
-    /// Reads up to the end marker; false if the file ends without one, `None` at an invalid segment.
+    /// Reads up to the end marker; false if the file ends without one, `None` at an invalid
+    /// segment.
     fn read_to_end(&mut self) -> Option<bool> {
         loop {
             let marker = match self.next_marker() {
@@ -215,8 +216,8 @@ impl<'a> Walk<'a> {
         Some(())
     }
 
-    /// Finds the end of a scan. `None` if the decoder doesn't know the next marker: it would drop the
-    /// image data that it has read ahead.
+    /// Finds the end of a scan. `None` if the decoder doesn't know the next marker: it would drop
+    /// the image data that it has read ahead.
     fn end_scan(&mut self) -> Option<()> {
         let offset = self.offset;
         let marker = self.next_marker();

@@ -7,9 +7,9 @@
 //! next to images, `nearby` explains folders that are no data set.
 //!
 //! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left
-//! corner, scene units) with lens distortion; [`Frame::photograph`] reads the image, and turns it as
-//! EXIF requires only if the camera's width and height are turned. After [`Dataset::undistorted`],
-//! images are read with lens distortion removed.
+//! corner, scene units) with lens distortion; [`Frame::photograph`] reads the image, and turns it
+//! as EXIF requires only if the camera's width and height are turned. After
+//! [`Dataset::undistorted`], images are read with lens distortion removed.
 //!
 //! Lengths are in the units of the poses; pixel coordinates start at the stored image's top left
 //! corner, so that the first pixel's centre is (0.5, 0.5). All content of files is checked: sizes

@@ -120,8 +120,8 @@ impl Photographs {
     }
 }
 
-/// Finds the folder with one image per pose: `images`, or the first of `images_2`, `images_3` and so
-/// on. Without such a folder, a list may name the images that have poses.
+/// Finds the folder with one image per pose: `images`, or the first of `images_2`, `images_3` and
+/// so on. Without such a folder, a list may name the images that have poses.
 fn find_photographs(folder: &Path, path: &Path, poses: usize) -> Result<Photographs, DatasetError> {
     let mut names = vec!["images".to_owned()];
     names.extend((2..=64).map(|n| format!("images_{n}")));

@@ -111,7 +111,8 @@ fn without_images_folder(parent: &Path) -> PathBuf {
     if is_images { parts.collect() } else { parent.to_path_buf() }
 }
 
-/// Finds the single file of a folder with one of the names, in any case; fails if there are several.
+/// Finds the single file of a folder with one of the names, in any case; fails if there are
+/// several.
 fn find_single_file(
     listings: &mut Listings,
     folder: &Path,

@@ -9,8 +9,8 @@ use crate::file_status::{path_text, visible_entries};
 use crate::find_format;
 use crate::format::Format;
 
-/// Maximum number of folders two levels below that are searched: a home folder may have many. Chosen
-/// by hand.
+/// Maximum number of folders two levels below that are searched: a home folder may have many.
+/// Chosen by hand.
 const MAX_FOLDERS: usize = 1000;
 /// Maximum number of data sets that a message lists.
 const MAX_LISTED: usize = 3;
@@ -92,7 +92,8 @@ fn has_extension(path: &Path, extension: &str) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension))
 }
 
-/// Recognises exports of Polycam and Record3D, also in a folder's only sub-folder, as in an archive.
+/// Recognises exports of Polycam and Record3D, also in a folder's only sub-folder, as in an
+/// archive.
 fn find_export(folder: &Path) -> Option<Nearby> {
     let mut candidates = vec![folder.to_path_buf()];
     if let [only] = &sub_folders(folder)[..] {

@@ -257,7 +257,8 @@ fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
 }
 
 impl Frame {
-    /// Returns the peak memory of [`Frame::photograph`] in bytes, estimated from the image's header.
+    /// Returns the peak memory of [`Frame::photograph`] in bytes, estimated from the image's
+    /// header.
     pub fn reading_bytes(&self) -> Result<u64, DatasetError> {
         Ok(reading_bytes(&self.image)?)
     }
@@ -281,8 +282,9 @@ impl Frame {
         Ok((self.without_distortion(image), clipping))
     }
 
-    /// Returns the mask of [`Frame::photograph`]: pixels that count in its mask file and have a ray.
-    /// `None` if all pixels count. A mask file of a different size is resampled by nearest neighbour.
+    /// Returns the mask of [`Frame::photograph`]: pixels that count in its mask file and have a
+    /// ray. `None` if all pixels count. A mask file of a different size is resampled by nearest
+    /// neighbour.
     pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
         let lens = self.intrinsics().lens_mask();
         let Some(file) = &self.mask else { return Ok(lens) };

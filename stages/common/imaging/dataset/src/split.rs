@@ -67,9 +67,9 @@ impl FrameNames {
 }
 
 impl SplitLists<'_> {
-    /// Returns the split of `count` frames that the lists describe, with notes. Validation views are
-    /// test views if there are no others. If only one side is listed, unlisted frames are on the
-    /// other side.
+    /// Returns the split of `count` frames that the lists describe, with notes. Validation views
+    /// are test views if there are no others. If only one side is listed, unlisted frames are on
+    /// the other side.
     pub(crate) fn split(
         &self,
         count: usize,

@@ -39,7 +39,8 @@ fn decode(mut bytes: Vec<u8>) -> Result<String, FileReason> {
     })
 }
 
-/// True if the text begins with a UTF-16 byte order mark, or has a null byte in its first character.
+/// True if the text begins with a UTF-16 byte order mark, or has a null byte in its first
+/// character.
 fn is_utf16(bytes: &[u8]) -> bool {
     matches!(bytes, [0xff, 0xfe, ..] | [0xfe, 0xff, ..] | [0, _, ..] | [_, 0, ..])
 }

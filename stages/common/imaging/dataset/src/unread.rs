@@ -63,7 +63,8 @@ pub fn is_unread_name(path: &Path) -> bool {
     UnreadFormat::from_name(path).is_some()
 }
 
-/// Returns the error for an image in an unsupported format, recognised by content, otherwise by name.
+/// Returns the error for an image in an unsupported format, recognised by content, otherwise by
+/// name.
 pub(crate) fn unsupported_error(path: &Path) -> Option<PixelError> {
     let mut bytes = [0; SIGNATURE_BYTES];
     let is_read = File::open(path).and_then(|mut file| file.read_exact(&mut bytes)).is_ok();

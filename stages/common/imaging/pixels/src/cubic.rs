@@ -1,8 +1,8 @@
 use crate::image_buffer::Image;
 
 /// Interpolates an image of the given (width, height) at a position in pixels from its top left
-/// corner, by Catmull-Rom splines (Catmull and Rom 1974). Pixel centres are at half-integers; border
-/// pixels repeat outside the image. Values are not clamped.
+/// corner, by Catmull-Rom splines (Catmull and Rom 1974). Pixel centres are at half-integers;
+/// border pixels repeat outside the image. Values are not clamped.
 pub fn sample_cubic<const N: usize>(
     (width, height): (usize, usize),
     [x, y]: [f64; 2],
@@ -31,7 +31,8 @@ fn sample_index(second: f64, k: usize, count: usize) -> usize {
     ((second + k as f64 - 1.0).max(0.0) as usize).min(count - 1)
 }
 
-/// Returns the weights of four samples at a position `t` of 0 to 1 between the second and the third.
+/// Returns the weights of four samples at a position `t` of 0 to 1 between the second and the
+/// third.
 fn catmull_rom(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [

@@ -34,8 +34,8 @@ impl<'a> DepthMap<'a> {
         is_surface(self.opacity[pixel])
     }
 
-    /// Returns the 1 % and 99 % quantiles of the surfaces' depths in scene units, the range to draw:
-    /// a few floaters must not stretch it. `None` without a surface.
+    /// Returns the 1 % and 99 % quantiles of the surfaces' depths in scene units, the range to
+    /// draw: a few floaters must not stretch it. `None` without a surface.
     pub fn range(&self) -> Option<(f32, f32)> {
         let surfaces = (0..self.depth.len()).filter(|i| self.has_surface(*i));
         let mut depths: Vec<f32> = surfaces.map(|i| self.depth[i]).collect();

@@ -17,8 +17,8 @@ const MIN_BLOCKS: f64 = 12.0;
 const MIN_VARIANCE: f64 = 1e-5;
 /// Range of plausible gains: images outside it show different content. Chosen by hand.
 const GAIN_RANGE: [f32; 2] = [0.1, 10.0];
-/// Maximum deviation of a gain from 1, and of an offset from 0, that a field's errors explain: views
-/// of fern deviate by 1 %, of lego by 6 %.
+/// Maximum deviation of a gain from 1, and of an offset from 0, that a field's errors explain:
+/// views of fern deviate by 1 %, of lego by 6 %.
 const NEGLIGIBLE_CHANGE: [f32; 2] = [0.1, 0.05];
 
 impl Exposure {

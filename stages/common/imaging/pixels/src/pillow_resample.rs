@@ -8,7 +8,8 @@ use std::borrow::Cow;
 
 use crate::image_buffer::Rgba8;
 
-/// Resampling kernel, widened by the scale when downscaling, which makes it an anti-aliasing filter.
+/// Resampling kernel, widened by the scale when downscaling, which makes it an anti-aliasing
+/// filter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Filter {
     /// Box: half a pixel to either side.

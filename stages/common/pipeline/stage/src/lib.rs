@@ -3,7 +3,8 @@
 //! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked
 //!   parameters, `describe`, progress, exit codes, interruption and an atomic output for free.
 //! * [`Context`]: inputs, output and checkpoint folder of a running stage.
-//! * [`Description`], [`Schema`], [`Rule`]: a stage's description, and the checks of values against it.
+//! * [`Description`], [`Schema`], [`Rule`]: a stage's description, and the checks of values against
+//!   it.
 //! * [`Progress`], [`Event`]: progress reports for a terminal and for the runner.
 //! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic;
 //!   the runner uses them, too.

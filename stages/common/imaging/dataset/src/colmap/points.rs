@@ -42,7 +42,8 @@ pub(super) fn removed_points_note(removed: usize, all: usize) -> String {
     )
 }
 
-/// Quantiles of the points' depths that bound a view; a few points are always wrong. Chosen by hand.
+/// Quantiles of the points' depths that bound a view; a few points are always wrong. Chosen by
+/// hand.
 const DEPTH_QUANTILES: [f64; 2] = [0.001, 0.999];
 
 /// Returns the [nearest, farthest] depth of the points that an image observes; their distances

@@ -1,10 +1,11 @@
-//! Finds the files that a data set names inside its folder, even if the folder was written on another
-//! machine, or its files were moved, renamed, converted or reduced (docs/design/005).
+//! Finds the files that a data set names inside its folder, even if the folder was written on
+//! another machine, or its files were moved, renamed, converted or reduced (docs/design/005).
 //!
-//! A name is tried literally; with `\` read as `/`; as the longest tail of an absolute path, with the
-//! same number of leading parts removed from all names; with a missing or doubled extension; and in
-//! a different case. Steps combine, each logs one line per data set ([`Lookup::notes`]), and two
-//! candidates are an error. Paths out of the folder are never opened; links inside it are followed.
+//! A name is tried literally; with `\` read as `/`; as the longest tail of an absolute path, with
+//! the same number of leading parts removed from all names; with a missing or doubled extension;
+//! and in a different case. Steps combine, each logs one line per data set ([`Lookup::notes`]), and
+//! two candidates are an error. Paths out of the folder are never opened; links inside it are
+//! followed.
 
 mod listings;
 mod matching;
@@ -99,8 +100,8 @@ impl Lookup {
         lookup
     }
 
-    /// Creates the lookup of names relative to `images` or a reduced copy of it or, if none is found
-    /// there, to the data set's folder.
+    /// Creates the lookup of names relative to `images` or a reduced copy of it or, if none is
+    /// found there, to the data set's folder.
     pub(crate) fn in_images(folder: &Path, names: &[&str]) -> Self {
         let mut inside = Self::new(folder, PathBuf::from(IMAGES), names);
         inside.choose_base(names);
