@@ -639,7 +639,7 @@ fn what_slurm_is_told() {
     fake(&project, "sbatch", "echo 'sbatch: error: invalid partition' >&2; exit 1");
     project.write("queue", "");
     run_on_path(&project, &path, &["run"])
-        .fails(1, &["3 jobs left: sbatch: error: invalid partition; run this again"]);
+        .fails(1, &["3 jobs not submitted: sbatch: error: invalid partition; run this again"]);
     run_on_path(&project, &path, &["run", "-j", "2"])
         .fails(2, &["--jobs, --threads, --memory and --keep-going need --executor local"]);
     project.write("site.yaml", "partitions: gpu\n");

@@ -43,7 +43,7 @@ struct GlobalArgs {
     /// Compute device: cpu or cuda:N
     #[arg(long, global = true, default_value = DEFAULT_DEVICE)]
     device: String,
-    /// Where stages run: on this machine, or as jobs of a Slurm cluster. With slurm, stages whose
+    /// Executor of stages: this machine, or jobs of a Slurm cluster. With slurm, stages whose
     /// `resources` request GPUs compute on cuda:0
     #[arg(long, global = true, value_enum, default_value = DEFAULT_EXECUTOR,
         env = "NERF_SR_EXECUTOR")]
