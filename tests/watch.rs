@@ -127,7 +127,7 @@ fn what_cannot_be_watched_is_said_and_the_run_goes_on() {
     let unknown = project.run(&["run", "eval", "-p", "train-ss.seed=2", "--watch=nowhere"]);
     assert_eq!(unknown.code, 0, "{}", unknown.stderr);
     let said = unknown.stderr.lines().find(|line| line.contains("not watched")).unwrap();
-    assert!(said.starts_with("train-ss: not watched: view nowhere: "), "{said}");
+    assert!(said.starts_with("train-ss: not watched: no view nowhere; known: r_0"), "{said}");
     let slurm = project.run(&["run", "--executor", "slurm", "--watch"]);
     slurm.fails(2, &["--watch", "--executor local"]);
 }
