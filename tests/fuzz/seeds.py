@@ -115,7 +115,7 @@ exr += b"".join(struct.pack("<iI", y, 32) + struct.pack("<e", 0.5) * 16 for y in
 seed("picture", "exr", b"\x02" + exr)
 
 # Pillow's JPEGs of 20×20 pixels with subsampled chroma, restart markers and progressive scans, and of 20×12 grey pixels. The byte before
-# each is the length at which the target cuts the file, in 256ths.
+# each is the length at which the target cuts the file, in units of 1/256.
 jpegs = {
     "baseline": """
 /9j/4AAQSkZJRgABAQAAAQABAAD/2wBDABQODxIPDRQSEBIXFRQYHjIhHhwcHj0sLiQySUBMS0dARkVQWnNiUFVtVkVGZIhlbXd7gYKBTmCNl4x9lnN+gXz/2wBD

@@ -199,7 +199,7 @@ fn a_sweep_of_the_file_gives_way() {
     let data = data();
     let text = EXPERIMENT.replace("  variants:\n", "  sweeps: {train.rays: [5, 6]}\n  variants:\n");
     let choose = |r: &mut Request| {
-        (r.selection.scenes, r.selection.max_variants) = (vec!["demo".to_owned()], Some(1))
+        (r.selection.scenes, r.selection.max_variants) = (vec!["demo".to_owned()], Some(1));
     };
     let plan = plan_of(&text, data.path(), choose).unwrap();
     assert_eq!(labels(&plan)[1..3], ["train [rays=5]", "train [rays=6]"]);

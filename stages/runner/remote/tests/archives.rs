@@ -240,7 +240,7 @@ const HARM: &[(&str, Harm)] = &[
     ("not a manifest", |s| s.entries[MANIFEST].bytes = b"[]".to_vec()),
     ("not a record", |s| s.entries[RECORD].bytes = b"{}".to_vec()),
     ("its key differs from its name", |s| {
-        s.record(|r| drop(r.key_parts.insert("x".into(), json!(1))))
+        s.record(|r| drop(r.key_parts.insert("x".into(), json!(1))));
     }),
     ("is not a hash", |s| s.record(|r| r.output = "../../../evil".into())),
     ("is not a hash", |s| s.record(|r| r.made_of = vec!["/tmp/evil".into()])),
@@ -248,7 +248,7 @@ const HARM: &[(&str, Harm)] = &[
     ("no record of the artifact", |s| s.index(|i| i["artifact"] = json!("0".repeat(64)))),
     ("not sorted hashes", |s| s.index(|i| i["objects"] = json!(["../../evil"]))),
     ("not sorted hashes", |s| {
-        s.index(|i| i["actions"] = json!([i["actions"][0], i["actions"][0]]))
+        s.index(|i| i["actions"] = json!([i["actions"][0], i["actions"][0]]));
     }),
     ("export format 2", |s| s.index(|i| i["export"] = json!(2))),
     ("store format 2", |s| s.index(|i| i["store"] = json!(2))),

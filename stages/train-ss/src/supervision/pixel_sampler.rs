@@ -226,7 +226,7 @@ mod tests {
         let importance = Importance::new(7.0, 200, detailed_pixels(&flat).into_iter().collect());
         let (mut counts, draws) = ([0u32; 200], 400_000);
         (0..draws).for_each(|k| {
-            counts[importance.draw(200, &mut CounterRng::new(1, 2, k)) as usize] += 1
+            counts[importance.draw(200, &mut CounterRng::new(1, 2, k)) as usize] += 1;
         });
         for (pixel, &count) in (0..200).zip(&counts) {
             let mean =

@@ -60,7 +60,7 @@ pub(crate) fn new_trainer(
         }
         #[cfg(feature = "torch")]
         ResolvedField::Mlp { architecture, density_noise_std, given } => {
-            let device = nets::device(device).map_err(device_failure)?;
+            let device = nets::device(device).map_err(|error| device_failure(&error))?;
             nets::deterministic();
             let field = match init {
                 Some(weights) => torch_field::Mlp::read(weights, *architecture, bounds, device)
@@ -90,7 +90,7 @@ pub(crate) fn read_field(
         FieldModel::Grid(architecture) => Ok(Box::new(Field::read(weights, architecture, bounds)?)),
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
-            let device = nets::device(device).map_err(device_failure)?;
+            let device = nets::device(device).map_err(|error| device_failure(&error))?;
             Ok(Box::new(torch_field::Mlp::read(weights, architecture, bounds, device)?))
         }
         #[cfg(not(feature = "torch"))]
@@ -128,7 +128,7 @@ pub(crate) fn average_weights(
 }
 
 #[cfg(feature = "torch")]
-fn device_failure(error: nets::DeviceError) -> Failure {
+fn device_failure(error: &nets::DeviceError) -> Failure {
     Failure::Usage(error.to_string())
 }
 
@@ -139,7 +139,7 @@ fn new_grid_trainer_on(
     field: &Field,
     options: TrainingOptions,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let device = nets::device(device).map_err(device_failure)?;
+    let device = nets::device(device).map_err(|error| device_failure(&error))?;
     nets::deterministic();
     Ok(Box::new(torch_field::GridTrainer::new(field, options, device)?))
 }

@@ -1,5 +1,5 @@
 //! Fuzzes a JPEG photograph, complete and truncated; the first byte is the truncated length in
-//! 256ths. A truncated file must be refused or have the pixels of the complete one.
+//! units of 1/256. A truncated file must be refused or have the pixels of the complete one.
 #![no_main]
 
 use std::sync::LazyLock;

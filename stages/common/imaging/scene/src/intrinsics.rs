@@ -68,12 +68,12 @@ impl Intrinsics {
     }
 
     /// Returns the plane position, in focal lengths, of an image position in pixels.
-    fn to_plane(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+    fn to_plane(self, [x, y]: [f64; 2]) -> [f64; 2] {
         [(x - self.cx) / self.fx, (y - self.cy) / self.fy]
     }
 
     /// Returns the image position, in pixels, of a plane position in focal lengths.
-    fn to_image(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+    fn to_image(self, [x, y]: [f64; 2]) -> [f64; 2] {
         [self.fx.mul_add(x, self.cx), self.fy.mul_add(y, self.cy)]
     }
 
