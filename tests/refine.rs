@@ -886,6 +886,6 @@ fn the_paper_s_network_refines_by_references() {
         &project,
         &inputs,
         r#"{"references_per_view": 1}"#,
-        &["input views: references_per_view needs at least two views"],
+        &["input views: references_per_view needs at least three views"],
     );
 }

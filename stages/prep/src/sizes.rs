@@ -35,6 +35,16 @@ pub(crate) enum SizeError {
         or choose scale = 1"
     )]
     Unchanged { scale: f64, hr: u32 },
+    #[error(
+        "hr_width = {hr} and scale = {scale} contradict each other for photographs {native} pixels \
+        wide; give one of them"
+    )]
+    EnlargedContradiction { native: u32, hr: u32, scale: f64 },
+    #[error(
+        "hr_width = {hr} is less than the photographs' width of {native} pixels; choose a larger \
+        hr_width"
+    )]
+    BelowPhotographs { hr: u32, native: u32 },
     #[error("scale = {scale} reduces a width of {hr} pixels to 0; choose a smaller scale")]
     Empty { scale: f64, hr: u32 },
 }
@@ -98,18 +108,13 @@ pub(crate) fn enlarged_sizes(
 ) -> Result<Sizes, SizeError> {
     let scale = match (hr, scale) {
         (Some(hr), Some(scale)) if (f64::from(native.0) * scale).round() != f64::from(hr) => {
-            return Err(SizeError::Contradiction { lr: native.0, hr, scale });
+            return Err(SizeError::EnlargedContradiction { native: native.0, hr, scale });
         }
         (Some(hr), _) => f64::from(hr) / f64::from(native.0),
         (None, scale) => scale.unwrap_or(DEFAULT_SCALE),
     };
     if scale < 1.0 {
-        return Err(SizeError::TooLarge {
-            name: "lr_width",
-            requested: native.0,
-            larger: "hr_width",
-            limit: hr.unwrap_or_default(),
-        });
+        return Err(SizeError::BelowPhotographs { hr: hr.unwrap_or_default(), native: native.0 });
     }
     Ok(Sizes { lr: native, hr: (scaled_by(native.0, scale), scaled_by(native.1, scale)) })
 }
@@ -151,11 +156,11 @@ mod tests {
         assert_eq!(enlarged_sizes((90, 61), None, None).map(|s| s.hr), Ok((180, 122)));
         assert!(matches!(
             enlarged_sizes((90, 61), Some(80), None),
-            Err(SizeError::TooLarge { name: "lr_width", requested: 90, limit: 80, .. })
+            Err(SizeError::BelowPhotographs { hr: 80, native: 90 })
         ));
         assert!(matches!(
             enlarged_sizes((90, 61), Some(200), Some(2.0)),
-            Err(SizeError::Contradiction { .. })
+            Err(SizeError::EnlargedContradiction { native: 90, hr: 200, .. })
         ));
     }
 

@@ -41,8 +41,8 @@ pub struct Params {
     /// where the image is locally quadratic. 0 casts all rays everywhere.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub tolerance: f64,
-    /// Kind of depth in channel `Z`. The median lies on a surface; the mean lies between the
-    /// surface and floaters in front of it.
+    /// Kind of depth in channel `Z`. `median` lies on a surface; `expected`, the mean over the ray,
+    /// lies between the surface and floaters in front of it.
     pub depth: Depth,
     /// Also writes the distance along the ray, as channel `distance`.
     pub ray_distance: bool,

@@ -166,8 +166,9 @@ impl<S: Source> Baker<'_, S> {
         let positions = sample_positions(brick, voxels.iter().copied(), self.resolution);
         let mut directions = Vec::with_capacity(voxels.len());
         for (i, &voxel) in voxels.iter().enumerate() {
-            let centre = positions[i * SAMPLES_PER_VOXEL + SAMPLES_PER_VOXEL / 2];
-            directions.push(self.directions(centre, seen[voxel]));
+            // No sample is at the voxel's centre; any of them is near enough for directions.
+            let position = positions[i * SAMPLES_PER_VOXEL + SAMPLES_PER_VOXEL / 2];
+            directions.push(self.directions(position, seen[voxel]));
         }
         let mut means = vec![Shaded { colour: [0.0; 3], view: [0.0; COEFFICIENTS] }; voxels.len()];
         let mut weights = vec![0.0f32; voxels.len()];

@@ -238,8 +238,8 @@ impl<'a> Expansion<'a> {
             let values = self.axes[axis].values.len();
             if points.len() * values + self.nodes.len() > MAX_NODES {
                 let problem = format!(
-                    "the sweep has more than {MAX_NODES} points of {stage}; sweep fewer values at \
-                    once"
+                    "with the points of {stage}, the plan has more than {MAX_NODES} nodes; sweep \
+                    fewer values at once"
                 );
                 return Err(PlanError::Usage(problem));
             }

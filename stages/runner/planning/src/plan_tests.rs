@@ -301,7 +301,12 @@ fn command_lines_that_cannot_be_meant() {
     let values = (0..120).map(|i| i.to_string()).collect::<Vec<_>>().join(",");
     let arguments = [format!("make.seed={values}"), format!("train.seed={values}")];
     let problem = refused(PIPELINE, &["train", "-p", &arguments[0], "-p", &arguments[1]]);
-    assert!(problem.to_string().contains("more than 10000 points of train"), "{problem}");
+    assert!(
+        problem
+            .to_string()
+            .contains("with the points of train, the plan has more than 10000 nodes"),
+        "{problem}"
+    );
 }
 
 /// Each error names its line.

@@ -95,7 +95,8 @@ pub(crate) fn enter(store: &Store, stop: &AtomicBool) -> anyhow::Result<Entered>
 }
 
 /// Parses a record from a remote or an archive, called `name` in messages. Fails if its key differs
-/// from `key`, or if it contains anything but hashes that may become parts of paths.
+/// from `key`, or if `made_of` or `output`, which become parts of paths, contain anything but
+/// hashes.
 pub(crate) fn parse_record(bytes: &[u8], key: &str, name: &str) -> Result<Record, Failure> {
     let problem = match serde_json::from_slice::<Record>(bytes) {
         Err(error) => format!("not a record: {error}"),

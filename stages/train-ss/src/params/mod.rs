@@ -249,8 +249,9 @@ pub struct MlpParams {
     /// Final learning rate as a fraction of the highest one.
     #[schemars(range(min = 1e-6, max = 1.0), extend("x-group" = "optimiser"))]
     pub learning_rate_decay: f64,
-    /// Schedule of the learning rate. A training shorter than the paper's compresses the whole
-    /// schedule into its steps.
+    /// Schedule of the learning rate: that of the paper's `code`, or that in the text of the
+    /// `paper`. A training shorter than the published one compresses the whole schedule into its
+    /// steps.
     #[schemars(extend("x-group" = "optimiser"))]
     pub schedule: RateSchedule,
     /// Maximum number of restarts, each with the next seed, of an MLP that has collapsed to the

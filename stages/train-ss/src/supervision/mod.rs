@@ -416,8 +416,8 @@ mod tests {
         bundles.collect()
     }
 
-    /// Behind an opaque scene lies another colour in every bundle, and what is asked for is the
-    /// same: a field that is opaque alone can give it.
+    /// Each bundle of an opaque scene has its own background colour, but the photographs stay the
+    /// same, so only an opaque field can match them.
     #[test]
     fn nothing_can_pretend_to_be_an_opaque_scenes_background() {
         assert!(backgrounds(Background::White).iter().all(|b| *b == [1.0; 3]));
@@ -483,7 +483,7 @@ mod tests {
         assert!(average.0 > 1e-4 && average.1 > 1e-3, "{average:?}");
     }
 
-    /// What a kernel clipped at white asks no rendering to be white alone.
+    /// A photograph's pixel clipped to white doesn't require a rendering of exactly white.
     #[test]
     fn clipped_white_asks_for_white_or_more() {
         let white = Image::new(5, 4, 3, vec![1.0; 60]);
@@ -569,8 +569,8 @@ mod tests {
         camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction
     }
 
-    /// References join LR images as they are: whatever made those, each sub-pixel ray is a
-    /// reference's pixel, and all are met by some.
+    /// References are used at their full size, with either supervision: each sub-pixel ray goes
+    /// through one pixel of the reference, and every pixel of the reference gets a ray.
     #[test]
     fn references_are_compared_with_themselves() {
         let (_, camera) = example(Supervision::Kernel, 2.0, None);
@@ -636,7 +636,7 @@ mod tests {
             plain.loss_and_gradient(drawn(&plain), &colours, &mut gradients[1]);
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
         }
-        // Of a larger one no more is drawn.
+        // A larger reference doesn't get more draws.
         let larger = supersampling(
             given(&camera, "a", 5, 4),
             Some(given(&camera, "a", 20, 16)),
@@ -651,8 +651,9 @@ mod tests {
         assert!(block_means(&masked, [2, 2]).data.iter().all(|v| v.is_nan()));
     }
 
-    /// At a broken scale a box may be whole for a photograph of one size and not for another's:
-    /// then the pixels of both are cached, and each is compared with its own.
+    /// With a fractional supersample, the ratio of HR to LR size may be an integer for one
+    /// photograph and not for another. Then the pixels of both are cached, each compared with its
+    /// own photograph.
     #[test]
     fn sizes_share_a_cache() {
         let (_, camera) = example(Supervision::Kernel, 2.0, None);

@@ -14,9 +14,9 @@ pub(crate) struct InitField<'a> {
 
 impl<'a> InitField<'a> {
     /// Reads the description of the field and fails if it differs from `file`, the field to train.
-    /// A field written before bounds were rounded and positions scaled keeps its frame: its bounds,
-    /// which equal those of `file` after rounding around `anchor`, and its positions replace those
-    /// of `file`.
+    /// Older versions neither rounded bounds nor scaled positions. So that their fields can still
+    /// be trained, the initial field's bounds replace those of `file` if they are equal after
+    /// rounding around `anchor`, and its `scaled_positions` replaces that of `file`.
     pub(crate) fn read(
         input: &'a GivenInput,
         file: &mut FieldFile,

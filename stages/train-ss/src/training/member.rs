@@ -96,7 +96,10 @@ impl<'a> Member<'a> {
             };
             let mut work = self.work.clone();
             if restart > 0 {
-                self.context.say(format!("{collapse}: starting over with seed {}", params.seed));
+                self.context.say(format!(
+                    "starting over with seed {}, since training failed: {collapse}",
+                    params.seed
+                ));
                 // A folder per restart: a checkpoint resumes with the seed it began with.
                 work = work.map(|work| work.join(format!("restart-{restart}")));
             }

@@ -7,16 +7,12 @@
 //!   damping.
 //! * [`MeanMotion`]: mean motion of cameras, for a log; [`photometric_error`]: quality of poses.
 //! * [`remove_common_motion`]: removes the motion that all cameras share, which photographs can't
-//!   tell from a motion of the scene.
-//!
-//! A photograph's gradient gives the change of each pixel with a motion in the image; the rendered
-//! depth gives the motion in the image with that of the camera (Lucas and Kanade 1981; the
-//! template's gradient, as in Baker and Matthews 2004). A step renders a few thousand pixels and
-//! needs no derivative of the field, so any field that renders colour and depth will do.
-//!
-//! Lengths are in scene units, angles in radians; camera axes are those of `scene` (x right, y up,
-//! looking along -z).
-//!
+//! tell from a motion of the scene.  A photograph's gradient is the derivative of each pixel by its
+//! position in the image; the rendered depth gives the derivative of this position by the camera's
+//! motion (Lucas and Kanade 1981; the gradient is that of the template, as in Baker and Matthews
+//! 2004). A step renders a few thousand pixels and needs no derivative of the field, so any field
+//! that renders colour and depth will do.  Lengths are in scene units, angles in radians; camera
+//! axes are those of `scene` (x right, y up, looking along -z).
 //! ```
 //! use poses::{Pyramid, Refinement, refine};
 //! use pixels::Image;
@@ -112,8 +108,9 @@ pub fn refine(
 const MIN_PIXELS: usize = 24;
 /// Damping of the first step, relative to the equations' diagonal; chosen by hand.
 const FIRST_DAMPING: f64 = 1e-3;
-/// Minimum opacity of a pixel whose depth is used. Edges that are still soft have to pull from both
-/// sides: with their opaque halves alone cameras backed away by 6 % (docs/design/025).
+/// Minimum opacity of a pixel whose depth is used. Pixels on both sides of a blurred edge are
+/// needed: with only the opaque side, cameras moved back by 6 % of their distance
+/// (docs/design/025).
 const MIN_DEPTH_OPACITY: f32 = 0.02;
 
 /// Least-squares equations of a small camera motion, linearised at the current pose.

@@ -63,7 +63,7 @@ pub enum RayMap {
         start: f32,
         /// Derivative of the distance at t = 0.
         scale: f32,
-        /// Relative change of the derivative with t; 0 in a box.
+        /// Inverse of the t at which the distance becomes infinite; 0 in a box.
         perspective: f32,
     },
     /// Contraction: `origin` is the ray's point nearest to the centre, in ball radii. The point at

@@ -133,7 +133,7 @@ struct Sample {
     counts: bool,
 }
 
-/// All samples of each ray, marched at once.
+/// Returns all samples of each ray; each ray is marched alone, by a single call.
 fn samples(
     field: &Field,
     rays: &[NormalizedRay],

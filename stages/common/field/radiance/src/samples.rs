@@ -50,9 +50,10 @@ impl Round {
     }
 }
 
-/// Activations of the density network, stored by round, then by row.
+/// Inputs and activations of the density network. Activations are stored by round, then by row.
 #[derive(Debug, Default)]
 pub(crate) struct DensityRows {
+    /// Positions of the last round only: three rows.
     positions: Aligned,
     pub(crate) features: Aligned,
     pub(crate) hidden: Aligned,
@@ -202,7 +203,7 @@ impl Samples {
     }
 
     /// Computes each sample's optical depth, transmittance and weight from the network's outputs,
-    /// and the rays' median t. A sample spans `step` times its length, in cube sides.
+    /// and the rays' median t. `step` is the length of one step in cube sides.
     fn compute_weights(&mut self, round: Round, step: f32, sums: &mut [RaySum]) {
         let Round { start, n, .. } = round;
         for buffer in [&mut self.tau, &mut self.before, &mut self.transmittance, &mut self.weight] {
@@ -245,8 +246,7 @@ impl Samples {
         }
     }
 
-    /// Lists the densities and cells of samples that stop light. A sample spans `step` times its
-    /// length, in cube sides.
+    /// Lists the densities and cells of samples that stop light. `step` is the length of one step in cube sides.
     pub(crate) fn list_hits(&self, counted: &Counted, step: f32, hits: &mut Vec<CellHit>) {
         let MarchedSamples { positions, lengths, .. } = &self.marched;
         let samples = counted.sample.iter().map(|&i| i as usize);

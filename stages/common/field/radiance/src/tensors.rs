@@ -66,8 +66,8 @@ pub enum FieldProblem {
     NotFinite,
 }
 
-/// Vector to write. Its bytes are created while it is written, so that one vector at a time is
-/// copied.
+/// Vector to write. Its bytes are created only when it is written, so that memory never holds
+/// copies of two vectors.
 pub(crate) struct Tensor<'a> {
     data: TensorData<'a>,
     shape: [usize; 1],

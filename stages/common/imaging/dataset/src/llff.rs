@@ -42,8 +42,9 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
 }
 
 /// Returns the lens distortion of COLMAP's model next to the poses, with a note if it is unknown.
-/// LLFF's file has no distortion, but its poses are COLMAP's and refer to the lens of that model if
-/// that has one camera with their focal length (docs/design/005).
+/// `poses_bounds.npy` stores no distortion, but its poses were estimated by COLMAP. They share the
+/// lens of its model if the model has exactly one camera, with the focal length of the poses
+/// (docs/design/005).
 fn colmap_distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<String>) {
     let camera = match colmap::only_camera(folder) {
         Ok(Some(camera)) if !camera.distortion.is_none() => camera,

@@ -26,7 +26,7 @@ pub(crate) enum Nearby {
     File { folder: PathBuf },
     /// Export of an application, identified by the file or folder `sign`; `remedy` converts it.
     Export { application: &'static str, sign: PathBuf, remedy: String },
-    /// File with almost the name `meant` of a data set's file.
+    /// File or folder `found`, whose name is similar to `meant`, a name that a data set uses.
     Misspelt { found: String, meant: &'static str },
     /// Test views without training views.
     Incomplete { found: &'static str },
@@ -154,7 +154,7 @@ fn shell_quoted(path: &Path) -> String {
     format!("'{}'", path_text(path).replace('\'', r"'\''"))
 }
 
-/// Recognises files and folders with almost the name of a data set's.
+/// Recognises files and folders whose name is similar to a name that a data set uses.
 fn find_misnamed(folder: &Path) -> Option<Nearby> {
     if let Some(found) = PARTS.into_iter().find(|part| folder.join(part).is_file()) {
         return Some(Nearby::Incomplete { found });

@@ -77,13 +77,15 @@ pub(crate) fn unsupported_error(path: &Path) -> Option<PixelError> {
     })
 }
 
-/// Returns the number and format of unsupported images among files, with the command that converts
-/// them; `None` if there are none.
+/// Returns the format of the first unsupported image among files, the number of images in that
+/// format, and the command that converts them; `None` if there are none.
 pub fn unread_images(files: &[PathBuf]) -> Option<String> {
-    let mut unread = files.iter().filter(|path| is_unread_name(path));
-    let first = unread.next()?;
+    let first = files.iter().find(|path| is_unread_name(path))?;
     let format = UnreadFormat::from_name(first)?;
-    let count = 1 + unread.count();
+    let is_same = |path: &&PathBuf| {
+        UnreadFormat::from_name(path).is_some_and(|other| other.name == format.name)
+    };
+    let count = files.iter().filter(is_same).count();
     Some(format!(
         "{count} in {}, which is not supported; convert: {}",
         format.name,

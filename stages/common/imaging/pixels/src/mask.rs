@@ -128,14 +128,14 @@ mod tests {
         assert_eq!(mask(4, &["#..#"]).counted_fraction(), 0.5);
     }
 
-    /// Another size leaves out whatever a pixel that doesn't count has a part in, and nothing else.
+    /// A resized mask leaves out each new pixel that overlaps one that doesn't count, and no other.
     #[test]
     fn resized_masks_are_careful() {
         let whole = mask(6, &["######", "#####.", "######", "######"]);
         assert_eq!(whole.resized((3, 2), 0), mask(3, &["##.", "###"]));
         assert_eq!(whole.resized((3, 2), 1), mask(3, &["#..", "#.."]));
         assert_eq!(whole.resized((6, 4), 0), whole);
-        // Four columns of one and a half: the last two have a part in column 4 or 5.
+        // Each of the four columns covers one and a half old ones: only the last overlaps column 5.
         assert_eq!(whole.resized((4, 4), 0), mask(4, &["####", "###.", "####", "####"]));
         assert_eq!(whole.resized((4, 1), 0), mask(4, &["###."]));
         assert_eq!(whole.resized((12, 8), 0).counted_fraction(), 23.0 / 24.0);

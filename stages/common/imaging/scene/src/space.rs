@@ -134,7 +134,7 @@ pub(crate) fn multiple(value: f64, step: f64) -> f64 {
     if step > 0.0 { (value / step).round() * step } else { value }
 }
 
-/// Rounds a number to 26 binary digits.
+/// Rounds a number to 26 binary digits after the leading one.
 pub(crate) fn rounded(value: f64) -> f64 {
     multiple(value, rounding_step(value))
 }

@@ -70,8 +70,8 @@ impl<T, E: Into<anyhow::Error>> FailureExt<T> for Result<T, E> {
     }
 }
 
-/// Returns the end of a message about a file without permission: its owner, and the advice how
-/// users share a store. Empty for other errors.
+/// Returns the end of a message about a file to which access was denied: its owner, and advice on
+/// how users can share a store. Empty for other errors.
 pub fn permission_advice(path: &Path, error: &io::Error) -> String {
     if error.kind() != io::ErrorKind::PermissionDenied {
         return String::new();

@@ -19,7 +19,7 @@ pub(crate) struct Arguments {
     /// JSON file with parameters; omitted ones have their defaults
     #[arg(long, value_name = "FILE")]
     pub(crate) params: Option<PathBuf>,
-    /// Input, e.g. --input scene=DIR; may be repeated
+    /// Name of an input and its folder; may be repeated
     #[arg(long = "input", value_name = "NAME=DIR")]
     pub(crate) inputs: Vec<String>,
     /// Folder to create; must not exist, and appears only when complete

@@ -11,7 +11,7 @@ use stage::{MEMORY_REMEDY, out_of_memory_message};
 #[derive(Debug, Clone, thiserror::Error)]
 #[error("{message}")]
 pub struct StageFailure {
-    /// Exit code of the stage; 1 if a signal ended it.
+    /// Exit code of the stage; if a signal ended it, 130 if it was asked to end, otherwise 1.
     pub code: u8,
     /// Reason, on one line.
     pub message: String,
@@ -87,7 +87,8 @@ fn without_name<'a>(line: &'a str, name: &str) -> &'a str {
     line.strip_prefix(name).and_then(|rest| rest.strip_prefix(": ")).unwrap_or(line).trim()
 }
 
-/// Returns whether Rust's runtime adds a line to a panic message: a hint or a frame of a backtrace.
+/// Returns whether a line is one that Rust's runtime adds to a panic message: a hint or a frame of
+/// a backtrace.
 /// Such lines are for the log alone.
 pub(crate) fn is_noise(line: &str) -> bool {
     let text = line.trim_start();

@@ -26,8 +26,8 @@ pub(super) trait RayKind {
     -> [f32; LANES];
 }
 
-/// Mask of an empty cube's size: shifts known to be below 32 vectorise without a check.
-const SIZE_BITS: u32 = 7;
+/// Mask of an empty cube's size, at most 7: shifts known to be below 32 vectorise without a check.
+const SIZE_MASK: u32 = 0b111;
 
 /// The rays of all lanes.
 pub(super) struct LaneRays {
@@ -198,7 +198,7 @@ impl<'a> RayLanes<'a> {
         let lane_positions = LanePositions { t, positions, cells };
         let sizes = occupancy.empty_cube_sizes(&lane_positions.cells);
         // Exits of occupied cells aren't used.
-        let exits = K::exits(&self.rays, &lane_positions, &sizes.map(|size| size & SIZE_BITS));
+        let exits = K::exits(&self.rays, &lane_positions, &sizes.map(|size| size & SIZE_MASK));
         let mut stops = 0;
         for i in 0..LANES {
             let leap = first_step((exits[i] - enter[i]).mul_add(1.0 / step, -offset[i]));

@@ -19,7 +19,7 @@ pub(crate) struct March<'a> {
     pub(crate) strides: Strides,
 }
 
-/// Samples found by marching, by ray.
+/// Samples found by marching, by round, then by ray; padding follows each round's samples.
 #[derive(Debug, Default)]
 pub(crate) struct MarchedSamples {
     /// Ray parameter of each sample.
@@ -28,7 +28,7 @@ pub(crate) struct MarchedSamples {
     pub(crate) lengths: Vec<f32>,
     /// Position of each sample in the unit cube.
     pub(crate) positions: Vec<[f32; 3]>,
-    /// Index of each active ray's first sample, and the end.
+    /// Index of each active ray's first sample in the last round, and the end without padding.
     pub(crate) starts: Vec<usize>,
     pub(super) slots: SampleSlots,
 }
