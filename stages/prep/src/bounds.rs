@@ -48,12 +48,16 @@ const MIN_CONTRACTION_DISTANCE: f64 = 2.5;
 pub(crate) type CameraDepths = (Camera, Option<[f64; 2]>);
 
 /// Returns the scene's bounds, around the training views; `others` are test views, which the space
-/// must suit, too.  Without a requested `kind` the space is NDC if all cameras face one direction
-/// and their depths are known, the contraction if known depths reach far outside the box, otherwise
-/// the box. If the scene is unbounded (opaque background) and depths are unknown, a box might not
-/// contain the scene. Then depths are guessed if the cameras face one direction; otherwise the
-/// space is the contraction.  All is computed relative to a point near the cameras: sums of large
-/// coordinates would lose the digits in which cameras differ.
+/// must suit, too.
+///
+/// Without a requested `kind` the space is NDC if all cameras face one direction and their depths
+/// are known, the contraction if known depths reach far outside the box, otherwise the box. If the
+/// scene is unbounded (opaque background) and depths are unknown, a box might not contain the
+/// scene. Then depths are guessed if the cameras face one direction; otherwise the space is the
+/// contraction.
+///
+/// All is computed relative to a point near the cameras: sums of large coordinates would lose the
+/// digits in which cameras differ.
 pub(crate) fn scene_bounds(
     training: &[CameraDepths],
     others: &[CameraDepths],

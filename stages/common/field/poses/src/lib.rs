@@ -7,12 +7,17 @@
 //!   damping.
 //! * [`MeanMotion`]: mean motion of cameras, for a log; [`photometric_error`]: quality of poses.
 //! * [`remove_common_motion`]: removes the motion that all cameras share, which photographs can't
-//! tell from a motion of the scene.  A photograph's gradient is the derivative of each pixel by its
-//! position in the image; the rendered depth gives the derivative of this position by the camera's
-//! motion (Lucas and Kanade 1981; the gradient is that of the template, as in Baker and Matthews
-//! 2004). A step renders a few thousand pixels and needs no derivative of the field, so any field
-//! that renders colour and depth will do.  Lengths are in scene units, angles in radians; camera
-//! axes are those of `scene` (x right, y up, looking along -z).
+//!   tell from a motion of the scene.
+//!
+//! A photograph's gradient is the derivative of each pixel by its position in the image; the
+//! rendered depth gives the derivative of this position by the camera's motion (Lucas and Kanade
+//! 1981; the gradient is that of the template, as in Baker and Matthews 2004). A step renders a few
+//! thousand pixels and needs no derivative of the field, so any field that renders colour and depth
+//! will do.
+//!
+//! Lengths are in scene units, angles in radians; camera axes are those of `scene` (x right, y up,
+//! looking along -z).
+//!
 //! ```
 //! use poses::{Pyramid, Refinement, refine};
 //! use pixels::Image;

@@ -1,8 +1,10 @@
 //! The paper's own refinement network: 30 million weights that redraw a patch of a rendered view,
-//! given patches of HR references of the same surface.  The network is here for comparison. It is
-//! trained for one scene, on the rendered view of a reference and the reference itself, both warped
-//! by random perspectives: as published, 46,875 steps of 32 patches. Each step takes a minute or
-//! two on two cores.
+//! given patches of HR references of the same surface.
+//!
+//! The network is here for comparison. It is trained for one scene, on the rendered view of a
+//! reference and the reference itself, both warped by random perspectives: as published, 46,875
+//! steps of 32 patches. Each step takes a minute or two on two cores.
+//!
 //! * [`PaperRefiner`]: the network (Choi et al. 2019's maximum over references, batch
 //!   normalisation, tanh). [`PaperRefiner::refine`] redraws a view in overlapping patches and
 //!   blends them; depth gives the positions of the reference patches.
