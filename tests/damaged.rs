@@ -161,10 +161,7 @@ const DAMAGES: &[Damage] = &[
             std::fs::rename(data.join("train/r_2.png"), data.join("train/._r_2.png")).unwrap();
             edit_training(data, |list| list["frames"][2]["file_path"] = json!("train/._r_2.png"));
         },
-        &[
-            "frame 2 (train/._r_2.png)",
-            "._r_2.png is named like an editor's or a system's own files",
-        ],
+        &["frame 2 (train/._r_2.png)", "._r_2.png is named like an editor or system file"],
     ),
 ];
 

@@ -188,14 +188,14 @@ mod tests {
         assert_eq!(
             need.describe(MAX_PIXEL_BYTES),
             format!(
-                "memory: about {total} (300.0 MB for the field, 4.0 GB for pixels); 1.0 GB of \
-                pixels in a file"
+                "memory: about {total}, of which 300.0 MB for the field and 4.0 GB for pixels; \
+                1.0 GB of pixels in a file"
             )
         );
         let total = sized(minimum + 2_000_000);
         assert_eq!(
             MemoryNeed { pixels: 2_000_000, ..need }.describe(MAX_PIXEL_BYTES),
-            format!("memory: about {total} (300.0 MB for the field, 2.0 MB for pixels)")
+            format!("memory: about {total}, of which 300.0 MB for the field and 2.0 MB for pixels")
         );
     }
 }
