@@ -447,7 +447,7 @@ fn contradictions_are_refused() {
         &folder,
         &out,
         r#"{"lr_source": "photographs", "hr_width": 16}"#,
-        &["32", "larger than", "16"],
+        &["hr_width = 16 is less than", "32 pixels"],
     );
 }
 

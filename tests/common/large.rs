@@ -25,7 +25,8 @@ impl Small {
         small.make("train-ss", FIELD, &[("scene", "scene/train")], "field");
         let cameras = [("field", "field"), ("cameras", "scene/train")];
         small.make("render-depth", r#"{"samples_per_axis": 1}"#, &cameras, "views");
-        let refiner = r#"{"steps": 1, "batch": 1, "patch_size": 8, "features": 64, "blocks": 16}"#;
+        let refiner =
+            r#"{"steps": 1, "batch_size": 1, "patch_size": 8, "features": 64, "blocks": 16}"#;
         small.make("train-refine", refiner, &[("views", "views"), ("truth", "scene/train")], "net");
         small
     }
