@@ -291,7 +291,7 @@ fn references_are_used_by_a_network_that_knows_how() {
     let both = [("references", references.as_path()), ("reference-views", views.as_path())];
     refine_with(&project, &views, "no", &refiner, &both)
         .0
-        .fails(3, &["input reference-views: no view r_0 with that pose"]);
+        .fails(3, &["input reference-views: no view r_0 with the reference's pose"]);
     // A network that can't use them says so.
     let plain_target = [&["train-refine"], &target[1..]].concat();
     project.ok(&[&["run"], &plain_target[..]].concat());
