@@ -46,6 +46,14 @@ impl CounterRng {
         (self.next() >> 40) as f32 / (1u64 << 24) as f32
     }
 
+    /// Draws from the standard normal distribution (Box and Muller 1958).
+    pub fn normal(&mut self) -> f64 {
+        // Never 0, whose logarithm is infinite.
+        let u = 1.0 - f64::from(self.uniform());
+        let v = f64::from(self.uniform());
+        (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+    }
+
     /// Draws an integer in 0..bound.
     #[inline]
     pub fn below(&mut self, bound: u64) -> u64 {

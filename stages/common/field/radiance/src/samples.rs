@@ -246,7 +246,8 @@ impl Samples {
         }
     }
 
-    /// Lists the densities and cells of samples that stop light. `step` is the length of one step in cube sides.
+    /// Lists the densities and cells of samples that stop light. `step` is the length of one step
+    /// in cube sides.
     pub(crate) fn list_hits(&self, counted: &Counted, step: f32, hits: &mut Vec<CellHit>) {
         let MarchedSamples { positions, lengths, .. } = &self.marched;
         let samples = counted.sample.iter().map(|&i| i as usize);

@@ -11,7 +11,7 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::composite::{Composite, composite};
 use crate::error::TorchFieldError;
-use crate::network::{MlpNetwork, encode, normal};
+use crate::network::{MlpNetwork, encode};
 use crate::ray_maps::{RayMaps, columns, matrix, to_host};
 use crate::sampling::{importance, midpoints, stratified};
 use crate::step::run_in_pieces;
@@ -94,7 +94,7 @@ impl SampleDraws {
         let (rays, device) = (first..first + n as u64, field.device);
         let noise = if noise > 0.0 {
             let all = draw_rows(seed, NOISE, rays.clone(), 2 * coarse + fine, device, |rng| {
-                (noise * normal(rng)) as f32
+                (noise * rng.normal()) as f32
             })?;
             Some([
                 all.f_narrow(1, 0, coarse as i64)?,

@@ -90,7 +90,7 @@ impl MlpNetwork {
         for (_, inputs, outputs) in Self::layers(&architecture) {
             let deviation = (2.0 / inputs as f64).sqrt();
             let values: Vec<f32> =
-                (0..inputs * outputs).map(|_| (deviation * normal(&mut rng)) as f32).collect();
+                (0..inputs * outputs).map(|_| (deviation * rng.normal()) as f32).collect();
             parameters.push(Tensor::f_from_slice(&values)?.f_reshape([outputs, inputs])?);
             parameters.push(Tensor::f_zeros([outputs], (Kind::Float, Device::Cpu))?);
         }
@@ -171,10 +171,4 @@ fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchError
 
 fn onednn_linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
     x.f_to_mkldnn(None)?.f_mkldnn_linear(weight, Some(bias))?.f_to_dense(None, false)
-}
-
-/// Draws from the standard normal distribution (Box and Muller 1958).
-pub(crate) fn normal(rng: &mut CounterRng) -> f64 {
-    let radius = (-2.0 * (1.0 - f64::from(rng.uniform())).ln()).sqrt();
-    radius * (std::f64::consts::TAU * f64::from(rng.uniform())).cos()
 }

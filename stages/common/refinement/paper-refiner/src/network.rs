@@ -76,10 +76,10 @@ impl PaperRefiner {
             let inputs = shape[1..].iter().product::<i64>() as f64;
             let values: Vec<f32> = match kind {
                 LayerTensor::Kernel => {
-                    (0..count).map(|_| ((2.0 / inputs).sqrt() * normal(&mut rng)) as f32).collect()
+                    (0..count).map(|_| ((2.0 / inputs).sqrt() * rng.normal()) as f32).collect()
                 }
                 LayerTensor::Scale => {
-                    (0..count).map(|_| (1.0 + 0.02 * normal(&mut rng)) as f32).collect()
+                    (0..count).map(|_| (1.0 + 0.02 * rng.normal()) as f32).collect()
                 }
                 LayerTensor::Variance => vec![1.0; count as usize],
                 LayerTensor::Bias | LayerTensor::Shift | LayerTensor::Mean => {
@@ -194,14 +194,6 @@ impl PaperRefiner {
         }
         x.ok_or_else(|| TchError::Shape("a decoder without layers".to_owned()))
     }
-}
-
-/// Draws from the standard normal distribution (Box and Muller 1958).
-fn normal(rng: &mut CounterRng) -> f64 {
-    // Never 0, whose logarithm is infinite.
-    let u = 1.0 - f64::from(rng.uniform());
-    let v = f64::from(rng.uniform());
-    (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 /// Builds the layers of the encoder or decoder; trainable tensors require gradients.
