@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use crate::stage_call::{DescribeError, Interrupted, describe_all};
-use artifact::{nearest, write_atomically};
+use artifact::{hash_file, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use stage::{Description, DescriptionError, Schema, SchemaError};
@@ -358,10 +358,4 @@ fn nearest_program(name: &str) -> Option<String> {
     }
     programs.sort_unstable();
     nearest(name, programs.iter().map(String::as_str)).map(str::to_owned)
-}
-
-fn hash_file(path: &Path) -> std::io::Result<String> {
-    let mut hasher = blake3::Hasher::new();
-    hasher.update_reader(std::fs::File::open(path)?)?;
-    Ok(hasher.finalize().to_hex().to_string())
 }

@@ -42,7 +42,7 @@ pub use listing::{
     ListedFiles, OutputFileError, PathError, file_kind, is_ignored_name, list_files,
     list_output_files, list_source_files, relative_path,
 };
-pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest};
+pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_file};
 pub use run_record::{
     FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, label, sink_folders,
 };

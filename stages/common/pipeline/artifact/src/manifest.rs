@@ -206,7 +206,8 @@ fn manifest_path(relative: &Path) -> io::Result<String> {
         .ok_or_else(|| io::Error::other(format!("{relative:?}: the file name isn't UTF-8")))
 }
 
-fn hash_file(path: &Path) -> io::Result<String> {
+/// Returns the blake3 hash of a file, in hexadecimal.
+pub fn hash_file(path: &Path) -> io::Result<String> {
     let mut hasher = blake3::Hasher::new();
     hasher.update_reader(File::open(path)?)?;
     Ok(hasher.finalize().to_hex().to_string())
