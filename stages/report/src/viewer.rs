@@ -51,8 +51,8 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                 }
                 p id="stage-help" class="note" {
                     "Drag to move the division, or to pan a zoomed view. Ctrl and wheel, pinch, + "
-                    "and − zoom; 0 fits, 1 or a double click shows one pixel as one; N and P "
-                    "change the view."
+                    "and − zoom. 0 fits the view; 1 or a double click shows one image pixel per "
+                    "screen pixel. N and P change the view."
                 }
                 div id="scales" {}
                 div class="wide" tabindex="0" role="region" aria-label="Numbers of this view" {
