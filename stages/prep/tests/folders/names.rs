@@ -64,7 +64,7 @@ fn ambiguous_case(folder: &Path) {
     write_photograph(&folder.join("images/Frame_0.png"), 1);
 }
 
-/// What macOS and others leave in folders.
+/// Hidden files that macOS and other systems leave in folders.
 fn hidden(folder: &Path) {
     write_photographs(folder, "images/IMG_#.png", 10);
     for number in 0..10 {
