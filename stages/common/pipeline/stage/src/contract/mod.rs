@@ -10,7 +10,7 @@
 //! The runner checks values with this module before it starts a stage. The stage checks them again.
 //!
 //! ```
-//! use crate::contract::Schema;
+//! use stage::Schema;
 //! use serde_json::{Map, json};
 //!
 //! let properties = json!({"rays": {"type": "integer", "minimum": 1, "default": 5}});
@@ -19,7 +19,7 @@
 //! let none = Map::from_iter([("rays".to_owned(), json!(0))]);
 //! let problems = schema.resolve(&none).unwrap_err();
 //! assert_eq!(problems[0].to_string(), "parameter rays: 0 is less than the minimum of 1");
-//! # Ok::<(), crate::stage::SchemaError>(())
+//! # Ok::<(), stage::SchemaError>(())
 //! ```
 
 mod describe;
