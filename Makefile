@@ -51,9 +51,9 @@ PREFIX ?= /usr/local
 install: $(if $(wildcard $(HOME)/.cargo/bin/cargo)$(shell command -v cargo),build remote) ## Install programs, completions and man pages: make install PREFIX=/usr/local DESTDIR=
 	@DESTDIR=$(DESTDIR) scripts/install.sh $(PREFIX) $(LIBTORCH_DIR)
 
-test: build remote ## Run all tests and doctests, list skipped and slowest tests; FILTER=TEXT selects tests by name
-	@python3 scripts/run-tests.py $(FILTER)
+test: build remote ## Run all doctests and tests, list skipped and slowest tests; FILTER=TEXT selects tests by name
 	cargo test --release --workspace --exclude $(REMOTE) --doc --quiet
+	@python3 scripts/run-tests.py $(FILTER)
 
 KILLS ?= 200
 RUNNERS ?= 10
