@@ -12,7 +12,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use artifact::GivenInput;
-use radiance::{Architecture, Family, Field, Passes, Ray, Trainer, set_family};
+use radiance::{Architecture, Family, Field, Passes, Phase, PhaseTimes, Ray, Trainer, set_family};
 use scene::{Bounds, Camera, Views};
 use serde::{Deserialize, Serialize};
 #[cfg(feature = "torch")]
@@ -257,7 +257,6 @@ fn passes(rows: &mut Rows) {
         let field = Field::new(architecture, bounds, 1);
         let rays = rays(4096);
         let mut passes = Passes::new(&field);
-        let mut table = vec![0.0; field.grid_len()];
         let [marched, coloured] = passes.run(&field, &rays, false);
         let per_sample = |seconds: f64| seconds / marched as f64 * 1e9;
         let forward = per_sample(best(5, || {
@@ -265,9 +264,9 @@ fn passes(rows: &mut Rows) {
         }));
         let both = per_sample(best(5, || {
             passes.run(&field, &rays, true);
-            passes.scatter(&field, &mut table);
+            passes.scatter(&field);
         }));
-        black_box(&table);
+        black_box(&passes);
         rows.add(format!("forward_ns_per_sample{name}"), forward, "ns");
         rows.add(format!("forward_backward_ns_per_sample{name}"), both, "ns");
         if name.is_empty() {
@@ -292,10 +291,17 @@ struct Scene {
     views: Views,
 }
 
+/// Finished training run.
+struct Trained {
+    field: Field,
+    rays_per_second: f64,
+    samples_per_ray: f64,
+    phases: [PhaseTimes; Phase::ALL.len()],
+}
+
 impl Scene {
-    /// Trains a field completely and adds the speed to the rows. `name` is the suffix of the rows'
-    /// names.
-    fn train(&self, rows: &mut Rows, params: &Params, name: &str) -> anyhow::Result<Field> {
+    /// Trains a field completely.
+    fn train(&self, params: &Params) -> anyhow::Result<Trained> {
         let Self { input, views } = self;
         let params = params.resolve(&SceneFacts::of(views, true));
         let mut supervision =
@@ -311,11 +317,67 @@ impl Scene {
             samples += report.samples;
         }
         let done = trainer.rays_done() as f64;
-        let speed = done / start.elapsed().as_secs_f64();
-        rows.add(format!("train_rays_per_s{name}"), speed, "rays/s");
-        rows.add(format!("train_samples_per_ray{name}"), samples as f64 / done, "samples");
-        Ok(trainer.finish())
+        Ok(Trained {
+            rays_per_second: done / start.elapsed().as_secs_f64(),
+            samples_per_ray: samples as f64 / done,
+            phases: trainer.phase_times(),
+            field: trainer.finish(),
+        })
     }
+
+    /// Trains a field and adds the speed to the rows, whose names end with `name`.
+    fn measure(&self, rows: &mut Rows, params: &Params, name: &str) -> anyhow::Result<Trained> {
+        let trained = self.train(params)?;
+        rows.add(format!("train_rays_per_s{name}"), trained.rays_per_second, "rays/s");
+        rows.add(format!("train_samples_per_ray{name}"), trained.samples_per_ray, "samples");
+        Ok(trained)
+    }
+}
+
+/// Number of runs with one thread and with all threads, which alternate.
+const ALTERNATIONS: usize = 5;
+
+/// Adds the ratio of the median speeds with all threads and with one thread.
+fn add_ratio(
+    rows: &mut Rows,
+    name: &str,
+    mut speed: impl FnMut() -> anyhow::Result<f64> + Send,
+) -> anyhow::Result<()> {
+    let (mut one, mut all) = (Vec::new(), Vec::new());
+    for _ in 0..ALTERNATIONS {
+        one.push(one_core(&mut speed)?);
+        all.push(speed()?);
+    }
+    rows.add(format!("{name}_all_threads_over_one"), median(&mut all) / median(&mut one), "times");
+    Ok(())
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Adds the phases of a training run's steps. On one core, time outside of tasks is serial.
+fn add_phases(rows: &mut Rows, one_core: &Trained) {
+    let steps = one_core.phases.iter().map(|phase| phase.steps).max().unwrap_or(1).max(1) as f64;
+    let total: f64 = one_core.phases.iter().map(|phase| phase.elapsed).sum();
+    println!(
+        "{:<16} {:>12} {:>12} {:>14} {:>16}",
+        "phase", "ms per step", "tasks", "longest task", "serial of step"
+    );
+    for (phase, times) in Phase::ALL.iter().zip(&one_core.phases) {
+        let serial = times.elapsed - times.in_tasks;
+        println!(
+            "{:<16} {:>12.3} {:>12.1} {:>12.1} % {:>14.2} %",
+            format!("{phase:?}"),
+            1e3 * times.elapsed / steps,
+            times.tasks as f64 / times.steps.max(1) as f64,
+            100.0 * times.in_longest_tasks / times.in_tasks.max(f64::MIN_POSITIVE),
+            100.0 * serial / total
+        );
+    }
+    let in_tasks: f64 = one_core.phases.iter().map(|phase| phase.in_tasks).sum();
+    rows.add("serial_share_of_step", 100.0 * (total - in_tasks) / total, "%");
 }
 
 /// Measures complete trainings, with one and all threads, and renders of the first one's field.
@@ -329,14 +391,17 @@ fn training(rows: &mut Rows, folder: &Path, rays: u64) -> anyhow::Result<()> {
             FieldParams::Grid(GridParams { rays, pixel_importance, ..GridParams::default() });
         Params { field, ..Params::default() }
     };
-    let field = scene.train(rows, &grid(rays, Some(1.0)), "")?;
-    scene.train(rows, &grid(rays, None), "_by_detail")?;
+    let field = scene.measure(rows, &grid(rays, Some(1.0)), "")?.field;
+    scene.measure(rows, &grid(rays, None), "_by_detail")?;
     let short = grid(rays / 6, Some(1.0));
-    scene.train(rows, &short, "_first_sixth")?;
-    one_core(|| scene.train(rows, &short, "_first_sixth_one_core"))?;
+    scene.measure(rows, &short, "_first_sixth")?;
+    let one_core = one_core(|| scene.measure(rows, &short, "_first_sixth_one_core"))?;
+    add_phases(rows, &one_core);
+    add_ratio(rows, "train", || Ok(scene.train(&short)?.rays_per_second))?;
+    add_ratio(rows, "sgemm", || Ok(sgemm()))?;
     for scale in [1.0, 4.0] {
         let scaled = Params { supersample: scale, ..short.clone() };
-        scene.train(rows, &scaled, &format!("_first_sixth_x{scale}"))?;
+        scene.measure(rows, &scaled, &format!("_first_sixth_x{scale}"))?;
     }
 
     #[cfg(feature = "torch")]

@@ -174,16 +174,12 @@ impl HrCache {
         residuals[y - ys.start][x - xs.start]
     }
 
-    /// Stores the freshly rendered colours of an LR pixel's block.
-    pub(crate) fn store(&mut self, pixel: LrPixel, colours: &[[f32; 3]]) {
+    /// Stores the levels of the freshly rendered colours of an LR pixel's block.
+    pub(crate) fn store(&mut self, pixel: LrPixel, levels: &[[u8; 3]]) {
         let [left, top] = self.block_start(pixel);
         let view = &mut self.views[pixel.view];
-        for (b, colours) in colours.chunks_exact(self.supersample[0]).enumerate() {
-            ROW_BUFFERS.with_borrow_mut(|buffers| {
-                buffers.bytes.clear();
-                buffers.bytes.extend(colours.as_flattened().iter().map(|&v| to_u8(v)));
-                view.rendered.write(3 * ((top + b) * view.width + left), &buffers.bytes);
-            });
+        for (b, levels) in levels.chunks_exact(self.supersample[0]).enumerate() {
+            view.rendered.write(3 * ((top + b) * view.width + left), levels.as_flattened());
         }
     }
 
@@ -408,7 +404,7 @@ mod tests {
     fn stored_pixels_are_restored() {
         let kernel = Arc::new(KernelOperator::new(Filter::Box, (8, 6), (4, 3)));
         let mut first = cache([2, 2], &pattern(8, 6), kernel.clone());
-        first.store(LrPixel { view: 0, x: 3, y: 1 }, &[[1.0, 0.0, 0.2]; 4]);
+        first.store(LrPixel { view: 0, x: 3, y: 1 }, &[[255, 0, 51]; 4]);
         let kept = written(&first);
         assert_eq!(first.byte_length(), kept.len());
         assert_eq!(kept[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);

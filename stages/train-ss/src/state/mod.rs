@@ -104,7 +104,7 @@ mod tests {
     fn every_part_is_restored() {
         let mut first = state(4.0);
         let pixel = LrPixel { view: 0, x: 3, y: 5 };
-        first.cache.as_mut().unwrap().store(pixel, &[[1.0, 0.0, 0.2]; 4]);
+        first.cache.as_mut().unwrap().store(pixel, &[[255, 0, 51]; 4]);
         first.exposures.as_mut().unwrap().add_pixel(0, [0.5; 3], [0.25; 3]);
         let bytes = written(&first);
         assert_eq!(bytes.len(), first.byte_length());

@@ -11,8 +11,10 @@ mod setup;
 use std::io;
 
 use counter_rng::CounterRng;
+use pixels::to_u8;
 use poses::MeanMotion;
-use radiance::{Ray, RayField};
+use radiance::{PhaseClock, Ray, RayField, RenderedBundles};
+use rayon::prelude::*;
 use scene::{Background, Camera, CameraRays};
 
 use crate::params::Supervision;
@@ -190,6 +192,44 @@ impl Supersampling {
     }
 }
 
+/// Pixels of bundles in sequence, and the 8-bit levels of their sub-pixel rays.
+struct RenderedPixels {
+    pixels: Vec<RenderedPixel>,
+    levels: Vec<[u8; 3]>,
+}
+
+/// Pixel whose bundle was rendered.
+struct RenderedPixel {
+    position: LrPixel,
+    /// Photographed colour; NaN in clipped channels.
+    photographed: [f32; 3],
+    /// Mean colour of the rays.
+    rendered: [f32; 3],
+    /// True if the levels belong in the cache.
+    is_cached: bool,
+}
+
+impl Supersampling {
+    /// Finds the pixels of rendered bundles, and converts the bundles' colours for storage.
+    fn rendered_pixels(&self, bundles: &RenderedBundles<'_>, rays: usize) -> RenderedPixels {
+        let pixels = bundles.bundles(rays).map(|(bundle, colours)| {
+            let (view, pixel) = self.drawn_pixel(bundle);
+            let sample = self.views[view].image.pixel(pixel);
+            RenderedPixel {
+                position: self.position(view, pixel),
+                photographed: [0, 1, 2]
+                    .map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] }),
+                rendered: [0, 1, 2].map(|c| {
+                    colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
+                }),
+                is_cached: matches!(self.comparison(view), Comparison::Kernel(_)),
+            }
+        });
+        let levels = bundles.colours.iter().map(|colour| colour.map(to_u8));
+        RenderedPixels { pixels: pixels.collect(), levels: levels.collect() }
+    }
+}
+
 /// Returns the factors from a view's photograph to the field's colours.
 fn exposure_correction(exposures: Option<&Exposures>, view: usize) -> [f32; 3] {
     exposures.map_or([1.0; 3], |exposures| exposures.gains()[view].map(f32::recip))
@@ -269,24 +309,25 @@ impl radiance::Supervisor for Supersampling {
         }
     }
 
-    fn remember(&mut self, bundle: u64, colours: &[[f32; 3]]) {
+    fn remember(&mut self, rendered: &[RenderedBundles<'_>], clock: &PhaseClock) {
         if self.state.cache.is_none() && self.state.exposures.is_none() {
             return;
         }
-        let (view, pixel) = self.drawn_pixel(bundle);
-        if let Some(exposures) = &mut self.state.exposures {
-            let sample = self.views[view].image.pixel(pixel);
-            let photographed =
-                [0, 1, 2].map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] });
-            let rendered = [0, 1, 2].map(|c| {
-                colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
-            });
-            exposures.add_pixel(view, photographed, rendered);
-        }
-        let is_cached = matches!(self.comparison(view), Comparison::Kernel(_));
-        let pixel = self.position(view, pixel);
-        if let Some(cache) = self.state.cache.as_mut().filter(|_| is_cached) {
-            cache.store(pixel, colours);
+        let rays = self.rays_per_bundle();
+        // Draws and conversions take almost all of the time, and only they run in parallel: sums
+        // and overlapping blocks need the bundles' order.
+        let drawn: Vec<RenderedPixels> = (rendered.par_iter())
+            .map(|bundles| clock.task(|| self.rendered_pixels(bundles, rays)))
+            .collect();
+        for RenderedPixels { pixels, levels } in drawn {
+            for (pixel, levels) in pixels.iter().zip(levels.chunks_exact(rays)) {
+                if let Some(exposures) = &mut self.state.exposures {
+                    exposures.add_pixel(pixel.position.view, pixel.photographed, pixel.rendered);
+                }
+                if let Some(cache) = self.state.cache.as_mut().filter(|_| pixel.is_cached) {
+                    cache.store(pixel.position, levels);
+                }
+            }
         }
     }
 }
@@ -302,6 +343,11 @@ mod tests {
     use super::*;
     use crate::params::{Order, Params, Resolved, SceneFacts};
     use crate::photographs::Photographs;
+
+    fn remember(supersampling: &mut Supersampling, first_bundle: u64, colours: &[[f32; 3]]) {
+        let rendered = RenderedBundles { first_bundle, colours };
+        supersampling.remember(&[rendered], &PhaseClock::start());
+    }
 
     fn options(supervision: Supervision, supersample: f64) -> SupersamplingOptions {
         let scene = SceneFacts {
@@ -460,7 +506,7 @@ mod tests {
                 .collect();
             let mut gradients = [[0.0; 3]; 4];
             let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
-            supersampling.remember(bundle, &colours);
+            remember(&mut supersampling, bundle, &colours);
             // Until then the cache isn't full of the truth.
             if bundle >= 400 {
                 let gradient =
@@ -611,7 +657,7 @@ mod tests {
                     (pulled - 0.2 / 12.0).abs() < 1e-6
                         && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
                 );
-                joined.remember(bundle, &colours);
+                remember(&mut joined, bundle, &colours);
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-pixel rays they meet the block's mean together.
@@ -670,7 +716,7 @@ mod tests {
         for bundle in 0..50 {
             let colours = vec![[0.5, 0.4, 0.3]; joined.rays_per_bundle()];
             assert!(joined.loss_and_gradient(bundle, &colours, &mut gradients).is_finite());
-            joined.remember(bundle, &colours);
+            remember(&mut joined, bundle, &colours);
         }
         assert_eq!(joined.state.byte_length(), 3 * (2 * 2 + 5 * 3));
     }

@@ -273,7 +273,7 @@ mod tests {
         let mut field = Field::new(architecture, bounds, 1);
         let (.., occupancy) = field.parts_mut();
         let (mut density, mut cells) =
-            (occupancy.density().to_vec(), vec![0; occupancy.density().len()]);
+            (occupancy.densities(), vec![0; occupancy.densities().len()]);
         density[5000..5002].copy_from_slice(&[10.0, 1000.0]);
         cells[5000..5002].copy_from_slice(&[1, 2]);
         (density[9000], cells[9000]) = (10.0, 1);

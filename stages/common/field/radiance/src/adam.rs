@@ -1,3 +1,5 @@
+use std::ops::Range;
+
 use crate::simd::{LANES, kernel};
 use crate::spec::{ADAM_BETA, ADAM_EPSILON};
 
@@ -30,62 +32,103 @@ impl AdamStep {
     }
 }
 
-/// Marks of the blocks of 16 floats that a step has touched. A mark is a byte, since a bit would
-/// have to be read before it is set.
-pub(crate) type Touched = [u8];
-
-/// Number of blocks whose marks are scanned together; chosen by hand.
-const BLOCKS_PER_SCAN: usize = 256;
+/// Number of bricks whose marks are scanned together; chosen by hand.
+const BRICKS_PER_SCAN: usize = 128;
 /// Number of touched blocks that are prefetched before their use; chosen by hand.
 const BLOCKS_AHEAD: usize = 8;
 
+/// Takes the Adam step of sixteen weights. Weights whose gradient is 0 keep value and moments.
+#[inline(always)]
+fn update_block(
+    step: &AdamStep,
+    gradients: &[f32; LANES],
+    weights: &mut [f32; LANES],
+    first: &mut [f32; LANES],
+    second: &mut [f32; LANES],
+) {
+    for i in 0..LANES {
+        let touched = gradients[i] != 0.0;
+        let gradient = step.decay.mul_add(weights[i], gradients[i]);
+        let m1 = (first[i] - gradient).mul_add(step.beta1, gradient);
+        let square = gradient * gradient;
+        let v1 = (second[i] - square).mul_add(step.beta2, square);
+        let w1 = (-step.rate).mul_add(m1 / (v1.sqrt() + step.epsilon), weights[i]);
+        first[i] = if touched { m1 } else { first[i] };
+        second[i] = if touched { v1 } else { second[i] };
+        weights[i] = if touched { w1 } else { weights[i] };
+    }
+}
+
 kernel! {
-    /// Takes one lazy Adam step: entries whose gradient is 0 keep value and moments. Visits only
-    /// the touched blocks, and clears their gradients and marks. Lengths are equal multiples of 16.
+    /// Takes an Adam step of the networks' weights, and clears the gradients. Lengths are equal
+    /// multiples of 16.
     pub(crate) fn adam<L>(
-        step: &AdamStep, touched: &mut Touched, weights: &mut [f32], gradients: &mut [f32],
-        first: &mut [f32], second: &mut [f32],
+        step: &AdamStep, gradients: &mut [f32], weights: &mut [f32], first: &mut [f32],
+        second: &mut [f32],
     ) {
         let (weights, gradients) = (weights.as_chunks_mut::<LANES>().0,
             gradients.as_chunks_mut::<LANES>().0);
         let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
-        let n_blocks = touched.len().min(weights.len());
-        let mut list = [0; BLOCKS_PER_SCAN];
-        for start in (0..n_blocks).step_by(BLOCKS_PER_SCAN) {
-            let marks = &mut touched[start..(start + BLOCKS_PER_SCAN).min(n_blocks)];
-            if marks.iter().fold(0, |any, m| any | m) == 0 {
-                continue;
-            }
-            let mut count = 0;
-            for (block, mark) in (start..).zip(marks) {
-                list[count] = block;
-                count += usize::from(std::mem::take(mark) != 0);
-            }
+        let blocks = gradients.iter_mut().zip(weights).zip(first.iter_mut().zip(second));
+        for ((gradients, weights), (first, second)) in blocks {
+            update_block(step, gradients, weights, first, second);
+            *gradients = [0.0; LANES];
+        }
+    }
+}
+
+/// Gradients of half of the entries of some bricks, and marks of the bricks that have one.
+pub(crate) type HalfPiece<'a> = (&'a mut [f32], &'a mut [u8]);
+
+kernel! {
+    /// Takes one lazy Adam step of some bricks of a level: entries whose gradient is 0 keep value
+    /// and moments. Visits only touched halves of bricks, and clears their gradients and marks.
+    pub(crate) fn adam_of_bricks<L>(
+        step: &AdamStep, halves: &mut [HalfPiece<'_>; 2], weights: &mut [f32],
+        first: &mut [f32], second: &mut [f32],
+    ) {
+        let weights = weights.as_chunks_mut::<LANES>().0;
+        let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
+        let n_bricks = weights.len() / 2;
+        let mut list = [0; 2 * BRICKS_PER_SCAN];
+        for start in (0..n_bricks).step_by(BRICKS_PER_SCAN) {
+            let bricks = start..(start + BRICKS_PER_SCAN).min(n_bricks);
+            let count = list_touched(halves, bricks, &mut list);
             for at in 0..count {
                 // Blocks are far apart in memory, and each needs little arithmetic.
                 let ahead = list[(at + BLOCKS_AHEAD).min(count - 1)];
                 L::prefetch(&weights[ahead]);
-                L::prefetch(&gradients[ahead]);
+                L::prefetch(&halves[ahead % 2].0[ahead / 2 * LANES..]);
                 L::prefetch(&first[ahead]);
                 L::prefetch(&second[ahead]);
                 let block = list[at];
-                let (w, g, m, v) = (&mut weights[block], &mut gradients[block], &mut first[block],
+                let sums = &mut halves[block % 2].0.as_chunks_mut::<LANES>().0[block / 2];
+                update_block(step, sums, &mut weights[block], &mut first[block],
                     &mut second[block]);
-                for i in 0..LANES {
-                    let touched = g[i] != 0.0;
-                    let gradient = step.decay.mul_add(w[i], g[i]);
-                    let m1 = (m[i] - gradient).mul_add(step.beta1, gradient);
-                    let square = gradient * gradient;
-                    let v1 = (v[i] - square).mul_add(step.beta2, square);
-                    let w1 = (-step.rate).mul_add(m1 / (v1.sqrt() + step.epsilon), w[i]);
-                    m[i] = if touched { m1 } else { m[i] };
-                    v[i] = if touched { v1 } else { v[i] };
-                    w[i] = if touched { w1 } else { w[i] };
-                    g[i] = 0.0;
-                }
+                *sums = [0.0; LANES];
             }
         }
     }
+}
+
+/// Lists the touched blocks of a range of bricks, and clears the marks. Returns the number of
+/// blocks.
+#[inline(always)]
+fn list_touched(
+    halves: &mut [HalfPiece<'_>; 2],
+    bricks: Range<usize>,
+    list: &mut [usize; 2 * BRICKS_PER_SCAN],
+) -> usize {
+    let mut count = 0;
+    let [(_, even), (_, odd)] = halves;
+    let marks = even[bricks.clone()].iter_mut().zip(&mut odd[bricks.clone()]);
+    for (brick, (even, odd)) in bricks.zip(marks) {
+        for (half, mark) in [even, odd].into_iter().enumerate() {
+            list[count] = 2 * brick + half;
+            count += usize::from(std::mem::take(mark) != 0);
+        }
+    }
+    count
 }
 
 kernel! {
@@ -125,8 +168,7 @@ mod tests {
                     e[0] -= 0.01 * mh / (vh.sqrt() + 1e-15);
                 }
             }
-            let mut touched = [1; 2];
-            adam(&AdamStep::new(t as u64, 0.01, 0.0), &mut touched, &mut w, &mut g, &mut m, &mut v);
+            adam(&AdamStep::new(t as u64, 0.01, 0.0), &mut g, &mut w, &mut m, &mut v);
             assert!(g.iter().all(|&g| g == 0.0));
         }
         for (i, (w, e)) in w.iter().zip(&exact).enumerate() {
@@ -135,38 +177,53 @@ mod tests {
         assert_eq!(w[3], 0.3);
     }
 
-    /// Numbers of many blocks, few of them touched, after a step in pieces of so many blocks.
-    fn after_step(in_pieces_of: usize) -> [Vec<f32>; 4] {
-        let blocks = 9001;
-        let [mut w, mut m, mut v, mut g] = [0, 1, 2, 3].map(|purpose| -> Vec<f32> {
-            (0..(blocks * LANES) as u64).map(|i| uniform(7, purpose, i)).collect()
+    /// Number of bricks of the tests.
+    const BRICKS: usize = 4501;
+
+    fn is_touched(block: usize) -> bool {
+        uniform(8, 0, block as u64) < 0.1
+    }
+
+    /// Returns weights and moments of many bricks, few of whose halves are touched, after a step in
+    /// pieces of `bricks` bricks.
+    fn after_step(bricks: usize) -> [Vec<f32>; 3] {
+        let [mut w, mut m, mut v] = [0, 1, 2].map(|purpose| -> Vec<f32> {
+            (0..(2 * BRICKS * LANES) as u64).map(|i| uniform(7, purpose, i)).collect()
         });
-        let mut touched: Vec<u8> =
-            (0..blocks as u64).map(|block| u8::from(uniform(8, 0, block) < 0.1)).collect();
-        for (block, numbers) in g.chunks_mut(LANES).enumerate() {
-            if touched[block] == 0 {
-                numbers.fill(0.0);
-            }
+        let mut marks = [0, 1].map(|half| -> Vec<u8> {
+            (0..BRICKS).map(|brick| u8::from(is_touched(2 * brick + half))).collect()
+        });
+        let mut sums = marks.each_ref().map(|marks| -> Vec<f32> {
+            marks.iter().flat_map(|mark| [0.5 * f32::from(*mark); LANES]).collect()
+        });
+        let step = AdamStep::new(3, 0.01, 0.0);
+        for first in (0..BRICKS).step_by(bricks) {
+            let here = first..(first + bricks).min(BRICKS);
+            let blocks = here.start * LANES..here.end * LANES;
+            let table = 2 * blocks.start..2 * blocks.end;
+            let [w, m, v] = [&mut w, &mut m, &mut v].map(|n| &mut n[table.clone()]);
+            let [even, odd] = &mut sums;
+            let [even_marks, odd_marks] = &mut marks;
+            let mut halves = [
+                (&mut even[blocks.clone()], &mut even_marks[here.clone()]),
+                (&mut odd[blocks], &mut odd_marks[here]),
+            ];
+            adam_of_bricks(&step, &mut halves, w, m, v);
         }
-        let (step, len) = (AdamStep::new(3, 0.01, 0.0), in_pieces_of * LANES);
-        for (i, touched) in touched.chunks_mut(in_pieces_of).enumerate() {
-            let here = i * len..(i * len + touched.len() * LANES);
-            let [w, g, m, v] = [&mut w, &mut g, &mut m, &mut v].map(|n| &mut n[here.clone()]);
-            adam(&step, touched, w, g, m, v);
-        }
-        assert!(touched.iter().all(|mark| *mark == 0));
-        [w, g, m, v]
+        assert!(marks.iter().flatten().all(|mark| *mark == 0));
+        assert!(sums.iter().flatten().all(|sum| *sum == 0.0));
+        [w, m, v]
     }
 
     #[test]
     fn pieces_and_families_give_equal_bits_and_leave_what_is_untouched() {
-        let whole = after_step(1 << 20);
+        let whole = after_step(BRICKS);
         for (block, numbers) in whole[0].chunks(LANES).enumerate() {
             let begin = uniform(7, 0, (block * LANES) as u64);
-            assert_eq!(numbers[0] != begin, uniform(8, 0, block as u64) < 0.1, "block {block}");
+            assert_eq!(numbers[0] != begin, is_touched(block), "block {block}");
         }
         by_every_family(|family| {
-            for pieces in [1, 255, 4096] {
+            for pieces in [1, 127, 2048] {
                 assert!(after_step(pieces) == whole, "{family:?}, pieces of {pieces}");
             }
         });

@@ -3,6 +3,7 @@
 
 use crate::aligned::Aligned;
 use crate::field::Field;
+use crate::grid::PositionRows;
 use crate::march::March;
 use crate::occupancy::CellHit;
 use crate::ray::NormalizedRay;
@@ -19,6 +20,8 @@ pub(crate) const CHUNK_RAYS: usize = 64;
 #[derive(Debug, Default)]
 pub(crate) struct FeatureGradients {
     pub(crate) positions: Vec<[f32; 3]>,
+    /// The positions in rows, arranged once all samples are listed.
+    pub(crate) rows: Vec<PositionRows>,
     /// One list per level, as long as `positions`.
     pub(crate) levels: Vec<Vec<[f32; FEATURES]>>,
 }

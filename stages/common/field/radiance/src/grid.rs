@@ -5,14 +5,11 @@
 //! level whose bricks fit its table is stored densely; bricks of a finer level are hashed (Müller
 //! et al. 2022, "Instant neural graphics primitives", eq. 4) without resolving collisions.
 
-use crate::adam::Touched;
+use crate::aligned::Aligned;
 use crate::architecture::Architecture;
 use crate::math::floor;
 use crate::simd::{LANES, Quad as _, kernel};
 use crate::spec::{BRICK, FEATURES, HASH_FACTORS};
-
-/// Number of entries in a block of the optimiser.
-const ENTRIES_PER_BLOCK: usize = LANES / FEATURES;
 
 impl Architecture {
     /// Returns the number of floats in the grid.
@@ -29,7 +26,7 @@ pub(crate) struct Level {
     /// Number of entries in the table.
     pub(crate) entries: usize,
     /// Bricks along x and y.
-    bricks: [u32; 2],
+    bricks_across: [u32; 2],
     /// True if bricks are hashed; `entries` is then a power of two.
     pub(crate) hashed: bool,
     /// Index of the table's first float.
@@ -37,9 +34,9 @@ pub(crate) struct Level {
 }
 
 impl Level {
-    /// Returns the number of the optimiser's blocks.
-    pub(crate) fn blocks(&self) -> usize {
-        self.entries.div_ceil(ENTRIES_PER_BLOCK)
+    /// Returns the number of bricks in the table.
+    pub(crate) fn bricks(&self) -> usize {
+        self.entries / BRICK
     }
 
     pub(crate) fn range(&self) -> std::ops::Range<usize> {
@@ -63,12 +60,60 @@ pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
             let vertices = bricks.iter().map(|n| u64::from(*n)).product::<u64>() * BRICK as u64;
             let hashed = vertices > max_entries;
             let entries = if hashed { max_entries } else { vertices } as usize;
-            let level =
-                Level { resolution, entries, bricks: [bricks[0], bricks[1]], hashed, offset };
+            let level = Level {
+                resolution,
+                entries,
+                bricks_across: [bricks[0], bricks[1]],
+                hashed,
+                offset,
+            };
             offset += entries * FEATURES;
             level
         })
         .collect()
+}
+
+/// Cells around sixteen positions in the unit cube, and the positions within them. Rows are axes.
+struct Cells {
+    cell: [[u32; LANES]; 3],
+    fraction: [[f32; LANES]; 3],
+}
+
+impl Cells {
+    #[inline(always)]
+    fn around(level: &Level, p: [&[f32; LANES]; 3]) -> Self {
+        let mut cells = Self { cell: [[0; LANES]; 3], fraction: [[0.0; LANES]; 3] };
+        for axis in 0..3 {
+            let resolution = level.resolution[axis] as f32;
+            let last = resolution - 1.0;
+            for l in 0..LANES {
+                let at = p[axis][l].max(0.0).min(1.0) * resolution;
+                // A position on the far face belongs to the last cell; 0.5 keeps the product
+                // inside.
+                let (whole, cell) = floor(at.min(last + 0.5));
+                cells.cell[axis][l] = cell;
+                cells.fraction[axis][l] = at - whole;
+            }
+        }
+        cells
+    }
+}
+
+/// Returns the weight of a cell's first or second vertex along an axis.
+#[inline(always)]
+fn share(fraction: f32, is_second: u32) -> f32 {
+    if is_second == 1 { fraction } else { 1.0 - fraction }
+}
+
+/// Returns the index of the brick with these coordinates. `mask` is the number of bricks - 1.
+#[inline(always)]
+fn brick_index(level: &Level, mask: u32, [x, y, z]: [u32; 3]) -> u32 {
+    if level.hashed {
+        (x ^ y.wrapping_mul(HASH_FACTORS[0]) ^ z.wrapping_mul(HASH_FACTORS[1])) & mask
+    } else {
+        let [across, down] = level.bricks_across;
+        x + across * (y + down * z)
+    }
 }
 
 /// Entry indices and weights of the eight corners around sixteen positions in the unit cube.
@@ -79,33 +124,14 @@ struct Corners {
 
 #[inline(always)]
 fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
-    let mut cell = [[0u32; LANES]; 3];
-    let mut fraction = [[0.0f32; LANES]; 3];
-    for axis in 0..3 {
-        let resolution = level.resolution[axis] as f32;
-        let last = resolution - 1.0;
-        for l in 0..LANES {
-            let at = p[axis][l].max(0.0).min(1.0) * resolution;
-            // A position on the far face belongs to the last cell; 0.5 keeps the product inside.
-            let (whole, c) = floor(at.min(last + 0.5));
-            cell[axis][l] = c;
-            fraction[axis][l] = at - whole;
-        }
-    }
-    let [across, down] = level.bricks;
-    let mask = (level.entries / BRICK) as u32 - 1;
+    let Cells { cell, fraction } = Cells::around(level, p);
+    let mask = level.bricks() as u32 - 1;
     for (corner, (index, weight)) in out.index.iter_mut().zip(&mut out.weight).enumerate() {
         let (dx, dy, dz) = (corner as u32 & 1, corner as u32 >> 1 & 1, corner as u32 >> 2);
         for l in 0..LANES {
             let (x, y, z) = (cell[0][l] + dx, cell[1][l] + dy, cell[2][l] + dz);
-            let (bx, by, bz) = (x >> 1, y >> 1, z >> 1);
-            let brick = if level.hashed {
-                (bx ^ by.wrapping_mul(HASH_FACTORS[0]) ^ bz.wrapping_mul(HASH_FACTORS[1])) & mask
-            } else {
-                bx + across * (by + down * bz)
-            };
+            let brick = brick_index(level, mask, [x >> 1, y >> 1, z >> 1]);
             index[l] = brick << 3 | (z & 1) << 2 | (y & 1) << 1 | x & 1;
-            let share = |f: f32, d: u32| if d == 1 { f } else { 1.0 - f };
             weight[l] =
                 share(fraction[0][l], dx) * share(fraction[1][l], dy) * share(fraction[2][l], dz);
         }
@@ -147,33 +173,115 @@ kernel! {
     }
 }
 
-kernel! {
-    /// Adds each sample's feature gradient to its eight corners' entries, in sample order, and
-    /// marks the touched blocks.
-    pub(crate) fn scatter<L>(
-        level: &Level, gradient: &mut [f32], touched: &mut Touched, positions: &[[f32; 3]],
+/// Number of entries in half of a brick: a cache line, and a block of the optimiser.
+const HALF_BRICK: usize = BRICK / 2;
+
+/// Gradients by the entries of a level's table, in two arrays: entries whose vertices have an even
+/// z coordinate, and those with an odd one. Each cell has four corners in each array, so threads
+/// add to the arrays in parallel, with equal work and without sharing cache lines.
+#[derive(Debug)]
+pub(crate) struct LevelGradients {
+    pub(crate) halves: [HalfGradients; 2],
+}
+
+/// Gradients by the entries whose vertices have an even or an odd z coordinate.
+#[derive(Debug)]
+pub(crate) struct HalfGradients {
+    /// Lowest bit of the z coordinate.
+    z_bit: u32,
+    /// Sums of gradients, 16 floats for each brick's half.
+    pub(crate) sums: Aligned,
+    /// Marks of the bricks that have a gradient. A mark is a byte, since a bit would have to be
+    /// read before it is set.
+    pub(crate) touched: Vec<u8>,
+}
+
+impl LevelGradients {
+    /// Creates gradients of zero.
+    pub(crate) fn zeros(level: &Level) -> Self {
+        let half = |z_bit| HalfGradients {
+            z_bit,
+            sums: Aligned::zeros(level.bricks() * LANES),
+            touched: vec![0; level.bricks()],
+        };
+        Self { halves: [half(0), half(1)] }
+    }
+
+    /// Adds the gradients to a table with the level's layout.
+    pub(crate) fn add_to(&self, table: &mut [f32]) {
+        for (block, features) in table.chunks_exact_mut(LANES).enumerate() {
+            let gradients = &self.halves[block % 2].sums[block / 2 * LANES..];
+            for (sum, gradient) in features.iter_mut().zip(gradients) {
+                *sum += gradient;
+            }
+        }
+    }
+}
+
+impl HalfGradients {
+    /// Adds each sample's feature gradient to the entries of this half, in the order of the rows,
+    /// and marks the bricks. `positions` is arranged by [`arrange_in_rows`].
+    pub(crate) fn scatter(
+        &mut self,
+        level: &Level,
+        positions: &[PositionRows],
         feature_gradients: &[[f32; FEATURES]],
     ) {
-        let (gradient, _) = gradient.as_chunks_mut::<FEATURES>();
-        let mut around = Corners::new();
-        for (positions, gradients) in positions.chunks(LANES).zip(feature_gradients.chunks(LANES)) {
-            let mut p = [[0.0f32; LANES]; 3];
-            for (l, position) in positions.iter().enumerate() {
-                for axis in 0..3 {
-                    p[axis][l] = position[axis];
+        let Self { z_bit, sums, touched } = self;
+        scatter_half(level, *z_bit, positions, feature_gradients, sums, touched);
+    }
+}
+
+/// Positions of sixteen samples in the unit cube: rows of x, y and z.
+pub(crate) type PositionRows = [[f32; LANES]; 3];
+
+kernel! {
+    fn scatter_half<L>(
+        level: &Level, z_bit: u32, positions: &[PositionRows],
+        feature_gradients: &[[f32; FEATURES]], sums: &mut [f32], touched: &mut [u8],
+    ) {
+        let (sums, _) = sums.as_chunks_mut::<FEATURES>();
+        let mask = level.bricks() as u32 - 1;
+        let mut index = [[0u32; LANES]; HALF_BRICK];
+        let mut weight = [[0.0f32; LANES]; HALF_BRICK];
+        for (block, p) in positions.iter().enumerate() {
+            let Cells { cell, fraction } = Cells::around(level, [&p[0], &p[1], &p[2]]);
+            for (corner, (index, weight)) in index.iter_mut().zip(&mut weight).enumerate() {
+                let (dx, dy) = (corner as u32 & 1, corner as u32 >> 1);
+                for l in 0..LANES {
+                    // The cell's first or second vertex along z has the half's lowest bit.
+                    let dz = (cell[2][l] ^ z_bit) & 1;
+                    let (x, y, z) = (cell[0][l] + dx, cell[1][l] + dy, cell[2][l] + dz);
+                    let brick = brick_index(level, mask, [x >> 1, y >> 1, z >> 1]);
+                    index[l] = brick << 2 | (y & 1) << 1 | x & 1;
+                    weight[l] = share(fraction[0][l], dx) * share(fraction[1][l], dy)
+                        * share(fraction[2][l], dz);
                 }
             }
-            corners(level, [&p[0], &p[1], &p[2]], &mut around);
-            for (l, d) in gradients.iter().enumerate() {
+            for l in 0..LANES {
+                let Some(d) = feature_gradients.get(l * positions.len() + block) else { break };
                 let d = L::Quad::load(d);
-                for c in 0..8 {
-                    let index = around.index[c][l] as usize;
-                    touched[index / ENTRIES_PER_BLOCK] = 1;
-                    let entry = &mut gradient[index];
-                    d.mul_add(L::Quad::splat(around.weight[c][l]),
-                        L::Quad::load(entry)).store(entry);
+                for c in 0..HALF_BRICK {
+                    let index = index[c][l] as usize;
+                    touched[index / HALF_BRICK] = 1;
+                    let entry = &mut sums[index];
+                    d.mul_add(L::Quad::splat(weight[c][l]), L::Quad::load(entry)).store(entry);
                 }
             }
+        }
+    }
+}
+
+/// Arranges positions in rows of sixteen: block b has the samples b, b + n, b + 2·n, … of n blocks.
+/// Samples of a ray, which are often in one cell, are thus far apart, and their additions to one
+/// entry don't wait for each other. The last lanes are padded with zeros.
+pub(crate) fn arrange_in_rows(positions: &[[f32; 3]], rows: &mut Vec<PositionRows>) {
+    let blocks = positions.len().div_ceil(LANES);
+    rows.clear();
+    rows.resize(blocks, [[0.0; LANES]; 3]);
+    for (i, position) in positions.iter().enumerate() {
+        for axis in 0..3 {
+            rows[i % blocks][axis][i / blocks] = position[axis];
         }
     }
 }
@@ -246,13 +354,18 @@ mod tests {
             let p = positions(n);
             let mut out = vec![0.0; FEATURES * n];
             encode(&level, &table, &rows(&p), &mut out, n);
-            let mut gradient = vec![0.0; table.len()];
-            let mut touched = vec![0; level.blocks()];
-            scatter(&level, &mut gradient, &mut touched, &p, &d);
-            for (block, numbers) in gradient.chunks(LANES).enumerate() {
-                let marked = touched[block] == 1;
-                assert!(marked || numbers.iter().all(|g| *g == 0.0), "block {block} isn't marked");
+            let mut rows = Vec::new();
+            arrange_in_rows(&p, &mut rows);
+            let mut gradients = LevelGradients::zeros(&level);
+            for half in &mut gradients.halves {
+                half.scatter(&level, &rows, &d);
+                for (brick, numbers) in half.sums.chunks(LANES).enumerate() {
+                    let is_marked = half.touched[brick] == 1;
+                    assert!(is_marked || numbers.iter().all(|g| *g == 0.0), "brick {brick}");
+                }
             }
+            let mut gradient = vec![0.0; table.len()];
+            gradients.add_to(&mut gradient);
             let left: f64 = (0..n)
                 .flat_map(|s| (0..4).map(move |k| (s, k)))
                 .map(|(s, k)| f64::from(out[k * n + s]) * f64::from(d[s][k]))

@@ -85,5 +85,8 @@ pub use render::{Pixel, RayField, RenderError};
 pub use simd::{Family, set_family};
 pub use spec::Strides;
 pub use tensors::{FieldError, FieldProblem};
-pub use trainer::{StepReport, Supervisor, Trainer, TrainingError, TrainingOptions};
+pub use trainer::{
+    Phase, PhaseClock, PhaseTimes, RenderedBundles, StepReport, Supervisor, Trainer, TrainingError,
+    TrainingOptions,
+};
 pub use training_state::TrainingState;

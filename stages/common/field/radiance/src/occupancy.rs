@@ -1,6 +1,8 @@
 //! Occupancy grid of the unit cube: rays skip empty cells, and training rays sample thin cells at
 //! double stride.
 
+use std::sync::atomic::{AtomicU32, Ordering};
+
 use counter_rng::CounterRng;
 use rayon::prelude::*;
 
@@ -44,6 +46,8 @@ const EMPTY_PERIOD: usize = 16;
 const WARM_UP_STEPS: u64 = 512;
 /// Step by which every cell has been evaluated once.
 const FIRST_KNOWN_STEP: u64 = STEPS_PER_UPDATE * OCCUPIED_PERIOD as u64;
+/// Number of cells whose densities a task stores; chosen by hand.
+const CELLS_PER_TASK: usize = 4096;
 /// Decay of a cell's density each time the cell is evaluated; chosen by hand.
 const DENSITY_DECAY: f32 = 0.7;
 
@@ -139,12 +143,55 @@ impl Cell {
     }
 }
 
+/// Density of each cell per cube side.
+#[derive(Debug)]
+struct CellDensities(Vec<AtomicU32>);
+
+impl CellDensities {
+    fn new(densities: Vec<f32>) -> Self {
+        Self(densities.into_iter().map(|density| AtomicU32::new(density.to_bits())).collect())
+    }
+
+    fn get(&self, cell: usize) -> f32 {
+        f32::from_bits(self.0[cell].load(Ordering::Relaxed))
+    }
+
+    fn set(&self, cell: usize, density: f32) {
+        self.0[cell].store(density.to_bits(), Ordering::Relaxed);
+    }
+
+    /// Raises a cell's density unless it is unknown. Threads may do so in any order.
+    fn raise(&self, cell: usize, density: f32) {
+        let known = self.get(cell);
+        if known != UNKNOWN_DENSITY && density > known {
+            // Positive floats have the order of their bits.
+            self.0[cell].fetch_max(density.to_bits(), Ordering::Relaxed);
+        }
+    }
+
+    fn to_vec(&self) -> Vec<f32> {
+        (0..self.0.len()).map(|cell| self.get(cell)).collect()
+    }
+}
+
+impl Clone for CellDensities {
+    fn clone(&self) -> Self {
+        Self::new(self.to_vec())
+    }
+}
+
+impl PartialEq for CellDensities {
+    fn eq(&self, other: &Self) -> bool {
+        (0..self.0.len().max(other.0.len())).all(|cell| self.get(cell) == other.get(cell))
+    }
+}
+
 /// Slowly decaying maximum of each cell's density, and the cell's kind: 128³ cells over the unit
 /// cube, x fastest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Occupancy {
     /// Density per cube side of each cell.
-    density: Vec<f32>,
+    density: CellDensities,
     /// Mask of the cells that may become occupied; `None` for all.
     allowed: Option<Vec<bool>>,
     /// One word per brick: bits of the cells that aren't empty.
@@ -161,7 +208,7 @@ impl Occupancy {
     /// Creates a grid of dense cells.
     pub fn full() -> Self {
         let mut full = Self {
-            density: vec![UNKNOWN_DENSITY; CELLS],
+            density: CellDensities::new(vec![UNKNOWN_DENSITY; CELLS]),
             allowed: None,
             bricks: Vec::new(),
             blocks: Vec::new(),
@@ -245,14 +292,17 @@ impl Occupancy {
         if cells.is_empty() {
             return;
         }
-        for (&cell, &new_density) in cells.iter().zip(densities) {
-            let density = &mut self.density[cell as usize];
-            *density = (*density * DENSITY_DECAY).max(new_density);
-        }
+        let pieces = cells.par_chunks(CELLS_PER_TASK).zip(densities.par_chunks(CELLS_PER_TASK));
+        pieces.for_each(|(cells, densities)| {
+            for (&cell, &new_density) in cells.iter().zip(densities) {
+                let decayed = self.density.get(cell as usize) * DENSITY_DECAY;
+                self.density.set(cell as usize, decayed.max(new_density));
+            }
+        });
         // While all space is semi-transparent, the mean keeps cells below it empty.
         let empty = self.mean_density().min(MAX_EMPTY_OPTICAL_DEPTH / step);
         let thin = MAX_THIN_OPTICAL_DEPTH / step;
-        let (bricks, dense) = brick_words(|cell| match self.density[cell] {
+        let (bricks, dense) = brick_words(|cell| match self.density.get(cell) {
             _ if !self.is_allowed(cell) => Cell::Empty,
             d if d < 0.0 => self.cell(cell),
             d if d < empty => Cell::Empty,
@@ -264,21 +314,20 @@ impl Occupancy {
 
     /// Raises cells' densities to those of training samples, for the next update. Cells that were
     /// never evaluated are dense anyway.
-    pub fn raise_densities(&mut self, hits: &[CellHit]) {
+    pub fn raise_densities(&self, hits: &[CellHit]) {
         for &CellHit { cell, density } in hits {
-            let known = &mut self.density[cell as usize];
-            if *known != UNKNOWN_DENSITY {
-                *known = known.max(density);
-            }
+            self.density.raise(cell as usize, density);
         }
     }
 
     /// Returns the mean density of the cells that have been evaluated; sums have a fixed order.
     fn mean_density(&self) -> f32 {
-        let parts: Vec<(f64, u32)> = (self.density.par_chunks(GRID * GRID))
-            .map(|part| {
-                let known = part.iter().filter(|density| **density >= 0.0);
-                known.fold((0.0, 0), |(sum, count), &d| (sum + f64::from(d), count + 1))
+        let planes = (0..CELLS).into_par_iter().step_by(GRID * GRID);
+        let parts: Vec<(f64, u32)> = planes
+            .map(|first| {
+                let cells = (first..first + GRID * GRID).map(|cell| self.density.get(cell));
+                let known = cells.filter(|density| *density >= 0.0);
+                known.fold((0.0, 0), |(sum, count), d| (sum + f64::from(d), count + 1))
             })
             .collect();
         let sum = parts.iter().fold(0.0, |sum, part| sum + part.0);
@@ -334,13 +383,18 @@ impl Occupancy {
     }
 
     /// Returns each cell's density per cube side; below 0 if unknown.
-    pub fn density(&self) -> &[f32] {
-        &self.density
+    pub fn densities(&self) -> Vec<f32> {
+        self.density.to_vec()
+    }
+
+    /// Returns a cell's density per cube side; below 0 if unknown.
+    pub(crate) fn density(&self, cell: usize) -> f32 {
+        self.density.get(cell)
     }
 
     /// Restores the densities and cells of a checkpoint.
     pub fn restore(&mut self, density: Vec<f32>, cells: &[u8]) {
-        self.density = density;
+        self.density = CellDensities::new(density);
         self.set(|cell| Cell::from_byte(cells[cell]));
     }
 
@@ -480,7 +534,7 @@ mod tests {
         let all: Vec<u32> = (0..CELLS as u32).collect();
         let mut densities = vec![0.0; CELLS];
         occupancy.raise_densities(&[hit]);
-        assert_eq!(occupancy.density()[hit.cell as usize], UNKNOWN_DENSITY);
+        assert_eq!(occupancy.density(hit.cell as usize), UNKNOWN_DENSITY);
         (densities[missed], densities[hit.cell as usize]) = (found, found);
         occupancy.update(&all, &densities, 0.003);
         assert_eq!(occupancy.cells().count(), 2);

@@ -1,6 +1,7 @@
 use crate::aligned::Aligned;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients, Roulette};
 use crate::field::Field;
+use crate::grid::{LevelGradients, arrange_in_rows};
 use crate::ray::{Ray, clip};
 use crate::regularisers::Regularisers;
 use crate::shading::{NetworkGradients, RayGradients};
@@ -14,7 +15,7 @@ pub struct Passes {
     transposed: Aligned,
     network: Vec<f32>,
     features: FeatureGradients,
-    touched: Vec<u8>,
+    grid: Vec<LevelGradients>,
 }
 
 impl Passes {
@@ -24,13 +25,12 @@ impl Passes {
         for layer in field.layers.all() {
             layer.transpose(&field.network, &mut transposed);
         }
-        let blocks = field.levels.iter().map(crate::grid::Level::blocks).max().unwrap_or(0);
         Self {
             chunk: Chunk::default(),
             transposed,
             network: vec![0.0; field.network.len()],
             features: FeatureGradients::default(),
-            touched: vec![0; blocks],
+            grid: field.levels.iter().map(LevelGradients::zeros).collect(),
         }
     }
 
@@ -66,21 +66,24 @@ impl Passes {
         samples
     }
 
-    /// Adds the last backward pass's gradients to a table of the grid's size.
-    ///
-    /// # Panics
-    /// If the table has another size.
-    pub fn scatter(&mut self, field: &Field, table: &mut [f32]) {
-        for (level, gradients) in field.levels.iter().zip(&self.features.levels) {
-            let touched = &mut self.touched[..level.blocks()];
-            crate::grid::scatter(
-                level,
-                &mut table[level.range()],
-                touched,
-                &self.features.positions,
-                gradients,
-            );
+    /// Adds the last backward pass's gradients of the grid's features to their sums.
+    pub fn scatter(&mut self, field: &Field) {
+        arrange_in_rows(&self.features.positions, &mut self.features.rows);
+        let levels = field.levels.iter().zip(&self.features.levels).zip(&mut self.grid);
+        for ((level, gradients), sums) in levels {
+            for half in &mut sums.halves {
+                half.scatter(level, &self.features.rows, gradients);
+            }
         }
+    }
+
+    /// Returns the gradient by the grid's features, summed by all calls of [`Passes::scatter`].
+    pub fn grid_gradient(&self, field: &Field) -> Vec<f32> {
+        let mut table = vec![0.0; field.grid_len()];
+        for (level, gradients) in field.levels.iter().zip(&self.grid) {
+            gradients.add_to(&mut table[level.range()]);
+        }
+        table
     }
 
     /// Returns the gradient by the networks' weights, by layer and input, summed over all backward

@@ -6,7 +6,7 @@ use scene::Bounds;
 use crate::architecture::Architecture;
 use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::field::Field;
-use crate::grid::{Level, scatter};
+use crate::grid::{Level, LevelGradients, arrange_in_rows};
 use crate::march::{March, MarchedSamples, march};
 use crate::math::spherical_harmonics;
 use crate::mlp::Layer;
@@ -174,15 +174,14 @@ fn fused_gradients(
         &mut NetworkGradients { transposed: &transposed, sums: &mut network },
         &mut features,
     );
+    arrange_in_rows(&features.positions, &mut features.rows);
     let mut grid = vec![0.0f32; field.grid.len()];
     for (level, gradients) in field.levels.iter().zip(&features.levels) {
-        scatter(
-            level,
-            &mut grid[level.range()],
-            &mut vec![0; level.blocks()],
-            &features.positions,
-            gradients,
-        );
+        let mut sums = LevelGradients::zeros(level);
+        for half in &mut sums.halves {
+            half.scatter(level, &features.rows, gradients);
+        }
+        sums.add_to(&mut grid[level.range()]);
     }
     (grid, network, features.positions.len())
 }

@@ -37,7 +37,7 @@ fn find_specks(occupancy: &Occupancy) -> Vec<bool> {
             if group.len() <= MAX_SPECK_CELLS
                 && group
                     .iter()
-                    .all(|&cell| (0.0..HALF_OPAQUE_DENSITY).contains(&occupancy.density()[cell]))
+                    .all(|&cell| (0.0..HALF_OPAQUE_DENSITY).contains(&occupancy.density(cell)))
             {
                 for cell in group {
                     is_speck[cell] = true;

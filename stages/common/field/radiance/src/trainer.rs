@@ -1,21 +1,24 @@
 mod checkpoint;
 mod options;
+mod phases;
 mod shard;
 
 use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use crate::adam::{AdamStep, adam, update_average};
+use crate::adam::{AdamStep, adam, adam_of_bricks, update_average};
 use crate::aligned::Aligned;
 use crate::field::Field;
-use crate::grid::{Level, scatter};
+use crate::grid::LevelGradients;
 use crate::occupancy::Occupancy;
 use crate::samples::DensityRows;
 use crate::simd::LANES;
+use crate::spec::{BRICK, FEATURES};
 use crate::training_state::TrainingState;
 
-pub use options::{Supervisor, TrainingOptions};
+pub use options::{RenderedBundles, Supervisor, TrainingOptions};
+pub use phases::{Phase, PhaseClock, PhaseTimes};
 
 use shard::{Shard, StepWork, Worker};
 
@@ -50,9 +53,13 @@ pub enum TrainingError {
 
 /// Number of shards of a step (docs/design/006), fixed so that sums have one order at any thread
 /// count.
-const SHARDS: usize = 32;
-/// Number of a level's blocks per task of the optimiser; chosen by hand.
-const ADAM_BLOCKS: usize = 1 << 12;
+const SHARDS: usize = 64;
+/// Number of networks' weights per task that sums their gradients; chosen by hand.
+const SUMS_PIECE: usize = 64;
+/// Number of a level's bricks per task of the optimiser; chosen by hand.
+const ADAM_BRICKS: usize = 1 << 9;
+/// Number of cells per task that evaluates their densities; chosen by hand.
+const CELLS_PER_TASK: usize = 1024;
 /// Number of weights per task that updates their average; chosen by hand.
 const AVERAGE_PIECE: usize = 1 << 16;
 
@@ -62,17 +69,17 @@ pub struct Trainer {
     options: TrainingOptions,
     first: Moments,
     second: Moments,
-    gradients: Moments,
+    network_gradients: Aligned,
+    /// Gradients of the grid's levels.
+    grid_gradients: Vec<LevelGradients>,
     /// Running average of the weights, created by the first update.
     average: Option<Moments>,
-    /// Marks of each level's blocks that have a gradient.
-    touched: Vec<Vec<u8>>,
-    touched_network: Vec<u8>,
     transposed: Aligned,
     state: TrainingState,
     samples_per_ray: f64,
     shards: Vec<Shard>,
     workers: Mutex<Vec<Worker>>,
+    times: [PhaseTimes; Phase::ALL.len()],
 }
 
 /// One float per parameter.
@@ -96,15 +103,15 @@ impl Trainer {
         Self {
             first: Moments::zeros(&field),
             second: Moments::zeros(&field),
-            gradients: Moments::zeros(&field),
+            network_gradients: Aligned::zeros(field.network.len()),
+            grid_gradients: field.levels.iter().map(LevelGradients::zeros).collect(),
             average: None,
-            touched: field.levels.iter().map(|l| vec![0; l.blocks()]).collect(),
-            touched_network: vec![0; field.network.len().div_ceil(LANES)],
             transposed: Aligned::zeros(field.network.len()),
             state: TrainingState::default(),
             samples_per_ray: field.architecture.samples_per_full_ray(),
             shards: (0..SHARDS).map(|_| Shard::default()).collect(),
             workers: Mutex::new(Vec::new()),
+            times: Default::default(),
             field,
             options,
         }
@@ -146,42 +153,52 @@ impl Trainer {
         else {
             return Ok(None);
         };
-        self.update_occupancy();
+        self.phase(Phase::Occupancy, Self::update_occupancy);
         for layer in self.field.layers.all() {
             layer.transpose(&self.field.network, &mut self.transposed);
         }
 
         let first_bundle = self.state.bundles;
-        self.run_shards(&*supervision, bundles);
-        self.sum_network_gradients();
+        self.phase(Phase::Passes, |t, clock| t.run_shards(&*supervision, bundles, clock));
+        self.phase(Phase::Sums, Self::sum_network_gradients);
         let samples: usize = self.shards.iter().map(|s| s.samples).sum();
         let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / bundles as f64;
         self.state.count(bundles, bundle);
         self.samples_per_ray = samples as f64 / (bundles * bundle) as f64;
         let nonfinite = self.find_nonfinite(loss);
         if let Some(tensor) = nonfinite {
-            self.gradients.network.fill(0.0);
+            self.network_gradients.fill(0.0);
             if !self.state.record_nonfinite_step() {
                 return Err(TrainingError::NotFinite { step: self.state.steps, tensor });
             }
         } else {
-            self.apply_gradients();
-            self.update_average();
-            for shard in &self.shards {
-                self.field.occupancy.raise_densities(&shard.hits);
-            }
-            let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(bundle));
-            for (i, colours) in colours.enumerate() {
-                supervision.remember(first_bundle + i as u64, colours);
-            }
+            self.phase(Phase::GridGradients, Self::sum_grid_gradients);
+            self.phase(Phase::Adam, Self::apply_gradients);
+            self.phase(Phase::Average, Self::update_average);
+            self.phase(Phase::Records, |trainer, clock| {
+                trainer.record(supervision, first_bundle, bundle, clock);
+            });
         }
         self.state.steps += 1;
         let skipped = nonfinite.is_some();
         Ok(Some(StepReport { loss, rays: bundles * bundle, samples, skipped }))
     }
 
+    /// Returns the time spent in each phase so far.
+    pub fn phase_times(&self) -> [PhaseTimes; Phase::ALL.len()] {
+        self.times
+    }
+
+    /// Runs a phase of a step and records its time.
+    fn phase<T>(&mut self, phase: Phase, run: impl FnOnce(&mut Self, &PhaseClock) -> T) -> T {
+        let clock = PhaseClock::start();
+        let result = run(self, &clock);
+        self.times[phase as usize].add(&clock);
+        result
+    }
+
     /// Runs the forward and backward pass of a step's bundles, a range of them per shard.
-    fn run_shards(&mut self, supervision: &impl Supervisor, bundles: usize) {
+    fn run_shards(&mut self, supervision: &impl Supervisor, bundles: usize, clock: &PhaseClock) {
         let work = StepWork {
             field: &self.field,
             transposed: &self.transposed,
@@ -195,22 +212,25 @@ impl Trainer {
         let workers = &self.workers;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let mut worker = lock(workers).pop().unwrap_or_default();
-            shard.run(&mut worker, &work, bundles * i / SHARDS..bundles * (i + 1) / SHARDS);
+            let range = bundles * i / SHARDS..bundles * (i + 1) / SHARDS;
+            clock.task(|| shard.run(&mut worker, &work, range));
             lock(workers).push(worker);
         });
     }
 
     /// Sums the networks' gradients over all shards, in the shards' order.
-    fn sum_network_gradients(&mut self) {
+    fn sum_network_gradients(&mut self, clock: &PhaseClock) {
         let shards = &self.shards;
-        let parts = self.gradients.network.par_chunks_mut(1024).enumerate();
+        let parts = self.network_gradients.par_chunks_mut(SUMS_PIECE).enumerate();
         parts.for_each(|(i, sums)| {
-            for shard in shards {
-                let part = &shard.network[1024 * i..][..sums.len()];
-                for (sum, gradient) in sums.iter_mut().zip(part) {
-                    *sum += gradient;
+            clock.task(|| {
+                for shard in shards {
+                    let part = &shard.network[SUMS_PIECE * i..][..sums.len()];
+                    for (sum, gradient) in sums.iter_mut().zip(part) {
+                        *sum += gradient;
+                    }
                 }
-            }
+            });
         });
     }
 
@@ -219,67 +239,74 @@ impl Trainer {
     fn find_nonfinite(&self, loss: f64) -> Option<&'static str> {
         if !loss.is_finite() {
             Some("the loss")
-        } else if !self.gradients.network.iter().sum::<f32>().is_finite() {
+        } else if !self.network_gradients.iter().sum::<f32>().is_finite() {
             Some("the networks' gradient")
-        } else if !self
-            .shards
-            .par_iter()
-            .all(|s| s.features.levels.iter().flatten().flatten().all(|g| g.is_finite()))
-        {
+        } else if !self.shards.iter().all(|shard| shard.is_finite) {
             Some("the grid's gradient")
         } else {
             None
         }
     }
 
-    /// Takes an Adam step of networks and grid; first adds the shards' gradients of each level.
-    fn apply_gradients(&mut self) {
+    /// Sums the grid's gradients over all shards, in the shards' order.
+    fn sum_grid_gradients(&mut self, clock: &PhaseClock) {
+        let mut tasks = Vec::with_capacity(2 * self.grid_gradients.len());
+        // The finest levels take longest, so they go first.
+        let levels = self.field.levels.iter().zip(&mut self.grid_gradients).enumerate();
+        for (i, (level, gradients)) in levels.rev() {
+            tasks.extend(gradients.halves.iter_mut().map(|half| (i, level, half)));
+        }
+        let shards = &self.shards;
+        tasks.into_par_iter().with_max_len(1).for_each(|(i, level, half)| {
+            clock.task(|| {
+                for shard in shards {
+                    if let Some(gradients) = shard.features.levels.get(i) {
+                        half.scatter(level, &shard.features.rows, gradients);
+                    }
+                }
+            });
+        });
+    }
+
+    /// Takes an Adam step of networks and grid.
+    fn apply_gradients(&mut self, clock: &PhaseClock) {
         let options = &self.options;
         let (schedule, step) = (options.schedule(&self.state), self.state.steps + 1);
         let network_step =
             AdamStep::new(step, options.mlp_learning_rate * schedule, options.network_decay);
-        // Every weight of the networks has a gradient.
-        self.touched_network.fill(1);
         adam(
             &network_step,
-            &mut self.touched_network,
+            &mut self.network_gradients,
             &mut self.field.network,
-            &mut self.gradients.network,
             &mut self.first.network,
             &mut self.second.network,
         );
 
-        let shards = &self.shards;
-        let levels = &self.field.levels;
-        let [w, g, m, v] = [
-            &mut self.field.grid,
-            &mut self.gradients.grid,
-            &mut self.first.grid,
-            &mut self.second.grid,
-        ]
-        .map(|parameters| split_by_level(levels, parameters));
-        let touched = self.touched.par_iter_mut();
-        let work = (levels.par_iter(), touched, w, g, m, v).into_par_iter().enumerate();
-        // The finest levels take longest, so they go first.
-        work.rev().with_max_len(1).for_each(|(i, (level, touched, w, g, m, v))| {
-            for shard in shards {
-                if let Some(gradients) = shard.features.levels.get(i) {
-                    scatter(level, g, touched, &shard.features.positions, gradients);
-                }
-            }
-            let adam_step = AdamStep::new(step, options.rate_of_level(i, schedule), 0.0);
-            let len = ADAM_BLOCKS * LANES;
-            // In pieces, so that the last level occupies all threads.
-            let [w, g, m, v] = [w, g, m, v].map(|numbers| numbers.par_chunks_mut(len));
-            (touched.par_chunks_mut(ADAM_BLOCKS), w, g, m, v)
-                .into_par_iter()
-                .for_each(|(touched, w, g, m, v)| adam(&adam_step, touched, w, g, m, v));
+        let (mut weights, mut first, mut second) =
+            (&mut *self.field.grid, &mut *self.first.grid, &mut *self.second.grid);
+        let mut tasks = Vec::new();
+        let levels = self.field.levels.iter().zip(&mut self.grid_gradients);
+        for (i, (level, gradients)) in levels.enumerate() {
+            let level_step = AdamStep::new(step, options.rate_of_level(i, schedule), 0.0);
+            let [w, m, v] = [&mut weights, &mut first, &mut second].map(|parameters| {
+                let (part, rest) = std::mem::take(parameters).split_at_mut(level.range().len());
+                *parameters = rest;
+                part.chunks_mut(ADAM_BRICKS * BRICK * FEATURES)
+            });
+            let [even, odd] = gradients.halves.each_mut().map(|half| {
+                half.sums.chunks_mut(ADAM_BRICKS * LANES).zip(half.touched.chunks_mut(ADAM_BRICKS))
+            });
+            let pieces = even.zip(odd).zip(w.zip(m.zip(v)));
+            tasks.extend(pieces.map(|((even, odd), tables)| (level_step, [even, odd], tables)));
+        }
+        tasks.into_par_iter().for_each(|(step, mut halves, (w, (m, v)))| {
+            clock.task(|| adam_of_bricks(&step, &mut halves, w, m, v));
         });
     }
 
     /// Updates the average of the weights (Polyak) late in the training, which cancels the steps'
     /// noise (docs/design/007).
-    fn update_average(&mut self) {
+    fn update_average(&mut self, clock: &PhaseClock) {
         if !self.options.is_averaging_step(&self.state) {
             return;
         }
@@ -293,47 +320,85 @@ impl Trainer {
         for (average, now) in pairs {
             (average.par_chunks_mut(AVERAGE_PIECE), now.par_chunks(AVERAGE_PIECE))
                 .into_par_iter()
-                .for_each(|(average, now)| update_average(average, now, share));
+                .for_each(|(average, now)| {
+                    clock.task(|| update_average(average, now, share));
+                });
         }
     }
 
+    /// Raises cells' densities to those of the step's samples, and passes the rendered colours to
+    /// the supervision.
+    fn record(
+        &mut self,
+        supervision: &mut impl Supervisor,
+        first_bundle: u64,
+        bundle: usize,
+        clock: &PhaseClock,
+    ) {
+        let occupancy = &self.field.occupancy;
+        self.shards.par_iter().for_each(|shard| {
+            clock.task(|| occupancy.raise_densities(&shard.hits));
+        });
+        let mut next = first_bundle;
+        let rendered: Vec<_> = self
+            .shards
+            .iter()
+            .map(|shard| {
+                let colours = &shard.colours[..];
+                let first_bundle = next;
+                next += (colours.len() / bundle) as u64;
+                RenderedBundles { first_bundle, colours }
+            })
+            .collect();
+        supervision.remember(&rendered, clock);
+    }
+
     /// Evaluates the density of the cells that are due, and updates the occupancy.
-    fn update_occupancy(&mut self) {
+    fn update_occupancy(&mut self, clock: &PhaseClock) {
         let field = &self.field;
         let seed = self.options.seed;
         let step = self.state.steps;
         let cells = field.occupancy.cells_to_update(step);
-        let densities = cells.par_chunks(1024).map_init(
-            || (DensityRows::default(), vec![0.0; 3 * 1024]),
-            |(rows, positions), cells| {
-                let n = cells.len().next_multiple_of(LANES);
-                for (k, &cell) in cells.iter().enumerate() {
-                    let position = Occupancy::random_position(cell, seed, step);
-                    for axis in 0..3 {
-                        positions[axis * n + k] = position[axis];
-                    }
-                }
-                let mut densities = vec![0.0; n];
-                rows.densities(field, &positions[..3 * n], n, &mut densities);
-                densities.truncate(cells.len());
-                densities
-            },
-        );
-        let densities: Vec<f32> = densities.flatten_iter().collect();
+        let mut densities = vec![0.0; cells.len()];
+        let pieces = cells.par_chunks(CELLS_PER_TASK).zip(densities.par_chunks_mut(CELLS_PER_TASK));
+        pieces.for_each_init(CellBuffers::default, |buffers, (cells, densities)| {
+            clock.task(|| buffers.evaluate(field, cells, (seed, step), densities));
+        });
         let distance = field.step();
-        self.field.occupancy.update(&cells, &densities, distance);
+        clock.task(|| self.field.occupancy.update(&cells, &densities, distance));
     }
 }
 
-/// Splits one float per grid parameter into the parts of the levels.
-fn split_by_level<'a>(levels: &[Level], mut parameters: &'a mut [f32]) -> Vec<&'a mut [f32]> {
-    let mut parts = Vec::with_capacity(levels.len());
-    for level in levels {
-        let (part, rest) = parameters.split_at_mut(level.range().len());
-        parts.push(part);
-        parameters = rest;
+/// Buffers of one thread that evaluates cells' densities.
+#[derive(Default)]
+struct CellBuffers {
+    rows: DensityRows,
+    positions: Vec<f32>,
+    densities: Vec<f32>,
+}
+
+impl CellBuffers {
+    /// Evaluates the density at a random position in each cell.
+    fn evaluate(
+        &mut self,
+        field: &Field,
+        cells: &[u32],
+        (seed, step): (u64, u64),
+        densities: &mut [f32],
+    ) {
+        let n = cells.len().next_multiple_of(LANES);
+        self.positions.clear();
+        self.positions.resize(3 * n, 0.0);
+        for (k, &cell) in cells.iter().enumerate() {
+            let position = Occupancy::random_position(cell, seed, step);
+            for axis in 0..3 {
+                self.positions[axis * n + k] = position[axis];
+            }
+        }
+        self.densities.resize(n, 0.0);
+        self.rows.densities(field, &self.positions, n, &mut self.densities[..n]);
+        densities.copy_from_slice(&self.densities[..cells.len()]);
     }
-    parts
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {

@@ -570,8 +570,8 @@ mod tests {
             let rays = rays(300, 1.0);
             let mut passes = Passes::new(&field);
             passes.run(&field, &rays, true);
-            let mut table = vec![0.0; field.grid_len()];
-            passes.scatter(&field, &mut table);
+            passes.scatter(&field);
+            let table = passes.grid_gradient(&field);
             let network = passes.network_gradient();
             let own = field.render(&rays);
             for &device in &devices {

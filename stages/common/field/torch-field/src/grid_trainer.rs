@@ -240,7 +240,7 @@ impl GridTrainer {
         tensors.extend(numbered("first", &self.first));
         tensors.extend(numbered("second", &self.second));
         tensors.extend(self.average.iter().flat_map(|a| numbered("average", a)));
-        tensors.push((DENSITY.to_owned(), Tensor::f_from_slice(self.occupancy.density())?));
+        tensors.push((DENSITY.to_owned(), Tensor::f_from_slice(&self.occupancy.densities())?));
         tensors.push((OCCUPIED.to_owned(), Tensor::f_from_slice(&self.occupancy.to_bytes())?));
         let mut counts = self.tally.counters().map(|c| c as i64).to_vec();
         counts.push(self.samples_per_ray.to_bits() as i64);
@@ -268,7 +268,7 @@ impl GridTrainer {
         } else {
             None
         };
-        let cells = self.occupancy.density().len() as i64;
+        let cells = self.occupancy.densities().len() as i64;
         let density = to_host(&weights.tensor(DENSITY, &[cells])?)?;
         let occupied = Vec::<u8>::try_from(weights.bytes(OCCUPIED, cells)?)?;
         no_grad(|| -> Result<(), TchError> {
@@ -353,7 +353,7 @@ fn lazy_adam(
 #[cfg(test)]
 mod tests {
     use counter_rng::CounterRng;
-    use radiance::{Architecture, Ray, Trainer};
+    use radiance::{Architecture, PhaseClock, Ray, RenderedBundles, Trainer};
     use scene::{Bounds, Frustum, Space};
 
     use super::*;
@@ -401,8 +401,11 @@ mod tests {
             loss
         }
 
-        fn remember(&mut self, _: u64, colours: &[[f32; 3]]) {
-            self.seen.push(colours[0][0]);
+        fn remember(&mut self, rendered: &[RenderedBundles<'_>], _: &PhaseClock) {
+            for bundles in rendered {
+                let rays = self.rays_per_bundle();
+                self.seen.extend(bundles.bundles(rays).map(|(_, colours)| colours[0][0]));
+            }
         }
     }
 
@@ -544,8 +547,9 @@ mod tests {
                 assert!(judge.step(&mut its).unwrap().is_none() && losses.len() == 36);
                 assert!(losses[35] < 0.9 * losses[0], "{losses:?}");
                 assert_eq!(mine.seen.len(), its.seen.len());
-                let (known, other) = (ours.field().parts().2.density(), judge.occupancy.density());
-                let pairs = known.iter().zip(other).filter(|(a, _)| **a > 0.0);
+                let (known, other) =
+                    (ours.field().parts().2.densities(), judge.occupancy.densities());
+                let pairs = known.iter().zip(&other).filter(|(a, _)| **a > 0.0);
                 let differ = pairs.filter(|(a, b)| (**a / **b - 1.0).abs() > 1e-3).count();
                 // Without what rays met in the last steps, 4 cells and more differ. A GPU's
                 // rounding may put samples into other cells.

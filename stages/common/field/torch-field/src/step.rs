@@ -1,6 +1,6 @@
 use std::ops::Range;
 
-use radiance::{Ray, Supervisor, TrainingState};
+use radiance::{PhaseClock, Ray, RenderedBundles, Supervisor, TrainingState};
 use tch::{TchError, Tensor};
 
 use crate::error::TorchFieldError;
@@ -116,13 +116,13 @@ impl Step {
 
     /// Passes the rendered colours of all pieces, in order, to the supervision.
     pub(crate) fn remember(self, supervision: &mut impl Supervisor, pieces: &[Vec<[f32; 3]>]) {
-        let mut bundle = self.first_bundle;
+        let mut first_bundle = self.first_bundle;
+        let mut rendered = Vec::with_capacity(pieces.len());
         for colours in pieces {
-            for colours in colours.chunks_exact(self.rays_per_bundle) {
-                supervision.remember(bundle, colours);
-                bundle += 1;
-            }
+            rendered.push(RenderedBundles { first_bundle, colours });
+            first_bundle += (colours.len() / self.rays_per_bundle) as u64;
         }
+        supervision.remember(&rendered, &PhaseClock::start());
     }
 
     /// Runs the step's bundles in as few pieces as memory allows.

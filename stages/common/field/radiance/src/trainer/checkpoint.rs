@@ -17,6 +17,7 @@ impl Trainer {
         let counters = self.state.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
         let counters: Vec<u8> = counters.flat_map(u64::to_le_bytes).collect();
         let occupied = self.field.occupancy.to_bytes();
+        let density = self.field.occupancy.densities();
         let average = self.average.iter();
         let average = average.flat_map(|a| {
             [
@@ -27,7 +28,7 @@ impl Trainer {
         let tensors: Vec<_> = average
             .chain([
                 ("counters", Tensor::of_bytes(&counters)),
-                ("density", Tensor::of_floats(self.field.occupancy.density())),
+                ("density", Tensor::of_floats(&density)),
                 ("first.grid", Tensor::of_floats(&self.first.grid)),
                 ("first.network", Tensor::of_floats(&self.first.network)),
                 ("grid", Tensor::of_floats(&self.field.grid)),

@@ -3,6 +3,7 @@ use counter_rng::uniform;
 use crate::chunk::Roulette;
 use crate::ray::Ray;
 use crate::regularisers::Regularisers;
+use crate::trainer::PhaseClock;
 use crate::training_state::TrainingState;
 
 /// Training steps per update of the averaged weights; chosen by hand.
@@ -110,6 +111,23 @@ pub trait Supervisor: Sync {
         colours: &[[f32; 3]],
         gradients: &mut [[f32; 3]],
     ) -> f64;
-    /// Stores a bundle's rendered colours. Called in bundle order after each step that was applied.
-    fn remember(&mut self, _bundle: u64, _colours: &[[f32; 3]]) {}
+    /// Stores a step's rendered colours. Called after each step that was applied, with all bundles
+    /// in order. Parallel tasks are run by the clock.
+    fn remember(&mut self, _rendered: &[RenderedBundles<'_>], _clock: &PhaseClock) {}
+}
+
+/// Rendered colours of bundles in sequence.
+#[derive(Clone, Copy, Debug)]
+pub struct RenderedBundles<'a> {
+    /// Number of the first bundle.
+    pub first_bundle: u64,
+    /// Colour of each ray, bundle by bundle.
+    pub colours: &'a [[f32; 3]],
+}
+
+impl<'a> RenderedBundles<'a> {
+    /// Returns each bundle's number and colours.
+    pub fn bundles(&self, rays_per_bundle: usize) -> impl Iterator<Item = (u64, &'a [[f32; 3]])> {
+        (self.first_bundle..).zip(self.colours.chunks_exact(rays_per_bundle))
+    }
 }

@@ -3,6 +3,7 @@ use std::ops::Range;
 use super::options::{Supervisor, TrainingOptions};
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
 use crate::field::Field;
+use crate::grid::arrange_in_rows;
 use crate::occupancy::CellHit;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};
@@ -32,6 +33,8 @@ pub(super) struct Shard {
     pub(super) samples: usize,
     /// Densities and cells of samples that stop light.
     pub(super) hits: Vec<CellHit>,
+    /// False if a gradient of the grid isn't finite.
+    pub(super) is_finite: bool,
 }
 
 /// Buffers of one thread.
@@ -67,6 +70,9 @@ impl Shard {
             next = here.end;
             self.run_chunk(worker, work, here);
         }
+        arrange_in_rows(&self.features.positions, &mut self.features.rows);
+        let gradients = self.features.levels.iter().flatten().flatten();
+        self.is_finite = gradients.fold(true, |all, g| all & g.is_finite());
     }
 
     /// Runs the forward and backward pass of a chunk's bundles.
