@@ -185,12 +185,8 @@ impl<'a> Member<'a> {
     ) -> anyhow::Result<()> {
         let Training { trainer, supervision, checkpoints, curve } = training;
         loop {
-            if self.context.is_interrupted() {
-                checkpoints
-                    .write(&**trainer, supervision, curve)
-                    .context("cannot write the checkpoint")?;
-                return Err(Failure::Interrupted.into());
-            }
+            let is_interrupted = self.context.is_interrupted();
+            checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
             let Some(report) = trainer.step(supervision)? else { return Ok(()) };
             if let Some(error) = supervision.first_error() {
                 anyhow::bail!("cannot read or write the file of pixels: {error}");
@@ -205,9 +201,6 @@ impl<'a> Member<'a> {
             supervision.refine_poses(rays as f64 / total as f64, || trainer.field())?;
             curve.add(&report, rays, total);
             progress.set(self.rays_before + rays, &curve.last_psnr());
-            checkpoints
-                .write_if_due(&**trainer, supervision, curve)
-                .context("cannot write the checkpoint")?;
         }
     }
 
