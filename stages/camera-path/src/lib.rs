@@ -87,11 +87,7 @@ impl Stage for CameraPath {
         let mut first = scene.views[0].camera.clone();
         // Frames have no lens distortion.
         first.intrinsics = first.intrinsics.pinhole().unwrap_or(first.intrinsics);
-        let degradation: Option<Degradation> = if input.path(DEGRADATION_FILE).exists() {
-            Some(input.read_json(DEGRADATION_FILE)?)
-        } else {
-            None
-        };
+        let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
         let hr_width = degradation.map(|degradation| degradation.hr[0]);
         let width = params.size.or(hr_width).unwrap_or(first.intrinsics.width);
         let aspect = f64::from(first.intrinsics.height) / f64::from(first.intrinsics.width);

@@ -99,9 +99,7 @@ impl Stage for Eval {
         let (views_input, truth_input) = (context.input("views")?, context.input("truth")?);
         let (views, truth) = (Views::read(views_input)?, Views::read(truth_input)?);
         let metrics = metrics(Perceptual::new(context.optional_input("weights"))?);
-        let is_known = truth_input.path(DEGRADATION_FILE).exists();
-        let degradation: Option<Degradation> =
-            if is_known { Some(truth_input.read_json(DEGRADATION_FILE)?) } else { None };
+        let degradation: Option<Degradation> = truth_input.read_optional_json(DEGRADATION_FILE)?;
         let scene =
             ScoredScene { views_input, views: &views, truth_input, truth: &truth, degradation };
         let progress = context.progress("scoring", truth.views.len() as u64);
