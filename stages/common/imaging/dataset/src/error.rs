@@ -92,7 +92,10 @@ pub(crate) enum FrameReason {
     #[error("transform_matrix must have 4 rows of 4 numbers")]
     MatrixSize,
     /// Missing or unusable image, mask or depth image.
-    #[error("{problem}; {remedy}")]
+    #[error("{problem}; {}", match problem {
+        FileProblem::IgnoredName { .. } => "rename the file",
+        _ => remedy,
+    })]
     File { problem: FileProblem, remedy: &'static str },
     #[error("camera {id} not found")]
     CameraNotFound { id: u32 },
