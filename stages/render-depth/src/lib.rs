@@ -13,9 +13,9 @@ use std::ops::Range;
 
 use anyhow::Context as _;
 use artifact::{amount, counted};
-use fields::{Members, lower_median, mean};
+use fields::{Members, lower_median, mean, pixel_rays};
 use pixels::{PngRows, to_u8};
-use radiance::{Ray, RayField};
+use radiance::RayField;
 use scene::{
     Background, Camera, VIEW_CHANNELS, VIEWS_FILE, View, Views, image_file, preview_file,
     write_view_image,
@@ -208,19 +208,7 @@ impl RenderJob<'_> {
 
     /// Renders the pixels at `[x, y]` with n × n rays each.
     fn cast(&self, positions: &[[usize; 2]], n: usize) -> anyhow::Result<Vec<ViewPixel>> {
-        let background = [self.background.shown(); 3];
-        let camera_rays = self.camera.rays();
-        let mut rays = Vec::with_capacity(positions.len() * n * n);
-        let mut z_per_distance = Vec::with_capacity(rays.capacity());
-        for [x, y] in positions {
-            for sub in 0..n * n {
-                let u = *x as f64 + ((sub % n) as f64 + 0.5) / n as f64;
-                let v = *y as f64 + ((sub / n) as f64 + 0.5) / n as f64;
-                let ray = camera_rays.ray(u, v);
-                rays.push(Ray::new(&ray, background));
-                z_per_distance.push(self.camera.depth_per_distance(&ray) as f32);
-            }
-        }
+        let (rays, z_per_distance) = pixel_rays(self.camera, self.background, positions, n);
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
         let rendered = rendered.map_err(fields::rendering_failure)?;
         let (mut pixels, mut samples) = (Vec::with_capacity(positions.len()), Vec::new());
@@ -311,6 +299,7 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
+    use radiance::Ray;
     use scene::Intrinsics;
 
     use super::*;

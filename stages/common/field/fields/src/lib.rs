@@ -2,6 +2,7 @@
 //!
 //! * [`Members`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
 //!   cancels errors where images don't determine the scene (docs/design/011).
+//! * [`pixel_rays`]: the rays of a view's pixels.
 //! * [`mean`], [`lower_median`]: a pixel's value from several fields or rays.
 //!
 //! ```no_run
@@ -14,6 +15,7 @@
 
 use artifact::{Failure, FailureExt as _, GivenInput};
 use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Pixel, Ray, RayField, RenderError};
+use scene::{Background, Camera};
 
 /// Environment variables that change renders, in builds with and without libtorch. If 1, libtorch's
 /// variable lets CUDA multiply in TensorFloat-32, with a mantissa of ten bits.
@@ -77,6 +79,29 @@ fn average_pixels(pixels: &mut [Pixel]) -> Pixel {
         depth: mean(pixels, |p| p.depth),
         median_depth: lower_median(pixels, |p| p.median_depth).map_or(0.0, |p| p.median_depth),
     }
+}
+
+/// Returns n × n rays through each of a camera's pixels `[x, y]`, pixel by pixel, and the z-depth
+/// per unit of distance along each ray.
+pub fn pixel_rays(
+    camera: &Camera,
+    background: Background,
+    pixels: &[[usize; 2]],
+    n: usize,
+) -> (Vec<Ray>, Vec<f32>) {
+    let (camera_rays, background) = (camera.rays(), [background.shown(); 3]);
+    let mut rays = Vec::with_capacity(pixels.len() * n * n);
+    let mut z_per_distance = Vec::with_capacity(rays.capacity());
+    for &[x, y] in pixels {
+        for sub in 0..n * n {
+            let u = x as f64 + ((sub % n) as f64 + 0.5) / n as f64;
+            let v = y as f64 + ((sub / n) as f64 + 0.5) / n as f64;
+            let ray = camera_rays.ray(u, v);
+            rays.push(Ray::new(&ray, background));
+            z_per_distance.push(camera.depth_per_distance(&ray) as f32);
+        }
+    }
+    (rays, z_per_distance)
 }
 
 /// Returns the mean of one number over all items; 0 if there are none.
@@ -156,7 +181,7 @@ fn move_grid(field: Field, device: &str) -> Result<Box<dyn RayField>, Failure> {
 mod tests {
     use super::*;
     use radiance::Architecture;
-    use scene::{Background, Bounds};
+    use scene::Bounds;
     use std::path::Path;
 
     /// A field of one opacity everywhere.
