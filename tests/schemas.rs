@@ -73,7 +73,7 @@ fn schemas() -> BTreeMap<String, Value> {
         ("views", of::<scene::Views>()),
         ("scene", of::<prep::SceneSummary>()),
         ("field", of::<radiance::FieldFile>()),
-        ("training", of::<train_ss::TrainingLog>()),
+        ("training", of::<radiance::TrainingLog>()),
         ("refiner", of::<refinement::RefinerFile>()),
         ("metrics", of::<metrics::Metrics>()),
         ("results", of::<Vec<report::ResultRow>>()),

@@ -19,7 +19,7 @@ mod training;
 
 use artifact::{Failure, WARNING, amount, with_warnings};
 use pixels::DEGRADATION_FILE;
-use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile};
+use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile, TRAINING_FILE, TrainingLog};
 use scene::Views;
 use serde_json::json;
 use stage::{Context, Stage};
@@ -31,8 +31,7 @@ pub use params::{
 };
 use supervision::transparent_background;
 pub use supervision::{Supersampling, supervision};
-pub use training::{CurvePoint, TrainingLog};
-use training::{InitField, Member, TRAINING_FILE, TrainingData, train_with_best_poses};
+use training::{InitField, Member, TrainingData, train_with_best_poses};
 
 /// Stage `train-ss`.
 pub struct TrainSs;

@@ -2,12 +2,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use pixels::psnr_of;
-use radiance::StepReport;
+use radiance::{CurvePoint, StepReport, TrainingLog};
 use serde::{Deserialize, Serialize};
 use stage::CheckpointSchedule;
 
 use super::field_trainer::FieldTrainer;
-use super::log::{CurvePoint, TrainingLog};
 use crate::supervision::Supersampling;
 
 /// File name of a trainer's checkpoint.

@@ -3,13 +3,12 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use artifact::{Failure, GivenInput};
 use poses::MeanMotion;
-use radiance::{FieldFile, FieldModel};
+use radiance::{FieldFile, FieldModel, TRAINING_FILE, TrainingLog};
 use scene::{Bounds, Views};
 use stage::{Context, Progress};
 
 use super::checkpoint::{Checkpoints, Curve, read_latest};
 use super::field_trainer::{Collapsed, FieldTrainer, average_weights, new_trainer};
-use super::log::TrainingLog;
 use crate::params::{Combine, Resolved};
 use crate::supervision::{Supersampling, supervision};
 
@@ -47,8 +46,6 @@ pub(crate) struct Member<'a> {
 
 /// File name of a trained member's weights in the member's work folder.
 const DONE_WEIGHTS: &str = "field.safetensors";
-/// File name of a trained member's log, which is written last.
-const DONE_LOG: &str = "training.json";
 
 impl<'a> Member<'a> {
     pub(crate) fn new(
@@ -129,7 +126,7 @@ impl<'a> Member<'a> {
     /// Copies the weights that an earlier run finished to the output, and returns their log.
     fn copy_finished(&self) -> Option<TrainingLog> {
         let work = self.work.as_ref()?;
-        let log = serde_json::from_slice(&std::fs::read(work.join(DONE_LOG)).ok()?).ok()?;
+        let log = serde_json::from_slice(&std::fs::read(work.join(TRAINING_FILE)).ok()?).ok()?;
         std::fs::copy(work.join(DONE_WEIGHTS), &self.output).ok()?;
         Some(log)
     }
@@ -221,7 +218,8 @@ impl<'a> Member<'a> {
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS))
                 .context("cannot copy the field")?;
-            artifact::write_json(&work.join(DONE_LOG), &log)?;
+            // Written last: the log marks the member as trained.
+            artifact::write_json(&work.join(TRAINING_FILE), &log)?;
         }
         Ok(log)
     }

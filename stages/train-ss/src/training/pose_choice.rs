@@ -3,10 +3,10 @@ use std::path::Path;
 use anyhow::Context as _;
 use pixels::{Image, psnr_of};
 use poses::{PosedPhotograph, photometric_error};
+use radiance::TrainingLog;
 use scene::Camera;
 
 use super::field_trainer::read_field;
-use super::log::TrainingLog;
 use super::member::{Member, TrainingData};
 use crate::photographs::{PackedPhotograph, Photographs, PixelMemory};
 

@@ -1,7 +1,8 @@
 //! The fast radiance field: a multi-resolution grid with small MLPs, written for the CPU. No
 //! autograd, no torch.
 //!
-//! * [`RayField`]: trait of fields that render rays; [`FieldFile`] describes a field artifact.
+//! * [`RayField`]: trait of fields that render rays.
+//! * [`FieldFile`], [`TrainingLog`]: JSON files of a field artifact.
 //! * [`Field`]: parameters and occupancy grid; [`Field::render`] returns colour, opacity and depth
 //!   of rays.
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that
@@ -68,6 +69,7 @@ pub mod spec;
 mod specks;
 mod tensors;
 mod trainer;
+mod training_log;
 mod training_state;
 
 pub use architecture::{Architecture, OutOfRange};
@@ -86,4 +88,5 @@ pub use simd::{Family, set_family};
 pub use spec::Strides;
 pub use tensors::{FieldError, FieldProblem};
 pub use trainer::{StepReport, Supervisor, Trainer, TrainingError, TrainingOptions};
+pub use training_log::{CurvePoint, TRAINING_FILE, TrainingLog};
 pub use training_state::TrainingState;
