@@ -111,7 +111,7 @@ impl Stage for CameraPath {
         context.write_json(VIEWS_FILE, &views)?;
         context.write_summary(&format!(
             "{} of {width}×{height}, {}",
-            artifact::counted(views.views.len(), "frame"),
+            artifact::format_count(views.views.len(), "frame"),
             format!("{kind:?}").to_lowercase()
         ))
     }

@@ -82,8 +82,8 @@ impl Stage for DemoScene {
         let [width, height] = splits[0].2.sides;
         context.write_summary(&format!(
             "{}, {}, {width}×{height}",
-            artifact::counted(params.train as usize, "training view"),
-            artifact::counted(params.test as usize, "test view"),
+            artifact::format_count(params.train as usize, "training view"),
+            artifact::format_count(params.test as usize, "test view"),
         ))
     }
 }

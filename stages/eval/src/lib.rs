@@ -127,7 +127,7 @@ impl Stage for Eval {
         context.write_json(METRICS_FILE, &result)?;
         let mut summary: Vec<String> =
             metrics.iter().filter_map(|metric| metric.summary(&result.mean)).collect();
-        summary.push(artifact::counted(result.views.len(), "view"));
+        summary.push(artifact::format_count(result.views.len(), "view"));
         context.write_summary(&summary.join(" · "))
     }
 }

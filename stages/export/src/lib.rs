@@ -35,7 +35,7 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write as _};
 
 use anyhow::Context as _;
-use artifact::{Failure, amount, counted};
+use artifact::{Failure, format_amount, format_count};
 use fields::Members;
 use glam::DVec3;
 use scene::{Bounds, Camera, Views};
@@ -203,10 +203,10 @@ fn summary_text(summary: &ExportSummary) -> String {
     let mut parts = Vec::new();
     for (count, noun) in [(points, "points"), (splats, "splats"), (triangles, "triangles")] {
         if count > 0 {
-            parts.push(format!("{} {noun}", amount(count as u64)));
+            parts.push(format!("{} {noun}", format_amount(count as u64)));
         }
     }
-    parts.push(counted(summary.cameras, "camera"));
+    parts.push(format_count(summary.cameras, "camera"));
     parts.join(", ")
 }
 

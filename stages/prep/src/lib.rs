@@ -35,7 +35,7 @@ mod writer;
 
 use std::path::Path;
 
-use artifact::{Failure, FailureExt as _, counted, list_source_files, printable};
+use artifact::{Failure, FailureExt as _, format_count, list_source_files, printable};
 use dataset::{Dataset, Frame};
 use scene::Background;
 use serde_json::json;
@@ -159,7 +159,7 @@ fn log_ignored_files(context: &Context, folder: &Path) {
     if let Some(first) = ignored.first() {
         context.say(format!(
             "{} ignored: dangling links, editor and system files (first: {})",
-            counted(ignored.len(), "file"),
+            format_count(ignored.len(), "file"),
             printable(&first.display().to_string())
         ));
     }

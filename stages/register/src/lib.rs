@@ -5,7 +5,7 @@
 //! views, and a camera that is off by a pixel costs more decibels than any error of the field
 //! (design note 025). LR photographs are preferred, because views are scored against the HR ones.
 
-use artifact::{FailureExt as _, GivenInput, WARNING, counted, with_warnings};
+use artifact::{FailureExt as _, GivenInput, WARNING, format_count, with_warnings};
 use pixels::{Image, PixelError};
 use poses::{CameraMotion, MeanMotion, Options, Pyramid, refine};
 use radiance::{RayField, RenderError};
@@ -154,7 +154,7 @@ fn summary(registered: &[Registered]) -> (String, Option<String>) {
     let summary = format!(
         "{} of {} registered: {moved}; error (Huber) {before:.4} before, {after:.4} after",
         errors.len(),
-        counted(registered.len(), "camera")
+        format_count(registered.len(), "camera")
     );
     let warning = format!(
         "cameras have {moved}; unless the given poses are that far off, the field and the \

@@ -12,7 +12,7 @@
 use std::ops::Range;
 
 use anyhow::Context as _;
-use artifact::{amount, counted};
+use artifact::{format_amount, format_count};
 use fields::{Members, lower_median, mean, pixel_rays};
 use pixels::{PngRows, to_u8};
 use radiance::RayField;
@@ -125,7 +125,8 @@ impl Stage for RenderDepth {
                 ..View::camera_only(camera)
             });
         }
-        let summary = format!("{}, {} pixels", counted(views.len(), "view"), amount(pixels));
+        let summary =
+            format!("{}, {} pixels", format_count(views.len(), "view"), format_amount(pixels));
         context.write_json(VIEWS_FILE, &Views::new(file.background, cameras.bounds, views))?;
         context.write_summary(&summary)
     }

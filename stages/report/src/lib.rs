@@ -35,7 +35,7 @@ mod scale;
 mod tables;
 mod viewer;
 
-use artifact::{Failure, RunRecord, counted, sized};
+use artifact::{Failure, RunRecord, format_count, format_size};
 use stage::{Context, Stage};
 use stage::{Input, Output};
 
@@ -83,9 +83,9 @@ impl Stage for Report {
         let html = page::page(&report, Some(&data))?.into_string();
         std::fs::write(context.output_path("index.html")?, &html)?;
         context.write_json("results.json", &results::results(&run))?;
-        let results = counted(report.rows.len(), "result");
-        let pictures = counted(data.pictures.len(), "picture");
-        let size = sized(html.len() as u64);
+        let results = format_count(report.rows.len(), "result");
+        let pictures = format_count(data.pictures.len(), "picture");
+        let size = format_size(html.len() as u64);
         context.write_summary(&format!("{results}, {pictures}, {size}"))
     }
 }

@@ -17,7 +17,7 @@ mod supersample;
 mod supervision;
 mod training;
 
-use artifact::{Failure, WARNING, amount, with_warnings};
+use artifact::{Failure, WARNING, format_amount, with_warnings};
 use pixels::DEGRADATION_FILE;
 use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile, TRAINING_FILE, TrainingLog};
 use scene::Views;
@@ -157,7 +157,7 @@ fn publish(context: &Context, file: &FieldFile, log: &TrainingLog) -> anyhow::Re
     context.write_json(FIELD_FILE, file)?;
     context.write_json(TRAINING_FILE, log)?;
     let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
-    let (rays, steps, samples) = (amount(log.rays), log.steps, log.samples_per_ray);
+    let (rays, steps, samples) = (format_amount(log.rays), log.steps, log.samples_per_ray);
     let summary = format!(
         "{rays} rays in {steps} steps, {samples:.1} samples per ray, training PSNR {psnr:.2} dB"
     );

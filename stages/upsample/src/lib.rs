@@ -153,7 +153,10 @@ impl Stage for Upsample {
         let hr = Views::new(views.background, views.bounds, hr.collect());
         context.write_json(VIEWS_FILE, &hr)?;
         let name = format!("{:?}", params.method).to_lowercase();
-        context.write_summary(&format!("{}, by {name}", artifact::counted(hr.views.len(), "view")))
+        context.write_summary(&format!(
+            "{}, by {name}",
+            artifact::format_count(hr.views.len(), "view")
+        ))
     }
 }
 

@@ -14,7 +14,7 @@ use std::fs;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
-use artifact::counted;
+use artifact::format_count;
 use dataset::{Dataset, DatasetError, Frame};
 
 use unposed::UnposedImages;
@@ -166,7 +166,7 @@ fn summarize(set: &Dataset) -> String {
         Some(first) if sizes.all(|size| size == first) => format!(" of {}×{}", first.0, first.1),
         _ => " of several sizes".to_owned(),
     };
-    format!("{}: {}{size}", set.format.title(), counted(set.frames.len(), "photograph"))
+    format!("{}: {}{size}", set.format.title(), format_count(set.frames.len(), "photograph"))
 }
 
 fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {
