@@ -387,7 +387,7 @@ fn what_masks_leave_out_is_not_learnt() {
     let metrics = project.json("eval", "metrics.json", &small);
     let list: scene::Views =
         serde_json::from_slice(&std::fs::read(truth.join("views.json")).unwrap()).unwrap();
-    let shown = list.background.shown();
+    let shown = list.background.grey_level();
     for (view, scores) in list.views.iter().zip(metrics["views"].as_array().unwrap()) {
         let file = |path: &Option<String>| truth.join(path.as_ref().unwrap());
         let name = &view.camera.name;

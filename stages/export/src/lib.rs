@@ -153,7 +153,7 @@ impl Stage for Export {
         let views = Views::read(context.input("cameras")?)?;
         let cameras: Vec<Camera> = views.views.into_iter().map(|view| view.camera).collect();
         for note in lens_notes(&cameras, params) {
-            context.say(note);
+            context.log_line(note);
         }
         let coordinates = Coordinates::new(&field.file.bounds);
         let bounds = field.file.bounds.moved(-coordinates.offset);
@@ -348,7 +348,7 @@ impl ExportJob<'_> {
             return Ok(());
         }
         let ([x, y, z], files) = (offset.offset, offset.files.join(", "));
-        self.context.say(format!(
+        self.context.log_line(format!(
             "the scene is far from the origin: coordinates of {files} lack the offset ({x}, {y}, \
             {z}); add the offset, also in {OFFSET_FILE}, to get the input's coordinates"
         ));

@@ -97,7 +97,7 @@ impl Stage for Prep {
         notes.push(images.note(&split));
         notes.extend(warnings);
         for note in &notes {
-            context.say(note);
+            context.log_line(note);
         }
         let used = split.train.iter().chain(&split.test).map(|&i| &set.frames[i]);
         let threads = memory::thread_pool(context, used, &images)?;
@@ -106,12 +106,12 @@ impl Stage for Prep {
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
         let writer = SceneWriter::new(context, &plan);
         for note in border_notes.into_iter().chain([space_note(&plan.bounds, background)]) {
-            context.say(&note);
+            context.log_line(&note);
             notes.push(note);
         }
         threads.install(|| writer.write())?;
         if let Some(note) = writer.clipping_note() {
-            context.say(&note);
+            context.log_line(&note);
             notes.push(note);
         }
         let summary = SceneSummary::new(&set, &plan, notes);
@@ -157,7 +157,7 @@ fn check_lenses(set: &Dataset) -> Result<(), Failure> {
 fn log_ignored_files(context: &Context, folder: &Path) {
     let Ok((_, ignored)) = list_source_files(folder) else { return };
     if let Some(first) = ignored.first() {
-        context.say(format!(
+        context.log_line(format!(
             "{} ignored: dangling links, editor and system files (first: {})",
             format_count(ignored.len(), "file"),
             printable(&first.display().to_string())

@@ -71,7 +71,7 @@ pub(crate) fn thread_pool<'a>(
     if let (Some(largest), Some(free)) = (largest, available_memory()?) {
         count = largest.max_concurrent(free)?.min(context.threads);
         if count < context.threads {
-            context.say(format!(
+            context.log_line(format!(
                 "using {count} of {} threads: an image needs {} of memory, and {} are free",
                 context.threads,
                 format_size(largest.bytes),

@@ -26,7 +26,8 @@ impl<'a> EnlargedPhotographs<'a> {
         let Some(photograph) = view.read_photograph(self.input).bad_input(&name)? else {
             return Ok(image);
         };
-        let Photograph { image: mut other, mask } = photograph.over(self.views.background.shown());
+        let Photograph { image: mut other, mask } =
+            photograph.over(self.views.background.grey_level());
         if (other.width, other.height) != (image.width, image.height) {
             let message = format!(
                 "{name}: {}×{} pixels, but the view to refine has {}×{}",

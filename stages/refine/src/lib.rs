@@ -117,7 +117,7 @@ impl Stage for Refine {
         let job = RefineJob {
             context,
             input,
-            background: views.background.shown(),
+            background: views.background.grey_level(),
             network: AnyRefiner::read(refiner, &file)?,
             application: Application::new(params, &file),
             photographs: context
@@ -188,7 +188,7 @@ fn refine_all(
         progress.add(1);
     }
     if job.expects_consistent && summary.consistent < summary.views {
-        job.context.say(
+        job.context.log_line(
             "the network was trained on views consistent with LR photographs of their own, but \
             some of these views have none; train a network without input photographs",
         );
@@ -204,7 +204,7 @@ fn report_invisible_references(job: &RefineJob<'_>, references: &[KnownView], us
     for (i, reference) in references.iter().enumerate() {
         if uses[i].seen == 0 {
             let name = &reference.rendered.camera.name;
-            job.context.say(format!("reference {name} shows no part of these views"));
+            job.context.log_line(format!("reference {name} shows no part of these views"));
         }
     }
 }

@@ -59,7 +59,7 @@ impl Stage for Register {
         let members = fields::Members::read(context.input("field")?, &context.device)?;
         let input = context.input("photographs")?;
         let given = Views::read(input)?;
-        let background = members.file.background.shown();
+        let background = members.file.background.grey_level();
         let progress = context.progress("locating", given.views.len() as u64);
         let mut registered = Vec::with_capacity(given.views.len());
         for view in &given.views {
@@ -77,7 +77,7 @@ impl Stage for Register {
         }
         let (summary, warning) = summary(&registered);
         if let Some(warning) = &warning {
-            context.say(format!("{WARNING}{warning}"));
+            context.log_line(format!("{WARNING}{warning}"));
         }
         let views = registered.into_iter().map(|view| View::camera_only(view.to)).collect();
         context.write_json(VIEWS_FILE, &Views::new(given.background, given.bounds, views))?;

@@ -40,7 +40,7 @@ impl Examples {
         photographs: Option<&LrObservations<'_>>,
     ) -> Result<Self, Failure> {
         let true_views = Views::read(truth)?;
-        let background = true_views.background.shown();
+        let background = true_views.background.grey_level();
         let sources = Sources { views, truth, photographs, background };
         let mut all = Vec::new();
         for view in &Views::read(views)?.views {
@@ -96,7 +96,7 @@ pub(crate) fn lr_photographs(context: &Context) -> Result<Option<LrObservations<
     if !photographs.cover(&Views::read(cameras)?) {
         return Ok(None);
     }
-    context.say(
+    context.log_line(
         "all views to be refined have LR photographs of their own: the network is trained on views \
         consistent with theirs",
     );

@@ -93,6 +93,6 @@ fn report_gain(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Re
         "{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight \
         {residual_weight:.2})"
     );
-    context.say(&summary);
+    context.log_line(&summary);
     context.write_summary(&summary)
 }

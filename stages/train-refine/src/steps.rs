@@ -21,7 +21,7 @@ pub(crate) fn train(
 ) -> anyhow::Result<()> {
     let checkpoint = context.work().map(|work| work.join("checkpoint.safetensors"));
     if let Some(path) = checkpoint.as_deref().filter(|p| p.exists()) {
-        context.say(resume(trainer, path));
+        context.log_line(resume(trainer, path));
     }
     let progress = context.progress("training", steps);
     take_steps(

@@ -142,7 +142,7 @@ impl Stage for TrainSs {
                 member.run(&data)?
             };
             for warning in &trained.warnings {
-                context.say(format!("{WARNING}{warning}"));
+                context.log_line(format!("{WARNING}{warning}"));
             }
             rays += trained.rays;
             log.append(trained);

@@ -136,7 +136,7 @@ impl Stage for Upsample {
                         .bad_input(name.clone())?
                         .with_context(|| format!("{name} has no image"));
                     let Photograph { image: lr, mask } =
-                        photograph.bad_input("input views")?.over(views.background.shown());
+                        photograph.bad_input("input views")?.over(views.background.grey_level());
                     let hr = enlarge(network.as_deref(), &lr, camera).context(name)?;
                     let mask = mask.map(|mask| mask.resized((hr.width, hr.height), 0));
                     write_view(context, &camera.name, &hr, mask)?;

@@ -166,7 +166,7 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
             let message = String::from_utf8_lossy(&output.stderr);
-            context.say(format!(
+            context.log_line(format!(
                 "no video.mp4: ffmpeg failed: {}; only frames are written",
                 message.lines().next().unwrap_or("no message")
             ));
@@ -177,7 +177,7 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
             Ok(())
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-            context.say("no video.mp4: ffmpeg isn't installed; only frames are written");
+            context.log_line("no video.mp4: ffmpeg isn't installed; only frames are written");
             Ok(())
         }
         Err(e) => Err(e).with_context(|| format!("cannot run ffmpeg for {folder}")),

@@ -127,7 +127,7 @@ fn write_page(
         resolution,
         bricks: atlas.bricks,
         components: atlas.components.for_shader(),
-        background: file.background.shown(),
+        background: file.background.grey_level(),
         // Only the box's faces limit rays: a viewer may be nearer or farther than the cameras were.
         bounds: Bounds { near: 0.0, far: 1e30, ..file.bounds },
         centre: centre.to_array(),

@@ -126,7 +126,7 @@ impl Supersampling {
             return Ok(());
         };
         cameras
-            .step(&*field()?, progress, self.background.shown(), |view| {
+            .step(&*field()?, progress, self.background.grey_level(), |view| {
                 exposure_correction(exposures.as_ref(), view)
             })
             .map_err(fields::rendering_failure)?;
@@ -150,7 +150,7 @@ impl Supersampling {
     ) -> anyhow::Result<Option<MeanMotion>> {
         let Some(cameras) = &self.state.cameras else { return Ok(None) };
         let moved = cameras
-            .moved(&*field()?, self.lr_views(), self.background.shown())
+            .moved(&*field()?, self.lr_views(), self.background.grey_level())
             .map_err(fields::rendering_failure)?;
         Ok(Some(moved))
     }
@@ -185,7 +185,7 @@ impl Supersampling {
             let mut rng = CounterRng::new(self.seed, BACKGROUND_STREAM, bundle);
             [0, 1, 2].map(|_| rng.uniform())
         } else {
-            [self.background.shown(); 3]
+            [self.background.grey_level(); 3]
         }
     }
 }
@@ -269,7 +269,7 @@ impl radiance::Supervisor for Supersampling {
         }
     }
 
-    fn remember(&mut self, bundle: u64, colours: &[[f32; 3]]) {
+    fn record_colours(&mut self, bundle: u64, colours: &[[f32; 3]]) {
         if self.state.cache.is_none() && self.state.exposures.is_none() {
             return;
         }
@@ -460,7 +460,7 @@ mod tests {
                 .collect();
             let mut gradients = [[0.0; 3]; 4];
             let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
-            supersampling.remember(bundle, &colours);
+            supersampling.record_colours(bundle, &colours);
             // Until then the cache isn't full of the truth.
             if bundle >= 400 {
                 let gradient =
@@ -611,7 +611,7 @@ mod tests {
                     (pulled - 0.2 / 12.0).abs() < 1e-6
                         && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
                 );
-                joined.remember(bundle, &colours);
+                joined.record_colours(bundle, &colours);
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-pixel rays they meet the block's mean together.
@@ -670,7 +670,7 @@ mod tests {
         for bundle in 0..50 {
             let colours = vec![[0.5, 0.4, 0.3]; joined.rays_per_bundle()];
             assert!(joined.loss_and_gradient(bundle, &colours, &mut gradients).is_finite());
-            joined.remember(bundle, &colours);
+            joined.record_colours(bundle, &colours);
         }
         assert_eq!(joined.state.byte_length(), 3 * (2 * 2 + 5 * 3));
     }

@@ -82,7 +82,7 @@ impl<'a> Member<'a> {
     /// seed, as often as the parameters allow.
     pub(crate) fn run(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         if let Some(log) = self.copy_finished() {
-            self.context.say("using the field that an earlier run trained");
+            self.context.log_line("using the field that an earlier run trained");
             return Ok(log);
         }
         let mut collapse = String::new();
@@ -93,7 +93,7 @@ impl<'a> Member<'a> {
             };
             let mut work = self.work.clone();
             if restart > 0 {
-                self.context.say(format!(
+                self.context.log_line(format!(
                     "starting over with seed {}, since training failed: {collapse}",
                     params.seed
                 ));
@@ -156,7 +156,7 @@ impl<'a> Member<'a> {
             std::fs::create_dir_all(work)
                 .with_context(|| format!("cannot create {}", work.display()))?;
         }
-        let log = |text: String| self.context.say(text);
+        let log = |text: String| self.context.log_line(text);
         let mut supervision = supervision(input, params, references, folder, work.is_some(), &log)?;
         let bundle: usize = supervision.supersample().iter().product();
         if params.rays < bundle as u64 {
@@ -168,8 +168,8 @@ impl<'a> Member<'a> {
         }
         let mut trainer = self.new_trainer(params, views.bounds)?;
         let checkpoints = Checkpoints::new(work);
-        let curve =
-            checkpoints.resume(&mut *trainer, &mut supervision, |text| self.context.say(text))?;
+        let curve = checkpoints
+            .resume(&mut *trainer, &mut supervision, |text| self.context.log_line(text))?;
         Ok(Training { trainer, supervision, checkpoints, curve })
     }
 
@@ -189,7 +189,7 @@ impl<'a> Member<'a> {
                 anyhow::bail!("cannot read or write the file of pixels: {error}");
             }
             if report.skipped {
-                self.context.say(format!(
+                self.context.log_line(format!(
                     "step {}: a value was not finite; step discarded, learning rates halved",
                     trainer.steps()
                 ));
@@ -206,7 +206,7 @@ impl<'a> Member<'a> {
         let Training { trainer, supervision, curve, .. } = training;
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
         if let Some(moved) = supervision.moved(|| trainer.field())? {
-            self.context.say(format!("cameras have {moved}"));
+            self.context.log_line(format!("cameras have {moved}"));
             if moved.is_far() {
                 log.warnings.push(far_warning(&moved));
             }

@@ -39,7 +39,7 @@ pub(crate) fn train_with_best_poses(
     });
     // Without comparable photographs, the given poses are kept.
     if refined_error.zip(given_error).is_some_and(|(refined, given)| refined < given) {
-        member.context.say(format!(
+        member.context.log_line(format!(
             "refined poses are used: photographs match their neighbours better ({refined_psnr}) \
             than with the given poses ({given_psnr})"
         ));
@@ -67,7 +67,7 @@ impl<'a> PoseJudge<'a> {
     fn new(member: &'a Member<'a>, data: &'a TrainingData<'a>) -> anyhow::Result<Self> {
         let photographs = Photographs::read(data.input, usize::MAX, &mut PixelMemory::unlimited())?
             .over_background();
-        let background = photographs.views.background.shown();
+        let background = photographs.views.background.grey_level();
         Ok(Self {
             member,
             data,

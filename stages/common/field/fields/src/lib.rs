@@ -89,7 +89,7 @@ pub fn pixel_rays(
     pixels: &[[usize; 2]],
     n: usize,
 ) -> (Vec<Ray>, Vec<f32>) {
-    let (camera_rays, background) = (camera.rays(), [background.shown(); 3]);
+    let (camera_rays, background) = (camera.rays(), [background.grey_level(); 3]);
     let mut rays = Vec::with_capacity(pixels.len() * n * n);
     let mut z_per_distance = Vec::with_capacity(rays.capacity());
     for &[x, y] in pixels {

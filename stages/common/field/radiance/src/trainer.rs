@@ -172,7 +172,7 @@ impl Trainer {
             }
             let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(bundle));
             for (i, colours) in colours.enumerate() {
-                supervision.remember(first_bundle + i as u64, colours);
+                supervision.record_colours(first_bundle + i as u64, colours);
             }
         }
         self.state.steps += 1;

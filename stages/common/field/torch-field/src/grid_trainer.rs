@@ -125,7 +125,7 @@ impl GridTrainer {
         } else {
             no_grad(|| self.apply_gradients(&sum))?;
             self.occupancy.raise_densities(&hits);
-            step.remember(supervision, &colours);
+            step.record_colours(supervision, &colours);
         }
         self.tally.steps += 1;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
@@ -401,7 +401,7 @@ mod tests {
             loss
         }
 
-        fn remember(&mut self, _: u64, colours: &[[f32; 3]]) {
+        fn record_colours(&mut self, _: u64, colours: &[[f32; 3]]) {
             self.seen.push(colours[0][0]);
         }
     }

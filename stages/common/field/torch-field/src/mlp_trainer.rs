@@ -170,7 +170,7 @@ impl MlpTrainer {
             }
         } else {
             self.apply_gradients(&sum.gradients, done)?;
-            step.remember(supervision, &[sum.colours]);
+            step.record_colours(supervision, &[sum.colours]);
         }
         self.tally.steps += 1;
         self.check_collapse(sum.stopped, rays)?;

@@ -115,11 +115,15 @@ impl Step {
     }
 
     /// Passes the rendered colours of all pieces, in order, to the supervision.
-    pub(crate) fn remember(self, supervision: &mut impl Supervisor, pieces: &[Vec<[f32; 3]>]) {
+    pub(crate) fn record_colours(
+        self,
+        supervision: &mut impl Supervisor,
+        pieces: &[Vec<[f32; 3]>],
+    ) {
         let mut bundle = self.first_bundle;
         for colours in pieces {
             for colours in colours.chunks_exact(self.rays_per_bundle) {
-                supervision.remember(bundle, colours);
+                supervision.record_colours(bundle, colours);
                 bundle += 1;
             }
         }

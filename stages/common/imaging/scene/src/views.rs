@@ -166,7 +166,7 @@ pub enum Background {
 impl Background {
     /// Returns the grey level behind displayed images: white for a transparent background, the mean
     /// of black and white for gaps in an opaque scene.
-    pub fn shown(self) -> f32 {
+    pub fn grey_level(self) -> f32 {
         match self {
             Self::Black => 0.0,
             Self::White | Self::Alpha => 1.0,
@@ -216,7 +216,7 @@ impl Views {
 
     /// Reads an image of a view over the displayed background: RGB.
     pub fn read_over(&self, path: &Path) -> Result<Image, PixelError> {
-        Ok(read_premultiplied(path)?.over(self.background.shown()))
+        Ok(read_premultiplied(path)?.over(self.background.grey_level()))
     }
 
     /// Reads and checks the `views.json` of an input.

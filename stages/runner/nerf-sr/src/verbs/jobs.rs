@@ -95,7 +95,7 @@ fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
     let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
     let threads = slurm::available_cores();
     if let Some(sink) = run.plan.sinks.first() {
-        check_parents(run.plan, &sink.stage, sink.shows.iter().copied(), &records)?;
+        check_parents(run.plan, &sink.stage, sink.nodes.iter().copied(), &records)?;
         let progress = RunProgress { command, ..RunProgress::not_started(&records) };
         run_sink(run, sink, threads, &progress)?.print(&sink.stage);
         return Ok(());

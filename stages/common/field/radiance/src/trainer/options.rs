@@ -111,5 +111,5 @@ pub trait Supervisor: Sync {
         gradients: &mut [[f32; 3]],
     ) -> f64;
     /// Stores a bundle's rendered colours. Called in bundle order after each step that was applied.
-    fn remember(&mut self, _bundle: u64, _colours: &[[f32; 3]]) {}
+    fn record_colours(&mut self, _bundle: u64, _colours: &[[f32; 3]]) {}
 }
