@@ -13,8 +13,7 @@ use scene::{
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 /// Parameters of `camera-path`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

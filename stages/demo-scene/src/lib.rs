@@ -20,8 +20,7 @@ mod world;
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
-use stage::Output;
-use stage::{Context, Stage};
+use stage::{Context, Output, Stage};
 
 use camera::ViewCamera;
 use dataset_writer::DatasetWriter;

@@ -28,8 +28,7 @@ use rayon::prelude::*;
 use scene::{Background, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 use derived::{least_gain, near_references};
 use metric::{Metric, mean_of};

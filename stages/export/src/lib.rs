@@ -41,8 +41,7 @@ use glam::DVec3;
 use scene::{Bounds, Camera, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 use cameras::CameraFormat;
 use coordinates::Coordinates;

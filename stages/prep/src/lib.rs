@@ -39,8 +39,7 @@ use artifact::{Failure, FailureExt as _, format_count, list_source_files, printa
 use dataset::{Dataset, Frame};
 use scene::Background;
 use serde_json::json;
-use stage::{Context, Stage};
-use stage::{Input, Output, Rule};
+use stage::{Context, Input, Output, Rule, Stage};
 
 use borders::Borders;
 pub use bounds::SpaceKind;

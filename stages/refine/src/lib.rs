@@ -27,8 +27,7 @@ use refinement::{KnownView, LrObservations, REFINER_FILE, RefinerFile, Use};
 use scene::{VIEWS_FILE, Views, image_file, preview_file};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 use enlarged::EnlargedPhotographs;
 use network::{AnyRefiner, Application};

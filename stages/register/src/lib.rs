@@ -12,8 +12,7 @@ use radiance::{RayField, RenderError};
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 /// Parameters of `register`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -36,8 +36,7 @@ mod tables;
 mod viewer;
 
 use artifact::{Failure, RunRecord, format_count, format_size};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 pub use data::Params;
 pub use results::{ResultRow, StageResult};

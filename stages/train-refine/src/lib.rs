@@ -22,8 +22,7 @@ mod params;
 mod steps;
 
 use refinement::RefinerFile;
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 pub use params::{CompactParams, Net, PaperParams, Params};
 

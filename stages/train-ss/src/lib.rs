@@ -22,8 +22,7 @@ use pixels::DEGRADATION_FILE;
 use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile, TRAINING_FILE, TrainingLog};
 use scene::Views;
 use serde_json::json;
-use stage::{Context, Stage};
-use stage::{Input, Output, Rule};
+use stage::{Context, Input, Output, Rule, Stage};
 
 pub use params::{
     Combine, FieldParams, GridParams, MlpParams, Order, Params, ParamsError, RateSchedule,

@@ -33,8 +33,7 @@ use radiance::{Field, FieldFile, FieldModel};
 use scene::{Bounds, Camera, Intrinsics, Space, Views, undistort_image};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 use crate::atlas::Atlas;
 use crate::bake::{Baker, Shape, Volume};
