@@ -72,7 +72,7 @@ fn schemas() -> BTreeMap<String, Value> {
         ("run", of::<artifact::RunRecord>()),
         ("views", of::<scene::Views>()),
         ("scene", of::<prep::SceneSummary>()),
-        ("field", of::<radiance::FieldFile>()),
+        ("field", of::<fields::FieldFile>()),
         ("training", of::<radiance::TrainingLog>()),
         ("refiner", of::<refinement::RefinerFile>()),
         ("metrics", of::<metrics::Metrics>()),

@@ -18,8 +18,9 @@ mod supervision;
 mod training;
 
 use artifact::{Failure, WARNING, format_amount, with_warnings};
+use fields::{FIELD_FILE, FIELD_FORMAT, FieldFile};
 use pixels::DEGRADATION_FILE;
-use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile, TRAINING_FILE, TrainingLog};
+use radiance::{TRAINING_FILE, TrainingLog};
 use scene::Views;
 use serde_json::json;
 use stage::{Context, Input, Output, Rule, Stage};

@@ -2,7 +2,8 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _};
-use radiance::{Field, FieldModel, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
+use fields::FieldModel;
+use radiance::{Field, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
 use scene::Bounds;
 
 use crate::params::{Resolved, ResolvedField};

@@ -2,8 +2,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use artifact::{Failure, GivenInput};
+use fields::{FieldFile, FieldModel};
 use poses::MeanMotion;
-use radiance::{FieldFile, FieldModel, TRAINING_FILE, TrainingLog};
+use radiance::{TRAINING_FILE, TrainingLog};
 use scene::{Bounds, Views};
 use stage::{Context, Progress};
 

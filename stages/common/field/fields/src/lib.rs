@@ -2,6 +2,7 @@
 //!
 //! * [`Members`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
 //!   cancels errors where images don't determine the scene (docs/design/011).
+//! * [`FieldFile`]: description of a field artifact.
 //! * [`pixel_rays`]: the rays of a view's pixels.
 //! * [`mean`], [`lower_median`]: a pixel's value from several fields or rays.
 //!
@@ -13,9 +14,13 @@
 //! # Ok::<(), artifact::Failure>(())
 //! ```
 
+mod field_file;
+
 use artifact::{Failure, FailureExt as _, GivenInput};
-use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Pixel, Ray, RayField, RenderError};
+use radiance::{Field, Pixel, Ray, RayField, RenderError};
 use scene::{Background, Camera};
+
+pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel};
 
 /// Environment variables that change renders, in builds with and without libtorch. If 1, libtorch's
 /// variable lets CUDA multiply in TensorFloat-32, with a mantissa of ten bits.
@@ -195,7 +200,7 @@ mod tests {
 
     fn seen(opacity: f32) -> Result<Vec<Pixel>, RenderError> {
         let file = FieldFile {
-            format: radiance::FIELD_FORMAT,
+            format: FIELD_FORMAT,
             field: FieldModel::Grid(Architecture::default()),
             members: 1,
             bounds: Bounds::default(),
@@ -252,7 +257,7 @@ mod tests {
 
     fn write_file(folder: &Path, architecture: Architecture, bounds: Bounds, members: u32) {
         let file = FieldFile {
-            format: radiance::FIELD_FORMAT,
+            format: FIELD_FORMAT,
             field: FieldModel::Grid(architecture),
             members,
             bounds,

@@ -2,7 +2,7 @@
 //! autograd, no torch.
 //!
 //! * [`RayField`]: trait of fields that render rays.
-//! * [`FieldFile`], [`TrainingLog`]: JSON files of a field artifact.
+//! * [`TrainingLog`]: course of a training, a file of a field artifact.
 //! * [`Field`]: parameters and occupancy grid; [`Field::render`] returns colour, opacity and depth
 //!   of rays.
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that
@@ -49,7 +49,6 @@ mod architecture;
 mod chunk;
 mod composite;
 mod field;
-mod field_file;
 mod grid;
 mod march;
 mod math;
@@ -72,11 +71,8 @@ mod trainer;
 mod training_log;
 mod training_state;
 
-pub use architecture::{Architecture, OutOfRange};
+pub use architecture::{Architecture, OutOfRange, check_ranges};
 pub use field::Field;
-pub use field_file::{
-    FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel, MlpArchitecture,
-};
 pub use math::spherical_harmonics;
 pub use occupancy::{CellHit, Occupancy};
 pub use passes::Passes;

@@ -2,11 +2,11 @@
 //! (`make goldens`).
 
 use counter_rng::uniform;
-use radiance::MlpArchitecture;
 use safetensors::SafeTensors;
 use scene::Bounds;
 use tch::{Device, Kind, Tensor};
 
+use crate::architecture::MlpArchitecture;
 use crate::mlp::{Batch, Mlp, SampleDraws};
 use crate::mlp_trainer::{MlpTrainer, MlpTraining};
 use crate::network::MlpNetwork;

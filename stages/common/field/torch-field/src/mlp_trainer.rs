@@ -2,10 +2,11 @@ use std::ops::Range;
 use std::path::Path;
 
 use nets::Adam;
-use radiance::{MlpArchitecture, StepReport, Supervisor, TrainingState};
+use radiance::{StepReport, Supervisor, TrainingState};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor};
 
+use crate::architecture::MlpArchitecture;
 use crate::error::TorchFieldError;
 use crate::mlp::{Batch, Mlp, SampleDraws};
 use crate::step::{Schedule, Step};
