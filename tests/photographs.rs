@@ -152,8 +152,7 @@ fn one_command_makes_hr_views_of_lr_photographs() {
 }
 
 fn scored_with(project: &Project, exposure: &str) -> (f64, Value) {
-    // Each exposure has a grey of its own behind the things: that looks like a scene that goes
-    // on.
+    // Each exposure has a grey of its own behind the things: that looks like a scene that goes on.
     let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", exposure];
     project.ok(&[&["run"], &settings[..]].concat());
     (lr_psnr(project, "eval", &settings), project.json("train-ss", "training.json", &settings))

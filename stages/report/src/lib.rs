@@ -44,8 +44,7 @@ pub use results::{ResultRow, StageResult};
 /// The stage.
 pub struct Report;
 
-/// Maximum size of a page in bytes, unless the text of a very long run is larger
-/// (docs/design/041).
+/// Maximum size of a page in bytes, unless the text of a very long run is larger (docs/design/041).
 const MAX_PAGE_BYTES: usize = 15_000_000;
 /// Bytes reserved for labels and file names of the pictures; chosen by hand.
 const CAPTION_BYTES: usize = 700_000;

@@ -1,5 +1,4 @@
-//! First pipeline for a folder of posed photographs, as `nerf-sr init` writes it
-//! (docs/design/040).
+//! First pipeline for a folder of posed photographs, as `nerf-sr init` writes it (docs/design/040).
 //!
 //! * [`Starter`]: summary of the folder, and a complete, commented pipeline file for it.
 //! * [`Starter::write`]: writes the pipeline file and, next to it, `pipelines/` with the shipped
