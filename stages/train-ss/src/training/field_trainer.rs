@@ -61,8 +61,7 @@ pub(crate) fn new_trainer(
         }
         #[cfg(feature = "torch")]
         ResolvedField::Mlp { architecture, density_noise_std, given } => {
-            let device = nets::device(device).map_err(|error| device_failure(&error))?;
-            nets::deterministic();
+            let device = fields::torch_device(device)?;
             let field = match init {
                 Some(weights) => torch_field::Mlp::read(weights, *architecture, bounds, device)
                     .bad_input("input init")?,
@@ -76,27 +75,6 @@ pub(crate) fn new_trainer(
             let message = "parameter field: mlp needs libtorch, and train-ss was built without \
                 it; run `make build`";
             Err(Failure::Usage(message.to_owned()).into())
-        }
-    }
-}
-
-/// Reads a trained field.
-pub(crate) fn read_field(
-    model: FieldModel,
-    bounds: Bounds,
-    weights: &Path,
-    device: &str,
-) -> anyhow::Result<Box<dyn RayField>> {
-    match model {
-        FieldModel::Grid(architecture) => Ok(Box::new(Field::read(weights, architecture, bounds)?)),
-        #[cfg(feature = "torch")]
-        FieldModel::Mlp(architecture) => {
-            let device = nets::device(device).map_err(|error| device_failure(&error))?;
-            Ok(Box::new(torch_field::Mlp::read(weights, architecture, bounds, device)?))
-        }
-        #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {
-            anyhow::bail!("cannot read MLPs for {device}: train-ss was built without libtorch")
         }
     }
 }
@@ -128,11 +106,6 @@ pub(crate) fn average_weights(
     Ok(())
 }
 
-#[cfg(feature = "torch")]
-fn device_failure(error: &nets::DeviceError) -> Failure {
-    Failure::Usage(error.to_string())
-}
-
 /// Creates a trainer of a grid in libtorch.
 #[cfg(feature = "torch")]
 fn new_grid_trainer_on(
@@ -140,8 +113,7 @@ fn new_grid_trainer_on(
     field: &Field,
     options: TrainingOptions,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let device = nets::device(device).map_err(|error| device_failure(&error))?;
-    nets::deterministic();
+    let device = fields::torch_device(device)?;
     Ok(Box::new(torch_field::GridTrainer::new(field, options, device)?))
 }
 

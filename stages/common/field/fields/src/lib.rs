@@ -1,7 +1,8 @@
 //! Loader of field artifacts for stages that render: hash-grid fields and the paper's field.
 //!
 //! * [`Members`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
-//!   cancels errors where images don't determine the scene (docs/design/011).
+//!   cancels errors where images don't determine the scene (docs/design/011). [`read_field`] reads
+//!   one of them.
 //! * [`FieldFile`]: description of a field artifact.
 //! * [`pixel_rays`]: the rays of a view's pixels.
 //! * [`mean`], [`lower_median`]: a pixel's value from several fields or rays.
@@ -16,9 +17,11 @@
 
 mod field_file;
 
+use std::path::Path;
+
 use artifact::{Failure, FailureExt as _, GivenInput};
 use radiance::{Field, Pixel, Ray, RayField, RenderError};
-use scene::{Background, Camera};
+use scene::{Background, Bounds, Camera};
 
 pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel};
 
@@ -42,7 +45,9 @@ impl Members {
     /// used.
     pub fn read(input: &GivenInput, device: &str) -> Result<Self, Failure> {
         let file = read_field_file(input)?;
-        let fields = read_all(&file, input, device)?;
+        let paths = (0..file.members).map(|index| input.path(&FieldFile::member_file(index)));
+        let fields = paths.map(|path| read_field(file.field, file.bounds, &path, device));
+        let fields = fields.collect::<Result<_, _>>()?;
         Ok(Self { file, fields })
     }
 }
@@ -131,29 +136,25 @@ pub fn rendering_failure(error: RenderError) -> anyhow::Error {
     }
 }
 
-fn read_all(
-    file: &FieldFile,
-    input: &GivenInput,
+/// Reads the weights of one field onto device `cpu` or `cuda:N`.
+///
+/// # Errors
+/// Those of [`Members::read`].
+pub fn read_field(
+    model: FieldModel,
+    bounds: Bounds,
+    weights: &Path,
     device: &str,
-) -> Result<Vec<Box<dyn RayField>>, Failure> {
-    let paths = (0..file.members).map(|i| input.path(&FieldFile::member_file(i)));
-    match file.field {
-        FieldModel::Grid(architecture) => paths
-            .map(|path| {
-                let field = Field::read(&path, architecture, file.bounds).bad_input("field")?;
-                move_grid(field, device)
-            })
-            .collect(),
+) -> Result<Box<dyn RayField>, Failure> {
+    match model {
+        FieldModel::Grid(architecture) => {
+            move_grid(Field::read(weights, architecture, bounds).bad_input("field")?, device)
+        }
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
-            let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
-            nets::deterministic();
-            paths
-                .map(|path| {
-                    let field = torch_field::Mlp::read(&path, architecture, file.bounds, device);
-                    Ok(Box::new(field.bad_input("field")?) as Box<dyn RayField>)
-                })
-                .collect()
+            let device = torch_device(device)?;
+            let field = torch_field::Mlp::read(weights, architecture, bounds, device);
+            Ok(Box::new(field.bad_input("field")?))
         }
         #[cfg(not(feature = "torch"))]
         FieldModel::Mlp(_) => {
@@ -170,11 +171,9 @@ fn move_grid(field: Field, device: &str) -> Result<Box<dyn RayField>, Failure> {
         return Ok(Box::new(field));
     }
     #[cfg(feature = "torch")]
-    {
-        let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
-        nets::deterministic();
-        Ok(Box::new(torch_field::TorchGrid::new(&field, device).usage("--device")?))
-    }
+    return Ok(Box::new(
+        torch_field::TorchGrid::new(&field, torch_device(device)?).usage("--device")?,
+    ));
     #[cfg(not(feature = "torch"))]
     Err(Failure::Usage(format!(
         "--device {device} needs libtorch, and this program was built without libtorch; run `make \
@@ -182,12 +181,20 @@ fn move_grid(field: Field, device: &str) -> Result<Box<dyn RayField>, Failure> {
     )))
 }
 
+/// Opens a device of libtorch, on which equal calls give equal bits.
+///
+/// # Errors
+/// [`Failure::Usage`] if the device can't be used.
+#[cfg(feature = "torch")]
+pub fn torch_device(device: &str) -> Result<nets::Device, Failure> {
+    nets::deterministic();
+    nets::device(device).map_err(|error| Failure::Usage(error.to_string()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use radiance::Architecture;
-    use scene::Bounds;
-    use std::path::Path;
 
     /// A field of one opacity everywhere.
     struct Even(f32);
