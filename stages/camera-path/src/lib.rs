@@ -260,8 +260,7 @@ mod tests {
         cameras(&places, |p| p + DVec3::Y)
     }
 
-    const BOX: Bounds =
-        Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, space: Space::Box };
+    const BOX: Bounds = Bounds::cube(1.0, 2.0, 6.0);
 
     fn whole(poses: &[Pose]) -> Vec<Camera> {
         let cameras: Vec<Camera> = poses.iter().map(|&pose| camera("c", pose)).collect();

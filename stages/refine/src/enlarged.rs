@@ -76,8 +76,7 @@ mod tests {
             mask: Some("mask.png".to_owned()),
             ..without("masked")
         };
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let views = Views::new(Background::White, bounds, vec![whole, masked, without("empty")]);
         write_json(&folder.path().join(VIEWS_FILE), &views).unwrap();
         folder

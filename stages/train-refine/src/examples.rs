@@ -109,7 +109,7 @@ mod tests {
 
     use pixels::{Image, write_png};
     use scene::{
-        Background, Bounds, Camera, Intrinsics, Space, VIEW_CHANNELS, VIEWS_FILE, write_view_image,
+        Background, Bounds, Camera, Intrinsics, VIEW_CHANNELS, VIEWS_FILE, write_view_image,
     };
 
     use super::*;
@@ -140,8 +140,7 @@ mod tests {
                 write_png(&path, &grey.to_rgba8()).unwrap();
             }
         }
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.1, far: 9.0, space: Space::default() };
+        let bounds = Bounds::cube(1.0, 0.1, 9.0);
         let list = Views::new(Background::White, bounds, views);
         artifact::write_json(&folder.join(VIEWS_FILE), &list).unwrap();
         GivenInput::open(name, &folder).unwrap()

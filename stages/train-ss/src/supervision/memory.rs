@@ -137,8 +137,7 @@ mod tests {
     }
 
     fn need(images: usize, filter: Filter, pose_refinement: bool) -> MemoryNeed {
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let views = Views::new(
             Background::Opaque,
             bounds,

@@ -241,8 +241,7 @@ mod tests {
     fn field() -> Field {
         let architecture =
             Architecture { n_levels: 2, log2_hashmap_size: 8, ..Architecture::default() };
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let mut field = Field::new(architecture, bounds, 1);
         let (.., occupancy) = field.parts_mut();
         let (mut density, mut cells) =

@@ -281,8 +281,7 @@ mod tests {
     /// is an error.
     #[test]
     fn members_are_averaged() {
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let architecture = Architecture {
             max_resolution: 32,
             n_levels: 4,

@@ -30,13 +30,7 @@
 //!
 //! ```
 //! use radiance::{Architecture, Field, Ray};
-//! let bounds = scene::Bounds {
-//!     min: [-1.0; 3],
-//!     max: [1.0; 3],
-//!     near: 2.0,
-//!     far: 6.0,
-//!     ..Default::default()
-//! };
+//! let bounds = scene::Bounds::cube(1.0, 2.0, 6.0);
 //! let field = Field::new(Architecture::default(), bounds, 7);
 //! let ray = Ray { origin: [0.0, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
 //! let pixel = field.render(&[ray])[0];

@@ -19,13 +19,7 @@
 //! ```no_run
 //! use radiance::Ray;
 //! use torch_field::{Mlp, MlpArchitecture};
-//! let bounds = scene::Bounds {
-//!     min: [-1.0; 3],
-//!     max: [1.0; 3],
-//!     near: 2.0,
-//!     far: 6.0,
-//!     ..Default::default()
-//! };
+//! let bounds = scene::Bounds::cube(1.0, 2.0, 6.0);
 //! let field = Mlp::new(MlpArchitecture::default(), bounds, 7, nets::device("cpu")?)?;
 //! let ray = Ray { origin: [0.0, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
 //! let pixel = field.render(&[ray])?[0];

@@ -386,8 +386,7 @@ mod tests {
             fine_samples: 8,
             ..MlpArchitecture::default()
         };
-        let bounds =
-            Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(2.0, 2.0, 6.0);
         let options = MlpTraining {
             rays: 8 * 250,
             max_rays_per_step: 8,

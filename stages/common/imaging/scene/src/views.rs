@@ -286,7 +286,6 @@ fn check_path(path: &str) -> Result<(), ViewsError> {
 mod tests {
     use super::*;
     use crate::intrinsics::Intrinsics;
-    use crate::space::Space;
 
     fn views() -> Views {
         let camera = Camera {
@@ -294,7 +293,7 @@ mod tests {
             intrinsics: Intrinsics::from_angle_x(8, 6, 0.7),
             camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]],
         };
-        let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 2., far: 6., space: Space::Box };
+        let bounds = Bounds::cube(1., 2., 6.);
         Views::new(Background::White, bounds, vec![View::camera_only(camera)])
     }
 
