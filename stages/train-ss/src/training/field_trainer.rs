@@ -3,7 +3,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _};
 use fields::FieldModel;
-use radiance::{Field, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
+use radiance::{Field, RayField, StepReport, Trainer, TrainingError};
 use scene::Bounds;
 
 use crate::params::{Resolved, ResolvedField};
@@ -54,10 +54,17 @@ pub(crate) fn new_trainer(
                 None => Field::new(*architecture, bounds, params.seed),
             };
             let options = params.grid_training(given, regularisers);
-            if device != "cpu" {
-                return new_grid_trainer_on(device, &field, options);
+            if device == "cpu" {
+                return Ok(Box::new(Trainer::new(field, options)));
             }
-            Ok(Box::new(Trainer::new(field, options)))
+            #[cfg(feature = "torch")]
+            return Ok(Box::new(torch_field::GridTrainer::new(
+                &field,
+                options,
+                fields::torch_device(device)?,
+            )?));
+            #[cfg(not(feature = "torch"))]
+            Err(fields::needs_libtorch(&format!("--device {device}")).into())
         }
         #[cfg(feature = "torch")]
         ResolvedField::Mlp { architecture, density_noise_std, given } => {
@@ -71,11 +78,7 @@ pub(crate) fn new_trainer(
             Ok(Box::new(torch_field::MlpTrainer::new(field, options)?))
         }
         #[cfg(not(feature = "torch"))]
-        ResolvedField::Mlp { .. } => {
-            let message = "parameter field: mlp needs libtorch, and train-ss was built without \
-                it; run `make build`";
-            Err(Failure::Usage(message.to_owned()).into())
-        }
+        ResolvedField::Mlp { .. } => Err(fields::needs_libtorch("parameter field: mlp").into()),
     }
 }
 
@@ -104,29 +107,6 @@ pub(crate) fn average_weights(
         FieldModel::Mlp(_) => {}
     }
     Ok(())
-}
-
-/// Creates a trainer of a grid in libtorch.
-#[cfg(feature = "torch")]
-fn new_grid_trainer_on(
-    device: &str,
-    field: &Field,
-    options: TrainingOptions,
-) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let device = fields::torch_device(device)?;
-    Ok(Box::new(torch_field::GridTrainer::new(field, options, device)?))
-}
-
-#[cfg(not(feature = "torch"))]
-fn new_grid_trainer_on(
-    device: &str,
-    _: &Field,
-    _: TrainingOptions,
-) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let message = format!(
-        "--device {device} needs libtorch, and train-ss was built without it; run `make build`"
-    );
-    Err(Failure::Usage(message).into())
 }
 
 /// Implements the methods of [`FieldTrainer`] that all trainers have under the same names.

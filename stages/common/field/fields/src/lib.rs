@@ -157,11 +157,7 @@ pub fn read_field(
             Ok(Box::new(field.bad_input("field")?))
         }
         #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {
-            let message = "field: mlp needs libtorch, and this program was built without libtorch; \
-                run `make build`";
-            Err(Failure::Usage(message.to_owned()))
-        }
+        FieldModel::Mlp(_) => Err(needs_libtorch("field: mlp")),
     }
 }
 
@@ -175,10 +171,14 @@ fn move_grid(field: Field, device: &str) -> Result<Box<dyn RayField>, Failure> {
         torch_field::TorchGrid::new(&field, torch_device(device)?).usage("--device")?,
     ));
     #[cfg(not(feature = "torch"))]
-    Err(Failure::Usage(format!(
-        "--device {device} needs libtorch, and this program was built without libtorch; run `make \
-        build`"
-    )))
+    Err(needs_libtorch(&format!("--device {device}")))
+}
+
+/// Creates the failure of a program without libtorch, which `argument` needs.
+pub fn needs_libtorch(argument: &str) -> Failure {
+    Failure::Usage(format!(
+        "{argument} needs libtorch, and this program was built without it; run `make build`"
+    ))
 }
 
 /// Opens a device of libtorch, on which equal calls give equal bits.
