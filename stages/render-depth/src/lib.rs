@@ -344,17 +344,11 @@ mod tests {
 
     /// Renders a picture in bands of some rows; returns red of each pixel and the number of rays.
     fn red(colour: fn(f64, f64) -> f64, tolerance: f64, band: usize) -> (Vec<f32>, usize) {
-        let camera = camera();
+        let (camera, params) = (&camera(), &Params { tolerance, ..Params::default() });
         let count = Arc::new(AtomicUsize::new(0));
-        let members: Vec<Box<dyn RayField>> =
-            vec![Box::new(Picture { colour, rays: Arc::clone(&count) })];
-        let params = Params { tolerance, ..Params::default() };
-        let job = RenderJob {
-            params: &params,
-            members: &members,
-            background: Background::White,
-            camera: &camera,
-        };
+        let members: &[Box<dyn RayField>] =
+            &[Box::new(Picture { colour, rays: Arc::clone(&count) })];
+        let job = RenderJob { params, members, background: Background::White, camera };
         let mut centres = CentreRows::default();
         let bands = (0..SIZE).step_by(band).map(|first| first..(first + band).min(SIZE));
         let shown: Vec<ViewPixel> =
@@ -418,7 +412,7 @@ mod tests {
     /// is the mean.
     #[test]
     fn a_pixel_has_the_depth_of_one_ray_of_one_member() {
-        let camera = camera();
+        let camera = &camera();
         // The four rays of the pixel pass the plane z = -1 in these distances from the camera.
         let [x, y] = [[2.25f32, 2.75], [0.25, 0.75]];
         let away = |i: usize, j: usize| (1.0 + x[i] * x[i] + y[j] * y[j]).sqrt();
@@ -432,13 +426,8 @@ mod tests {
             let members: Vec<Box<dyn RayField>> =
                 walls.iter().map(|wall| Box::new(Wall(*wall)) as Box<dyn RayField>).collect();
             for (depth, times) in [(Depth::Median, 1.0), (Depth::Expected, 2.0)] {
-                let params = Params { depth, ..Params::default() };
-                let job = RenderJob {
-                    params: &params,
-                    members: &members,
-                    background: Background::White,
-                    camera: &camera,
-                };
+                let (params, members) = (&Params { depth, ..Params::default() }, &members[..]);
+                let job = RenderJob { params, members, background: Background::White, camera };
                 let shown = job.cast(&[[14, 12]], 2).unwrap()[0].channels;
                 let expected = [opacity, times * wall, times * distance];
                 let is_near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-4;

@@ -73,11 +73,8 @@ fn plan_of(text: &str, data: &Path, change: impl Fn(&mut Request)) -> Result<Pla
         ..Request::default()
     };
     change(&mut request);
-    Plan::from_descriptions(
-        &Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?,
-        &descriptions(),
-        &request,
-    )
+    let pipeline = Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?;
+    Plan::from_descriptions(&pipeline, &descriptions(), &request)
 }
 
 fn data() -> tempfile::TempDir {

@@ -91,11 +91,8 @@ fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
             _ => request.targets.push(word),
         }
     }
-    Plan::from_descriptions(
-        &Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?,
-        &descriptions(),
-        &request,
-    )
+    let pipeline = Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?;
+    Plan::from_descriptions(&pipeline, &descriptions(), &request)
 }
 
 #[track_caller]
