@@ -10,8 +10,9 @@ use artifact::GivenInput;
 use common::splats::{read_ply, vectors};
 use common::surfaces::Glb;
 use common::{Project, stage};
+use fields::{FIELD_FILE, FieldFile};
 use glam::{DMat3, DVec3};
-use radiance::{FIELD_FILE, FieldFile, NormalizedRay, Ray, clip};
+use radiance::{NormalizedRay, Ray, clip};
 use scene::{Bounds, Views};
 use serde_json::{Value, json};
 

@@ -161,7 +161,10 @@ const DAMAGES: &[Damage] = &[
             std::fs::rename(data.join("train/r_2.png"), data.join("train/._r_2.png")).unwrap();
             edit_training(data, |list| list["frames"][2]["file_path"] = json!("train/._r_2.png"));
         },
-        &["frame 2 (train/._r_2.png)", "._r_2.png is named like an editor or system file"],
+        &[
+            "frame 2 (train/._r_2.png)",
+            "._r_2.png is named like an editor or system file, which are ignored; rename the file",
+        ],
     ),
 ];
 

@@ -20,6 +20,7 @@ use std::time::{Duration, SystemTime};
 
 use artifact::{Manifest, list_files};
 use common::leftovers::{Files, files_below, is_leftover, lasting_files};
+use common::random::number;
 use common::{Finished, Project, bin, root};
 
 /// A stage in shell: its output follows from the data set and from the seed.
@@ -365,12 +366,6 @@ fn make_old(folder: &Path) {
     }
 }
 
-fn number(variable: &str) -> Option<usize> {
-    std::env::var(variable)
-        .ok()
-        .map(|text| text.parse().unwrap_or_else(|_| panic!("{variable}={text}: not a number")))
-}
-
 /// Containers may forbid that one process watches another.
 fn can_trace() -> bool {
     let report = Path::new(&*TRACER).with_extension("report");
@@ -385,8 +380,8 @@ fn kills_at_every_call_lose_nothing() {
         println!("skipped: this machine does not allow ptrace");
         return;
     }
-    let step = number("NERF_SR_CALL_STEP").unwrap_or(DEFAULT_STEP);
-    let seed = number("NERF_SR_SEED").unwrap_or(std::process::id() as usize);
+    let step = number("NERF_SR_CALL_STEP").map_or(DEFAULT_STEP, |step| step as usize);
+    let seed = number("NERF_SR_SEED").unwrap_or_else(|| std::process::id().into()) as usize;
     println!("NERF_SR_CALL_STEP={step} NERF_SR_SEED={seed}");
     let (next, all) = (AtomicUsize::new(0), AtomicUsize::new(0));
     std::thread::scope(|scope| {

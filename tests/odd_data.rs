@@ -315,7 +315,7 @@ fn trained_with(project: &Project, refined: &str) -> (Vec<u8>, String, Value, St
     let run = project.run(&[&["run"], &settings[..]].concat());
     assert_eq!(run.code, 0, "{}", run.stderr);
     let weights = std::fs::read(
-        project.artifact("train-ss", &settings).join(radiance::FieldFile::member_file(0)),
+        project.artifact("train-ss", &settings).join(fields::FieldFile::member_file(0)),
     )
     .unwrap();
     let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();

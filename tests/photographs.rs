@@ -152,8 +152,7 @@ fn one_command_makes_hr_views_of_lr_photographs() {
 }
 
 fn scored_with(project: &Project, exposure: &str) -> (f64, Value) {
-    // Each exposure has a grey of its own behind the things: that looks like a scene that goes
-    // on.
+    // Each exposure has a grey of its own behind the things: that looks like a scene that goes on.
     let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", exposure];
     project.ok(&[&["run"], &settings[..]].concat());
     (lr_psnr(project, "eval", &settings), project.json("train-ss", "training.json", &settings))
@@ -387,7 +386,7 @@ fn what_masks_leave_out_is_not_learnt() {
     let metrics = project.json("eval", "metrics.json", &small);
     let list: scene::Views =
         serde_json::from_slice(&std::fs::read(truth.join("views.json")).unwrap()).unwrap();
-    let shown = list.background.shown();
+    let shown = list.background.grey_level();
     for (view, scores) in list.views.iter().zip(metrics["views"].as_array().unwrap()) {
         let file = |path: &Option<String>| truth.join(path.as_ref().unwrap());
         let name = &view.camera.name;

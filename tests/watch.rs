@@ -75,8 +75,7 @@ fn psnr(look: &str) -> f64 {
 }
 
 /// How near to the end a look comes, in dB. Of 21.6 dB in the end a look has 17.9 after 26,000
-/// rays,
-/// 20.8 after 73,000 and 21.5 after 314,000. A slow machine's is an early one.
+/// rays, 20.8 after 73,000 and 21.5 after 314,000. A slow machine's is an early one.
 fn nearness(look: &str) -> f64 {
     let (_, after) = look.split_once(" view (").unwrap();
     let rays = after.split_whitespace().next().unwrap().replace(',', "");

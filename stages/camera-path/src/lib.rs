@@ -13,8 +13,7 @@ use scene::{
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 /// Parameters of `camera-path`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -87,11 +86,7 @@ impl Stage for CameraPath {
         let mut first = scene.views[0].camera.clone();
         // Frames have no lens distortion.
         first.intrinsics = first.intrinsics.pinhole().unwrap_or(first.intrinsics);
-        let degradation: Option<Degradation> = if input.path(DEGRADATION_FILE).exists() {
-            Some(input.read_json(DEGRADATION_FILE)?)
-        } else {
-            None
-        };
+        let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
         let hr_width = degradation.map(|degradation| degradation.hr[0]);
         let width = params.size.or(hr_width).unwrap_or(first.intrinsics.width);
         let aspect = f64::from(first.intrinsics.height) / f64::from(first.intrinsics.width);
@@ -115,7 +110,7 @@ impl Stage for CameraPath {
         context.write_json(VIEWS_FILE, &views)?;
         context.write_summary(&format!(
             "{} of {width}×{height}, {}",
-            artifact::counted(views.views.len(), "frame"),
+            artifact::format_count(views.views.len(), "frame"),
             format!("{kind:?}").to_lowercase()
         ))
     }
@@ -265,8 +260,7 @@ mod tests {
         cameras(&places, |p| p + DVec3::Y)
     }
 
-    const BOX: Bounds =
-        Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, space: Space::Box };
+    const BOX: Bounds = Bounds::cube(1.0, 2.0, 6.0);
 
     fn whole(poses: &[Pose]) -> Vec<Camera> {
         let cameras: Vec<Camera> = poses.iter().map(|&pose| camera("c", pose)).collect();

@@ -20,8 +20,7 @@ mod world;
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
-use stage::Output;
-use stage::{Context, Stage};
+use stage::{Context, Output, Stage};
 
 use camera::ViewCamera;
 use dataset_writer::DatasetWriter;
@@ -82,8 +81,8 @@ impl Stage for DemoScene {
         let [width, height] = splits[0].2.sides;
         context.write_summary(&format!(
             "{}, {}, {width}×{height}",
-            artifact::counted(params.train as usize, "training view"),
-            artifact::counted(params.test as usize, "test view"),
+            artifact::format_count(params.train as usize, "training view"),
+            artifact::format_count(params.test as usize, "test view"),
         ))
     }
 }

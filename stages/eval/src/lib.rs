@@ -28,8 +28,7 @@ use rayon::prelude::*;
 use scene::{Background, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 use derived::{least_gain, near_references};
 use metric::{Metric, mean_of};
@@ -99,9 +98,7 @@ impl Stage for Eval {
         let (views_input, truth_input) = (context.input("views")?, context.input("truth")?);
         let (views, truth) = (Views::read(views_input)?, Views::read(truth_input)?);
         let metrics = metrics(Perceptual::new(context.optional_input("weights"))?);
-        let is_known = truth_input.path(DEGRADATION_FILE).exists();
-        let degradation: Option<Degradation> =
-            if is_known { Some(truth_input.read_json(DEGRADATION_FILE)?) } else { None };
+        let degradation: Option<Degradation> = truth_input.read_optional_json(DEGRADATION_FILE)?;
         let scene =
             ScoredScene { views_input, views: &views, truth_input, truth: &truth, degradation };
         let progress = context.progress("scoring", truth.views.len() as u64);
@@ -129,7 +126,7 @@ impl Stage for Eval {
         context.write_json(METRICS_FILE, &result)?;
         let mut summary: Vec<String> =
             metrics.iter().filter_map(|metric| metric.summary(&result.mean)).collect();
-        summary.push(artifact::counted(result.views.len(), "view"));
+        summary.push(artifact::format_count(result.views.len(), "view"));
         context.write_summary(&summary.join(" · "))
     }
 }

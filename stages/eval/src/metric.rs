@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use metrics::{Figure, Score, Scores};
+use metrics::{Score, ScoreFormat, Scores};
 use pixels::Rgba8;
 
 use crate::scored_view::{ScoredScene, ScoredView};
@@ -11,7 +11,7 @@ pub(crate) trait Metric: Sync {
     /// Returns the key of the metric's convention, which is also the name of its pictures.
     fn name(&self) -> &'static str;
     /// Returns the metric's figures, the most important first.
-    fn figures(&self) -> Vec<Figure>;
+    fn figures(&self) -> Vec<ScoreFormat>;
     /// Describes the definition of the figures.
     fn convention(&self, scene: &ScoredScene<'_>) -> String;
     /// Scores a view; without scores if the view lacks an image that the metric needs. Pixels that

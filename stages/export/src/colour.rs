@@ -24,7 +24,7 @@ pub(crate) fn vertex_colours(
         .map(|vertex| mean_colour(views, mesh, lattice, vertex))
         .collect();
     let unseen: Vec<usize> = (0..observed.len()).filter(|&v| observed[v].is_none()).collect();
-    let background = [field.file.background.shown(); 3];
+    let background = [field.file.background.grey_level(); 3];
     let rays: Vec<Ray> = unseen
         .iter()
         .map(|&vertex| {

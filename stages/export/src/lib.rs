@@ -35,14 +35,13 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write as _};
 
 use anyhow::Context as _;
-use artifact::{Failure, amount, counted};
+use artifact::{Failure, format_amount, format_count};
 use fields::Members;
 use glam::DVec3;
 use scene::{Bounds, Camera, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 use cameras::CameraFormat;
 use coordinates::Coordinates;
@@ -153,7 +152,7 @@ impl Stage for Export {
         let views = Views::read(context.input("cameras")?)?;
         let cameras: Vec<Camera> = views.views.into_iter().map(|view| view.camera).collect();
         for note in lens_notes(&cameras, params) {
-            context.say(note);
+            context.log_line(note);
         }
         let coordinates = Coordinates::new(&field.file.bounds);
         let bounds = field.file.bounds.moved(-coordinates.offset);
@@ -203,10 +202,10 @@ fn summary_text(summary: &ExportSummary) -> String {
     let mut parts = Vec::new();
     for (count, noun) in [(points, "points"), (splats, "splats"), (triangles, "triangles")] {
         if count > 0 {
-            parts.push(format!("{} {noun}", amount(count as u64)));
+            parts.push(format!("{} {noun}", format_amount(count as u64)));
         }
     }
-    parts.push(counted(summary.cameras, "camera"));
+    parts.push(format_count(summary.cameras, "camera"));
     parts.join(", ")
 }
 
@@ -348,7 +347,7 @@ impl ExportJob<'_> {
             return Ok(());
         }
         let ([x, y, z], files) = (offset.offset, offset.files.join(", "));
-        self.context.say(format!(
+        self.context.log_line(format!(
             "the scene is far from the origin: coordinates of {files} lack the offset ({x}, {y}, \
             {z}); add the offset, also in {OFFSET_FILE}, to get the input's coordinates"
         ));

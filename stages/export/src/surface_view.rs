@@ -1,7 +1,8 @@
 use std::ops::Range;
 
+use fields::{pixel_rays, rendering_failure};
 use glam::{DMat3, DVec3, Mat3, Vec3};
-use radiance::{Pixel, Ray, RayField};
+use radiance::{Pixel, RayField};
 use scene::{Background, Camera, Intrinsics};
 use stage::Progress;
 
@@ -109,17 +110,11 @@ impl SurfaceView {
         pixels: Range<usize>,
     ) -> anyhow::Result<()> {
         let width = self.intrinsics.width as usize;
-        let (camera_rays, background) = (camera.rays(), [background.shown(); 3]);
-        let mut rays = Vec::with_capacity(pixels.len());
-        let mut depth_scales = Vec::with_capacity(pixels.len());
-        for i in pixels {
-            let ray = camera_rays.ray((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
-            rays.push(Ray::new(&ray, background));
-            depth_scales.push(camera.depth_per_distance(&ray) as f32);
-        }
-        let rendered = field.render(&rays).map_err(fields::rendering_failure)?;
-        for (pixel, depth_scale) in rendered.iter().zip(depth_scales) {
-            self.pixels.push(surface_pixel(pixel, depth_scale));
+        let positions: Vec<_> = pixels.map(|i| [i % width, i / width]).collect();
+        let (rays, z_per_distance) = pixel_rays(camera, background, &positions, 1);
+        let rendered = field.render(&rays).map_err(rendering_failure)?;
+        for (pixel, z_per_distance) in rendered.iter().zip(z_per_distance) {
+            self.pixels.push(surface_pixel(pixel, z_per_distance));
         }
         Ok(())
     }
@@ -297,12 +292,12 @@ impl SurfaceView {
     }
 }
 
-/// Converts a rendered pixel; `depth_scale` is z-depth per distance along its ray.
-fn surface_pixel(pixel: &Pixel, depth_scale: f32) -> SurfacePixel {
+/// Converts a rendered pixel; `z_per_distance` is z-depth per distance along its ray.
+fn surface_pixel(pixel: &Pixel, z_per_distance: f32) -> SurfacePixel {
     let has_surface = pixel.opacity >= MIN_OPACITY;
     let level = |v: f32| (255.0 * v.clamp(0.0, 1.0) + 0.5) as u8;
     SurfacePixel {
-        depth: if has_surface { pixel.median_depth * depth_scale } else { 0.0 },
+        depth: if has_surface { pixel.median_depth * z_per_distance } else { 0.0 },
         normal: Vec3::ZERO,
         colour: pixel.premultiplied.map(|v| level(v / pixel.opacity.max(MIN_OPACITY))),
         opacity: level(pixel.opacity),

@@ -39,8 +39,7 @@ fn ball_pixel(ray: &Ray) -> Pixel {
     Pixel { colour, premultiplied: colour, opacity: 1.0, depth, median_depth: depth }
 }
 
-const BOX: Bounds =
-    Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, space: Space::Box };
+const BOX: Bounds = Bounds::cube(1.0, 1.0, 9.0);
 
 fn camera_around(i: u32, count: u32, lowest: f64) -> Camera {
     let share = (f64::from(i) + 0.5) / f64::from(count);

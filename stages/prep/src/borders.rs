@@ -2,7 +2,7 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use artifact::{FailureExt as _, WARNING, counted};
+use artifact::{FailureExt as _, WARNING, format_count};
 use dataset::Frame;
 use pixels::Rgba8;
 use rayon::prelude::*;
@@ -163,7 +163,7 @@ impl Borders {
 impl Display for Borders {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let flat = self.flat;
-        let views = counted(self.views, "sampled view");
+        let views = format_count(self.views, "sampled view");
         match self.backdrop {
             Backdrop::Transparent => write!(f, "images have alpha"),
             Backdrop::Flat([r, g, b]) => write!(

@@ -8,8 +8,7 @@ pub(crate) fn extension(kernel: Kernel) -> &'static str {
 }
 
 /// Returns the number of neighbouring LR pixels that must be unmasked, too, for a pixel to count:
-/// beyond them are only a kernel's last lobe and less than a tenth of its weight
-/// (docs/design/005).
+/// beyond them are only a kernel's last lobe and less than a tenth of its weight (docs/design/005).
 pub(crate) fn mask_reach(kernel: Kernel) -> usize {
     match kernel {
         Kernel::Lanczos | Kernel::Bicubic => 1,

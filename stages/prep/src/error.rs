@@ -1,4 +1,4 @@
-use artifact::{Failure, number};
+use artifact::{Failure, format_number};
 use dataset::Frame;
 
 use crate::bounds::SpaceError;
@@ -31,9 +31,12 @@ pub(crate) enum ParameterError {
     Sizes(SizeError),
     #[error(transparent)]
     Space(#[from] SpaceError),
-    #[error("parameter {name}: {} is not a valid distance", number(*value))]
+    #[error("parameter {name}: {} is not a valid distance", format_number(*value))]
     InvalidDistance { name: &'static str, value: f64 },
-    #[error("parameter near: {} is not less than far = {}", number(*near), number(*far))]
+    #[error(
+        "parameter near: {} is not less than far = {}",
+        format_number(*near), format_number(*far)
+    )]
     NearAndFar { near: f64, far: f64 },
 }
 

@@ -1,4 +1,4 @@
-use artifact::{Failure, counted};
+use artifact::{Failure, format_count};
 use dataset::{Dataset, Split};
 use pixels::Kernel;
 use scene::{Camera, Intrinsics};
@@ -89,8 +89,8 @@ impl ImagePlan {
         let Sizes { lr, hr } = self.sizes;
         let kernel = format!("{:?}", self.kernel).to_lowercase();
         let shared = split.train.iter().filter(|i| split.test.contains(i)).count();
-        let train = counted(split.train.len(), "training view");
-        let mut views = format!("{train}, {}", counted(split.test.len(), "test view"));
+        let train = format_count(split.train.len(), "training view");
+        let mut views = format!("{train}, {}", format_count(split.test.len(), "test view"));
         if shared > 0 {
             views += &format!(" ({shared} in both)");
         }

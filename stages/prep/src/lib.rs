@@ -35,12 +35,11 @@ mod writer;
 
 use std::path::Path;
 
-use artifact::{Failure, FailureExt as _, counted, list_source_files, printable};
+use artifact::{Failure, FailureExt as _, format_count, list_source_files, printable};
 use dataset::{Dataset, Frame};
 use scene::Background;
 use serde_json::json;
-use stage::{Context, Stage};
-use stage::{Input, Output, Rule};
+use stage::{Context, Input, Output, Rule, Stage};
 
 use borders::Borders;
 pub use bounds::SpaceKind;
@@ -97,7 +96,7 @@ impl Stage for Prep {
         notes.push(images.note(&split));
         notes.extend(warnings);
         for note in &notes {
-            context.say(note);
+            context.log_line(note);
         }
         let used = split.train.iter().chain(&split.test).map(|&i| &set.frames[i]);
         let threads = memory::thread_pool(context, used, &images)?;
@@ -106,12 +105,12 @@ impl Stage for Prep {
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
         let writer = SceneWriter::new(context, &plan);
         for note in border_notes.into_iter().chain([space_note(&plan.bounds, background)]) {
-            context.say(&note);
+            context.log_line(&note);
             notes.push(note);
         }
         threads.install(|| writer.write())?;
         if let Some(note) = writer.clipping_note() {
-            context.say(&note);
+            context.log_line(&note);
             notes.push(note);
         }
         let summary = SceneSummary::new(&set, &plan, notes);
@@ -157,9 +156,9 @@ fn check_lenses(set: &Dataset) -> Result<(), Failure> {
 fn log_ignored_files(context: &Context, folder: &Path) {
     let Ok((_, ignored)) = list_source_files(folder) else { return };
     if let Some(first) = ignored.first() {
-        context.say(format!(
+        context.log_line(format!(
             "{} ignored: dangling links, editor and system files (first: {})",
-            counted(ignored.len(), "file"),
+            format_count(ignored.len(), "file"),
             printable(&first.display().to_string())
         ));
     }

@@ -1,6 +1,6 @@
 //! Peak memory of preparing images, estimated from their headers before any is decoded.
 
-use artifact::{Failure, FailureExt as _, sized};
+use artifact::{Failure, FailureExt as _, format_size};
 use dataset::Frame;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use stage::{Context, MEMORY_REMEDY, available_memory};
@@ -41,8 +41,8 @@ impl MemoryNeed {
                 "{}: preparing its image of {width}×{height} pixels needs {} of memory, and {} \
                 are free; {MEMORY_REMEDY}",
                 self.frame,
-                sized(self.bytes),
-                sized(free)
+                format_size(self.bytes),
+                format_size(free)
             )));
         }
         Ok(count)
@@ -71,11 +71,11 @@ pub(crate) fn thread_pool<'a>(
     if let (Some(largest), Some(free)) = (largest, available_memory()?) {
         count = largest.max_concurrent(free)?.min(context.threads);
         if count < context.threads {
-            context.say(format!(
+            context.log_line(format!(
                 "using {count} of {} threads: an image needs {} of memory, and {} are free",
                 context.threads,
-                sized(largest.bytes),
-                sized(free)
+                format_size(largest.bytes),
+                format_size(free)
             ));
         }
     }

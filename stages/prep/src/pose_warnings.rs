@@ -1,6 +1,6 @@
 //! Checks of implausible poses (docs/design/030).
 
-use artifact::counted;
+use artifact::format_count;
 use glam::DVec3;
 use scene::{Camera, Intrinsics, length};
 
@@ -134,7 +134,7 @@ fn off_centre(all: &[LabelledCamera]) -> Option<String> {
         "{} of {} have a principal point far from the image centre (first: {first} with \
         ({:.1}, {:.1}) in {}×{} pixels); do cx, cy, w and h refer to the same size?",
         off.len(),
-        counted(all.len(), "view"),
+        format_count(all.len(), "view"),
         k.cx,
         k.cy,
         k.width,

@@ -1,4 +1,4 @@
-use artifact::{WARNING, counted, with_warnings};
+use artifact::{WARNING, format_count, with_warnings};
 use dataset::Dataset;
 use pixels::Kernel;
 use scene::{Background, Bounds, length};
@@ -67,7 +67,8 @@ impl SceneSummary {
         let warnings: Vec<String> =
             self.notes.iter().filter_map(|n| n.strip_prefix(WARNING)).map(str::to_owned).collect();
         let ([lr_width, lr_height], [hr_width, hr_height]) = (self.lr, self.hr);
-        let (train, test) = (counted(self.train, "training view"), counted(self.test, "test view"));
+        let (train, test) =
+            (format_count(self.train, "training view"), format_count(self.test, "test view"));
         let [near, far] = [self.bounds.near, self.bounds.far].map(|end| length(end, 2));
         let kernel = self.kernel;
         let summary = format!(

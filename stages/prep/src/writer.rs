@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context as _;
-use artifact::{FailureExt as _, WARNING, counted, printable};
+use artifact::{FailureExt as _, WARNING, format_count, printable};
 use dataset::{Clipping, Frame};
 use pixels::{
     Channel, DEGRADATION_FILE, DEPTH_CHANNELS, Degradation, DepthMap, Kernel, Mask, Rgba8,
@@ -58,7 +58,7 @@ impl<'a> SceneWriter<'a> {
             sum.clipped,
             sum.pixels,
             100.0 * sum.clipped as f64 / sum.pixels as f64,
-            counted(all.len(), "EXR photograph"),
+            format_count(all.len(), "EXR photograph"),
         ))
     }
 

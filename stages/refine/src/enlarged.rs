@@ -26,7 +26,8 @@ impl<'a> EnlargedPhotographs<'a> {
         let Some(photograph) = view.read_photograph(self.input).bad_input(&name)? else {
             return Ok(image);
         };
-        let Photograph { image: mut other, mask } = photograph.over(self.views.background.shown());
+        let Photograph { image: mut other, mask } =
+            photograph.over(self.views.background.grey_level());
         if (other.width, other.height) != (image.width, image.height) {
             let message = format!(
                 "{name}: {}×{} pixels, but the view to refine has {}×{}",
@@ -75,8 +76,7 @@ mod tests {
             mask: Some("mask.png".to_owned()),
             ..without("masked")
         };
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let views = Views::new(Background::White, bounds, vec![whole, masked, without("empty")]);
         write_json(&folder.path().join(VIEWS_FILE), &views).unwrap();
         folder

@@ -27,8 +27,7 @@ use refinement::{KnownView, LrObservations, REFINER_FILE, RefinerFile, Use};
 use scene::{VIEWS_FILE, Views, image_file, preview_file};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 use enlarged::EnlargedPhotographs;
 use network::{AnyRefiner, Application};
@@ -117,7 +116,7 @@ impl Stage for Refine {
         let job = RefineJob {
             context,
             input,
-            background: views.background.shown(),
+            background: views.background.grey_level(),
             network: AnyRefiner::read(refiner, &file)?,
             application: Application::new(params, &file),
             photographs: context
@@ -188,7 +187,7 @@ fn refine_all(
         progress.add(1);
     }
     if job.expects_consistent && summary.consistent < summary.views {
-        job.context.say(
+        job.context.log_line(
             "the network was trained on views consistent with LR photographs of their own, but \
             some of these views have none; train a network without input photographs",
         );
@@ -204,7 +203,7 @@ fn report_invisible_references(job: &RefineJob<'_>, references: &[KnownView], us
     for (i, reference) in references.iter().enumerate() {
         if uses[i].seen == 0 {
             let name = &reference.rendered.camera.name;
-            job.context.say(format!("reference {name} shows no part of these views"));
+            job.context.log_line(format!("reference {name} shows no part of these views"));
         }
     }
 }

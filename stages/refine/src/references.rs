@@ -16,7 +16,7 @@ pub(crate) fn read_references(
     let given = context.optional_input("references").zip(context.optional_input("reference-views"));
     let Some((images, rendered)) = given else {
         if takes_references {
-            context.say(
+            context.log_line(
                 "the network can use references, but none are given; give inputs references and \
                 reference-views",
             );
@@ -24,7 +24,7 @@ pub(crate) fn read_references(
         return Ok(Vec::new());
     };
     if !takes_references {
-        context.say(
+        context.log_line(
             "references are ignored: the network was trained without references; set \
             train-refine.references_per_view",
         );
@@ -46,12 +46,12 @@ pub(crate) fn read_references(
             );
             return Err(Failure::BadInput(message).into());
         };
-        let view = read_view(rendered, view, background.shown())?.0;
-        let known = KnownView::new(view, truth.over(background.shown()))
+        let view = read_view(rendered, view, background.grey_level())?.0;
+        let known = KnownView::new(view, truth.over(background.grey_level()))
             .bad_input("input reference-views")?;
         let (reference, note) = correct_exposure(known);
         if let Some(note) = note {
-            context.say(note);
+            context.log_line(note);
         }
         references.push(reference);
     }
@@ -103,7 +103,7 @@ pub(crate) fn remove_misleading(
         views: &views.views,
         guidance,
         read: &|view| Ok(job.read(view)?.rendered),
-        log: &|note| job.context.say(note),
+        log: &|note| job.context.log_line(note),
     }
     .retain_reliable(references, confidence)
 }

@@ -1,4 +1,4 @@
-use artifact::counted;
+use artifact::format_count;
 use refinement::Use;
 
 /// Statistics of a run for its summary.
@@ -22,7 +22,7 @@ impl Summary {
     pub(crate) fn text(&self) -> String {
         let mut text = format!(
             "{}{}, residual weight {:.2}",
-            counted(self.views, "view"),
+            format_count(self.views, "view"),
             self.references(),
             self.residual_weight
         );
@@ -40,7 +40,7 @@ impl Summary {
         if self.uses.is_empty() {
             return String::new();
         }
-        let references = counted(self.uses.len(), "reference");
+        let references = format_count(self.uses.len(), "reference");
         if !self.is_reference_based {
             return format!(" by {references}");
         }

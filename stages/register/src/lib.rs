@@ -5,15 +5,14 @@
 //! views, and a camera that is off by a pixel costs more decibels than any error of the field
 //! (design note 025). LR photographs are preferred, because views are scored against the HR ones.
 
-use artifact::{FailureExt as _, GivenInput, WARNING, counted, with_warnings};
+use artifact::{FailureExt as _, GivenInput, WARNING, format_count, with_warnings};
 use pixels::{Image, PixelError};
 use poses::{CameraMotion, MeanMotion, Options, Pyramid, refine};
 use radiance::{RayField, RenderError};
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 /// Parameters of `register`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -59,7 +58,7 @@ impl Stage for Register {
         let members = fields::Members::read(context.input("field")?, &context.device)?;
         let input = context.input("photographs")?;
         let given = Views::read(input)?;
-        let background = members.file.background.shown();
+        let background = members.file.background.grey_level();
         let progress = context.progress("locating", given.views.len() as u64);
         let mut registered = Vec::with_capacity(given.views.len());
         for view in &given.views {
@@ -77,7 +76,7 @@ impl Stage for Register {
         }
         let (summary, warning) = summary(&registered);
         if let Some(warning) = &warning {
-            context.say(format!("{WARNING}{warning}"));
+            context.log_line(format!("{WARNING}{warning}"));
         }
         let views = registered.into_iter().map(|view| View::camera_only(view.to)).collect();
         context.write_json(VIEWS_FILE, &Views::new(given.background, given.bounds, views))?;
@@ -154,7 +153,7 @@ fn summary(registered: &[Registered]) -> (String, Option<String>) {
     let summary = format!(
         "{} of {} registered: {moved}; error (Huber) {before:.4} before, {after:.4} after",
         errors.len(),
-        counted(registered.len(), "camera")
+        format_count(registered.len(), "camera")
     );
     let warning = format!(
         "cameras have {moved}; unless the given poses are that far off, the field and the \

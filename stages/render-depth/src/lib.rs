@@ -12,18 +12,17 @@
 use std::ops::Range;
 
 use anyhow::Context as _;
-use artifact::{amount, counted};
-use fields::{Members, lower_median, mean};
+use artifact::{format_amount, format_count};
+use fields::{Members, lower_median, mean, pixel_rays};
 use pixels::{PngRows, to_u8};
-use radiance::{Ray, RayField};
+use radiance::RayField;
 use scene::{
     Background, Camera, VIEW_CHANNELS, VIEWS_FILE, View, Views, image_file, preview_file,
     write_view_image,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 /// Parameters of `render-depth`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -125,7 +124,8 @@ impl Stage for RenderDepth {
                 ..View::camera_only(camera)
             });
         }
-        let summary = format!("{}, {} pixels", counted(views.len(), "view"), amount(pixels));
+        let summary =
+            format!("{}, {} pixels", format_count(views.len(), "view"), format_amount(pixels));
         context.write_json(VIEWS_FILE, &Views::new(file.background, cameras.bounds, views))?;
         context.write_summary(&summary)
     }
@@ -208,19 +208,7 @@ impl RenderJob<'_> {
 
     /// Renders the pixels at `[x, y]` with n × n rays each.
     fn cast(&self, positions: &[[usize; 2]], n: usize) -> anyhow::Result<Vec<ViewPixel>> {
-        let background = [self.background.shown(); 3];
-        let camera_rays = self.camera.rays();
-        let mut rays = Vec::with_capacity(positions.len() * n * n);
-        let mut z_per_distance = Vec::with_capacity(rays.capacity());
-        for [x, y] in positions {
-            for sub in 0..n * n {
-                let u = *x as f64 + ((sub % n) as f64 + 0.5) / n as f64;
-                let v = *y as f64 + ((sub / n) as f64 + 0.5) / n as f64;
-                let ray = camera_rays.ray(u, v);
-                rays.push(Ray::new(&ray, background));
-                z_per_distance.push(self.camera.depth_per_distance(&ray) as f32);
-            }
-        }
+        let (rays, z_per_distance) = pixel_rays(self.camera, self.background, positions, n);
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
         let rendered = rendered.map_err(fields::rendering_failure)?;
         let (mut pixels, mut samples) = (Vec::with_capacity(positions.len()), Vec::new());
@@ -311,6 +299,7 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
+    use radiance::Ray;
     use scene::Intrinsics;
 
     use super::*;
@@ -355,17 +344,11 @@ mod tests {
 
     /// Renders a picture in bands of some rows; returns red of each pixel and the number of rays.
     fn red(colour: fn(f64, f64) -> f64, tolerance: f64, band: usize) -> (Vec<f32>, usize) {
-        let camera = camera();
+        let (camera, params) = (&camera(), &Params { tolerance, ..Params::default() });
         let count = Arc::new(AtomicUsize::new(0));
-        let members: Vec<Box<dyn RayField>> =
-            vec![Box::new(Picture { colour, rays: Arc::clone(&count) })];
-        let params = Params { tolerance, ..Params::default() };
-        let job = RenderJob {
-            params: &params,
-            members: &members,
-            background: Background::White,
-            camera: &camera,
-        };
+        let members: &[Box<dyn RayField>] =
+            &[Box::new(Picture { colour, rays: Arc::clone(&count) })];
+        let job = RenderJob { params, members, background: Background::White, camera };
         let mut centres = CentreRows::default();
         let bands = (0..SIZE).step_by(band).map(|first| first..(first + band).min(SIZE));
         let shown: Vec<ViewPixel> =
@@ -429,7 +412,7 @@ mod tests {
     /// is the mean.
     #[test]
     fn a_pixel_has_the_depth_of_one_ray_of_one_member() {
-        let camera = camera();
+        let camera = &camera();
         // The four rays of the pixel pass the plane z = -1 in these distances from the camera.
         let [x, y] = [[2.25f32, 2.75], [0.25, 0.75]];
         let away = |i: usize, j: usize| (1.0 + x[i] * x[i] + y[j] * y[j]).sqrt();
@@ -443,13 +426,8 @@ mod tests {
             let members: Vec<Box<dyn RayField>> =
                 walls.iter().map(|wall| Box::new(Wall(*wall)) as Box<dyn RayField>).collect();
             for (depth, times) in [(Depth::Median, 1.0), (Depth::Expected, 2.0)] {
-                let params = Params { depth, ..Params::default() };
-                let job = RenderJob {
-                    params: &params,
-                    members: &members,
-                    background: Background::White,
-                    camera: &camera,
-                };
+                let (params, members) = (&Params { depth, ..Params::default() }, &members[..]);
+                let job = RenderJob { params, members, background: Background::White, camera };
                 let shown = job.cast(&[[14, 12]], 2).unwrap()[0].channels;
                 let expected = [opacity, times * wall, times * distance];
                 let is_near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-4;

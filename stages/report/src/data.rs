@@ -1,6 +1,7 @@
 use std::collections::BTreeMap;
 
 use artifact::RunNode;
+use radiance::{TRAINING_FILE, TrainingLog};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -266,11 +267,9 @@ fn curves(nodes: &[RunNode]) -> Vec<Curve> {
 }
 
 fn curve(node: &RunNode) -> Option<Curve> {
-    let text = std::fs::read_to_string(node.folder.join("training.json")).ok()?;
-    let log: Value = serde_json::from_str(&text).ok()?;
-    let points = log["curve"].as_array()?.iter();
-    let points: Vec<[f64; 2]> =
-        points.filter_map(|p| Some([p["rays"].as_f64()?, p["psnr"].as_f64()?])).collect();
+    let bytes = std::fs::read(node.folder.join(TRAINING_FILE)).ok()?;
+    let log: TrainingLog = serde_json::from_slice(&bytes).ok()?;
+    let points: Vec<[f64; 2]> = log.curve.iter().map(|p| [p.rays as f64, p.psnr]).collect();
     let label = artifact::label(&node.stage, &node.point);
     (points.len() > 1).then_some(Curve { label, points })
 }

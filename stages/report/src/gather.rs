@@ -1,5 +1,5 @@
 use artifact::{RunNode, RunRecord};
-use metrics::{AnyMetrics, Figure};
+use metrics::{AnyMetrics, ScoreFormat};
 use serde_json::Value;
 
 use crate::results::scored_nodes;
@@ -12,7 +12,7 @@ pub(crate) struct Report<'a> {
     /// Data sets that have results, in the rows' order.
     pub(crate) scenes: Vec<SceneViews>,
     /// Figures of the results.
-    pub(crate) figures: Vec<Figure>,
+    pub(crate) figures: Vec<ScoreFormat>,
     /// Reasons why results can't be read.
     pub(crate) unread: Vec<String>,
 }
@@ -44,7 +44,7 @@ pub(crate) struct Row<'a> {
 
 impl Row<'_> {
     /// Returns the mean of a figure over the views.
-    pub(crate) fn mean(&self, figure: &Figure) -> Option<f64> {
+    pub(crate) fn mean(&self, figure: &ScoreFormat) -> Option<f64> {
         figure.value_in(self.metrics.mean())
     }
 
@@ -134,13 +134,13 @@ impl<'a> Report<'a> {
 }
 
 /// True if some row has a figure.
-pub(crate) fn is_known(figure: &Figure, rows: &[Row<'_>]) -> bool {
+pub(crate) fn is_known(figure: &ScoreFormat, rows: &[Row<'_>]) -> bool {
     rows.iter().any(|row| row.mean(figure).is_some())
 }
 
 /// True if a row has the best value of a figure among the rows of its data set; false if the data
 /// set has only this row.
-pub(crate) fn is_best(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> bool {
+pub(crate) fn is_best(figure: &ScoreFormat, row: &Row<'_>, rows: &[Row<'_>]) -> bool {
     let rivals: Vec<&Row<'_>> = rows.iter().filter(|other| other.scene == row.scene).collect();
     let values = rivals.iter().filter_map(|row| row.mean(figure));
     let best = match figure.higher_is_better {
@@ -154,8 +154,8 @@ pub(crate) fn is_best(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> bool 
 
 /// Returns the figures that rows have, or would have with more inputs, as their metrics declare
 /// them; of metrics without declarations, the numbers among their means.
-fn figures(rows: &[Row<'_>]) -> Vec<Figure> {
-    let mut figures: Vec<Figure> = Vec::new();
+fn figures(rows: &[Row<'_>]) -> Vec<ScoreFormat> {
+    let mut figures: Vec<ScoreFormat> = Vec::new();
     for row in rows {
         let declared = row.metrics.figures();
         for figure in declared.unwrap_or_else(|| numbers(row.metrics.mean())) {
@@ -169,10 +169,10 @@ fn figures(rows: &[Row<'_>]) -> Vec<Figure> {
 }
 
 /// Returns a figure for each number of an object.
-fn numbers(mean: &Value) -> Vec<Figure> {
+fn numbers(mean: &Value) -> Vec<ScoreFormat> {
     let entries = mean.as_object().into_iter().flatten().filter(|(_, value)| value.is_number());
     entries
-        .map(|(name, _)| Figure {
+        .map(|(name, _)| ScoreFormat {
             path: name.clone(),
             label: name.clone(),
             digits: 4,

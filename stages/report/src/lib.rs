@@ -35,9 +35,8 @@ mod scale;
 mod tables;
 mod viewer;
 
-use artifact::{Failure, RunRecord, counted, sized};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use artifact::{Failure, RunRecord, format_count, format_size};
+use stage::{Context, Input, Output, Stage};
 
 pub use data::Params;
 pub use results::{ResultRow, StageResult};
@@ -45,8 +44,7 @@ pub use results::{ResultRow, StageResult};
 /// The stage.
 pub struct Report;
 
-/// Maximum size of a page in bytes, unless the text of a very long run is larger
-/// (docs/design/041).
+/// Maximum size of a page in bytes, unless the text of a very long run is larger (docs/design/041).
 const MAX_PAGE_BYTES: usize = 15_000_000;
 /// Bytes reserved for labels and file names of the pictures; chosen by hand.
 const CAPTION_BYTES: usize = 700_000;
@@ -83,9 +81,9 @@ impl Stage for Report {
         let html = page::page(&report, Some(&data))?.into_string();
         std::fs::write(context.output_path("index.html")?, &html)?;
         context.write_json("results.json", &results::results(&run))?;
-        let results = counted(report.rows.len(), "result");
-        let pictures = counted(data.pictures.len(), "picture");
-        let size = sized(html.len() as u64);
+        let results = format_count(report.rows.len(), "result");
+        let pictures = format_count(data.pictures.len(), "picture");
+        let size = format_size(html.len() as u64);
         context.write_summary(&format!("{results}, {pictures}, {size}"))
     }
 }

@@ -1,4 +1,4 @@
-use artifact::{RunRecord, counted, format_utc};
+use artifact::{RunRecord, format_count, format_utc};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use crate::commands::{commands, file_name};
@@ -118,7 +118,10 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
                 }
                 div {
                     dt { "Shows" }
-                    dd { (counted(report.rows.len(), "result")) " · " (counted(views, "view")) }
+                    dd {
+                        (format_count(report.rows.len(), "result")) " · "
+                        (format_count(views, "view"))
+                    }
                 }
             }
             nav aria-label="Sections" {

@@ -2,7 +2,8 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use artifact::{
-    RunInput, RunNode, RunRecord, UnfinishedNode, counted, format_duration, format_utc, sized,
+    RunInput, RunNode, RunRecord, UnfinishedNode, format_count, format_duration, format_size,
+    format_utc,
 };
 use maud::{Markup, html};
 use serde_json::Value;
@@ -185,7 +186,7 @@ impl Block<'_> {
         }
         let time = format_duration(self.done.iter().map(|node| node.seconds).sum());
         let memory = self.done.iter().filter_map(|node| node.peak_memory).max();
-        memory.map_or(time.clone(), |bytes| format!("{time} · {}", sized(bytes)))
+        memory.map_or(time.clone(), |bytes| format!("{time} · {}", format_size(bytes)))
     }
 
     /// Returns state and hash as text; for several points, their number in each state.
@@ -250,7 +251,7 @@ fn node_details(run: &RunRecord, node: &RunNode) -> Markup {
         ("Time", format_duration(node.seconds)),
     ];
     facts.extend(node.processor_seconds.map(|time| ("Processor time", format_duration(time))));
-    facts.extend(node.peak_memory.map(|bytes| ("Peak memory", sized(bytes))));
+    facts.extend(node.peak_memory.map(|bytes| ("Peak memory", format_size(bytes))));
     facts.push(("Threads", node.threads.to_string()));
     if !node.host.is_empty() {
         facts.push(("Machine", node.host.clone()));
@@ -296,7 +297,7 @@ fn parameters(given: &Values, resolved: &Values) -> Markup {
     html! {
         @if !given.is_empty() {
             table class="parameters" {
-                caption { (counted(given.len(), "parameter")) }
+                caption { (format_count(given.len(), "parameter")) }
                 tbody {
                     @for (name, value) in given {
                         tr {

@@ -1,6 +1,6 @@
 use artifact::format_duration;
 use maud::{Markup, html};
-use metrics::Figure;
+use metrics::ScoreFormat;
 
 use crate::gather::{Report, Row, is_best, is_known};
 
@@ -45,7 +45,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
     if rows.is_empty() {
         return html! {};
     }
-    let known: Vec<&Figure> = report.figures.iter().filter(|f| is_known(f, rows)).collect();
+    let known: Vec<&ScoreFormat> = report.figures.iter().filter(|f| is_known(f, rows)).collect();
     let with_data_sets = report.scenes.len() > 1;
     html! {
         section id="scores" aria-labelledby="scores-heading" {
@@ -86,7 +86,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
 }
 
 /// Cell of the table of means.
-fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
+fn mean(figure: &ScoreFormat, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
     let Some(value) = row.mean(figure) else {
         // Without HR truth, weights of LPIPS wouldn't help.
         let has_truth = row.metrics.has_hr_truth();
@@ -125,7 +125,7 @@ fn missing(report: &Report<'_>) -> Markup {
 
 /// Table of every view's figures, which needs neither pointer nor script.
 pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
-    let known: Vec<&Figure> =
+    let known: Vec<&ScoreFormat> =
         report.figures.iter().filter(|figure| is_known(figure, &report.rows)).collect();
     let views: usize = report.rows.iter().map(Row::view_count).sum();
     if views == 0 || views * known.len() > MAX_CELLS {

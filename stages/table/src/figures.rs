@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use metrics::{AnyMetrics, Figure};
+use metrics::{AnyMetrics, ScoreFormat};
 
 /// Figures by their names in rows: paths with `.` between keys.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Figures(BTreeMap<String, Figure>);
+pub(crate) struct Figures(BTreeMap<String, ScoreFormat>);
 
 /// Values that the table adds to those of metrics: name, title, digits, and true if higher values
 /// are better.

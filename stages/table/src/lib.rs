@@ -18,8 +18,7 @@ mod values;
 
 use anyhow::Context as _;
 use artifact::{Failure, RunRecord};
-use stage::{Context, Stage};
-use stage::{Input, Output, plain};
+use stage::{Context, Input, Output, Stage, plain};
 
 use figures::Figures;
 pub use params::{Gain, Group, Params};

@@ -4,6 +4,8 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{RunNode, RunRecord};
 use metrics::AnyMetrics;
+use radiance::{TRAINING_FILE, TrainingLog};
+use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use crate::figures::Figures;
@@ -91,7 +93,7 @@ fn seconds_per_view(row: &Row) -> Option<(String, Value)> {
 fn scores(node: &RunNode, figures: &mut Figures) -> anyhow::Result<Row> {
     let mut found = Row::new();
     if node.kind == "refiner" {
-        let file = read(&node.folder.join("refiner.json"))?;
+        let file: Value = read(&node.folder.join("refiner.json"))?;
         numbers("", &file, &mut found);
         let scores = (file["refined_psnr"].as_f64(), file["rendered_psnr"].as_f64());
         if let (Some(refined), Some(rendered)) = scores {
@@ -131,7 +133,7 @@ fn numbers(name: &str, value: &Value, found: &mut Row) {
     }
 }
 
-fn read(path: &Path) -> anyhow::Result<Value> {
+fn read<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
     let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
     serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
 }
@@ -164,14 +166,12 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     // The first field of the run is the one that the views show; a refiner's field is later.
     let field = trained.iter().map(|&i| &run.nodes[i]).find(|node| node.kind == "field");
     if let Some(field) = field {
-        let path = field.folder.join("training.json");
+        let path = field.folder.join(TRAINING_FILE);
         if path.exists() {
-            let log = read(&path)?;
-            row.insert("samples_per_ray".to_owned(), log["samples_per_ray"].clone());
-            row.insert(
-                "rays_per_s".to_owned(),
-                json!(log["rays"].as_f64().unwrap_or(0.0) / field.seconds.max(1e-9)),
-            );
+            let log: TrainingLog = read(&path)?;
+            row.insert("samples_per_ray".to_owned(), json!(log.samples_per_ray));
+            let rays_per_second = log.rays as f64 / field.seconds.max(1e-9);
+            row.insert("rays_per_s".to_owned(), json!(rays_per_second));
         }
     }
     Ok(row)

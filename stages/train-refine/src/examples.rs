@@ -40,7 +40,7 @@ impl Examples {
         photographs: Option<&LrObservations<'_>>,
     ) -> Result<Self, Failure> {
         let true_views = Views::read(truth)?;
-        let background = true_views.background.shown();
+        let background = true_views.background.grey_level();
         let sources = Sources { views, truth, photographs, background };
         let mut all = Vec::new();
         for view in &Views::read(views)?.views {
@@ -96,7 +96,7 @@ pub(crate) fn lr_photographs(context: &Context) -> Result<Option<LrObservations<
     if !photographs.cover(&Views::read(cameras)?) {
         return Ok(None);
     }
-    context.say(
+    context.log_line(
         "all views to be refined have LR photographs of their own: the network is trained on views \
         consistent with theirs",
     );
@@ -109,7 +109,7 @@ mod tests {
 
     use pixels::{Image, write_png};
     use scene::{
-        Background, Bounds, Camera, Intrinsics, Space, VIEW_CHANNELS, VIEWS_FILE, write_view_image,
+        Background, Bounds, Camera, Intrinsics, VIEW_CHANNELS, VIEWS_FILE, write_view_image,
     };
 
     use super::*;
@@ -140,8 +140,7 @@ mod tests {
                 write_png(&path, &grey.to_rgba8()).unwrap();
             }
         }
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.1, far: 9.0, space: Space::default() };
+        let bounds = Bounds::cube(1.0, 0.1, 9.0);
         let list = Views::new(Background::White, bounds, views);
         artifact::write_json(&folder.join(VIEWS_FILE), &list).unwrap();
         GivenInput::open(name, &folder).unwrap()

@@ -22,8 +22,7 @@ mod params;
 mod steps;
 
 use refinement::RefinerFile;
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 pub use params::{CompactParams, Net, PaperParams, Params};
 
@@ -93,6 +92,6 @@ fn report_gain(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Re
         "{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight \
         {residual_weight:.2})"
     );
-    context.say(&summary);
+    context.log_line(&summary);
     context.write_summary(&summary)
 }

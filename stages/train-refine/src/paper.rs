@@ -30,7 +30,7 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     };
     options.check(&known).bad_input("input truth")?;
     let perceptual = context.optional_input("weights").map(read_perceptual_loss).transpose()?;
-    context.say(match &perceptual {
+    context.log_line(match &perceptual {
         Some(loss) => {
             format!("loss: L1 and perceptual, by {} of VGG-19's 5 blocks", loss.blocks())
         }

@@ -1,17 +1,14 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use anyhow::Context as _;
 use artifact::Failure;
 use refinement::{KnownView, RefinementError, Training};
-use stage::Context;
+use stage::{CheckpointSchedule, Context};
 
 /// Steps between two progress reports; chosen by hand.
 const STEPS_PER_REPORT: u64 = 50;
 /// Maximum time between two progress reports; chosen by hand.
 const MAX_REPORT_INTERVAL: Duration = Duration::from_secs(10);
-/// Minimum ratio of the time between two checkpoints to the time that one takes; chosen by hand.
-const MIN_CHECKPOINT_INTERVAL_RATIO: u32 = 50;
 
 /// Trains to the end, from the checkpoint of an earlier run if there is one. `format_error` formats
 /// a mean error for the progress bar.
@@ -24,7 +21,7 @@ pub(crate) fn train(
 ) -> anyhow::Result<()> {
     let checkpoint = context.work().map(|work| work.join("checkpoint.safetensors"));
     if let Some(path) = checkpoint.as_deref().filter(|p| p.exists()) {
-        context.say(resume(trainer, path));
+        context.log_line(resume(trainer, path));
     }
     let progress = context.progress("training", steps);
     take_steps(
@@ -53,22 +50,13 @@ fn take_steps(
     interrupted: impl Fn() -> bool,
     report: impl Fn(u64, f64),
 ) -> anyhow::Result<()> {
-    let mut last_checkpoint = Instant::now();
-    let mut checkpoint_time = Duration::from_millis(20);
+    let mut schedule = CheckpointSchedule::default();
     let mut last_report = Instant::now();
     let (mut loss_sum, mut loss_count) = (0.0, 0u64);
     loop {
-        let is_interrupted = interrupted();
-        let is_due = last_checkpoint.elapsed() > MIN_CHECKPOINT_INTERVAL_RATIO * checkpoint_time;
-        if let Some(path) = checkpoint.filter(|_| is_interrupted || is_due) {
-            let started = Instant::now();
-            write_checkpoint(trainer, path).context("cannot write the checkpoint")?;
-            last_checkpoint = Instant::now();
-            checkpoint_time = started.elapsed();
-        }
-        if is_interrupted {
-            return Err(Failure::Interrupted.into());
-        }
+        schedule.write_if_due(interrupted(), || {
+            checkpoint.map_or(Ok(()), |path| write_checkpoint(trainer, path))
+        })?;
         let loss = trainer.step(examples).map_err(|error| match error {
             RefinementError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
             error => anyhow::Error::from(error),

@@ -229,8 +229,7 @@ fn rays(count: usize) -> Vec<Ray> {
 
 /// Measures one core in a field of low density, where every sample gets a colour.
 fn passes(rows: &mut Rows) {
-    let bounds =
-        Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, ..Default::default() };
+    let bounds = Bounds::cube(1.0, 1.0, 9.0);
     let default = Architecture::default();
     let variants = [
         ("", Architecture { n_levels: 8, log2_hashmap_size: 17, hidden_dim: 32, ..default }),

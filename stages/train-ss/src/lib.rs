@@ -17,13 +17,13 @@ mod supersample;
 mod supervision;
 mod training;
 
-use artifact::{Failure, WARNING, amount, with_warnings};
+use artifact::{Failure, WARNING, format_amount, with_warnings};
+use fields::{FIELD_FILE, FIELD_FORMAT, FieldFile};
 use pixels::DEGRADATION_FILE;
-use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile};
+use radiance::{TRAINING_FILE, TrainingLog};
 use scene::Views;
 use serde_json::json;
-use stage::{Context, Stage};
-use stage::{Input, Output, Rule};
+use stage::{Context, Input, Output, Rule, Stage};
 
 pub use params::{
     Combine, FieldParams, GridParams, MlpParams, Order, Params, ParamsError, RateSchedule,
@@ -31,8 +31,7 @@ pub use params::{
 };
 use supervision::transparent_background;
 pub use supervision::{Supersampling, supervision};
-pub use training::{CurvePoint, TrainingLog};
-use training::{InitField, Member, TRAINING_FILE, TrainingData, train_with_best_poses};
+use training::{InitField, Member, TrainingData, train_with_best_poses};
 
 /// Stage `train-ss`.
 pub struct TrainSs;
@@ -143,7 +142,7 @@ impl Stage for TrainSs {
                 member.run(&data)?
             };
             for warning in &trained.warnings {
-                context.say(format!("{WARNING}{warning}"));
+                context.log_line(format!("{WARNING}{warning}"));
             }
             rays += trained.rays;
             log.append(trained);
@@ -158,7 +157,7 @@ fn publish(context: &Context, file: &FieldFile, log: &TrainingLog) -> anyhow::Re
     context.write_json(FIELD_FILE, file)?;
     context.write_json(TRAINING_FILE, log)?;
     let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
-    let (rays, steps, samples) = (amount(log.rays), log.steps, log.samples_per_ray);
+    let (rays, steps, samples) = (format_amount(log.rays), log.steps, log.samples_per_ray);
     let summary = format!(
         "{rays} rays in {steps} steps, {samples:.1} samples per ray, training PSNR {psnr:.2} dB"
     );

@@ -31,8 +31,7 @@ use scene::{
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
-use stage::{Context, Stage};
-use stage::{Input, Output, Rule};
+use stage::{Context, Input, Output, Rule, Stage};
 use tch::no_grad;
 
 use network::Network;
@@ -136,7 +135,7 @@ impl Stage for Upsample {
                         .bad_input(name.clone())?
                         .with_context(|| format!("{name} has no image"));
                     let Photograph { image: lr, mask } =
-                        photograph.bad_input("input views")?.over(views.background.shown());
+                        photograph.bad_input("input views")?.over(views.background.grey_level());
                     let hr = enlarge(network.as_deref(), &lr, camera).context(name)?;
                     let mask = mask.map(|mask| mask.resized((hr.width, hr.height), 0));
                     write_view(context, &camera.name, &hr, mask)?;
@@ -153,7 +152,10 @@ impl Stage for Upsample {
         let hr = Views::new(views.background, views.bounds, hr.collect());
         context.write_json(VIEWS_FILE, &hr)?;
         let name = format!("{:?}", params.method).to_lowercase();
-        context.write_summary(&format!("{}, by {name}", artifact::counted(hr.views.len(), "view")))
+        context.write_summary(&format!(
+            "{}, by {name}",
+            artifact::format_count(hr.views.len(), "view")
+        ))
     }
 }
 

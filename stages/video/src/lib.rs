@@ -15,8 +15,7 @@ use rayon::prelude::*;
 use scene::{View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 /// Parameters of `video`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -166,7 +165,7 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
             let message = String::from_utf8_lossy(&output.stderr);
-            context.say(format!(
+            context.log_line(format!(
                 "no video.mp4: ffmpeg failed: {}; only frames are written",
                 message.lines().next().unwrap_or("no message")
             ));
@@ -177,7 +176,7 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
             Ok(())
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-            context.say("no video.mp4: ffmpeg isn't installed; only frames are written");
+            context.log_line("no video.mp4: ffmpeg isn't installed; only frames are written");
             Ok(())
         }
         Err(e) => Err(e).with_context(|| format!("cannot run ffmpeg for {folder}")),

@@ -379,7 +379,7 @@ pub(crate) mod tests {
     }
 
     pub(crate) fn bounds() -> Bounds {
-        Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() }
+        Bounds::cube(1.0, 0.0, 9.0)
     }
 
     fn camera((x, y): (f64, f64)) -> Camera {

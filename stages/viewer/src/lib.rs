@@ -28,13 +28,13 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput, RunNode, RunRecord, sink_folders};
 use base64::Engine as _;
+use fields::{FieldFile, FieldModel};
 use pixels::{Filter, Rgba8, encode_png, resize_pillow};
-use radiance::{Field, FieldFile, FieldModel};
+use radiance::Field;
 use scene::{Bounds, Camera, Intrinsics, Space, Views, undistort_image};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Stage};
-use stage::{Input, Output};
+use stage::{Context, Input, Output, Stage};
 
 use crate::atlas::Atlas;
 use crate::bake::{Baker, Shape, Volume};
@@ -127,7 +127,7 @@ fn write_page(
         resolution,
         bricks: atlas.bricks,
         components: atlas.components.for_shader(),
-        background: file.background.shown(),
+        background: file.background.grey_level(),
         // Only the box's faces limit rays: a viewer may be nearer or farther than the cameras were.
         bounds: Bounds { near: 0.0, far: 1e30, ..file.bounds },
         centre: centre.to_array(),

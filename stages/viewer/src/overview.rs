@@ -108,8 +108,7 @@ mod tests {
 
     #[test]
     fn the_middle_is_that_of_most_voxels() {
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 0.0, 9.0);
         let voxel = |position| Voxel {
             position,
             opacity: 1.0,

@@ -144,8 +144,7 @@ mod tests {
             let [.., z] = bricks.position(voxel);
             opacity[voxel] = if z == 10 || z == 20 { 1.0 } else { 0.0 };
         }
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 0.0, 9.0);
         let cameras = [camera_at(4.0), camera_at(-4.0)];
         let look = || visible_from(&bricks, &opacity, (&cameras, &bounds), &Progress::silent());
         let seen = look();

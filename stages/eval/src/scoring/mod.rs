@@ -13,7 +13,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::FailureExt as _;
-use metrics::{Figure, Score, Scores};
+use metrics::{Score, ScoreFormat, Scores};
 use pixels::{DEPTH_CHANNELS, ExrImage, Image, psnr_of, read_exr};
 use scene::length;
 
@@ -62,8 +62,8 @@ impl Metric for PsnrMetric {
         "psnr"
     }
 
-    fn figures(&self) -> Vec<Figure> {
-        vec![Figure::new("psnr", "PSNR ↑ dB", 2, true)]
+    fn figures(&self) -> Vec<ScoreFormat> {
+        vec![ScoreFormat::new("psnr", "PSNR ↑ dB", 2, true)]
     }
 
     fn convention(&self, scene: &ScoredScene<'_>) -> String {
@@ -94,10 +94,10 @@ impl Metric for SsimMetric {
         "ssim"
     }
 
-    fn figures(&self) -> Vec<Figure> {
+    fn figures(&self) -> Vec<ScoreFormat> {
         vec![
-            Figure::new("ssim", "SSIM ↑", 4, true),
-            Figure::new("ssim_valid", "SSIM ↑ whole windows", 4, true),
+            ScoreFormat::new("ssim", "SSIM ↑", 4, true),
+            ScoreFormat::new("ssim_valid", "SSIM ↑ whole windows", 4, true),
         ]
     }
 
@@ -129,10 +129,10 @@ impl Metric for LowResolutionMetric {
         "low_resolution"
     }
 
-    fn figures(&self) -> Vec<Figure> {
+    fn figures(&self) -> Vec<ScoreFormat> {
         vec![
-            Figure::new("low_resolution/psnr", "PSNR at LR ↑ dB", 2, true),
-            Figure::new("low_resolution/ssim", "SSIM at LR ↑", 4, true),
+            ScoreFormat::new("low_resolution/psnr", "PSNR at LR ↑ dB", 2, true),
+            ScoreFormat::new("low_resolution/ssim", "SSIM at LR ↑", 4, true),
         ]
     }
 
@@ -172,10 +172,10 @@ impl Metric for WarpMetric {
         "warp"
     }
 
-    fn figures(&self) -> Vec<Figure> {
+    fn figures(&self) -> Vec<ScoreFormat> {
         vec![
-            Figure::new("warp/psnr", "PSNR of neighbours by depth ↑ dB", 2, true),
-            Figure::new("warp/seen", "share that neighbours see ↑", 4, true),
+            ScoreFormat::new("warp/psnr", "PSNR of neighbours by depth ↑ dB", 2, true),
+            ScoreFormat::new("warp/seen", "share that neighbours see ↑", 4, true),
         ]
     }
 
@@ -207,11 +207,11 @@ impl Metric for DepthMetric {
         "depth"
     }
 
-    fn figures(&self) -> Vec<Figure> {
+    fn figures(&self) -> Vec<ScoreFormat> {
         vec![
-            Figure::new("depth/mean_absolute", "depth error, mean of pixels ↓", 4, false),
-            Figure::new("depth/median_absolute", "depth error, median of pixels ↓", 4, false),
-            Figure::new("depth/missed", "share of surface missed ↓", 4, false),
+            ScoreFormat::new("depth/mean_absolute", "depth error, mean of pixels ↓", 4, false),
+            ScoreFormat::new("depth/median_absolute", "depth error, median of pixels ↓", 4, false),
+            ScoreFormat::new("depth/missed", "share of surface missed ↓", 4, false),
         ]
     }
 
@@ -261,7 +261,7 @@ mod tests {
     #[test]
     fn figures_are_told_apart() {
         let all = metrics(Perceptual::new(None).unwrap());
-        let figures: Vec<Figure> = all.iter().flat_map(|metric| metric.figures()).collect();
+        let figures: Vec<ScoreFormat> = all.iter().flat_map(|metric| metric.figures()).collect();
         for (i, figure) in figures.iter().enumerate() {
             assert!(figures[..i].iter().all(|f| f.path != figure.path && f.label != figure.label));
         }

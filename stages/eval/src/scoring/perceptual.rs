@@ -1,5 +1,5 @@
 use artifact::{Failure, GivenInput};
-use metrics::{Figure, Score, Scores};
+use metrics::{Score, ScoreFormat, Scores};
 use pixels::Image;
 
 #[cfg(feature = "torch")]
@@ -113,10 +113,10 @@ impl Metric for Perceptual {
         "lpips"
     }
 
-    fn figures(&self) -> Vec<Figure> {
+    fn figures(&self) -> Vec<ScoreFormat> {
         let mut figures = LpipsNetwork::ALL
             .map(LpipsNetwork::labels)
-            .map(|labels| Figure::new(labels.key, labels.table, 4, false))
+            .map(|labels| ScoreFormat::new(labels.key, labels.table, 4, false))
             .to_vec();
         figures[0].missing = Some(MISSING.to_owned());
         figures

@@ -94,7 +94,7 @@ impl PlanReport {
         let sinks = plan
             .sinks
             .iter()
-            .map(|sink| SinkReport { stage: sink.stage.clone(), shows: sink.shows.clone() });
+            .map(|sink| SinkReport { stage: sink.stage.clone(), shows: sink.nodes.clone() });
         Ok(Self { nodes, sinks: sinks.collect() })
     }
 

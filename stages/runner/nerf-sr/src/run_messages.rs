@@ -1,6 +1,6 @@
 //! Messages at the end of a run.
 
-use artifact::counted;
+use artifact::format_count;
 
 /// Returns the message after a successful run: the numbers of stages that ran and were cached.
 pub(crate) fn end_message(ran: usize, all: usize, has_written_page: bool) -> String {
@@ -8,7 +8,7 @@ pub(crate) fn end_message(ran: usize, all: usize, has_written_page: bool) -> Str
         return all_cached(all);
     }
     let cached = all - ran;
-    format!("{ran} of {} ran, {cached} {} cached", counted(all, "stage"), was_or_were(cached))
+    format!("{ran} of {} ran, {cached} {} cached", format_count(all, "stage"), was_or_were(cached))
 }
 
 /// Returns the message of a run in which every stage was cached.
@@ -51,7 +51,7 @@ impl FailureHint {
     pub(crate) fn message(&self, label: &str, stage: &str, skipped: usize) -> String {
         let skipped = match skipped {
             0 => String::new(),
-            n => format!("; {} {} not run", counted(n, "stage"), was_or_were(n)),
+            n => format!("; {} {} not run", format_count(n, "stage"), was_or_were(n)),
         };
         format!("nerf-sr: {label} failed{skipped}; `{}` shows its log", self.log_command(stage))
     }

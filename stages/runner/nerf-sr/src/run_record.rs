@@ -45,7 +45,7 @@ pub(crate) fn run_record(
         is_complete.push(is_done && node.parents().all(|parent| is_complete[parent]));
     }
     let (shown, missing): (Vec<usize>, Vec<usize>) =
-        sink.shows.iter().partition(|&&index| is_complete[index]);
+        sink.nodes.iter().partition(|&&index| is_complete[index]);
     let can_be_partial = sink.program.description.partial;
     if !missing.is_empty() && !can_be_partial {
         return None;
@@ -92,7 +92,7 @@ pub(crate) fn run_record(
 
 /// Returns the nodes that a sink shows and their ancestors, in the plan's order.
 fn nodes_with_ancestors(plan: &Plan, sink: &Sink) -> BTreeSet<usize> {
-    let mut found: BTreeSet<usize> = sink.shows.iter().copied().collect();
+    let mut found: BTreeSet<usize> = sink.nodes.iter().copied().collect();
     for index in (0..plan.nodes.len()).rev() {
         if found.contains(&index) {
             found.extend(plan.nodes[index].parents());

@@ -102,10 +102,10 @@ impl<'a> Expansion<'a> {
     /// Creates a sink that shows all points of its stages.
     fn sink(&self, stage: &str, program: Arc<StageProgram>) -> Result<Sink, PlanError> {
         let parameters = self.resolve(stage, &program, &Point::new())?;
-        let mut shows = BTreeSet::new();
+        let mut nodes = BTreeSet::new();
         let mut left_out = Vec::new();
         for shown in shown_stages(self.pipeline, stage, self.selection) {
-            shows.extend(
+            nodes.extend(
                 self.nodes_by_stage.get(shown).into_iter().flatten().map(|(_, node)| *node),
             );
             for (point, reason) in self.left_out.get(shown).into_iter().flatten() {
@@ -117,8 +117,8 @@ impl<'a> Expansion<'a> {
                 });
             }
         }
-        let shows = shows.into_iter().collect();
-        Ok(Sink { stage: stage.to_owned(), program, parameters, shows, left_out })
+        let nodes = nodes.into_iter().collect();
+        Ok(Sink { stage: stage.to_owned(), program, parameters, nodes, left_out })
     }
 
     /// Returns the inputs of a block, without those that an axis replaces at every point.

@@ -73,11 +73,8 @@ fn plan_of(text: &str, data: &Path, change: impl Fn(&mut Request)) -> Result<Pla
         ..Request::default()
     };
     change(&mut request);
-    Plan::from_descriptions(
-        &Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?,
-        &descriptions(),
-        &request,
-    )
+    let pipeline = Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?;
+    Plan::from_descriptions(&pipeline, &descriptions(), &request)
 }
 
 fn data() -> tempfile::TempDir {
@@ -136,7 +133,7 @@ fn scenes_protocols_and_variants_are_axes() {
             && folder_of(&plan, 0, "dataset").ends_with("own")
     );
     assert!(folder_of(&plan, 6, "weights").ends_with("weights"));
-    assert_eq!(plan.sinks[0].shows.len(), 6);
+    assert_eq!(plan.sinks[0].nodes.len(), 6);
 }
 
 fn scores(data: &Path, change: &dyn Fn(&mut Request)) -> Vec<String> {
@@ -297,7 +294,7 @@ fn what_lacks_a_file_is_left_out() {
         scores,
         ["score [protocol=50x3]", "score [protocol=100x2]", "score-large [protocol=50x3]"]
     );
-    assert_eq!(plan.sinks[0].shows.len(), 3);
+    assert_eq!(plan.sinks[0].nodes.len(), 3);
     let [left_out] = &plan.sinks[0].left_out[..] else { panic!("{:?}", plan.sinks[0].left_out) };
     assert_eq!(
         (left_out.stage.as_str(), left_out.values["protocol"].as_str()),

@@ -88,7 +88,7 @@ impl FrozenPlan {
         let sinks = plan.sinks.iter().map(|sink| FrozenSink {
             stage: sink.stage.clone(),
             parameters: sink.parameters.clone(),
-            shows: sink.shows.clone(),
+            shows: sink.nodes.clone(),
             left_out: sink.left_out.clone(),
             program: sink.program.path.clone(),
         });
@@ -151,7 +151,7 @@ impl FrozenPlan {
                 *index = new_index[index];
             }
             let program = self.program(&program, &mut programs)?;
-            sinks.push(Sink { stage, parameters, shows, left_out, program });
+            sinks.push(Sink { stage, parameters, nodes: shows, left_out, program });
         }
         Ok(Plan {
             nodes,

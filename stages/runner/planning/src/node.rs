@@ -84,7 +84,7 @@ pub struct Sink {
     /// All parameters, including defaults.
     pub parameters: Value,
     /// Indices of the nodes to show.
-    pub shows: Vec<usize>,
+    pub nodes: Vec<usize>,
     /// Points that can't be shown because a required file is missing.
     pub left_out: Vec<FailedPoint>,
 }

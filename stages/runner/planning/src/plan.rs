@@ -32,8 +32,7 @@ impl Plan {
     }
 
     /// Creates a plan from given descriptions, keyed by the program's name or its path in `run`.
-    /// Starts
-    /// no program and reads no file.
+    /// Starts no program and reads no file.
     pub fn from_descriptions(
         pipeline: &Pipeline,
         descriptions: &BTreeMap<String, Description>,

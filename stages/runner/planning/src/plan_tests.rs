@@ -91,11 +91,8 @@ fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
             _ => request.targets.push(word),
         }
     }
-    Plan::from_descriptions(
-        &Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?,
-        &descriptions(),
-        &request,
-    )
+    let pipeline = Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?;
+    Plan::from_descriptions(&pipeline, &descriptions(), &request)
 }
 
 #[track_caller]
@@ -141,7 +138,7 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
         );
     }
     let plan = plan_of(PIPELINE, &["-p", "supersample=1,2", "-p", "views=2"]).unwrap();
-    assert_eq!((plan.sinks[0].stage.as_str(), &plan.sinks[0].shows[..]), ("report", &[4, 5][..]));
+    assert_eq!((plan.sinks[0].stage.as_str(), &plan.sinks[0].nodes[..]), ("report", &[4, 5][..]));
     assert_eq!(plan.sinks[0].parameters, json!({"views": 2}));
 }
 
@@ -483,6 +480,6 @@ fn a_frozen_plan_has_all_that_a_task_needs() {
         );
     }
     let page = frozen.task_plan(plan.nodes.len()).unwrap();
-    assert_eq!((page.nodes.len(), page.sinks[0].shows.len()), (plan.nodes.len(), 2));
+    assert_eq!((page.nodes.len(), page.sinks[0].nodes.len()), (plan.nodes.len(), 2));
     assert!(frozen.task_plan(plan.nodes.len() + 1).is_err());
 }

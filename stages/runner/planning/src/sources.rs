@@ -9,7 +9,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use artifact::{FileEntry, hash_json, list_source_files, report_line, sized, write_atomically};
+use artifact::{
+    FileEntry, format_size, hash_json, list_source_files, report_line, write_atomically,
+};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use store::Store;
@@ -175,7 +177,7 @@ impl HashProgress {
         if total == 0 {
             return format!("listing the files of {}", folder.display());
         }
-        format!("hashing {}: {} of {}", folder.display(), sized(done), sized(total))
+        format!("hashing {}: {} of {}", folder.display(), format_size(done), format_size(total))
     }
 }
 

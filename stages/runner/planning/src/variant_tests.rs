@@ -45,11 +45,8 @@ fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
         parameters: arguments.iter().map(|word| (*word).to_owned()).collect(),
         ..Request::default()
     };
-    Plan::from_descriptions(
-        &Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?,
-        &descriptions(),
-        &request,
-    )
+    let pipeline = Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?;
+    Plan::from_descriptions(&pipeline, &descriptions(), &request)
 }
 
 fn values(node: &Node, names: &[&str]) -> Vec<Value> {

@@ -12,7 +12,9 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, MANIFEST_FILE, Manifest, counted, print_line, report_line, sized};
+use artifact::{
+    Failure, MANIFEST_FILE, Manifest, format_count, format_size, print_line, report_line,
+};
 use serde::{Deserialize, Serialize};
 use store::{Record, Store};
 
@@ -113,7 +115,7 @@ impl History {
         if !missing.is_empty() {
             report_line!(
                 "{} of the history incomplete in this store: writing only their records",
-                counted(missing.len(), "artifact")
+                format_count(missing.len(), "artifact")
             );
         }
         Ok(Self { artifact, records, objects })
@@ -161,9 +163,9 @@ impl History {
             "{}: {} with {} and {}, {}",
             file.display(),
             &self.artifact[..10],
-            counted(self.records.len(), "record"),
-            counted(self.objects.len(), "artifact"),
-            sized(total)
+            format_count(self.records.len(), "record"),
+            format_count(self.objects.len(), "artifact"),
+            format_size(total)
         );
         Ok(())
     }

@@ -6,7 +6,9 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, FailureExt as _, FileEntry, MANIFEST_FILE, counted, file_kind, sized};
+use artifact::{
+    Failure, FailureExt as _, FileEntry, MANIFEST_FILE, file_kind, format_count, format_size,
+};
 use serde_json::Value;
 use store::{Arrival, Record, Store, is_hash};
 
@@ -36,9 +38,14 @@ pub struct Imported {
 
 impl fmt::Display for Imported {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let records = counted(self.records, "record");
-        let objects = counted(self.objects, "artifact");
-        write!(f, "{records} and {objects} read ({}), {} records new", sized(self.bytes), self.new)
+        let records = format_count(self.records, "record");
+        let objects = format_count(self.objects, "artifact");
+        write!(
+            f,
+            "{records} and {objects} read ({}), {} records new",
+            format_size(self.bytes),
+            self.new
+        )
     }
 }
 

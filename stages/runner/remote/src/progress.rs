@@ -3,7 +3,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use artifact::{Failure, report_line, sized};
+use artifact::{Failure, format_size, report_line};
 use indicatif::{ProgressBar, ProgressStyle};
 use stage::Pace;
 
@@ -53,7 +53,7 @@ impl Progress {
             return Ok(());
         }
         let left = state.pace.time_left(done, self.total);
-        let text = format!("{} of {} · {left} left", sized(done), sized(self.total));
+        let text = format!("{} of {} · {left} left", format_size(done), format_size(self.total));
         if let Some(bar) = &self.bar {
             bar.set_position(done);
             bar.set_message(text);

@@ -3,7 +3,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, MANIFEST_FILE, counted, one_line, print_line, sized};
+use artifact::{Failure, MANIFEST_FILE, format_count, format_size, one_line, print_line};
 use store::{Record, Store, StoreError};
 
 use crate::folder::{ACTIONS, Listing};
@@ -48,15 +48,15 @@ pub(crate) async fn pull(
     print_line!(
         "{}: {} pulled ({}), {existing} already present",
         remote.name(""),
-        counted(actions, "action"),
-        sized(bytes)
+        format_count(actions, "action"),
+        format_size(bytes)
     );
     Arc::into_inner(intake).map_or(Ok(()), Intake::end)?;
     match refused.len() {
         0 => Ok(()),
         count => Err(Failure::BadInput(format!(
             "{} refused; the rest was pulled",
-            counted(count, "file")
+            format_count(count, "file")
         ))
         .into()),
     }

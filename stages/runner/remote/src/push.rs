@@ -3,7 +3,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{MANIFEST_FILE, Manifest, counted, print_line, report_line, sized};
+use artifact::{MANIFEST_FILE, Manifest, format_count, format_size, print_line, report_line};
 use store::{Record, Store};
 
 use crate::intake::enter;
@@ -41,8 +41,8 @@ pub(crate) async fn push(
     print_line!(
         "{}: {} pushed ({}), {} already present",
         remote.name(""),
-        counted(actions, "action"),
-        sized(bytes),
+        format_count(actions, "action"),
+        format_size(bytes),
         selected.len() - missing.len()
     );
     Ok(())
@@ -68,7 +68,7 @@ async fn push_records(
         by_output.entry(record.output.clone()).or_default().push(record.clone());
     }
     if skipped > 0 {
-        let actions = counted(skipped, "action");
+        let actions = format_count(skipped, "action");
         report_line!("{actions} skipped: their artifacts are incomplete in this store");
     }
     let actions = by_output.values().map(Vec::len).sum();

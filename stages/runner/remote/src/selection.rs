@@ -1,6 +1,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 
-use artifact::{Failure, counted};
+use artifact::{Failure, format_count};
 use store::{Record, Store, StoreError};
 
 /// Selection of the actions to copy.
@@ -90,7 +90,7 @@ pub(crate) fn find_unique<'a>(
         0 => format!("{location}: no {noun} {start:?}; `nerf-sr status` lists the actions"),
         count => format!(
             "{location}: {} begin with {start:?}; give more characters",
-            counted(count, noun)
+            format_count(count, noun)
         ),
     };
     Err(Failure::Usage(problem).into())

@@ -4,9 +4,10 @@ mod resolve;
 mod resolved;
 mod scene_facts;
 
-use radiance::{Architecture, MlpArchitecture};
+use radiance::Architecture;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use torch_field::MlpArchitecture;
 
 pub use resolve::ParamsError;
 pub use resolved::{Resolved, ResolvedField, ResolvedRegularisers};

@@ -1,5 +1,6 @@
-use radiance::{Architecture, MlpArchitecture};
+use radiance::Architecture;
 use scene::{Background, Space};
+use torch_field::MlpArchitecture;
 
 use super::{
     Combine, FieldParams, GridParams, MlpParams, Order, Params, Resolved, ResolvedField,

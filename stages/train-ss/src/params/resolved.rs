@@ -1,7 +1,9 @@
 use std::collections::BTreeMap;
 
-use radiance::{Architecture, FieldModel, MlpArchitecture, Regularisers, TrainingOptions};
+use fields::FieldModel;
+use radiance::{Architecture, Regularisers, TrainingOptions};
 use serde_json::{Value, json};
+use torch_field::MlpArchitecture;
 
 use super::{Combine, GridParams, MlpParams, Order, Supervision};
 use crate::supersample::{warmup_stages, whole_supersample};

@@ -55,8 +55,11 @@ impl Photographs {
         if background == Background::Alpha {
             return self;
         }
-        let images =
-            self.images.into_iter().map(|photograph| photograph.over(background.shown())).collect();
+        let images = self
+            .images
+            .into_iter()
+            .map(|photograph| photograph.over(background.grey_level()))
+            .collect();
         Self { images, ..self }
     }
 }

@@ -135,8 +135,7 @@ mod tests {
     /// poses.
     #[test]
     fn rounds_are_counted_and_kept() {
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let field = Field::new(
             Architecture {
                 max_resolution: 32,

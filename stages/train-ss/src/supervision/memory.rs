@@ -1,6 +1,6 @@
 use std::path::PathBuf;
 
-use artifact::{Failure, sized};
+use artifact::{Failure, format_size};
 use scene::{Background, View, Views};
 use stage::{MEMORY_REMEDY, remaining_memory};
 
@@ -92,12 +92,12 @@ impl MemoryNeed {
         let in_memory = self.pixels.min(budget);
         let mut text = format!(
             "memory: about {}, of which {} for the field and {} for pixels",
-            sized(self.minimum() + in_memory),
-            sized(self.field),
-            sized(in_memory)
+            format_size(self.minimum() + in_memory),
+            format_size(self.field),
+            format_size(in_memory)
         );
         if self.pixels > budget {
-            text += &format!("; {} of pixels in a file", sized(self.pixels - budget));
+            text += &format!("; {} of pixels in a file", format_size(self.pixels - budget));
         }
         text
     }
@@ -137,8 +137,7 @@ mod tests {
     }
 
     fn need(images: usize, filter: Filter, pose_refinement: bool) -> MemoryNeed {
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let views = Views::new(
             Background::Opaque,
             bounds,
@@ -182,9 +181,9 @@ mod tests {
         assert_eq!(budget(None).unwrap(), MAX_PIXEL_BYTES);
         assert_eq!(budget(Some(minimum + 77)).unwrap(), 77);
         let message = budget(Some(minimum - 1_000_000)).unwrap_err().to_string();
-        let [needed, free] = [minimum, minimum - 1_000_000].map(sized);
+        let [needed, free] = [minimum, minimum - 1_000_000].map(format_size);
         assert!(message.contains(&needed) && message.contains(&free), "{message}");
-        let total = sized(minimum + MAX_PIXEL_BYTES);
+        let total = format_size(minimum + MAX_PIXEL_BYTES);
         assert_eq!(
             need.describe(MAX_PIXEL_BYTES),
             format!(
@@ -192,7 +191,7 @@ mod tests {
                 1.0 GB of pixels in a file"
             )
         );
-        let total = sized(minimum + 2_000_000);
+        let total = format_size(minimum + 2_000_000);
         assert_eq!(
             MemoryNeed { pixels: 2_000_000, ..need }.describe(MAX_PIXEL_BYTES),
             format!("memory: about {total}, of which 300.0 MB for the field and 2.0 MB for pixels")

@@ -128,7 +128,7 @@ impl Supersampling {
             return Ok(());
         };
         cameras
-            .step(&*field()?, progress, self.background.shown(), |view| {
+            .step(&*field()?, progress, self.background.grey_level(), |view| {
                 exposure_correction(exposures.as_ref(), view)
             })
             .map_err(fields::rendering_failure)?;
@@ -152,7 +152,7 @@ impl Supersampling {
     ) -> anyhow::Result<Option<MeanMotion>> {
         let Some(cameras) = &self.state.cameras else { return Ok(None) };
         let moved = cameras
-            .moved(&*field()?, self.lr_views(), self.background.shown())
+            .moved(&*field()?, self.lr_views(), self.background.grey_level())
             .map_err(fields::rendering_failure)?;
         Ok(Some(moved))
     }
@@ -187,7 +187,7 @@ impl Supersampling {
             let mut rng = CounterRng::new(self.seed, BACKGROUND_STREAM, bundle);
             [0, 1, 2].map(|_| rng.uniform())
         } else {
-            [self.background.shown(); 3]
+            [self.background.grey_level(); 3]
         }
     }
 }
@@ -309,7 +309,7 @@ impl radiance::Supervisor for Supersampling {
         }
     }
 
-    fn remember(&mut self, rendered: &[RenderedBundles<'_>], clock: &PhaseClock) {
+    fn record_colours(&mut self, rendered: &[RenderedBundles<'_>], clock: &PhaseClock) {
         if self.state.cache.is_none() && self.state.exposures.is_none() {
             return;
         }
@@ -344,9 +344,9 @@ mod tests {
     use crate::params::{Order, Params, Resolved, SceneFacts};
     use crate::photographs::Photographs;
 
-    fn remember(supersampling: &mut Supersampling, first_bundle: u64, colours: &[[f32; 3]]) {
+    fn record_colours(supersampling: &mut Supersampling, first_bundle: u64, colours: &[[f32; 3]]) {
         let rendered = RenderedBundles { first_bundle, colours };
-        supersampling.remember(&[rendered], &PhaseClock::start());
+        supersampling.record_colours(&[rendered], &PhaseClock::start());
     }
 
     fn options(supervision: Supervision, supersample: f64) -> SupersamplingOptions {
@@ -506,7 +506,7 @@ mod tests {
                 .collect();
             let mut gradients = [[0.0; 3]; 4];
             let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
-            remember(&mut supersampling, bundle, &colours);
+            record_colours(&mut supersampling, bundle, &colours);
             // Until then the cache isn't full of the truth.
             if bundle >= 400 {
                 let gradient =
@@ -657,7 +657,7 @@ mod tests {
                     (pulled - 0.2 / 12.0).abs() < 1e-6
                         && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
                 );
-                remember(&mut joined, bundle, &colours);
+                record_colours(&mut joined, bundle, &colours);
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-pixel rays they meet the block's mean together.
@@ -716,7 +716,7 @@ mod tests {
         for bundle in 0..50 {
             let colours = vec![[0.5, 0.4, 0.3]; joined.rays_per_bundle()];
             assert!(joined.loss_and_gradient(bundle, &colours, &mut gradients).is_finite());
-            remember(&mut joined, bundle, &colours);
+            record_colours(&mut joined, bundle, &colours);
         }
         assert_eq!(joined.state.byte_length(), 3 * (2 * 2 + 5 * 3));
     }

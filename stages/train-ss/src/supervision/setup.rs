@@ -78,19 +78,14 @@ pub fn supervision(
 /// require a kernel or a background that the scene lacks.
 fn kernel(input: &GivenInput, params: &Resolved, background: Background) -> anyhow::Result<Kernel> {
     let needs_kernel = params.supervision == Supervision::Kernel;
-    let is_known = input.path(DEGRADATION_FILE).exists();
-    if needs_kernel && !is_known {
+    let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
+    if needs_kernel && degradation.is_none() {
         let message = format!(
             "parameter supervision: kernel needs {DEGRADATION_FILE} in the scene, which states \
             the kernel of the LR images; choose average"
         );
         return Err(Failure::Usage(message).into());
     }
-    let kernel = if is_known {
-        input.read_json::<Degradation>(DEGRADATION_FILE)?.kernel
-    } else {
-        Kernel::Lanczos
-    };
     let enabled = [
         ("supervision", needs_kernel),
         ("pose_refinement", params.pose_refinement),
@@ -101,5 +96,5 @@ fn kernel(input: &GivenInput, params: &Resolved, background: Background) -> anyh
     {
         return Err(Failure::Usage(transparent_background(parameter)).into());
     }
-    Ok(kernel)
+    Ok(degradation.map_or(Kernel::Lanczos, |degradation| degradation.kernel))
 }

@@ -1,19 +1,16 @@
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use pixels::psnr_of;
-use radiance::StepReport;
+use radiance::{CurvePoint, StepReport, TrainingLog};
 use serde::{Deserialize, Serialize};
+use stage::CheckpointSchedule;
 
 use super::field_trainer::FieldTrainer;
-use super::log::{CurvePoint, TrainingLog};
 use crate::supervision::Supersampling;
 
 /// File name of a trainer's checkpoint.
 const CHECKPOINT: &str = "checkpoint.safetensors";
-/// Minimum ratio of the time between two checkpoints to the time that one takes; chosen by hand.
-const MIN_INTERVAL_RATIO: u32 = 50;
 
 /// Training curve of an unfinished training. Checkpoints contain all of it, so that a resumed
 /// training writes the same curve.
@@ -63,17 +60,12 @@ impl Curve {
 /// then `checkpoint.safetensors`, whose step decides which of these files belong to it.
 pub(crate) struct Checkpoints {
     folder: Option<PathBuf>,
-    last_written: Instant,
-    write_time: Duration,
+    schedule: CheckpointSchedule,
 }
 
 impl Checkpoints {
     pub(crate) fn new(folder: Option<&Path>) -> Self {
-        Self {
-            folder: folder.map(Path::to_path_buf),
-            last_written: Instant::now(),
-            write_time: Duration::from_millis(20),
-        }
+        Self { folder: folder.map(Path::to_path_buf), schedule: CheckpointSchedule::default() }
     }
 
     /// Resumes from the checkpoint of an earlier run, if any. An incomplete checkpoint is logged
@@ -109,46 +101,44 @@ impl Checkpoints {
         Ok(curve)
     }
 
-    /// Writes a checkpoint unless that would take more than a fiftieth of the time.
+    /// Writes a checkpoint if there is a work folder and one is due. Fails if the run is
+    /// interrupted.
     pub(crate) fn write_if_due(
         &mut self,
+        is_interrupted: bool,
         trainer: &dyn FieldTrainer,
         supervision: &Supersampling,
         curve: &Curve,
     ) -> anyhow::Result<()> {
-        if self.last_written.elapsed() > MIN_INTERVAL_RATIO * self.write_time {
-            self.write(trainer, supervision, curve)?;
-        }
-        Ok(())
+        self.schedule.write_if_due(is_interrupted, || match &self.folder {
+            Some(folder) => write(folder, trainer, supervision, curve),
+            None => Ok(()),
+        })
     }
+}
 
-    /// Writes a checkpoint, if there is a work folder, and removes the previous one.
-    pub(crate) fn write(
-        &mut self,
-        trainer: &dyn FieldTrainer,
-        supervision: &Supersampling,
-        curve: &Curve,
-    ) -> anyhow::Result<()> {
-        let Some(folder) = &self.folder else { return Ok(()) };
-        let started = Instant::now();
-        let partial = folder.join("checkpoint.partial");
-        let step = trainer.steps();
-        let files = [curve_name(step), state_name(step)];
-        artifact::write_json(&folder.join(&files[0]), curve)?;
-        supervision.state.write(&mut std::fs::File::create(folder.join(&files[1]))?)?;
-        trainer.write_checkpoint(&partial)?;
-        std::fs::rename(&partial, folder.join(CHECKPOINT))?;
-        for entry in std::fs::read_dir(folder)? {
-            let entry = entry?;
-            let file = entry.file_name().to_string_lossy().into_owned();
-            if (file.starts_with("curve-") || file.starts_with("kept-")) && !files.contains(&file) {
-                std::fs::remove_file(entry.path())?;
-            }
+/// Writes a checkpoint and removes the previous one.
+fn write(
+    folder: &Path,
+    trainer: &dyn FieldTrainer,
+    supervision: &Supersampling,
+    curve: &Curve,
+) -> anyhow::Result<()> {
+    let partial = folder.join("checkpoint.partial");
+    let step = trainer.steps();
+    let files = [curve_name(step), state_name(step)];
+    artifact::write_json(&folder.join(&files[0]), curve)?;
+    supervision.state.write(&mut std::fs::File::create(folder.join(&files[1]))?)?;
+    trainer.write_checkpoint(&partial)?;
+    std::fs::rename(&partial, folder.join(CHECKPOINT))?;
+    for entry in std::fs::read_dir(folder)? {
+        let entry = entry?;
+        let file = entry.file_name().to_string_lossy().into_owned();
+        if (file.starts_with("curve-") || file.starts_with("kept-")) && !files.contains(&file) {
+            std::fs::remove_file(entry.path())?;
         }
-        self.last_written = Instant::now();
-        self.write_time = started.elapsed();
-        Ok(())
     }
+    Ok(())
 }
 
 /// Restores a trainer from the latest checkpoint below a work folder and returns its curve; `None`

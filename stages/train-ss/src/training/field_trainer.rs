@@ -2,7 +2,8 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _};
-use radiance::{Field, FieldModel, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
+use fields::FieldModel;
+use radiance::{Field, RayField, StepReport, Trainer, TrainingError};
 use scene::Bounds;
 
 use crate::params::{Resolved, ResolvedField};
@@ -53,15 +54,21 @@ pub(crate) fn new_trainer(
                 None => Field::new(*architecture, bounds, params.seed),
             };
             let options = params.grid_training(given, regularisers);
-            if device != "cpu" {
-                return new_grid_trainer_on(device, &field, options);
+            if device == "cpu" {
+                return Ok(Box::new(Trainer::new(field, options)));
             }
-            Ok(Box::new(Trainer::new(field, options)))
+            #[cfg(feature = "torch")]
+            return Ok(Box::new(torch_field::GridTrainer::new(
+                &field,
+                options,
+                fields::torch_device(device)?,
+            )?));
+            #[cfg(not(feature = "torch"))]
+            Err(fields::needs_libtorch(&format!("--device {device}")).into())
         }
         #[cfg(feature = "torch")]
         ResolvedField::Mlp { architecture, density_noise_std, given } => {
-            let device = nets::device(device).map_err(|error| device_failure(&error))?;
-            nets::deterministic();
+            let device = fields::torch_device(device)?;
             let field = match init {
                 Some(weights) => torch_field::Mlp::read(weights, *architecture, bounds, device)
                     .bad_input("input init")?,
@@ -71,32 +78,7 @@ pub(crate) fn new_trainer(
             Ok(Box::new(torch_field::MlpTrainer::new(field, options)?))
         }
         #[cfg(not(feature = "torch"))]
-        ResolvedField::Mlp { .. } => {
-            let message = "parameter field: mlp needs libtorch, and train-ss was built without \
-                it; run `make build`";
-            Err(Failure::Usage(message.to_owned()).into())
-        }
-    }
-}
-
-/// Reads a trained field.
-pub(crate) fn read_field(
-    model: FieldModel,
-    bounds: Bounds,
-    weights: &Path,
-    device: &str,
-) -> anyhow::Result<Box<dyn RayField>> {
-    match model {
-        FieldModel::Grid(architecture) => Ok(Box::new(Field::read(weights, architecture, bounds)?)),
-        #[cfg(feature = "torch")]
-        FieldModel::Mlp(architecture) => {
-            let device = nets::device(device).map_err(|error| device_failure(&error))?;
-            Ok(Box::new(torch_field::Mlp::read(weights, architecture, bounds, device)?))
-        }
-        #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {
-            anyhow::bail!("cannot read MLPs for {device}: train-ss was built without libtorch")
-        }
+        ResolvedField::Mlp { .. } => Err(fields::needs_libtorch("parameter field: mlp").into()),
     }
 }
 
@@ -125,35 +107,6 @@ pub(crate) fn average_weights(
         FieldModel::Mlp(_) => {}
     }
     Ok(())
-}
-
-#[cfg(feature = "torch")]
-fn device_failure(error: &nets::DeviceError) -> Failure {
-    Failure::Usage(error.to_string())
-}
-
-/// Creates a trainer of a grid in libtorch.
-#[cfg(feature = "torch")]
-fn new_grid_trainer_on(
-    device: &str,
-    field: &Field,
-    options: TrainingOptions,
-) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let device = nets::device(device).map_err(|error| device_failure(&error))?;
-    nets::deterministic();
-    Ok(Box::new(torch_field::GridTrainer::new(field, options, device)?))
-}
-
-#[cfg(not(feature = "torch"))]
-fn new_grid_trainer_on(
-    device: &str,
-    _: &Field,
-    _: TrainingOptions,
-) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let message = format!(
-        "--device {device} needs libtorch, and train-ss was built without it; run `make build`"
-    );
-    Err(Failure::Usage(message).into())
 }
 
 /// Implements the methods of [`FieldTrainer`] that all trainers have under the same names.
@@ -268,8 +221,7 @@ mod tests {
     fn field() -> Field {
         let architecture =
             Architecture { n_levels: 2, log2_hashmap_size: 8, ..Architecture::default() };
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let mut field = Field::new(architecture, bounds, 1);
         let (.., occupancy) = field.parts_mut();
         let (mut density, mut cells) =

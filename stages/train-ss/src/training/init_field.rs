@@ -2,8 +2,8 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use artifact::{Failure, GivenInput};
+use fields::{FieldFile, FieldModel};
 use glam::DVec3;
-use radiance::{FieldFile, FieldModel};
 use stage::Context;
 
 /// Input `init`: the field that a training is initialised from.
@@ -73,8 +73,9 @@ impl<'a> InitField<'a> {
 
 #[cfg(test)]
 mod tests {
-    use radiance::{FIELD_FILE, FIELD_FORMAT, MlpArchitecture};
+    use fields::{FIELD_FILE, FIELD_FORMAT};
     use scene::{Background, Bounds};
+    use torch_field::MlpArchitecture;
 
     use super::*;
 

@@ -2,14 +2,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use artifact::{Failure, GivenInput};
+use fields::{FieldFile, FieldModel};
 use poses::MeanMotion;
-use radiance::{FieldFile, FieldModel};
+use radiance::{TRAINING_FILE, TrainingLog};
 use scene::{Bounds, Views};
 use stage::{Context, Progress};
 
 use super::checkpoint::{Checkpoints, Curve, read_latest};
 use super::field_trainer::{Collapsed, FieldTrainer, average_weights, new_trainer};
-use super::log::TrainingLog;
 use crate::params::{Combine, Resolved};
 use crate::supervision::{Supersampling, supervision};
 
@@ -47,8 +47,6 @@ pub(crate) struct Member<'a> {
 
 /// File name of a trained member's weights in the member's work folder.
 const DONE_WEIGHTS: &str = "field.safetensors";
-/// File name of a trained member's log, which is written last.
-const DONE_LOG: &str = "training.json";
 
 impl<'a> Member<'a> {
     pub(crate) fn new(
@@ -85,7 +83,7 @@ impl<'a> Member<'a> {
     /// seed, as often as the parameters allow.
     pub(crate) fn run(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         if let Some(log) = self.copy_finished() {
-            self.context.say("using the field that an earlier run trained");
+            self.context.log_line("using the field that an earlier run trained");
             return Ok(log);
         }
         let mut collapse = String::new();
@@ -96,7 +94,7 @@ impl<'a> Member<'a> {
             };
             let mut work = self.work.clone();
             if restart > 0 {
-                self.context.say(format!(
+                self.context.log_line(format!(
                     "starting over with seed {}, since training failed: {collapse}",
                     params.seed
                 ));
@@ -129,7 +127,7 @@ impl<'a> Member<'a> {
     /// Copies the weights that an earlier run finished to the output, and returns their log.
     fn copy_finished(&self) -> Option<TrainingLog> {
         let work = self.work.as_ref()?;
-        let log = serde_json::from_slice(&std::fs::read(work.join(DONE_LOG)).ok()?).ok()?;
+        let log = serde_json::from_slice(&std::fs::read(work.join(TRAINING_FILE)).ok()?).ok()?;
         std::fs::copy(work.join(DONE_WEIGHTS), &self.output).ok()?;
         Some(log)
     }
@@ -159,7 +157,7 @@ impl<'a> Member<'a> {
             std::fs::create_dir_all(work)
                 .with_context(|| format!("cannot create {}", work.display()))?;
         }
-        let log = |text: String| self.context.say(text);
+        let log = |text: String| self.context.log_line(text);
         let mut supervision = supervision(input, params, references, folder, work.is_some(), &log)?;
         let bundle: usize = supervision.supersample().iter().product();
         if params.rays < bundle as u64 {
@@ -171,8 +169,8 @@ impl<'a> Member<'a> {
         }
         let mut trainer = self.new_trainer(params, views.bounds)?;
         let checkpoints = Checkpoints::new(work);
-        let curve =
-            checkpoints.resume(&mut *trainer, &mut supervision, |text| self.context.say(text))?;
+        let curve = checkpoints
+            .resume(&mut *trainer, &mut supervision, |text| self.context.log_line(text))?;
         Ok(Training { trainer, supervision, checkpoints, curve })
     }
 
@@ -185,18 +183,14 @@ impl<'a> Member<'a> {
     ) -> anyhow::Result<()> {
         let Training { trainer, supervision, checkpoints, curve } = training;
         loop {
-            if self.context.is_interrupted() {
-                checkpoints
-                    .write(&**trainer, supervision, curve)
-                    .context("cannot write the checkpoint")?;
-                return Err(Failure::Interrupted.into());
-            }
+            let is_interrupted = self.context.is_interrupted();
+            checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
             let Some(report) = trainer.step(supervision)? else { return Ok(()) };
             if let Some(error) = supervision.first_error() {
                 anyhow::bail!("cannot read or write the file of pixels: {error}");
             }
             if report.skipped {
-                self.context.say(format!(
+                self.context.log_line(format!(
                     "step {}: a value was not finite; step discarded, learning rates halved",
                     trainer.steps()
                 ));
@@ -205,9 +199,6 @@ impl<'a> Member<'a> {
             supervision.refine_poses(rays as f64 / total as f64, || trainer.field())?;
             curve.add(&report, rays, total);
             progress.set(self.rays_before + rays, &curve.last_psnr());
-            checkpoints
-                .write_if_due(&**trainer, supervision, curve)
-                .context("cannot write the checkpoint")?;
         }
     }
 
@@ -216,7 +207,7 @@ impl<'a> Member<'a> {
         let Training { trainer, supervision, curve, .. } = training;
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
         if let Some(moved) = supervision.moved(|| trainer.field())? {
-            self.context.say(format!("cameras have {moved}"));
+            self.context.log_line(format!("cameras have {moved}"));
             if moved.is_far() {
                 log.warnings.push(far_warning(&moved));
             }
@@ -228,7 +219,8 @@ impl<'a> Member<'a> {
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS))
                 .context("cannot copy the field")?;
-            artifact::write_json(&work.join(DONE_LOG), &log)?;
+            // Written last: the log marks the member as trained.
+            artifact::write_json(&work.join(TRAINING_FILE), &log)?;
         }
         Ok(log)
     }

@@ -3,12 +3,9 @@
 mod checkpoint;
 mod field_trainer;
 mod init_field;
-mod log;
 mod member;
 mod pose_choice;
 
 pub(crate) use init_field::InitField;
-pub(crate) use log::TRAINING_FILE;
-pub use log::{CurvePoint, TrainingLog};
 pub(crate) use member::{Member, TrainingData};
 pub(crate) use pose_choice::train_with_best_poses;

@@ -1,12 +1,12 @@
 use std::path::Path;
 
 use anyhow::Context as _;
+use fields::{FieldModel, read_field};
 use pixels::{Image, psnr_of};
 use poses::{PosedPhotograph, photometric_error};
+use radiance::TrainingLog;
 use scene::Camera;
 
-use super::field_trainer::read_field;
-use super::log::TrainingLog;
 use super::member::{Member, TrainingData};
 use crate::photographs::{PackedPhotograph, Photographs, PixelMemory};
 
@@ -39,7 +39,7 @@ pub(crate) fn train_with_best_poses(
     });
     // Without comparable photographs, the given poses are kept.
     if refined_error.zip(given_error).is_some_and(|(refined, given)| refined < given) {
-        member.context.say(format!(
+        member.context.log_line(format!(
             "refined poses are used: photographs match their neighbours better ({refined_psnr}) \
             than with the given poses ({given_psnr})"
         ));
@@ -67,7 +67,7 @@ impl<'a> PoseJudge<'a> {
     fn new(member: &'a Member<'a>, data: &'a TrainingData<'a>) -> anyhow::Result<Self> {
         let photographs = Photographs::read(data.input, usize::MAX, &mut PixelMemory::unlimited())?
             .over_background();
-        let background = photographs.views.background.shown();
+        let background = photographs.views.background.grey_level();
         Ok(Self {
             member,
             data,
@@ -79,12 +79,11 @@ impl<'a> PoseJudge<'a> {
     /// Returns the mean squared error between photographs and their neighbours, warped by a trained
     /// field's depth; `None` if no pixels are comparable.
     fn error(&self, weights: &Path, log: &TrainingLog) -> anyhow::Result<Option<f64>> {
-        let field = read_field(
-            self.member.model,
-            self.data.views.bounds,
-            weights,
-            &self.member.context.device,
-        )?;
+        let (model, bounds) = (self.member.model, self.data.views.bounds);
+        // Grids are compared on the CPU, so that all devices choose the same poses.
+        let is_grid = matches!(model, FieldModel::Grid(_));
+        let device = if is_grid { "cpu" } else { &self.member.context.device };
+        let field = read_field(model, bounds, weights, device)?;
         let cameras: Vec<Camera> = (self.data.views.views.iter().zip(&log.poses))
             .map(|(view, pose)| Camera { camera_to_world: *pose, ..view.camera.clone() })
             .collect();

@@ -20,6 +20,6 @@ fuzz_target!(|data: &[u8]| {
         hidden_dim: 16,
         ..Architecture::default()
     };
-    let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 5.0, ..Bounds::default() };
+    let bounds = Bounds::cube(1.0, 1.0, 5.0);
     Field::read(&FOLDER.path("field.safetensors"), architecture, bounds).ok();
 });

@@ -1,7 +1,10 @@
 //! Loader of field artifacts for stages that render: hash-grid fields and the paper's field.
 //!
 //! * [`Members`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
-//!   cancels errors where images don't determine the scene (docs/design/011).
+//!   cancels errors where images don't determine the scene (docs/design/011). [`read_field`] reads
+//!   one of them.
+//! * [`FieldFile`]: description of a field artifact.
+//! * [`pixel_rays`]: the rays of a view's pixels.
 //! * [`mean`], [`lower_median`]: a pixel's value from several fields or rays.
 //!
 //! ```no_run
@@ -12,8 +15,15 @@
 //! # Ok::<(), artifact::Failure>(())
 //! ```
 
+mod field_file;
+
+use std::path::Path;
+
 use artifact::{Failure, FailureExt as _, GivenInput};
-use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Pixel, Ray, RayField, RenderError};
+use radiance::{Field, Pixel, Ray, RayField, RenderError};
+use scene::{Background, Bounds, Camera};
+
+pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel};
 
 /// Environment variables that change renders, in builds with and without libtorch. If 1, libtorch's
 /// variable lets CUDA multiply in TensorFloat-32, with a mantissa of ten bits.
@@ -35,7 +45,9 @@ impl Members {
     /// used.
     pub fn read(input: &GivenInput, device: &str) -> Result<Self, Failure> {
         let file = read_field_file(input)?;
-        let fields = read_all(&file, input, device)?;
+        let paths = (0..file.members).map(|index| input.path(&FieldFile::member_file(index)));
+        let fields = paths.map(|path| read_field(file.field, file.bounds, &path, device));
+        let fields = fields.collect::<Result<_, _>>()?;
         Ok(Self { file, fields })
     }
 }
@@ -79,6 +91,29 @@ fn average_pixels(pixels: &mut [Pixel]) -> Pixel {
     }
 }
 
+/// Returns n × n rays through each of a camera's pixels `[x, y]`, pixel by pixel, and the z-depth
+/// per unit of distance along each ray.
+pub fn pixel_rays(
+    camera: &Camera,
+    background: Background,
+    pixels: &[[usize; 2]],
+    n: usize,
+) -> (Vec<Ray>, Vec<f32>) {
+    let (camera_rays, background) = (camera.rays(), [background.grey_level(); 3]);
+    let mut rays = Vec::with_capacity(pixels.len() * n * n);
+    let mut z_per_distance = Vec::with_capacity(rays.capacity());
+    for &[x, y] in pixels {
+        for sub in 0..n * n {
+            let u = x as f64 + ((sub % n) as f64 + 0.5) / n as f64;
+            let v = y as f64 + ((sub / n) as f64 + 0.5) / n as f64;
+            let ray = camera_rays.ray(u, v);
+            rays.push(Ray::new(&ray, background));
+            z_per_distance.push(camera.depth_per_distance(&ray) as f32);
+        }
+    }
+    (rays, z_per_distance)
+}
+
 /// Returns the mean of one number over all items; 0 if there are none.
 pub fn mean<T>(items: &[T], number: impl Fn(&T) -> f32) -> f32 {
     let share = 1.0 / items.len().max(1) as f32;
@@ -101,36 +136,28 @@ pub fn rendering_failure(error: RenderError) -> anyhow::Error {
     }
 }
 
-fn read_all(
-    file: &FieldFile,
-    input: &GivenInput,
+/// Reads the weights of one field onto device `cpu` or `cuda:N`.
+///
+/// # Errors
+/// Those of [`Members::read`].
+pub fn read_field(
+    model: FieldModel,
+    bounds: Bounds,
+    weights: &Path,
     device: &str,
-) -> Result<Vec<Box<dyn RayField>>, Failure> {
-    let paths = (0..file.members).map(|i| input.path(&FieldFile::member_file(i)));
-    match file.field {
-        FieldModel::Grid(architecture) => paths
-            .map(|path| {
-                let field = Field::read(&path, architecture, file.bounds).bad_input("field")?;
-                move_grid(field, device)
-            })
-            .collect(),
+) -> Result<Box<dyn RayField>, Failure> {
+    match model {
+        FieldModel::Grid(architecture) => {
+            move_grid(Field::read(weights, architecture, bounds).bad_input("field")?, device)
+        }
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
-            let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
-            nets::deterministic();
-            paths
-                .map(|path| {
-                    let field = torch_field::Mlp::read(&path, architecture, file.bounds, device);
-                    Ok(Box::new(field.bad_input("field")?) as Box<dyn RayField>)
-                })
-                .collect()
+            let device = torch_device(device)?;
+            let field = torch_field::Mlp::read(weights, architecture, bounds, device);
+            Ok(Box::new(field.bad_input("field")?))
         }
         #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {
-            let message = "field: mlp needs libtorch, and this program was built without libtorch; \
-                run `make build`";
-            Err(Failure::Usage(message.to_owned()))
-        }
+        FieldModel::Mlp(_) => Err(needs_libtorch("field: mlp")),
     }
 }
 
@@ -140,24 +167,34 @@ fn move_grid(field: Field, device: &str) -> Result<Box<dyn RayField>, Failure> {
         return Ok(Box::new(field));
     }
     #[cfg(feature = "torch")]
-    {
-        let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
-        nets::deterministic();
-        Ok(Box::new(torch_field::TorchGrid::new(&field, device).usage("--device")?))
-    }
+    return Ok(Box::new(
+        torch_field::TorchGrid::new(&field, torch_device(device)?).usage("--device")?,
+    ));
     #[cfg(not(feature = "torch"))]
-    Err(Failure::Usage(format!(
-        "--device {device} needs libtorch, and this program was built without libtorch; run `make \
-        build`"
-    )))
+    Err(needs_libtorch(&format!("--device {device}")))
+}
+
+/// Creates the failure of a program without libtorch, which `argument` needs.
+pub fn needs_libtorch(argument: &str) -> Failure {
+    Failure::Usage(format!(
+        "{argument} needs libtorch, and this program was built without it; run `make build`"
+    ))
+}
+
+/// Opens a device of libtorch, on which equal calls give equal bits.
+///
+/// # Errors
+/// [`Failure::Usage`] if the device can't be used.
+#[cfg(feature = "torch")]
+pub fn torch_device(device: &str) -> Result<nets::Device, Failure> {
+    nets::deterministic();
+    nets::device(device).map_err(|error| Failure::Usage(error.to_string()))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use radiance::Architecture;
-    use scene::{Background, Bounds};
-    use std::path::Path;
 
     /// A field of one opacity everywhere.
     struct Even(f32);
@@ -170,7 +207,7 @@ mod tests {
 
     fn seen(opacity: f32) -> Result<Vec<Pixel>, RenderError> {
         let file = FieldFile {
-            format: radiance::FIELD_FORMAT,
+            format: FIELD_FORMAT,
             field: FieldModel::Grid(Architecture::default()),
             members: 1,
             bounds: Bounds::default(),
@@ -227,7 +264,7 @@ mod tests {
 
     fn write_file(folder: &Path, architecture: Architecture, bounds: Bounds, members: u32) {
         let file = FieldFile {
-            format: radiance::FIELD_FORMAT,
+            format: FIELD_FORMAT,
             field: FieldModel::Grid(architecture),
             members,
             bounds,
@@ -244,8 +281,7 @@ mod tests {
     /// is an error.
     #[test]
     fn members_are_averaged() {
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let architecture = Architecture {
             max_resolution: 32,
             n_levels: 4,

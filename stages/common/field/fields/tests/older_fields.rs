@@ -8,7 +8,8 @@ use std::path::Path;
 
 use artifact::GivenInput;
 use fields::Members;
-use radiance::{FIELD_FILE, FieldFile, Ray, RayField as _};
+use fields::{FIELD_FILE, FieldFile};
+use radiance::{Ray, RayField as _};
 use scene::{Camera, Intrinsics, Views};
 
 fn goldens() -> &'static Path {

@@ -87,7 +87,7 @@ pub struct OutOfRange {
 }
 
 /// Fails with the first of (name, value, minimum, maximum) whose value is out of range.
-pub(crate) fn check_ranges(ranges: &[(&'static str, u32, u32, u32)]) -> Result<(), OutOfRange> {
+pub fn check_ranges(ranges: &[(&'static str, u32, u32, u32)]) -> Result<(), OutOfRange> {
     for &(name, value, low, high) in ranges {
         if !(low..=high).contains(&value) {
             return Err(OutOfRange { name, value, low, high });

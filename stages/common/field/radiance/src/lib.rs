@@ -1,7 +1,8 @@
 //! The fast radiance field: a multi-resolution grid with small MLPs, written for the CPU. No
 //! autograd, no torch.
 //!
-//! * [`RayField`]: trait of fields that render rays; [`FieldFile`] describes a field artifact.
+//! * [`RayField`]: trait of fields that render rays.
+//! * [`TrainingLog`]: course of a training, a file of a field artifact.
 //! * [`Field`]: parameters and occupancy grid; [`Field::render`] returns colour, opacity and depth
 //!   of rays.
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that
@@ -29,13 +30,7 @@
 //!
 //! ```
 //! use radiance::{Architecture, Field, Ray};
-//! let bounds = scene::Bounds {
-//!     min: [-1.0; 3],
-//!     max: [1.0; 3],
-//!     near: 2.0,
-//!     far: 6.0,
-//!     ..Default::default()
-//! };
+//! let bounds = scene::Bounds::cube(1.0, 2.0, 6.0);
 //! let field = Field::new(Architecture::default(), bounds, 7);
 //! let ray = Ray { origin: [0.0, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
 //! let pixel = field.render(&[ray])[0];
@@ -48,7 +43,6 @@ mod architecture;
 mod chunk;
 mod composite;
 mod field;
-mod field_file;
 mod grid;
 mod march;
 mod math;
@@ -68,13 +62,11 @@ pub mod spec;
 mod specks;
 mod tensors;
 mod trainer;
+mod training_log;
 mod training_state;
 
-pub use architecture::{Architecture, OutOfRange};
+pub use architecture::{Architecture, OutOfRange, check_ranges};
 pub use field::Field;
-pub use field_file::{
-    FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel, MlpArchitecture,
-};
 pub use math::spherical_harmonics;
 pub use occupancy::{CellHit, Occupancy};
 pub use passes::Passes;
@@ -89,4 +81,5 @@ pub use trainer::{
     Phase, PhaseClock, PhaseTimes, RenderedBundles, StepReport, Supervisor, Trainer, TrainingError,
     TrainingOptions,
 };
+pub use training_log::{CurvePoint, TRAINING_FILE, TrainingLog};
 pub use training_state::TrainingState;

@@ -105,8 +105,7 @@ mod tests {
             march_steps: 64,
             ..Default::default()
         };
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 0.0, 9.0);
         let mut field = Field::new(architecture, bounds, 3);
         let (grid, network, _) = field.parts_mut();
         grid.iter_mut().for_each(|value| *value *= 4e3);
@@ -157,8 +156,7 @@ mod tests {
 
     #[test]
     fn a_region_holds_something_where_one_of_its_cells_does() {
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() };
+        let bounds = Bounds::cube(1.0, 0.0, 9.0);
         let mut field = Field::new(Architecture::default(), bounds, 3);
         let only = 100 + OCCUPANCY_CELLS * (20 + OCCUPANCY_CELLS * 30);
         field.occupancy.set(|cell| match cell == only {

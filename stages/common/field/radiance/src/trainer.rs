@@ -350,7 +350,7 @@ impl Trainer {
                 RenderedBundles { first_bundle, colours }
             })
             .collect();
-        supervision.remember(&rendered, clock);
+        supervision.record_colours(&rendered, clock);
     }
 
     /// Evaluates the density of the cells that are due, and updates the occupancy.

@@ -2,11 +2,11 @@
 //! (`make goldens`).
 
 use counter_rng::uniform;
-use radiance::MlpArchitecture;
 use safetensors::SafeTensors;
 use scene::Bounds;
 use tch::{Device, Kind, Tensor};
 
+use crate::architecture::MlpArchitecture;
 use crate::mlp::{Batch, Mlp, SampleDraws};
 use crate::mlp_trainer::{MlpTrainer, MlpTraining};
 use crate::network::MlpNetwork;
@@ -82,8 +82,7 @@ fn small() -> (Mlp, Batch, SampleDraws) {
         ndc_directions: false,
         scaled_positions: false,
     };
-    let bounds =
-        Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Default::default() };
+    let bounds = Bounds::cube(2.0, 2.0, 6.0);
     let [coarse, fine] = [2000, 3000].map(|purpose| network(architecture, purpose, Kind::Double));
     let field = Mlp { architecture, bounds, coarse, fine, device: Device::Cpu };
     let origin = 0.5 * draw(3, &[8, 3]) + Tensor::from_slice(&[0.0, 0.0, 4.0f64]);

@@ -624,8 +624,7 @@ mod tests {
     /// What misses the box, runs along its faces, begins inside, has no length or isn't finite.
     #[test]
     fn extreme_rays_are_finite_alike() {
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e6, ..Default::default() };
+        let bounds = Bounds::cube(1.0, 0.0, 1e6);
         let architecture = Architecture {
             max_resolution: 64,
             log2_hashmap_size: 12,

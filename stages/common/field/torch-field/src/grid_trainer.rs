@@ -125,7 +125,7 @@ impl GridTrainer {
         } else {
             no_grad(|| self.apply_gradients(&sum))?;
             self.occupancy.raise_densities(&hits);
-            step.remember(supervision, &colours);
+            step.record_colours(supervision, &colours);
         }
         self.tally.steps += 1;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
@@ -401,7 +401,7 @@ mod tests {
             loss
         }
 
-        fn remember(&mut self, rendered: &[RenderedBundles<'_>], _: &PhaseClock) {
+        fn record_colours(&mut self, rendered: &[RenderedBundles<'_>], _: &PhaseClock) {
             for bundles in rendered {
                 let rays = self.rays_per_bundle();
                 self.seen.extend(bundles.bundles(rays).map(|(_, colours)| colours[0][0]));

@@ -4,11 +4,12 @@ use std::path::Path;
 use counter_rng::CounterRng;
 use glam::DVec3;
 use radiance::spec::MIN_TOTAL_WEIGHT;
-use radiance::{MlpArchitecture, Pixel, Ray, RayField, RenderError};
+use radiance::{Pixel, Ray, RayField, RenderError};
 use rayon::prelude::*;
 use scene::{Bounds, Space};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
+use crate::architecture::MlpArchitecture;
 use crate::composite::{Composite, composite};
 use crate::error::TorchFieldError;
 use crate::network::{MlpNetwork, encode};

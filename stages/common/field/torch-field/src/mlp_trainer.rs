@@ -2,10 +2,11 @@ use std::ops::Range;
 use std::path::Path;
 
 use nets::Adam;
-use radiance::{MlpArchitecture, StepReport, Supervisor, TrainingState};
+use radiance::{StepReport, Supervisor, TrainingState};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor};
 
+use crate::architecture::MlpArchitecture;
 use crate::error::TorchFieldError;
 use crate::mlp::{Batch, Mlp, SampleDraws};
 use crate::step::{Schedule, Step};
@@ -170,7 +171,7 @@ impl MlpTrainer {
             }
         } else {
             self.apply_gradients(&sum.gradients, done)?;
-            step.remember(supervision, &[sum.colours]);
+            step.record_colours(supervision, &[sum.colours]);
         }
         self.tally.steps += 1;
         self.check_collapse(sum.stopped, rays)?;
@@ -385,8 +386,7 @@ mod tests {
             fine_samples: 8,
             ..MlpArchitecture::default()
         };
-        let bounds =
-            Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let bounds = Bounds::cube(2.0, 2.0, 6.0);
         let options = MlpTraining {
             rays: 8 * 250,
             max_rays_per_step: 8,

@@ -1,9 +1,9 @@
 use std::sync::LazyLock;
 
 use counter_rng::CounterRng;
-use radiance::MlpArchitecture;
 use tch::{Device, Kind, TchError, Tensor};
 
+use crate::architecture::MlpArchitecture;
 use crate::error::TorchFieldError;
 
 /// One of the two networks: position → density and feature; feature and direction → colour.

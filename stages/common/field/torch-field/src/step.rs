@@ -115,14 +115,18 @@ impl Step {
     }
 
     /// Passes the rendered colours of all pieces, in order, to the supervision.
-    pub(crate) fn remember(self, supervision: &mut impl Supervisor, pieces: &[Vec<[f32; 3]>]) {
+    pub(crate) fn record_colours(
+        self,
+        supervision: &mut impl Supervisor,
+        pieces: &[Vec<[f32; 3]>],
+    ) {
         let mut first_bundle = self.first_bundle;
         let mut rendered = Vec::with_capacity(pieces.len());
         for colours in pieces {
             rendered.push(RenderedBundles { first_bundle, colours });
             first_bundle += (colours.len() / self.rays_per_bundle) as u64;
         }
-        supervision.remember(&rendered, &PhaseClock::start());
+        supervision.record_colours(&rendered, &PhaseClock::start());
     }
 
     /// Runs the step's bundles in as few pieces as memory allows.

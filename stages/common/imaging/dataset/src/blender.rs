@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use artifact::{WARNING, counted};
+use artifact::{WARNING, format_count};
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
@@ -33,12 +33,12 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     }
     let (train, test) = (0..counts[0], counts[0]..frames.len());
     let mut notes = vec![if test.is_empty() {
-        format!("Blender format: {}, no test views", counted(train.len(), "view"))
+        format!("Blender format: {}, no test views", format_count(train.len(), "view"))
     } else {
         format!(
             "Blender format: {}, {}",
-            counted(train.len(), "training view"),
-            counted(test.len(), "test view")
+            format_count(train.len(), "training view"),
+            format_count(test.len(), "test view")
         )
     }];
     notes.extend(lookup.notes());

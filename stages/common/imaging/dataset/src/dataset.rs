@@ -1,6 +1,6 @@
 use std::collections::BTreeSet;
 
-use artifact::{WARNING, counted};
+use artifact::{WARNING, format_count};
 use scene::Intrinsics;
 
 use crate::error::DatasetError;
@@ -63,8 +63,8 @@ impl Dataset {
         if pixels > 0 {
             self.notes.push(format!(
                 "{} of {} are more than 89° from the axis of a fisheye lens and are masked",
-                counted(pixels, "pixel"),
-                counted(photographs, "photograph")
+                format_count(pixels, "pixel"),
+                format_count(photographs, "photograph")
             ));
         }
         self
@@ -88,7 +88,7 @@ impl Dataset {
         }
         self.notes.extend(angles_note(&angles));
         if undistorted > 0 {
-            let count = counted(undistorted, "photograph");
+            let count = format_count(undistorted, "photograph");
             self.notes.push(format!("lens distortion of {count} is removed"));
         }
         Ok(self)
@@ -103,7 +103,7 @@ impl Dataset {
             ignored += 1;
         }
         if ignored > 0 {
-            let count = counted(ignored, "photograph");
+            let count = format_count(ignored, "photograph");
             self.notes.push(format!("lens distortion of {count} is ignored"));
         }
         self
@@ -128,7 +128,7 @@ impl Dataset {
             self.notes.push(format!(
                 "{WARNING}rotations of {count} of {} have a scale of {range}, which is removed; \
                 centres are unchanged",
-                counted(self.frames.len(), "view")
+                format_count(self.frames.len(), "view")
             ));
         }
     }

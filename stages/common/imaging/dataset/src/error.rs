@@ -1,7 +1,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use artifact::{number, printable, shortened};
+use artifact::{format_number, printable, shortened};
 use scene::CameraError;
 
 use crate::file_reason::FileReason;
@@ -92,7 +92,10 @@ pub(crate) enum FrameReason {
     #[error("transform_matrix must have 4 rows of 4 numbers")]
     MatrixSize,
     /// Missing or unusable image, mask or depth image.
-    #[error("{problem}; {remedy}")]
+    #[error("{problem}; {}", match problem {
+        FileProblem::IgnoredName { .. } => "rename the file",
+        _ => remedy,
+    })]
     File { problem: FileProblem, remedy: &'static str },
     #[error("camera {id} not found")]
     CameraNotFound { id: u32 },
@@ -103,13 +106,13 @@ pub(crate) enum FrameReason {
         image.0, image.1, camera.0, camera.1
     )]
     AspectRatio { image: (u32, u32), camera: (u32, u32) },
-    #[error("{name} is {}; an image has 1 to {} pixels per side", number(*value), u32::MAX)]
+    #[error("{name} is {}; an image has 1 to {} pixels per side", format_number(*value), u32::MAX)]
     InvalidSide { name: &'static str, value: f64 },
     #[error(
         "bounds {} and {}, expected 0 < near < far; LLFF's imgs2poses confuses views if COLMAP \
         registered them in another order than that of their names: rerun COLMAP on images sorted \
         by name, or use COLMAP's model without poses_bounds.npy",
-        number(*near), number(*far)
+        format_number(*near), format_number(*far)
     )]
     InvalidDepths { near: f64, far: f64 },
     #[error(
@@ -123,7 +126,7 @@ pub(crate) enum FrameReason {
     /// Angle of view outside 0 to π; `focal` is the resulting focal length in image sides.
     #[error(
         "{name} is {}: focal length {}; the angle must be between 0 and π",
-        number(*angle), number(*focal)
+        format_number(*angle), format_number(*focal)
     )]
     InvalidAngle { name: &'static str, angle: f64, focal: f64 },
     /// View name that belongs to another frame, whose image is `first`.

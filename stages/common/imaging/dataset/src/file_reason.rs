@@ -1,7 +1,7 @@
 use std::borrow::Cow;
 use std::path::PathBuf;
 
-use artifact::{counted, number, shortened};
+use artifact::{format_count, format_number, shortened};
 use scene::Distortion;
 
 use crate::file_status::{FileProblem, path_text};
@@ -71,7 +71,7 @@ pub(crate) enum FileReason {
     ParameterCount { model: String, expected: usize, found: usize },
     #[error("image size {width}×{height} is invalid")]
     InvalidSize { width: u64, height: u64 },
-    #[error("({}) is not a rotation quaternion", .0.map(number).join(", "))]
+    #[error("({}) is not a rotation quaternion", .0.map(format_number).join(", "))]
     Rotation([f64; 4]),
     #[error("`frames` is empty; at least one view is required")]
     NoFrames,
@@ -134,7 +134,7 @@ fn folders_text(folders: &[ImageFolder]) -> String {
     for ImageFolder { name, images, unusable, unsupported } in folders {
         let remark = unusable.as_ref().map(ToString::to_string).or_else(|| unsupported.clone());
         let remark = remark.map(|remark| format!(" ({remark})")).unwrap_or_default();
-        listed.push(format!("{} in {name}/{remark}", counted(*images, "image")));
+        listed.push(format!("{} in {name}/{remark}", format_count(*images, "image")));
     }
     format!(
         "for {}; counts must match, or view_imgs.txt must list the images that have poses",

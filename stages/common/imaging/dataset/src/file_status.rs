@@ -37,10 +37,7 @@ pub(crate) enum FileProblem {
     /// Link that can't be followed, at the path or above it.
     #[error("{} is a symbolic link that cannot be followed: {error}", path_text(link))]
     BrokenLink { link: PathBuf, error: io::Error },
-    #[error(
-        "{} is named like an editor or system file, which are ignored; rename it",
-        path_text(path)
-    )]
+    #[error("{} is named like an editor or system file, which are ignored", path_text(path))]
     IgnoredName { path: PathBuf },
     #[error("{}: path is too long ({bytes} bytes)", shortened(&path_text(path)))]
     TooLong { path: PathBuf, bytes: usize },

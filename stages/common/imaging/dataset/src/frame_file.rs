@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use artifact::counted;
+use artifact::format_count;
 
 use crate::error::{DatasetError, FrameReason};
 use crate::file_reason::FileReason;
@@ -84,7 +84,7 @@ impl ReadFrames {
     /// Returns the note on missing depth images, if any.
     pub(crate) fn depth_note(&self) -> Option<String> {
         let first = self.missing_depths.first.as_ref()?;
-        let count = counted(self.missing_depths.count, "depth image");
+        let count = format_count(self.missing_depths.count, "depth image");
         Some(format!(
             "{count} (depth_file_path) not found (first: {first}); only EXR depth is used"
         ))

@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use artifact::counted;
+use artifact::format_count;
 use glam::{DMat3, DVec3};
 use scene::{Distortion, Intrinsics, pose_of};
 
@@ -115,7 +115,7 @@ struct Photographs {
 
 impl Photographs {
     fn new(images: Vec<PathBuf>, labels: Vec<PathBuf>, from: &str) -> Self {
-        let count = counted(images.len(), "photograph");
+        let count = format_count(images.len(), "photograph");
         let notes = vec![format!("LLFF (poses_bounds.npy): {count} from {from}")];
         Self { images, labels, notes }
     }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use artifact::{WARNING, counted};
+use artifact::{WARNING, format_count};
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
@@ -155,7 +155,7 @@ fn usage_note(frames: &[Frame]) -> Option<String> {
         parts.push(format!("{count} by {}, where {colour} is excluded", kind.title()));
     }
     let have = if masked == 1 { "has a mask" } else { "have masks" };
-    let views = counted(frames.len(), "view");
+    let views = format_count(frames.len(), "view");
     Some(format!("{masked} of {views} {have} ({})", parts.join("; ")))
 }
 

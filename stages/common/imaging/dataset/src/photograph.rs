@@ -1,5 +1,5 @@
 use std::fs::{self, File};
-use std::io::{self, BufRead, BufReader, Cursor, Seek};
+use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
 use image::metadata::Orientation;
@@ -28,21 +28,13 @@ pub(crate) fn is_exr(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
 }
 
-fn io_error(path: &Path, source: io::Error) -> PixelError {
-    PixelError::Io { path: path.to_path_buf(), source }
-}
-
-fn format_error(path: &Path, reason: String) -> PixelError {
-    PixelError::Format { path: path.to_path_buf(), reason }
-}
-
 /// Creates the decoder of a PNG or JPEG, recognised by content rather than by name.
 fn decoder<R: BufRead + Seek + 'static>(
     file: R,
     path: &Path,
 ) -> Result<impl ImageDecoder + use<R>, PixelError> {
     let guessed = ImageReader::new(file).with_guessed_format();
-    let mut reader = guessed.map_err(|source| io_error(path, source))?;
+    let mut reader = guessed.map_err(PixelError::io(path))?;
     let mut limits = Limits::default();
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
@@ -56,7 +48,7 @@ fn decoder<R: BufRead + Seek + 'static>(
             None => "neither PNG, JPEG nor EXR".to_owned(),
         },
     };
-    Err(format_error(path, reason))
+    Err(PixelError::format(path, reason))
 }
 
 /// Size and orientation of an image, from its header.
@@ -88,11 +80,11 @@ pub(crate) fn read_header(path: &Path) -> Result<ImageHeader, PixelError> {
         let size = (width as u32, height as u32);
         return Ok(ImageHeader { size, orientation: Orientation::NoTransforms });
     }
-    let file = File::open(path).map_err(|source| io_error(path, source))?;
+    let file = File::open(path).map_err(PixelError::io(path))?;
     let mut decoder = decoder(BufReader::new(file), path)?;
     let (width, height) = decoder.dimensions();
     if width == 0 || height == 0 {
-        return Err(format_error(path, format!("{width}×{height} pixels")));
+        return Err(PixelError::format(path, format!("{width}×{height} pixels")));
     }
     if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 {
         let (width, height) = (width as usize, height as usize);
@@ -142,17 +134,18 @@ fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelE
     if is_exr(path) {
         return read_exr_photograph(path);
     }
-    let mut bytes = fs::read(path).map_err(|source| io_error(path, source))?;
+    let mut bytes = fs::read(path).map_err(PixelError::io(path))?;
     let mut is_checked = true;
     if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
-        is_checked = complete_jpeg(&mut bytes).map_err(|reason| format_error(path, reason))?;
+        is_checked =
+            complete_jpeg(&mut bytes).map_err(|reason| PixelError::format(path, reason))?;
     }
     let mut decoder = decoder(Cursor::new(bytes), path)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
-        .map_err(|e| format_error(path, format!("incomplete or damaged image ({e})")))?;
+        .map_err(|e| PixelError::format(path, format!("incomplete or damaged image ({e})")))?;
     if !is_checked {
-        return Err(format_error(path, "damaged JPEG: headers and image data don't match".into()));
+        return Err(PixelError::format(path, "damaged JPEG: headers and image data don't match"));
     }
     if is_upright {
         image.apply_orientation(orientation);
@@ -185,7 +178,7 @@ fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<bool, String> {
 fn read_exr_photograph(path: &Path) -> Result<(Rgba8, Clipping), PixelError> {
     let image = read_exr(path)?.with_finite(&COLOUR_CHANNELS, path)?;
     let [r, g, b] = ["R", "G", "B"].map(|name| {
-        image.channel(name).ok_or_else(|| format_error(path, format!("no channel {name}")))
+        image.channel(name).ok_or_else(|| PixelError::format(path, format!("no channel {name}")))
     });
     let (r, g, b, a) = (r?, g?, b?, image.channel("A"));
     let mut data = Vec::with_capacity(4 * r.len());
@@ -249,7 +242,7 @@ fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
         let (width, height) = exr_size(path)?;
         return Ok(exr_reading_bytes(path)? + RGBA_BYTES * (width * height) as u64);
     }
-    let file = File::open(path).map_err(|source| io_error(path, source))?;
+    let file = File::open(path).map_err(PixelError::io(path))?;
     let decoder = decoder(BufReader::new(file), path)?;
     let (width, height) = decoder.dimensions();
     let pixels = u64::from(width) * u64::from(height);
@@ -277,7 +270,7 @@ impl Frame {
                 "image is {}×{} pixels, its camera {}×{}",
                 image.width, image.height, k.width, k.height
             );
-            return Err(format_error(&self.image, reason).into());
+            return Err(PixelError::format(&self.image, reason).into());
         }
         Ok((self.without_distortion(image), clipping))
     }

@@ -1,7 +1,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use artifact::{counted, relative_path};
+use artifact::{format_count, relative_path};
 
 use crate::file_reason::FileReason;
 use crate::lookup::{Located, Lookup, LookupError};
@@ -86,7 +86,7 @@ impl SplitLists<'_> {
         for (side, noun) in [(0, "training view"), (1, "test view")] {
             let is_missing = split[side].is_empty() && !split[1 - side].is_empty();
             if is_missing && !unlisted.is_empty() {
-                let views = counted(unlisted.len(), noun);
+                let views = format_count(unlisted.len(), noun);
                 notes.push(format!("{views}: the frames in no list"));
                 split[side].clone_from(&unlisted);
             }
@@ -121,7 +121,7 @@ fn listed_frames(
             let (count, first) = (unknown.len(), (*first).clone());
             return Err(FileReason::NoFrameListed { list, count, first });
         }
-        let names = counted(list_names.len(), "name");
+        let names = format_count(list_names.len(), "name");
         let have = if unknown.len() == 1 { "has" } else { "have" };
         notes.push(format!(
             "{} of {names} in {list} {have} no frame (first: {first})",

@@ -1,13 +1,13 @@
 use std::path::Path;
 
-use artifact::counted;
+use artifact::format_count;
 
 use crate::error::DatasetError;
 use crate::file_reason::FileReason;
 
 /// Formats a count with its noun and verb, such as `1 mask has` or `2 masks have`.
 pub(crate) fn counted_with_verb(count: usize, noun: &str, [one, many]: [&str; 2]) -> String {
-    format!("{} {}", counted(count, noun), if count == 1 { one } else { many })
+    format!("{} {}", format_count(count, noun), if count == 1 { one } else { many })
 }
 
 /// Reads a text file in UTF-8, with or without a byte order mark.

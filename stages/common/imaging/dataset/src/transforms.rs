@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use artifact::counted;
+use artifact::format_count;
 use scene::{CameraError, Intrinsics};
 use serde::Deserialize;
 
@@ -51,7 +51,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
         .map_err(|reason| DatasetError::format(file.path(), reason))?;
     let mut notes = vec![format!(
         "transforms.json (instant-ngp, nerfstudio): {}",
-        counted(read.frames.len(), "photograph")
+        format_count(read.frames.len(), "photograph")
     )];
     notes.extend(read.missing_note());
     notes.extend(lookup.notes());

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use artifact::{WARNING, counted};
+use artifact::{WARNING, format_count};
 
 use crate::file_status::path_text;
 use crate::format::Format;
@@ -61,7 +61,7 @@ fn relative(root: &Path, path: &Path) -> PathBuf {
 
 fn warning(format: Format, folder: &Path, files: &[PathBuf]) -> Option<String> {
     let first = files.first()?;
-    let count = counted(files.len(), "unused file");
+    let count = format_count(files.len(), "unused file");
     let look_like = if files.len() == 1 { "looks like a mask" } else { "look like masks" };
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     let remedy = match format {

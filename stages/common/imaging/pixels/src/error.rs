@@ -1,4 +1,4 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Error returned when an image can't be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -73,6 +73,18 @@ pub enum PixelError {
         /// Value of the sample.
         value: f32,
     },
+}
+
+impl PixelError {
+    /// Returns a conversion of an error of the operating system.
+    pub fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        move |source| Self::Io { path: path.to_path_buf(), source }
+    }
+
+    /// Creates the error of a file in another or a damaged format.
+    pub fn format(path: &Path, reason: impl Into<String>) -> Self {
+        Self::Format { path: path.to_path_buf(), reason: reason.into() }
+    }
 }
 
 /// Maximum number of pixels of an image: a header that claims more is damaged or hostile.

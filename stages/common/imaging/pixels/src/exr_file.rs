@@ -101,8 +101,7 @@ pub fn write_exr<E: From<PixelError>>(
     let mut order: Vec<usize> = (0..channels.len()).collect();
     order.sort_by_key(|&i| channels[i].name);
     let header = header((width, height), order.iter().map(|&i| &channels[i]), note);
-    let file =
-        File::create(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+    let file = File::create(path).map_err(PixelError::io(path))?;
     let mut failure: Option<E> = None;
     let mut samples = vec![0.0f32; width * BAND_ROWS * channels.len()];
     let written = exr::block::write(
@@ -209,20 +208,14 @@ fn block_bytes(samples: &[f32], width: usize, channels: &[Channel], order: &[usi
     data
 }
 
-fn format_error(path: &Path, reason: &str) -> PixelError {
-    PixelError::Format { path: path.to_path_buf(), reason: reason.to_owned() }
-}
-
 fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
-    File::open(path)
-        .map(BufReader::new)
-        .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
+    File::open(path).map(BufReader::new).map_err(PixelError::io(path))
 }
 
 /// Reads width and height of the first layer from the header; fails above [`MAX_PIXELS`].
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
     let meta = read_header(path)?;
-    let first = meta.headers.first().ok_or_else(|| format_error(path, "no layer"))?;
+    let first = meta.headers.first().ok_or_else(|| PixelError::format(path, "no layer"))?;
     Ok((first.layer_size.width(), first.layer_size.height()))
 }
 
@@ -240,7 +233,7 @@ const OFFSET_BYTES: u64 = 8;
 fn read_header(path: &Path) -> Result<MetaData, PixelError> {
     let file = open(path)?;
     let length = file.get_ref().metadata().map(|metadata| metadata.len());
-    let length = length.map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+    let length = length.map_err(PixelError::io(path))?;
     let meta = MetaData::read_from_buffered(file, false).map_err(|e| exr_error(path, e))?;
     if let Some(header) = meta.headers.iter().find(|h| h.layer_size.area() > MAX_PIXELS) {
         let (width, height) = (header.layer_size.width(), header.layer_size.height());
@@ -250,7 +243,7 @@ fn read_header(path: &Path) -> Result<MetaData, PixelError> {
     let chunks: u64 = meta.headers.iter().map(|header| header.chunk_count as u64).sum();
     if OFFSET_BYTES * chunks > length {
         let reason = "incomplete or damaged EXR (shorter than its offset table)";
-        return Err(format_error(path, reason));
+        return Err(PixelError::format(path, reason));
     }
     Ok(meta)
 }
@@ -268,7 +261,7 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
         .from_buffered(open(path)?)
         .map_err(|e| exr_error(path, e))?;
     let layer =
-        image.layer_data.into_iter().next().ok_or_else(|| format_error(path, "no layer"))?;
+        image.layer_data.into_iter().next().ok_or_else(|| PixelError::format(path, "no layer"))?;
     let (width, height) = (layer.size.width(), layer.size.height());
     let channels = layer
         .channel_data
@@ -282,9 +275,9 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
 fn exr_error(path: &Path, error: exr::error::Error) -> PixelError {
     match error {
         exr::error::Error::Io(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
-            PixelError::Io { path: path.to_path_buf(), source }
+            PixelError::io(path)(source)
         }
-        other => format_error(path, &format!("incomplete or damaged EXR ({other})")),
+        other => PixelError::format(path, format!("incomplete or damaged EXR ({other})")),
     }
 }
 
@@ -295,7 +288,7 @@ pub fn read_premultiplied(path: &Path) -> Result<Image, PixelError> {
         return Ok(Image::premultiplied(&read_png(path)?));
     }
     let image = read_exr(path)?.with_finite(&COLOUR_CHANNELS, path)?;
-    image.premultiplied().ok_or_else(|| format_error(path, "expected channels R, G, B and A"))
+    image.premultiplied().ok_or_else(|| PixelError::format(path, "expected channels R, G, B and A"))
 }
 
 #[cfg(test)]

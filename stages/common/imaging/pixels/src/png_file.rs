@@ -7,15 +7,14 @@ use crate::image_buffer::Rgba8;
 
 /// Reads a PNG of any type as 8-bit RGBA; without alpha it is opaque.
 pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
-    let file =
-        File::open(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+    let file = File::open(path).map_err(PixelError::io(path))?;
     let mut reader = image::ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
-    let image = reader.decode().map_err(|e| PixelError::Format {
-        path: path.to_path_buf(),
-        reason: format!("not a complete PNG of at most {MAX_PIXELS} pixels ({e})"),
+    let image = reader.decode().map_err(|e| {
+        let reason = format!("not a complete PNG of at most {MAX_PIXELS} pixels ({e})");
+        PixelError::format(path, reason)
     })?;
     Ok(image.into())
 }
@@ -23,8 +22,7 @@ pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
 /// Writes a PNG: RGB if all pixels are opaque, otherwise RGBA.
 pub fn write_png(path: &Path, image: &Rgba8) -> Result<(), PixelError> {
     let bytes = encode_png(image);
-    std::fs::write(path, bytes)
-        .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
+    std::fs::write(path, bytes).map_err(PixelError::io(path))
 }
 
 /// Returns the bytes that [`write_png`] writes.
@@ -62,8 +60,7 @@ pub struct PngRows {
 impl PngRows {
     /// Creates the file and writes its header.
     pub fn create(path: &Path, width: usize, height: usize) -> Result<Self, PixelError> {
-        let file = File::create(path)
-            .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+        let file = File::create(path).map_err(PixelError::io(path))?;
         let started = encoder(BufWriter::new(file), width, height, false).write_header();
         let stream =
             started.and_then(png::Writer::into_stream_writer).map_err(|e| png_error(path, e))?;
@@ -72,9 +69,7 @@ impl PngRows {
 
     /// Appends whole rows of 8-bit samples.
     pub fn write(&mut self, samples: &[u8]) -> Result<(), PixelError> {
-        self.stream
-            .write_all(samples)
-            .map_err(|source| PixelError::Io { path: self.path.clone(), source })
+        self.stream.write_all(samples).map_err(PixelError::io(&self.path))
     }
 
     /// Finishes the file after the last row.
@@ -86,7 +81,7 @@ impl PngRows {
 
 fn png_error(path: &Path, error: png::EncodingError) -> PixelError {
     match error {
-        png::EncodingError::IoError(source) => PixelError::Io { path: path.to_path_buf(), source },
-        other => PixelError::Format { path: path.to_path_buf(), reason: other.to_string() },
+        png::EncodingError::IoError(source) => PixelError::io(path)(source),
+        other => PixelError::format(path, other.to_string()),
     }
 }

@@ -22,6 +22,11 @@ pub struct Bounds {
 }
 
 impl Bounds {
+    /// Creates bounds whose box reaches from -`half_side` to `half_side` along each axis.
+    pub const fn cube(half_side: f64, near: f64, far: f64) -> Self {
+        Self { min: [-half_side; 3], max: [half_side; 3], near, far, space: Space::Box }
+    }
+
     /// Returns whether box, range and space aren't empty and all numbers are finite.
     pub fn is_valid(&self) -> bool {
         let mut numbers = self.min.iter().chain(&self.max).chain([&self.near, &self.far]);

@@ -1,6 +1,6 @@
 use std::ops::RangeInclusive;
 
-use artifact::number;
+use artifact::format_number;
 use glam::{DMat3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -76,7 +76,8 @@ pub enum CameraError {
     },
     /// A focal length isn't positive, or an intrinsic parameter isn't finite.
     #[error(
-        "{name} is {}; focal lengths must be above 0 and principal points finite", number(*value)
+        "{name} is {}; focal lengths must be above 0 and principal points finite",
+        format_number(*value)
     )]
     Intrinsics {
         /// `fx`, `fy`, `cx` or `cy`.
@@ -88,7 +89,7 @@ pub enum CameraError {
     #[error(
         "{name} is {} pixels, but the image's side has {side}; check that the {quantity} is in \
         pixels and belongs to this image",
-        number(*value)
+        format_number(*value)
     )]
     Proportion {
         /// `fx`, `fy`, `cx` or `cy`.

@@ -1,6 +1,6 @@
 use std::fmt;
 
-use artifact::number;
+use artifact::format_number;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -60,7 +60,8 @@ mod radial {
 
 impl fmt::Display for Distortion {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let ([k1, k2, k3, k4], [p1, p2]) = (self.radial.map(number), self.tangential.map(number));
+        let ([k1, k2, k3, k4], [p1, p2]) =
+            (self.radial.map(format_number), self.tangential.map(format_number));
         let lens = if self.is_fisheye() { "fisheye, " } else { "" };
         write!(f, "({lens}k1 {k1}, k2 {k2}, k3 {k3}, ")?;
         if self.radial[3] != 0.0 {
@@ -68,7 +69,7 @@ impl fmt::Display for Distortion {
         }
         write!(f, "p1 {p1}, p2 {p2}")?;
         if !is_zero(&self.denominator) {
-            let [d1, d2, d3] = self.denominator.map(number);
+            let [d1, d2, d3] = self.denominator.map(format_number);
             write!(f, ", denominator {d1}, {d2}, {d3}")?;
         }
         f.write_str(")")

@@ -166,7 +166,7 @@ pub enum Background {
 impl Background {
     /// Returns the grey level behind displayed images: white for a transparent background, the mean
     /// of black and white for gaps in an opaque scene.
-    pub fn shown(self) -> f32 {
+    pub fn grey_level(self) -> f32 {
         match self {
             Self::Black => 0.0,
             Self::White | Self::Alpha => 1.0,
@@ -216,7 +216,7 @@ impl Views {
 
     /// Reads an image of a view over the displayed background: RGB.
     pub fn read_over(&self, path: &Path) -> Result<Image, PixelError> {
-        Ok(read_premultiplied(path)?.over(self.background.shown()))
+        Ok(read_premultiplied(path)?.over(self.background.grey_level()))
     }
 
     /// Reads and checks the `views.json` of an input.
@@ -286,7 +286,6 @@ fn check_path(path: &str) -> Result<(), ViewsError> {
 mod tests {
     use super::*;
     use crate::intrinsics::Intrinsics;
-    use crate::space::Space;
 
     fn views() -> Views {
         let camera = Camera {
@@ -294,7 +293,7 @@ mod tests {
             intrinsics: Intrinsics::from_angle_x(8, 6, 0.7),
             camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]],
         };
-        let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 2., far: 6., space: Space::Box };
+        let bounds = Bounds::cube(1., 2., 6.);
         Views::new(Background::White, bounds, vec![View::camera_only(camera)])
     }
 

@@ -76,4 +76,15 @@ impl GivenInput {
         serde_path_to_error::deserialize(&mut serde_json::Deserializer::from_slice(&bytes))
             .bad_input(&context)
     }
+
+    /// Reads a JSON file that the input may lack.
+    ///
+    /// # Errors
+    /// Those of [`GivenInput::read_json`].
+    pub fn read_optional_json<T: DeserializeOwned>(
+        &self,
+        file: &str,
+    ) -> Result<Option<T>, Failure> {
+        if self.path(file).exists() { self.read_json(file).map(Some) } else { Ok(None) }
+    }
 }

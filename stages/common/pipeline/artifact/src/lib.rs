@@ -6,7 +6,7 @@
 //! * [`canonical_json`]: the only JSON form that is hashed.
 //! * [`RunRecord`]: record of a run, the input of a sink such as `report`.
 //! * [`Failure`]: an error by the user's next step; each kind has its exit code.
-//! * [`print_line!`], [`report_line!`], [`printable`], [`counted`]: text of messages.
+//! * [`print_line!`], [`report_line!`], [`printable`], [`format_count`]: text of messages.
 //!
 //! Descriptions of stages are in `contract`, the command line of stages is in `stage`. Libraries
 //! that stages share need neither.
@@ -47,8 +47,9 @@ pub use run_record::{
     FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, label, sink_folders,
 };
 pub use text::{
-    WARNING, amount, counted, format_duration, format_utc, known_names, nearest, number,
-    print_lines, print_text, printable, report_text, shortened, sized, warnings_of, with_warnings,
+    WARNING, format_amount, format_count, format_duration, format_number, format_size, format_utc,
+    known_names, nearest, print_lines, print_text, printable, report_text, shortened, warnings_of,
+    with_warnings,
 };
 
 /// Returns the current time in seconds since 1970.

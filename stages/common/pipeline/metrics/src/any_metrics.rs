@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use crate::figure::Figure;
+use crate::score_format::ScoreFormat;
 
 /// Name of the file in an artifact of kind `metrics`.
 pub const METRICS_FILE: &str = "metrics.json";
@@ -47,8 +47,9 @@ impl AnyMetrics {
         }
     }
 
-    /// Returns the figures; `None` if the list is missing or contains anything but a [`Figure`].
-    pub fn figures(&self) -> Option<Vec<Figure>> {
+    /// Returns the numbers to display; `None` if the list is missing or contains anything but a
+    /// [`ScoreFormat`].
+    pub fn figures(&self) -> Option<Vec<ScoreFormat>> {
         serde_json::from_value(self.0["figures"].clone()).ok()
     }
 

@@ -3,18 +3,18 @@
 //! * [`Metrics`]: the file as `eval` writes it, and as `eval` reads it from input `baseline`, with
 //!   [`ViewScores`] and [`NearReferences`].
 //! * [`Score`], [`Scores`]: numbers of one view, or means over all views, by name.
-//! * [`Figure`]: a number among the scores, with its label and format.
+//! * [`ScoreFormat`]: path, label, decimal places and direction of a number among the scores.
 //! * [`AnyMetrics`]: the file of any stage, for `report` and `table`; all fields are optional.
 //!
 //! `eval` computes the scores. No stage before `eval` uses this crate, so its changes don't repeat
 //! trainings.
 //!
 //! ```
-//! use metrics::{AnyMetrics, Figure, Metrics, Score, Scores};
+//! use metrics::{AnyMetrics, ScoreFormat, Metrics, Score, Scores};
 //!
 //! let written = Metrics {
 //!     conventions: Default::default(),
-//!     figures: vec![Figure::new("psnr", "PSNR ↑ dB", 2, true)],
+//!     figures: vec![ScoreFormat::new("psnr", "PSNR ↑ dB", 2, true)],
 //!     picture_titles: Default::default(),
 //!     mean: Scores::from([("psnr".to_owned(), Score::One(31.25))]),
 //!     least_gain: None,
@@ -30,7 +30,7 @@
 //! ```
 
 mod any_metrics;
-mod figure;
+mod score_format;
 
 use std::collections::BTreeMap;
 
@@ -38,7 +38,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use any_metrics::{AnyMetrics, METRICS_FILE, MetricsError};
-pub use figure::Figure;
+pub use score_format::ScoreFormat;
 
 /// `metrics.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -47,8 +47,8 @@ pub struct Metrics {
     /// Method of each metric as text; also the background of the scene (`background`) and the
     /// content of error maps (`error_maps`).
     pub conventions: BTreeMap<String, String>,
-    /// Figures to display, the most important first.
-    pub figures: Vec<Figure>,
+    /// Numbers to display, the most important first.
+    pub figures: Vec<ScoreFormat>,
     /// Titles of the metrics' pictures, by metric.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub picture_titles: BTreeMap<String, String>,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
-use artifact::{Failure, GivenInput, report_text, sized, write_json};
+use artifact::{Failure, GivenInput, format_size, report_text, write_json};
 use serde::Serialize;
 
 use crate::hooks::TestHooks;
@@ -94,7 +94,7 @@ impl Context {
     }
 
     /// Logs one line on stderr, which is also part of the action's log.
-    pub fn say(&self, text: impl std::fmt::Display) {
+    pub fn log_line(&self, text: impl std::fmt::Display) {
         if self.progress != ProgressMode::None {
             report_text(&text.to_string());
         }
@@ -107,7 +107,7 @@ impl Context {
     pub fn check_memory(&self, work: &str, need: u64, remedy: &str) -> Result<(), Failure> {
         remaining_memory(work, need, available_memory()?, remedy)?;
         if need >= MIN_LOGGED_BYTES {
-            self.say(format!("memory: about {} for {work}", sized(need)));
+            self.log_line(format!("memory: about {} for {work}", format_size(need)));
         }
         Ok(())
     }

@@ -6,6 +6,7 @@
 //! * [`Description`], [`Schema`], [`Rule`]: a stage's description, and the checks of values against
 //!   it.
 //! * [`Progress`], [`Event`]: progress reports for a terminal and for the runner.
+//! * [`CheckpointSchedule`]: times at which a training writes checkpoints.
 //! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic;
 //!   the runner uses them, too.
 //! * [`available_memory`], [`check_device`]: limits of memory, and the compute device.
@@ -41,6 +42,7 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod arguments;
+mod checkpoint_schedule;
 mod context;
 mod contract;
 mod help;
@@ -59,6 +61,7 @@ mod stage;
 mod staging;
 
 pub use arguments::{DeviceError, check_device};
+pub use checkpoint_schedule::CheckpointSchedule;
 pub use context::{Context, SUMMARY_FILE};
 pub use contract::{
     Description, DescriptionError, GivenInputs, Input, KeywordError, Output, PARAMETER_GROUPS,

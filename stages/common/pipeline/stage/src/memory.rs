@@ -1,4 +1,4 @@
-use artifact::{Failure, sized};
+use artifact::{Failure, format_size};
 use sysinfo::{MemoryRefreshKind, System};
 
 /// Phrases of allocators before the requested amount: Rust, libtorch, CUDA and NumPy.
@@ -90,7 +90,7 @@ pub fn remaining_memory(
 ) -> Result<u64, Failure> {
     let Some(free) = free else { return Ok(u64::MAX) };
     free.checked_sub(need).ok_or_else(|| {
-        let (need, free) = (sized(need), sized(free));
+        let (need, free) = (format_size(need), format_size(free));
         Failure::Usage(format!("{work} needs {need} of memory, and {free} are free; {remedy}"))
     })
 }
@@ -104,7 +104,7 @@ fn leading_amount(text: &str) -> Option<String> {
     let mut words = text.split_whitespace();
     let (number, unit) = (words.next()?, words.next()?.trim_end_matches(['.', ',', ';']));
     match unit {
-        "bytes" => Some(sized(number.parse().ok()?)),
+        "bytes" => Some(format_size(number.parse().ok()?)),
         "KiB" | "MiB" | "GiB" => number.parse::<f64>().ok().map(|_| format!("{number} {unit}")),
         _ => None,
     }

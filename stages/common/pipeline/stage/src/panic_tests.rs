@@ -21,7 +21,7 @@ impl Stage for Panics {
         Output::kind("text")
     }
     fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
-        context.say("before");
+        context.log_line("before");
         panic!("in a stage")
     }
 }

@@ -45,7 +45,7 @@ impl Context {
         let folder = work.join(PARTS_FOLDER).join(identity).join(name);
         if let Some(value) = self.restore_part(&folder, files) {
             if !self.resumed.swap(true, Ordering::Relaxed) {
-                self.say("resuming after the parts that an earlier run has finished");
+                self.log_line("resuming after the parts that an earlier run has finished");
             }
             return Ok(value);
         }

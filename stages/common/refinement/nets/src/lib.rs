@@ -20,9 +20,10 @@ mod adam;
 mod weights;
 
 use pixels::Image;
-use tch::{Cuda, Device, TchError, Tensor};
+use tch::{Cuda, TchError, Tensor};
 
 pub use adam::{Adam, add_gradients, all_finite};
+pub use tch::Device;
 pub use weights::{Conv, Weights, WeightsError, write};
 
 /// Makes libtorch's results reproducible: libtorch splits sums by thread, so it gets one thread.

@@ -37,7 +37,7 @@ impl<'a> LrObservations<'a> {
         let (width, height) = (k.width as usize, k.height as usize);
         Ok(photograph
             .filter(|p| p.image.width <= width && p.image.height <= height)
-            .map(|p| p.over(self.views.background.shown())))
+            .map(|p| p.over(self.views.background.grey_level())))
     }
 
     /// Makes a rendered view consistent with its own LR photograph, if there is one.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use artifact::{counted, report_line, sized};
+use artifact::{format_count, format_size, report_line};
 use planning::{PlanError, nearest_record};
 use serde_json::{Map, Value};
 use stage::machine_memory;
@@ -75,7 +75,7 @@ impl Budget {
     /// Decides whether a stage may start next to the running ones: a slot, a core and its memory
     /// must be free. One free core is enough for a stage of several threads.
     pub(crate) fn admission(&self, running: &BTreeMap<usize, Demand>, demand: Demand) -> Admission {
-        let (needed, limit) = (sized(demand.memory), sized(self.memory));
+        let (needed, limit) = (format_size(demand.memory), format_size(self.memory));
         if demand.memory > self.memory {
             return Admission::TooLarge(format!(
                 "needs {needed} of memory, as in its last run, but the limit is {limit}; change \
@@ -93,7 +93,7 @@ impl Budget {
         }
         Admission::WaitForMemory(format!(
             "needs {needed} of memory, as in its last run, but {} of {limit} are free",
-            sized(free)
+            format_size(free)
         ))
     }
 }
@@ -104,7 +104,7 @@ fn capped(option: &str, given: usize, cores: usize) -> usize {
     if given > max {
         report_line!(
             "nerf-sr: {option} {given} is more than {} can use; using {max}, with the same results",
-            counted(cores, "core")
+            format_count(cores, "core")
         );
     }
     given.min(max)

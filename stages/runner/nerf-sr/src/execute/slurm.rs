@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 
 use anyhow::Context as _;
-use artifact::{Failure, counted, hash_json, print_line, report_line};
+use artifact::{Failure, format_count, hash_json, print_line, report_line};
 use planning::{FrozenPlan, PlanError, Sink, State};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, SubmitOptions, Submitted, Task};
@@ -69,7 +69,7 @@ impl Cluster {
         if jobs.is_empty() && *already_queued + *remaining == 0 {
             print_line!("{}", run_messages::all_cached(run.plan.nodes.len()));
         } else {
-            let new = counted(jobs.len(), "job");
+            let new = format_count(jobs.len(), "job");
             print_line!("{new} submitted, {already_queued} already queued");
         }
         if run.stop.load(Ordering::Relaxed) {
@@ -83,7 +83,7 @@ impl Cluster {
             );
             report_line!(
                 "nerf-sr: {} not submitted: {reason}; run this again to submit the rest",
-                counted(*remaining, "job")
+                format_count(*remaining, "job")
             );
         }
         Ok(if error.is_some() { ExitCode::FAILURE } else { ExitCode::SUCCESS })
@@ -109,7 +109,7 @@ fn tasks(run: &Run<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
             stage: sink.stage.clone(),
             label: sink.stage.clone(),
             identity: sink_identity(sink, &identities, out),
-            parents: sink.shows.clone(),
+            parents: sink.nodes.clone(),
             resources: plan.resources.get(&sink.stage).cloned().unwrap_or_default(),
         });
     }
@@ -117,7 +117,7 @@ fn tasks(run: &Run<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
 }
 
 fn sink_identity(sink: &Sink, node_identities: &[String], out: &Path) -> String {
-    let shows: Vec<&String> = sink.shows.iter().map(|&index| &node_identities[index]).collect();
+    let shows: Vec<&String> = sink.nodes.iter().map(|&index| &node_identities[index]).collect();
     let code = &sink.program.description.code;
     hash_json(&json!({"sink": sink.stage, "code": code, "parameters": sink.parameters,
         "shows": shows, "out": out}))

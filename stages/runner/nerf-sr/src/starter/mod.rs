@@ -1,5 +1,4 @@
-//! First pipeline for a folder of posed photographs, as `nerf-sr init` writes it
-//! (docs/design/040).
+//! First pipeline for a folder of posed photographs, as `nerf-sr init` writes it (docs/design/040).
 //!
 //! * [`Starter`]: summary of the folder, and a complete, commented pipeline file for it.
 //! * [`Starter::write`]: writes the pipeline file and, next to it, `pipelines/` with the shipped
@@ -14,7 +13,7 @@ use std::fs;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
-use artifact::counted;
+use artifact::format_count;
 use dataset::{Dataset, DatasetError, Frame};
 
 use unposed::UnposedImages;
@@ -166,7 +165,7 @@ fn summarize(set: &Dataset) -> String {
         Some(first) if sizes.all(|size| size == first) => format!(" of {}×{}", first.0, first.1),
         _ => " of several sizes".to_owned(),
     };
-    format!("{}: {}{size}", set.format.title(), counted(set.frames.len(), "photograph"))
+    format!("{}: {}{size}", set.format.title(), format_count(set.frames.len(), "photograph"))
 }
 
 fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {

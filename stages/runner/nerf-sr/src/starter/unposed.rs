@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use artifact::counted;
+use artifact::format_count;
 use dataset::{is_image_name, is_unread_name, unread_images};
 
 /// Images of a folder, or of its subfolder `images`.
@@ -24,7 +24,7 @@ impl UnposedImages {
 
     /// Returns the number of images, with the command that converts those in unread formats.
     pub(crate) fn summary(&self) -> String {
-        let images = counted(self.files.len(), "image");
+        let images = format_count(self.files.len(), "image");
         match unread_images(&self.files) {
             Some(unread) => format!("{images} ({unread})"),
             None => images,

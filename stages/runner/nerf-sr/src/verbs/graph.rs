@@ -64,8 +64,8 @@ fn vertices<'a>(plan: &'a Plan, states: &[State]) -> Vec<Vertex<'a>> {
             label: sink.stage.clone(),
             state: "shows the run",
             is_sink: true,
-            inputs: sink.shows.iter().map(|&index| plan.nodes[index].label()).collect(),
-            parents: sink.shows.iter().map(|&index| (index, "")).collect(),
+            inputs: sink.nodes.iter().map(|&index| plan.nodes[index].label()).collect(),
+            parents: sink.nodes.iter().map(|&index| (index, "")).collect(),
         });
     }
     vertices

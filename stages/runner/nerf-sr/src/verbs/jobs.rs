@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
-use artifact::{counted, print_line, report_line, report_text};
+use artifact::{format_count, print_line, report_line, report_text};
 use planning::stage_call::{Display, StageFailure, stop_on_signals};
 use planning::{FrozenPlan, Plan, State};
 use signal_hook::consts::SIGUSR1;
@@ -31,7 +31,7 @@ pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<ExitC
         print_line!("{}: {job}", job.task.label);
     }
     let of_stage = stage.map(|stage| format!(" of {stage}")).unwrap_or_default();
-    print_line!("cancelled {}{of_stage}", counted(jobs.len(), "job"));
+    print_line!("cancelled {}{of_stage}", format_count(jobs.len(), "job"));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -95,7 +95,7 @@ fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
     let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
     let threads = slurm::available_cores();
     if let Some(sink) = run.plan.sinks.first() {
-        check_parents(run.plan, &sink.stage, sink.shows.iter().copied(), &records)?;
+        check_parents(run.plan, &sink.stage, sink.nodes.iter().copied(), &records)?;
         let progress = RunProgress { command, ..RunProgress::not_started(&records) };
         run_sink(run, sink, threads, &progress)?.print(&sink.stage);
         return Ok(());

@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::{counted, print_line};
+use artifact::{format_count, print_line};
 use planning::{PlanError, Request, State};
 
 use crate::session::{Session, command_line};
@@ -24,7 +24,7 @@ pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::R
         actions.push((node.stage.clone(), record.key()));
     }
     session.store.pin(&entered, name, command_line(), &actions)?;
-    print_line!("pinned {} as {name}", counted(actions.len(), "artifact"));
+    print_line!("pinned {} as {name}", format_count(actions.len(), "artifact"));
     Ok(ExitCode::SUCCESS)
 }
 

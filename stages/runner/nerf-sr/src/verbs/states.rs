@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use artifact::{counted, format_duration, hash_json, print_line, sized};
+use artifact::{format_count, format_duration, format_size, hash_json, print_line};
 use planning::{Plan, Request, State};
 
 use store::Record;
@@ -47,7 +47,7 @@ pub(crate) fn why(
     }
     if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
         print_line!("{stage}: {}", sink_text(&plan, sink, &states));
-        for &index in &sink.shows {
+        for &index in &sink.nodes {
             print_line!("  {}", explanation(session, &plan, &states, &records, index));
         }
         return Ok(ExitCode::SUCCESS);
@@ -103,7 +103,7 @@ pub(crate) fn status(session: &Session, request: &Request, json: bool) -> anyhow
         print_line!("{label:<40} {:<9} {}", state.name(), details.join("; "));
     }
     if other_jobs > 0 {
-        let jobs = counted(other_jobs, "job");
+        let jobs = format_count(other_jobs, "job");
         print_line!("also queued: {jobs}, for pages or for runs with other arguments");
     }
     Ok(ExitCode::SUCCESS)
@@ -115,7 +115,7 @@ fn cached_detail(session: &Session, record: &Record) -> String {
     format!(
         "{}  {:>9}  {:>9}  {}",
         &record.output[..10],
-        sized(size),
+        format_size(size),
         format_duration(record.seconds),
         age_text(record)
     )

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
-use artifact::{Damage, counted, print_line};
+use artifact::{Damage, format_count, print_line};
 use indicatif::{ProgressBar, ProgressStyle};
 use store::{Entered, Store, StoreError};
 
@@ -115,9 +115,9 @@ impl Tally {
     /// Prints the numbers. The exit code is 3 if anything is damaged or unreadable.
     fn print(&self) -> ExitCode {
         let Self { artifacts, damaged, damaged_records, unreadable } = *self;
-        let mut line = format!("{}, {damaged} damaged", counted(artifacts, "artifact"));
+        let mut line = format!("{}, {damaged} damaged", format_count(artifacts, "artifact"));
         if damaged_records > 0 {
-            line += &format!(", {} damaged", counted(damaged_records, "record"));
+            line += &format!(", {} damaged", format_count(damaged_records, "record"));
         }
         if unreadable > 0 {
             line += &format!(", {unreadable} unreadable");

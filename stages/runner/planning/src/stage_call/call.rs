@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{counted, format_duration, format_utc, printable, sized, unix_time};
+use artifact::{format_count, format_duration, format_size, format_utc, printable, unix_time};
 use stage::Description;
 use stage::{Event, SUMMARY_FILE};
 use wait4::ResUse;
@@ -110,7 +110,7 @@ impl Call<'_> {
                 log.line(format_args!(
                     "done in {time}; processor time {}, peak memory {}",
                     format_duration(usage.processor_seconds),
-                    sized(usage.peak_memory)
+                    format_size(usage.peak_memory)
                 ));
                 for line in read_summary(self.output).unwrap_or_default().lines() {
                     log.line(format_args!("result: {line}"));
@@ -129,7 +129,7 @@ impl Call<'_> {
             "program: {} {}, {}",
             self.program.display(),
             self.description.version,
-            counted(self.threads, "thread")
+            format_count(self.threads, "thread")
         ));
         log.line(format_args!("device: {}", self.device));
         let parameters = std::fs::read(self.params)

@@ -88,8 +88,7 @@ fn without_name<'a>(line: &'a str, name: &str) -> &'a str {
 }
 
 /// Returns whether a line is one that Rust's runtime adds to a panic message: a hint or a frame of
-/// a backtrace.
-/// Such lines are for the log alone.
+/// a backtrace. Such lines are for the log alone.
 pub(crate) fn is_noise(line: &str) -> bool {
     let text = line.trim_start();
     let is_frame = text.starts_with("at ")

@@ -51,7 +51,7 @@ fn straight_ray(seed: u64) -> NormalizedRay {
     let mut d: [f32; 3] = std::array::from_fn(|i| 1.2 * draw() - origin[i]);
     d.iter_mut().take(seed as usize / 3 % 3).for_each(|x| *x = 0.0);
     let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
-    let cube = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.1, far: 9.0, ..Bounds::default() };
+    let cube = Bounds::cube(1.0, 0.1, 9.0);
     let direction = d.map(|x| f64::from(x / length));
     clip(&cube, &Ray { origin: origin.map(f64::from), direction, background: [0.0; 3] })
 }

@@ -113,7 +113,7 @@ pub trait Supervisor: Sync {
     ) -> f64;
     /// Stores a step's rendered colours. Called after each step that was applied, with all bundles
     /// in order. Parallel tasks are run by the clock.
-    fn remember(&mut self, _rendered: &[RenderedBundles<'_>], _clock: &PhaseClock) {}
+    fn record_colours(&mut self, _rendered: &[RenderedBundles<'_>], _clock: &PhaseClock) {}
 }
 
 /// Rendered colours of bundles in sequence.

@@ -7,7 +7,7 @@ mod points;
 
 use std::path::{Path, PathBuf};
 
-use artifact::counted;
+use artifact::format_count;
 use scene::Intrinsics;
 
 use crate::dataset::Dataset;
@@ -144,7 +144,7 @@ fn read_largest_model<'a>(
     }
     let (path, model) = largest
         .ok_or_else(|| Problem::Unrecognised { path: folder.to_path_buf(), nearby: None })?;
-    let photographs = counted(model.images.len(), "photograph");
+    let photographs = format_count(model.images.len(), "photograph");
     let name = path.strip_prefix(folder).unwrap_or(path).display();
     let mut notes = vec![format!("COLMAP: {photographs} from {name}")];
     if models.len() > 1 {

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use artifact::counted;
+use artifact::format_count;
 use glam::DVec3;
 use scene::Intrinsics;
 
@@ -38,7 +38,7 @@ impl Reach {
 pub(super) fn removed_points_note(removed: usize, all: usize) -> String {
     format!(
         "{removed} of {} removed: too far from the cameras to have a measurable depth",
-        counted(all, "point")
+        format_count(all, "point")
     )
 }
 

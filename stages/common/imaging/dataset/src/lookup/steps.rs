@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use artifact::counted;
+use artifact::format_count;
 
 use crate::file_status::path_text;
 
@@ -23,7 +23,7 @@ impl Step {
     /// step.
     fn note(&self, how: &str) -> Option<String> {
         let (name, file) = self.first.as_ref()?;
-        let names = counted(self.names.len(), "file name");
+        let names = format_count(self.names.len(), "file name");
         Some(format!("{names} found {how} (first: {name} is {file})"))
     }
 }

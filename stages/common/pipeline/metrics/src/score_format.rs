@@ -2,12 +2,12 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// Figure of `metrics.json`: a number among the scores, with its label and format.
-// The schema describes the figures of `eval`. Those of other stages may have more fields, or none
+/// Format of a number among the scores: path, label, decimal places and direction.
+// The schema describes the formats of `eval`. Those of other stages may have more fields, or none
 // for the direction.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[schemars(deny_unknown_fields)]
-pub struct Figure {
+pub struct ScoreFormat {
     /// Path to the number in the scores: keys separated by `/`, the outermost first.
     pub path: String,
     /// Label, with unit.
@@ -17,14 +17,14 @@ pub struct Figure {
     /// True if higher values are better.
     #[schemars(with = "bool")]
     pub higher_is_better: Option<bool>,
-    /// Text displayed if the figure is missing from views that have others; without the text, only
-    /// results with the figure display it.
+    /// Text displayed if the number is missing from views that have others; without the text, only
+    /// results with the number display it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub missing: Option<String>,
 }
 
-impl Figure {
-    /// Creates a figure with a direction.
+impl ScoreFormat {
+    /// Creates a format with a direction.
     pub fn new(path: &str, label: &str, digits: usize, higher_is_better: bool) -> Self {
         Self {
             path: path.to_owned(),
@@ -35,12 +35,12 @@ impl Figure {
         }
     }
 
-    /// Returns the figure's number in the scores of a view, or in the means.
+    /// Returns the number in the scores of a view, or in the means.
     pub fn value_in(&self, scores: &Value) -> Option<f64> {
         scores.pointer(&format!("/{}", self.path))?.as_f64()
     }
 
-    /// Formats a value with the figure's decimal places, without unit.
+    /// Formats a value with its decimal places, without unit.
     pub fn format_value(&self, value: f64) -> String {
         // A file may request more digits than the formatter supports.
         format!("{value:.*}", self.digits.min(f64::DIGITS as usize))

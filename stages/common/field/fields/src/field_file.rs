@@ -1,10 +1,8 @@
+use radiance::{Architecture, OutOfRange, check_ranges};
+use scene::{Background, Bounds};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-use scene::Bounds;
-
-use crate::architecture::Architecture;
-use crate::architecture::{OutOfRange, check_ranges};
+use torch_field::MlpArchitecture;
 
 /// Name of the description in a field artifact. Each member's weights are next to it, in
 /// [`FieldFile::member_file`].
@@ -34,7 +32,7 @@ pub struct FieldFile {
     /// Bounds of the field, in scene units.
     pub bounds: Bounds,
     /// Background behind the scene.
-    pub background: scene::Background,
+    pub background: Background,
 }
 
 /// Returns the format of a file without `format`.
@@ -79,66 +77,8 @@ impl FieldFile {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum FieldModel {
-    /// Multi-resolution grid with small MLPs, of this crate.
+    /// Multi-resolution grid with small MLPs, of `radiance`.
     Grid(Architecture),
     /// The paper's coarse and fine MLP, of `torch-field`.
     Mlp(MlpArchitecture),
-}
-
-/// Sizes of the paper's field; defaults are the published ones. Aliases are the names of format 2.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct MlpArchitecture {
-    /// Octaves of the positional encoding of positions.
-    #[serde(alias = "position_octaves")]
-    pub position_frequencies: u32,
-    /// Octaves of the positional encoding of directions.
-    #[serde(alias = "direction_octaves")]
-    pub direction_frequencies: u32,
-    /// Number of layers before density and colour branch; the fifth has a skip connection.
-    #[serde(alias = "depth")]
-    pub layers: u32,
-    /// Width of the layers before the branch.
-    #[serde(alias = "width")]
-    pub hidden_dim: u32,
-    /// Number of samples per ray of the coarse network.
-    pub coarse_samples: u32,
-    /// Number of additional samples per ray of the fine network.
-    pub fine_samples: u32,
-    /// In NDC, colours depend on the NDC direction from the near to the far plane, not normalised,
-    /// as in the reference code; if false, on the world direction.
-    pub ndc_directions: bool,
-    /// In a box, positions are relative to the box's middle, in [`Bounds::unit`]s. If false, they
-    /// are in scene units from the origin, as in the reference code, which expects scenes of a few
-    /// units around the origin.
-    pub scaled_positions: bool,
-}
-
-impl Default for MlpArchitecture {
-    fn default() -> Self {
-        Self {
-            position_frequencies: 10,
-            direction_frequencies: 4,
-            layers: 8,
-            hidden_dim: 256,
-            coarse_samples: 64,
-            fine_samples: 64,
-            ndc_directions: false,
-            scaled_positions: false,
-        }
-    }
-}
-
-impl MlpArchitecture {
-    /// Fails with the first number that is out of range.
-    pub fn check(&self) -> Result<(), OutOfRange> {
-        check_ranges(&[
-            ("position_frequencies", self.position_frequencies, 0, 16),
-            ("direction_frequencies", self.direction_frequencies, 0, 16),
-            ("layers", self.layers, 1, 32),
-            ("hidden_dim", self.hidden_dim, 2, 4096),
-            ("coarse_samples", self.coarse_samples, 4, 4096),
-            ("fine_samples", self.fine_samples, 1, 4096),
-        ])
-    }
 }

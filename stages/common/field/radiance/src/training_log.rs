@@ -1,13 +1,17 @@
 use std::collections::BTreeMap;
 
-use scene::Views;
+use scene::{Pose, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+/// Name of a [`TrainingLog`] in a field artifact.
+pub const TRAINING_FILE: &str = "training.json";
+
 /// `training.json`: course of a training, over all ensemble members in order.
+// Sinks also read logs of other versions, which may have more fields.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[schemars(deny_unknown_fields)]
 pub struct TrainingLog {
     /// Number of steps.
     pub steps: u64,
@@ -28,7 +32,7 @@ pub struct TrainingLog {
     /// given ones if refinement didn't improve them; empty without pose refinement. From the first
     /// member.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub poses: Vec<scene::Pose>,
+    pub poses: Vec<Pose>,
     /// Warnings, one line each.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
@@ -36,7 +40,7 @@ pub struct TrainingLog {
 
 impl TrainingLog {
     /// Appends the log of the next training.
-    pub(crate) fn append(&mut self, next: TrainingLog) {
+    pub fn append(&mut self, next: TrainingLog) {
         let samples =
             self.samples_per_ray * self.rays as f64 + next.samples_per_ray * next.rays as f64;
         let before = self.rays;
@@ -53,20 +57,17 @@ impl TrainingLog {
     }
 
     /// True if the poses differ from the given ones.
-    pub(crate) fn has_moved_cameras(&self, views: &Views) -> bool {
+    pub fn has_moved_cameras(&self, views: &Views) -> bool {
         self.poses.iter().zip(&views.views).any(|(pose, view)| *pose != view.camera.camera_to_world)
     }
 }
 
 /// Point of the training curve.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[schemars(deny_unknown_fields)]
 pub struct CurvePoint {
     /// Number of rays cast so far.
     pub rays: u64,
     /// PSNR over the training pixels since the previous point, in dB.
     pub psnr: f64,
 }
-
-/// File name of a [`TrainingLog`] in the output.
-pub(crate) const TRAINING_FILE: &str = "training.json";
