@@ -16,6 +16,7 @@ use artifact::{format_amount, format_count};
 use fields::{Members, lower_median, mean, pixel_rays};
 use pixels::{PngRows, to_u8};
 use radiance::RayField;
+use rayon::prelude::*;
 use scene::{
     Background, Camera, VIEW_CHANNELS, VIEWS_FILE, View, Views, image_file, preview_file,
     write_view_image,
@@ -139,6 +140,9 @@ fn resize(camera: &Camera, width: Option<u32>) -> Camera {
     camera.resized(width, height as u32)
 }
 
+/// Minimum number of pixels whose rays a task combines; chosen by hand.
+const MIN_PIXELS_PER_TASK: usize = 64;
+
 /// View to render.
 struct RenderJob<'a> {
     params: &'a Params,
@@ -161,16 +165,25 @@ impl RenderJob<'_> {
         let exr = context.output_path(image)?;
         let mut png = PngRows::create(&context.output_path(preview)?, width, height)?;
         let mut centres = CentreRows::default();
+        let mut preview = Vec::new();
         write_view_image(&exr, (width, height), channels, |first, rows, samples| {
             context.check_interrupt()?;
-            let pixels = self.render_rows(&mut centres, first..first + rows)?;
+            // Another thread writes the preview's previous rows meanwhile.
+            let mut written = Ok(());
+            let pixels = rayon::in_place_scope(|scope| {
+                scope.spawn(|_| written = png.write(&preview));
+                self.render_rows(&mut centres, first..first + rows)
+            })?;
+            written?;
             for (i, sample) in samples.chunks_exact_mut(channels.len()).enumerate() {
                 sample.copy_from_slice(&pixels[i].channels[..channels.len()]);
             }
-            png.write(&pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect::<Vec<_>>())?;
+            preview.clear();
+            preview.extend(pixels.iter().flat_map(|pixel| pixel.colour.map(to_u8)));
             progress.add(rows as u64);
             anyhow::Ok(())
         })?;
+        png.write(&preview)?;
         png.finish().context("cannot write the preview")
     }
 
@@ -211,36 +224,39 @@ impl RenderJob<'_> {
         let (rays, z_per_distance) = pixel_rays(self.camera, self.background, positions, n);
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
         let rendered = rendered.map_err(fields::rendering_failure)?;
-        let (mut pixels, mut samples) = (Vec::with_capacity(positions.len()), Vec::new());
-        for i in 0..positions.len() {
+        let pixels = (0..positions.len()).into_par_iter().with_min_len(MIN_PIXELS_PER_TASK);
+        let depth = self.params.depth;
+        let combined = pixels.map_init(Vec::new, |samples, i| {
             let rays = i * n * n..(i + 1) * n * n;
             samples.clear();
             for member in &rendered {
                 samples.extend(member[rays.clone()].iter().zip(&z_per_distance[rays.clone()]));
             }
-            pixels.push(self.combine(&samples));
-        }
-        Ok(pixels)
+            combine(depth, samples)
+        });
+        Ok(combined.collect())
     }
+}
 
-    /// Combines the samples of a pixel's rays, each with its z-depth per distance: means of colour
-    /// and opacity, middle depth. A mean depth would lie between two surfaces.
-    fn combine(&self, samples: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
-        let [r, g, b] = std::array::from_fn(|c| mean(samples, |(p, _)| p.premultiplied[c]));
-        let mut distances: Vec<(f32, f32)> =
-            samples.iter().map(|(pixel, to_z)| (self.distance(pixel), **to_z)).collect();
-        let (distance, to_z) = lower_median(&mut distances, |d| d.0).copied().unwrap_or_default();
-        ViewPixel {
-            channels: [r, g, b, mean(samples, |(p, _)| p.opacity), distance * to_z, distance],
-            colour: std::array::from_fn(|c| mean(samples, |(p, _)| p.colour[c])),
-        }
+/// Combines the samples of a pixel's rays, each with its z-depth per distance: means of colour and
+/// opacity, middle depth. A mean depth would lie between two surfaces.
+fn combine(depth: Depth, samples: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
+    let [r, g, b] = std::array::from_fn(|c| mean(samples, |(p, _)| p.premultiplied[c]));
+    let mut distances: Vec<(f32, f32)> =
+        samples.iter().map(|(pixel, to_z)| (depth.distance(pixel), **to_z)).collect();
+    let (distance, to_z) = lower_median(&mut distances, |d| d.0).copied().unwrap_or_default();
+    ViewPixel {
+        channels: [r, g, b, mean(samples, |(p, _)| p.opacity), distance * to_z, distance],
+        colour: std::array::from_fn(|c| mean(samples, |(p, _)| p.colour[c])),
     }
+}
 
-    /// Returns the distance along the ray by the chosen kind of depth.
-    fn distance(&self, pixel: &radiance::Pixel) -> f32 {
-        match self.params.depth {
-            Depth::Expected => pixel.depth,
-            Depth::Median => pixel.median_depth,
+impl Depth {
+    /// Returns the distance along the ray by this kind of depth.
+    fn distance(self, pixel: &radiance::Pixel) -> f32 {
+        match self {
+            Self::Expected => pixel.depth,
+            Self::Median => pixel.median_depth,
         }
     }
 }

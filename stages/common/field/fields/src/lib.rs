@@ -21,6 +21,7 @@ use std::path::Path;
 
 use artifact::{Failure, FailureExt as _, GivenInput};
 use radiance::{Field, Pixel, Ray, RayField, RenderError};
+use rayon::prelude::*;
 use scene::{Background, Bounds, Camera};
 
 pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel};
@@ -91,6 +92,9 @@ fn average_pixels(pixels: &mut [Pixel]) -> Pixel {
     }
 }
 
+/// Minimum number of rays that a task casts; chosen by hand.
+const MIN_RAYS_PER_TASK: usize = 64;
+
 /// Returns n × n rays through each of a camera's pixels `[x, y]`, pixel by pixel, and the z-depth
 /// per unit of distance along each ray.
 pub fn pixel_rays(
@@ -100,18 +104,15 @@ pub fn pixel_rays(
     n: usize,
 ) -> (Vec<Ray>, Vec<f32>) {
     let (camera_rays, background) = (camera.rays(), [background.grey_level(); 3]);
-    let mut rays = Vec::with_capacity(pixels.len() * n * n);
-    let mut z_per_distance = Vec::with_capacity(rays.capacity());
-    for &[x, y] in pixels {
-        for sub in 0..n * n {
-            let u = x as f64 + ((sub % n) as f64 + 0.5) / n as f64;
-            let v = y as f64 + ((sub / n) as f64 + 0.5) / n as f64;
-            let ray = camera_rays.ray(u, v);
-            rays.push(Ray::new(&ray, background));
-            z_per_distance.push(camera.depth_per_distance(&ray) as f32);
-        }
-    }
-    (rays, z_per_distance)
+    let rays = (0..pixels.len() * n * n).into_par_iter().with_min_len(MIN_RAYS_PER_TASK);
+    rays.map(|i| {
+        let ([x, y], sub) = (pixels[i / (n * n)], i % (n * n));
+        let u = x as f64 + ((sub % n) as f64 + 0.5) / n as f64;
+        let v = y as f64 + ((sub / n) as f64 + 0.5) / n as f64;
+        let ray = camera_rays.ray(u, v);
+        (Ray::new(&ray, background), camera.depth_per_distance(&ray) as f32)
+    })
+    .unzip()
 }
 
 /// Returns the mean of one number over all items; 0 if there are none.

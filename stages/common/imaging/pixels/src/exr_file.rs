@@ -85,12 +85,13 @@ impl ExrImage {
 /// Number of rows that ZIP16 compresses together.
 const BAND_ROWS: usize = 16;
 
-/// Writes an EXR file (scan lines, ZIP) with reproducible bytes: increasing line order, sequential
-/// compression, one attribute.
+/// Writes an EXR file (scan lines, ZIP) with reproducible bytes: increasing line order, one
+/// attribute.
 ///
 /// `band(first_row, rows, samples)` fills up to 16 rows at a time, with `channels` interleaved in
-/// the given order, so that memory doesn't grow with the image. `note` describes the colours. Fails
-/// at the first sample that isn't finite.
+/// the given order, so that memory doesn't grow with the image. Another thread compresses the
+/// previous rows meanwhile. `note` describes the colours. Fails at the first sample that isn't
+/// finite.
 pub fn write_exr<E: From<PixelError>>(
     path: &Path,
     (width, height): (usize, usize),
@@ -109,25 +110,37 @@ pub fn write_exr<E: From<PixelError>>(
         [header].into_iter().collect(),
         true,
         |meta, writer| {
-            let mut compressor = writer.sequential_blocks_compressor(&meta);
+            let mut previous: Option<(usize, UncompressedBlock)> = None;
             for (index, block) in exr::block::enumerate_ordered_header_block_indices(&meta.headers)
             {
                 let (first, rows) = (block.pixel_position.y(), block.pixel_size.height());
                 let samples = &mut samples[..width * rows * channels.len()];
-                let filled = band(first, rows, samples).and_then(|()| {
-                    check_finite(path, channels, width, first, samples)?;
-                    Ok(block_bytes(samples, width, channels, &order))
+                let mut compressed = None;
+                let filled = rayon::in_place_scope(|scope| {
+                    if let Some((index, block)) = previous.take() {
+                        let (compressed, headers) = (&mut compressed, &meta.headers);
+                        scope.spawn(move |_| {
+                            *compressed = Some((index, block.compress_to_chunk(headers)));
+                        });
+                    }
+                    band(first, rows, samples).and_then(|()| {
+                        check_finite(path, channels, width, first, samples)?;
+                        Ok(block_bytes(samples, width, channels, &order))
+                    })
                 });
+                if let Some((index, chunk)) = compressed {
+                    writer.write_chunk(index, chunk?)?;
+                }
                 match filled {
-                    Ok(data) => compressor
-                        .compress_block(index, UncompressedBlock { index: block, data })?,
+                    Ok(data) => previous = Some((index, UncompressedBlock { index: block, data })),
                     Err(error) => {
                         failure = Some(error);
                         return Err(exr::error::Error::Aborted);
                     }
                 }
             }
-            Ok(())
+            let Some((index, block)) = previous else { return Ok(()) };
+            writer.write_chunk(index, block.compress_to_chunk(&meta.headers)?)
         },
     );
     match (failure, written) {
