@@ -42,7 +42,7 @@ use scoring::{Perceptual, metrics};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Absolute error of the brightest colour in error maps.
+    /// Absolute error that error maps display in the brightest colour.
     #[schemars(range(min = 0.001, max = 1.0))]
     pub error_range: f64,
 }
@@ -69,14 +69,14 @@ impl Stage for Eval {
                 "baseline",
                 Input::optional(
                     &["metrics"],
-                    "scores of the same views by another method, for the smallest gain of a view over them",
+                    "another method's scores of the same views, for the least gain of any view",
                 ),
             ),
             (
                 "references",
                 Input::optional(
                     &["scene/references"],
-                    "HR references, for scores of the views near one",
+                    "HR references, for scores of the views near a reference",
                 ),
             ),
             (

@@ -95,7 +95,7 @@ fn near_point(views: &[CameraDepths]) -> DVec3 {
     }
     let step = NEAR_POINT_STEP * power_of_two_below(extent);
     let point = (first / step).round() * step;
-    // The step is 0 for cameras at one position.
+    // For cameras at one position without known depths, the step is 0.
     if point.is_finite() { point } else { DVec3::ZERO }
 }
 
@@ -143,10 +143,10 @@ fn ndc_bounds(
 /// (docs/design/035).
 const GUESSED_DEPTH_FACTORS: [f64; 2] = [0.25, 50.0];
 
-/// Guesses the depth range of cameras that face one direction, from the point where their axes
-/// cross or, for parallel axes, from four times the cameras' extent (docs/design/035). A guess that
-/// is too near costs detail but cuts nothing off. `None` for cameras that face several directions
-/// or are at one position.
+/// Guesses the depth range of cameras that face one direction. The range is relative to the point
+/// where the cameras' axes cross or, for parallel axes, to four times the cameras' extent
+/// (docs/design/035). A near end that is too near costs detail but cuts nothing off. `None` for
+/// cameras that face several directions or are at one position.
 fn guess_depths(views: &[CameraDepths]) -> Option<[f64; 2]> {
     let cameras: Vec<&Camera> = views.iter().map(|(camera, _)| camera).collect();
     let forward = common_direction(cameras.iter().copied())?;
@@ -290,8 +290,8 @@ fn box_bounds(views: &[CameraDepths]) -> Bounds {
     with_ray_range(box_only, &cameras)
 }
 
-/// Maximum slope of a fisheye view's border that a box follows: 45° from the axis. A wider box
-/// around the region that the cameras face would contain the cameras (docs/design/005).
+/// Maximum slope of a fisheye view's border from which a box's size is computed: 45° from the axis.
+/// Larger slopes would yield boxes that contain the cameras (docs/design/005).
 const MAX_FISHEYE_SLOPE: f64 = 1.0;
 
 /// Returns half the longer side of a camera's view at the distance of `point`.
@@ -574,7 +574,8 @@ mod tests {
         Camera { intrinsics, ..camera.clone() }
     }
 
-    /// Between two distances a fisheye camera sees a part of a ball, which no frustum holds.
+    /// The points that a fisheye camera observes between two distances are part of a spherical
+    /// shell, which no frustum contains.
     #[test]
     fn fisheye_cameras_have_a_box_or_a_contraction() {
         let row: Vec<Camera> = (0..5).map(|i| fisheye(&parallel(1.0, i), 160.0)).collect();
@@ -606,7 +607,8 @@ mod tests {
             ),
             Err(SpaceError::Fisheye)
         );
-        // The box around what they look at doesn't hold them, however wide their view is.
+        // A box around the region that the cameras face doesn't contain the cameras, however wide
+        // their angle of view is.
         for (degrees, half) in [(60.0, 1.05 * 4.0 * f64::to_radians(30.0).tan()), (180.0, 4.2)] {
             let around = circle(DVec3::ZERO, 4.0);
             let ring: Vec<Camera> = around.iter().map(|c| fisheye(c, degrees)).collect();

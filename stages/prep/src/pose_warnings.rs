@@ -2,7 +2,7 @@
 
 use artifact::format_count;
 use glam::DVec3;
-use scene::{Camera, Intrinsics, length};
+use scene::{Camera, Intrinsics, format_length};
 
 use crate::error::SamePose;
 
@@ -81,8 +81,8 @@ fn single_position(cameras: &[Camera]) -> Option<String> {
         format!(
             "the {count} training cameras are up to {} units apart, but their centres are rounded \
             to {}: subtract an offset from all centres before rounding",
-            length(extent, 3),
-            length(error, 3)
+            format_length(extent, 3),
+            format_length(error, 3)
         )
     })
 }

@@ -1,6 +1,6 @@
 use artifact::{Failure, WARNING};
 use dataset::{Dataset, Frame, Split};
-use scene::{Background, Bounds, Camera, Space, length};
+use scene::{Background, Bounds, Camera, Space, format_length};
 
 use crate::bounds::{CameraDepths, scene_bounds};
 use crate::error::{ParameterError, SamePose};
@@ -106,21 +106,21 @@ pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
         Background::Alpha => "alpha",
         Background::Opaque => "opaque",
     };
-    let side = length(bounds.longest_side(), 3);
+    let side = format_length(bounds.longest_side(), 3);
     let space = match bounds.space {
         Space::Box => format!(
             "space: box of {side} units, rays from {} to {}",
-            length(bounds.near, 3),
-            length(bounds.far, 3)
+            format_length(bounds.near, 3),
+            format_length(bounds.far, 3)
         ),
         Space::Ndc(f) => format!(
             "space: NDC, since all cameras face one direction; depth from {} to {}",
-            length(f.near, 3),
-            length(f.far, 3)
+            format_length(f.near, 3),
+            format_length(f.far, 3)
         ),
         Space::Contraction => format!(
             "space: contraction around a ball of {side} units, rays up to {}",
-            length(bounds.far, 0)
+            format_length(bounds.far, 0)
         ),
     };
     format!("{space}; background {background}")

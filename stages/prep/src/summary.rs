@@ -1,7 +1,7 @@
 use artifact::{WARNING, format_count, with_warnings};
 use dataset::Dataset;
 use pixels::Kernel;
-use scene::{Background, Bounds, length};
+use scene::{Background, Bounds, format_length};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -69,7 +69,7 @@ impl SceneSummary {
         let ([lr_width, lr_height], [hr_width, hr_height]) = (self.lr, self.hr);
         let (train, test) =
             (format_count(self.train, "training view"), format_count(self.test, "test view"));
-        let [near, far] = [self.bounds.near, self.bounds.far].map(|end| length(end, 2));
+        let [near, far] = [self.bounds.near, self.bounds.far].map(|end| format_length(end, 2));
         let kernel = self.kernel;
         let summary = format!(
             "{train} at {lr_width}×{lr_height} from {hr_width}×{hr_height} ({kernel:?}), {test}; \

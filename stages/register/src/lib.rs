@@ -156,8 +156,8 @@ fn summary(registered: &[Registered]) -> (String, Option<String>) {
         format_count(registered.len(), "camera")
     );
     let warning = format!(
-        "cameras have {moved}; unless the given poses are that far off, the field and the \
-        photographs are of different scenes"
+        "cameras have {moved}; unless the given poses are that far off, check that the field and \
+        the photographs are of the same scene"
     );
     (summary, moved.is_far().then_some(warning))
 }

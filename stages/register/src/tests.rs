@@ -77,7 +77,9 @@ fn a_camera_is_registered_and_a_far_one_is_warned_of() {
     ]);
     assert!(text.starts_with("2 of 3 cameras registered: "), "{text}");
     assert!(
-        warning.as_ref().is_some_and(|w| w.contains("unless the given poses are that far off")),
+        warning.as_ref().is_some_and(
+            |w| w.contains("check that the field and the photographs are of the same scene")
+        ),
         "{warning:?}"
     );
 }

@@ -1,13 +1,13 @@
 use pixels::{DepthMap, ExrImage};
 
-/// Errors of a view's z-depth, in scene units.
+/// Errors of a view's z-depth over the pixels with a surface in the ground truth.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DepthError {
-    /// Mean absolute error, dominated by edges.
+    /// Mean absolute error in scene units, dominated by edges.
     pub mean_absolute: f64,
-    /// Median absolute error, that of surfaces.
+    /// Median absolute error in scene units, typical of surfaces.
     pub median_absolute: f64,
-    /// Fraction of the pixels with a surface where the render's opacity is below one half.
+    /// Fraction of these pixels where the render's opacity is below one half.
     pub missed: f64,
 }
 

@@ -15,7 +15,7 @@ use anyhow::Context as _;
 use artifact::FailureExt as _;
 use metrics::{Score, ScoreFormat, Scores};
 use pixels::{DEPTH_CHANNELS, ExrImage, Image, psnr_of, read_exr};
-use scene::length;
+use scene::format_length;
 
 use crate::metric::{Measurement, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
@@ -138,10 +138,10 @@ impl Metric for LowResolutionMetric {
 
     fn convention(&self, scene: &ScoredScene<'_>) -> String {
         let kernel = scene.degradation.map_or_else(
-            || "a box, for want of a better guess".to_owned(),
+            || "box (assumed: the degradation kernel is unknown)".to_owned(),
             |degradation| format!("{:?}", degradation.kernel).to_lowercase(),
         );
-        format!("the render shrunk by {kernel}, against the view's LR picture")
+        format!("render shrunk by {kernel}, compared with the view's LR image")
     }
 
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
@@ -180,9 +180,9 @@ impl Metric for WarpMetric {
     }
 
     fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "the true picture of the view whose camera is nearest, brought over by both rendered \
-        depths, against the view's own, where both see the same surface (depths within 2 %, or \
-        within a pixel as the view sees them; opacity at least one half)"
+        "the nearest view's ground truth, warped by both rendered depths, is compared with the \
+        view's own over pixels whose surface both views observe (depths within 2 %, or \
+        reprojection error of at most half a pixel; opacity at least one half)"
             .to_owned()
     }
 
@@ -216,8 +216,8 @@ impl Metric for DepthMetric {
     }
 
     fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "z-depth in scene units, of the pixels at whose centre the truth sees a surface; missed: \
-        the share of them where the render's opacity is below one half"
+        "error of z-depth in scene units, over pixels with a surface in the ground truth; missed: \
+        fraction of these pixels where the render's opacity is below one half"
             .to_owned()
     }
 
@@ -241,7 +241,7 @@ impl Metric for DepthMetric {
 
     fn summary(&self, mean: &Scores) -> Option<String> {
         let [mean, median] = ["mean_absolute", "median_absolute"]
-            .map(|part| Some(length(value(mean, &format!("depth/{part}"))?, 4)));
+            .map(|part| Some(format_length(value(mean, &format!("depth/{part}"))?, 4)));
         Some(format!("depth error {} mean, {} median", mean?, median?))
     }
 }

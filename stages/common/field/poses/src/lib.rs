@@ -45,7 +45,7 @@ use std::fmt;
 
 use glam::{DMat3, DQuat, DVec3};
 use radiance::{Pixel, Ray, RayField, RenderError};
-use scene::{Camera, CameraRay, length, pose_of};
+use scene::{Camera, CameraRay, format_length, pose_of};
 
 use crate::normal_matrix::{HUBER_THRESHOLD, NormalMatrix, huber};
 use crate::pyramid::{InformativePixel, PyramidLevel};
@@ -217,7 +217,7 @@ fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [[D
     let k = &camera.intrinsics;
     let [u, v] = k.undistort([u, v]);
     let (x, y) = ((u - k.cx) / k.fx, -(v - k.cy) / k.fy);
-    let [by_x, by_y] = k.distortion.derivative([x, -y]);
+    let [by_x, by_y] = k.distortion.jacobian([x, -y]);
     let point = depth * DVec3::new(x, y, -1.0);
     // Derivatives of the position on the plane of depth 1 by the point in camera space.
     let along_x = DVec3::new(1.0, 0.0, x) / depth;
@@ -312,9 +312,9 @@ impl fmt::Display for MeanMotion {
         let Self { angle, distance, pixels } = self;
         write!(
             f,
-            "turned by {:.3}° and moved by {} ({pixels:.1} LR pixels) on average",
+            "turned by {:.3}° and moved by {} ({pixels:.1} pixels of the photographs) on average",
             angle.to_degrees(),
-            length(*distance, 4)
+            format_length(*distance, 4)
         )
     }
 }

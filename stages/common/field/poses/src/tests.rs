@@ -267,7 +267,10 @@ fn motions_are_told() {
     assert!((told.angle - 0.005).abs() < 1e-6 && (told.distance - 0.25).abs() < 1e-9, "{told:?}");
     // Half of a focal length of 70 pixels times 0.5 / 4.
     assert!((told.pixels - 4.375).abs() < 1e-9, "{told:?}");
-    assert_eq!(told.to_string(), "turned by 0.286° and moved by 0.2500 (4.4 LR pixels) on average");
+    assert_eq!(
+        told.to_string(),
+        "turned by 0.286° and moved by 0.2500 (4.4 pixels of the photographs) on average"
+    );
     for (angle, pixels, is_far) in [(0.9f64, 2.9, false), (1.1, 0.0, true), (0.0, 3.1, true)] {
         assert_eq!(
             MeanMotion { angle: angle.to_radians(), pixels, distance: 0.0 }.is_far(),

@@ -102,9 +102,9 @@ impl Bounds {
     }
 }
 
-/// Formats a length in scene units with a number of decimals, or with three significant digits if
-/// all decimals would be 0, and for a million units and more.
-pub fn length(value: f64, decimals: u8) -> String {
+/// Formats a length in scene units with the given number of decimals. A length that would print as
+/// zeros, or of a million units or more, has three significant digits instead: `1.23e-5`.
+pub fn format_length(value: f64, decimals: u8) -> String {
     let fixed = format!("{value:.*}", usize::from(decimals));
     let shows_digits = fixed.contains(|digit| ('1'..='9').contains(&digit));
     if value == 0.0 || (shows_digits && value.abs() < 1e6) { fixed } else { format!("{value:.2e}") }
@@ -119,7 +119,7 @@ mod tests {
     use crate::pose::pose_of;
     use crate::space::Frustum;
 
-    /// Bounds of each space around a point, all lengths times a scale.
+    /// Returns bounds of each space around a point; all lengths are multiplied by `scale`.
     fn spaces(middle: DVec3, scale: f64) -> [Bounds; 3] {
         let turn = DMat3::from_rotation_y(0.3);
         let frustum = Frustum {
@@ -139,14 +139,14 @@ mod tests {
         })
     }
 
-    /// A vector with few binary digits.
+    /// Rounds a vector to few binary digits.
     fn short(v: DVec3) -> DVec3 {
         (1024.0 * v).round() / 1024.0
     }
 
     proptest! {
-        /// Errors of the last digits, as other positions cause, vanish, and what remains moves and
-        /// grows with the scene.
+        /// Rounding removes errors of the last digits, which depend on the scene's position. The
+        /// rounded bounds move and scale with the scene.
         #[test]
         fn rounding_removes_rounding_errors(
             anchor in prop::array::uniform3(-4.0..4.0f64),
@@ -198,7 +198,7 @@ mod tests {
             (f64::INFINITY, 2, "inf"),
             (f64::NAN, 2, "NaN"),
         ] {
-            assert_eq!(length(value, decimals), expected);
+            assert_eq!(format_length(value, decimals), expected);
         }
     }
 }

@@ -87,8 +87,8 @@ pub enum CameraError {
     },
     /// A focal length or principal point doesn't fit the image size.
     #[error(
-        "{name} is {} pixels, but the image's side has {side}; check that the {quantity} is in \
-        pixels and belongs to this image",
+        "{name} is {} pixels, but the image's side is {side} pixels; check that the {quantity} is \
+        in pixels and belongs to this image",
         format_number(*value)
     )]
     Proportion {
@@ -204,7 +204,7 @@ impl Camera {
         let undistorted = [k.cx + k.fx * p.x / depth, k.cy - k.fy * p.y / depth];
         let [x, y] = k.distort(undistorted);
         if !k.distortion.is_none() {
-            // A distortion may fold points outside back into the image.
+            // A distortion may map points outside its valid range back into the image.
             let [u, v] = k.undistort([x, y]);
             let error = (u - undistorted[0]).hypot(v - undistorted[1]);
             if error.is_nan() || error > 1e-3 {
@@ -239,11 +239,11 @@ impl Camera {
             return Err(CameraError::Empty { width: k.width, height: k.height });
         }
         for (name, value, side) in [("fx", k.fx, k.width), ("fy", k.fy, k.height)] {
-            check_length(name, value, value > 0.0)?;
+            check_intrinsic(name, value, value > 0.0)?;
             check_proportion(name, "focal length", value, side, ALLOWED_FOCAL_LENGTHS)?;
         }
         for (name, value, side) in [("cx", k.cx, k.width), ("cy", k.cy, k.height)] {
-            check_length(name, value, true)?;
+            check_intrinsic(name, value, true)?;
             check_proportion(name, "principal point", value, side, ALLOWED_PRINCIPAL_POINTS)?;
         }
         for (row, values) in self.camera_to_world.iter().enumerate() {
@@ -274,14 +274,14 @@ impl Camera {
     }
 }
 
-/// Allowed focal lengths in image sides: angles of view from 0.006° to 179.98°. The longest
-/// photographic lenses have about 1°.
+/// Allowed focal lengths, relative to the image's side: angles of view from 0.006° to 179.98°. The
+/// longest photographic lenses have angles of about 1°.
 const ALLOWED_FOCAL_LENGTHS: RangeInclusive<f64> = 1e-4..=1e4;
-/// Allowed principal points, in image sides from the corner. A crop of a photograph may be far from
-/// the principal point.
+/// Allowed coordinates of the principal point, relative to the image's side. A crop of a photograph
+/// may be far from the principal point.
 const ALLOWED_PRINCIPAL_POINTS: RangeInclusive<f64> = -1e4..=1e4;
 
-fn check_length(name: &'static str, value: f64, is_allowed: bool) -> Result<(), CameraError> {
+fn check_intrinsic(name: &'static str, value: f64, is_allowed: bool) -> Result<(), CameraError> {
     if value.is_finite() && is_allowed {
         Ok(())
     } else {
@@ -422,13 +422,13 @@ mod tests {
             (
                 1e300,
                 12.5,
-                "fx is 1e300 pixels, but the image's side has 37; check that the focal length",
+                "fx is 1e300 pixels, but the image's side is 37 pixels; check that the focal length",
             ),
             (1e-5, 12.5, "fx is 1e-5 pixels"),
             (
                 40.0,
                 -1e9,
-                "cy is -1e9 pixels, but the image's side has 23; check that the principal point",
+                "cy is -1e9 pixels, but the image's side is 23 pixels; check that the principal point",
             ),
             (40.0, f64::INFINITY, "cy is inf"),
         ] {

@@ -108,13 +108,13 @@ impl Distortion {
         self.distorted_position(self.projection.plane_position(slopes))
     }
 
-    /// Returns the derivative of [`Distortion::distort`]: [[∂x/∂x, ∂x/∂y], [∂y/∂x, ∂y/∂y]].
-    pub fn derivative(&self, slopes: [f64; 2]) -> [[f64; 2]; 2] {
-        let [a, b, c] = self.position_derivative(self.projection.plane_position(slopes));
+    /// Returns the Jacobian of [`Distortion::distort`]: [[∂x/∂x, ∂x/∂y], [∂y/∂x, ∂y/∂y]].
+    pub fn jacobian(&self, slopes: [f64; 2]) -> [[f64; 2]; 2] {
+        let [a, b, c] = self.position_jacobian(self.projection.plane_position(slopes));
         if self.projection.is_perspective() {
             return [[a, b], [b, c]];
         }
-        let [d, e, f] = self.projection.derivative(slopes);
+        let [d, e, f] = self.projection.jacobian(slopes);
         [[a * d + b * e, a * e + b * f], [b * d + c * e, b * e + c * f]]
     }
 
@@ -141,9 +141,9 @@ impl Distortion {
         ]
     }
 
-    /// Returns the derivative of [`Distortion::distorted_position`], a symmetric matrix: ∂x/∂x,
+    /// Returns the Jacobian of [`Distortion::distorted_position`], a symmetric matrix: ∂x/∂x,
     /// ∂x/∂y and ∂y/∂y.
-    fn position_derivative(&self, [x, y]: [f64; 2]) -> [f64; 3] {
+    fn position_jacobian(&self, [x, y]: [f64; 2]) -> [f64; 3] {
         let [p1, p2] = self.tangential;
         let (radial, growth) = self.radial_factor(x * x + y * y);
         [
@@ -175,7 +175,7 @@ impl Distortion {
         for _ in 0..MAX_STEPS {
             let [u, v] = self.distorted_position([x, y]);
             let [du, dv] = [distorted[0] - u, distorted[1] - v];
-            let [a, b, c] = self.position_derivative([x, y]);
+            let [a, b, c] = self.position_jacobian([x, y]);
             let determinant = a * c - b * b;
             x += (c * du - b * dv) / determinant;
             y += (a * dv - b * du) / determinant;
@@ -255,7 +255,7 @@ impl Distortion {
             && (0..=samples).all(|i| {
                 let fraction = f64::from(i) / f64::from(samples);
                 let [a, b, c] =
-                    self.position_derivative([fraction * position[0], fraction * position[1]]);
+                    self.position_jacobian([fraction * position[0], fraction * position[1]]);
                 a > 0.0 && a * c > b * b
             })
     }

@@ -40,7 +40,7 @@ mod view_image;
 mod views;
 mod warp;
 
-pub use bounds::{Bounds, length};
+pub use bounds::{Bounds, format_length};
 pub use camera::{Camera, CameraError, CameraRay, CameraRays, common_direction};
 pub use intrinsics::{Intrinsics, undistort_image};
 pub use lens::Distortion;

@@ -44,9 +44,9 @@ impl Projection {
         }
     }
 
-    /// Returns the derivative of [`Projection::plane_position`], a symmetric matrix: ∂x/∂x, ∂x/∂y
-    /// and ∂y/∂y.
-    pub(crate) fn derivative(self, [x, y]: [f64; 2]) -> [f64; 3] {
+    /// Returns the Jacobian of [`Projection::plane_position`] (u, v) at slopes (x, y), a symmetric
+    /// matrix: ∂u/∂x, ∂u/∂y and ∂v/∂y.
+    pub(crate) fn jacobian(self, [x, y]: [f64; 2]) -> [f64; 3] {
         match self {
             Self::Perspective => [1.0, 0.0, 1.0],
             Self::Fisheye => {

@@ -26,9 +26,9 @@ pub struct Visibility {
 
 /// Maximum relative difference between two depths of one surface; chosen by hand.
 const MAX_DEPTH_DIFFERENCE: f64 = 0.02;
-/// Maximum distance in the first image between a pixel and the second view's point, for both to be
-/// one surface whatever their depths; chosen by hand. Nearby cameras determine the depth of a far
-/// wall poorly, and the error shifts the wall just as little.
+/// Maximum reprojection error at which two views' points are one surface whatever their depths;
+/// chosen by hand. Nearby cameras determine the depth of a far wall poorly, but such an error of
+/// depth hardly moves the wall in the image.
 const MAX_REPROJECTION_ERROR_PIXELS: f64 = 0.5;
 
 impl Surface<'_> {
@@ -58,7 +58,8 @@ impl Surface<'_> {
             .then_some(visibility)
     }
 
-    /// Returns [`Surface::visibility`] in a camera as if nothing occluded the point.
+    /// Returns the visibility of a pixel's surface point in another camera, regardless of
+    /// occlusion. `None` if the pixel has no surface, or the point is outside the camera's image.
     ///
     /// # Panics
     /// If the map doesn't have one number per pixel, or the pixel is outside.
@@ -95,9 +96,9 @@ impl Surface<'_> {
         is_inside.then_some((visibility, point))
     }
 
-    /// Returns whether the surface at position (x, y) is `point`, which another camera observes at
-    /// `pixel`. One of the four surrounding pixels must have the point's depth, or a depth at which
-    /// the other camera observes the same pixel.
+    /// Returns whether this view's surface at position (x, y) contains `point`, which the camera
+    /// `other` observes at `pixel`. One of the four pixels around (x, y) must have the depth of
+    /// `point`, or a depth that `other` projects to `pixel`.
     fn has_point(
         &self,
         point: DVec3,

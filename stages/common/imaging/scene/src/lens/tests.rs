@@ -135,7 +135,7 @@ proptest! {
         let step = 1e-6;
         let [xx, yx] = slope_between(&d, [x + step, y], [x - step, y], step);
         let [xy, yy] = slope_between(&d, [x, y + step], [x, y - step], step);
-        let [by_x, by_y] = d.derivative([x, y]);
+        let [by_x, by_y] = d.jacobian([x, y]);
         for (slope, difference) in [(by_x[0], xx), (by_x[1], xy), (by_y[0], yx), (by_y[1], yy)] {
             prop_assert!((slope - difference).abs() < 1e-8, "{slope} {difference}");
         }
