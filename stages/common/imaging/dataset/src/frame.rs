@@ -25,7 +25,8 @@ pub enum Turn {
 /// Posed photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// Name of the view, unique within its side of the folder's own split and valid as a file name.
+    /// Name of the view: a valid file name, unique among the training or the test views of the
+    /// folder's own split.
     pub name: String,
     /// Path of the image: PNG, JPEG or EXR.
     pub image: PathBuf,
@@ -42,8 +43,8 @@ pub struct Frame {
     /// Pose `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in
     /// world space.
     pub camera_to_world: Pose,
-    /// Smallest and largest known depth of observed points along the axis; through a fisheye lens
-    /// their distances.
+    /// Smallest and largest depth of observed points along the optical axis, if known. For a
+    /// fisheye lens, the points' distances from the camera.
     pub depths: Option<[f64; 2]>,
 }
 
@@ -90,9 +91,9 @@ impl Frame {
         !self.stored_intrinsics.distortion.is_none()
     }
 
-    /// Fails if the camera is invalid. Allows a uniform scale of the rotation, which
-    /// [`Dataset::read`](crate::Dataset::read) removes, and pixels without a ray, which matter only
-    /// to some uses.
+    /// Fails if the camera is invalid. A uniform scale of the rotation is valid, because
+    /// [`Dataset::read`](crate::Dataset::read) removes the scale. Pixels without a ray are valid,
+    /// because only some callers need a ray through every pixel.
     pub(crate) fn check(&self) -> Result<(), CameraError> {
         let distortion = self.stored_intrinsics.distortion;
         if !distortion.is_finite() {

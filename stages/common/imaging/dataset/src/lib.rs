@@ -44,7 +44,7 @@ mod photograph;
 mod split;
 mod text;
 mod transforms;
-mod unread;
+mod unsupported;
 mod unused_masks;
 
 use std::path::Path;
@@ -62,7 +62,7 @@ pub use masks::{MaskFile, MaskKind};
 use nearby::Nearby;
 pub use photograph::{Clipping, is_image_name};
 pub use split::Split;
-pub use unread::{is_unread_name, unread_images};
+pub use unsupported::{is_unsupported_name, unsupported_images};
 
 impl Dataset {
     /// Reads a folder in any format. Of the images only the headers are read.

@@ -16,7 +16,7 @@ use crate::masks::without_dynamic_masks;
 use crate::npy::{ArrayReason, read_matrix};
 use crate::photograph::{ImageHeader, fit_camera, is_image_name, read_header};
 use crate::text::read_text;
-use crate::unread::unread_images;
+use crate::unsupported::unsupported_images;
 
 /// Numbers per photograph: a 3×5 matrix (axes down, right and back; centre; height, width and focal
 /// length), near and far.
@@ -149,7 +149,7 @@ fn list_images(folder: &Path, name: &str) -> Option<(Vec<PathBuf>, ImageFolder)>
     let entries = std::fs::read_dir(&path).ok()?.flatten().map(|entry| entry.path());
     let mut files: Vec<PathBuf> = entries.filter(|path| !is_hidden(path)).collect();
     files.sort();
-    let unsupported = unread_images(&files);
+    let unsupported = unsupported_images(&files);
     files.retain(|path| is_image_name(path));
     let mut files = without_dynamic_masks(files);
     let mut unusable = None;

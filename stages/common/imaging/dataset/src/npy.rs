@@ -1,6 +1,6 @@
 //! Reads matrices in NumPy's format, versions 1 to 3.
 
-/// Maximum length of a header, which is NumPy's default limit. A matrix has about a hundred bytes.
+/// Maximum length of a header: NumPy's default limit. The header of a matrix has about 100 bytes.
 const MAX_HEADER_BYTES: usize = 10_000;
 
 /// Reason why a file isn't a readable matrix.
@@ -13,7 +13,7 @@ pub(crate) enum ArrayReason {
     /// Header without a valid entry; contains the entry's name and type.
     #[error("header has no {0}")]
     Entry(&'static str),
-    #[error("shape is {0:?}")]
+    #[error("unsupported shape {0:?}; a matrix has rows and columns")]
     Shape(Vec<usize>),
     #[error("element type is {0:?}, not a float")]
     ElementType(String),
@@ -161,12 +161,12 @@ mod tests {
         for (kind, shape, words) in [
             ("'<i8'", "(2, 3)", "element type is \"<i8\""),
             ("[('x', '<f8')]", "(2, 3)", "no descr"),
-            ("'<f8'", "(2, 3, 1)", "shape is [2, 3, 1]"),
-            ("'<f8'", "()", "shape is []"),
+            ("'<f8'", "(2, 3, 1)", "unsupported shape [2, 3, 1]"),
+            ("'<f8'", "()", "unsupported shape []"),
             ("'<f8'", "(2, -3)", "no shape"),
             ("'<f8'", "((((2, 3))))", "no shape"),
             ("'<f8'", "(2, 4)", "cut short"),
-            ("'<f8'", &huge, "shape is"),
+            ("'<f8'", &huge, "unsupported shape"),
         ] {
             let reason =
                 read_matrix(&file(1, &header(kind, shape), &data)).unwrap_err().to_string();

@@ -13,7 +13,7 @@ use scene::{Intrinsics, undistort_image};
 use crate::error::{DatasetError, FrameReason};
 use crate::frame::{Frame, Turn};
 use crate::jpeg::{END_MARKER, Extent, extent};
-use crate::unread::unsupported_error;
+use crate::unsupported::unsupported_error;
 
 /// Extensions of supported images.
 pub(crate) const IMAGE_EXTENSIONS: [&str; 4] = [".png", ".jpg", ".jpeg", ".exr"];
@@ -67,7 +67,8 @@ impl ImageHeader {
         matches!(self.orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
     }
 
-    /// Returns the treatment of the orientation if the camera's shape doesn't settle it.
+    /// Returns the treatment of the EXIF orientation for a camera whose shape fits both the stored
+    /// and the turned image.
     pub(crate) fn assumed_turn(self) -> Turn {
         if self.orientation == Orientation::NoTransforms { Turn::Stored } else { Turn::Assumed }
     }
@@ -94,8 +95,8 @@ pub(crate) fn read_header(path: &Path) -> Result<ImageHeader, PixelError> {
     Ok(ImageHeader { size: (width, height), orientation })
 }
 
-/// Resizes a camera to the stored image, stored or turned; returns the intrinsics and the treatment
-/// of the EXIF orientation. Fails if the aspect ratios differ.
+/// Resizes a camera to an image, as stored or as turned by EXIF. Returns the resized intrinsics and
+/// the treatment of the EXIF orientation. Fails if the aspect ratios differ.
 pub(crate) fn fit_camera(
     k: Intrinsics,
     stored: ImageHeader,
@@ -135,16 +136,16 @@ fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelE
         return read_exr_photograph(path);
     }
     let mut bytes = fs::read(path).map_err(PixelError::io(path))?;
-    let mut is_checked = true;
+    let mut has_image_data = true;
     if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
-        is_checked =
+        has_image_data =
             complete_jpeg(&mut bytes).map_err(|reason| PixelError::format(path, reason))?;
     }
     let mut decoder = decoder(Cursor::new(bytes), path)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
         .map_err(|e| PixelError::format(path, format!("incomplete or damaged image ({e})")))?;
-    if !is_checked {
+    if !has_image_data {
         return Err(PixelError::format(path, "damaged JPEG: headers and image data don't match"));
     }
     if is_upright {
@@ -204,11 +205,11 @@ fn encode_pixel(colour: [f32; 3], alpha: f32) -> [u8; 4] {
     [r, g, b, to_u8(alpha)]
 }
 
-/// Maximum relative excess over 1 of a colour divided by its alpha that rounding to half floats
-/// explains.
+/// Maximum relative excess of a premultiplied colour over its alpha that rounding to half floats
+/// can cause.
 const HALF_ROUNDING: f32 = 1.0 / 1024.0;
 
-/// Number of pixels whose colour is clipped to 1. Only EXR files have brighter pixels.
+/// Counts of pixels whose colour is clipped to 1. Only EXR files have brighter pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Clipping {
     /// Number of clipped pixels.
@@ -322,7 +323,7 @@ pub(crate) mod tests {
     use jpeg_encoder::SamplingFactor;
     use scene::Distortion;
 
-    /// An image whose red says the column and whose green says the row.
+    /// Returns an image whose red encodes the column and whose green encodes the row.
     fn ramp(width: usize, height: usize) -> Rgba8 {
         let pixel =
             |i: usize| [(i % width * 255 / width) as u8, (i / width * 255 / height) as u8, 90, 255];
@@ -369,8 +370,8 @@ pub(crate) mod tests {
             ),
             "{message}"
         );
-        // The same with an EXIF block (APP1) that asks for a quarter turn: right where the camera's
-        // shape says so, else left alone.
+        // An EXIF block (APP1) that requires a quarter turn: the image is turned only if the
+        // camera has the turned shape.
         let mut turned = bytes[..2].to_vec();
         turned.extend(
             b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\
@@ -462,7 +463,8 @@ pub(crate) mod tests {
         }
     }
 
-    /// Smooth in the direction of the ray, so that what each lens sees is known exactly.
+    /// Returns a colour that depends smoothly on the ray's direction, so that the image through
+    /// each lens is known exactly.
     fn colour_towards([u, v]: [f64; 2]) -> [u8; 4] {
         [(128.0 + 90.0 * (6.0 * u).sin()) as u8, (128.0 + 90.0 * (5.0 * v).cos()) as u8, 60, 255]
     }
@@ -483,7 +485,7 @@ pub(crate) mod tests {
         Rgba8::new(120, 90, (0..120 * 90).flat_map(pixel).collect())
     }
 
-    /// A pinhole image seen through a lens and undone is the pinhole image again.
+    /// Removing the distortion of a distorted image returns the pinhole image.
     #[test]
     fn distortion_is_undone() {
         let distortion = Distortion::brown([-0.12, 0.02, 0.0], [0.002, -0.001]);

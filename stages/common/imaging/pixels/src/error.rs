@@ -21,7 +21,7 @@ pub enum PixelError {
     },
     /// The image format is not supported.
     #[error("{path} is a {format} image, which is not supported; convert: {command}")]
-    Unread {
+    Unsupported {
         /// Path of the image.
         path: PathBuf,
         /// Name of the format.
@@ -43,7 +43,9 @@ pub enum PixelError {
         height: usize,
     },
     /// A sample to write is NaN or infinite.
-    #[error("{path}: channel {channel} is {value} at pixel ({x}, {y}); nothing was written")]
+    #[error(
+        "{path}: channel {channel} is {value} at column {x}, row {y}; the file was not written"
+    )]
     NotFinite {
         /// Path of the image.
         path: PathBuf,

@@ -22,9 +22,9 @@ const GAIN_RANGE: [f32; 2] = [0.1, 10.0];
 const NEGLIGIBLE_CHANGE: [f32; 2] = [0.1, 0.05];
 
 impl Exposure {
-    /// Fits the exposure of `image` relative to a reference of the same size, by least squares per
-    /// channel over the means of square blocks, of pixels that are clipped in neither image. `None`
-    /// if too few blocks remain or the gain is implausible.
+    /// Fits the exposure of `image` relative to `reference`, an image of the same size. The fit is
+    /// by least squares per channel over means of square blocks; pixels that are clipped in either
+    /// image are ignored. `None` if too few blocks remain or the gain is implausible.
     ///
     /// # Panics
     /// With fewer than three channels, different sizes, or a block of 0 pixels.
@@ -78,7 +78,8 @@ impl Exposure {
     }
 }
 
-/// Returns both images' means over each block of which at least half is clipped in neither image.
+/// Returns, for each block, the means of both images over pixels that are clipped in neither image.
+/// Blocks with less than half of such pixels are omitted.
 fn block_means(reference: &Image, image: &Image, channel: usize, block: usize) -> Vec<[f64; 2]> {
     let mut means = Vec::new();
     for y in (0..image.height).step_by(block) {

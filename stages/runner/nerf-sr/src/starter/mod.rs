@@ -50,7 +50,7 @@ pub(crate) enum StarterError {
     NoCameras {
         /// Folder of the images.
         folder: PathBuf,
-        /// Number and unread formats of the images, as text.
+        /// Number and unsupported formats of the images, as text.
         found: String,
         /// Command that estimates the cameras.
         command: String,

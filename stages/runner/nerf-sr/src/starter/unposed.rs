@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use artifact::format_count;
-use dataset::{is_image_name, is_unread_name, unread_images};
+use dataset::{is_image_name, is_unsupported_name, unsupported_images};
 
 /// Images of a folder, or of its subfolder `images`.
 pub(crate) struct UnposedImages {
@@ -22,11 +22,12 @@ impl UnposedImages {
         Self { files: list_images(folder), in_subfolder: false }
     }
 
-    /// Returns the number of images, with the command that converts those in unread formats.
+    /// Returns the number of images as text, with the command that converts images of unsupported
+    /// formats.
     pub(crate) fn summary(&self) -> String {
         let images = format_count(self.files.len(), "image");
-        match unread_images(&self.files) {
-            Some(unread) => format!("{images} ({unread})"),
+        match unsupported_images(&self.files) {
+            Some(unsupported) => format!("{images} ({unsupported})"),
             None => images,
         }
     }
@@ -46,7 +47,7 @@ impl UnposedImages {
     }
 }
 
-/// Returns a folder's images, sorted by name. Images in unread formats are included.
+/// Returns a folder's images, sorted by name, including images of unsupported formats.
 fn list_images(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut files: Vec<PathBuf> =
@@ -57,5 +58,5 @@ fn list_images(folder: &Path) -> Vec<PathBuf> {
 
 fn is_image(path: &Path) -> bool {
     let is_hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-    !is_hidden && (is_image_name(path) || is_unread_name(path))
+    !is_hidden && (is_image_name(path) || is_unsupported_name(path))
 }

@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use crate::lookup::listings::Listings;
 use crate::photograph::{IMAGE_EXTENSIONS, is_image_name};
-use crate::unread::is_unread_name;
+use crate::unsupported::is_unsupported_name;
 
 /// Differences between a listed name and a file's name that a step of the lookup tolerates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -98,7 +98,7 @@ fn with_each_extension(stem: &str) -> Vec<Variant> {
 fn variants(name: &str, extensions: Extensions) -> Vec<Variant> {
     let path = Path::new(name);
     let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or(name);
-    if extensions == Extensions::Any && is_image_name(path) || is_unread_name(path) {
+    if extensions == Extensions::Any && is_image_name(path) || is_unsupported_name(path) {
         return with_each_extension(stem);
     }
     let mut found = with_each_extension(name);

@@ -18,7 +18,7 @@ use artifact::{PathError, relative_path};
 
 use crate::file_status::{FileProblem, FileStatus, file_status, path_text};
 use crate::photograph::is_image_name;
-use crate::unread::is_unread_name;
+use crate::unsupported::is_unsupported_name;
 
 pub(crate) use listings::Listings;
 use matching::{Extensions, Tolerance, absolute_parts, candidates};
@@ -267,7 +267,7 @@ impl Lookup {
     ) -> Vec<PathBuf> {
         let Interpretation { path, extensions, .. } = interpretation;
         let mut files = candidates(&mut self.listings, path, tolerance, *extensions);
-        if tolerance == Tolerance::NONE && !files.is_empty() && is_unread_name(path) {
+        if tolerance == Tolerance::NONE && !files.is_empty() && is_unsupported_name(path) {
             let converted = Tolerance { extension: true, ..tolerance };
             let found = candidates(&mut self.listings, path, converted, *extensions);
             files = if found.is_empty() { files } else { found };
@@ -364,7 +364,7 @@ pub(crate) fn reduced_copies(listings: &mut Listings) -> Vec<String> {
 
 /// True if a name has the extension of an image, supported or not.
 fn has_image_extension(path: &Path) -> bool {
-    is_image_name(path) || is_unread_name(path)
+    is_image_name(path) || is_unsupported_name(path)
 }
 
 #[cfg(test)]

@@ -8,27 +8,34 @@ use pixels::PixelError;
 
 /// Image format that isn't supported.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct UnreadFormat {
+struct UnsupportedFormat {
     name: &'static str,
     extensions: &'static [&'static str],
     /// Format to convert to, with options: JPEG for phone photographs.
     target: &'static str,
 }
 
-const HEIC: UnreadFormat =
-    UnreadFormat { name: "HEIC", extensions: &["heic", "heif", "hif"], target: "jpg -quality 98" };
-const AVIF: UnreadFormat = UnreadFormat { name: "AVIF", extensions: &["avif"], target: "png" };
-const WEBP: UnreadFormat = UnreadFormat { name: "WebP", extensions: &["webp"], target: "png" };
-const TIFF: UnreadFormat =
-    UnreadFormat { name: "TIFF", extensions: &["tif", "tiff"], target: "png" };
-const BMP: UnreadFormat = UnreadFormat { name: "BMP", extensions: &["bmp"], target: "png" };
-const GIF: UnreadFormat = UnreadFormat { name: "GIF", extensions: &["gif"], target: "png" };
-const FORMATS: [UnreadFormat; 6] = [HEIC, AVIF, WEBP, TIFF, BMP, GIF];
+const HEIC: UnsupportedFormat = UnsupportedFormat {
+    name: "HEIC",
+    extensions: &["heic", "heif", "hif"],
+    target: "jpg -quality 98",
+};
+const AVIF: UnsupportedFormat =
+    UnsupportedFormat { name: "AVIF", extensions: &["avif"], target: "png" };
+const WEBP: UnsupportedFormat =
+    UnsupportedFormat { name: "WebP", extensions: &["webp"], target: "png" };
+const TIFF: UnsupportedFormat =
+    UnsupportedFormat { name: "TIFF", extensions: &["tif", "tiff"], target: "png" };
+const BMP: UnsupportedFormat =
+    UnsupportedFormat { name: "BMP", extensions: &["bmp"], target: "png" };
+const GIF: UnsupportedFormat =
+    UnsupportedFormat { name: "GIF", extensions: &["gif"], target: "png" };
+const FORMATS: [UnsupportedFormat; 6] = [HEIC, AVIF, WEBP, TIFF, BMP, GIF];
 
 /// Number of bytes at a file's start that identify its format.
 const SIGNATURE_BYTES: usize = 12;
 
-impl UnreadFormat {
+impl UnsupportedFormat {
     fn from_name(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
         FORMATS.into_iter().find(|format| format.extensions.contains(&extension.as_str()))
@@ -59,8 +66,8 @@ impl UnreadFormat {
 }
 
 /// True if a file's name is that of an image in an unsupported format.
-pub fn is_unread_name(path: &Path) -> bool {
-    UnreadFormat::from_name(path).is_some()
+pub fn is_unsupported_name(path: &Path) -> bool {
+    UnsupportedFormat::from_name(path).is_some()
 }
 
 /// Returns the error for an image in an unsupported format, recognised by content, otherwise by
@@ -68,9 +75,9 @@ pub fn is_unread_name(path: &Path) -> bool {
 pub(crate) fn unsupported_error(path: &Path) -> Option<PixelError> {
     let mut bytes = [0; SIGNATURE_BYTES];
     let is_read = File::open(path).and_then(|mut file| file.read_exact(&mut bytes)).is_ok();
-    let format = UnreadFormat::from_signature(&bytes).filter(|_| is_read);
-    let format = format.or_else(|| UnreadFormat::from_name(path))?;
-    Some(PixelError::Unread {
+    let format = UnsupportedFormat::from_signature(&bytes).filter(|_| is_read);
+    let format = format.or_else(|| UnsupportedFormat::from_name(path))?;
+    Some(PixelError::Unsupported {
         path: path.to_path_buf(),
         format: format.name,
         command: format.command(path),
@@ -79,11 +86,11 @@ pub(crate) fn unsupported_error(path: &Path) -> Option<PixelError> {
 
 /// Returns the format of the first unsupported image among files, the number of images in that
 /// format, and the command that converts them; `None` if there are none.
-pub fn unread_images(files: &[PathBuf]) -> Option<String> {
-    let first = files.iter().find(|path| is_unread_name(path))?;
-    let format = UnreadFormat::from_name(first)?;
+pub fn unsupported_images(files: &[PathBuf]) -> Option<String> {
+    let first = files.iter().find(|path| is_unsupported_name(path))?;
+    let format = UnsupportedFormat::from_name(first)?;
     let is_same = |path: &&PathBuf| {
-        UnreadFormat::from_name(path).is_some_and(|other| other.name == format.name)
+        UnsupportedFormat::from_name(path).is_some_and(|other| other.name == format.name)
     };
     let count = files.iter().filter(is_same).count();
     Some(format!(
