@@ -22,8 +22,8 @@ mod references;
 mod summary;
 mod view;
 
-use paper_refiner::OVERLAP;
-use refinement::{KnownView, LrObservations, REFINER_FILE, RefinerFile, Use};
+use paper_refiner::DEFAULT_OVERLAP_PIXELS;
+use refinement::{KnownView, LrObservations, REFINER_FILE, ReferenceStatistics, RefinerFile};
 use scene::{VIEWS_FILE, Views, image_file, preview_file};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -39,15 +39,15 @@ use view::{RefineJob, RefinedView};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Fraction of the predicted residual that is added. Default: the best fraction for views that
-    /// the refiner's training left out.
+    /// Factor of the predicted residual, which is added to the view. Default: the best factor for
+    /// the views that were left out of the refiner's training.
     #[schemars(range(min = 0.0, max = 2.0), extend("x-default" = "by refiner"))]
     pub residual_weight: Option<f64>,
     /// Maximum number of HR references: the first ones of input `references` are used.
     #[schemars(extend("x-default" = "all"))]
     pub max_references: Option<u32>,
-    /// Rotated and mirrored versions of a view whose residuals are averaged (geometric
-    /// self-ensemble). Time is proportional to their number.
+    /// Number of rotated and mirrored versions of a view whose residuals are averaged (geometric
+    /// self-ensemble). The running time is proportional to this number.
     #[schemars(range(min = 1, max = 8))]
     pub self_ensemble: u32,
     /// For refiners of `net: paper`: pixels by which patches of 64 pixels overlap.
@@ -61,7 +61,7 @@ impl Default for Params {
             residual_weight: None,
             max_references: None,
             self_ensemble: 4,
-            overlap: OVERLAP as u32,
+            overlap: DEFAULT_OVERLAP_PIXELS as u32,
         }
     }
 }
@@ -90,14 +90,16 @@ impl Stage for Refine {
                 "photographs",
                 Input::optional(
                     &["scene/train"],
-                    "LR photographs; a view with the camera of a photograph is made consistent with that one",
+                    "LR photographs; a view with a photograph's camera is made consistent with the \
+                    photograph",
                 ),
             ),
             (
                 "enlarged",
                 Input::optional(
                     &["views"],
-                    "photographs enlarged to the views' size; a view with the camera of a photograph becomes the mean of view and photograph",
+                    "photographs enlarged to the views' size; a view with a photograph's camera is \
+                    averaged with the photograph",
                 ),
             ),
         ]
@@ -132,7 +134,7 @@ impl Stage for Refine {
         let references = usable_references(&job, &views, params, file.confidence.unwrap_or(1.0))?;
         let refined = refine_all(&job, &mut views, &references)?;
         context.write_json(VIEWS_FILE, &views)?;
-        report_invisible_references(&job, &references, &refined.uses);
+        report_invisible_references(&job, &references, &refined.statistics);
         context.write_summary(&refined.text())
     }
 }
@@ -167,8 +169,8 @@ fn refine_all(
         consistent: 0,
         means: 0,
         residual_weight: job.application.residual_weight,
-        is_reference_based: job.network.guidance().is_some(),
-        uses: vec![Use::default(); references.len()],
+        is_reference_based: job.network.warp_options().is_some(),
+        statistics: vec![ReferenceStatistics::default(); references.len()],
     };
     let progress = job.context.progress("refining", views.views.len() as u64);
     for view in &mut views.views {
@@ -181,7 +183,7 @@ fn refine_all(
         summary.consistent += usize::from(refined.is_consistent);
         summary.means +=
             usize::from(job.enlarged.as_ref().is_some_and(|enlarged| enlarged.has(&view.camera)));
-        network::add_uses(&mut summary.uses, &refined.uses);
+        network::add_statistics(&mut summary.statistics, &refined.statistics);
         view.depth = view.depth.as_ref().map(|_| image.clone());
         view.image = Some(image);
         progress.add(1);
@@ -195,13 +197,17 @@ fn refine_all(
     Ok(summary)
 }
 
-/// Logs the references that no view's points are visible from.
-fn report_invisible_references(job: &RefineJob<'_>, references: &[KnownView], uses: &[Use]) {
-    if job.network.guidance().is_none() {
+/// Logs the references in which no view's points are visible.
+fn report_invisible_references(
+    job: &RefineJob<'_>,
+    references: &[KnownView],
+    statistics: &[ReferenceStatistics],
+) {
+    if job.network.warp_options().is_none() {
         return;
     }
     for (i, reference) in references.iter().enumerate() {
-        if uses[i].seen == 0 {
+        if statistics[i].visible_pixels == 0 {
             let name = &reference.rendered.camera.name;
             job.context.log_line(format!("reference {name} shows no part of these views"));
         }

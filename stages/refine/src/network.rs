@@ -2,8 +2,8 @@ use artifact::{Failure, FailureExt as _, GivenInput};
 use paper_refiner::PaperRefiner;
 use pixels::Image;
 use refinement::{
-    Guidance, KnownView, Network, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE,
-    with_references,
+    KnownView, Network, ReferenceStatistics, Refiner, RefinerFile, Rendered, WEIGHTS_FILE,
+    WarpOptions, with_references,
 };
 
 use crate::Params;
@@ -49,37 +49,38 @@ impl AnyRefiner {
         .bad_input("input refiner")
     }
 
-    /// Returns the guidance by references, if the network is ours and takes references.
-    pub(crate) fn guidance(&self) -> Option<Guidance> {
+    /// Returns the options for warping references; `None` if the network is the paper's or takes no
+    /// references.
+    pub(crate) fn warp_options(&self) -> Option<WarpOptions> {
         let Self::Compact(network) = self else { return None };
         network.architecture().guidance
     }
 
     pub(crate) fn takes_references(&self) -> bool {
-        self.guidance().is_some() || matches!(self, Self::Paper(..))
+        self.warp_options().is_some() || matches!(self, Self::Paper(..))
     }
 
-    /// Refines a view to colours in 0..1, and adds each reference's use to `uses`.
+    /// Refines a view to colours in 0..1, and adds to each reference's `statistics`.
     pub(crate) fn refine(
         &self,
         rendered: &Rendered,
         references: &[KnownView],
         application: &Application,
-        uses: &mut [Use],
+        statistics: &mut [ReferenceStatistics],
     ) -> anyhow::Result<Image> {
         let references: Vec<&KnownView> = references.iter().collect();
         let &Application { residual_weight, self_ensemble, overlap } = application;
         match self {
             Self::Compact(network) => {
-                let Some(guidance) = self.guidance() else {
+                let Some(warp_options) = self.warp_options() else {
                     return Ok(network.refine_weighted(
                         &rendered.view,
                         residual_weight,
                         self_ensemble,
                     )?);
                 };
-                let conditioned = with_references(rendered, &references, guidance);
-                add_uses(uses, &conditioned.uses);
+                let conditioned = with_references(rendered, &references, warp_options);
+                add_statistics(statistics, &conditioned.statistics);
                 Ok(network.refine_weighted(&conditioned.view, residual_weight, self_ensemble)?)
             }
             Self::Paper(network, patches) => {
@@ -93,10 +94,10 @@ impl AnyRefiner {
     }
 }
 
-/// Adds each reference's use to its sum.
-pub(crate) fn add_uses(sums: &mut [Use], uses: &[Use]) {
+/// Adds each reference's statistics to its sum.
+pub(crate) fn add_statistics(sums: &mut [ReferenceStatistics], statistics: &[ReferenceStatistics]) {
     for (i, sum) in sums.iter_mut().enumerate() {
-        sum.add(&uses[i]);
+        sum.add(&statistics[i]);
     }
 }
 

@@ -1,9 +1,9 @@
 use artifact::{Failure, FailureExt as _};
-use refinement::{Guidance, KnownView, Rendered, Use, with_references};
+use refinement::{KnownView, ReferenceStatistics, Rendered, WarpOptions, with_references};
 use scene::{Background, View, Views};
 use stage::Context;
 
-use crate::network::add_uses;
+use crate::network::add_statistics;
 use crate::view::{RefineJob, read_view};
 
 /// Reads the references of a network that takes them; for other networks, logs that references are
@@ -72,12 +72,12 @@ fn correct_exposure(reference: KnownView) -> (KnownView, Option<String>) {
     (reference.with_corrected_exposure(&exposure), Some(note))
 }
 
-/// Minimum confidence in a reference, relative to that in the references of the network's training,
-/// below which the reference's depth is tested (design note 018).
+/// Minimum confidence in a reference, relative to the confidence in the references that the network
+/// was trained with. With less, the reference's depth is tested (design note 018).
 const MIN_RELATIVE_CONFIDENCE: f64 = 0.75;
 
-/// Minimum ratio of the confidence in a tested reference to that with all depths shifted by
-/// [`DEPTH_SHIFT`]; above it, depths count as correct (design note 018).
+/// Minimum ratio between the confidence in a reference and the confidence with all depths shifted
+/// by [`DEPTH_SHIFT`]. References with at least this ratio have correct depth (design note 018).
 const MIN_DEPTH_SENSITIVITY: f64 = 1.1;
 /// Relative shift of depths in the test (design note 018).
 const DEPTH_SHIFT: f32 = 0.1;
@@ -89,19 +89,19 @@ const MAX_JUDGING_VIEWS: usize = 8;
 /// reference is judged. A reference with low confidence stays if confidence is even lower with
 /// shifted depths: then its depths are correct, and its surfaces look different from another angle.
 ///
-/// `confidence` is that in the references of the network's training.
+/// `confidence` is the confidence in the references that the network was trained with.
 pub(crate) fn remove_misleading(
     job: &RefineJob<'_>,
     references: Vec<KnownView>,
     views: &Views,
     confidence: f64,
 ) -> anyhow::Result<Vec<KnownView>> {
-    let Some(guidance) = job.network.guidance().filter(|_| !references.is_empty()) else {
+    let Some(warp_options) = job.network.warp_options().filter(|_| !references.is_empty()) else {
         return Ok(references);
     };
     ReferenceJudge {
         views: &views.views,
-        guidance,
+        warp_options,
         read: &|view| Ok(job.read(view)?.rendered),
         log: &|note| job.context.log_line(note),
     }
@@ -111,7 +111,7 @@ pub(crate) fn remove_misleading(
 /// Test of references against some of the views to refine.
 struct ReferenceJudge<'a> {
     views: &'a [View],
-    guidance: Guidance,
+    warp_options: WarpOptions,
     /// Reads a view in the form that the network takes.
     read: &'a dyn Fn(&View) -> Result<Rendered, Failure>,
     /// Logs a removed reference.
@@ -125,7 +125,7 @@ impl ReferenceJudge<'_> {
         references: Vec<KnownView>,
         confidence: f64,
     ) -> anyhow::Result<Vec<KnownView>> {
-        let shares = self.confidence(&references, self.guidance, 1.0)?;
+        let shares = self.confidence(&references, self.warp_options, 1.0)?;
         let mut reliable = Vec::new();
         for (i, reference) in references.into_iter().enumerate() {
             let is_confident = shares[i] >= MIN_RELATIVE_CONFIDENCE * confidence;
@@ -143,14 +143,14 @@ impl ReferenceJudge<'_> {
         Ok(reliable)
     }
 
-    /// True if confidence in a reference is clearly lower with all depths nearer and farther.
+    /// True if confidence in a reference is clearly lower with smaller and with larger depths.
     fn has_correct_depth(&self, reference: &KnownView) -> anyhow::Result<bool> {
         // With shifted depths, the reference's own depth would hide every point.
-        let guidance = Guidance { occlusion: false, ..self.guidance };
+        let warp_options = WarpOptions { occlusion: false, ..self.warp_options };
         let reference = std::slice::from_ref(reference);
-        let unshifted = self.confidence(reference, guidance, 1.0)?[0];
-        let nearer = self.confidence(reference, guidance, 1.0 - DEPTH_SHIFT)?[0];
-        let farther = self.confidence(reference, guidance, 1.0 + DEPTH_SHIFT)?[0];
+        let unshifted = self.confidence(reference, warp_options, 1.0)?[0];
+        let nearer = self.confidence(reference, warp_options, 1.0 - DEPTH_SHIFT)?[0];
+        let farther = self.confidence(reference, warp_options, 1.0 + DEPTH_SHIFT)?[0];
         Ok(unshifted >= MIN_DEPTH_SENSITIVITY * f64::max(nearer, farther))
     }
 
@@ -159,21 +159,21 @@ impl ReferenceJudge<'_> {
     fn confidence(
         &self,
         references: &[KnownView],
-        guidance: Guidance,
+        warp_options: WarpOptions,
         depth_factor: f32,
     ) -> anyhow::Result<Vec<f64>> {
         let stride = self.views.len().div_ceil(MAX_JUDGING_VIEWS).max(1);
-        let mut uses = vec![Use::default(); references.len()];
+        let mut statistics = vec![ReferenceStatistics::default(); references.len()];
         let references: Vec<&KnownView> = references.iter().collect();
         for view in self.views.iter().step_by(stride) {
             let mut rendered = (self.read)(view)?;
             for depth in &mut rendered.depth {
                 *depth *= depth_factor;
             }
-            let conditioned = with_references(&rendered, &references, guidance);
-            add_uses(&mut uses, &conditioned.uses);
+            let conditioned = with_references(&rendered, &references, warp_options);
+            add_statistics(&mut statistics, &conditioned.statistics);
         }
-        Ok(uses.iter().map(Use::confidence_share).collect())
+        Ok(statistics.iter().map(ReferenceStatistics::confidence_share).collect())
     }
 }
 
@@ -191,8 +191,8 @@ mod tests {
     const FOCAL: f64 = 200.0;
     const DEPTH: f64 = 2.0;
 
-    /// What a camera sees of a wall from so many pixels to the right: red and blue rise, green
-    /// falls.
+    /// Returns the image of a wall from a camera `right` pixels to the right. Red and blue increase
+    /// along a row, green decreases.
     fn colours(right: f64) -> Vec<[f32; 3]> {
         (0..WIDTH * HEIGHT).map(|i| colour((i % WIDTH) as f64 + right)).collect()
     }
@@ -202,7 +202,7 @@ mod tests {
         [0.1 + rise, 0.9 - rise, 0.1 + rise]
     }
 
-    /// The wall as rendered from there, with a true image.
+    /// Returns the wall rendered by that camera, with a true image.
     fn known(name: &str, right: f64, truth: &[[f32; 3]]) -> KnownView {
         let camera = Camera {
             name: name.to_owned(),
@@ -229,7 +229,7 @@ mod tests {
         KnownView { rendered, truth }
     }
 
-    /// Names of the references that are kept of four.
+    /// Returns the names of the references, of four, that are kept.
     fn sorted(judge: &ReferenceJudge<'_>, confidence: f64) -> anyhow::Result<Vec<String>> {
         let right = 100.0;
         let tinted: Vec<[f32; 3]> =
@@ -244,8 +244,8 @@ mod tests {
         Ok(kept.into_iter().map(|reference| reference.rendered.camera.name).collect())
     }
 
-    /// A doubted reference stays where another depth would fit less, here the tinted one. It goes
-    /// where another depth would fit as well or better.
+    /// A reference with low confidence is kept if shifted depths fit worse, like the tinted one.
+    /// The reference is removed if shifted depths fit equally well or better.
     #[test]
     fn misleading_references_are_left_out() {
         let rendered = known("view", 0.0, &colours(0.0)).rendered;
@@ -257,8 +257,8 @@ mod tests {
         };
         let said = RefCell::new(Vec::new());
         let log = |note: String| said.borrow_mut().push(note);
-        let guidance = Guidance::default();
-        let judge = ReferenceJudge { views: &views, guidance, read: &read, log: &log };
+        let warp_options = WarpOptions::default();
+        let judge = ReferenceJudge { views: &views, warp_options, read: &read, log: &log };
         assert_eq!(sorted(&judge, 1.0).unwrap(), ["same", "tinted"]);
         // Per channel the farther wall differs by 0.0318, and (1 + 100 · 3 · 0.0318²)⁻² is 0.59.
         let starts = [
@@ -269,12 +269,12 @@ mod tests {
         assert_eq!(notes.len(), 2, "{notes:?}");
         assert!(notes[0].starts_with(starts[0]), "{}", notes[0]);
         assert!(notes[1].starts_with(starts[1]), "{}", notes[1]);
-        // Every second of nine views is asked for: once for all, then three times for each of three
-        // doubted references.
+        // Every second of nine views is read: once for all references, then three times for each of
+        // three references with low confidence.
         assert_eq!(asked.get(), 5 * (1 + 3 * 3));
-        // Where the network's training had less confidence, less is asked for.
+        // With lower confidence during training, lower confidence suffices.
         assert_eq!(sorted(&judge, 0.7).unwrap(), ["same", "tinted", "farther"]);
-        // What was said of one isn't lost where views can't be read for the next.
+        // The note on one reference is logged even if views can't be read for the next one.
         asked.set(0);
         said.borrow_mut().clear();
         let failing = |view: &View| {
@@ -289,7 +289,7 @@ mod tests {
         assert!(notes.len() == 1 && notes[0].starts_with(starts[0]), "{notes:?}");
     }
 
-    /// A reference whose channels are so many times as bright.
+    /// Returns a reference whose channels are multiplied by `gain`.
     fn seen(gain: [f32; 3]) -> KnownView {
         let truth: Vec<[f32; 3]> =
             colours(0.0).iter().map(|right| std::array::from_fn(|c| gain[c] * right[c])).collect();
@@ -310,7 +310,7 @@ mod tests {
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, f32::max);
         assert!(off < 1e-4, "{off}");
-        // What a field may get wrong, and an image that says nothing, stay as they are.
+        // Differences that a field's errors explain aren't corrected, nor is a uniform image.
         for same in [seen([1.05, 0.95, 1.0]), known("a", 0.0, &[[1.0; 3]; WIDTH * HEIGHT])] {
             let truth = same.truth.clone();
             let (reference, note) = correct_exposure(same);

@@ -1,5 +1,5 @@
 use artifact::format_count;
-use refinement::Use;
+use refinement::ReferenceStatistics;
 
 /// Statistics of a run for its summary.
 pub(crate) struct Summary {
@@ -11,10 +11,10 @@ pub(crate) struct Summary {
     pub(crate) means: usize,
     /// Fraction of the predicted residual that was added.
     pub(crate) residual_weight: f32,
-    /// True if the network reports the use of references.
+    /// True if the network reports statistics of references.
     pub(crate) is_reference_based: bool,
-    /// Use of each reference, summed over the views.
-    pub(crate) uses: Vec<Use>,
+    /// Statistics of each reference, summed over the views.
+    pub(crate) statistics: Vec<ReferenceStatistics>,
 }
 
 impl Summary {
@@ -37,18 +37,18 @@ impl Summary {
 
     /// Describes the number of references and the mean confidence in them.
     fn references(&self) -> String {
-        if self.uses.is_empty() {
+        if self.statistics.is_empty() {
             return String::new();
         }
-        let references = format_count(self.uses.len(), "reference");
+        let references = format_count(self.statistics.len(), "reference");
         if !self.is_reference_based {
             return format!(" by {references}");
         }
-        let mut all = Use::default();
-        for reference in &self.uses {
+        let mut all = ReferenceStatistics::default();
+        for reference in &self.statistics {
             all.add(reference);
         }
-        if all.seen == 0 {
+        if all.visible_pixels == 0 {
             return format!(" by {references} that show no part of them");
         }
         format!(" by {references} (confidence {:.0} %)", 100.0 * all.confidence_share())
@@ -67,16 +67,16 @@ mod tests {
             means: 0,
             residual_weight: 0.8,
             is_reference_based: false,
-            uses: Vec::new(),
+            statistics: Vec::new(),
         };
         assert_eq!(plain.text(), "1 view, residual weight 0.80");
-        let seen = Use { seen: 10, visibility: 8.0, confidence: 4.0 };
+        let seen = ReferenceStatistics { visible_pixels: 10, visibility: 8.0, confidence: 4.0 };
         let by_references = Summary {
             views: 3,
             consistent: 2,
             means: 1,
             is_reference_based: true,
-            uses: vec![seen, Use::default()],
+            statistics: vec![seen, ReferenceStatistics::default()],
             ..plain
         };
         assert_eq!(
@@ -84,7 +84,7 @@ mod tests {
             "3 views by 2 references (confidence 50 %), residual weight 0.80; 1 averaged with \
              their enlarged photographs; 2 consistent with their own photographs"
         );
-        let unseen = Summary { uses: vec![Use::default()], ..by_references };
+        let unseen = Summary { statistics: vec![ReferenceStatistics::default()], ..by_references };
         assert!(unseen.text().starts_with("3 views by 1 reference that show no part of them, "));
     }
 }

@@ -2,7 +2,7 @@ use std::path::Path;
 
 use artifact::{Failure, GivenInput};
 use pixels::{ExrImage, Image, write_png};
-use refinement::{KnownView, LrObservations, Rendered, Use};
+use refinement::{KnownView, LrObservations, ReferenceStatistics, Rendered};
 use scene::{Photograph, VIEW_CHANNELS, View, write_view_image};
 use serde::{Deserialize, Serialize};
 use stage::Context;
@@ -27,8 +27,8 @@ pub(crate) struct RefinedView {
     /// True if the view was made consistent with its own LR photograph.
     #[serde(alias = "agreed")]
     pub(crate) is_consistent: bool,
-    /// Use of each reference.
-    pub(crate) uses: Vec<Use>,
+    /// Statistics of each reference.
+    pub(crate) statistics: Vec<ReferenceStatistics>,
 }
 
 /// Settings and inputs of all views.
@@ -63,9 +63,9 @@ impl RefineJob<'_> {
         [image, preview]: [&str; 2],
     ) -> anyhow::Result<RefinedView> {
         let ViewToRefine { rendered, file, photograph } = self.read(view)?;
-        let mut uses = vec![Use::default(); references.len()];
+        let mut statistics = vec![ReferenceStatistics::default(); references.len()];
         let mut refined =
-            self.network.refine(&rendered, references, &self.application, &mut uses)?;
+            self.network.refine(&rendered, references, &self.application, &mut statistics)?;
         if let Some(enlarged) = &self.enlarged {
             refined = enlarged.average_with(refined, &view.camera)?;
         }
@@ -73,7 +73,7 @@ impl RefineJob<'_> {
         let path = self.context.output_path(image)?;
         write_recoloured(&path, &file, &refined, &rendered.opacity, self.background)?;
         write_png(&self.context.output_path(preview)?, &refined.to_rgba8())?;
-        Ok(RefinedView { is_consistent: photograph.is_some(), uses })
+        Ok(RefinedView { is_consistent: photograph.is_some(), statistics })
     }
 
     /// Reads a view.

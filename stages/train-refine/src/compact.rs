@@ -1,8 +1,8 @@
 use artifact::Failure;
 use pixels::psnr_of;
 use refinement::{
-    Guidance, Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer,
-    RefinerTraining, WEIGHTS_FILE,
+    Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer,
+    RefinerTraining, WEIGHTS_FILE, WarpOptions,
 };
 use stage::Context;
 
@@ -33,7 +33,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         channels: net.features,
         blocks: net.blocks,
         guidance: (net.references_per_view > 0)
-            .then_some(Guidance { occlusion: net.occlusion, alignment: net.alignment }),
+            .then_some(WarpOptions { occlusion: net.occlusion, alignment: net.alignment }),
     };
     let options = RefinerTraining {
         steps: net.steps,

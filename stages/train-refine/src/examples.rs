@@ -3,7 +3,7 @@ use refinement::{KnownView, LrObservations, Rendered};
 use scene::{View, Views};
 use stage::Context;
 
-/// Every n-th view is left out of training (design note 015).
+/// Interval of the views that are left out of training (design note 015).
 const HOLD_OUT_EVERY: usize = 8;
 
 /// Views with ground truth.
@@ -97,8 +97,8 @@ pub(crate) fn lr_photographs(context: &Context) -> Result<Option<LrObservations<
         return Ok(None);
     }
     context.log_line(
-        "all views to be refined have LR photographs of their own: the network is trained on views \
-        consistent with theirs",
+        "all views to be refined have LR photographs: training views are made consistent with \
+        their own LR photographs, too",
     );
     Ok(Some(photographs))
 }

@@ -59,7 +59,7 @@ impl Stage for TrainRefine {
                 Input::optional(
                     &cameras,
                     "net: compact: cameras of the views to be refined; if all have LR photographs, \
-                    training views are made consistent with theirs",
+                    training views are made consistent with their own LR photographs, too",
                 ),
             ),
             (

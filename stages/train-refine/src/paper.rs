@@ -1,5 +1,7 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
-use paper_refiner::{OVERLAP, PaperRefiner, PaperTrainer, PaperTraining, PerceptualLoss};
+use paper_refiner::{
+    DEFAULT_OVERLAP_PIXELS, PaperRefiner, PaperTrainer, PaperTraining, PerceptualLoss,
+};
 use pixels::{Image, psnr_of};
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 use stage::Context;
@@ -28,7 +30,7 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
         learning_rate: params.learning_rate,
         seed,
     };
-    options.check(&known).bad_input("input truth")?;
+    options.check(&known).bad_input("cannot train on input truth")?;
     let perceptual = context.optional_input("weights").map(read_perceptual_loss).transpose()?;
     context.log_line(match &perceptual {
         Some(loss) => {
@@ -44,8 +46,12 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     let (mut rendered, mut refined) = (0.0, 0.0);
     let share = 1.0 / known.len() as f64;
     for view in &known {
-        let redrawn =
-            trainer.network().refine(&view.rendered, &[view], options.references, OVERLAP)?;
+        let redrawn = trainer.network().refine(
+            &view.rendered,
+            &[view],
+            options.references,
+            DEFAULT_OVERLAP_PIXELS,
+        )?;
         rendered += share * psnr(&view.rendered.colours(), &view.truth);
         refined += share * psnr(&redrawn, &view.truth);
     }

@@ -33,5 +33,5 @@ mod trainer;
 
 pub use loss::PerceptualLoss;
 pub use network::PaperRefiner;
-pub use patches::OVERLAP;
+pub use patches::DEFAULT_OVERLAP_PIXELS;
 pub use trainer::{PaperTrainer, PaperTraining};

@@ -9,40 +9,41 @@ use tch::{TchError, no_grad};
 use crate::network::{PaperRefiner, patch_tensor};
 
 /// Side of a patch in pixels, as published.
-pub(crate) const PATCH: usize = 64;
-/// Default overlap of patches in pixels: a quarter of a patch (design note 024).
-pub const OVERLAP: usize = 16;
-/// Number of pixels along each side of a patch whose depth locates reference patches; chosen by
-/// hand.
+pub(crate) const PATCH_PIXELS: usize = 64;
+/// Default overlap of neighbouring patches in pixels: a quarter of a patch (design note 024).
+pub const DEFAULT_OVERLAP_PIXELS: usize = 16;
+/// Number of probes along each side of a patch: pixels whose depth locates reference patches;
+/// chosen by hand.
 const PROBES_PER_SIDE: usize = 4;
 
 /// Column and row of a patch's top left corner.
 type Corner = (usize, usize);
 
 impl PaperRefiner {
-    /// Redraws a view in patches of 64×64 pixels that overlap by `overlap` pixels, at most by half,
-    /// and are blended. Each patch gets at most `count` reference patches, at the positions where
-    /// the patch's pixels are visible in the references. A patch without reference patches is its
-    /// own reference, as in the paper's code. Returns an image of three channels in 0..1.
+    /// Redraws a view in patches of 64×64 pixels, blended over an overlap of `overlap` pixels, at
+    /// most half a patch. Each patch gets at most `max_references` reference patches, at positions
+    /// where the patch's pixels are visible in the references. A patch without reference patches is
+    /// its own reference, as in the paper's code. Returns an image of three channels in 0..1.
     pub fn refine(
         &self,
         rendered: &Rendered,
         references: &[&KnownView],
-        count: usize,
+        max_references: usize,
         overlap: usize,
     ) -> Result<Image, RefinementError> {
         let view = &rendered.view;
-        if view.width < PATCH || view.height < PATCH {
+        if view.width < PATCH_PIXELS || view.height < PATCH_PIXELS {
             let reason = format!(
-                "{}×{} pixels; the paper's network needs at least {PATCH}×{PATCH}",
+                "{}×{} pixels; the paper's network needs at least {PATCH_PIXELS}×{PATCH_PIXELS}",
                 view.width, view.height
             );
             return Err(RefinementError::View { name: rendered.camera.name.clone(), reason });
         }
-        if let Some(small) =
-            references.iter().find(|r| r.truth.width < PATCH || r.truth.height < PATCH)
+        if let Some(small) = references
+            .iter()
+            .find(|r| r.truth.width < PATCH_PIXELS || r.truth.height < PATCH_PIXELS)
         {
-            let reason = format!("reference of fewer than {PATCH}×{PATCH} pixels");
+            let reason = format!("reference of fewer than {PATCH_PIXELS}×{PATCH_PIXELS} pixels");
             return Err(RefinementError::View { name: small.rendered.camera.name.clone(), reason });
         }
         let corners: Vec<(Corner, Self)> = patch_starts(view.height, overlap)
@@ -52,29 +53,30 @@ impl PaperRefiner {
             .collect();
         let patches = corners
             .into_par_iter()
-            .map(|(corner, network)| network.redraw(rendered, corner, references, count))
+            .map(|(corner, network)| network.redraw(rendered, corner, references, max_references))
             .collect::<Result<Vec<_>, _>>()?;
         Ok(blend(view.width, view.height, &patches))
     }
 
-    /// Redraws a view's patch with at most `count` reference patches, in -1..1.
+    /// Redraws a view's patch with at most `max_references` reference patches, in -1..1.
     fn redraw(
         &self,
         rendered: &Rendered,
         corner: Corner,
         references: &[&KnownView],
-        count: usize,
+        max_references: usize,
     ) -> Result<(Corner, Vec<f32>), TchError> {
         let own = patch(&rendered.view, corner);
-        let mut matching: Vec<Vec<f32>> = matching_patches(rendered, references, corner, count)
-            .into_iter()
-            .map(|(r, corner)| patch(&references[r].truth, corner))
-            .collect();
+        let mut matching: Vec<Vec<f32>> =
+            matching_patches(rendered, references, corner, max_references)
+                .into_iter()
+                .map(|(r, corner)| patch(&references[r].truth, corner))
+                .collect();
         if matching.is_empty() {
             matching.push(own.clone());
         }
-        let own = patch_tensor(&own, 1, PATCH)?;
-        let matching = patch_tensor(&matching.concat(), matching.len(), PATCH)?;
+        let own = patch_tensor(&own, 1, PATCH_PIXELS)?;
+        let matching = patch_tensor(&matching.concat(), matching.len(), PATCH_PIXELS)?;
         let redrawn = no_grad(|| self.forward(&own, &matching, false))?;
         let redrawn = redrawn.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
         Ok((corner, Vec::<f32>::try_from(&redrawn)?))
@@ -83,17 +85,18 @@ impl PaperRefiner {
 
 /// Returns the starts of patches along an axis; the last patch ends at the border.
 fn patch_starts(size: usize, overlap: usize) -> Vec<usize> {
-    let last = size - PATCH;
-    let mut all: Vec<usize> = (0..last).step_by(PATCH - overlap.min(PATCH / 2)).collect();
+    let last = size - PATCH_PIXELS;
+    let mut all: Vec<usize> =
+        (0..last).step_by(PATCH_PIXELS - overlap.min(PATCH_PIXELS / 2)).collect();
     all.push(last);
     all
 }
 
 /// Returns a patch of an image, row by row, in -1..1.
 pub(crate) fn patch(image: &Image, (x, y): Corner) -> Vec<f32> {
-    let mut samples = Vec::with_capacity(PATCH * PATCH * 3);
-    for row in y..y + PATCH {
-        for column in x..x + PATCH {
+    let mut samples = Vec::with_capacity(PATCH_PIXELS * PATCH_PIXELS * 3);
+    for row in y..y + PATCH_PIXELS {
+        for column in x..x + PATCH_PIXELS {
             let start = (row * image.width + column) * image.channels;
             samples.extend(image.data[start..start + 3].iter().map(|v| 2.0 * v - 1.0));
         }
@@ -101,18 +104,18 @@ pub(crate) fn patch(image: &Image, (x, y): Corner) -> Vec<f32> {
     samples
 }
 
-/// Finds reference patches of the surface in a view's patch, the most visible first: index of the
-/// reference, and corner. Each probe pixel that is visible in a reference gives one candidate;
-/// equal corners count once.
+/// Finds at most `max_count` reference patches that display the surface in a view's patch, the most
+/// visible first. Returns the index of the reference and the corner of each. Each probe that is
+/// visible in a reference yields one candidate; duplicates are dropped.
 fn matching_patches(
     rendered: &Rendered,
     references: &[&KnownView],
     (x, y): Corner,
-    count: usize,
+    max_count: usize,
 ) -> Vec<(usize, Corner)> {
     let surface = rendered.surface();
     let surfaces: Vec<Surface<'_>> = references.iter().map(|r| r.rendered.surface()).collect();
-    let step = PATCH / PROBES_PER_SIDE;
+    let step = PATCH_PIXELS / PROBES_PER_SIDE;
     let mut candidates = Vec::new();
     for (dx, dy) in (0..PROBES_PER_SIDE)
         .flat_map(|j| (0..PROBES_PER_SIDE).map(move |i| (i * step + step / 2, j * step + step / 2)))
@@ -132,14 +135,15 @@ fn matching_patches(
         .into_iter()
         .map(|(_, r, corner)| (r, corner))
         .filter(|patch| taken.insert(*patch))
-        .take(count)
+        .take(max_count)
         .collect()
 }
 
-/// Returns the start of a patch along an axis of a reference, such that the pixel at index `before`
-/// of the patch has its centre at `position`; clamped to the reference.
-fn matching_start(position: f32, before: usize, size: usize) -> usize {
-    ((position - 0.5).round() as isize - before as isize).clamp(0, (size - PATCH) as isize) as usize
+/// Returns the start of a patch along an axis of a reference, so that the patch's pixel `offset` is
+/// the one that contains `position`. The patch is clamped to the reference of `size` pixels.
+fn matching_start(position: f32, offset: usize, size: usize) -> usize {
+    ((position - 0.5).round() as isize - offset as isize).clamp(0, (size - PATCH_PIXELS) as isize)
+        as usize
 }
 
 /// Blends patches in -1..1 to an image in 0..1, weighted by distance from the patch's border.
@@ -148,7 +152,7 @@ fn blend(width: usize, height: usize, patches: &[(Corner, Vec<f32>)]) -> Image {
     let mut weights = vec![0.0f32; width * height];
     for ((x, y), samples) in patches {
         for (i, pixel) in samples.chunks_exact(3).enumerate() {
-            let (column, row) = (i % PATCH, i / PATCH);
+            let (column, row) = (i % PATCH_PIXELS, i / PATCH_PIXELS);
             let index = (y + row) * width + x + column;
             let weight = border_distance(column) * border_distance(row);
             for c in 0..3 {
@@ -165,7 +169,7 @@ fn blend(width: usize, height: usize, patches: &[(Corner, Vec<f32>)]) -> Image {
 
 /// Returns the distance in pixels of a patch's column or row from the border of the patch.
 fn border_distance(i: usize) -> f32 {
-    (i + 1).min(PATCH - i) as f32
+    (i + 1).min(PATCH_PIXELS - i) as f32
 }
 
 #[cfg(test)]
@@ -199,7 +203,7 @@ mod tests {
     #[test]
     fn patches_overlap_by_as_much_as_asked() {
         assert_eq!(patch_starts(256, 0), [0, 64, 128, 192]);
-        assert_eq!(patch_starts(256, OVERLAP), [0, 48, 96, 144, 192]);
+        assert_eq!(patch_starts(256, DEFAULT_OVERLAP_PIXELS), [0, 48, 96, 144, 192]);
         assert_eq!(patch_starts(150, 32), [0, 32, 64, 86]);
         // Never by more than half.
         assert_eq!(patch_starts(150, 64), patch_starts(150, 32));
@@ -252,12 +256,19 @@ mod tests {
         let network = PaperRefiner::new(4, 1).unwrap();
         let (view, other) = (known(0.0), known(20.0));
         for references in [vec![], vec![&other]] {
-            let drawn = network.refine(&view.rendered, &references, 8, OVERLAP).unwrap();
+            let drawn =
+                network.refine(&view.rendered, &references, 8, DEFAULT_OVERLAP_PIXELS).unwrap();
             assert_eq!((drawn.width, drawn.height, drawn.channels), (160, 96, 3));
             assert!(drawn.data.iter().all(|v| (0.0..=1.0).contains(v)));
         }
         let mut small = view.rendered.clone();
         small.view = image(63, 96, 4);
-        assert!(network.refine(&small, &[], 8, OVERLAP).unwrap_err().to_string().contains("64×64"));
+        assert!(
+            network
+                .refine(&small, &[], 8, DEFAULT_OVERLAP_PIXELS)
+                .unwrap_err()
+                .to_string()
+                .contains("64×64")
+        );
     }
 }

@@ -27,9 +27,10 @@ pub struct PaperTraining {
     pub seed: u64,
 }
 
-/// Trains a [`PaperRefiner`] on references and their rendered views: a patch of both, warped by one
-/// of 200 random perspectives, with reference patches from a fixed window around the patch in the
-/// unwarped reference. The reported error is the mean absolute error of colours in -1..1.
+/// Trains a [`PaperRefiner`] on references and their rendered views. An example is a patch of both,
+/// warped by one of 200 random perspectives. Its reference patches come from a window of fixed size
+/// around the patch in the unwarped reference. The reported loss is the mean absolute error of
+/// colours in -1..1.
 pub struct PaperTrainer {
     network: PaperRefiner,
     options: PaperTraining,
@@ -107,8 +108,8 @@ impl Training for PaperTrainer {
     }
 }
 
-/// Computes the loss of patches in -1..1, L1 plus the perceptual loss if there is one, and the L1
-/// alone.
+/// Computes the loss of patches in -1..1: L1, plus the perceptual loss if enabled. Returns the loss
+/// and L1 alone.
 pub(crate) fn loss(
     redrawn: &Tensor,
     truth: &Tensor,
@@ -142,7 +143,7 @@ struct TrainingPatch<'a> {
 }
 
 impl<'a> TrainingPatch<'a> {
-    /// Draws a patch of an example; `index` is the example's.
+    /// Draws a patch of the example with index `index`, and its reference patches.
     fn draw(
         example: &'a KnownView,
         index: u64,
@@ -182,7 +183,7 @@ impl<'a> TrainingPatch<'a> {
         }
     }
 
-    /// Appends the patch at a corner of a warped image, row by row, in -1..1.
+    /// Warps an image and appends its patch with corner (x, y), row by row, in -1..1.
     fn append_patch(
         &self,
         image: &Image,
@@ -210,8 +211,8 @@ fn draw_near(start: usize, last: usize, rng: &mut CounterRng) -> usize {
 }
 
 impl PaperTraining {
-    /// Checks that the network can halve patches three times, and that patches fit into every
-    /// example.
+    /// Fails if the network can't halve patches three times, or if an example is smaller than a
+    /// patch.
     pub fn check(&self, examples: &[KnownView]) -> Result<(), RefinementError> {
         let size = self.patch_size;
         for KnownView { rendered, truth } in examples {
@@ -221,9 +222,7 @@ impl PaperTraining {
             }
         }
         if size == 0 || !size.is_multiple_of(PATCH_MULTIPLE) {
-            let reason =
-                format!("patches of {size} pixels: a multiple of {PATCH_MULTIPLE} is expected");
-            return Err(RefinementError::View { name: "any".to_owned(), reason });
+            return Err(RefinementError::PatchSize { size, multiple: PATCH_MULTIPLE });
         }
         Ok(())
     }
@@ -236,7 +235,7 @@ mod tests {
 
     use super::*;
 
-    /// Stripes beside the same with less contrast.
+    /// Returns an example of stripes, whose render has less contrast.
     fn example() -> KnownView {
         let level = |i: usize| if (i % 48 / 6).is_multiple_of(2) { 0.2f32 } else { 0.8 };
         let view = (0..48 * 40)

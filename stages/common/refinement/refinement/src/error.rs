@@ -23,6 +23,14 @@ pub enum RefinementError {
         /// Reason, as a sentence fragment.
         reason: String,
     },
+    /// The network can't divide patches of this size.
+    #[error("a patch size of {size} pixels is not a multiple of {multiple}")]
+    PatchSize {
+        /// Side of a patch in pixels.
+        size: usize,
+        /// Number that must divide the side.
+        multiple: usize,
+    },
     /// A view has the wrong number of channels.
     #[error("expected a view of {expected} channels, found {channels}")]
     Channels {

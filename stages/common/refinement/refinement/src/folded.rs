@@ -35,7 +35,7 @@ impl Window {
         }
     }
 
-    /// Returns the image's pixel at a column and row of the square, or the nearest border pixel.
+    /// Returns the image's pixel at a column and row of the window, or the nearest border pixel.
     pub(crate) fn pixel(self, image: &Image, column: usize, row: usize) -> &[f32] {
         let column = clamped_index(self.x, column, image.width);
         let row = clamped_index(self.y, row, image.height);
@@ -43,8 +43,8 @@ impl Window {
         &image.data[start..start + image.channels]
     }
 
-    /// Calls `pixel` with the column and row in the square and the channels of each pixel of folded
-    /// samples.
+    /// Calls `pixel` for each pixel of folded samples, with the column and row in the window and
+    /// the channels.
     pub(crate) fn unfold(
         self,
         samples: &[f32],
@@ -58,8 +58,9 @@ impl Window {
         }
     }
 
-    /// Converts folded samples of squares of this size to a tensor (squares × channels × rows ×
-    /// columns), channels last in memory, the fastest layout for convolutions.
+    /// Converts folded samples of windows of this size to a tensor: windows × 4·`channels` × rows
+    /// of folds × columns of folds. Channels are last in memory, the fastest layout for
+    /// convolutions.
     pub(crate) fn tensor(self, samples: &[f32], channels: usize) -> Result<Tensor, TchError> {
         let (width, height, depth) =
             (self.size.0 / FOLD, self.size.1 / FOLD, channels * FOLD * FOLD);
@@ -74,7 +75,7 @@ fn clamped_index(start: isize, offset: usize, size: usize) -> usize {
     (start + offset as isize).clamp(0, size as isize - 1) as usize
 }
 
-/// One of a square's eight orientations: rotations by right angles and reflections.
+/// One of eight orientations of a window: rotations by right angles and reflections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Orientation {
     /// True if rows and columns are exchanged.
@@ -95,16 +96,16 @@ impl Orientation {
         all
     };
 
-    /// Returns the square with the size that it has in this orientation.
-    pub(crate) fn oriented(self, square: Window) -> Window {
-        let (width, height) = square.size;
-        Window { size: if self.swap { (height, width) } else { (width, height) }, ..square }
+    /// Returns the window in this orientation: width and height are exchanged if necessary.
+    pub(crate) fn oriented(self, window: Window) -> Window {
+        let (width, height) = window.size;
+        Window { size: if self.swap { (height, width) } else { (width, height) }, ..window }
     }
 
-    /// Maps a column and row of the oriented square to those of the original square.
-    pub(crate) fn source(self, square: Window, x: usize, y: usize) -> (usize, usize) {
+    /// Maps a column and row of the oriented window to those of the original window.
+    pub(crate) fn source(self, window: Window, x: usize, y: usize) -> (usize, usize) {
         let (x, y) = if self.swap { (y, x) } else { (x, y) };
-        let (width, height) = square.size;
+        let (width, height) = window.size;
         (if self.flip_x { width - 1 - x } else { x }, if self.flip_y { height - 1 - y } else { y })
     }
 }
@@ -122,13 +123,13 @@ mod tests {
     #[test]
     fn what_is_folded_unfolds() {
         let image = Image::new(7, 5, 3, (0..105).map(|v| v as f32).collect());
-        let square = Window { x: -2, y: 1, size: (6, 4) };
+        let window = Window { x: -2, y: 1, size: (6, 4) };
         let mut folded = Vec::new();
-        square.fold(|x, y| folded.extend_from_slice(square.pixel(&image, x, y)));
-        let again = folded_samples(&square.tensor(&folded, 3).unwrap()).unwrap();
+        window.fold(|x, y| folded.extend_from_slice(window.pixel(&image, x, y)));
+        let again = folded_samples(&window.tensor(&folded, 3).unwrap()).unwrap();
         assert_eq!(again, folded);
         let mut count = 0;
-        square.unfold(&again, 3, |x, y, pixel| {
+        window.unfold(&again, 3, |x, y, pixel| {
             let (column, row) = ((x as isize - 2).clamp(0, 6) as usize, (y + 1).min(4));
             assert_eq!(pixel, &image.data[(row * 7 + column) * 3..][..3]);
             count += 1;
@@ -138,17 +139,17 @@ mod tests {
 
     #[test]
     fn turns_are_eight_and_lose_nothing() {
-        let square = Window { x: 3, y: 4, size: (6, 2) };
+        let window = Window { x: 3, y: 4, size: (6, 2) };
         let mut seen = std::collections::BTreeSet::new();
         for orientation in Orientation::ALL {
             let mut places = Vec::new();
-            orientation.oriented(square).fold(|x, y| places.push(orientation.source(square, x, y)));
+            orientation.oriented(window).fold(|x, y| places.push(orientation.source(window, x, y)));
             let all: std::collections::BTreeSet<_> = places.iter().copied().collect();
             assert_eq!(all.len(), 12);
             assert!(all.iter().all(|&(x, y)| x < 6 && y < 2));
             seen.insert(places);
         }
         assert_eq!(seen.len(), 8);
-        assert_eq!(Orientation::ALL[0].source(square, 4, 1), (4, 1));
+        assert_eq!(Orientation::ALL[0].source(window, 4, 1), (4, 1));
     }
 }

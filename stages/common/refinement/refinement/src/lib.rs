@@ -13,7 +13,7 @@
 //! * [`Rendered`]: a view rendered from a field; [`KnownView`]: a rendered view with its ground
 //!   truth, an example or a reference.
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
-//! * [`with_references`]: adds reference features to a view; [`Guidance`] has the options.
+//! * [`with_references`]: adds reference features to a view; [`WarpOptions`] has the options.
 //! * [`LrObservations`]: LR photographs that views are made consistent with (data consistency).
 //! * [`RefinerTrainer`], [`RefinerTraining`]: training on examples, a [`Training`].
 //! * [`RefinerFile`]: description of a refiner in its artifact.
@@ -50,4 +50,4 @@ pub use error::RefinementError;
 pub use refiner::{Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerScores, RefinerTrainer, RefinerTraining, Training};
 pub use view::{KnownView, Rendered};
-pub use warped_reference::{ConditionedView, Guidance, Use, with_references};
+pub use warped_reference::{ConditionedView, ReferenceStatistics, WarpOptions, with_references};

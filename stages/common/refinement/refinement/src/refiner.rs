@@ -10,7 +10,7 @@ use tch::{TchError, Tensor, no_grad};
 use crate::error::RefinementError;
 use crate::folded::{FOLD, Orientation, Window, folded_samples};
 use crate::view::{INPUTS, OUTPUTS, REFERENCE_INPUTS};
-use crate::warped_reference::Guidance;
+use crate::warped_reference::WarpOptions;
 
 /// Size and inputs of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -21,7 +21,7 @@ pub struct RefinerArchitecture {
     /// Number of residual blocks of two layers each.
     pub blocks: u32,
     /// Warping of references; `None` if the network takes no references.
-    pub guidance: Option<Guidance>,
+    pub guidance: Option<WarpOptions>,
 }
 
 impl RefinerArchitecture {
@@ -167,7 +167,8 @@ impl Refiner {
         2 * self.architecture.blocks as usize + 2
     }
 
-    /// Predicts the residuals of squares, from the squares grown by [`Refiner::receptive_radius`].
+    /// Predicts the residuals of windows from their pixels and those around, up to
+    /// [`Refiner::receptive_radius`].
     pub(crate) fn forward(&self, input: &Tensor) -> Result<Tensor, TchError> {
         let mut x = self.layer(input, 0)?;
         for block in 0..self.architecture.blocks as usize {
@@ -214,15 +215,15 @@ impl Refiner {
             .map(|(x, y, refiner)| -> Result<_, TchError> {
                 let size = [width - x, height - y]
                     .map(|remaining| remaining.min(TILE_SIDE).next_multiple_of(FOLD));
-                let square = Window { x: x as isize, y: y as isize, size: size.into() };
-                Ok((square, refiner.residual(view, square, orientations)?))
+                let window = Window { x: x as isize, y: y as isize, size: size.into() };
+                Ok((window, refiner.residual(view, window, orientations)?))
             })
             .collect::<Result<_, _>>()?;
         let mut data = vec![0.0; width * height * OUTPUTS];
-        for (square, residual) in &residuals {
+        for (window, residual) in &residuals {
             for (i, residual) in residual.chunks_exact(OUTPUTS).enumerate() {
-                let column = square.x as usize + i % square.size.0;
-                let row = square.y as usize + i / square.size.0;
+                let column = window.x as usize + i % window.size.0;
+                let row = window.y as usize + i / window.size.0;
                 if column < width && row < height {
                     let index = row * width + column;
                     for c in 0..OUTPUTS {
@@ -235,17 +236,17 @@ impl Refiner {
         Ok(Image::new(width, height, OUTPUTS, data))
     }
 
-    /// Predicts the residual of a square of a view, the mean over orientations: row by row,
+    /// Predicts the residual in a window of a view, the mean over orientations: row by row,
     /// channels interleaved.
     fn residual(
         &self,
         view: &Image,
-        square: Window,
+        window: Window,
         orientations: &[Orientation],
     ) -> Result<Vec<f32>, TchError> {
-        let around = square.grown(self.receptive_radius());
+        let around = window.grown(self.receptive_radius());
         let inputs = self.architecture.input_channels();
-        let mut sum = vec![0.0; square.size.0 * square.size.1 * OUTPUTS];
+        let mut sum = vec![0.0; window.size.0 * window.size.1 * OUTPUTS];
         let mut input = Vec::with_capacity(around.size.0 * around.size.1 * inputs);
         for orientation in orientations {
             input.clear();
@@ -256,9 +257,9 @@ impl Refiner {
             });
             let output = no_grad(|| self.forward(&oriented.tensor(&input, inputs)?))?;
             let residual = folded_samples(&output)?;
-            orientation.oriented(square).unfold(&residual, OUTPUTS, |x, y, residual| {
-                let (x, y) = orientation.source(square, x, y);
-                let start = (y * square.size.0 + x) * OUTPUTS;
+            orientation.oriented(window).unfold(&residual, OUTPUTS, |x, y, residual| {
+                let (x, y) = orientation.source(window, x, y);
+                let start = (y * window.size.0 + x) * OUTPUTS;
                 for c in 0..OUTPUTS {
                     sum[start + c] += residual[c];
                 }
@@ -329,7 +330,7 @@ mod tests {
         refiner
     }
 
-    /// Tiles meet exactly: a view of several is what one convolution of the whole gives.
+    /// Tiles join without seams: a view of several tiles equals one convolution of the view.
     #[test]
     fn tiles_leave_no_seams() {
         nets::deterministic();
@@ -337,12 +338,12 @@ mod tests {
         let refiner = random(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
             let view = image(width, height);
-            let square = Window {
+            let window = Window {
                 x: 0,
                 y: 0,
                 size: (width.next_multiple_of(FOLD), height.next_multiple_of(FOLD)),
             };
-            let around = square.grown(refiner.receptive_radius());
+            let around = window.grown(refiner.receptive_radius());
             let mut input = Vec::new();
             around.fold(|x, y| input.extend_from_slice(around.pixel(&view, x, y)));
             let added = folded_samples(
@@ -350,7 +351,7 @@ mod tests {
             )
             .unwrap();
             let refined = refiner.refine(&view).unwrap();
-            square.unfold(&added, OUTPUTS, |x, y, added| {
+            window.unfold(&added, OUTPUTS, |x, y, added| {
                 if x < width && y < height {
                     for c in 0..OUTPUTS {
                         let whole =
@@ -370,8 +371,8 @@ mod tests {
         refiner.residual(view, Window { x: 4, y: 4, size: (8, 8) }, &Orientation::ALL[..1]).unwrap()
     }
 
-    /// Internal learning from little pushes features below 0 everywhere. What the network adds must
-    /// still follow what it sees, or it would never learn again.
+    /// Training on few images pushes features below 0 everywhere. The residual must still depend
+    /// on the input, or gradients would vanish for good.
     #[test]
     fn a_network_does_not_fall_silent() {
         nets::deterministic();
@@ -400,7 +401,7 @@ mod tests {
         straight.data.iter().zip(&turned.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
     }
 
-    /// Asked in all eight ways, a network treats a turned view as it treats the view itself.
+    /// With all eight orientations, refining a mirrored view equals mirroring the refined view.
     #[test]
     fn all_turns_together_prefer_no_direction() {
         nets::deterministic();
@@ -415,7 +416,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(WEIGHTS_FILE);
         let architecture =
-            RefinerArchitecture { channels: 6, blocks: 1, guidance: Some(Guidance::default()) };
+            RefinerArchitecture { channels: 6, blocks: 1, guidance: Some(WarpOptions::default()) };
         let refiner = random(architecture);
         refiner.write(&path).unwrap();
         let again = Refiner::read(&path, architecture).unwrap();

@@ -11,21 +11,21 @@ use crate::error::RefinementError;
 use crate::folded::{FOLD, Orientation, Window};
 use crate::refiner::Refiner;
 use crate::view::{KnownView, OUTPUTS, REFERENCE_INPUTS};
-use crate::warped_reference::{Guidance, Use, with_references};
+use crate::warped_reference::{ReferenceStatistics, WarpOptions, with_references};
 
 /// Interruptible training, step by step.
 pub trait Training {
     /// Returns the number of steps taken.
     fn steps(&self) -> u64;
 
-    /// Takes one step on some of the examples, of which there is at least one. Returns the error
-    /// before the step, or `None` after the last step.
+    /// Takes one step on some of `examples`, which must not be empty. Returns the loss before the
+    /// step, or `None` after the last step.
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError>;
 
     /// Writes a checkpoint, from which the training resumes. The caller makes the write atomic.
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError>;
 
-    /// Resumes from a checkpoint of a training with the same network and options.
+    /// Resumes from a checkpoint of a training run with the same network and options.
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError>;
 }
 
@@ -70,7 +70,7 @@ impl Pool {
     fn new(
         round: u64,
         options: &RefinerTraining,
-        guidance: Guidance,
+        guidance: WarpOptions,
         examples: &[KnownView],
     ) -> Self {
         let numbers = round * POOL_VIEWS..(round + 1) * POOL_VIEWS;
@@ -79,11 +79,11 @@ impl Pool {
     }
 }
 
-/// Draws the `number`-th example of the training, with random references.
+/// Draws the `number`-th example of the training run, with random references.
 fn draw_view(
     number: u64,
     options: &RefinerTraining,
-    guidance: Guidance,
+    guidance: WarpOptions,
     examples: &[KnownView],
 ) -> (usize, Image) {
     let mut rng = CounterRng::new(options.seed, POOLS, number);
@@ -153,10 +153,10 @@ impl RefinerTrainer {
         examples: &[KnownView],
         references: &[KnownView],
     ) -> Result<RefinerScores, RefinementError> {
-        let mut uses = Use::default();
+        let mut statistics = ReferenceStatistics::default();
         let mut views = Vec::with_capacity(examples.len());
         for (number, example) in examples.iter().enumerate() {
-            views.push(self.conditioned(number as u64, example, references, &mut uses));
+            views.push(self.conditioned(number as u64, example, references, &mut statistics));
         }
         let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
         for (i, view) in views.iter().enumerate() {
@@ -190,7 +190,7 @@ impl RefinerTrainer {
             rendered_psnr: rendered / count,
             refined_psnr: refined / count,
             residual_weight,
-            confidence: (uses.seen > 0).then(|| uses.confidence_share()),
+            confidence: (statistics.visible_pixels > 0).then(|| statistics.confidence_share()),
         })
     }
 
@@ -200,7 +200,7 @@ impl RefinerTrainer {
         number: u64,
         example: &KnownView,
         references: &[KnownView],
-        uses: &mut Use,
+        statistics: &mut ReferenceStatistics,
     ) -> Image {
         let Some(guidance) = self.refiner.architecture().guidance else {
             return example.rendered.view.clone();
@@ -210,8 +210,8 @@ impl RefinerTrainer {
             .map(|_| &references[rng.below(references.len() as u64) as usize])
             .collect();
         let conditioned = with_references(&example.rendered, &drawn, guidance);
-        for statistics in &conditioned.uses {
-            uses.add(statistics);
+        for reference in &conditioned.statistics {
+            statistics.add(reference);
         }
         conditioned.view
     }
@@ -338,7 +338,7 @@ struct TrainingPatch<'a> {
 }
 
 impl<'a> TrainingPatch<'a> {
-    /// Draws the `number`-th patch of the training.
+    /// Draws the `number`-th patch of the training run.
     fn draw(options: &RefinerTraining, number: u64, views: &[TrainingView<'a>]) -> Self {
         let mut rng = CounterRng::new(options.seed, PATCHES, number);
         let (mut view, mut square) = draw_square(views, options.patch_size, &mut rng);
@@ -463,7 +463,7 @@ mod tests {
         KnownView { rendered, truth: Image::new(32, 32, 3, truth) }
     }
 
-    fn trained(guidance: Option<Guidance>) -> (RefinerTrainer, Vec<KnownView>) {
+    fn trained(guidance: Option<WarpOptions>) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
         let options = RefinerTraining {
             steps: 300,
@@ -483,7 +483,7 @@ mod tests {
 
     #[test]
     fn a_blur_is_unlearnt() {
-        for guidance in [None, Some(Guidance::default())] {
+        for guidance in [None, Some(WarpOptions::default())] {
             let (trainer, examples) = trained(guidance);
             let scores = trainer.score(&[example(5)], &examples).unwrap();
             assert!(scores.refined_psnr > scores.rendered_psnr + 6.0, "{scores:?}");
@@ -491,12 +491,12 @@ mod tests {
         }
     }
 
-    /// References of the stripes' own wall show them as they are, at their place, with full
-    /// confidence; wherever they can't see, nothing.
+    /// References of the same wall display the stripes unchanged and in place, with full
+    /// confidence. Pixels that no reference observes have no features.
     #[test]
     fn references_show_what_is_there() {
         let (view, other) = (example(5), example(2));
-        let pixels = with_references(&view.rendered, &[&other], Guidance::default()).view;
+        let pixels = with_references(&view.rendered, &[&other], WarpOptions::default()).view;
         let (mut seen, mut worst) = (0, 0.0f32);
         for (i, pixel) in pixels.data.chunks_exact(REFERENCE_INPUTS).enumerate() {
             let column = i % 32;
@@ -517,7 +517,7 @@ mod tests {
         }
         assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
         assert!(
-            with_references(&view.rendered, &[], Guidance::default())
+            with_references(&view.rendered, &[], WarpOptions::default())
                 .view
                 .data
                 .chunks_exact(REFERENCE_INPUTS)

@@ -16,16 +16,15 @@ use crate::warped_pixel::WarpedPixel;
 /// Options for warping references to a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct Guidance {
-    /// True if a reference contributes only points that are visible in it by its own depth; false
-    /// if also hidden points.
+pub struct WarpOptions {
+    /// True if points that are hidden in a reference, according to its own depth, are excluded.
     pub occlusion: bool,
     /// True if a reference's pixels are moved, by up to two pixels, to fit the rendered view.
     pub alignment: bool,
 }
 
-impl Default for Guidance {
-    /// Returns the test for occlusion, without alignment.
+impl Default for WarpOptions {
+    /// Returns options that exclude hidden points and don't align references.
     fn default() -> Self {
         Self { occlusion: true, alignment: false }
     }
@@ -34,12 +33,15 @@ impl Default for Guidance {
 /// Features of references for some rows of a view.
 #[derive(Debug)]
 struct ReferenceFeatures {
-    /// Features of each pixel: the references' difference to the rendered colour; the confidence,
-    /// from 0 (visible in none of them) to 1 (visible in one from the same direction and as large,
-    /// and equal to the rendered view); and the detail that the references' own rendered views
-    /// lack, which helps even if a reference shows a point slightly off or in another light.
+    /// Features of each pixel:
+    /// * colour difference between references and render;
+    /// * confidence, from 0 (visible in no reference) to 1 (visible in a reference from the same
+    ///   direction, at the view's resolution or a finer one, with the rendered colour);
+    /// * detail: difference between references and their own renders. Detail helps even if a
+    ///   reference displays a point slightly displaced or in another light.
     features: Vec<[f32; FEATURES]>,
-    uses: Vec<Use>,
+    /// Statistics of each reference.
+    statistics: Vec<ReferenceStatistics>,
 }
 
 /// Number of channels of reference features.
@@ -47,18 +49,19 @@ const FEATURES: usize = REFERENCE_INPUTS - INPUTS;
 
 /// Statistics of one reference in a view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Use {
+pub struct ReferenceStatistics {
     /// Number of the view's pixels that are visible in the reference.
-    pub seen: usize,
-    /// Sum over them of their visibility, by angle and size.
+    #[serde(rename = "seen")]
+    pub visible_pixels: usize,
+    /// Sum of the visible pixels' visibility, which depends on viewing angle and resolution.
     #[serde(alias = "sight")]
     pub visibility: f64,
-    /// Sum over them of the confidence: visibility, reduced where the reference disagrees with the
-    /// rendered view.
+    /// Sum of the visible pixels' confidence: visibility, reduced where the reference differs from
+    /// the rendered view.
     pub confidence: f64,
 }
 
-impl Use {
+impl ReferenceStatistics {
     /// Returns the confidence as a fraction of the visibility.
     pub fn confidence_share(&self) -> f64 {
         if self.visibility > 0.0 { self.confidence / self.visibility } else { 1.0 }
@@ -66,7 +69,7 @@ impl Use {
 
     /// Adds statistics of the same reference for other pixels.
     pub fn add(&mut self, other: &Self) {
-        self.seen += other.seen;
+        self.visible_pixels += other.visible_pixels;
         self.visibility += other.visibility;
         self.confidence += other.confidence;
     }
@@ -79,13 +82,14 @@ pub struct ConditionedView {
     /// confidence and detail.
     pub view: Image,
     /// Statistics of each reference.
-    pub uses: Vec<Use>,
+    pub statistics: Vec<ReferenceStatistics>,
 }
 
 /// Mean difference around a pixel that quarters the confidence (design note 018).
 const QUARTERING_DIFFERENCE: f32 = 0.1;
-/// Jump between neighbours that halves the confidence, in pixels of the reference; chosen by hand.
-const HALVING_JUMP: f32 = 1.0;
+/// Second difference of neighbouring warped positions that halves the confidence, in pixels of the
+/// reference; chosen by hand.
+const HALVING_SECOND_DIFFERENCE: f32 = 1.0;
 /// Number of rows of a view that are warped together, so that memory doesn't grow with the view.
 const BAND_ROWS: usize = 32;
 
@@ -129,40 +133,40 @@ impl ReferenceFeatures {
         rendered: &Rendered,
         references: &[&KnownView],
         rows: Range<usize>,
-        guidance: Guidance,
+        options: WarpOptions,
     ) -> Self {
         let mut sums = vec![FeatureSums::default(); rendered.view.width * rows.len()];
-        let mut uses = Vec::with_capacity(references.len());
+        let mut statistics = Vec::with_capacity(references.len());
         for reference in references {
-            let mut statistics = Use::default();
-            let warped = warp(rendered, reference, &rows, guidance);
+            let mut own = ReferenceStatistics::default();
+            let warped = warp(rendered, reference, &rows, options);
             for (sums, pixel) in sums.iter_mut().zip(&warped) {
-                statistics.seen += usize::from(pixel.visibility > 0.0);
-                statistics.visibility += f64::from(pixel.visibility);
-                statistics.confidence += f64::from(pixel.confidence);
+                own.visible_pixels += usize::from(pixel.visibility > 0.0);
+                own.visibility += f64::from(pixel.visibility);
+                own.confidence += f64::from(pixel.confidence);
                 sums.add(pixel);
             }
-            uses.push(statistics);
+            statistics.push(own);
         }
-        Self { features: sums.into_iter().map(FeatureSums::features).collect(), uses }
+        Self { features: sums.into_iter().map(FeatureSums::features).collect(), statistics }
     }
 }
 
 /// Warps a reference to rows of a view. Confidence is lower where the reference differs from the
 /// rendered view in the mean around a pixel (wrong depth, a moved object, a highlight), and where
-/// neighbouring pixels map to positions out of line (noisy depth, an edge).
+/// the warped positions of neighbouring pixels aren't evenly spaced (noisy depth, an edge).
 fn warp(
     rendered: &Rendered,
     reference: &KnownView,
     rows: &Range<usize>,
-    guidance: Guidance,
+    options: WarpOptions,
 ) -> Vec<WarpedPixel> {
     let (width, height) = (rendered.view.width, rendered.view.height);
     // Alignment makes every compared pixel depend on its own neighbourhood.
-    let around = if guidance.alignment { 2 * COMPARED_RADIUS } else { COMPARED_RADIUS };
+    let around = if options.alignment { 2 * COMPARED_RADIUS } else { COMPARED_RADIUS };
     let near = rows.start.saturating_sub(around)..(rows.end + around).min(height);
-    let mut warped = warp_by_depth(rendered, reference, near.clone(), guidance.occlusion);
-    if guidance.alignment {
+    let mut warped = warp_by_depth(rendered, reference, near.clone(), options.occlusion);
+    if options.alignment {
         warped = align(&warped, rendered, reference, near.start);
     }
     let terms = warped.iter().map(|pixel| {
@@ -177,9 +181,9 @@ fn warp(
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
                 let difference = mean_difference(&sums, x, y) / QUARTERING_DIFFERENCE;
-                let jump = positions.squared_jump(x, y);
+                let squared = positions.squared_second_differences(x, y);
                 own.confidence *= (1.0 + difference * difference).powi(-2)
-                    / (1.0 + jump / (HALVING_JUMP * HALVING_JUMP));
+                    / (1.0 + squared / HALVING_SECOND_DIFFERENCE.powi(2));
             }
             pixels.push(own);
         }
@@ -234,41 +238,42 @@ impl WarpedPositions<'_> {
         (other.confidence > 0.0).then_some(other.position)
     }
 
-    /// Returns the squared distances of a pixel's position from the line through its horizontal and
-    /// its vertical neighbours.
-    fn squared_jump(&self, x: usize, y: usize) -> f32 {
+    /// Returns the squared second differences of the positions around a pixel: the sum of the
+    /// horizontal and the vertical one.
+    fn squared_second_differences(&self, x: usize, y: usize) -> f32 {
         let own = self.warped[y * self.width + x].position;
-        squared_bend(own, self.of_neighbour(x, y, -1, 0), self.of_neighbour(x, y, 1, 0))
-            + squared_bend(own, self.of_neighbour(x, y, 0, -1), self.of_neighbour(x, y, 0, 1))
+        let horizontal = [self.of_neighbour(x, y, -1, 0), self.of_neighbour(x, y, 1, 0)];
+        let vertical = [self.of_neighbour(x, y, 0, -1), self.of_neighbour(x, y, 0, 1)];
+        squared_second_difference(own, horizontal) + squared_second_difference(own, vertical)
     }
 }
 
 /// Returns the squared second difference a + b - 2·own; 0 if a neighbour is missing.
-fn squared_bend(own: [f32; 2], a: Option<[f32; 2]>, b: Option<[f32; 2]>) -> f32 {
-    let (Some(a), Some(b)) = (a, b) else { return 0.0 };
+fn squared_second_difference(own: [f32; 2], neighbours: [Option<[f32; 2]>; 2]) -> f32 {
+    let [Some(a), Some(b)] = neighbours else { return 0.0 };
     (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
 }
 
-/// Adds reference features to a view, as a refiner with this
-/// [`crate::RefinerArchitecture::guidance`] takes them.
+/// Adds reference features to a view. `options` must be those of the refiner
+/// ([`crate::RefinerArchitecture::guidance`]).
 pub fn with_references(
     rendered: &Rendered,
     references: &[&KnownView],
-    guidance: Guidance,
+    options: WarpOptions,
 ) -> ConditionedView {
     let (width, height) = (rendered.view.width, rendered.view.height);
     let mut data = vec![0.0; width * height * REFERENCE_INPUTS];
     let bands = data.par_chunks_mut(width * BAND_ROWS * REFERENCE_INPUTS).enumerate();
-    let uses: Vec<Vec<Use>> = bands
-        .map(|(i, band)| fill_band(band, i * BAND_ROWS, rendered, references, guidance))
+    let parts: Vec<Vec<ReferenceStatistics>> = bands
+        .map(|(i, band)| fill_band(band, i * BAND_ROWS, rendered, references, options))
         .collect();
-    let mut sums = vec![Use::default(); references.len()];
-    for band in &uses {
-        for (sum, statistics) in sums.iter_mut().zip(band) {
-            sum.add(statistics);
+    let mut statistics = vec![ReferenceStatistics::default(); references.len()];
+    for part in &parts {
+        for (sum, part) in statistics.iter_mut().zip(part) {
+            sum.add(part);
         }
     }
-    ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), uses: sums }
+    ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), statistics }
 }
 
 /// Fills a band of a conditioned view, starting at `first_row`; returns the references' statistics.
@@ -277,18 +282,18 @@ fn fill_band(
     first_row: usize,
     rendered: &Rendered,
     references: &[&KnownView],
-    guidance: Guidance,
-) -> Vec<Use> {
+    options: WarpOptions,
+) -> Vec<ReferenceStatistics> {
     let Image { width, height, .. } = rendered.view;
     let rows = first_row..(first_row + BAND_ROWS).min(height);
-    let ReferenceFeatures { features, uses } =
-        ReferenceFeatures::new(rendered, references, rows.clone(), guidance);
+    let ReferenceFeatures { features, statistics } =
+        ReferenceFeatures::new(rendered, references, rows.clone(), options);
     let view = &rendered.view.data[rows.start * width * INPUTS..];
     for (i, pixel) in band.chunks_exact_mut(REFERENCE_INPUTS).enumerate() {
         pixel[..INPUTS].copy_from_slice(&view[i * INPUTS..(i + 1) * INPUTS]);
         pixel[INPUTS..].copy_from_slice(&features[i]);
     }
-    uses
+    statistics
 }
 
 #[cfg(test)]
@@ -311,8 +316,8 @@ mod tests {
             / 6.0
     }
 
-    /// A wall at distance 2 with patches of six pixels, as it is and blurred, from a camera so many
-    /// pixels to the right; `depth` is what the field believes.
+    /// Returns a view of a wall at distance 2 with patches of six pixels; the render is blurred.
+    /// The camera is `right` pixels to the right, and `depth` is the rendered depth.
     fn wall(right: usize, depth: impl Fn(usize) -> f32) -> KnownView {
         let pixels = || (0..HEIGHT as isize).flat_map(|y| (0..WIDTH as isize).map(move |x| (x, y)));
         let truth = pixels().flat_map(|(x, y)| [0, 1, 2].map(|c| level(right, x, y, c))).collect();
@@ -344,14 +349,15 @@ mod tests {
         KnownView { rendered, truth: Image::new(WIDTH, HEIGHT, 3, truth) }
     }
 
-    /// Share of the view that is known of, confidence there, and how far what is shown there is
-    /// from the truth, weighted by the confidence.
-    fn judged(view: &KnownView, reference: &KnownView, guidance: Guidance) -> (f64, f64, f64) {
-        let ConditionedView { view: conditioned, uses } =
-            with_references(&view.rendered, &[reference], guidance);
+    /// Returns the fraction of the view's pixels that are visible in the reference, their mean
+    /// confidence, and the mean error of warped colours, weighted by confidence.
+    fn judged(view: &KnownView, reference: &KnownView, options: WarpOptions) -> (f64, f64, f64) {
+        let ConditionedView { view: conditioned, statistics } =
+            with_references(&view.rendered, &[reference], options);
+        let visible = statistics[0].visible_pixels;
         let (seen, confidence) = (
-            uses[0].seen as f64 / (WIDTH * HEIGHT) as f64,
-            uses[0].confidence / uses[0].seen.max(1) as f64,
+            visible as f64 / (WIDTH * HEIGHT) as f64,
+            statistics[0].confidence / visible.max(1) as f64,
         );
         let (mut sum, mut all) = (0.0, 0.0);
         for (pixel, truth) in
@@ -369,36 +375,37 @@ mod tests {
     #[test]
     fn confidence_falls_where_it_looks_otherwise_than_rendered() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
-        let (seen, confidence, off) = judged(&view, &reference, Guidance::default());
+        let (seen, confidence, off) = judged(&view, &reference, WarpOptions::default());
         assert!(
             (0.7..0.8).contains(&seen) && confidence > 0.85 && off < 0.01,
             "right: {seen} {confidence} {off}"
         );
-        // A plane a third too far away: the reference shows what lies eight pixels to the side.
-        let (_, confidence, _) = judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0), Guidance::default());
-        assert!(confidence < 0.5, "shifted: {confidence}");
-        // Depths with noise within what counts as the same surface, seen from far aside.
-        let noisy = |seed: u64| move |i: usize| 2.0 + 0.03 * (uniform(seed, 1, i as u64) - 0.5);
-        let (_, calm, _) = judged(&wall(0, |_| 2.0), &wall(60, |_| 2.0), Guidance::default());
+        // Depth 3 instead of 2 displaces warped references by eight pixels.
         let (_, confidence, _) =
-            judged(&wall(0, noisy(1)), &wall(60, noisy(2)), Guidance::default());
+            judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0), WarpOptions::default());
+        assert!(confidence < 0.5, "shifted: {confidence}");
+        // Depths with noise within the tolerance of the visibility test, from a distant camera.
+        let noisy = |seed: u64| move |i: usize| 2.0 + 0.03 * (uniform(seed, 1, i as u64) - 0.5);
+        let (_, calm, _) = judged(&wall(0, |_| 2.0), &wall(60, |_| 2.0), WarpOptions::default());
+        let (_, confidence, _) =
+            judged(&wall(0, noisy(1)), &wall(60, noisy(2)), WarpOptions::default());
         assert!(confidence < 0.8 * calm, "noisy: {confidence} of {calm}");
-        // A reference of something else.
+        // A reference with other colours.
         let mut other = wall(24, |_| 2.0);
         other.truth.data.iter_mut().for_each(|v| *v = 1.0 - *v);
-        let (_, confidence, _) = judged(&view, &other, Guidance::default());
+        let (_, confidence, _) = judged(&view, &other, WarpOptions::default());
         assert!(confidence < 0.5, "other: {confidence}");
-        // One that looks away.
-        assert_eq!(judged(&view, &wall(500, |_| 2.0), Guidance::default()).0, 0.0);
+        // A reference that observes another part of the wall.
+        assert_eq!(judged(&view, &wall(500, |_| 2.0), WarpOptions::default()).0, 0.0);
     }
 
     fn error_at_depth(depth: f32, alignment: bool) -> f64 {
-        let guidance = Guidance { alignment, ..Guidance::default() };
-        judged(&wall(0, |_| depth), &wall(24, |_| depth), guidance).2
+        let options = WarpOptions { alignment, ..WarpOptions::default() };
+        judged(&wall(0, |_| depth), &wall(24, |_| depth), options).2
     }
 
-    /// Depths a little off put what a reference shows a pixel and more to the side: it is moved
-    /// back; where depths are right it stays.
+    /// Depths with a small error displace a warped reference by a pixel or more. Alignment corrects
+    /// the displacement, and leaves a reference with correct depth in place.
     #[test]
     fn alignment_moves_what_is_shown_to_where_it_fits() {
         for depth in [1.9, 2.1] {
@@ -410,11 +417,11 @@ mod tests {
     }
 
     fn seen(view: &KnownView, reference: &KnownView, occlusion: bool) -> usize {
-        let guidance = Guidance { occlusion, ..Guidance::default() };
-        with_references(&view.rendered, &[reference], guidance).uses[0].seen
+        let options = WarpOptions { occlusion, ..WarpOptions::default() };
+        with_references(&view.rendered, &[reference], options).statistics[0].visible_pixels
     }
 
-    /// What something stands before is shown only by references that needn't see it.
+    /// Hidden points are warped only without the test for occlusion.
     #[test]
     fn what_is_hidden_is_not_shown() {
         // The reference has a plate before the middle third of its image.
@@ -426,13 +433,15 @@ mod tests {
         assert!((0.28..0.36).contains(&hidden), "{hidden} of the view is hidden");
     }
 
-    /// Bands have what the whole has.
+    /// Features of a band of rows equal those of the complete view.
     #[test]
     fn bands_are_those_of_the_whole() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
-        for guidance in [Guidance::default(), Guidance { alignment: true, ..Guidance::default() }] {
-            let whole = with_references(&view.rendered, &[&reference], guidance).view;
-            let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, guidance);
+        for options in
+            [WarpOptions::default(), WarpOptions { alignment: true, ..WarpOptions::default() }]
+        {
+            let whole = with_references(&view.rendered, &[&reference], options).view;
+            let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, options);
             assert_eq!(band.features.len(), 34 * WIDTH);
             let expected =
                 whole.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
