@@ -18,9 +18,11 @@ pub struct Pixel {
     pub premultiplied: [f32; 3],
     /// Fraction of the light that is stopped.
     pub opacity: f32,
-    /// Expected distance at which light is stopped, in scene units; the far end if none is.
+    /// Expected distance along the ray at which light is stopped, in scene units; distance of the
+    /// far end if no light is stopped.
     pub depth: f32,
-    /// Distance at which half of the light is stopped, in scene units; the far end if less is.
+    /// Distance along the ray at which half of the light is stopped, in scene units; distance of
+    /// the far end if less is stopped.
     pub median_depth: f32,
 }
 

@@ -8,7 +8,7 @@ use serde_json::Value;
 /// Name of a [`TrainingLog`] in a field artifact.
 pub const TRAINING_FILE: &str = "training.json";
 
-/// `training.json`: course of a training, over all ensemble members in order.
+/// Content of `training.json`: course of training, over all ensemble members in order.
 // Sinks also read logs of other versions, which may have more fields.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[schemars(deny_unknown_fields)]

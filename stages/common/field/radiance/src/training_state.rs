@@ -1,6 +1,5 @@
-/// Progress of a training, and its response to numbers that aren't finite: the first such step is
-/// skipped and halves the learning rates; a second one within 100 steps ends the training
-/// (docs/design/006).
+/// Progress of a training run, and its response to non-finite steps. The first such step is skipped
+/// and halves the learning rates; a second one within 100 steps ends the run (docs/design/006).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrainingState {
     /// Number of steps taken.
@@ -14,7 +13,7 @@ pub struct TrainingState {
     last_nonfinite_step: Option<u64>,
 }
 
-/// Minimum number of steps between two that aren't finite (docs/design/006).
+/// Minimum number of steps between two non-finite ones; otherwise the run ends (docs/design/006).
 const MIN_STEPS_BETWEEN_FAULTS: u64 = 100;
 
 impl Default for TrainingState {
@@ -29,8 +28,9 @@ impl TrainingState {
         (self.rays as f64 / rays.max(1) as f64).min(1.0)
     }
 
-    /// Returns the number of bundles of the next step, given the training's rays, the step's target
-    /// number of rays and the rays per bundle; `None` after the last step.
+    /// Returns the number of bundles of the next step; `None` after the last step. `rays` is the
+    /// number of rays of the training run, `target_rays` that of the step, `bundle` that of a
+    /// bundle.
     pub fn bundles_of_step(&self, rays: u64, target_rays: usize, bundle: usize) -> Option<usize> {
         let remaining = rays.saturating_sub(self.rays) as usize / bundle;
         (remaining > 0).then(|| (target_rays / bundle).clamp(1, remaining))
@@ -42,8 +42,8 @@ impl TrainingState {
         self.rays += (bundles * bundle) as u64;
     }
 
-    /// Records a step that wasn't finite and halves the learning rates. Returns whether the
-    /// training may continue.
+    /// Records a non-finite step and halves the learning rates. Returns whether training may
+    /// continue.
     pub fn record_nonfinite_step(&mut self) -> bool {
         let is_repeated = self
             .last_nonfinite_step

@@ -100,7 +100,7 @@ fn sampling_and_compositing_in_f64() {
     let t = stratified(&ends[0], &ends[1], 8, Some(&draws.coarse)).unwrap();
     close("stratified", &t, 1e-12);
     let seen = field.forward(&batch, Some(&draws)).unwrap();
-    // The reference multiplies by 1 - α + 1e-10, we add optical depths.
+    // The reference implementation multiplies by 1 - α + 1e-10; `composite` adds optical depths.
     close("coarse.weights", &seen.coarse.weights, 1e-8);
     let inner = seen.coarse.weights.narrow(1, 1, 6);
     close("importance", &importance(&midpoints(&t).unwrap(), &inner, &draws.fine).unwrap(), 1e-9);

@@ -24,7 +24,7 @@ pub struct GridTrainer {
     second: Vec<Tensor>,
     /// Moving average of the parameters, late in the training.
     average: Option<Vec<Tensor>>,
-    tally: TrainingState,
+    state: TrainingState,
     samples_per_ray: f64,
 }
 
@@ -57,18 +57,18 @@ impl GridTrainer {
             grid,
             options,
             average: None,
-            tally: TrainingState::default(),
+            state: TrainingState::default(),
         })
     }
 
     /// Returns the number of steps taken.
     pub fn steps(&self) -> u64 {
-        self.tally.steps
+        self.state.steps
     }
 
     /// Returns the number of rays cast.
     pub fn rays_done(&self) -> u64 {
-        self.tally.rays
+        self.state.rays
     }
 
     /// Returns the field, with the average of its weights if one is maintained.
@@ -92,16 +92,16 @@ impl GridTrainer {
         &mut self,
         supervision: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
-        supervision.set_progress(self.tally.progress(self.options.rays));
+        supervision.set_progress(self.state.progress(self.options.rays));
         let rays_per_bundle = supervision.rays_per_bundle();
-        let target = self.options.rays_of_step(&self.tally, self.samples_per_ray);
-        let bundles = self.tally.bundles_of_step(self.options.rays, target, rays_per_bundle);
+        let target = self.options.rays_of_step(&self.state, self.samples_per_ray);
+        let bundles = self.state.bundles_of_step(self.options.rays, target, rays_per_bundle);
         let Some(bundles) = bundles else { return Ok(None) };
         self.update_occupancy()?;
-        let step = Step::new(&self.tally, bundles, rays_per_bundle);
+        let step = Step::new(&self.state, bundles, rays_per_bundle);
         let rays = step.rays();
         let pieces = step.run_in_pieces(|range| self.run(&*supervision, step, range))?;
-        self.tally.count(bundles, rays_per_bundle);
+        self.state.count(bundles, rays_per_bundle);
         let (mut samples, mut loss) = (0, 0.0);
         let (mut hits, mut colours, mut sum) = (Vec::new(), Vec::new(), Vec::new());
         for piece in pieces {
@@ -119,15 +119,15 @@ impl GridTrainer {
         self.samples_per_ray = samples as f64 / rays as f64;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum)?;
         if skipped {
-            if !self.tally.record_nonfinite_step() {
-                return Err(TorchFieldError::NotFinite { step: self.tally.steps });
+            if !self.state.record_nonfinite_step() {
+                return Err(TorchFieldError::NotFinite { step: self.state.steps });
             }
         } else {
             no_grad(|| self.apply_gradients(&sum))?;
             self.occupancy.raise_densities(&hits);
             step.record_colours(supervision, &colours);
         }
-        self.tally.steps += 1;
+        self.state.steps += 1;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
     }
 
@@ -143,7 +143,7 @@ impl GridTrainer {
         let offsets: Vec<f32> =
             (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
         let offsets = Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?;
-        let strides = self.occupancy.strides(self.tally.steps);
+        let strides = self.occupancy.strides(self.state.steps);
         let forward = self.grid.forward(&rays, &offsets, strides)?;
         let backgrounds = columns(&rays, self.grid.device, |r| r.background)?;
         let colour = forward
@@ -178,8 +178,8 @@ impl GridTrainer {
     /// Updates the parameters and, late in the training, their average.
     fn apply_gradients(&mut self, gradients: &[Tensor]) -> Result<(), TchError> {
         let options = &self.options;
-        let schedule = options.schedule(&self.tally);
-        let t = self.tally.steps + 1;
+        let schedule = options.schedule(&self.state);
+        let t = self.state.steps + 1;
         for (i, level) in self.grid.levels.iter().enumerate() {
             let learning_rate = options.rate_of_level(i, schedule);
             lazy_adam(
@@ -201,7 +201,7 @@ impl GridTrainer {
                 [self.first[i + 1].shallow_clone(), self.second[i + 1].shallow_clone()],
             )?;
         }
-        if options.is_averaging_step(&self.tally) {
+        if options.is_averaging_step(&self.state) {
             let current = self.grid.parameters();
             if let Some(average) = &mut self.average {
                 let weight = 1.0 - f64::from(options.ema_decay);
@@ -218,7 +218,7 @@ impl GridTrainer {
 
     /// Evaluates the density of the occupancy cells that are due in this step.
     fn update_occupancy(&mut self) -> Result<(), TchError> {
-        let (seed, step) = (self.options.seed, self.tally.steps);
+        let (seed, step) = (self.options.seed, self.state.steps);
         let cells = self.occupancy.cells_to_update(step);
         if cells.is_empty() {
             return Ok(());
@@ -234,7 +234,7 @@ impl GridTrainer {
         self.grid.set_occupancy(&self.occupancy)
     }
 
-    /// Writes a checkpoint, from which a training resumes. The caller makes the write atomic.
+    /// Writes a checkpoint, from which training resumes. The caller makes the write atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
         let mut tensors = numbered("parameter", &self.grid.parameters());
         tensors.extend(numbered("first", &self.first));
@@ -242,7 +242,7 @@ impl GridTrainer {
         tensors.extend(self.average.iter().flat_map(|a| numbered("average", a)));
         tensors.push((DENSITY.to_owned(), Tensor::f_from_slice(&self.occupancy.densities())?));
         tensors.push((OCCUPIED.to_owned(), Tensor::f_from_slice(&self.occupancy.to_bytes())?));
-        let mut counts = self.tally.counters().map(|c| c as i64).to_vec();
+        let mut counts = self.state.counters().map(|c| c as i64).to_vec();
         counts.push(self.samples_per_ray.to_bits() as i64);
         tensors.push((COUNTS.to_owned(), Tensor::f_from_slice(&counts)?));
         Ok(nets::write(path, &tensors)?)
@@ -257,7 +257,7 @@ impl GridTrainer {
     /// Resumes from a checkpoint of a trainer with the same field and options.
     pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
         let weights = nets::Weights::read(path)?;
-        let [tally @ .., samples_per_ray] = read_counts(&weights)?;
+        let [counters @ .., samples_per_ray] = read_counts(&weights)?;
         let current = self.grid.parameters();
         let device = self.grid.device;
         let parameters = read_numbered(&weights, "parameter", &current, device)?;
@@ -282,7 +282,7 @@ impl GridTrainer {
         self.first = first;
         self.second = second;
         self.average = average;
-        self.tally = TrainingState::from_counters(tally);
+        self.state = TrainingState::from_counters(counters);
         self.samples_per_ray = f64::from_bits(samples_per_ray);
         Ok(())
     }
@@ -466,7 +466,7 @@ mod tests {
         std::iter::once(Device::Cpu).chain(nets::device("cuda").ok()).collect()
     }
 
-    /// A training from nothing begins with double strides everywhere, which [`field`] has nowhere:
+    /// Training from scratch begins with double strides everywhere, which [`field`] has nowhere:
     /// equal losses and samples, in a space of straight rays and in one of bent rays.
     #[test]
     fn begins_with_double_strides_as_the_hand_written_trainer_does() {

@@ -17,10 +17,12 @@ use crate::ray_maps::{RayMaps, columns, matrix, to_host};
 use crate::sampling::{importance, midpoints, stratified};
 use crate::step::run_in_pieces;
 
-/// The paper's field: a coarse network, whose weights place the samples of a fine network. In a
-/// box, positions are in [`MlpFrame`], and rays run from `near` to `far` of the bounds. In NDC and
-/// in a contraction, positions are in the unit cube stretched to -1..1, and samples are evenly
-/// spaced through it, as in the paper for forward-facing scenes. Directions are in world space.
+/// The paper's field: a coarse network, whose sample weights determine the samples of a fine
+/// network. Directions are in world space.
+///
+/// In a box, positions are in [`MlpFrame`], and rays start at `near` and end at `far` of the
+/// bounds. In NDC and in a contraction, positions are in the unit cube, scaled to -1..1. There,
+/// samples are evenly spaced in the cube, as in the paper for forward-facing scenes.
 #[derive(Debug)]
 pub struct Mlp {
     pub(crate) architecture: MlpArchitecture,
@@ -42,8 +44,8 @@ pub(crate) struct SampleDraws {
     pub(crate) noise: Option<[Tensor; 2]>,
 }
 
-/// Frame of the networks' positions in a box: its origin and unit in world space. The unit is also
-/// that of t.
+/// Coordinate frame of the networks' positions in a box: origin and unit of length in world space.
+/// Distances t along a ray have the same unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct MlpFrame {
     origin: DVec3,
@@ -82,20 +84,21 @@ const IMPORTANCE: u64 = 202;
 const NOISE: u64 = 203;
 
 impl SampleDraws {
-    /// Draws the numbers of the rays `first..first + n` of a training.
+    /// Draws the random numbers of rays `first..first + n`, counted over the training run.
+    /// `noise_std` is the standard deviation of the noise on raw densities.
     pub(crate) fn new(
         field: &Mlp,
         seed: u64,
         first: u64,
         n: usize,
-        noise: f64,
+        noise_std: f64,
     ) -> Result<Self, TchError> {
         let coarse = field.architecture.coarse_samples as usize;
         let fine = field.architecture.fine_samples as usize;
         let (rays, device) = (first..first + n as u64, field.device);
-        let noise = if noise > 0.0 {
+        let noise = if noise_std > 0.0 {
             let all = draw_rows(seed, NOISE, rays.clone(), 2 * coarse + fine, device, |rng| {
-                (noise * rng.normal()) as f32
+                (noise_std * rng.normal()) as f32
             })?;
             Some([
                 all.f_narrow(1, 0, coarse as i64)?,
@@ -161,7 +164,7 @@ impl Mlp {
     }
 
     /// Reads a file that [`Mlp::write`] wrote, or that `scripts/convert-checkpoint.py` converted
-    /// from the reference's checkpoints.
+    /// from checkpoints of the reference implementation.
     pub fn read(
         path: &Path,
         architecture: MlpArchitecture,
@@ -178,8 +181,8 @@ impl Mlp {
         Ok(Self { architecture, bounds, coarse, fine, device })
     }
 
-    /// Writes both networks as safetensors: `coarse.NAME` and `fine.NAME`, with the reference's
-    /// layer names.
+    /// Writes both networks as safetensors: `coarse.NAME` and `fine.NAME`, with the layer names of
+    /// the reference implementation.
     pub fn write(&self, path: &Path) -> Result<(), TorchFieldError> {
         Ok(nets::write(path, &self.named_parameters())?)
     }
@@ -302,8 +305,8 @@ impl Mlp {
         composite(t, &colour.f_reshape([n, m, 3])?, &raw, &batch.background)
     }
 
-    /// Renders colour, opacity and depth of each ray. On the CPU in parallel, with results that
-    /// don't depend on the number of threads; on a GPU in pieces as large as its memory allows.
+    /// Renders colour, opacity and depth of each ray. The CPU renders in parallel, with results
+    /// independent of the number of threads; a GPU renders pieces as large as its memory allows.
     pub fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TorchFieldError> {
         const CPU_RAYS: usize = 32;
         const GPU_RAYS: usize = 1 << 14;
@@ -402,8 +405,8 @@ mod tests {
 
     use super::*;
 
-    /// In NDC and in a contraction rays are sampled from where they enter to where they leave,
-    /// nearer things first and more of them; what misses the space sees its background.
+    /// In NDC and in a contraction, rays are sampled between their intersections with the cube,
+    /// more densely near the camera. A ray that misses the cube renders its background.
     #[test]
     fn rays_are_sampled_in_every_space() {
         let pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
@@ -458,8 +461,8 @@ mod tests {
         assert_eq!((away.colour, away.opacity), ([0.1, 0.2, 0.3], 0.0));
     }
 
-    /// In a box a field with scaled positions renders the same wherever the scene lies and whatever
-    /// its unit; one without, as the reference's, only around the origin in its unit.
+    /// In a box, a field with scaled positions renders the same at any position and scale of the
+    /// scene. A field without, like that of the reference implementation, depends on both.
     #[test]
     fn scaled_positions_move_with_the_scene() {
         let utm = DVec3::new(500_000.0, 4_649_776.0, 120.0);

@@ -36,7 +36,7 @@ pub struct MlpTrainer {
     field: Mlp,
     options: MlpTraining,
     adam: Adam,
-    tally: TrainingState,
+    state: TrainingState,
     /// Number of consecutive steps in which a network was stuck.
     stuck_steps: u64,
 }
@@ -55,42 +55,43 @@ fn shard_count(rays: usize) -> usize {
 const CHUNK_SAMPLES: usize = 4096;
 /// Number of consecutive stuck steps that count as a collapse (design note 022).
 const MAX_STUCK_STEPS: u64 = 200;
-/// Minimum fraction of the light that all samples together stop. Below it, the background alone
-/// explains the images, and ReLU passes no gradient (design note 022).
-const MIN_STOPPED_FRACTION: f64 = 1e-3;
-/// Maximum fraction of the light that the first samples stop. Above it, the rest gets through only
-/// where the second sample is drawn close to the first, and nothing behind them gets a gradient
-/// (design note 022).
-const MAX_FIRST_STOPPED_FRACTION: f64 = 0.9;
+/// Minimum mean opacity of the rays. Below this opacity, the background alone explains the images,
+/// and ReLU passes no gradient (design note 022).
+const MIN_MEAN_OPACITY: f64 = 1e-3;
+/// Maximum mean weight of the rays' first samples. Above this weight, light passes only if the
+/// second sample is drawn close to the first, and no later sample gets a gradient (design note
+/// 022).
+const MAX_MEAN_FIRST_WEIGHT: f64 = 0.9;
 
-/// Light that a network's samples stop, summed over rays.
+/// Sample weights of a network, summed over rays.
 #[derive(Clone, Copy, Default)]
-struct StoppedLight {
-    /// Light stopped by all samples.
-    total: f64,
-    /// Light stopped by the first sample of each ray.
+struct WeightSums {
+    /// Sum of all samples' weights: the rays' opacities.
+    opacity: f64,
+    /// Sum of the weights of each ray's first sample.
     first: f64,
 }
 
-impl StoppedLight {
+impl WeightSums {
     fn new(weights: &Tensor) -> Result<Self, TchError> {
         let first = weights.f_narrow(1, 0, 1)?;
         Ok(Self {
-            total: weights.f_sum(Kind::Double)?.f_double_value(&[])?,
+            opacity: weights.f_sum(Kind::Double)?.f_double_value(&[])?,
             first: first.f_sum(Kind::Double)?.f_double_value(&[])?,
         })
     }
 
     fn add(self, other: Self) -> Self {
-        Self { total: self.total + other.total, first: self.first + other.first }
+        Self { opacity: self.opacity + other.opacity, first: self.first + other.first }
     }
 
-    /// Returns why the network is stuck, if it is; the sums are over `rays` rays.
+    /// Returns the reason why the network is stuck; `None` if the network can train. The sums are
+    /// over `rays` rays.
     fn stuck_reason(self, rays: f64) -> Option<&'static str> {
-        if self.total < MIN_STOPPED_FRACTION * rays {
-            Some("it renders only the background, where its ReLU passes no gradient")
-        } else if self.first > MAX_FIRST_STOPPED_FRACTION * rays {
-            Some("it renders a wall in front of every camera, behind which nothing gets a gradient")
+        if self.opacity < MIN_MEAN_OPACITY * rays {
+            Some("only the background is rendered, and ReLU passes no gradient")
+        } else if self.first > MAX_MEAN_FIRST_WEIGHT * rays {
+            Some("a wall is rendered in front of every camera, and blocks all gradients behind")
         } else {
             None
         }
@@ -104,8 +105,8 @@ struct MlpPiece {
     colours: Vec<[f32; 3]>,
     /// Sum of the bundles' losses.
     loss: f64,
-    /// Light stopped in the coarse and in the fine network.
-    stopped: [StoppedLight; 2],
+    /// Sample weights of the coarse and the fine network.
+    weights: [WeightSums; 2],
 }
 
 impl MlpPiece {
@@ -115,7 +116,7 @@ impl MlpPiece {
         self.colours.extend(other.colours);
         self.loss += other.loss;
         for i in 0..2 {
-            self.stopped[i] = self.stopped[i].add(other.stopped[i]);
+            self.weights[i] = self.weights[i].add(other.weights[i]);
         }
         Ok(())
     }
@@ -125,7 +126,7 @@ impl MlpTrainer {
     /// Creates a trainer of `field`.
     pub fn new(field: Mlp, options: MlpTraining) -> Result<Self, TorchFieldError> {
         let adam = Adam::new(field.parameters())?;
-        Ok(Self { field, options, adam, tally: TrainingState::default(), stuck_steps: 0 })
+        Ok(Self { field, options, adam, state: TrainingState::default(), stuck_steps: 0 })
     }
 
     /// Returns the field in its current state.
@@ -135,12 +136,12 @@ impl MlpTrainer {
 
     /// Returns the number of steps taken.
     pub fn steps(&self) -> u64 {
-        self.tally.steps
+        self.state.steps
     }
 
     /// Returns the number of rays cast.
     pub fn rays_done(&self) -> u64 {
-        self.tally.rays
+        self.state.rays
     }
 
     /// Takes one step; returns `None` after all rays are used.
@@ -148,33 +149,33 @@ impl MlpTrainer {
         &mut self,
         supervision: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
-        let done = self.tally.progress(self.options.rays);
+        let done = self.state.progress(self.options.rays);
         supervision.set_progress(done);
         let rays_per_bundle = supervision.rays_per_bundle();
-        let Some(bundles) = self.tally.bundles_of_step(
+        let Some(bundles) = self.state.bundles_of_step(
             self.options.rays,
             self.options.max_rays_per_step,
             rays_per_bundle,
         ) else {
             return Ok(None);
         };
-        let step = Step::new(&self.tally, bundles, rays_per_bundle);
+        let step = Step::new(&self.state, bundles, rays_per_bundle);
         let rays = step.rays();
         let pieces = self.run_step(&*supervision, step)?;
-        self.tally.count(bundles, rays_per_bundle);
+        self.state.count(bundles, rays_per_bundle);
         let Some(sum) = sum_in_order(pieces.into_iter().map(Ok))? else { return Ok(None) };
         let loss = sum.loss / bundles as f64;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum.gradients)?;
         if skipped {
-            if !self.tally.record_nonfinite_step() {
-                return Err(TorchFieldError::NotFinite { step: self.tally.steps });
+            if !self.state.record_nonfinite_step() {
+                return Err(TorchFieldError::NotFinite { step: self.state.steps });
             }
         } else {
             self.apply_gradients(&sum.gradients, done)?;
             step.record_colours(supervision, &[sum.colours]);
         }
-        self.tally.steps += 1;
-        self.check_collapse(sum.stopped, rays)?;
+        self.state.steps += 1;
+        self.check_collapse(sum.weights, rays)?;
         let MlpArchitecture { coarse_samples, fine_samples, .. } = self.field.architecture;
         let samples = rays * (2 * coarse_samples + fine_samples) as usize;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
@@ -183,7 +184,7 @@ impl MlpTrainer {
     /// Counts consecutive stuck steps; fails if a network has collapsed.
     fn check_collapse(
         &mut self,
-        [coarse, fine]: [StoppedLight; 2],
+        [coarse, fine]: [WeightSums; 2],
         rays: usize,
     ) -> Result<(), TorchFieldError> {
         let coarse = coarse.stuck_reason(rays as f64).map(|reason| ("coarse", reason));
@@ -194,7 +195,7 @@ impl MlpTrainer {
         };
         self.stuck_steps += 1;
         if self.stuck_steps >= MAX_STUCK_STEPS {
-            return Err(TorchFieldError::Collapsed { step: self.tally.steps, network, reason });
+            return Err(TorchFieldError::Collapsed { step: self.state.steps, network, reason });
         }
         Ok(())
     }
@@ -206,8 +207,11 @@ impl MlpTrainer {
         supervision: &impl Supervisor,
         step: Step,
     ) -> Result<Vec<MlpPiece>, TorchFieldError> {
-        let context =
-            StepContext { step, seed: self.options.seed, noise: self.options.density_noise_std };
+        let context = StepContext {
+            step,
+            seed: self.options.seed,
+            noise_std: self.options.density_noise_std,
+        };
         if self.field.device != Device::Cpu {
             return step.run_in_pieces(|range| context.run(&self.field, supervision, range));
         }
@@ -222,21 +226,21 @@ impl MlpTrainer {
         Ok(pieces?.into_iter().flatten().collect())
     }
 
-    /// Updates the parameters when a fraction `done` of the training is over.
+    /// Updates the parameters when a fraction `done` of the training run is over.
     pub(crate) fn apply_gradients(
         &mut self,
         gradients: &[Tensor],
         done: f64,
     ) -> Result<(), TchError> {
         let MlpTraining { schedule, learning_rate, learning_rate_decay, .. } = self.options;
-        let learning_rate = self.tally.learning_rate_scale
+        let learning_rate = self.state.learning_rate_scale
             * schedule.learning_rate(learning_rate, learning_rate_decay, done);
         self.adam.step(self.field.parameters(), gradients, learning_rate)
     }
 
-    /// Writes a checkpoint, from which a training resumes. The caller makes the write atomic.
+    /// Writes a checkpoint, from which training resumes. The caller makes the write atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
-        let [steps, bundles, rays, scale, fault] = self.tally.counters();
+        let [steps, bundles, rays, scale, fault] = self.state.counters();
         Ok(self.adam.write_checkpoint(
             path,
             self.field.named_parameters(),
@@ -252,10 +256,10 @@ impl MlpTrainer {
 
     /// Resumes from a checkpoint of a trainer with the same field and options.
     pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
-        let (adam, [tally @ .., stuck_steps]): (Adam, [u64; 6]) =
+        let (adam, [counters @ .., stuck_steps]): (Adam, [u64; 6]) =
             Adam::resume(path, &self.field.named_parameters())?;
         self.adam = adam;
-        self.tally = TrainingState::from_counters(tally);
+        self.state = TrainingState::from_counters(counters);
         self.stuck_steps = stuck_steps;
         Ok(())
     }
@@ -280,7 +284,7 @@ fn sum_in_order(
 struct StepContext {
     step: Step,
     seed: u64,
-    noise: f64,
+    noise_std: f64,
 }
 
 impl StepContext {
@@ -315,7 +319,7 @@ impl StepContext {
             self.seed,
             self.step.first_ray(&range),
             rays.len(),
-            self.noise,
+            self.noise_std,
         )?;
         let forward = field.forward(&Batch::new(&rays, field)?, Some(&draws))?;
         let coarse = self.step.loss(supervision, &range, &forward.coarse.colour)?;
@@ -331,9 +335,9 @@ impl StepContext {
             gradients,
             colours: fine.colours,
             loss: coarse.sum + fine.sum,
-            stopped: [
-                StoppedLight::new(&forward.coarse.weights)?,
-                StoppedLight::new(&forward.fine.weights)?,
+            weights: [
+                WeightSums::new(&forward.coarse.weights)?,
+                WeightSums::new(&forward.fine.weights)?,
             ],
         })
     }
@@ -377,7 +381,7 @@ mod tests {
         }
     }
 
-    /// How a training ends of which one network's raw densities are shifted, if not well.
+    /// Trains after shifting one network's raw densities; returns the error of a failed run.
     fn collapse(network: fn(&Mlp) -> &MlpNetwork, shift: f64) -> Option<String> {
         let architecture = MlpArchitecture {
             layers: 5,
@@ -415,8 +419,8 @@ mod tests {
         }
     }
 
-    /// Whatever keeps a network from learning is told: nothing stops the light, or all of it is
-    /// stopped at once. A sound field goes on.
+    /// A stuck network is reported: its samples stop no light, or its first samples stop all light.
+    /// Other fields train on.
     #[test]
     fn collapses_are_told() {
         assert_eq!(collapse(|f| &f.fine, 0.5), None);
@@ -424,12 +428,12 @@ mod tests {
             (
                 (|f| &f.coarse) as fn(&Mlp) -> &MlpNetwork,
                 -300.0,
-                "the coarse network has collapsed: it renders only the background",
+                "the coarse network has collapsed: only the background is rendered",
             ),
             (
                 |f| &f.fine,
                 300.0,
-                "the fine network has collapsed: it renders a wall in front of every camera",
+                "the fine network has collapsed: a wall is rendered in front of every camera",
             ),
         ] {
             let error = collapse(network, shift).expect("a collapse");

@@ -14,7 +14,7 @@ pub(crate) struct MlpNetwork {
     pub(crate) parameters: Vec<Tensor>,
 }
 
-/// Linear layer: name in the reference's checkpoints, inputs, outputs.
+/// Linear layer: name in the reference implementation's checkpoints, inputs, outputs.
 type Layer = (String, i64, i64);
 
 /// Index of the layer that also takes the encoded position (Mildenhall et al. 2020).
@@ -28,8 +28,8 @@ fn encoded_dims(dims: i64, octaves: u32) -> i64 {
     dims * (1 + 2 * i64::from(octaves))
 }
 
-/// Encodes rows x as x, then sin(2ᵏx) and cos(2ᵏx) for k = 0, 1, …: in the reference's order, and
-/// without the paper's π.
+/// Encodes rows x as x, then sin(2ᵏx) and cos(2ᵏx) for k = 0, 1, …: in the order of the reference
+/// implementation, and without the paper's π.
 pub(crate) fn encode(x: &Tensor, octaves: u32) -> Result<Tensor, TchError> {
     let mut parts = vec![x.shallow_clone()];
     for k in 0..octaves {
@@ -77,8 +77,8 @@ impl MlpNetwork {
         })
     }
 
-    /// Initialises every layer like the reference: weights by He et al. 2015 (normal), biases 0.
-    /// Networks of one seed differ in `index`.
+    /// Initialises every layer like the reference implementation: weights by He et al. 2015
+    /// (normal), biases 0. Networks of one seed differ in `index`.
     pub(crate) fn new(
         architecture: MlpArchitecture,
         seed: u64,

@@ -145,8 +145,8 @@ mod tests {
         [0, 1, 2].map(|i| maps.view.double_value(&[0, i]))
     }
 
-    /// In NDC a direction goes from the near to the far plane, as the reference computes it: d' =
-    /// to - from with z from -1 to 1.
+    /// In NDC a direction points from the near to the far plane, as in the reference
+    /// implementation: d' = to - from with z from -1 to 1.
     #[test]
     fn ndc_directions_are_the_references() {
         let camera_to_world = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]];

@@ -2,7 +2,8 @@ use tch::{Kind, TchError, Tensor};
 
 /// Returns `count` distances from `near` to `far` (n × 1 each) at equal steps: n × count. With
 /// `draws` in 0..1 (n × count), each distance is drawn between the midpoints to its neighbours
-/// (Mildenhall et al. 2020, eq. 2, as in the reference: the ends stay inside).
+/// (Mildenhall et al. 2020, eq. 2). As in the reference implementation, the first and the last
+/// distance stay between `near` and `far`.
 pub(crate) fn stratified(
     near: &Tensor,
     far: &Tensor,
@@ -43,7 +44,8 @@ pub(crate) fn importance(
     let above = above.f_clamp_max(bins)?;
     let low = cumulative.f_gather(1, &below, false)?;
     let width = cumulative.f_gather(1, &above, false)?.f_sub(&low)?;
-    // In an empty bin the distance grows from the lower edge with slope 1, as in the reference.
+    // In an empty bin the distance grows from the lower edge with slope 1, as in the reference
+    // implementation.
     let width = width.f_where_self(&width.f_ge(1e-5)?, &width.f_ones_like()?)?;
     let first = edges.f_gather(1, &below, false)?;
     let last = edges.f_gather(1, &above, false)?;

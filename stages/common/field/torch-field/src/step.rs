@@ -6,25 +6,25 @@ use tch::{TchError, Tensor};
 use crate::error::TorchFieldError;
 use crate::ray_maps::to_host;
 
-/// Learning rate over a training.
+/// Learning rate over a training run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Schedule {
     /// Exponential decay with every step, as in the paper's text.
     Exponential,
-    /// Decay by epochs, as in the reference's code: constant until the last ten epochs, each of
-    /// which multiplies the rate by the eleventh root of the decay, so that the final rate is never
-    /// quite reached. A training of fewer than twenty epochs goes through the same twenty faster.
+    /// Decay by epochs, as in the reference implementation: constant until the last ten epochs,
+    /// each of which multiplies the rate by the eleventh root of the decay. The final rate is never
+    /// quite reached. Fewer than twenty epochs pass through the same schedule faster.
     Epochs {
-        /// Number of epochs of the training.
+        /// Number of epochs of the training run.
         epochs: u64,
     },
 }
 
 impl Schedule {
-    /// Number of epochs at the end during which the code's schedule decays.
+    /// Number of final epochs during which [`Schedule::Epochs`] decays.
     const FALLING_EPOCHS: u64 = 10;
 
-    /// Returns the learning rate when a fraction `done` of the training is over.
+    /// Returns the learning rate when a fraction `done` of the training run is over.
     pub fn learning_rate(self, highest: f64, decay: f64, done: f64) -> f64 {
         let progress = match self {
             Self::Exponential => done,
@@ -54,14 +54,14 @@ pub(crate) struct StepLoss {
     pub(crate) sum: f64,
     /// Colours of the rays.
     pub(crate) colours: Vec<[f32; 3]>,
-    /// Scalar whose gradient is that of the step's mean loss.
+    /// Scalar whose gradient is these bundles' part of the gradient of the step's mean loss.
     pub(crate) surrogate: Tensor,
 }
 
 impl Step {
-    /// Creates the step that follows those counted in `tally`.
-    pub(crate) fn new(tally: &TrainingState, bundles: usize, rays_per_bundle: usize) -> Self {
-        Self { first_bundle: tally.bundles, first_ray: tally.rays, bundles, rays_per_bundle }
+    /// Creates the step that follows those counted in `state`.
+    pub(crate) fn new(state: &TrainingState, bundles: usize, rays_per_bundle: usize) -> Self {
+        Self { first_bundle: state.bundles, first_ray: state.rays, bundles, rays_per_bundle }
     }
 
     /// Returns the number of rays of the step.
@@ -69,8 +69,7 @@ impl Step {
         self.bundles * self.rays_per_bundle
     }
 
-    /// Returns the index of the first ray of a range of the step's bundles, over the whole
-    /// training.
+    /// Returns the index, over the training run, of the first ray of a range of the step's bundles.
     pub(crate) fn first_ray(self, range: &Range<usize>) -> u64 {
         self.first_ray + (range.start * self.rays_per_bundle) as u64
     }
@@ -176,7 +175,7 @@ mod tests {
         }
     }
 
-    /// Memory that holds three bundles at most: nothing is lost, nothing done twice.
+    /// With memory for three bundles, each bundle is processed exactly once.
     #[test]
     fn pieces_get_smaller_until_they_fit() {
         let step = Step::new(&TrainingState::default(), 17, 4);
@@ -187,7 +186,7 @@ mod tests {
         assert!(step.run_in_pieces(never).is_err());
     }
 
-    /// The rates that the reference's log shows for 20 epochs.
+    /// The rates are those in the reference implementation's log for 20 epochs.
     #[test]
     fn epochs_are_the_references() {
         let schedule = Schedule::Epochs { epochs: 20 };

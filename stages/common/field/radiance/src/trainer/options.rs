@@ -18,10 +18,10 @@ const STEP_GROWTH: f64 = 8.0 / 3.0;
 /// Minimum number of rays of a step while rays have many samples; chosen by hand.
 const MIN_RAYS_PER_STEP: usize = 256;
 
-/// Options of a training.
+/// Options of a training run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrainingOptions {
-    /// Number of rays of the whole training.
+    /// Number of rays of the whole training run.
     pub rays: u64,
     /// Maximum number of rays per step.
     pub max_rays_per_step: usize,
