@@ -379,7 +379,7 @@ fn add_phases(rows: &mut Rows, one_core: &Trained) {
     rows.add("serial_share_of_step", 100.0 * (total - in_tasks) / total, "%");
 }
 
-/// Measures complete trainings, with one and all threads, and renders of the first one's field.
+/// Measures complete training runs, with one and all threads, and renders of the first run's field.
 fn training(rows: &mut Rows, folder: &Path, rays: u64) -> anyhow::Result<()> {
     let input = GivenInput::open("scene", &folder.join("train"))?;
     let views = Views::read(&input)?;

@@ -109,9 +109,10 @@ pub struct GridParams {
     #[schemars(extend("x-group" = "sampling"))]
     pub order: Order,
     /// Factor by which pixels with detail around them are drawn more often than flat pixels, with
-    /// `order: random`. A pixel's weight in the loss is divided by this factor, which keeps the
-    /// expected loss unchanged. Default: 10 with `order: random`, otherwise 1.
-    #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling", "x-default" = "10"))]
+    /// `order: random`. In the loss, flat pixels have a weight larger by this factor, which keeps
+    /// the expected loss unchanged. Default: 10 with `order: random`, otherwise 1.
+    #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
+    #[schemars(extend("x-default" = "by `order`"))]
     pub pixel_importance: Option<f64>,
     /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
     /// per side at first, then 2, 4 and so on, up to `supersample`.
@@ -165,8 +166,8 @@ pub struct GridParams {
     /// unit cube, at least `base_resolution`.
     #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub max_resolution: Option<u32>,
-    /// Maximum number of cells along z, of any level. Default: in NDC, where rays run along z, the
-    /// number of samples along a ray; otherwise no limit.
+    /// Maximum number of cells along z at every level. Default: in NDC, where rays run along z, the
+    /// number of samples along the cube's z axis; otherwise no limit.
     #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub finest_z: Option<u32>,
     /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at a
@@ -223,8 +224,8 @@ pub struct MlpParams {
     #[schemars(extend("x-group" = "sampling"))]
     pub order: Order,
     /// Factor by which pixels with detail around them are drawn more often than flat pixels, with
-    /// `order: random`. A pixel's weight in the loss is divided by this factor, which keeps the
-    /// expected loss unchanged.
+    /// `order: random`. In the loss, flat pixels have a weight larger by this factor, which keeps
+    /// the expected loss unchanged.
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
     pub pixel_importance: f64,
     /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
@@ -250,9 +251,8 @@ pub struct MlpParams {
     /// Final learning rate as a fraction of the highest one.
     #[schemars(range(min = 1e-6, max = 1.0), extend("x-group" = "optimiser"))]
     pub learning_rate_decay: f64,
-    /// Schedule of the learning rate: that of the paper's `code`, or that in the text of the
-    /// `paper`. A training shorter than the published one compresses the whole schedule into its
-    /// steps.
+    /// Schedule of the learning rate, according to the paper's `code` or to the text of the
+    /// `paper`. A training run shorter than the published one passes through the whole schedule.
     #[schemars(extend("x-group" = "optimiser"))]
     pub schedule: RateSchedule,
     /// Maximum number of restarts, each with the next seed, of an MLP that has collapsed to the
@@ -337,8 +337,8 @@ pub enum Combine {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum RateSchedule {
-    /// The paper's code: constant until the last ten epochs, then a decay per epoch.
+    /// Constant until the last ten epochs, then a decay per epoch, as in the paper's code.
     Code,
-    /// The paper's text: exponential decay throughout.
+    /// Exponential decay throughout, as in the paper's text.
     Paper,
 }

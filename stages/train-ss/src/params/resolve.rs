@@ -8,11 +8,11 @@ use super::{
 };
 use crate::supersample::whole_supersample;
 
-/// Epochs of the published trainings of Blender scenes (NeRF-SR).
+/// Epochs of the published training runs of Blender scenes (NeRF-SR).
 const EPOCHS: u64 = 20;
-/// Epochs of the published trainings of photographs in NDC (NeRF-SR).
+/// Epochs of the published training runs of photographs in NDC (NeRF-SR).
 const EPOCHS_IN_NDC: u64 = 30;
-/// Precrop steps of the published trainings of Blender scenes (design note 022).
+/// Precrop steps of the published training runs of Blender scenes (design note 022).
 const PRECROP_STEPS: u32 = 1000;
 /// Weight of the distortion loss with an opaque background in NDC (design note 012).
 const DISTORTION_IN_NDC: f64 = 0.004;

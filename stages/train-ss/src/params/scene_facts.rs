@@ -18,7 +18,7 @@ pub struct SceneFacts {
 }
 
 impl SceneFacts {
-    /// Returns the properties of a scene for a training from scratch.
+    /// Returns the properties of a scene for training from scratch.
     pub fn of(views: &Views, has_kernel: bool) -> Self {
         let mut facts = Self {
             space: views.bounds.space,

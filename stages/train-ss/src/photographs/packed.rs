@@ -10,7 +10,7 @@ use super::pixel_set::PixelSet;
 
 /// Format of a photograph's samples, row by row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Samples {
+enum SampleFormat {
     /// Three 8-bit levels; the photograph is opaque.
     Rgb8,
     /// Four 8-bit levels, straight alpha.
@@ -19,7 +19,7 @@ enum Samples {
     Rgba32,
 }
 
-impl Samples {
+impl SampleFormat {
     /// Returns the number of bytes of a pixel.
     fn size(self) -> usize {
         match self {
@@ -56,9 +56,9 @@ impl Samples {
 pub(crate) struct PackedPhotograph {
     pub(crate) width: usize,
     pub(crate) height: usize,
-    samples: Samples,
+    format: SampleFormat,
     bytes: Bytes,
-    /// Pixels that count; `None` if all do.
+    /// Valid pixels; `None` if all are valid.
     mask: Option<PixelSet>,
     /// Grey level of the background; `None` for a transparent background.
     background: Option<f32>,
@@ -68,11 +68,11 @@ impl PackedPhotograph {
     /// Packs a photograph in premultiplied RGBA or in RGB.
     pub(crate) fn new(photograph: &Photograph, memory: &mut PixelMemory) -> io::Result<Self> {
         let Photograph { image, mask } = photograph;
-        let (samples, bytes) = pack(image);
+        let (format, bytes) = pack(image);
         Ok(Self {
             width: image.width,
             height: image.height,
-            samples,
+            format,
             bytes: memory.store(bytes)?,
             mask: mask.as_ref().map(|mask| mask.counts.iter().copied().collect()),
             background: None,
@@ -93,20 +93,20 @@ impl PackedPhotograph {
         Self { background: Some(background), ..self }
     }
 
-    /// True if any pixel counts.
-    pub(crate) fn is_known(&self) -> bool {
+    /// True if the mask contains any valid pixel.
+    pub(crate) fn has_valid_pixels(&self) -> bool {
         self.mask.as_ref().is_none_or(|mask| mask.len() > 0)
     }
 
-    /// True if a pixel counts.
-    pub(crate) fn counts(&self, pixel: usize) -> bool {
+    /// True if a pixel is valid: neither masked nor NaN.
+    pub(crate) fn is_valid(&self, pixel: usize) -> bool {
         let is_masked = self.mask.as_ref().is_some_and(|mask| !mask.contains(pixel as u64));
-        // Block means of a reference are NaN where no pixel of the block counts.
-        !is_masked && (self.samples != Samples::Rgba32 || !self.pixel(pixel)[0].is_nan())
+        // Block means of a reference are NaN for blocks without valid pixels.
+        !is_masked && (self.format != SampleFormat::Rgba32 || !self.pixel(pixel)[0].is_nan())
     }
 
     /// Returns a pixel in premultiplied RGBA, composited if there is a background; NaN if the pixel
-    /// doesn't count.
+    /// is masked.
     pub(crate) fn pixel(&self, pixel: usize) -> [f32; 4] {
         let mut out = [[0.0; 4]];
         self.read_row(pixel..pixel + 1, &mut out);
@@ -126,17 +126,17 @@ impl PackedPhotograph {
 
     /// Prefetches both ends of a row of neighbouring pixels, see [`Bytes::prefetch`].
     pub(crate) fn prefetch(&self, pixels: &Range<usize>) {
-        let size = self.samples.size();
+        let size = self.format.size();
         self.bytes.prefetch(&(size * pixels.start..size * pixels.end));
     }
 
     /// Reads neighbouring pixels of a row and ignores the mask.
     fn read_unmasked_row(&self, pixels: Range<usize>, out: &mut [[f32; 4]]) {
-        let size = self.samples.size();
+        let size = self.format.size();
         let mut buffer = Vec::new();
         let bytes = self.bytes.read(size * pixels.start..size * pixels.end, &mut buffer);
         for (out, bytes) in out.iter_mut().zip(bytes.chunks_exact(size)) {
-            let pixel = self.samples.pixel(bytes);
+            let pixel = self.format.pixel(bytes);
             *out = match self.background {
                 Some(background) => {
                     let [r, g, b] = [0, 1, 2].map(|c| pixel[c] + (1.0 - pixel[3]) * background);
@@ -152,7 +152,7 @@ impl PackedPhotograph {
         self.image(Self::read_unmasked_row)
     }
 
-    /// Returns the image, NaN at pixels that don't count.
+    /// Returns the image, NaN at masked pixels.
     pub(crate) fn masked(&self) -> Image {
         self.image(Self::read_row)
     }
@@ -209,24 +209,24 @@ fn row_pixels(image: &Image, y: usize) -> impl Iterator<Item = [f32; 4]> {
 }
 
 /// Encodes an RGBA or RGB image in the smallest format that restores every sample.
-fn pack(image: &Image) -> (Samples, Vec<u8>) {
+fn pack(image: &Image) -> (SampleFormat, Vec<u8>) {
     let rows = || (0..image.height).into_par_iter();
-    let samples = if !rows()
+    let format = if !rows()
         .all(|y| row_pixels(image, y).all(|pixel| premultiplied(straight(pixel)) == pixel))
     {
-        Samples::Rgba32
+        SampleFormat::Rgba32
     } else if rows().all(|y| row_pixels(image, y).all(|pixel| pixel[3] == 1.0)) {
-        Samples::Rgb8
+        SampleFormat::Rgb8
     } else {
-        Samples::Rgba8
+        SampleFormat::Rgba8
     };
-    let mut bytes = vec![0; samples.size() * image.width * image.height];
-    bytes.par_chunks_mut((samples.size() * image.width).max(1)).enumerate().for_each(|(y, row)| {
-        for (out, pixel) in row.chunks_exact_mut(samples.size()).zip(row_pixels(image, y)) {
-            samples.write(pixel, out);
+    let mut bytes = vec![0; format.size() * image.width * image.height];
+    bytes.par_chunks_mut((format.size() * image.width).max(1)).enumerate().for_each(|(y, row)| {
+        for (out, pixel) in row.chunks_exact_mut(format.size()).zip(row_pixels(image, y)) {
+            format.write(pixel, out);
         }
     });
-    (samples, bytes)
+    (format, bytes)
 }
 
 #[cfg(test)]
@@ -244,8 +244,8 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever a PNG holds takes a byte a sample, and comes back to the last bit, from memory
-        /// and from a file.
+        /// Every PNG's content needs a byte per sample, and is restored exactly from memory and
+        /// from a file.
         #[test]
         fn eight_bits_come_back(bytes in prop::collection::vec(any::<u8>(), 4 * 6), opaque: bool,
             background in 0.0f32..1.0) {
@@ -259,8 +259,8 @@ mod tests {
                 let mut memory = PixelMemory::new(budget, folder.path().to_path_buf());
                 let packed = packed_photograph(image.clone(), None, &mut memory);
                 let is_opaque = image.data.chunks_exact(4).all(|p| p[3] == 1.0);
-                prop_assert_eq!(packed.samples,
-                    if is_opaque { Samples::Rgb8 } else { Samples::Rgba8 });
+                prop_assert_eq!(packed.format,
+                    if is_opaque { SampleFormat::Rgb8 } else { SampleFormat::Rgba8 });
                 prop_assert_eq!(matches!(packed.bytes, Bytes::File { .. }), budget == 0);
                 prop_assert_eq!(packed.unmasked(), image.clone());
                 let over = packed.over(background);
@@ -277,15 +277,17 @@ mod tests {
         let mask = Mask { width: 2, height: 1, counts: vec![false, true] };
         let packed =
             packed_photograph(image.clone(), Some(mask.clone()), &mut PixelMemory::unlimited());
-        assert_eq!(packed.samples, Samples::Rgba32);
+        assert_eq!(packed.format, SampleFormat::Rgba32);
         assert!(
             packed.pixel(0).iter().all(|v| v.is_nan())
                 && packed.pixel(1) == [0.5, 0.25, 0.125, 1.0]
         );
         assert_eq!(packed.unpack(), Photograph { image, mask: Some(mask) });
-        assert!(packed.is_known());
+        assert!(packed.has_valid_pixels());
         let none = Mask { width: 2, height: 1, counts: vec![false; 2] };
         let grey = Image::new(2, 1, 3, vec![0.5; 6]);
-        assert!(!packed_photograph(grey, Some(none), &mut PixelMemory::unlimited()).is_known());
+        assert!(
+            !packed_photograph(grey, Some(none), &mut PixelMemory::unlimited()).has_valid_pixels()
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! State that a training estimates in addition to the field.
+//! State that training estimates in addition to the field.
 
 mod exposure;
 mod hr_cache;

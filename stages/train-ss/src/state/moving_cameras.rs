@@ -4,17 +4,18 @@ use scene::Camera;
 
 use crate::photographs::{PackedPhotograph, Photographs};
 
-/// Number of rounds in a training; every camera moves in each round (design note 025).
+/// Number of rounds in a training run; every camera moves in each round (design note 025).
 const ROUNDS: u32 = 24;
-/// Training progress at the first round: before floaters explain photographs with wrong poses
-/// (design note 025).
+/// Training progress at the first round, before the field fits wrong poses with floaters (design
+/// note 025).
 const FIRST_PROGRESS: f64 = 0.02;
 /// Training progress after the last round: before weights are averaged (design note 025).
 const LAST_PROGRESS: f64 = 0.7;
 /// Training progress from which photographs are compared at full size. Until then they are smaller,
 /// since the residuals of a blurred field have a wider basin of convergence (design note 025).
 const FULL_SIZE_PROGRESS: f64 = 0.4;
-/// Maximum number of renders of a camera in a round: two Gauss-Newton steps (design note 025).
+/// Maximum number of renders per camera and round, enough for two Gauss-Newton steps (design note
+/// 025).
 const MAX_RENDERS_PER_ROUND: u32 = 3;
 /// Number of times that the photographs are halved at first (design note 025).
 const FIRST_HALVINGS: u32 = 3;
@@ -46,15 +47,15 @@ impl MovingCameras {
         &self.current
     }
 
-    /// True if the next round is due at a training progress in 0..1.
+    /// True if the next round is due at `progress`, the fraction of the training that is done.
     pub(crate) fn are_due(&self, progress: f64) -> bool {
         let range = LAST_PROGRESS - FIRST_PROGRESS;
         self.rounds < ROUNDS
             && progress >= FIRST_PROGRESS + range * f64::from(self.rounds) / f64::from(ROUNDS)
     }
 
-    /// Moves every camera for one round. `exposure` returns the factors from a view's photograph to
-    /// the field's colours.
+    /// Optimises the pose of every camera for one round. `exposure` returns, for a view's index,
+    /// the factors per channel from the photograph to the field's colours.
     pub(crate) fn step(
         &mut self,
         field: &dyn RayField,
@@ -76,8 +77,8 @@ impl MovingCameras {
         Ok(())
     }
 
-    /// Measures the motion of the first `count` cameras, relative to the depth that the field
-    /// renders for them.
+    /// Measures the motion of the first `count` cameras since the start, relative to the depth that
+    /// the field renders for each camera.
     pub(crate) fn moved(
         &self,
         field: &dyn RayField,

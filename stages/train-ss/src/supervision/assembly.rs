@@ -137,7 +137,7 @@ impl<'a> Assembly<'a> {
         if self.options.params.pixel_importance > 1.0 {
             let mut detailed = detailed_pixels(unmasked);
             for (pixel, is_detailed) in detailed.iter_mut().enumerate() {
-                *is_detailed &= image.counts(pixel);
+                *is_detailed &= image.is_valid(pixel);
             }
             for _ in 0..draws {
                 self.detailed.extend(detailed.iter().copied());

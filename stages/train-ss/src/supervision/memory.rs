@@ -8,7 +8,7 @@ use super::options::SupersamplingOptions;
 use crate::params::{Resolved, ResolvedField};
 use crate::photographs::PixelMemory;
 
-/// Peak memory of a training, in bytes.
+/// Peak memory of training, in bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct MemoryNeed {
     /// Field, optimiser state, and the copy that a checkpoint is written from.
@@ -41,7 +41,7 @@ const BYTES_PER_PYRAMID_PIXEL: u64 = 16 + BYTES_PER_RGB_PIXEL;
 const MIN_MLP_BYTES: u64 = 500_000_000;
 
 impl MemoryNeed {
-    /// Estimates the memory of a training with HR `references`, with or without checkpoints.
+    /// Estimates the memory of training with HR `references`, with or without checkpoints.
     pub(crate) fn of(
         options: &SupersamplingOptions,
         views: &Views,

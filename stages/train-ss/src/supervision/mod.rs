@@ -171,7 +171,7 @@ impl Supersampling {
 
     /// Returns the view and pixel that a bundle trains on.
     fn drawn_pixel(&self, bundle: u64) -> (usize, usize) {
-        self.sampler.draw(bundle, |view, pixel| self.views[view].image.counts(pixel))
+        self.sampler.draw(bundle, |view, pixel| self.views[view].image.is_valid(pixel))
     }
 
     /// Returns the column and row of a view's pixel.

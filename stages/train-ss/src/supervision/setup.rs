@@ -30,7 +30,7 @@ pub(crate) fn transparent_background(parameter: &str) -> String {
     format!("parameter {parameter}: {problem}")
 }
 
-/// Reads and checks photographs and references, and sets up the supervision of a training. Pixels
+/// Reads and checks photographs and references, and sets up the supervision of training. Pixels
 /// beyond the memory budget go into a file in `folder`. `log` reports the memory need, and
 /// references that are corrected or dropped.
 pub fn supervision(
@@ -58,7 +58,7 @@ pub fn supervision(
     let mut memory = need.plan(available_memory()?, folder.to_path_buf())?;
     log(need.describe(memory.left()));
     let photographs = Photographs::read(input, usize::MAX, &mut memory)?;
-    if !photographs.images.iter().any(PackedPhotograph::is_known) {
+    if !photographs.images.iter().any(PackedPhotograph::has_valid_pixels) {
         let message = "scene: masks exclude every pixel of every photograph; white pixels count";
         return Err(Failure::BadInput(message.to_owned()).into());
     }

@@ -30,7 +30,7 @@ pub(crate) trait FieldTrainer {
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()>;
 }
 
-/// Error of a training that can't make progress; another seed may succeed.
+/// Error of a training run that can't make progress; another seed may succeed.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct Collapsed(pub(crate) String);

@@ -6,7 +6,7 @@ use fields::{FieldFile, FieldModel};
 use glam::DVec3;
 use stage::Context;
 
-/// Input `init`: the field that a training is initialised from.
+/// Input `init`: the field that training is initialised from.
 pub(crate) struct InitField<'a> {
     input: &'a GivenInput,
     members: u32,

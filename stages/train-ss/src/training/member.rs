@@ -13,7 +13,7 @@ use super::field_trainer::{Collapsed, FieldTrainer, average_weights, new_trainer
 use crate::params::{Combine, Resolved};
 use crate::supervision::{Supersampling, supervision};
 
-/// Inputs of a training, and its progress bar.
+/// Inputs of a training run, and its progress bar.
 #[derive(Clone, Copy)]
 pub(crate) struct TrainingData<'a> {
     pub(crate) input: &'a GivenInput,
@@ -144,7 +144,7 @@ impl<'a> Member<'a> {
         self.finish(training, data.views.bounds)
     }
 
-    /// Starts a training, or resumes it from its last checkpoint in `work`.
+    /// Starts training, or resumes from the last checkpoint in `work`.
     fn start(
         &self,
         params: &Resolved,
@@ -234,7 +234,7 @@ impl<'a> Member<'a> {
         new_trainer(params, init, bounds, &self.context.device)
     }
 
-    /// Writes the weights of a training, averaged with the initial ones if requested.
+    /// Writes the trained weights, averaged with the initial ones if requested.
     fn write_weights(&self, trainer: Box<dyn FieldTrainer>, bounds: Bounds) -> anyhow::Result<()> {
         trainer.finish(&self.output)?;
         if let Some((init, Combine::AverageWeights)) = &self.init {
