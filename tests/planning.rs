@@ -246,7 +246,7 @@ fn sinks_are_part_of_the_picture() {
             ][..],
         ),
         (&["plan"], &["shows eval"]),
-        (&["graph"], &["report (shows the run)  ← eval\n"]),
+        (&["graph"], &["report (displays the run)  ← eval\n"]),
         (&["graph", "--format", "dot"], &["[label=\"report\", shape=note]", "n4 -> n5"]),
     ] {
         let said = project.ok(arguments);

@@ -1,7 +1,7 @@
 //! The command line.
 //!
-//! Structs that are flattened into a command, and values of options, have `//` comments: clap would
-//! print doc comments as the verb's help, or give every verb's help its long form.
+//! Structs that are flattened into a command, and values of options, have `//` comments. From doc
+//! comments, clap would take the verb's help, or print every verb's help in the long form.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -106,8 +106,8 @@ struct RunOptions {
     /// Maximum number of stages that run at once [default: number of cores, at most 4]
     #[arg(short, long, value_name = "N")]
     jobs: Option<usize>,
-    /// Threads of each stage, and cores that all stages share; results don't depend on the number
-    /// [default: all cores]
+    /// Number of cores that all stages share, and of threads of each stage; results don't depend on
+    /// the number [default: all cores]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
     /// Memory limit for all stages together, such as 8G; each stage counts with the peak memory of
@@ -195,10 +195,10 @@ enum Verb {
     },
     /// Compare two results: parameters, defaults in use, metrics, images
     Diff {
-        /// Stage with its arguments as one word ("eval -p kernel=box"), first characters of an
-        /// artifact's hash, ID of a recorded run, or name of a pin
+        /// Result to compare: a stage with its arguments, quoted ("eval -p kernel=box"), the first
+        /// characters of an artifact's hash, the ID of a recorded run, or the name of a pin
         before: String,
-        /// Result to compare with, in one of these forms
+        /// Result to compare with BEFORE, given in the same way
         now: String,
         /// Print JSON
         #[arg(long)]

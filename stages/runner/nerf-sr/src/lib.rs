@@ -39,8 +39,15 @@ use artifact::report_line;
 use planning::PlanError;
 use planning::stage_call::StageFailure;
 
-/// Runs the program. Exit codes: 0 for success, a failed stage's own code, 2 for an invalid file or
-/// command line, 70 for a panic. A closed stdout changes none of them.
+/// Runs the program. A closed stdout doesn't change the exit code:
+///
+/// * 0: success
+/// * 1: other failures, such as those of the store
+/// * 2: invalid pipeline file or command line
+/// * 3: unusable input folder or artifact
+/// * 70: panic
+/// * 130: interruption
+/// * after a stage has failed: that stage's exit code
 pub fn main() -> ExitCode {
     stage::install_panic_hook("nerf-sr");
     cli::run_command_line().unwrap_or_else(|error| {

@@ -149,7 +149,7 @@ impl NodeReport {
             }
             State::Waits { on } => report.waits_on.clone_from(on),
         }
-        report.by_scene = node.by_scene(&folder);
+        report.by_scene = node.scene_defaults(&folder);
         Ok(report)
     }
 }

@@ -23,15 +23,15 @@ fn was_or_were(count: usize) -> &'static str {
     if count == 1 { "was" } else { "were" }
 }
 
-/// A complete command that prints a failed stage's log, so that users can paste it.
+/// Message after a stage's failure, with the complete command that prints the stage's log.
 pub(crate) struct FailureHint {
     program: String,
-    /// The user's arguments, except the verb and options of `run` alone.
+    /// The user's arguments, without the verb and without options that only `run` has.
     arguments: Vec<String>,
 }
 
 impl FailureHint {
-    /// Creates a hint from the arguments of `nerf-sr log` after the stage.
+    /// Creates a hint. `arguments` follow the stage's name in the command `nerf-sr log STAGE …`.
     pub(crate) fn new(arguments: Vec<String>) -> Self {
         let program = std::env::args_os()
             .next()
@@ -46,14 +46,14 @@ impl FailureHint {
         words.join(" ")
     }
 
-    /// Returns the message after a stage's failure; `skipped` is the number of stages that were not
-    /// run because of it.
+    /// Returns the message after a stage's failure. `skipped` is the number of stages that were not
+    /// run because of the failure.
     pub(crate) fn message(&self, label: &str, stage: &str, skipped: usize) -> String {
         let skipped = match skipped {
             0 => String::new(),
             n => format!("; {} {} not run", format_count(n, "stage"), was_or_were(n)),
         };
-        format!("nerf-sr: {label} failed{skipped}; `{}` shows its log", self.log_command(stage))
+        format!("nerf-sr: {label} failed{skipped}; `{}` prints the log", self.log_command(stage))
     }
 }
 
@@ -99,7 +99,7 @@ mod tests {
             program: "nerf-sr".to_owned(),
             arguments: vec!["-p".to_owned(), "x=a b".to_owned()],
         };
-        let log = "`nerf-sr log prep -p 'x=a b'` shows its log";
+        let log = "`nerf-sr log prep -p 'x=a b'` prints the log";
         for (skipped, between) in
             [(0, ""), (1, "; 1 stage was not run"), (2, "; 2 stages were not run")]
         {

@@ -74,20 +74,13 @@ pub(crate) fn run_record(
     if can_be_partial {
         failed.extend_from_slice(&sink.left_out);
     }
-    // JSON can't contain a path that isn't UTF-8. Without the path a table has no commit.
-    let home = std::path::absolute(run.out)
+    // JSON can't contain a path that isn't UTF-8. Without the path, tables don't name a commit.
+    let pages_folder = std::path::absolute(run.out)
         .ok()
-        .filter(|home| home.to_str().is_some())
+        .filter(|folder| folder.to_str().is_some())
         .unwrap_or_default();
     let data_sets = data_sets(plan, sink);
-    Some(RunRecord {
-        pages_folder: home,
-        command: Vec::new(),
-        data_sets,
-        nodes,
-        failed,
-        unfinished,
-    })
+    Some(RunRecord { pages_folder, command: Vec::new(), data_sets, nodes, failed, unfinished })
 }
 
 /// Returns the nodes that a sink shows and their ancestors, in the plan's order.
@@ -185,7 +178,7 @@ pub(crate) fn add_details(record: &mut RunRecord, plan: &Plan, progress: &RunPro
             .iter()
             .position(|planned| planned.stage == node.stage && planned.point == node.point);
         let Some(index) = index else { continue };
-        node.resolved = plan.nodes[index].by_scene(&node.folder);
+        node.resolved = plan.nodes[index].scene_defaults(&node.folder);
         node.is_cached = progress.ran.map(|ran| !ran.contains(&index));
     }
     record.command = progress.command.to_vec();

@@ -42,8 +42,8 @@ impl Session {
         Ok(Self { pipeline, store, devices })
     }
 
-    /// Creates a plan for a verb that runs nothing. No program except the runner's own stages is
-    /// started.
+    /// Creates a plan for a verb that runs no stage. Only the runner's own programs are started, to
+    /// describe themselves.
     pub(crate) fn plan(&self, request: &Request) -> anyhow::Result<Plan> {
         self.new_plan(request, Describing::Own)
     }
@@ -168,7 +168,7 @@ pub(crate) fn nodes_of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, Pla
     }
     if plan.sinks.iter().any(|sink| sink.stage == stage) {
         return Err(PlanError::Usage(format!(
-            "{stage} is a sink, which shows each run and has no artifact"
+            "{stage} is a sink, which displays runs and has no artifact"
         )));
     }
     let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();

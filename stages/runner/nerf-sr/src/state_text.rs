@@ -72,7 +72,7 @@ pub(crate) fn by_scene_text(session: &Session, node: &Node, state: &State) -> Op
         _ => PathBuf::new(),
     };
     let mut entries = Vec::new();
-    for (name, value) in node.by_scene(&artifact) {
+    for (name, value) in node.scene_defaults(&artifact) {
         entries.push(match value {
             Value::Null => name,
             Value::String(text) => format!("{name}={text}"),
@@ -82,8 +82,8 @@ pub(crate) fn by_scene_text(session: &Session, node: &Node, state: &State) -> Op
     (!entries.is_empty()).then(|| format!("by scene: {}", entries.join(", ")))
 }
 
-/// Describes what a run does with a sink. Only `run` knows the folder of pages, so this doesn't
-/// depend on an existing page.
+/// Describes a sink's nodes and when a run writes the sink's page. The text doesn't depend on an
+/// existing page, because only `run` knows the folder of pages.
 pub(crate) fn sink_text(plan: &Plan, sink: &Sink, states: &[State]) -> String {
     let mut names: Vec<&str> =
         sink.nodes.iter().map(|&index| plan.nodes[index].stage.as_str()).collect();

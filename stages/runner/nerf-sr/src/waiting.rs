@@ -1,4 +1,4 @@
-//! Waits for locks, which end on signals and report the lock's holder.
+//! Waits for locks. Each wait reports the lock's holder and ends on a signal.
 
 use artifact::format_duration;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -82,7 +82,7 @@ pub(crate) fn holder_text(holder: Option<&Holder>) -> String {
         format!(" by process {pid}")
     } else {
         // A killed runner's stage inherited the lock.
-        format!(" by a stage of process {pid}, which has ended")
+        format!(" by a stage of process {pid} (ended)")
     }
 }
 
@@ -116,7 +116,7 @@ mod tests {
             format!(" by process {} on far", holder.pid)
         );
         let gone = holder_text(Some(&Holder { pid: 0x7fff_fff0, ..holder }));
-        assert!(gone.ends_with("which has ended"), "{gone}");
+        assert!(gone.ends_with("(ended)"), "{gone}");
         assert_eq!(holder_text(None), "");
     }
 }

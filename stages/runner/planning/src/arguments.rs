@@ -1,8 +1,8 @@
 //! Values on the command line: `-p NAME=VALUE[,VALUE…]` (docs/design/030, S3.6).
 //!
 //! A JSON number, `true`, `false` or `null` is parsed as JSON. An empty value is `null`. A value
-//! that starts with `[`, `{` or `"` is JSON and may contain commas. Any other value is a string:
-//! also `0x10`, `+2`, `02` and ` 2`, which the type of a numeric parameter refuses.
+//! that starts with `[`, `{` or `"` is JSON and may contain commas. Any other value is a string,
+//! including `0x10`, `+2`, `02` and ` 2`, which numeric parameters therefore refuse.
 
 use serde_json::Value;
 
@@ -21,14 +21,14 @@ pub(crate) fn folders(text: &str) -> Result<Vec<&str>, String> {
     }
     let folders: Vec<&str> = text.split(',').collect();
     if folders.contains(&"") {
-        return Err("empty folder name between commas; remove the comma".to_owned());
+        return Err("empty folder name in the list; remove the comma".to_owned());
     }
     Ok(folders)
 }
 
 fn parse_value(text: &str) -> Result<Value, String> {
     if text.is_empty() {
-        return Err("empty value between commas; remove the comma, or write null".to_owned());
+        return Err("empty value in the list; remove the comma, or write null".to_owned());
     }
     let parsed = serde_json::from_str::<Value>(text);
     if text.starts_with(JSON_START) {
@@ -113,8 +113,8 @@ mod tests {
     #[test]
     fn what_cannot_be_meant_is_refused() {
         for (text, words) in [
-            (",", "empty value between commas"),
-            ("1,,2", "empty value between commas"),
+            (",", "empty value in the list"),
+            ("1,,2", "empty value in the list"),
             ("1,", "write null"),
             ("[1,2", "is invalid JSON"),
             ("\"a", "is invalid JSON"),

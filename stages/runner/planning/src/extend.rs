@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::file::{File, PipelineError};
+use crate::file::{ParsedFile, PipelineError};
 use crate::pipeline::Pipeline;
 
 /// Maximum length of a chain of files that extend one another, chosen by hand.
@@ -37,7 +37,7 @@ impl Pipeline {
     /// Parses a pipeline file and reads the files that it extends. `path` locates the file for
     /// relative paths and error messages.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
-        let file = File::parse(bytes, path)?;
+        let file = ParsedFile::parse(bytes, path)?;
         let mut chain = vec![file.canonical_path.clone()];
         read_extended(file, &mut chain)
     }
@@ -65,7 +65,7 @@ impl Pipeline {
 
 /// Joins the files that a file extends, and overrides them with the file. `chain` contains the
 /// files that extend one another down to this one.
-fn read_extended(file: File, chain: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineError> {
+fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineError> {
     let mut joined: Option<Pipeline> = None;
     for extended in &file.content.extends {
         let path = file.folder().join(extended).canonicalize().map_err(|e| {
@@ -85,7 +85,7 @@ fn read_extended(file: File, chain: &mut Vec<PathBuf>) -> Result<Pipeline, Pipel
         }
         let bytes = std::fs::read(&path).map_err(|e| extends_error(&file, extended, e))?;
         chain.push(path.clone());
-        let pipeline = read_extended(File::parse(&bytes, &display_path(&path))?, chain)?;
+        let pipeline = read_extended(ParsedFile::parse(&bytes, &display_path(&path))?, chain)?;
         chain.pop();
         joined = Some(match joined {
             None => pipeline,
@@ -106,7 +106,11 @@ fn read_extended(file: File, chain: &mut Vec<PathBuf>) -> Result<Pipeline, Pipel
     Ok(pipeline)
 }
 
-fn extends_error(file: &File, extended: &str, problem: impl std::fmt::Display) -> PipelineError {
+fn extends_error(
+    file: &ParsedFile,
+    extended: &str,
+    problem: impl std::fmt::Display,
+) -> PipelineError {
     file.error(&["extends"], format!("extends {extended}: {problem}"))
 }
 

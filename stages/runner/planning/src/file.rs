@@ -57,8 +57,8 @@ pub struct StageBlock {
     /// Program: a path relative to the file's folder, or the name of a program next to `nerf-sr`.
     /// The default is the block's name.
     pub run: Option<String>,
-    /// Block whose program and parameters are inherited. Parameters given here override inherited
-    /// ones from the file and the command line.
+    /// Block whose program and parameters are inherited. Parameters of this block override
+    /// inherited ones, including those that the command line sets.
     pub extends: Option<String>,
     /// Inputs by name: a stage (`prep`), a subtree of its artifact (`prep/train`), or the path of a
     /// folder, which starts with `.` or `/`.
@@ -92,8 +92,8 @@ impl StageBlock {
         }
     }
 
-    /// Overrides parts of the block with those of `other`, the block of the same name in a file
-    /// that extends this one's.
+    /// Overrides parts of the block with those of `other`, the block of the same name in an
+    /// extending file.
     pub fn override_with(&mut self, other: &Self) {
         if other.run.is_some() || other.extends.is_some() {
             self.run.clone_from(&other.run);
@@ -172,9 +172,9 @@ impl PipelineError {
     }
 }
 
-/// Pipeline file that was read.
+/// Parsed pipeline file with its path and text.
 #[derive(Debug)]
-pub struct File {
+pub struct ParsedFile {
     /// Path for messages.
     pub path: PathBuf,
     /// Canonical path, the identity of the file.
@@ -183,7 +183,7 @@ pub struct File {
     text: String,
 }
 
-impl File {
+impl ParsedFile {
     /// Parses a pipeline file. Fails on duplicate keys, unknown keys and wrong types.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let text = crate::yaml_lines::decode(bytes)
@@ -252,7 +252,7 @@ fn parse_content(text: &str, path: &Path) -> Result<PipelineFile, PipelineError>
 /// Maximum length of a stage's name, which becomes part of file names; chosen by hand.
 const MAX_NAME_BYTES: usize = 100;
 
-/// Returns the problem of a stage's name as part of file names and command lines.
+/// Returns why a stage's name can't be part of file names and command lines; `None` if it can.
 fn stage_name_problem(name: &str) -> Option<&'static str> {
     if name.is_empty() {
         Some("name is empty")

@@ -9,7 +9,7 @@
 //! * [`Plan`]: nodes (stages × swept values) in topological order, and their states: cached, to run
 //!   or waiting. `check` checks the whole pipeline, `arguments` and `axes` parse the command line,
 //!   `expand` creates the nodes.
-//! * [`Source`]: content hash of a folder outside the store, and changes since.
+//! * [`Source`]: content hash of a folder outside the store, and detection of later changes.
 //!   [`StageProgram::confirm`] checks that a program is still the planned one.
 //! * [`stage_call`]: the caller's half of the stage contract, for descriptions and for runs.
 //! * [`key_parts`]: parts of an action's key. The key is their hash, and [`changes`] explains

@@ -6,7 +6,7 @@ use artifact::{FailedPoint, RunInput, hash_json, label};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use slurm::Resources;
-use store::{Record, Waiting};
+use store::{PartialKey, Record};
 
 use crate::stages::StageProgram;
 
@@ -112,17 +112,17 @@ impl Node {
         label(&self.stage, &self.point)
     }
 
-    /// Returns the known part of the node's record, while inputs are unknown.
-    pub fn waiting(&self) -> Waiting {
-        Waiting {
+    /// Returns the part of the node's key that is known while inputs are unknown.
+    pub fn partial_key(&self) -> PartialKey {
+        PartialKey {
             program: self.program.description.name.clone(),
             parameters: self.parameters.as_object().cloned().unwrap_or_default(),
         }
     }
 
     /// Returns the parameters whose defaults depend on the scene, with the values that the artifact
-    /// records; null if the artifact doesn't exist yet.
-    pub fn by_scene(&self, artifact: &Path) -> Map<String, Value> {
+    /// records. Values are null if the artifact doesn't exist yet.
+    pub fn scene_defaults(&self, artifact: &Path) -> Map<String, Value> {
         let output = &self.program.description.output;
         if output.resolved.is_none() {
             return Map::new();

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use slurm::Resources;
 
 use crate::experiment::Experiment;
-use crate::file::{File, InputSource, Part, PipelineError, StageBlock};
+use crate::file::{InputSource, ParsedFile, Part, PipelineError, StageBlock};
 
 /// Blocks of a pipeline file and of the files that it extends.
 #[derive(Clone, Debug, Default)]
@@ -17,15 +17,15 @@ pub struct Pipeline {
     /// Scenes, protocols and variants.
     pub experiment: Experiment,
     /// The given file and the files that it extends; each file comes before those that it extends.
-    pub files: Vec<Arc<File>>,
+    pub files: Vec<Arc<ParsedFile>>,
 }
 
 /// Folders of further pipelines and of experiments, next to pipeline.yaml.
 pub(crate) const TARGET_FOLDERS: [&str; 2] = ["pipelines", "experiments"];
 
 impl Pipeline {
-    /// Returns the blocks that give a stage's parameters: the block that it extends, then its own,
-    /// which overrides it.
+    /// Returns the names of the blocks that set a stage's parameters: the extended block, if any,
+    /// then the stage's own block, which overrides the extended one.
     pub fn layers<'a>(&'a self, stage: &'a str) -> impl Iterator<Item = &'a str> {
         self.stages[stage].extends.as_deref().into_iter().chain([stage])
     }
@@ -71,17 +71,17 @@ impl Pipeline {
     }
 
     /// Returns the file that gives a part of a block, or else the first file with the block.
-    fn file_of_part(&self, stage: &str, part: Part) -> &File {
+    fn file_of_part(&self, stage: &str, part: Part) -> &ParsedFile {
         let file = self.files.iter().find(|file| file.has(stage, part));
         file.map_or_else(|| self.file_of_block(stage), Arc::as_ref)
     }
 
     /// Returns the first file with a stage's block.
-    pub fn file_of_block(&self, stage: &str) -> &File {
+    pub fn file_of_block(&self, stage: &str) -> &ParsedFile {
         self.find_file(|file| file.has(stage, Part::Block))
     }
 
-    fn find_file(&self, is_wanted: impl Fn(&File) -> bool) -> &File {
+    fn find_file(&self, is_wanted: impl Fn(&ParsedFile) -> bool) -> &ParsedFile {
         self.files.iter().find(|file| is_wanted(file)).unwrap_or(&self.files[0])
     }
 

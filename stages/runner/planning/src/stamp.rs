@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 /// Maximum step of a file system's clock: FAT has two seconds.
 const MAX_TICK_SECONDS: u64 = 2;
 
-/// Size, times and inode of a file. Equal stamps mean equal contents (docs/design/002).
+/// Size, times and inode of a file. If a settled stamp stays equal, so does the file's content
+/// (docs/design/002).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
     /// Size in bytes.
@@ -39,16 +40,16 @@ impl Stamp {
         Self { inode: earlier.inode, ..*self } == *earlier
     }
 
-    /// Returns whether the next change of the file will change the stamp. A change in the same
-    /// clock tick as the last one would not.
+    /// Returns whether every later change of the file will change the stamp. A second change within
+    /// one tick of the file system's clock leaves the times unchanged.
     pub(crate) fn is_settled(&self) -> bool {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs() as i64;
         let times = [self.modified.0, self.changed.0];
         times.iter().all(|time| now.abs_diff(*time) > MAX_TICK_SECONDS)
     }
 
-    /// Returns the size and the time of the content's last change. A copy of the file may have
-    /// equal ones.
+    /// Returns the size and the time of the content's last change, which copies of a file may
+    /// preserve.
     pub(crate) fn of_content(&self) -> (u64, (i64, i64)) {
         (self.size, self.modified)
     }

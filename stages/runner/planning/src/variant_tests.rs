@@ -222,7 +222,7 @@ fn one_choice_is_one_key() {
     assert_eq!(training_key(PIPELINE, &["field=grid"]), training_key(PIPELINE, &[]));
     assert_ne!(training_key(PIPELINE, &["field=mlp"]), training_key(PIPELINE, &[]));
     let plan = plan_of(PIPELINE, &[]).unwrap();
-    let open: Vec<String> = plan.nodes[1].by_scene(Path::new("")).keys().cloned().collect();
+    let open: Vec<String> = plan.nodes[1].scene_defaults(Path::new("")).keys().cloned().collect();
     assert!(
         ["march_steps", "supervision"].iter().all(|name| open.contains(&(*name).to_owned())),
         "{open:?}"

@@ -30,7 +30,7 @@ impl Destination<'_> {
     }
 
     /// Fails if the path exists and may not be replaced. Only regular files may be replaced, since
-    /// writing to a device or through a link would have unknown effects.
+    /// replacing a device or a link may have effects outside the folder.
     pub(crate) fn check(&self) -> anyhow::Result<()> {
         let name = self.name();
         let problem = match self.file.symlink_metadata() {

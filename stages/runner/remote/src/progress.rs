@@ -11,7 +11,7 @@ use stage::Pace;
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Progress in bytes with the remaining time: a bar on a terminal, otherwise a line at intervals.
-/// Also checks for signals, since work does both between two pieces of data.
+/// Signals are checked as well, since both are due between two pieces of data.
 pub(crate) struct Progress {
     label: &'static str,
     total: u64,
@@ -23,11 +23,13 @@ pub(crate) struct Progress {
 struct State {
     done: u64,
     pace: Pace,
-    reported: Instant,
+    /// Time of the last report without a terminal.
+    last_report: Instant,
 }
 
 impl Progress {
-    /// Creates progress; with a total of 0 it only checks for signals.
+    /// Creates progress of `total` bytes. With a total of 0, nothing is displayed, and only signals
+    /// are checked.
     pub(crate) fn new(label: &'static str, total: u64, stop: &Arc<AtomicBool>) -> Self {
         let bar = (total > 0 && std::io::stderr().is_terminal()).then(|| {
             let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}")
@@ -36,7 +38,7 @@ impl Progress {
         });
         let mut pace = Pace::default();
         pace.start(0);
-        let state = Mutex::new(State { done: 0, pace, reported: Instant::now() });
+        let state = Mutex::new(State { done: 0, pace, last_report: Instant::now() });
         Self { label, total, bar, state, stop: Arc::clone(stop) }
     }
 
@@ -48,7 +50,7 @@ impl Progress {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.done += bytes;
         let done = state.done;
-        let is_due = self.total > 0 && state.reported.elapsed() >= REPORT_INTERVAL;
+        let is_due = self.total > 0 && state.last_report.elapsed() >= REPORT_INTERVAL;
         if self.bar.is_none() && !is_due {
             return Ok(());
         }
@@ -58,7 +60,7 @@ impl Progress {
             bar.set_position(done);
             bar.set_message(text);
         } else {
-            state.reported = Instant::now();
+            state.last_report = Instant::now();
             report_line!("{}: {text}", self.label);
         }
         Ok(())

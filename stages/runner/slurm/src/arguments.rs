@@ -19,7 +19,7 @@ pub(crate) struct JobRequest<'a> {
     /// Jobs that must succeed first.
     pub(crate) after: &'a [&'a str],
     /// Working directory.
-    pub(crate) folder: &'a Path,
+    pub(crate) working_folder: &'a Path,
     pub(crate) log: &'a Path,
     pub(crate) script: &'a Path,
     /// Index of the task, passed to the script.
@@ -37,7 +37,7 @@ impl JobRequest<'_> {
                 .map(OsString::from)
                 .into();
         arguments.push(option("--job-name", name));
-        arguments.push(option("--chdir", self.folder));
+        arguments.push(option("--chdir", self.working_folder));
         arguments.push(option("--output", escape_patterns(self.log)));
         arguments.push(option("--signal", format!("B:USR1@{}", site.notice.seconds)));
         let optional = [
@@ -95,7 +95,7 @@ mod tests {
             resources: &resources,
             site: &site,
             after,
-            folder: Path::new("/work"),
+            working_folder: Path::new("/work"),
             log: Path::new("/s/50%/7.log"),
             script: Path::new("/s/job.sh"),
             number: 7,

@@ -20,7 +20,7 @@ pub struct SubmitOptions<'a> {
     /// Data that the command reads from [`Submission::plan_path`].
     pub plan: &'a [u8],
     /// Working directory of the jobs.
-    pub folder: &'a Path,
+    pub working_folder: &'a Path,
     /// Callback that returns true to stop submitting.
     pub is_stopped: &'a dyn Fn() -> bool,
 }
@@ -32,17 +32,18 @@ pub struct Submitted {
     pub jobs: Vec<(usize, String)>,
     /// Number of tasks for which a job was queued before.
     pub already_queued: usize,
-    /// Number of tasks without a job, because the queue is full or submitting failed.
+    /// Number of unfinished tasks without a job: the queue is full, submitting failed or was
+    /// stopped, or a parent has no job.
     pub remaining: usize,
     /// Error that ended submitting.
     pub error: Option<SlurmError>,
 }
 
 impl Submission {
-    /// Submits a job for each task that is neither done nor queued. `find_done` returns for each
-    /// task whether it is done. It is called after the queue was read, so that a task that ends in
-    /// between counts as done. The folder is written only if a job is submitted, and before the
-    /// first one.
+    /// Submits a job for each task that is neither done nor queued. `find_done` returns a flag per
+    /// task, true if the task is done. `find_done` is called after the queue is read, so that a
+    /// task that ends in between counts as done. The submission's folder is written before the
+    /// first job; without jobs, no folder is written.
     pub fn submit<E: From<SlurmError>>(
         &self,
         root: &Path,
@@ -108,7 +109,7 @@ impl Submission {
             resources: &task.resources,
             site: options.site,
             after: &after,
-            folder: options.folder,
+            working_folder: options.working_folder,
             log: &self.log_path(number),
             script: &self.script_path(),
             number,
@@ -194,7 +195,7 @@ mod tests {
                 site: &site,
                 command: &[OsStr::new("run")],
                 plan: b"{}",
-                folder: Path::new("/work"),
+                working_folder: Path::new("/work"),
                 is_stopped: &|| false,
             };
             let submission = Submission::new(self.dir.path(), id, tasks);

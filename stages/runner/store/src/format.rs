@@ -11,9 +11,9 @@ use crate::folder::Store;
 pub const FORMAT: u32 = 1;
 
 impl Store {
-    /// Opens the store in a folder, and creates it if necessary. A store of an older format is
-    /// marked with this one, after which older runners don't change it, including those in
-    /// progress.
+    /// Opens the store in a folder, which is created if necessary. An older store is marked with
+    /// this program's format. After that, older runners, including those in progress, don't change
+    /// the store.
     pub fn open(root: &Path) -> Result<Self, StoreError> {
         Self::open_as(root, FORMAT)
     }
@@ -52,8 +52,8 @@ impl Store {
         }
     }
 
-    /// Marks the store with this program's format. The store is closed meanwhile, so that other
-    /// processes have left it before or will read the mark.
+    /// Marks the store with this program's format. The store is closed while it is marked: every
+    /// other process has left the store before, or reads the mark on entering.
     fn mark_format(&self) -> Result<(), StoreError> {
         let gate = match self.open_gate() {
             Err(StoreError::Io { source, .. })

@@ -21,9 +21,9 @@ impl Store {
         Ok(finished)
     }
 
-    /// Removes the temporary files of killed processes. `Closed` keeps processes out of the store,
-    /// and they write records, pins and the format only inside, so none of these is being written
-    /// now. Files of `cache` may be; a deleted one is created again.
+    /// Removes the temporary files of killed processes. Only processes inside the store write
+    /// records, pins and the format, and `Closed` excludes such processes. Files of `cache` may be
+    /// in use; a deleted cache file is created again.
     pub fn remove_leftovers(&self, _: &Closed) -> Result<(), StoreError> {
         for folder in FOLDERS {
             let folder = self.root().join(folder);

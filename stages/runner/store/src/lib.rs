@@ -7,7 +7,7 @@
 //! * [`is_hash`]: the form of keys and identities.
 //! * [`KeyLock`]: one OS lock per key. [`Entered`] and [`Closed`]: mutual exclusion of runs and
 //!   garbage collection.
-//! * [`RunFile`], [`Run`], [`Waiting`]: the actions that runs and pins need.
+//! * [`RunFile`], [`Run`], [`PartialKey`]: the actions that runs and pins need.
 //!
 //! Only a file that is not found counts as absent. Any other error while reading is reported with
 //! the file's name, since an unreadable file may be needed.
@@ -55,4 +55,4 @@ pub use folder::Store;
 pub use format::FORMAT;
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
 pub use objects::is_hash;
-pub use run::{Run, RunFile, Waiting};
+pub use run::{PartialKey, Run, RunFile};

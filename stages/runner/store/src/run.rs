@@ -21,21 +21,21 @@ pub(crate) enum RunLine {
     /// Action whose record or checkpoints the run needs.
     Action { stage: String, key: String },
     /// Action whose key depends on outputs that don't exist yet.
-    Waiting(Waiting),
+    Waiting(PartialKey),
     /// Last line, unless the run was killed.
     Ended { unix: u64 },
 }
 
-/// Node whose key is not known yet. Any record of its stage with its parameters may be its own.
+/// Known part of a key whose inputs are unknown. Every record with these parts may have the key.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Waiting {
+pub struct PartialKey {
     /// Name of the program, as in the part `stage` of a key.
     pub program: String,
     /// All parameters, as in the parts `parameter NAME` of a key.
     pub parameters: Map<String, Value>,
 }
 
-impl Waiting {
+impl PartialKey {
     /// Returns whether a record may belong to the node.
     pub fn matches(&self, record: &Record) -> bool {
         let mut count = 0;
@@ -64,7 +64,7 @@ pub struct Run {
     /// Keys of the needed actions.
     pub keys: BTreeSet<String>,
     /// Needed nodes whose keys weren't known at the start.
-    pub waiting: Vec<Waiting>,
+    pub waiting: Vec<PartialKey>,
     /// End time in seconds since 1970; `None` for a killed run and one in progress.
     pub ended_unix: Option<u64>,
     /// True if the run is in progress.
@@ -187,7 +187,7 @@ impl RunFile {
     }
 
     /// Records that the run needs a node whose key is not known yet.
-    pub fn record_waiting(&self, _: &Entered, waiting: Waiting) -> Result<(), StoreError> {
+    pub fn record_waiting(&self, _: &Entered, waiting: PartialKey) -> Result<(), StoreError> {
         self.write(&RunLine::Waiting(waiting))
     }
 
@@ -220,7 +220,7 @@ mod tests {
 
     #[test]
     fn a_waiting_node_may_be_any_record_of_its_stage_and_parameters() {
-        let waiting = Waiting {
+        let waiting = PartialKey {
             program: "prep".into(),
             parameters: json!({"lr": 2, "kernel": null}).as_object().unwrap().clone(),
         };

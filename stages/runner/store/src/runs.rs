@@ -121,7 +121,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::run::Waiting;
+    use crate::run::PartialKey;
     use crate::testing::{UNREADABLE, entered};
 
     #[test]
@@ -130,7 +130,7 @@ mod tests {
         let store = Store::open(dir.path()).unwrap();
         let file = store.begin_run(&entered(&store), vec!["nerf-sr".into(), "run".into()]).unwrap();
         file.record_action(&entered(&store), "prep", "k1").unwrap();
-        let waiting = Waiting {
+        let waiting = PartialKey {
             program: "train-ss".into(),
             parameters: json!({"rays": 3}).as_object().unwrap().clone(),
         };

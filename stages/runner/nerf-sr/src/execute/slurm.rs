@@ -46,7 +46,7 @@ impl Executor for Cluster {
             command: &[runner.as_os_str(), JOB_VERB.as_ref()],
             plan: &serde_json::to_vec(&FrozenPlan::new(run.plan, &out))
                 .context("cannot serialise the plan")?,
-            folder: &std::env::current_dir()?,
+            working_folder: &std::env::current_dir()?,
             is_stopped: &|| run.stop.load(Ordering::Relaxed),
         };
         let submitted = submission.submit(root, &options, || find_done(run, &out))?;

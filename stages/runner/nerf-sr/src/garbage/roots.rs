@@ -2,21 +2,21 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use artifact::unix_time;
 use slurm::{Queue, Slurm};
-use store::{Run, Store, StoreError, Waiting};
+use store::{PartialKey, Run, Store, StoreError};
 
 use crate::garbage::contents::Contents;
 
-/// Actions that are needed, and why.
+/// Actions to keep, with the reason.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Root {
-    /// Reason for keeping them, as a sentence fragment.
+    /// Reason for keeping the actions, as a sentence fragment.
     pub(crate) reason: String,
     /// Keys of actions.
     pub(crate) keys: BTreeSet<String>,
-    /// Nodes with unknown inputs: each keeps all records that may be the node's.
-    pub(crate) waiting: Vec<Waiting>,
-    /// True if the actions that produced their inputs are needed, too. Plans and runs list these
-    /// actions themselves.
+    /// Partial keys of nodes with unknown inputs. Every record that matches a partial key is kept.
+    pub(crate) waiting: Vec<PartialKey>,
+    /// True to keep also the actions that produced the inputs of `keys`. False for plans and runs,
+    /// whose `keys` include these actions.
     pub(crate) with_inputs: bool,
 }
 
@@ -72,14 +72,14 @@ pub(crate) fn find_roots(
             roots.push(action_root(reason, key));
         }
         if !policy.drop_old && record.has_old_key() {
-            let reason = "created by an older version of nerf-sr (--drop-old)";
+            let reason = "created by an older version of nerf-sr; deleted by --drop-old";
             roots.push(action_root(reason.to_owned(), key));
         }
     }
     if !policy.drop_unfinished {
         for key in contents.unfinished.keys() {
             if store.has_checkpoint(key)? {
-                let reason = "has a checkpoint (--drop-unfinished)";
+                let reason = "has a checkpoint; deleted by --drop-unfinished";
                 roots.push(action_root(reason.to_owned(), key));
             }
         }

@@ -7,7 +7,7 @@ use artifact::{hash_json, unix_time};
 use proptest::prelude::*;
 use serde_json::{Map, Value, json};
 use store::{
-    KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting,
+    KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, PartialKey, Record, RunFile, Store, Unfinished,
 };
 
 use super::{Collection, Policy, Root};
@@ -123,9 +123,9 @@ fn days_ago(days: u64) -> u64 {
     unix_time() - days * 86_400
 }
 
-fn waiting((stage, parameter): (u8, u8)) -> Waiting {
+fn waiting((stage, parameter): (u8, u8)) -> PartialKey {
     let parameters = json!({ "p": parameter }).as_object().unwrap().clone();
-    Waiting { program: format!("s{stage}"), parameters }
+    PartialKey { program: format!("s{stage}"), parameters }
 }
 
 fn make(case: &Case) -> Made {
@@ -402,7 +402,9 @@ fn what_an_older_version_made_stays_until_it_is_dropped() {
             .decisions()
             .iter()
             .map(ToString::to_string)
-            .filter(|line| line.ends_with("created by an older version of nerf-sr (--drop-old)"))
+            .filter(|line| {
+                line.ends_with("created by an older version of nerf-sr; deleted by --drop-old")
+            })
             .count();
         assert_eq!(reason, expected.len());
         collection.carry_out(&store, &held(|| store.try_close())).unwrap();

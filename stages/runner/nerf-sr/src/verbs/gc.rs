@@ -92,7 +92,7 @@ fn plan_root(session: &Session, request: &Request) -> anyhow::Result<Root> {
     for (index, state) in states.iter().enumerate() {
         match state.key() {
             Some(key) => _ = root.keys.insert(key),
-            None => root.waiting.push(plan.nodes[index].waiting()),
+            None => root.waiting.push(plan.nodes[index].partial_key()),
         }
     }
     Ok(root)

@@ -33,7 +33,7 @@ struct Vertex<'a> {
     label: String,
     state: &'static str,
     is_sink: bool,
-    /// Inputs as text, such as `scene = prep/train`; a sink's nodes.
+    /// Inputs as text, such as `scene = prep/train`; for a sink, the nodes that it displays.
     inputs: Vec<String>,
     /// Index and subtree of each parent. Parents come before their children.
     parents: Vec<(usize, &'a str)>,
@@ -62,7 +62,7 @@ fn vertices<'a>(plan: &'a Plan, states: &[State]) -> Vec<Vertex<'a>> {
     for sink in &plan.sinks {
         vertices.push(Vertex {
             label: sink.stage.clone(),
-            state: "shows the run",
+            state: "displays the run",
             is_sink: true,
             inputs: sink.nodes.iter().map(|&index| plan.nodes[index].label()).collect(),
             parents: sink.nodes.iter().map(|&index| (index, "")).collect(),

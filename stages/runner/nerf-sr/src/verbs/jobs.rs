@@ -1,4 +1,4 @@
-//! `cancel` cancels the jobs of a cluster; `job` is the command of one.
+//! Verbs of cluster jobs: `cancel` cancels jobs, and `job` is the command that a job runs.
 
 use std::path::Path;
 use std::process::ExitCode;

@@ -23,7 +23,7 @@ pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::
         return Ok(ExitCode::SUCCESS);
     }
     let Some((unix, log)) = find_last_log(&session.store, stage)? else {
-        // A stage of the plan may have no log yet; another stage is an error.
+        // A stage of the plan may not have a log yet; an unknown stage is an error.
         nodes?;
         print_line!("{stage}: has not run yet");
         return Ok(ExitCode::SUCCESS);
@@ -51,7 +51,7 @@ impl NodeLog {
     }
 }
 
-/// Finds the existing logs of some nodes: of the stage, and of the node's newest job.
+/// Finds the existing logs of nodes: for each node, the stage's log and that of the newest job.
 fn find_logs(session: &Session, plan: &Plan, nodes: &[usize]) -> anyhow::Result<Vec<NodeLog>> {
     let store = &session.store;
     // Keys are unknown if an input folder is missing, but an earlier run may have a log.
@@ -85,6 +85,7 @@ fn find_job_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
     identities.iter().map(|identity| logs.get(identity).cloned()).collect()
 }
 
+/// Returns the path of the log of an unfinished action.
 fn attempt_log(store: &Store, key: &str) -> PathBuf {
     store.partial(key).join("log")
 }

@@ -47,7 +47,7 @@ pub(super) fn begin_run(
     for (index, node) in plan.nodes.iter().enumerate() {
         match states.get(index).and_then(State::key) {
             Some(key) => file.record_action(&entered, &node.stage, &key),
-            None => file.record_waiting(&entered, node.waiting()),
+            None => file.record_waiting(&entered, node.partial_key()),
         }
         .map_err(failure)?;
     }

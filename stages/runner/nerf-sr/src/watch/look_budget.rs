@@ -7,7 +7,7 @@ const START_SECONDS: f64 = 0.3;
 /// Estimated seconds to render and score one pixel of the first look (docs/design/044).
 const PIXEL_SECONDS: f64 = 8e-6;
 
-/// Budget of the looks at one training, in processor time.
+/// Budget of the looks at one training run, in processor time.
 pub(super) struct LookBudget {
     /// Threads of the training: processor seconds per second.
     threads: f64,
@@ -18,7 +18,7 @@ pub(super) struct LookBudget {
 }
 
 impl LookBudget {
-    /// Creates the budget of a training with the given number of threads and a view of the given
+    /// Creates the budget of a run with the given number of threads and a view of the given
     /// number of pixels.
     pub(super) fn new(threads: usize, pixels: u64) -> Self {
         Self {

@@ -62,7 +62,7 @@ impl Watching<'_> {
         if let Err(problem) = self.take_looks(training) {
             self.display.line(&format!("{}: {problem:#}", self.label));
         }
-        // Leftovers have no value. The parent folder may contain those of other trainings.
+        // Leftovers have no value. The parent folder may contain those of other training runs.
         std::fs::remove_dir_all(&self.scratch).ok();
         self.scratch.parent().map(std::fs::remove_dir);
     }
