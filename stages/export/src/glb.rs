@@ -7,10 +7,13 @@ use serde_json::{Value, json};
 use crate::coordinates::Coordinates;
 use crate::mesh::Mesh;
 
-/// Codes of glTF for component types and buffer targets.
+/// glTF's code of the component type `f32`.
 const FLOAT: u32 = 5126;
+/// glTF's code of the component type `u32`.
 const UNSIGNED: u32 = 5125;
+/// glTF's code of the buffer target for vertices (`ARRAY_BUFFER`).
 const VERTICES: u32 = 34962;
+/// glTF's code of the buffer target for indices (`ELEMENT_ARRAY_BUFFER`).
 const INDICES: u32 = 34963;
 
 /// Writes a mesh as binary glTF 2.0, unlit, since the colours include the scene's light. The
@@ -109,7 +112,8 @@ fn vector_accessor(buffer_view: u32, count: usize) -> Value {
     json!({"bufferView": buffer_view, "componentType": FLOAT, "count": count, "type": "VEC3"})
 }
 
-/// Returns the view of a part of the buffer.
+/// Returns the buffer view of `length` bytes from byte `first`; `target` is [`VERTICES`] or
+/// [`INDICES`].
 fn buffer_view(first: usize, length: usize, target: u32) -> Value {
     json!({"buffer": 0, "byteOffset": first, "byteLength": length, "target": target})
 }

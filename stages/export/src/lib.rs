@@ -249,8 +249,8 @@ fn render_views(
     Ok(views)
 }
 
-/// Returns the maximum number of bytes that an export needs: all pixels, and either the samples
-/// that are merged or the mesh's lattice.
+/// Returns the peak memory of an export in bytes: all pixels, and the larger of the merged samples
+/// and the mesh's lattice.
 fn memory_need(cameras: &[Camera], lattice: Option<&Lattice>) -> u64 {
     let pixels: u64 = cameras.iter().map(pixel_count).sum();
     let values = lattice.map_or(0, |lattice| BYTES_PER_NODE * lattice.len() as u64);

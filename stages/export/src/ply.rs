@@ -7,8 +7,9 @@ use glam::{DQuat, DVec3};
 use crate::coordinates::Coordinates;
 use crate::surfel::Surfel;
 
-/// PLY's type names of 32-bit floats and 8-bit unsigned integers.
+/// PLY's name of the type `f32`.
 const FLOAT: &str = "float";
+/// PLY's name of the type `u8`.
 const BYTE: &str = "uchar";
 
 /// Maximum distance in pixels from a silhouette at which normals are uncertain (design note 043).

@@ -23,12 +23,13 @@ pub(crate) struct Surfel {
 
 /// Surface pixel: cell of its point, then indices of view and pixel, which make the order unique.
 type Sample = ([u32; 3], u32, u32);
-/// Maximum bytes per pixel that [`merge`] needs: a sample, twice while samples are collected.
+/// Maximum number of bytes per pixel that [`merge`] needs: two copies of each sample exist while
+/// samples are collected.
 pub(crate) const BYTES_PER_PIXEL: u64 = 2 * size_of::<Sample>() as u64;
 
-/// Merges the surface pixels of all views to one surfel per cell of a grid over the field's unit
-/// cube. Cells are half as wide as the median pixel, or wider if there would be more than
-/// `max_surfels` (design note 043). Surfels are in the order of their cells.
+/// Merges the surface pixels of all views into one surfel per cell of a grid over the field's unit
+/// cube. Cells are half as wide as the median pixel, or wider to limit the number of surfels to
+/// `max_surfels` (design note 043). Surfels are sorted by cell.
 pub(crate) fn merge(views: &[SurfaceView], bounds: &Bounds, max_surfels: usize) -> Vec<Surfel> {
     let mut edge = finest_edge(views, bounds);
     loop {
@@ -45,7 +46,7 @@ pub(crate) fn merge(views: &[SurfaceView], bounds: &Bounds, max_surfels: usize) 
     }
 }
 
-/// Returns half of the median width of all surface pixels, in sides of the cube.
+/// Returns half of the median width of all surface pixels, relative to the cube's side.
 fn finest_edge(views: &[SurfaceView], bounds: &Bounds) -> f64 {
     let mut widths: Vec<f64> = views
         .par_iter()
@@ -59,7 +60,7 @@ fn finest_edge(views: &[SurfaceView], bounds: &Bounds) -> f64 {
     widths.get(widths.len() / 2).map_or(1.0, |width| 0.5 * width).max(1e-6)
 }
 
-/// Returns the sides of the cube per scene unit at a pixel's point.
+/// Returns the scale from scene units to the unit cube at a pixel's point.
 fn cube_scale(view: &SurfaceView, bounds: &Bounds, index: usize) -> f64 {
     let (point, width) = (view.world_point(index), view.pixel_width(index));
     (bounds.to_cube(point + width * view.right()) - bounds.to_cube(point)).length() / width
@@ -83,14 +84,15 @@ fn collect_samples(views: &[SurfaceView], bounds: &Bounds, edge: f64) -> Vec<Sam
     samples
 }
 
-/// Returns the mean of a cell's pixels, weighted by pixel density on the surface and angle of view.
+/// Returns a cell's surfel: the mean of the cell's pixels, weighted by pixel density on the surface
+/// and viewing angle. `None` if all pixels are at silhouettes.
 fn mean_surfel(
     views: &[SurfaceView],
     bounds: &Bounds,
     edge: f64,
     group: &[Sample],
 ) -> Option<Surfel> {
-    // Silhouettes are known only to a pixel, so a cell without other pixels is dropped.
+    // Silhouettes are accurate only to a pixel, so a cell with silhouette pixels alone is dropped.
     let margins = group.iter().map(|&(_, view, i)| views[view as usize].pixel(i as usize).margin);
     let margin = margins.max().filter(|margin| *margin > 0)?;
     let (mut position, mut normal, mut colour) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);

@@ -1,4 +1,4 @@
-//! The volume in the bytes that the page reads, deflated (zlib).
+//! Encodes the volume as the bytes that the page reads, deflated (zlib).
 //!
 //! First a byte for each grid position of bricks, x fastest: the distance to the nearest brick.
 //! Then one plane per channel, with a byte for every voxel of all bricks: opacity; premultiplied
@@ -128,11 +128,11 @@ mod tests {
             }
         }
         assert!(opaque == volume.voxels.len() && opaque > 0);
-        // Besides there is nothing.
+        // All other voxels are empty.
         assert_eq!(planes[..count].iter().filter(|&&opacity| opacity > 0).count(), opaque);
     }
 
-    /// A ball's surface takes a few bytes a voxel.
+    /// A ball's surface needs less than 8 bytes per voxel, and packing is deterministic.
     #[test]
     fn packing_is_small_and_repeats() {
         let (volume, atlas) = packed();

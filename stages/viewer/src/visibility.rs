@@ -1,5 +1,5 @@
-//! Visibility of voxels from training cameras: only visible voxels are kept, and their colours are
-//! fitted to the directions of these cameras.
+//! Visibility of voxels from training cameras. Invisible voxels are dropped; the colours of visible
+//! voxels are fitted to the cameras' viewing directions.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -31,8 +31,8 @@ pub(crate) fn observers(cameras: &[&Camera], resolution: usize) -> Vec<Camera> {
         .collect()
 }
 
-/// Finds the cameras that see each voxel: bit i is set for camera i. `opacity` is that of a step of
-/// one voxel's length, by voxel index.
+/// Finds the cameras from which each voxel is visible: bit i is set for camera i. `opacity` is the
+/// opacity of each voxel for a step of one voxel's length.
 pub(crate) fn visible_from(
     bricks: &Bricks,
     opacity: &[f32],
@@ -67,7 +67,8 @@ struct March<'a> {
 }
 
 impl March<'_> {
-    /// Calls `visit` with every voxel that stops light of a ray.
+    /// Calls `visit` with the visible voxels along a ray: those that stop at least
+    /// [`MIN_STOPPED_LIGHT`] of the ray's light.
     fn trace(&self, bounds: &Bounds, ray: &Ray, mut visit: impl FnMut(usize)) {
         let ray = clip(bounds, ray);
         let step = 1.0 / self.bricks.resolution as f32;
