@@ -7,7 +7,7 @@
 //! * [`AnyMetrics`]: the file of any stage, for `report` and `table`; all fields are optional.
 //!
 //! `eval` computes the scores. No stage before `eval` uses this crate, so its changes don't repeat
-//! trainings.
+//! training runs.
 //!
 //! ```
 //! use metrics::{AnyMetrics, ScoreFormat, Metrics, Score, Scores};

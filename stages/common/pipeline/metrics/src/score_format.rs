@@ -3,8 +3,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 /// Format of a number among the scores: path, label, decimal places and direction.
-// The schema describes the formats of `eval`. Those of other stages may have more fields, or none
-// for the direction.
+// The schema describes the formats of `eval`. Formats of other stages may have additional fields,
+// or lack `higher_is_better`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[schemars(deny_unknown_fields)]
 pub struct ScoreFormat {
@@ -17,8 +17,8 @@ pub struct ScoreFormat {
     /// True if higher values are better.
     #[schemars(with = "bool")]
     pub higher_is_better: Option<bool>,
-    /// Text displayed if the number is missing from views that have others; without the text, only
-    /// results with the number display it.
+    /// Text displayed in place of a missing number. Without this text, results without the number
+    /// don't display the figure.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub missing: Option<String>,
 }

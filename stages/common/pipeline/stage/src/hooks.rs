@@ -8,7 +8,7 @@ use std::time::Duration;
 pub const STOP_VARIABLE: &str = "NERF_SR_STOP_AFTER";
 
 /// Environment variable for tests, `COUNT FILE`: number of finished steps from which a stage is
-/// slowed until the file exists, so that a test can observe a training in progress on any machine.
+/// slowed until the file exists, so that a test can observe training in progress on any machine.
 pub const SLOW_VARIABLE: &str = "NERF_SR_SLOW_UNTIL";
 
 /// Pause of a slowed stage at each progress update. The stage still advances, so that it reaches

@@ -16,8 +16,8 @@ const GRACE_PERIOD: Duration = Duration::from_secs(1);
 /// Interval between checks of the flag that signals set.
 const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Returns a flag that is set by the first of the [`stop_signals`]. The second one ends the process
-/// immediately, with exit code 130.
+/// Returns a flag that is set when the first of any of the [`stop_signals`] arrives. The second
+/// signal, the same or another, ends the process immediately with exit code 130.
 pub fn stop_on_signals() -> io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in stop_signals() {

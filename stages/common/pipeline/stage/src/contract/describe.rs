@@ -241,7 +241,10 @@ mod tests {
             (with(Rule::new("").needs("nothing")), "rule 1: no input \"nothing\""),
             (with(Rule::new("").when("nothing", json!({}))), "no parameter \"nothing\""),
             (with(Rule::new("").must("nothing.x", json!({}))), "no parameter \"nothing.x\""),
-            (with(Rule::new("").must("scale", no_schema.clone())), "scale: not a JSON Schema"),
+            (
+                with(Rule::new("").must("scale", no_schema.clone())),
+                "scale: invalid or unsupported JSON Schema",
+            ),
             (Description { parameters: no_schema, ..description() }, "parameter schema"),
             (Description { name: String::new(), ..description() }, "no name"),
             (

@@ -4,7 +4,7 @@ use serde_json::Value;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SchemaError {
     /// A part of the schema is invalid or not supported.
-    #[error("not a JSON Schema: {0}")]
+    #[error("invalid or unsupported JSON Schema: {0}")]
     Keyword(KeywordError),
     /// Two parameters select a variant; at most one may.
     #[error("{first} and {second} both select a variant; at most one parameter may")]
@@ -15,7 +15,7 @@ pub enum SchemaError {
         second: String,
     },
     /// A common parameter and a variant's parameter have the same name.
-    #[error("{name} is a parameter both next to {selector} and inside its variant {variant}")]
+    #[error("variant {variant} of {selector} has a parameter {name}, like the stage itself")]
     AmbiguousName {
         /// Name of both parameters.
         name: String,

@@ -40,7 +40,7 @@ pub enum RuleError {
     #[error("no parameter {0:?}")]
     UnknownParameter(String),
     /// A JSON Schema of the rule can't be used.
-    #[error("{name}: not a JSON Schema: {reason}")]
+    #[error("{name}: invalid or unsupported JSON Schema: {reason}")]
     Schema {
         /// Parameter that the schema belongs to.
         name: String,

@@ -146,7 +146,7 @@ fn a_name_means_one_parameter() {
         Schema::new(&twice)
             .unwrap_err()
             .to_string()
-            .contains("layers is a parameter both next to field and inside its variant mlp")
+            .contains("variant mlp of field has a parameter layers, like the stage itself")
     );
     let mut two = described();
     two["properties"]["other"] = two["properties"]["field"].clone();
