@@ -10,7 +10,8 @@ pub(crate) const CAMERA_ANGLE: f64 = 0.691_111_2;
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the images in pixels; only of the test views if `projection` or `angle` is given.
+    /// Width of the images in pixels. With `projection` or `angle`, only test views have this
+    /// width; that of training views follows from their angle of view.
     #[schemars(range(min = 1, max = 2048))]
     pub size: u32,
     /// Width of the images divided by their height.

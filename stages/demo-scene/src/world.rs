@@ -158,11 +158,11 @@ impl World {
             }
         }
         first.map(|(t, object, local_normal)| {
-            let size = object.shape.half_size();
+            let scale = object.shape.texture_scale();
             Hit {
                 t,
                 normal: object.to_local.transpose() * local_normal,
-                local: object.to_local * (origin + t * direction - object.centre) / size,
+                local: object.to_local * (origin + t * direction - object.centre) / scale,
                 local_normal,
                 material: object.material,
             }
@@ -300,8 +300,9 @@ fn solve_quadratic(a: f64, b: f64, c: f64) -> Option<(f64, f64)> {
 }
 
 impl Shape {
-    /// Returns the size that scales textures: half of the shape's size along each axis, about.
-    fn half_size(self) -> DVec3 {
+    /// Returns the lengths along each axis by which texture coordinates are divided: about half of
+    /// the shape's size.
+    fn texture_scale(self) -> DVec3 {
         match self {
             Self::Ball(r) => DVec3::splat(r),
             Self::Block(half) => half,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use stage::Context;
 
-use crate::gather::{Report, Row, is_known};
+use crate::gather::{Report, Row, has_values};
 use crate::layers::{Group, Layer, layers, max_pixels};
 use crate::pictures::{Picture, Request, write_pictures};
 use crate::scale::Scale;
@@ -20,10 +20,10 @@ pub struct Params {
     /// results has fewer.
     #[schemars(range(min = 1, max = 1000))]
     pub views: u32,
-    /// Name of the view that the page shows first.
+    /// Name of the view that the page displays first.
     #[schemars(extend("x-default" = "the first"))]
     pub compare: Option<String>,
-    /// Square of that view to show first: x, y and side, in pixels.
+    /// Square of the view that the page displays first: x, y and side, in pixels.
     #[schemars(extend("x-default" = "the whole view"))]
     pub crop: Option<[u32; 3]>,
 }
@@ -92,7 +92,7 @@ struct LayerData {
     scale: Option<usize>,
 }
 
-/// PSNR of a training against its rays.
+/// Training PSNR as a function of the number of rays.
 #[derive(Serialize)]
 struct Curve {
     label: String,
@@ -231,7 +231,7 @@ fn error_scale(row: &Row<'_>) -> Scale {
 }
 
 fn figures(report: &Report<'_>) -> Vec<FigureData> {
-    let known = report.figures.iter().filter(|figure| is_known(figure, &report.rows));
+    let known = report.figures.iter().filter(|figure| has_values(figure, &report.rows));
     known
         .map(|figure| FigureData {
             label: figure.label.clone(),
@@ -242,7 +242,7 @@ fn figures(report: &Report<'_>) -> Vec<FigureData> {
 }
 
 fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
-    let known: Vec<_> = report.figures.iter().filter(|f| is_known(f, &report.rows)).collect();
+    let known: Vec<_> = report.figures.iter().filter(|f| has_values(f, &report.rows)).collect();
     let mut scores = Vec::new();
     for (scene, scene_views) in report.scenes.iter().enumerate() {
         for name in &scene_views.views {

@@ -7,14 +7,14 @@ use crate::results::scored_nodes;
 /// Content of a page: results, data sets and figures of a run.
 pub(crate) struct Report<'a> {
     pub(crate) run: &'a RunRecord,
-    /// Results, those with fewer stages before them first.
+    /// Results, sorted by the number of their ancestors.
     pub(crate) rows: Vec<Row<'a>>,
     /// Data sets that have results, in the rows' order.
     pub(crate) scenes: Vec<SceneViews>,
     /// Figures of the results.
     pub(crate) figures: Vec<ScoreFormat>,
     /// Reasons why results can't be read.
-    pub(crate) unread: Vec<String>,
+    pub(crate) unreadable: Vec<String>,
 }
 
 /// Views of a data set.
@@ -25,7 +25,7 @@ pub(crate) struct SceneViews {
     pub(crate) views: Vec<String>,
 }
 
-/// A result: scores of the views that one method made.
+/// Result: scores of the views that one method rendered.
 pub(crate) struct Row<'a> {
     pub(crate) node: &'a RunNode,
     /// Index of the node in the run.
@@ -34,7 +34,7 @@ pub(crate) struct Row<'a> {
     pub(crate) metrics: AnyMetrics,
     /// Name that is unique among the rows.
     pub(crate) label: String,
-    /// Index of the data set in the report.
+    /// Index of the data set in [`Report::scenes`].
     pub(crate) scene: usize,
     /// Seconds of training.
     pub(crate) training: f64,
@@ -63,11 +63,11 @@ impl<'a> Report<'a> {
     /// Reads the scores of a run.
     pub(crate) fn new(run: &'a RunRecord) -> Self {
         let mut report =
-            Self { run, rows: vec![], scenes: vec![], figures: vec![], unread: vec![] };
+            Self { run, rows: vec![], scenes: vec![], figures: vec![], unreadable: vec![] };
         for (index, node) in scored_nodes(run) {
             match AnyMetrics::read(&node.folder) {
                 Ok(metrics) => report.add(index, node, metrics),
-                Err(error) => report.unread.push(error.to_string()),
+                Err(error) => report.unreadable.push(error.to_string()),
             }
         }
         report.figures = figures(&report.rows);
@@ -112,7 +112,8 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Returns the row with the best mean of the first figure; the first row without figures.
+    /// Returns the row with the best mean of the first figure. Without figures, returns the first
+    /// row.
     pub(crate) fn best(&self) -> Option<&Row<'a>> {
         let figure = self.figures.first();
         let lower_is_better = figure.and_then(|f| f.higher_is_better) == Some(false);
@@ -121,8 +122,8 @@ impl<'a> Report<'a> {
             let value = figure.and_then(|figure| row.mean(figure));
             let is_better = match (best, value) {
                 (None, _) | (Some((_, None)), Some(_)) => true,
-                (Some((_, Some(held))), Some(new)) if lower_is_better => new < held,
-                (Some((_, Some(held))), Some(new)) => new > held,
+                (Some((_, Some(old))), Some(new)) if lower_is_better => new < old,
+                (Some((_, Some(old))), Some(new)) => new > old,
                 (Some(_), None) => false,
             };
             if is_better {
@@ -133,8 +134,8 @@ impl<'a> Report<'a> {
     }
 }
 
-/// True if some row has a figure.
-pub(crate) fn is_known(figure: &ScoreFormat, rows: &[Row<'_>]) -> bool {
+/// True if any row has a value of a figure.
+pub(crate) fn has_values(figure: &ScoreFormat, rows: &[Row<'_>]) -> bool {
     rows.iter().any(|row| row.mean(figure).is_some())
 }
 
@@ -152,8 +153,8 @@ pub(crate) fn is_best(figure: &ScoreFormat, row: &Row<'_>, rows: &[Row<'_>]) -> 
     best.is_some() && row.mean(figure) == best
 }
 
-/// Returns the figures that rows have, or would have with more inputs, as their metrics declare
-/// them; of metrics without declarations, the numbers among their means.
+/// Returns the figures that the rows' metrics declare, if they have values or a text for a missing
+/// value. Metrics without declared figures have one for each number among their means.
 fn figures(rows: &[Row<'_>]) -> Vec<ScoreFormat> {
     let mut figures: Vec<ScoreFormat> = Vec::new();
     for row in rows {
@@ -164,7 +165,7 @@ fn figures(rows: &[Row<'_>]) -> Vec<ScoreFormat> {
             }
         }
     }
-    figures.retain(|figure| figure.missing.is_some() || is_known(figure, rows));
+    figures.retain(|figure| figure.missing.is_some() || has_values(figure, rows));
     figures
 }
 

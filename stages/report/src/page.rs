@@ -153,10 +153,10 @@ fn notices(report: &Report<'_>) -> Markup {
                 }
             }
         }
-        @if !report.unread.is_empty() {
+        @if !report.unreadable.is_empty() {
             section class="notice bad" aria-labelledby="unread-heading" {
                 h2 id="unread-heading" { "Scores that can't be read" }
-                ul { @for problem in &report.unread { li { (problem) } } }
+                ul { @for problem in &report.unreadable { li { (problem) } } }
             }
         }
         @if !warnings.is_empty() {

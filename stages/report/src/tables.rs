@@ -2,7 +2,7 @@ use artifact::format_duration;
 use maud::{Markup, html};
 use metrics::ScoreFormat;
 
-use crate::gather::{Report, Row, is_best, is_known};
+use crate::gather::{Report, Row, has_values, is_best};
 
 /// Number of figures in the summary; chosen by hand.
 const SUMMARY_FIGURES: usize = 4;
@@ -45,7 +45,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
     if rows.is_empty() {
         return html! {};
     }
-    let known: Vec<&ScoreFormat> = report.figures.iter().filter(|f| is_known(f, rows)).collect();
+    let known: Vec<&ScoreFormat> = report.figures.iter().filter(|f| has_values(f, rows)).collect();
     let with_data_sets = report.scenes.len() > 1;
     html! {
         section id="scores" aria-labelledby="scores-heading" {
@@ -107,7 +107,7 @@ fn mean(figure: &ScoreFormat, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
 /// Note on figures that no result has, with the reasons.
 fn missing(report: &Report<'_>) -> Markup {
     let has_truth = report.rows.iter().any(|row| row.metrics.has_hr_truth());
-    let unknown = report.figures.iter().filter(|figure| !is_known(figure, &report.rows));
+    let unknown = report.figures.iter().filter(|figure| !has_values(figure, &report.rows));
     let unknown: Vec<_> = unknown.filter_map(|f| Some((f, f.missing.as_ref()?))).collect();
     html! {
         @if has_truth && !unknown.is_empty() {
@@ -126,7 +126,7 @@ fn missing(report: &Report<'_>) -> Markup {
 /// Table of every view's figures, which needs neither pointer nor script.
 pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
     let known: Vec<&ScoreFormat> =
-        report.figures.iter().filter(|figure| is_known(figure, &report.rows)).collect();
+        report.figures.iter().filter(|figure| has_values(figure, &report.rows)).collect();
     let views: usize = report.rows.iter().map(Row::view_count).sum();
     if views == 0 || views * known.len() > MAX_CELLS {
         return html! {};

@@ -30,7 +30,7 @@ pub struct Table;
 impl Stage for Table {
     type Params = Params;
     const NAME: &'static str = "table";
-    const SUMMARY: &'static str = "Writes figures of an experiment as Markdown, CSV and JSON.";
+    const SUMMARY: &'static str = "Writes an experiment's scores as Markdown, CSV and JSON.";
     const SINK: bool = true;
     const PARTIAL: bool = true;
 

@@ -12,12 +12,12 @@ use crate::values::Row;
 pub struct Params {
     /// Heading of the table.
     pub title: String,
-    /// Keys whose values make a row: axes of the run (`scene`, `protocol`, `variant`, a swept
+    /// Keys whose values identify a row: axes of the run (`scene`, `protocol`, `variant`, a swept
     /// parameter), or `method` for the scored block. Results that differ only in other keys are
     /// averaged. Default: all keys that differ, except `scene`.
     #[schemars(extend("x-default" = "all keys that differ, except `scene`"))]
     pub rows: Vec<String>,
-    /// Keys whose values make a column, with all `values` in one cell.
+    /// Keys whose values identify a column. Each cell then contains all `values`.
     #[schemars(extend("x-default" = "a column for each value"))]
     pub columns: Vec<String>,
     /// Values in the table, in this order: `psnr`, `ssim`, `lpips`, `train_s`, `render_s`, or any
@@ -45,8 +45,8 @@ pub struct Params {
     /// Heading and key of the groups' column.
     pub group_by: String,
     /// Rows from other sources, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:
-    /// 29.77}]`. Such a row appears in tables whose results have the values of its keys, and is
-    /// never marked as the best.
+    /// 29.77}]`. An extra row appears in tables whose results have the values of the row's keys,
+    /// and is never marked as the best.
     #[schemars(extend("x-default" = "none"))]
     pub extra_rows: Vec<Row>,
     /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over:

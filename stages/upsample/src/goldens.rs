@@ -1,5 +1,5 @@
-//! Networks against PyTorch's (`scripts/goldens/upsample.py`), and what their readers make of
-//! broken files.
+//! Tests that networks agree with PyTorch's (`scripts/goldens/upsample.py`), and that broken files
+//! are refused.
 
 use std::path::{Path, PathBuf};
 
@@ -62,8 +62,8 @@ fn networks_are_those_of_pytorch() {
     }
 }
 
-/// A file that lacks a tensor, or has an empty one in its place, is refused or means another
-/// network; it never panics.
+/// A file with a missing or empty tensor is refused or describes another network. Reading never
+/// panics.
 #[test]
 fn broken_weights_are_refused() {
     let folder = tempfile::tempdir().unwrap();
