@@ -21,7 +21,7 @@
 //!
 //! A step's rays are cut into shards by index. A shard's samples go through encoding, density,
 //! compositing, shading and back in chunks that fit the cache. Gradients of the grid are stored and
-//! then added level by level, in sample order. All sums have a fixed order, so results have equal
+//! then added by two tasks per level. All sums have a fixed order, so results have equal
 //! bits at any thread count. Kernels work on 16 logical lanes on any machine and fuse all
 //! multiply-adds, so AVX-512, AVX2 and portable code give equal bits, too.
 //!

@@ -10,6 +10,7 @@ use crate::math::floor;
 use crate::ray::NormalizedRay;
 use crate::spec::Strides;
 use crate::spec::{MAX_EMPTY_OPTICAL_DEPTH, MAX_THIN_OPTICAL_DEPTH, OCCUPANCY_CELLS as GRID};
+use crate::trainer::PhaseClock;
 
 /// Number of cells.
 pub(crate) const CELLS: usize = GRID * GRID * GRID;
@@ -46,6 +47,8 @@ const EMPTY_PERIOD: usize = 16;
 const WARM_UP_STEPS: u64 = 512;
 /// Step by which every cell has been evaluated once.
 const FIRST_KNOWN_STEP: u64 = STEPS_PER_UPDATE * OCCUPIED_PERIOD as u64;
+/// Number of bricks that a task classifies; chosen by hand.
+const BRICKS_PER_TASK: usize = 256;
 /// Number of cells whose densities a task stores; chosen by hand.
 const CELLS_PER_TASK: usize = 4096;
 /// Decay of a cell's density each time the cell is evaluated; chosen by hand.
@@ -68,9 +71,13 @@ pub(crate) fn cell_and_neighbours(cell: usize) -> impl Iterator<Item = usize> {
 }
 
 /// Computes two words per brick: bits of the cells that aren't empty, and bits of the dense cells.
-fn brick_words(kind: impl Fn(usize) -> Cell + Sync) -> (Vec<u64>, Vec<u64>) {
-    let bricks = (0..BRICKS * BRICKS * BRICKS).into_par_iter().with_min_len(256);
-    bricks.map(|brick| words_of_brick(brick, &kind)).unzip()
+fn brick_words(kind: impl Fn(usize) -> Cell + Sync, clock: &PhaseClock) -> (Vec<u64>, Vec<u64>) {
+    let firsts = (0..BRICKS * BRICKS * BRICKS).into_par_iter().step_by(BRICKS_PER_TASK);
+    let words = firsts.map(|first| {
+        let bricks = first..first + BRICKS_PER_TASK;
+        clock.task(|| bricks.map(|brick| words_of_brick(brick, &kind)).collect::<Vec<_>>())
+    });
+    words.flatten_iter().unzip()
 }
 
 /// Computes the words of occupied and of dense cells of one brick.
@@ -288,27 +295,30 @@ impl Occupancy {
 
     /// Stores the densities evaluated in `cells` and classifies every cell, for rays with samples
     /// `step` apart in cube sides.
-    pub fn update(&mut self, cells: &[u32], densities: &[f32], step: f32) {
+    pub fn update(&mut self, cells: &[u32], densities: &[f32], step: f32, clock: &PhaseClock) {
         if cells.is_empty() {
             return;
         }
         let pieces = cells.par_chunks(CELLS_PER_TASK).zip(densities.par_chunks(CELLS_PER_TASK));
         pieces.for_each(|(cells, densities)| {
-            for (&cell, &new_density) in cells.iter().zip(densities) {
-                let decayed = self.density.get(cell as usize) * DENSITY_DECAY;
-                self.density.set(cell as usize, decayed.max(new_density));
-            }
+            clock.task(|| {
+                for (&cell, &new_density) in cells.iter().zip(densities) {
+                    let decayed = self.density.get(cell as usize) * DENSITY_DECAY;
+                    self.density.set(cell as usize, decayed.max(new_density));
+                }
+            });
         });
         // While all space is semi-transparent, the mean keeps cells below it empty.
-        let empty = self.mean_density().min(MAX_EMPTY_OPTICAL_DEPTH / step);
+        let empty = self.mean_density(clock).min(MAX_EMPTY_OPTICAL_DEPTH / step);
         let thin = MAX_THIN_OPTICAL_DEPTH / step;
-        let (bricks, dense) = brick_words(|cell| match self.density.get(cell) {
+        let kind = |cell| match self.density.get(cell) {
             _ if !self.is_allowed(cell) => Cell::Empty,
             d if d < 0.0 => self.cell(cell),
             d if d < empty => Cell::Empty,
             d if d < thin => Cell::Thin,
             _ => Cell::Dense,
-        });
+        };
+        let (bricks, dense) = brick_words(kind, clock);
         self.set_words(bricks, dense);
     }
 
@@ -321,13 +331,15 @@ impl Occupancy {
     }
 
     /// Returns the mean density of the cells that have been evaluated; sums have a fixed order.
-    fn mean_density(&self) -> f32 {
+    fn mean_density(&self, clock: &PhaseClock) -> f32 {
         let planes = (0..CELLS).into_par_iter().step_by(GRID * GRID);
         let parts: Vec<(f64, u32)> = planes
             .map(|first| {
-                let cells = (first..first + GRID * GRID).map(|cell| self.density.get(cell));
-                let known = cells.filter(|density| *density >= 0.0);
-                known.fold((0.0, 0), |(sum, count), d| (sum + f64::from(d), count + 1))
+                clock.task(|| {
+                    let cells = (first..first + GRID * GRID).map(|cell| self.density.get(cell));
+                    let known = cells.filter(|density| *density >= 0.0);
+                    known.fold((0.0, 0), |(sum, count), d| (sum + f64::from(d), count + 1))
+                })
             })
             .collect();
         let sum = parts.iter().fold(0.0, |sum, part| sum + part.0);
@@ -353,7 +365,7 @@ impl Occupancy {
 
     /// Sets every cell's kind.
     pub(crate) fn set(&mut self, kind: impl Fn(usize) -> Cell + Sync) {
-        let (bricks, dense) = brick_words(kind);
+        let (bricks, dense) = brick_words(kind, &PhaseClock::start());
         self.set_words(bricks, dense);
     }
 
@@ -503,7 +515,7 @@ mod tests {
         let updates = (1..=OCCUPIED_PERIOD as u64)
             .map(|turn| occupancy.cells_to_update(turn * STEPS_PER_UPDATE).len());
         assert_eq!(updates.sum::<usize>(), 26 + 8, "each once a round of turns");
-        occupancy.update(&all, &vec![1e3; CELLS], 0.003);
+        occupancy.update(&all, &vec![1e3; CELLS], 0.003, &PhaseClock::start());
         assert_eq!(occupancy.cells().count(), 26 + 8);
     }
 
@@ -536,13 +548,13 @@ mod tests {
         occupancy.raise_densities(&[hit]);
         assert_eq!(occupancy.density(hit.cell as usize), UNKNOWN_DENSITY);
         (densities[missed], densities[hit.cell as usize]) = (found, found);
-        occupancy.update(&all, &densities, 0.003);
+        occupancy.update(&all, &densities, 0.003, &PhaseClock::start());
         assert_eq!(occupancy.cells().count(), 2);
         densities.fill(0.0);
         densities[0] = found;
         for _ in 0..50 {
             occupancy.raise_densities(&[hit, CellHit { density: 0.1, ..hit }]);
-            occupancy.update(&all, &densities, 0.003);
+            occupancy.update(&all, &densities, 0.003, &PhaseClock::start());
         }
         assert!(occupancy.cells().eq([0, hit.cell as usize]));
     }

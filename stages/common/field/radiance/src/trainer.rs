@@ -365,7 +365,7 @@ impl Trainer {
             clock.task(|| buffers.evaluate(field, cells, (seed, step), densities));
         });
         let distance = field.step();
-        clock.task(|| self.field.occupancy.update(&cells, &densities, distance));
+        self.field.occupancy.update(&cells, &densities, distance, clock);
     }
 }
 

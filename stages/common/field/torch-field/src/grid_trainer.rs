@@ -2,7 +2,9 @@ use std::ops::Range;
 use std::path::Path;
 
 use radiance::spec::{ADAM_BETA, ADAM_EPSILON};
-use radiance::{CellHit, Field, Occupancy, StepReport, Supervisor, TrainingOptions, TrainingState};
+use radiance::{
+    CellHit, Field, Occupancy, PhaseClock, StepReport, Supervisor, TrainingOptions, TrainingState,
+};
 use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::error::TorchFieldError;
@@ -230,7 +232,7 @@ impl GridTrainer {
             })?;
             densities.extend(to_host(&self.grid.densities(&positions)?)?);
         }
-        self.occupancy.update(&cells, &densities, self.grid.step() as f32);
+        self.occupancy.update(&cells, &densities, self.grid.step() as f32, &PhaseClock::start());
         self.grid.set_occupancy(&self.occupancy)
     }
 
@@ -353,7 +355,7 @@ fn lazy_adam(
 #[cfg(test)]
 mod tests {
     use counter_rng::CounterRng;
-    use radiance::{Architecture, PhaseClock, Ray, RenderedBundles, Trainer};
+    use radiance::{Architecture, Ray, RenderedBundles, Trainer};
     use scene::{Bounds, Frustum, Space};
 
     use super::*;
