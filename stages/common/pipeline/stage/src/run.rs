@@ -164,7 +164,7 @@ impl Program {
             identity,
             resumed: AtomicBool::new(false),
         };
-        if arguments.threads.is_none() {
+        if arguments.threads.is_none() && arguments.progress == ProgressMode::Plain {
             context.say(format!("{}: {}", counted(threads, "thread"), processors().limit));
         }
         let result = work(&context)
