@@ -332,7 +332,7 @@ fn more_threads_than_a_machine_can_use_are_not_started() {
     let project = talking(&format!("echo \"threads=$threads\" >&2; {WELL}"));
     let run = project.run(&["run", "--threads", "100000", "--jobs", "100000"]);
     assert_eq!(run.code, 0, "{}", run.stderr);
-    let most = 4 * std::thread::available_parallelism().unwrap().get();
+    let most = 4 * stage::processors().count;
     for words in [
         "nerf-sr: --threads 100000 is more than",
         "nerf-sr: --jobs 100000 is more than",

@@ -249,7 +249,7 @@ fn in_time(label: &str, mut attempt: impl FnMut(usize) -> Ended) -> Ended {
         let Some(after) = ended.after.filter(|after| *after > LIMIT) else { return ended };
         let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
         let busy: f64 = load.split(' ').next().and_then(|text| text.parse().ok()).unwrap_or(0.0);
-        let cores = std::thread::available_parallelism().unwrap().get();
+        let cores = stage::processors().count;
         let words = format!("{label}: {after:?} from the signal to its end; load {busy}");
         assert!(number < ATTEMPTS && busy > cores as f64, "{words}\n{}", ended.stderr);
         eprintln!("{words}: tried again");

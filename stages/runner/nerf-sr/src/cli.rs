@@ -107,7 +107,7 @@ struct RunOptions {
     #[arg(short, long, value_name = "N")]
     jobs: Option<usize>,
     /// Number of cores that all stages share, and of threads of each stage; results don't depend on
-    /// the number [default: all cores]
+    /// the number [default: processors of this process]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
     /// Memory limit for all stages together, such as 8G; each stage counts with the peak memory of

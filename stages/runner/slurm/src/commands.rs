@@ -22,14 +22,6 @@ pub fn current_job_id() -> Option<String> {
     std::env::var("SLURM_JOB_ID").ok()
 }
 
-/// Returns the number of cores of this job, or of the machine outside a job.
-pub fn available_cores() -> usize {
-    let allocated = std::env::var("SLURM_CPUS_ON_NODE").ok().and_then(|text| text.parse().ok());
-    allocated
-        .filter(|&n| n > 0)
-        .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, std::num::NonZero::get))
-}
-
 impl Slurm {
     /// Returns the programs in a folder.
     pub fn in_folder(folder: impl Into<PathBuf>) -> Self {

@@ -38,7 +38,7 @@ mod submit;
 use std::path::{Path, PathBuf};
 
 pub use amounts::{AmountError, Memory, Period};
-pub use commands::{Slurm, available_cores, current_job_id};
+pub use commands::{Slurm, current_job_id};
 pub use queue::{Job, Queue};
 pub use resources::Resources;
 pub use site::Site;

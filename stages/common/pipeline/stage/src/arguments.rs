@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use crate::contract::{Description, Schema};
 use anyhow::anyhow;
 use artifact::{Failure, FailureExt as _, known_names};
-use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use crate::progress::ProgressMode;
@@ -34,7 +33,7 @@ pub(crate) struct Arguments {
     /// Compute device: cpu or cuda:N
     #[arg(long, default_value = "cpu")]
     pub(crate) device: String,
-    /// Number of threads; doesn't affect the result [default: all cores]
+    // Its help is `threads_help`.
     #[arg(long, value_name = "N")]
     pub(crate) threads: Option<usize>,
     /// Format of progress reports
@@ -76,12 +75,21 @@ pub(crate) fn input_folders<'a>(
     Ok(folders)
 }
 
-/// Reads the parameters, or takes the defaults without a file. Returns the checked values as JSON
-/// and as the stage's own type.
-pub(crate) fn read_params<P: DeserializeOwned>(
+/// Checked parameters.
+pub(crate) struct Parameters {
+    /// Values of all parameters.
+    pub(crate) resolved: Value,
+    /// The same values in the form of the stage's own type.
+    pub(crate) nested: Value,
+    /// Name of the argument, for messages.
+    pub(crate) context: String,
+}
+
+/// Reads and checks the parameters, or takes the defaults without a file.
+pub(crate) fn read_params(
     file: Option<&Path>,
     description: &Description,
-) -> anyhow::Result<(Value, P)> {
+) -> anyhow::Result<Parameters> {
     let context = format!("--params {}", file.unwrap_or(Path::new("")).display());
     let given = match file {
         None => serde_json::Map::new(),
@@ -96,8 +104,8 @@ pub(crate) fn read_params<P: DeserializeOwned>(
         let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
         Failure::Usage(format!("{context}: {}", problems.join("; ")))
     })?;
-    let params = serde_path_to_error::deserialize(schema.nested(&resolved)).usage(&context)?;
-    Ok((resolved, params))
+    let nested = schema.nested(&resolved);
+    Ok(Parameters { resolved, nested, context })
 }
 
 /// Error returned for an invalid `--device`.

@@ -9,7 +9,8 @@
 //! * [`CheckpointSchedule`]: times at which a training writes checkpoints.
 //! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic;
 //!   the runner uses them, too.
-//! * [`available_memory`], [`check_device`]: limits of memory, and the compute device.
+//! * [`available_memory`], [`processors`], [`check_device`]: limits of memory, the default number of
+//!   threads, and the compute device.
 //!
 //! The crate knows neither images nor tensors nor the store. Artifacts and failures are in
 //! `artifact`.
@@ -52,6 +53,7 @@ mod memory;
 mod panic_tests;
 mod panics;
 mod parts;
+mod processors;
 mod progress;
 mod run;
 #[cfg(test)]
@@ -74,6 +76,7 @@ pub use memory::{
     remaining_memory,
 };
 pub use panics::install_panic_hook;
+pub use processors::{ProcessorLimit, Processors, processors, start_threads};
 pub use progress::{Event, Pace, Progress, ProgressMode};
 pub use run::{RUNNER_VARIABLE, run_stage};
 pub use signals::{stop_on_signals, stop_signals};

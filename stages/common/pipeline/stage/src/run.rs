@@ -8,15 +8,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::contract::Description;
 use anyhow::Context as _;
-use artifact::{Failure, GivenInput, exit_code, hash_json, one_line, print_lines, report_line};
+use artifact::{
+    Failure, FailureExt as _, GivenInput, counted, exit_code, hash_json, one_line, print_lines,
+    report_line,
+};
 use clap::CommandFactory as _;
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
+use serde_json::Value;
 
-use crate::arguments::{Arguments, Command, input_folders, read_params};
+use crate::arguments::{Arguments, Command, Parameters, input_folders, read_params};
 use crate::context::Context;
 use crate::help::render_help;
 use crate::panics::install_panic_hook;
+use crate::processors::{Processors, processors, start_threads};
 use crate::progress::{ProgressMode, enable_events, failed_event};
 use crate::signals::{EndClaim, stop_on_signals};
 use crate::stage::Stage;
@@ -38,121 +43,170 @@ pub(crate) fn run_stage_with<S: Stage>(
     arguments: impl IntoIterator<Item = OsString>,
 ) -> ExitCode {
     install_panic_hook(S::NAME);
-    match parse_and_run::<S>(version, code, arguments) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            let message = one_line(&error);
-            report_line!("{}: {message}", S::NAME);
-            if let Some(event) = failed_event(&message) {
-                io::stdout().write_all(event.as_bytes()).ok();
-            }
-            ExitCode::from(exit_code(&error))
-        }
-    }
+    let program = Program {
+        name: S::NAME,
+        summary: S::SUMMARY,
+        version,
+        description: S::describe(version, code),
+        work: |params| {
+            let params: S::Params = serde_path_to_error::deserialize(params)?;
+            Ok(Box::new(move |context| S::run(context, &params)))
+        },
+    };
+    program.run(arguments.into_iter().collect())
 }
 
-fn parse_and_run<S: Stage>(
+/// A stage with checked parameters.
+type Work = Box<dyn FnOnce(&Context) -> anyhow::Result<()>>;
+/// Error of a parameter, with its path.
+type ParamsError = serde_path_to_error::Error<serde_json::Error>;
+
+/// Program of a stage, without the stage's type: its code is compiled here and not again in each
+/// program.
+struct Program {
+    name: &'static str,
+    summary: &'static str,
     version: &'static str,
-    code: &str,
-    arguments: impl IntoIterator<Item = OsString>,
-) -> anyhow::Result<()> {
-    let description = S::describe(version, code);
-    let mut command = Arguments::command()
-        .name(S::NAME)
-        .about(S::SUMMARY)
-        .after_help(render_help(&description))
-        .mut_arg("from_checkpoint", |argument| argument.hide(!S::FROM_CHECKPOINT));
-    if !version.is_empty() {
-        command = command.version(version);
-    }
-    let arguments = match command.clone().try_get_matches_from(arguments) {
-        Ok(matches) => <Arguments as clap::FromArgMatches>::from_arg_matches(&matches)?,
-        // `--help` and `--version` are errors, too; clap prints them and exits.
-        Err(error) => error.exit(),
-    };
-    match arguments.command {
-        Some(Command::Describe) => {
-            print_lines(&serde_json::to_string_pretty(&description)?);
-            Ok(())
+    description: Description,
+    /// Function that converts checked parameters to the stage's type.
+    work: fn(Value) -> Result<Work, ParamsError>,
+}
+
+impl Program {
+    fn run(&self, arguments: Vec<OsString>) -> ExitCode {
+        match self.parse_and_run(arguments) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                let message = one_line(&error);
+                report_line!("{}: {message}", self.name);
+                if let Some(event) = failed_event(&message) {
+                    io::stdout().write_all(event.as_bytes()).ok();
+                }
+                ExitCode::from(exit_code(&error))
+            }
         }
-        None => execute::<S>(arguments, &description),
+    }
+
+    fn parse_and_run(&self, arguments: Vec<OsString>) -> anyhow::Result<()> {
+        let mut command = Arguments::command()
+            .name(self.name)
+            .about(self.summary)
+            .after_help(render_help(&self.description))
+            .mut_arg("from_checkpoint", |argument| argument.hide(!self.description.from_checkpoint))
+            .mut_arg("threads", |argument| argument.help(threads_help()));
+        if !self.version.is_empty() {
+            command = command.version(self.version);
+        }
+        let arguments = match command.try_get_matches_from(arguments) {
+            Ok(matches) => <Arguments as clap::FromArgMatches>::from_arg_matches(&matches)?,
+            // `--help` and `--version` are errors, too; clap prints them and exits.
+            Err(error) => error.exit(),
+        };
+        match arguments.command {
+            Some(Command::Describe) => {
+                print_lines(&serde_json::to_string_pretty(&self.description)?);
+                Ok(())
+            }
+            None => self.execute(arguments),
+        }
     }
 }
 
-fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow::Result<()> {
-    let is_for_runner = arguments.progress == ProgressMode::Json;
-    if is_for_runner {
-        enable_events();
-    }
-    let (params, threads, inputs) = check_arguments::<S>(&arguments, description)?;
-    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
-    let interrupted = stop_on_signals()?;
-    if is_for_runner {
-        end_with_runner(Arc::clone(&interrupted))?;
-    }
-    let output = arguments.output.expect("clap requires --output");
-    let staging = Staging::new(&output)?;
-    let end = EndClaim::default();
-    end.enforce_deadline(S::NAME, &interrupted, staging.folder())?;
-    if let Some(work) = &arguments.work {
-        fs::create_dir_all(work)
-            .with_context(|| format!("--work {}: cannot create the folder", work.display()))?;
-    }
-    let identities: Option<BTreeMap<&str, &str>> =
-        inputs.iter().map(|(name, input)| Some((name.as_str(), input.identity()?))).collect();
-    let identity = identities
-        .map(|inputs| hash_json(&(&params, inputs, &description.code, &arguments.device)));
-    let context = Context {
-        threads,
-        device: arguments.device,
-        inputs,
-        output: staging.folder().to_path_buf(),
-        work: arguments.work,
-        from_checkpoint: arguments.from_checkpoint,
-        progress: arguments.progress,
-        interrupted,
-        identity,
-        resumed: AtomicBool::new(false),
-    };
-    let result = S::run(&context, &params)
-        .and_then(|()| context.check_interrupt())
-        .and_then(|()| staging.complete(&description.output.kind));
-    end.claim();
-    result?;
-    staging.publish(&output)
+/// Returns the help of `--threads`, with the default in this process.
+fn threads_help() -> String {
+    let Processors { count, limit } = processors();
+    format!("Number of threads; doesn't affect the result [default: {count}, {limit}]")
 }
 
-/// Checks the arguments and returns the parameters, the number of threads, and the inputs.
-fn check_arguments<S: Stage>(
-    arguments: &Arguments,
-    description: &Description,
-) -> anyhow::Result<(S::Params, usize, BTreeMap<String, GivenInput>)> {
-    let (resolved, params) = read_params::<S::Params>(arguments.params.as_deref(), description)?;
-    let folders = input_folders(&arguments.inputs, description)?;
-    // The runner checks rules about the stages that created the inputs, which are unknown here.
-    let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
-    if let Some(problem) = description.broken_rule(&resolved, &given) {
-        return Err(Failure::Usage(problem).into());
-    }
-    if arguments.from_checkpoint && !S::FROM_CHECKPOINT {
-        let problem = format!(
-            "--from-checkpoint: stage {} doesn't support this option; leave it out",
-            S::NAME
-        );
-        return Err(Failure::Usage(problem).into());
-    }
-    let threads = match arguments.threads {
-        Some(0) => {
-            return Err(Failure::Usage("--threads 0: at least 1 is required".to_owned()).into());
+/// Arguments of a run.
+struct CheckedArguments {
+    /// Values of all parameters.
+    params: Value,
+    work: Work,
+    threads: usize,
+    inputs: BTreeMap<String, GivenInput>,
+}
+
+impl Program {
+    fn execute(&self, arguments: Arguments) -> anyhow::Result<()> {
+        let is_for_runner = arguments.progress == ProgressMode::Json;
+        if is_for_runner {
+            enable_events();
         }
-        Some(n) => n,
-        None => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
-    };
-    let mut inputs = BTreeMap::new();
-    for (name, folder) in folders {
-        inputs.insert(name.to_owned(), GivenInput::open(name, folder)?);
+        let CheckedArguments { params, work, threads, inputs } =
+            self.check_arguments(&arguments)?;
+        start_threads(threads);
+        let interrupted = stop_on_signals()?;
+        if is_for_runner {
+            end_with_runner(Arc::clone(&interrupted))?;
+        }
+        let output = arguments.output.expect("clap requires --output");
+        let staging = Staging::new(&output)?;
+        let end = EndClaim::default();
+        end.enforce_deadline(self.name, &interrupted, staging.folder())?;
+        if let Some(work) = &arguments.work {
+            fs::create_dir_all(work)
+                .with_context(|| format!("--work {}: cannot create the folder", work.display()))?;
+        }
+        let identities: Option<BTreeMap<&str, &str>> =
+            inputs.iter().map(|(name, input)| Some((name.as_str(), input.identity()?))).collect();
+        let identity = identities
+            .map(|inputs| hash_json(&(&params, inputs, &self.description.code, &arguments.device)));
+        let context = Context {
+            threads,
+            device: arguments.device,
+            inputs,
+            output: staging.folder().to_path_buf(),
+            work: arguments.work,
+            from_checkpoint: arguments.from_checkpoint,
+            progress: arguments.progress,
+            interrupted,
+            identity,
+            resumed: AtomicBool::new(false),
+        };
+        if arguments.threads.is_none() && arguments.progress == ProgressMode::Plain {
+            context.say(format!("{}: {}", counted(threads, "thread"), processors().limit));
+        }
+        let result = work(&context)
+            .and_then(|()| context.check_interrupt())
+            .and_then(|()| staging.complete(&self.description.output.kind));
+        end.claim();
+        result?;
+        staging.publish(&output)
     }
-    Ok((params, threads, inputs))
+
+    /// Checks the arguments.
+    fn check_arguments(&self, arguments: &Arguments) -> anyhow::Result<CheckedArguments> {
+        let description = &self.description;
+        let Parameters { resolved, nested, context } =
+            read_params(arguments.params.as_deref(), description)?;
+        let work = (self.work)(nested).usage(context)?;
+        let folders = input_folders(&arguments.inputs, description)?;
+        // The runner checks rules about the stages that created the inputs, which are unknown here.
+        let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
+        if let Some(problem) = description.broken_rule(&resolved, &given) {
+            return Err(Failure::Usage(problem).into());
+        }
+        if arguments.from_checkpoint && !description.from_checkpoint {
+            let problem = format!(
+                "--from-checkpoint: stage {} doesn't support this option; leave it out",
+                self.name
+            );
+            return Err(Failure::Usage(problem).into());
+        }
+        let threads = match arguments.threads {
+            Some(0) => {
+                return Err(Failure::Usage("--threads 0: at least 1 is required".to_owned()).into());
+            }
+            Some(n) => n,
+            None => processors().count,
+        };
+        let mut inputs = BTreeMap::new();
+        for (name, folder) in folders {
+            inputs.insert(name.to_owned(), GivenInput::open(name, folder)?);
+        }
+        Ok(CheckedArguments { params: resolved, work, threads, inputs })
+    }
 }
 
 /// Interrupts the stage when its runner is killed, so that it writes a checkpoint and doesn't keep

@@ -10,7 +10,7 @@ pub trait Stage {
     /// Parameters. Defaults, ranges and documentation come from the type; `#[serde(default,
     /// deny_unknown_fields)]` is expected. One field may be an externally tagged `enum` of structs:
     /// it selects a variant, whose parameters are given on the same level.
-    type Params: Serialize + DeserializeOwned + JsonSchema + Default;
+    type Params: Serialize + DeserializeOwned + JsonSchema + Default + 'static;
     /// Name of the stage and of its binary.
     const NAME: &'static str;
     /// Purpose of the stage, in one sentence.

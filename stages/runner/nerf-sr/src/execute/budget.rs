@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use artifact::{format_count, format_size, report_line};
 use planning::{PlanError, nearest_record};
 use serde_json::{Map, Value};
-use stage::machine_memory;
+use stage::{ProcessorLimit, Processors, machine_memory, processors};
 use store::Record;
 
 /// Maximum number of threads or stages per core. A larger number would only cost memory and time;
@@ -52,6 +52,8 @@ pub(crate) struct Budget {
     pub(crate) threads: usize,
     /// Memory in bytes.
     pub(crate) memory: u64,
+    /// Limit below the machine's number of processors, if the number of threads is due to one.
+    pub(crate) limit: Option<ProcessorLimit>,
 }
 
 impl Budget {
@@ -64,12 +66,20 @@ impl Budget {
         if jobs == Some(0) || threads == Some(0) {
             return Err(PlanError::Usage("--jobs and --threads must be at least 1".to_owned()));
         }
-        let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+        let Processors { count: cores, limit } = processors();
         Ok(Self {
             stages: capped("--jobs", jobs.unwrap_or(cores.min(DEFAULT_MAX_STAGES)), cores),
             threads: capped("--threads", threads.unwrap_or(cores), cores),
             memory: memory.or_else(machine_memory).unwrap_or(u64::MAX),
+            limit: Some(limit)
+                .filter(|&limit| threads.is_none() && limit != ProcessorLimit::Machine),
         })
+    }
+
+    /// Returns the line that names a limit below the machine's number of processors.
+    pub(crate) fn limit_line(&self) -> Option<String> {
+        let limit = self.limit?;
+        Some(format!("nerf-sr: {}: {limit}", counted(self.threads, "thread")))
     }
 
     /// Decides whether a stage may start next to the running ones: a slot, a core and its memory
@@ -128,7 +138,7 @@ mod tests {
     use serde_json::json;
 
     const GB: u64 = 1_000_000_000;
-    const BUDGET: Budget = Budget { stages: 3, threads: 4, memory: 8 * GB };
+    const BUDGET: Budget = Budget { stages: 3, threads: 4, memory: 8 * GB, limit: None };
 
     fn demand(cores: usize, gb: u64) -> Demand {
         Demand { cores, memory: gb * GB }

@@ -225,9 +225,13 @@ impl<'a> Schedule<'a> {
             match self.job(index).look_up() {
                 Ok(Lookup::Cached(record)) => self.outcome.records[index] = Some(record),
                 Ok(Lookup::Pending(action)) => {
-                    // If records can't be read, every stage gets the default demand.
-                    let records =
-                        self.records.get_or_init(|| self.run.store.records().unwrap_or_default());
+                    let records = self.records.get_or_init(|| {
+                        if let Some(line) = self.options.budget.limit_line() {
+                            self.display.line(&line);
+                        }
+                        // If records can't be read, every stage gets the default demand.
+                        self.run.store.records().unwrap_or_default()
+                    });
                     let demand = Demand::estimate(&action.key_parts, &node.stage, records);
                     self.ready.insert(index, ReadyNode { action, demand, is_reported: false });
                 }

@@ -93,7 +93,8 @@ fn requeue(plan: &Plan, store: &Store) -> anyhow::Result<()> {
 fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
     let states = run.plan.states(run.store, Some(run.stop)).map_err(|e| input_failure(&e))?;
     let records: Vec<Option<Record>> = states.into_iter().map(State::into_record).collect();
-    let threads = slurm::available_cores();
+    let threads = stage::processors().count;
+    stage::start_threads(threads);
     if let Some(sink) = run.plan.sinks.first() {
         check_parents(run.plan, &sink.stage, sink.nodes.iter().copied(), &records)?;
         let progress = RunProgress { command, ..RunProgress::not_started(&records) };

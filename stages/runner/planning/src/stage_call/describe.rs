@@ -72,13 +72,12 @@ pub enum DescribeError {
 /// Descriptions, or the errors instead, by the program's path.
 pub type Descriptions = BTreeMap<PathBuf, Result<Description, DescribeError>>;
 
-/// Describes programs, as many in parallel as the machine has cores.
+/// Describes programs, as many in parallel as this process has processors.
 pub fn describe_all(
     paths: &[PathBuf],
     stop: Option<&AtomicBool>,
 ) -> Result<Descriptions, Interrupted> {
-    let threads =
-        std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(paths.len());
+    let threads = stage::processors().count.min(paths.len());
     let next = &AtomicUsize::new(0);
     let (sender, receiver) = mpsc::channel();
     let mut descriptions = Descriptions::new();

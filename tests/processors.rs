@@ -1,0 +1,149 @@
+//! Default number of threads: the processors that a process may use.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use common::{Finished, Project, bin, stage_command};
+use stage::{ProcessorLimit, processors};
+
+/// Variables that would change the number of processors.
+const VARIABLES: [&str; 2] = ["SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"];
+
+/// Returns the line in which a stage reports its threads, called through a program such as
+/// `taskset`, with and without a variable of Slurm.
+fn reported(project: &Project, through: &[&str], variable: Option<(&str, &str)>) -> String {
+    let output = project.path("data");
+    fs::remove_dir_all(&output).ok();
+    let params = r#"{"size": 16, "train": 1, "test": 1, "samples_per_axis": 1}"#;
+    let call = stage_command("demo-scene", params, &[], &output, &["--progress", "plain"]);
+    let mut command = match through {
+        [] => Command::new(call.get_program()),
+        [first, others @ ..] => {
+            let mut command = Command::new(first);
+            command.args(others).arg(call.get_program());
+            command
+        }
+    };
+    command.args(call.get_args());
+    for name in VARIABLES {
+        command.env_remove(name);
+    }
+    let finished = Finished::of(command.envs(variable).output().unwrap());
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
+    finished.stderr.lines().next().unwrap_or_default().to_owned()
+}
+
+/// True if a program can be started.
+fn exists(program: &str) -> bool {
+    Command::new(program).arg("--help").output().is_ok()
+}
+
+#[test]
+fn affinity_limits_threads_of_stages_and_runs() {
+    if !exists("taskset") {
+        eprintln!("skipped: no taskset");
+        return;
+    }
+    let project = Project::fast();
+    let Some(processor) = any_processor() else {
+        eprintln!("skipped: no list of processors in /proc/self/status");
+        return;
+    };
+    let through = ["taskset", "-c", processor.as_str()];
+    let said = reported(&project, &through, None);
+    if processors().limit == ProcessorLimit::Machine && processors().count == 1 {
+        assert_eq!(said, "1 thread: all processors of this machine");
+        return;
+    }
+    assert_eq!(said, "1 thread: the CPU affinity of this process");
+    let help = Command::new(through[0]).args(&through[1..]).arg(bin("eval")).arg("--help").output();
+    let help = Finished::of(help.unwrap()).stdout;
+    assert!(help.contains("[default: 1, the CPU affinity of this process]"), "{help}");
+    let nerf_sr = project.command(&["run", "prep"]);
+    let mut run = Command::new(through[0]);
+    run.args(&through[1..]).arg(nerf_sr.get_program()).args(nerf_sr.get_args());
+    for name in VARIABLES {
+        run.env_remove(name);
+    }
+    let run = Finished::of(run.current_dir(project.path(".")).output().unwrap());
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    assert!(run.stderr.contains("nerf-sr: 1 thread: the CPU affinity"), "{}", run.stderr);
+    let log = project.ok(&["log", "prep"]);
+    assert!(log.lines().any(|line| line.ends_with(", 1 thread")), "{log}");
+}
+
+/// Returns the number of a processor that this process may use.
+fn any_processor() -> Option<String> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let list = status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:"))?;
+    list.trim().split(['-', ',']).next().map(str::to_owned)
+}
+
+#[test]
+fn slurms_variables_limit_threads() {
+    let project = Project::new("");
+    for name in VARIABLES {
+        let said = reported(&project, &[], Some((name, "1")));
+        let expected = if processors().count == 1 { "1 thread: " } else { "1 thread: SLURM_CPUS_" };
+        assert!(said.starts_with(expected), "{said}");
+    }
+    let all = reported(&project, &[], None);
+    for value in ["0", "x", "", "1000000"] {
+        assert_eq!(reported(&project, &[], Some(("SLURM_CPUS_ON_NODE", value))), all, "{value}");
+    }
+}
+
+/// A cgroup with a quota of one processor, removed when dropped.
+struct Quota(PathBuf);
+
+impl Quota {
+    /// Creates a cgroup of version 1 or 2; `None` if that isn't permitted.
+    fn create() -> Option<Self> {
+        let name = format!("nerf-sr-test-{}", std::process::id());
+        let versions: [(&str, &[(&str, &str)]); 3] = [
+            ("/sys/fs/cgroup", &[("cpu.max", "100000 100000")]),
+            (
+                "/sys/fs/cgroup/cpu",
+                &[("cpu.cfs_period_us", "100000"), ("cpu.cfs_quota_us", "100000")],
+            ),
+            (
+                "/sys/fs/cgroup/cpu,cpuacct",
+                &[("cpu.cfs_period_us", "100000"), ("cpu.cfs_quota_us", "100000")],
+            ),
+        ];
+        versions.iter().find_map(|(root, settings)| {
+            // Without this file the folder isn't a hierarchy with cgroups.
+            Path::new(root).join("cgroup.procs").is_file().then_some(())?;
+            let group = Self(Path::new(root).join(&name));
+            fs::create_dir(&group.0).ok()?;
+            settings
+                .iter()
+                .try_for_each(|(file, text)| fs::write(group.0.join(file), text))
+                .ok()?;
+            Some(group)
+        })
+    }
+}
+
+impl Drop for Quota {
+    fn drop(&mut self) {
+        fs::remove_dir(&self.0).ok();
+    }
+}
+
+#[test]
+fn a_quota_limits_threads() {
+    let Some(group) = Quota::create() else {
+        eprintln!("skipped: this process may not create a cgroup with a CPU quota");
+        return;
+    };
+    let project = Project::new("");
+    let enter = format!("echo $$ > {}/cgroup.procs && exec \"$0\" \"$@\"", group.0.display());
+    let said = reported(&project, &["sh", "-c", &enter], None);
+    let expected = if processors().count == 1 { "1 thread: " } else { "1 thread: the CPU quota" };
+    assert!(said.starts_with(expected), "{said}");
+}
