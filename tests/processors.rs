@@ -147,3 +147,37 @@ fn a_quota_limits_threads() {
     let expected = if processors().count == 1 { "1 thread: " } else { "1 thread: the CPU quota" };
     assert!(said.starts_with(expected), "{said}");
 }
+
+/// Returns the largest number of threads of a stage with an input, which is checked in parallel.
+fn most_threads(project: &Project, threads: &str) -> usize {
+    let data = project.path("data");
+    if !data.exists() {
+        let params = r#"{"size": 32, "train": 2, "test": 1, "samples_per_axis": 1}"#;
+        let made = stage_command("demo-scene", params, &[], &data, &[]).output().unwrap();
+        assert!(made.status.success());
+    }
+    let params = r#"{"lr_width": 16, "scale": 2}"#;
+    let scene = project.path(&format!("scene-{threads}"));
+    let made = stage_command("prep", params, &[("dataset", &data)], &scene, &[]).output().unwrap();
+    assert!(made.status.success());
+    let params = r#"{"field": "grid", "rays": 300000}"#;
+    let (input, output) = (scene.join("train"), project.path(&format!("field-{threads}")));
+    let inputs = [("scene", input.as_path())];
+    let mut command = stage_command("train-ss", params, &inputs, &output, &["--threads", threads]);
+    let mut training = command.spawn().unwrap();
+    let tasks = PathBuf::from(format!("/proc/{}/task", training.id()));
+    let mut most = 0;
+    while training.try_wait().unwrap().is_none() {
+        most = most.max(fs::read_dir(&tasks).map_or(0, Iterator::count));
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    assert!(training.wait().unwrap().success());
+    most
+}
+
+#[test]
+fn a_stage_has_as_many_threads_as_given() {
+    let project = Project::fast();
+    let [few, many] = ["1", "6"].map(|threads| most_threads(&project, threads));
+    assert_eq!(many - few, 5, "{few} and {many} threads");
+}

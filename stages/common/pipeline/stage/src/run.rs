@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use crate::contract::Description;
 use anyhow::Context as _;
 use artifact::{
-    Failure, FailureExt as _, GivenInput, counted, exit_code, hash_json, one_line, print_lines,
-    report_line,
+    Failure, FailureExt as _, GivenInput, exit_code, format_count, hash_json, one_line,
+    print_lines, report_line,
 };
 use clap::CommandFactory as _;
 use rustix::event::{PollFd, PollFlags, poll};
@@ -135,7 +135,6 @@ impl Program {
         }
         let CheckedArguments { params, work, threads, inputs } =
             self.check_arguments(&arguments)?;
-        start_threads(threads);
         let interrupted = stop_on_signals()?;
         if is_for_runner {
             end_with_runner(Arc::clone(&interrupted))?;
@@ -165,7 +164,11 @@ impl Program {
             resumed: AtomicBool::new(false),
         };
         if arguments.threads.is_none() && arguments.progress == ProgressMode::Plain {
-            context.say(format!("{}: {}", counted(threads, "thread"), processors().limit));
+            context.log_line(format!(
+                "{}: {}",
+                format_count(threads, "thread"),
+                processors().limit
+            ));
         }
         let result = work(&context)
             .and_then(|()| context.check_interrupt())
@@ -201,6 +204,8 @@ impl Program {
             Some(n) => n,
             None => processors().count,
         };
+        // Inputs are opened in parallel: without a pool, rayon would start one of its own size.
+        start_threads(threads);
         let mut inputs = BTreeMap::new();
         for (name, folder) in folders {
             inputs.insert(name.to_owned(), GivenInput::open(name, folder)?);

@@ -79,7 +79,7 @@ impl Budget {
     /// Returns the line that names a limit below the machine's number of processors.
     pub(crate) fn limit_line(&self) -> Option<String> {
         let limit = self.limit?;
-        Some(format!("nerf-sr: {}: {limit}", counted(self.threads, "thread")))
+        Some(format!("nerf-sr: {}: {limit}", format_count(self.threads, "thread")))
     }
 
     /// Decides whether a stage may start next to the running ones: a slot, a core and its memory
