@@ -3,6 +3,7 @@ mod options;
 mod phases;
 mod shard;
 
+use std::ops::RangeInclusive;
 use std::sync::Mutex;
 
 use rayon::prelude::*;
@@ -51,9 +52,10 @@ pub enum TrainingError {
     },
 }
 
-/// Number of shards of a step (docs/design/006), fixed so that sums have one order at any thread
-/// count.
-const SHARDS: usize = 64;
+/// Number of rays of a shard (docs/design/047): fewer fill the vectors badly.
+const RAYS_PER_SHARD: usize = 40;
+/// Minimum and maximum number of shards of a step (docs/design/047).
+const SHARDS: RangeInclusive<usize> = 32..=128;
 /// Number of networks' weights per task that sums their gradients; chosen by hand.
 const SUMS_PIECE: usize = 64;
 /// Number of a level's bricks per task of the optimiser; chosen by hand.
@@ -109,7 +111,7 @@ impl Trainer {
             transposed: Aligned::zeros(field.network.len()),
             state: TrainingState::default(),
             samples_per_ray: field.architecture.samples_per_full_ray(),
-            shards: (0..SHARDS).map(|_| Shard::default()).collect(),
+            shards: Vec::new(),
             workers: Mutex::new(Vec::new()),
             times: Default::default(),
             field,
@@ -209,10 +211,14 @@ impl Trainer {
             first_ray: self.state.rays,
             bundles,
         };
+        // Independent of the number of threads, so that sums have one order.
+        let shards = (bundles * supervision.rays_per_bundle() / RAYS_PER_SHARD)
+            .clamp(*SHARDS.start(), *SHARDS.end());
+        self.shards.resize_with(shards, Shard::default);
         let workers = &self.workers;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let mut worker = lock(workers).pop().unwrap_or_default();
-            let range = bundles * i / SHARDS..bundles * (i + 1) / SHARDS;
+            let range = bundles * i / shards..bundles * (i + 1) / shards;
             clock.task(|| shard.run(&mut worker, &work, range));
             lock(workers).push(worker);
         });
