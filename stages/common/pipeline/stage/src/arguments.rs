@@ -79,7 +79,7 @@ pub(crate) fn input_folders<'a>(
 pub(crate) struct Parameters {
     /// Values of all parameters.
     pub(crate) resolved: Value,
-    /// The same values in the form of the stage's own type.
+    /// Values in the form of the stage's own type.
     pub(crate) nested: Value,
     /// Name of the argument, for messages.
     pub(crate) context: String,
