@@ -219,8 +219,8 @@ impl LevelGradients {
 }
 
 impl HalfGradients {
-    /// Adds each sample's feature gradient to the entries of this half, in the order of the rows,
-    /// and marks the bricks. `positions` is arranged by [`arrange_in_rows`].
+    /// Adds each sample's feature gradient to the entries of this half, in sample order, and marks
+    /// the bricks. `positions` is arranged by [`arrange_in_rows`].
     pub(crate) fn scatter(
         &mut self,
         level: &Level,
@@ -244,7 +244,7 @@ kernel! {
         let mask = level.bricks() as u32 - 1;
         let mut index = [[0u32; LANES]; HALF_BRICK];
         let mut weight = [[0.0f32; LANES]; HALF_BRICK];
-        for (block, p) in positions.iter().enumerate() {
+        for (p, gradients) in positions.iter().zip(feature_gradients.chunks(LANES)) {
             let Cells { cell, fraction } = Cells::around(level, [&p[0], &p[1], &p[2]]);
             for (corner, (index, weight)) in index.iter_mut().zip(&mut weight).enumerate() {
                 let (dx, dy) = (corner as u32 & 1, corner as u32 >> 1);
@@ -258,8 +258,7 @@ kernel! {
                         * share(fraction[2][l], dz);
                 }
             }
-            for l in 0..LANES {
-                let Some(d) = feature_gradients.get(l * positions.len() + block) else { break };
+            for (l, d) in gradients.iter().enumerate() {
                 let d = L::Quad::load(d);
                 for c in 0..HALF_BRICK {
                     let index = index[c][l] as usize;
@@ -272,16 +271,13 @@ kernel! {
     }
 }
 
-/// Arranges positions in rows of sixteen: block b has the samples b, b + n, b + 2·n, … of n blocks.
-/// Samples of a ray, which are often in one cell, are thus far apart, and their additions to one
-/// entry don't wait for each other. The last lanes are padded with zeros.
+/// Arranges positions in rows of sixteen; the last rows are padded with zeros.
 pub(crate) fn arrange_in_rows(positions: &[[f32; 3]], rows: &mut Vec<PositionRows>) {
-    let blocks = positions.len().div_ceil(LANES);
     rows.clear();
-    rows.resize(blocks, [[0.0; LANES]; 3]);
+    rows.resize(positions.len().div_ceil(LANES), [[0.0; LANES]; 3]);
     for (i, position) in positions.iter().enumerate() {
         for axis in 0..3 {
-            rows[i % blocks][axis][i / blocks] = position[axis];
+            rows[i / LANES][axis][i % LANES] = position[axis];
         }
     }
 }
