@@ -148,8 +148,9 @@ fn a_quota_limits_threads() {
     assert!(said.starts_with(expected), "{said}");
 }
 
-/// Returns the largest number of threads of a stage with an input, which is checked in parallel.
-fn most_threads(project: &Project, threads: &str) -> usize {
+/// Returns the largest number of threads of a training with an input, which is checked in parallel,
+/// and the bytes of the trained field.
+fn train_with_threads(project: &Project, threads: &str) -> (usize, Vec<u8>) {
     let data = project.path("data");
     if !data.exists() {
         let params = r#"{"size": 32, "train": 2, "test": 1, "samples_per_axis": 1}"#;
@@ -172,12 +173,17 @@ fn most_threads(project: &Project, threads: &str) -> usize {
         std::thread::sleep(std::time::Duration::from_millis(5));
     }
     assert!(training.wait().unwrap().success());
-    most
+    (most, fs::read(output.join("field-0.safetensors")).unwrap())
 }
 
+/// A stage has as many threads as given, and fields have equal bytes.
 #[test]
-fn a_stage_has_as_many_threads_as_given() {
+fn fields_are_equal_at_any_number_of_threads() {
     let project = Project::fast();
-    let [few, many] = ["1", "6"].map(|threads| most_threads(&project, threads));
-    assert_eq!(many - few, 5, "{few} and {many} threads");
+    let (one, field) = train_with_threads(&project, "1");
+    for threads in [2, 3, 8, 16] {
+        let (most, other) = train_with_threads(&project, &threads.to_string());
+        assert_eq!(most - one, threads - 1, "{one} and {most} threads");
+        assert!(other == field, "{threads} threads");
+    }
 }
