@@ -296,7 +296,7 @@ fn poses_are_refined_and_test_views_registered() {
     let folder = as_transforms(&project);
     let file = folder.join("transforms.json");
     let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
-    let mut rng = counter_rng::CounterRng::new(7, 1, 1);
+    let mut rng = numerics::CounterRng::new(7, 1, 1);
     let mut off =
         |size: f64| DVec3::from([0, 1, 2].map(|_| size * f64::from(2.0 * rng.uniform() - 1.0)));
     for frame in transforms["frames"].as_array_mut().unwrap() {

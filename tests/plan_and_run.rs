@@ -9,7 +9,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use common::Project;
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use serde_json::Value;
 
 /// A stage in shell. Its output follows from its inputs and from half of its value, that in `sub`

@@ -362,7 +362,7 @@ fn change_depth(path: &Path, change: fn(usize, f32) -> f32) {
 
 /// A depth's factor, different at every pixel.
 fn noise(seed: u64, pixel: usize) -> f32 {
-    1.0 + 0.03 * (counter_rng::uniform(seed, 2, pixel as u64) - 0.5)
+    1.0 + 0.03 * (numerics::uniform(seed, 2, pixel as u64) - 0.5)
 }
 
 fn with_depths(project: &Project, name: &str, of: &Path, change: fn(usize, f32) -> f32) -> PathBuf {

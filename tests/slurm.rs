@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::{Duration, Instant};
 
 use common::{Finished, Project, happens, root, wait_until};
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 
 /// A stage in plain Python. It goes so many steps, each from the one before, and leaves a
 /// checkpoint when it is asked to end, or where it `keeps` them at every step. While a file is

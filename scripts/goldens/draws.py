@@ -1,4 +1,4 @@
-"""Module that repeats the draws of `counter_rng::uniform`, so that golden files needn't contain random weights."""
+"""Module that repeats the draws of `numerics::uniform`, so that golden files needn't contain random weights."""
 
 import numpy
 

@@ -2,7 +2,7 @@
 """Generates the golden file of the paper's field (`torch-field`) with PyTorch's own layers and optimiser: run by `make goldens`.
 
 Networks, sampling and compositing are built here from their published descriptions. Inputs and weights are draws of
-`counter_rng::uniform`, which draws.py repeats, so the safetensors file contains only outputs. The script also writes two small
+`numerics::uniform`, which draws.py repeats, so the safetensors file contains only outputs. The script also writes two small
 checkpoints for tests/checkpoint.rs.
 """
 
@@ -20,7 +20,7 @@ SEED = 11
 
 
 def draw(purpose, *shape):
-    """Returns the numbers in [0, 1) of `counter_rng::uniform(SEED, purpose, 0..)`."""
+    """Returns the numbers in [0, 1) of `numerics::uniform(SEED, purpose, 0..)`."""
     return torch.from_numpy(draws.uniform(SEED, purpose, math.prod(shape))).reshape(shape)
 
 

@@ -86,9 +86,8 @@ fn lpips_is_that_of_pytorch_with_every_network() {
                     entry["shift"].as_f64().unwrap() as f32,
                 );
                 let count = shape.iter().product::<i64>() as u64;
-                let values: Vec<f32> = (0..count)
-                    .map(|i| scale * counter_rng::uniform(7, purpose, i) + shift)
-                    .collect();
+                let values: Vec<f32> =
+                    (0..count).map(|i| scale * numerics::uniform(7, purpose, i) + shift).collect();
                 purpose += 1;
                 (
                     entry["name"].as_str().unwrap().to_owned(),

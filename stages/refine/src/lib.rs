@@ -60,7 +60,7 @@ impl Default for Params {
         Self {
             residual_weight: None,
             max_references: None,
-            self_ensemble: 4,
+            self_ensemble: 2,
             overlap: DEFAULT_OVERLAP_PIXELS as u32,
         }
     }

@@ -12,7 +12,8 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use artifact::GivenInput;
-use radiance::{Architecture, Family, Field, Passes, Phase, PhaseTimes, Ray, Trainer, set_family};
+use numerics::simd::{Family, set_family};
+use radiance::{Architecture, Field, Passes, Phase, PhaseTimes, Ray, Trainer};
 use scene::{Bounds, Camera, Views};
 use serde::{Deserialize, Serialize};
 #[cfg(feature = "torch")]

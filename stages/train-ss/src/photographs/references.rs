@@ -145,7 +145,7 @@ mod tests {
 
     fn hr_sample(i: usize) -> f32 {
         let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
-        0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64)
+        0.2 + 0.5 * numerics::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64)
             + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
     }
 

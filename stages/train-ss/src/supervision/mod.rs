@@ -10,7 +10,7 @@ mod setup;
 
 use std::io;
 
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use pixels::to_u8;
 use poses::MeanMotion;
 use radiance::{PhaseClock, Ray, RayField, RenderedBundles};

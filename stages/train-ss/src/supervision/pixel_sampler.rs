@@ -1,4 +1,4 @@
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use pixels::Image;
 use rayon::prelude::*;
 

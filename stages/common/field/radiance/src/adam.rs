@@ -1,7 +1,8 @@
 use std::ops::Range;
 
-use crate::simd::{LANES, kernel};
 use crate::spec::{ADAM_BETA, ADAM_EPSILON};
+use numerics::kernel;
+use numerics::simd::LANES;
 
 /// Constants of one optimiser step.
 #[derive(Clone, Copy, Debug)]
@@ -142,10 +143,10 @@ kernel! {
 
 #[cfg(test)]
 mod tests {
-    use counter_rng::uniform;
+    use numerics::uniform;
 
     use super::*;
-    use crate::simd::by_every_family;
+    use numerics::simd::by_every_family;
 
     #[test]
     fn equals_adam_in_f64_where_touched() {

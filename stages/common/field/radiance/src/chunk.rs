@@ -9,9 +9,10 @@ use crate::occupancy::CellHit;
 use crate::ray::NormalizedRay;
 use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
 use crate::shading::{LayerInput, NetworkGradients, RayGradients, Shading, dot};
-use crate::simd::{LANES, kernel};
 use crate::spec::Strides;
 use crate::spec::{DENSITY_OUTPUTS, FEATURES};
+use numerics::kernel;
+use numerics::simd::LANES;
 
 /// Number of rays in a chunk, whose samples fill the vectors and fit the cache (docs/design/006).
 pub(crate) const CHUNK_RAYS: usize = 64;

@@ -2,8 +2,8 @@
 //! (1-α) can round to 0.
 
 use crate::math::{exp, one_minus_exp_neg};
-use crate::simd::kernel;
 use crate::spec::MAX_RAW_DENSITY;
+use numerics::kernel;
 
 kernel! {
     /// Computes each sample's optical depth τ: density e^raw times the step.

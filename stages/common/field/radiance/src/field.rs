@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use safetensors::SafeTensors;
 use scene::Bounds;
 
@@ -9,11 +9,11 @@ use crate::architecture::Architecture;
 use crate::grid::{Level, levels};
 use crate::mlp::Layers;
 use crate::occupancy::{CELLS, Cell, Occupancy};
-use crate::simd::LANES;
 use crate::spec::FEATURES;
 use crate::tensors::{
     FieldError, FieldProblem, Tensor, read_f32, read_tensors, read_u8, write_tensors,
 };
+use numerics::simd::LANES;
 
 /// Radiance field: density and view-dependent colour at every point of the unit cube.
 #[derive(Clone, Debug)]
@@ -34,7 +34,7 @@ impl Field {
     pub fn new(architecture: Architecture, bounds: Bounds, seed: u64) -> Self {
         let mut field = Self::empty(architecture, bounds);
         for (i, value) in field.grid.iter_mut().enumerate() {
-            *value = 2e-4 * (counter_rng::uniform(seed, 1, i as u64) - 0.5);
+            *value = 2e-4 * (numerics::uniform(seed, 1, i as u64) - 0.5);
         }
         let mut rng = CounterRng::new(seed, 2, 0);
         for layer in field.layers.all() {

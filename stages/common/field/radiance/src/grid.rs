@@ -8,8 +8,9 @@
 use crate::aligned::Aligned;
 use crate::architecture::Architecture;
 use crate::math::floor;
-use crate::simd::{LANES, Quad as _, kernel};
 use crate::spec::{BRICK, FEATURES, HASH_FACTORS};
+use numerics::kernel;
+use numerics::simd::{LANES, Quad as _};
 
 impl Architecture {
     /// Returns the number of floats in the grid.
@@ -285,7 +286,7 @@ pub(crate) fn arrange_in_rows(positions: &[[f32; 3]], rows: &mut Vec<PositionRow
 #[cfg(test)]
 mod tests {
     use super::*;
-    use counter_rng::uniform;
+    use numerics::uniform;
 
     fn positions(n: usize) -> Vec<[f32; 3]> {
         let mut p: Vec<[f32; 3]> =

@@ -57,7 +57,6 @@ pub mod regularisers;
 mod render;
 mod samples;
 mod shading;
-mod simd;
 pub mod spec;
 mod specks;
 mod tensors;
@@ -74,7 +73,6 @@ pub use points::PointSample;
 pub use ray::{NormalizedRay, Ray, RayMap, clip};
 pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};
-pub use simd::{Family, set_family};
 pub use spec::Strides;
 pub use tensors::{FieldError, FieldProblem};
 pub use trainer::{

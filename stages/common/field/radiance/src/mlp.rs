@@ -2,8 +2,9 @@
 //! weights are stored by input (`w[i·outputs + j]`). There are no biases: the first spherical
 //! harmonic is a constant input.
 
-use crate::simd::{LANES, Lanes, Quad as _, kernel};
 use crate::spec::{DENSITY_OUTPUTS, VIEW_INPUTS};
+use numerics::kernel;
+use numerics::simd::{LANES, Lanes, Quad as _};
 
 #[inline(always)]
 fn row<L: Lanes>(from: &[f32], at: usize) -> L {
@@ -274,8 +275,8 @@ impl Layers {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::by_every_family;
-    use counter_rng::uniform;
+    use numerics::simd::by_every_family;
+    use numerics::uniform;
 
     fn numbers(seed: u64, len: usize) -> Vec<f32> {
         (0..len).map(|i| 2.0 * uniform(seed, 0, i as u64) - 1.0).collect()

@@ -3,7 +3,7 @@
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use rayon::prelude::*;
 
 use crate::math::floor;
@@ -201,6 +201,8 @@ pub struct Occupancy {
     density: CellDensities,
     /// Mask of the cells that may become occupied; `None` for all.
     allowed: Option<Vec<bool>>,
+    /// True if the occupied cells are known from another field.
+    is_known: bool,
     /// One word per brick: bits of the cells that aren't empty.
     bricks: Vec<u64>,
     /// One word per block: bits of the bricks that aren't empty.
@@ -217,6 +219,7 @@ impl Occupancy {
         let mut full = Self {
             density: CellDensities::new(vec![UNKNOWN_DENSITY; CELLS]),
             allowed: None,
+            is_known: false,
             bricks: Vec::new(),
             blocks: Vec::new(),
             dense: Vec::new(),
@@ -234,6 +237,7 @@ impl Occupancy {
             .map(|cell| cell_and_neighbours(cell).any(|near| self.is_occupied(near)))
             .collect();
         self.limit_to(mask);
+        self.is_known = true;
     }
 
     /// Limits occupancy to a mask of cells, within earlier limits; all cells left become dense.
@@ -280,11 +284,7 @@ impl Occupancy {
     /// Returns the strides of a training step: double until every cell has been evaluated, unless
     /// the training is limited to cells known from another field.
     pub fn strides(&self, step: u64) -> Strides {
-        if step < FIRST_KNOWN_STEP && self.allowed.is_none() {
-            Strides::Double
-        } else {
-            Strides::ByCell
-        }
+        if step < FIRST_KNOWN_STEP && !self.is_known { Strides::Double } else { Strides::ByCell }
     }
 
     /// Draws the position in a cell, in the unit cube, at which its density is evaluated.

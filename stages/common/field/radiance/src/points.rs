@@ -7,11 +7,11 @@ use crate::math::spherical_harmonics;
 use crate::occupancy::cell_at;
 use crate::samples::DensityRows;
 use crate::shading::view_network;
-use crate::simd::LANES;
 use crate::spec::{
     DENSITY_OUTPUTS, MAX_RAW_DENSITY, OCCUPANCY_CELLS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES,
     VIEW_INPUTS,
 };
+use numerics::simd::LANES;
 
 /// Density and colour of a field at a point.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -361,7 +361,7 @@ mod tests {
             for (shift, tolerance) in [(utm, 1e-6), (ecef, 1e-6), (DVec3::splat(1024.0), 1e-7)] {
                 let there = here.moved(shift);
                 for k in 0..200 {
-                    let mut rng = counter_rng::CounterRng::new(5, 1, k);
+                    let mut rng = numerics::CounterRng::new(5, 1, k);
                     let mut draw = || f64::from(rng.uniform()) - 0.5;
                     let direction =
                         (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
@@ -410,7 +410,7 @@ mod tests {
             let bounds = |space| Bounds { min: [-scale; 3], max: [scale; 3], near, far, space };
             let mut met = [0; 2];
             for k in 0..200 {
-                let mut rng = counter_rng::CounterRng::new(5, 0, k);
+                let mut rng = numerics::CounterRng::new(5, 0, k);
                 let mut draw = || f64::from(rng.uniform()) - 0.5;
                 let from = centre + scale * DVec3::new(draw(), draw(), draw());
                 let direction =
@@ -459,7 +459,7 @@ mod tests {
             |a: [f32; 3], b: [f32; 3]| (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt();
         let mut most_bent: f32 = 0.0;
         for k in 0..300 {
-            let mut rng = counter_rng::CounterRng::new(6, 0, k);
+            let mut rng = numerics::CounterRng::new(6, 0, k);
             let mut draw = || 2.0 * f64::from(rng.uniform()) - 1.0;
             let far = [0.5, 3.0, 40.0, 0.0][k as usize % 4];
             let origin = [far * draw(), far * draw(), far * draw()];

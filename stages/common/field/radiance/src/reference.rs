@@ -1,6 +1,6 @@
 //! Plain f64 implementation of the field, for tests of the fused f32 passes.
 
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use scene::Bounds;
 
 use crate::architecture::Architecture;
@@ -419,7 +419,7 @@ fn outcome(field: &Field, rays: &[Ray]) -> Vec<u32> {
 
 #[test]
 fn every_family_renders_and_trains_to_equal_bits() {
-    use crate::simd::by_every_family;
+    use numerics::simd::by_every_family;
     let (field, rays) = example();
     let best = outcome(&field, &rays);
     by_every_family(|family| {

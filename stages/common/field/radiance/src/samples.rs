@@ -8,12 +8,12 @@ use crate::march::{DONE, March, MarchedSamples, march};
 use crate::math::exp;
 use crate::mlp::{After, multiply};
 use crate::occupancy::CellHit;
-use crate::simd::LANES;
 use crate::spec::Strides;
 use crate::spec::{
     DENSITY_OUTPUTS, FEATURES, MAX_OPTICAL_DEPTH, MAX_RAW_DENSITY, MIN_HIT_WEIGHT,
     MIN_TRANSMITTANCE, MIN_WEIGHT, TRAINING_ROUND_SAMPLES,
 };
+use numerics::simd::LANES;
 
 /// Sums over one ray's samples.
 #[derive(Clone, Copy, Debug, Default)]

@@ -12,8 +12,9 @@ use crate::mlp::{After, Layer, add_outer, multiply};
 use crate::ray::NormalizedRay;
 use crate::regularisers::{LossGradients, Regularisers, ShadedRay};
 use crate::samples::{Counted, RaySum, Samples};
-use crate::simd::{LANES, kernel};
 use crate::spec::{DENSITY_OUTPUTS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES, VIEW_INPUTS};
+use numerics::kernel;
+use numerics::simd::LANES;
 
 /// Buffers of the view network, one column per ray with samples, and of the samples' colours.
 #[derive(Debug, Default)]

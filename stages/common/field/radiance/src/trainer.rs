@@ -14,9 +14,9 @@ use crate::field::Field;
 use crate::grid::LevelGradients;
 use crate::occupancy::Occupancy;
 use crate::samples::DensityRows;
-use crate::simd::LANES;
 use crate::spec::{BRICK, FEATURES};
 use crate::training_state::TrainingState;
+use numerics::simd::LANES;
 
 pub use options::{RenderedBundles, Supervisor, TrainingOptions};
 pub use phases::{Phase, PhaseClock, PhaseTimes};
@@ -417,10 +417,10 @@ mod tests {
     use crate::architecture::Architecture;
     use crate::ray::Ray;
     use crate::regularisers::Regularisers;
-    use counter_rng::CounterRng;
+    use numerics::CounterRng;
     use scene::{Bounds, Space};
 
-    use crate::simd::by_every_family;
+    use numerics::simd::by_every_family;
 
     /// Rays through the cube, before black or white, that should all be white.
     struct White {

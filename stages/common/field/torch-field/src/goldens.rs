@@ -1,7 +1,7 @@
 //! Against PyTorch: `tests/goldens/mlp.safetensors` is made by `scripts/goldens/torch_field.py`
 //! (`make goldens`).
 
-use counter_rng::uniform;
+use numerics::uniform;
 use safetensors::SafeTensors;
 use scene::Bounds;
 use tch::{Device, Kind, Tensor};

@@ -506,7 +506,7 @@ impl RayField for TorchGrid {
 
 #[cfg(test)]
 mod tests {
-    use counter_rng::CounterRng;
+    use numerics::CounterRng;
     use radiance::Passes;
 
     use super::*;

@@ -354,7 +354,7 @@ fn lazy_adam(
 
 #[cfg(test)]
 mod tests {
-    use counter_rng::CounterRng;
+    use numerics::CounterRng;
     use radiance::{Architecture, Ray, RenderedBundles, Trainer};
     use scene::{Bounds, Frustum, Space};
 

@@ -1,8 +1,8 @@
 use std::ops::Range;
 use std::path::Path;
 
-use counter_rng::CounterRng;
 use glam::DVec3;
+use numerics::CounterRng;
 use radiance::spec::MIN_TOTAL_WEIGHT;
 use radiance::{Pixel, Ray, RayField, RenderError};
 use rayon::prelude::*;

@@ -1,6 +1,6 @@
 use std::sync::LazyLock;
 
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::architecture::MlpArchitecture;

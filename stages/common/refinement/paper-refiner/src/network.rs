@@ -1,7 +1,7 @@
 use std::path::Path;
 
-use counter_rng::CounterRng;
 use nets::Weights;
+use numerics::CounterRng;
 use refinement::RefinementError;
 use tch::{TchError, Tensor};
 

@@ -1,4 +1,4 @@
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use pixels::Image;
 
 /// Random perspective warp, like torchvision's: every corner of an image moves inwards by at most a

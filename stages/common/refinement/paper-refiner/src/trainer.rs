@@ -1,7 +1,7 @@
 use std::path::Path;
 
-use counter_rng::CounterRng;
 use nets::Adam;
+use numerics::CounterRng;
 use pixels::Image;
 use refinement::{KnownView, RefinementError, Training};
 use tch::{Kind, TchError, Tensor};

@@ -1,5 +1,4 @@
 use pixels::Image;
-use tch::{TchError, Tensor};
 
 /// Pixels along each side of a fold. The network takes 2×2 pixels as one with four times as many
 /// channels (space-to-depth), which widens its receptive field at equal cost (design note 015).
@@ -58,15 +57,15 @@ impl Window {
         }
     }
 
-    /// Converts folded samples of windows of this size to a tensor: windows × 4·`channels` × rows
-    /// of folds × columns of folds. Channels are last in memory, the fastest layout for
-    /// convolutions.
-    pub(crate) fn tensor(self, samples: &[f32], channels: usize) -> Result<Tensor, TchError> {
-        let (width, height, depth) =
-            (self.size.0 / FOLD, self.size.1 / FOLD, channels * FOLD * FOLD);
-        let count = samples.len() / (width * height * depth);
-        let shape = [count, height, width, depth].map(|d| d as i64);
-        Tensor::f_from_slice(samples)?.f_reshape(shape)?.f_permute([0, 3, 1, 2])
+    /// Returns the number of folds along each axis.
+    pub(crate) fn folds(self) -> (usize, usize) {
+        (self.size.0 / FOLD, self.size.1 / FOLD)
+    }
+
+    /// Returns whether all pixels have opacity 0, the fourth channel.
+    pub(crate) fn is_transparent(self, image: &Image) -> bool {
+        let (width, height) = self.size;
+        (0..height).all(|y| (0..width).all(|x| self.pixel(image, x, y)[3] == 0.0))
     }
 }
 
@@ -110,12 +109,6 @@ impl Orientation {
     }
 }
 
-/// Returns a tensor's folded samples, as [`Window::unfold`] takes them.
-pub(crate) fn folded_samples(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
-    let flat = tensor.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
-    Vec::<f32>::try_from(&flat)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -126,10 +119,8 @@ mod tests {
         let window = Window { x: -2, y: 1, size: (6, 4) };
         let mut folded = Vec::new();
         window.fold(|x, y| folded.extend_from_slice(window.pixel(&image, x, y)));
-        let again = folded_samples(&window.tensor(&folded, 3).unwrap()).unwrap();
-        assert_eq!(again, folded);
         let mut count = 0;
-        window.unfold(&again, 3, |x, y, pixel| {
+        window.unfold(&folded, 3, |x, y, pixel| {
             let (column, row) = ((x as isize - 2).clamp(0, 6) as usize, (y + 1).min(4));
             assert_eq!(pixel, &image.data[(row * 7 + column) * 3..][..3]);
             count += 1;

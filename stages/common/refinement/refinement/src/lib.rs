@@ -20,8 +20,8 @@
 //!
 //! Colours are display-encoded sRGB, composited on the background.
 //!
-//! Each tile and each shard of a step runs through libtorch in one thread, and gradients are added
-//! in order, so bytes don't depend on the number of threads.
+//! Convolutions are Winograd's, on kernels of sixteen lanes. Gradients of shards are added in order,
+//! so bytes don't depend on the number of threads.
 //!
 //! ```
 //! use pixels::Image;
@@ -36,8 +36,10 @@
 
 mod align;
 mod consistency;
+mod convolution;
 mod error;
 mod folded;
+mod network;
 mod refiner;
 mod sums;
 mod trainer;

@@ -1,14 +1,16 @@
 use std::path::Path;
 
-use counter_rng::CounterRng;
+use numerics::CounterRng;
 use pixels::Image;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use tch::{TchError, Tensor, no_grad};
+use tch::{TchError, Tensor};
 
+use crate::convolution::Convolution;
 use crate::error::RefinementError;
-use crate::folded::{FOLD, Orientation, Window, folded_samples};
+use crate::folded::{FOLD, Orientation, Window};
+use crate::network::{Layers, Pass};
 use crate::view::{INPUTS, OUTPUTS, REFERENCE_INPUTS};
 use crate::warped_reference::WarpOptions;
 
@@ -28,6 +30,11 @@ impl RefinerArchitecture {
     /// Returns the number of input channels.
     pub(crate) fn input_channels(self) -> usize {
         if self.guidance.is_some() { REFERENCE_INPUTS } else { INPUTS }
+    }
+
+    /// Returns the radius of the receptive field in folds.
+    pub(crate) fn receptive_radius(self) -> usize {
+        2 * self.blocks as usize + 2
     }
 }
 
@@ -157,35 +164,13 @@ impl Refiner {
         self.parameters.iter().map(Tensor::shallow_clone)
     }
 
-    /// Returns another handle to the same parameters, for another thread.
-    pub(crate) fn shallow_clone(&self) -> Self {
-        Self { architecture: self.architecture, parameters: self.parameters().collect() }
-    }
-
-    /// Returns the radius of the receptive field in folds.
-    pub(crate) fn receptive_radius(&self) -> usize {
-        2 * self.architecture.blocks as usize + 2
-    }
-
-    /// Predicts the residuals of windows from their pixels and those around, up to
-    /// [`Refiner::receptive_radius`].
-    pub(crate) fn forward(&self, input: &Tensor) -> Result<Tensor, TchError> {
-        let mut x = self.layer(input, 0)?;
-        for block in 0..self.architecture.blocks as usize {
-            let inner = self.layer(&x, 1 + 2 * block)?.f_relu()?;
-            let [_, _, height, width] = x.size()[..] else {
-                unreachable!("a convolution's output has four dimensions")
-            };
-            let middle = x.f_narrow(2, 2, height - 4)?.f_narrow(3, 2, width - 4)?;
-            x = middle.f_add(&self.layer(&inner, 2 + 2 * block)?)?;
-        }
-        self.layer(&x, 1 + 2 * self.architecture.blocks as usize)
-    }
-
-    /// Applies the layer with this index.
-    fn layer(&self, x: &Tensor, i: usize) -> Result<Tensor, TchError> {
-        let kernel = self.parameters[2 * i].f_permute([0, 3, 1, 2])?;
-        x.f_conv2d(&kernel, Some(&self.parameters[2 * i + 1]), 1, 0, 1, 1)
+    /// Returns the layers, transformed for convolution.
+    pub(crate) fn layers(&self) -> Result<Layers, TchError> {
+        let parameters =
+            self.parameters.iter().map(|p| Vec::<f32>::try_from(&p.f_detach()?.f_view([-1])?));
+        let parameters = parameters.collect::<Result<Vec<_>, _>>()?;
+        let layers = parameters.par_chunks_exact(2);
+        Ok(Layers(layers.map(|layer| Convolution::new(&layer[0], &layer[1])).collect()))
     }
 
     /// Adds `residual_weight` times the network's residual to a view, and clamps colours to 0..1. A
@@ -198,27 +183,28 @@ impl Refiner {
         residual_weight: f32,
         orientations: u32,
     ) -> Result<Image, RefinementError> {
-        let inputs = self.architecture.input_channels();
+        let architecture = self.architecture;
+        let inputs = architecture.input_channels();
         if view.channels != inputs {
             return Err(RefinementError::Channels { channels: view.channels, expected: inputs });
         }
         let count = (orientations as usize).clamp(1, Orientation::ALL.len());
         let orientations = &Orientation::ALL[..count];
         let (width, height) = (view.width, view.height);
-        let tiles: Vec<(usize, usize, Self)> = (0..height)
+        let tiles: Vec<(usize, usize)> = (0..height)
             .step_by(TILE_SIDE)
             .flat_map(|y| (0..width).step_by(TILE_SIDE).map(move |x| (x, y)))
-            .map(|(x, y)| (x, y, self.shallow_clone()))
             .collect();
+        let layers = self.layers()?;
         let residuals: Vec<(Window, Vec<f32>)> = tiles
             .into_par_iter()
-            .map(|(x, y, refiner)| -> Result<_, TchError> {
+            .map_init(Pass::default, |pass, (x, y)| {
                 let size = [width - x, height - y]
                     .map(|remaining| remaining.min(TILE_SIDE).next_multiple_of(FOLD));
                 let window = Window { x: x as isize, y: y as isize, size: size.into() };
-                Ok((window, refiner.residual(view, window, orientations)?))
+                (window, predict_residual(architecture, &layers, pass, view, window, orientations))
             })
-            .collect::<Result<_, _>>()?;
+            .collect();
         let mut data = vec![0.0; width * height * OUTPUTS];
         for (window, residual) in &residuals {
             for (i, residual) in residual.chunks_exact(OUTPUTS).enumerate() {
@@ -236,49 +222,55 @@ impl Refiner {
         Ok(Image::new(width, height, OUTPUTS, data))
     }
 
-    /// Predicts the residual in a window of a view, the mean over orientations: row by row,
-    /// channels interleaved.
-    fn residual(
-        &self,
-        view: &Image,
-        window: Window,
-        orientations: &[Orientation],
-    ) -> Result<Vec<f32>, TchError> {
-        let around = window.grown(self.receptive_radius());
-        let inputs = self.architecture.input_channels();
-        let mut sum = vec![0.0; window.size.0 * window.size.1 * OUTPUTS];
-        let mut input = Vec::with_capacity(around.size.0 * around.size.1 * inputs);
-        for orientation in orientations {
-            input.clear();
-            let oriented = orientation.oriented(around);
-            oriented.fold(|x, y| {
-                let (x, y) = orientation.source(around, x, y);
-                input.extend_from_slice(around.pixel(view, x, y));
-            });
-            let output = no_grad(|| self.forward(&oriented.tensor(&input, inputs)?))?;
-            let residual = folded_samples(&output)?;
-            orientation.oriented(window).unfold(&residual, OUTPUTS, |x, y, residual| {
-                let (x, y) = orientation.source(window, x, y);
-                let start = (y * window.size.0 + x) * OUTPUTS;
-                for c in 0..OUTPUTS {
-                    sum[start + c] += residual[c];
-                }
-            });
-        }
-        for value in &mut sum {
-            *value /= orientations.len() as f32;
-        }
-        Ok(sum)
-    }
-
     /// Adds the network's full residual to a view, without self-ensemble.
     pub fn refine(&self, view: &Image) -> Result<Image, RefinementError> {
         self.refine_weighted(view, 1.0, 1)
     }
 }
 
+/// Predicts the residual in a window of a view, the mean over orientations: row by row,
+/// channels interleaved. It is 0 where the view is transparent as far as the network sees.
+fn predict_residual(
+    architecture: RefinerArchitecture,
+    layers: &Layers,
+    pass: &mut Pass,
+    view: &Image,
+    window: Window,
+    orientations: &[Orientation],
+) -> Vec<f32> {
+    let around = window.grown(architecture.receptive_radius());
+    let inputs = architecture.input_channels();
+    let mut sum = vec![0.0; window.size.0 * window.size.1 * OUTPUTS];
+    if inputs == INPUTS && around.is_transparent(view) {
+        return sum;
+    }
+    let mut residual = Vec::new();
+    let mut input = Vec::with_capacity(around.size.0 * around.size.1 * inputs);
+    for orientation in orientations {
+        input.clear();
+        let oriented = orientation.oriented(around);
+        oriented.fold(|x, y| {
+            let (x, y) = orientation.source(around, x, y);
+            input.extend_from_slice(around.pixel(view, x, y));
+        });
+        let output = pass.forward(layers, oriented.folds(), &input);
+        output.copy_samples(OUTPUTS * FOLD * FOLD, &mut residual);
+        orientation.oriented(window).unfold(&residual, OUTPUTS, |x, y, residual| {
+            let (x, y) = orientation.source(window, x, y);
+            let start = (y * window.size.0 + x) * OUTPUTS;
+            for c in 0..OUTPUTS {
+                sum[start + c] += residual[c];
+            }
+        });
+    }
+    for value in &mut sum {
+        *value /= orientations.len() as f32;
+    }
+    sum
+}
+
 /// Returns name, inputs and outputs of each layer.
-fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
+pub(crate) fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
     let width = architecture.channels as usize;
     let blocks = (0..architecture.blocks).flat_map(|i| {
         [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]
@@ -289,7 +281,7 @@ fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
 }
 
 /// Returns the shape of a layer's kernel: outputs × rows × columns × inputs.
-fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
+pub(crate) fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
     [outputs as i64, 3, 3, inputs as i64]
 }
 
@@ -343,13 +335,13 @@ mod tests {
                 y: 0,
                 size: (width.next_multiple_of(FOLD), height.next_multiple_of(FOLD)),
             };
-            let around = window.grown(refiner.receptive_radius());
+            let around = window.grown(refiner.architecture.receptive_radius());
             let mut input = Vec::new();
             around.fold(|x, y| input.extend_from_slice(around.pixel(&view, x, y)));
-            let added = folded_samples(
-                &no_grad(|| refiner.forward(&around.tensor(&input, INPUTS).unwrap())).unwrap(),
-            )
-            .unwrap();
+            let mut pass = Pass::default();
+            let output = pass.forward(&refiner.layers().unwrap(), around.folds(), &input);
+            let mut added = Vec::new();
+            output.copy_samples(OUTPUTS * FOLD * FOLD, &mut added);
             let refined = refiner.refine(&view).unwrap();
             window.unfold(&added, OUTPUTS, |x, y, added| {
                 if x < width && y < height {
@@ -368,7 +360,10 @@ mod tests {
     }
 
     fn added_to(refiner: &Refiner, view: &Image) -> Vec<f32> {
-        refiner.residual(view, Window { x: 4, y: 4, size: (8, 8) }, &Orientation::ALL[..1]).unwrap()
+        let window = Window { x: 4, y: 4, size: (8, 8) };
+        let layers = refiner.layers().unwrap();
+        let (architecture, mut pass) = (refiner.architecture, Pass::default());
+        predict_residual(architecture, &layers, &mut pass, view, window, &Orientation::ALL[..1])
     }
 
     /// Training on few images pushes features below 0 everywhere. The residual must still depend

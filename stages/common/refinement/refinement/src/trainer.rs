@@ -1,15 +1,16 @@
 use std::ops::Range;
 use std::path::Path;
 
-use counter_rng::CounterRng;
 use nets::Adam;
+use numerics::CounterRng;
 use pixels::{Image, psnr_of};
 use rayon::prelude::*;
-use tch::{Kind, TchError, Tensor};
+use tch::{TchError, Tensor};
 
 use crate::error::RefinementError;
 use crate::folded::{FOLD, Orientation, Window};
-use crate::refiner::Refiner;
+use crate::network::{Layers, Pass};
+use crate::refiner::{Refiner, RefinerArchitecture, kernel_shape, layers};
 use crate::view::{KnownView, OUTPUTS, REFERENCE_INPUTS};
 use crate::warped_reference::{ReferenceStatistics, WarpOptions, with_references};
 
@@ -55,6 +56,7 @@ pub struct RefinerTrainer {
     adam: Adam,
     /// Current training views of a reference-based network.
     pool: Option<Pool>,
+    shards: Vec<Shard>,
 }
 
 /// Random examples with random references. References are warped once for all patches of a view,
@@ -138,7 +140,8 @@ impl RefinerTrainer {
     /// Creates a trainer of `refiner`.
     pub fn new(refiner: Refiner, options: RefinerTraining) -> Result<Self, RefinementError> {
         let adam = Adam::new(refiner.parameters())?;
-        Ok(Self { refiner, options, adam, pool: None })
+        let shards = (0..SHARDS).map(|_| Shard::default()).collect();
+        Ok(Self { refiner, options, adam, pool: None, shards })
     }
 
     /// Returns the refiner in its current state.
@@ -251,25 +254,18 @@ impl Training for RefinerTrainer {
         if step >= steps {
             return Ok(None);
         }
-        let shards: Vec<(Refiner, Range<usize>)> = (0..SHARDS)
-            .map(|i| {
-                let range = batch_size * i / SHARDS..batch_size * (i + 1) / SHARDS;
-                (self.refiner.shallow_clone(), range)
-            })
-            .collect();
         self.update_pool(examples);
+        let mut shards = std::mem::take(&mut self.shards);
         let views = self.views(examples);
-        let parts: Vec<(f64, Vec<Tensor>)> = shards
-            .into_par_iter()
-            .filter(|(_, range)| !range.is_empty())
-            .map(|(refiner, range)| run_shard(&refiner, &options, step, range, &views))
-            .collect::<Result<_, _>>()?;
-        let loss: f64 = parts.iter().map(|(loss, _)| loss).sum();
-        let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
-        let mut gradients = parts.next().unwrap_or_default();
-        for part in parts {
-            nets::add_gradients(&mut gradients, &part)?;
-        }
+        let layers = self.refiner.layers()?;
+        let architecture = self.refiner.architecture();
+        shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
+            let range = batch_size * i / SHARDS..batch_size * (i + 1) / SHARDS;
+            shard.run(architecture, &layers, &options, step, range, &views);
+        });
+        let loss: f64 = shards.iter().map(|shard| shard.loss).sum();
+        let gradients = merge_gradients(&mut shards, architecture)?;
+        self.shards = shards;
         if !loss.is_finite() || !nets::all_finite(&gradients)? {
             return Err(RefinementError::NotFinite { step });
         }
@@ -289,33 +285,86 @@ impl Training for RefinerTrainer {
     }
 }
 
-/// Computes loss and gradients of a range of a step's patches.
-fn run_shard(
-    refiner: &Refiner,
-    options: &RefinerTraining,
-    step: u64,
-    range: Range<usize>,
-    views: &[TrainingView<'_>],
-) -> Result<(f64, Vec<Tensor>), TchError> {
-    let (mut inputs, mut residuals) = (Vec::new(), Vec::new());
-    let square = Window { x: 0, y: 0, size: (options.patch_size, options.patch_size) };
-    let around = square.grown(refiner.receptive_radius());
-    for i in range {
-        let number = step * options.batch_size as u64 + i as u64;
-        let patch = TrainingPatch::draw(options, number, views);
-        patch.append(refiner, &mut inputs, &mut residuals);
+/// Memory and results of a range of a step's patches.
+#[derive(Debug, Default)]
+struct Shard {
+    pass: Pass,
+    /// Network's input for a patch.
+    input: Vec<f32>,
+    /// True residual of a patch, then the slope of the loss.
+    residual: Vec<f32>,
+    /// Predicted residual.
+    predicted: Vec<f32>,
+    /// Sum of the patches' losses.
+    loss: f64,
+}
+
+impl Shard {
+    /// Computes loss and gradients of a range of a step's patches.
+    fn run(
+        &mut self,
+        architecture: RefinerArchitecture,
+        layers: &Layers,
+        options: &RefinerTraining,
+        step: u64,
+        range: Range<usize>,
+        views: &[TrainingView<'_>],
+    ) {
+        let Self { pass, input, residual, predicted, loss } = self;
+        let square = Window { x: 0, y: 0, size: (options.patch_size, options.patch_size) };
+        let around = square.grown(architecture.receptive_radius());
+        let samples = (options.batch_size * residual_samples(options)) as f64;
+        pass.reset(layers);
+        *loss = 0.0;
+        for i in range {
+            let number = step * options.batch_size as u64 + i as u64;
+            let patch = TrainingPatch::draw(options, number, views);
+            input.clear();
+            residual.clear();
+            patch.append(architecture, input, residual);
+            let output = pass.forward(layers, around.folds(), input);
+            output.copy_samples(OUTPUTS * FOLD * FOLD, predicted);
+            let mut squares = 0.0;
+            for (truth, predicted) in residual.iter_mut().zip(predicted.iter()) {
+                let error = predicted - *truth;
+                squares += f64::from(error).powi(2);
+                // The loss's slope replaces the true residual.
+                *truth = 2.0 * error / samples as f32;
+            }
+            *loss += squares / samples;
+            pass.backward(layers, residual);
+        }
     }
-    let input = around.tensor(&inputs, refiner.architecture().input_channels())?;
-    let samples = (options.batch_size * options.patch_size * options.patch_size * OUTPUTS) as f64;
-    let loss = refiner
-        .forward(&input)?
-        .f_sub(&square.tensor(&residuals, OUTPUTS)?)?
-        .f_square()?
-        .f_sum(None::<Kind>)?
-        .f_div_scalar(samples)?;
-    let parameters: Vec<Tensor> = refiner.parameters().collect();
-    let gradients = Tensor::f_run_backward(&[&loss], &parameters, false, false)?;
-    Ok((loss.f_double_value(&[])?, gradients))
+}
+
+/// Returns the number of samples of a patch's residual.
+fn residual_samples(options: &RefinerTraining) -> usize {
+    options.patch_size * options.patch_size * OUTPUTS
+}
+
+/// Adds the shards' gradients in order, and returns those of the parameters.
+fn merge_gradients(
+    shards: &mut [Shard],
+    architecture: RefinerArchitecture,
+) -> Result<Vec<Tensor>, TchError> {
+    let [first, others @ ..] = shards else { return Ok(Vec::new()) };
+    let layers = layers(architecture);
+    let sums = first.pass.gradients.par_iter_mut().enumerate();
+    let gradients: Vec<(Vec<f32>, Vec<f32>)> = sums
+        .map(|(i, sum)| {
+            for other in &*others {
+                sum.add(&other.pass.gradients[i]);
+            }
+            let (_, inputs, outputs) = layers[i];
+            (sum.kernels(inputs, outputs), sum.bias(outputs).to_vec())
+        })
+        .collect();
+    let mut tensors = Vec::with_capacity(2 * layers.len());
+    for ((kernels, bias), (_, inputs, outputs)) in gradients.iter().zip(&layers) {
+        tensors.push(Tensor::f_from_slice(kernels)?.f_reshape(kernel_shape(*inputs, *outputs))?);
+        tensors.push(Tensor::f_from_slice(bias)?);
+    }
+    Ok(tensors)
 }
 
 /// Input view of the network with its ground truth.
@@ -363,9 +412,14 @@ impl<'a> TrainingPatch<'a> {
 
     /// Appends the network's input, which includes the receptive field around the patch, and the
     /// true residual.
-    fn append(&self, refiner: &Refiner, inputs: &mut Vec<f32>, residuals: &mut Vec<f32>) {
+    fn append(
+        &self,
+        architecture: RefinerArchitecture,
+        inputs: &mut Vec<f32>,
+        residuals: &mut Vec<f32>,
+    ) {
         let TrainingView { view, truth } = self.view;
-        let around = self.square.grown(refiner.receptive_radius());
+        let around = self.square.grown(architecture.receptive_radius());
         around.fold(|x, y| {
             let (x, y) = self.orientation.source(around, x, y);
             let pixel = around.pixel(view, x, y);
@@ -409,11 +463,14 @@ fn draw_start(size: usize, side: usize, rng: &mut CounterRng) -> isize {
 
 /// Returns the range of the green channel in a square of the ground truth.
 fn contrast(truth: &Image, square: Window) -> f32 {
+    let (left, top) = (square.x as usize, square.y as usize);
+    let (width, height) = square.size;
     let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
-    square.fold(|x, y| {
-        let green = square.pixel(truth, x, y)[1];
-        (low, high) = (low.min(green), high.max(green));
-    });
+    for row in truth.data.chunks_exact(truth.width * truth.channels).skip(top).take(height) {
+        for pixel in row.chunks_exact(truth.channels).skip(left).take(width) {
+            (low, high) = (low.min(pixel[1]), high.max(pixel[1]));
+        }
+    }
     high - low
 }
 

@@ -148,7 +148,7 @@ impl KnownView {
 
 #[cfg(test)]
 mod tests {
-    use counter_rng::CounterRng;
+    use numerics::CounterRng;
     use scene::Intrinsics;
 
     use super::*;
@@ -173,7 +173,7 @@ mod tests {
         let (mut view, mut truth) = (Vec::new(), Vec::new());
         for i in 0..width * height {
             let patch = (i % width / 12 + i / width / 12 * 8) as u64;
-            let colour = [0, 1, 2].map(|c| 0.2 + 0.5 * counter_rng::uniform(5, c, patch));
+            let colour = [0, 1, 2].map(|c| 0.2 + 0.5 * numerics::uniform(5, c, patch));
             view.extend(colour);
             view.push(1.0);
             truth.extend(

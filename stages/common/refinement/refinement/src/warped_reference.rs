@@ -298,7 +298,7 @@ fn fill_band(
 
 #[cfg(test)]
 mod tests {
-    use counter_rng::uniform;
+    use numerics::uniform;
     use scene::{Camera, Intrinsics};
 
     use super::*;

@@ -5,8 +5,8 @@ use crate::occupancy::Occupancy;
 use crate::ray::{
     MAX_ACCELERATION, MAX_SPEED, NormalizedRay, RayMap, contracted_position, contracted_velocity,
 };
-use crate::simd::LANES;
 use crate::spec::OCCUPANCY_CELLS as GRID;
+use numerics::simd::LANES;
 
 /// Rays through the contraction.
 pub(super) struct Curved;

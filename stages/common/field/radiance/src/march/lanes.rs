@@ -5,7 +5,7 @@ use super::marched::{DONE, March, MarchedSamples};
 use crate::math::floor;
 use crate::occupancy::{OCCUPIED, Occupancy, cell_along};
 use crate::ray::NormalizedRay;
-use crate::simd::LANES;
+use numerics::simd::LANES;
 
 /// Paths of straight or curved rays through the unit cube, for all lanes at once.
 pub(super) trait RayKind {

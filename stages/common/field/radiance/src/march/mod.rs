@@ -8,7 +8,7 @@ mod straight;
 mod tests;
 
 use crate::ray::RayMap;
-use crate::simd::kernel;
+use numerics::kernel;
 
 use curved::Curved;
 pub(crate) use marched::{DONE, March, MarchedSamples};

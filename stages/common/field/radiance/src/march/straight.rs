@@ -3,8 +3,8 @@
 use super::lanes::{LanePositions, LaneRays, RayKind};
 use crate::occupancy::Occupancy;
 use crate::ray::NormalizedRay;
-use crate::simd::LANES;
 use crate::spec::OCCUPANCY_CELLS as GRID;
+use numerics::simd::LANES;
 
 /// Rays through a box or a frustum.
 pub(super) struct Straight;

@@ -1,4 +1,4 @@
-use counter_rng::uniform;
+use numerics::uniform;
 
 use crate::chunk::Roulette;
 use crate::ray::Ray;

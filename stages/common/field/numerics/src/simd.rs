@@ -6,7 +6,7 @@
 use std::sync::atomic::{AtomicU8, Ordering};
 
 /// Number of logical lanes of every kernel.
-pub(crate) const LANES: usize = 16;
+pub const LANES: usize = 16;
 
 /// SIMD family of machine code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,7 +24,7 @@ static CHOSEN: AtomicU8 = AtomicU8::new(0);
 
 impl Family {
     /// Returns the family set with [`set_family`], by default the best that the machine supports.
-    pub(crate) fn current() -> Self {
+    pub fn current() -> Self {
         match CHOSEN.load(Ordering::Relaxed) {
             1 => Self::Avx512,
             2 => Self::Avx2,
@@ -75,8 +75,7 @@ pub fn set_family(family: Family) {
 }
 
 /// Runs a test with every family that the machine supports, and prints the others.
-#[cfg(test)]
-pub(crate) fn by_every_family(mut test: impl FnMut(Family)) {
+pub fn by_every_family(mut test: impl FnMut(Family)) {
     // Tests run in parallel, and the family is global.
     static ALONE_HERE: std::sync::Mutex<()> = std::sync::Mutex::new(());
     let _alone = ALONE_HERE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
@@ -94,9 +93,12 @@ pub(crate) fn by_every_family(mut test: impl FnMut(Family)) {
 }
 
 /// Four `f32`: the features of a vertex.
-pub(crate) trait Quad: Copy {
+pub trait Quad: Copy {
+    /// Returns a number in all lanes.
     fn splat(value: f32) -> Self;
+    /// Reads four numbers.
     fn load(from: &[f32; 4]) -> Self;
+    /// Writes four numbers.
     fn store(self, to: &mut [f32; 4]);
     /// Returns self · factor + addend, rounded once.
     fn mul_add(self, factor: Self, addend: Self) -> Self;
@@ -122,13 +124,16 @@ impl Quad for [f32; 4] {
 }
 
 /// Sixteen `f32`.
-pub(crate) trait Lanes: Copy {
+pub trait Lanes: Copy {
     /// Four `f32` of the same family.
     type Quad: Quad;
     /// True if 24 values fit into registers at once.
     const WIDE: bool;
+    /// Returns a number in all lanes.
     fn splat(value: f32) -> Self;
+    /// Reads sixteen numbers.
     fn load(from: &[f32; LANES]) -> Self;
+    /// Writes sixteen numbers.
     fn store(self, to: &mut [f32; LANES]);
     /// Returns self · factor + addend, rounded once.
     fn mul_add(self, factor: Self, addend: Self) -> Self;
@@ -142,8 +147,9 @@ pub(crate) trait Lanes: Copy {
     fn prefetch(_soon: &[f32]) {}
 }
 
-#[derive(Clone, Copy)]
-pub(crate) struct Portable([f32; LANES]);
+/// Sixteen floats for the compilation target.
+#[derive(Clone, Copy, Debug)]
+pub struct Portable([f32; LANES]);
 
 impl Lanes for Portable {
     type Quad = [f32; 4];
@@ -188,8 +194,8 @@ impl Lanes for Portable {
 }
 
 #[cfg(target_arch = "x86_64")]
-pub(crate) mod x86 {
-    //! Intrinsics fix the vector width: with auto-vectorisation the accumulators of a matrix tile
+pub mod x86 {
+    //! Lanes in registers of x86-64. Intrinsics fix the vector width: with auto-vectorisation the accumulators of a matrix tile
     //! spill. The `unsafe` is sound because these types are only used in functions compiled for
     //! their features (see `kernel!`). There are no closures: a closure wouldn't inherit the
     //! features, and its intrinsics would be calls.
@@ -198,8 +204,9 @@ pub(crate) mod x86 {
 
     use super::{LANES, Lanes, Quad};
 
-    #[derive(Clone, Copy)]
-    pub(crate) struct Four(__m128);
+    /// Four floats.
+    #[derive(Clone, Copy, Debug)]
+    pub struct Four(__m128);
 
     impl Quad for Four {
         #[inline(always)]
@@ -247,8 +254,9 @@ pub(crate) mod x86 {
         }
     }
 
-    #[derive(Clone, Copy)]
-    pub(crate) struct Avx512(__m512);
+    /// Sixteen floats in one register.
+    #[derive(Clone, Copy, Debug)]
+    pub struct Avx512(__m512);
 
     impl Lanes for Avx512 {
         type Quad = Four;
@@ -307,8 +315,9 @@ pub(crate) mod x86 {
         }
     }
 
-    #[derive(Clone, Copy)]
-    pub(crate) struct Avx2([__m256; 2]);
+    /// Sixteen floats in two registers.
+    #[derive(Clone, Copy, Debug)]
+    pub struct Avx2([__m256; 2]);
 
     impl Lanes for Avx2 {
         type Quad = Four;
@@ -384,6 +393,7 @@ pub(crate) mod x86 {
 
 /// Defines a kernel: one body, generic over `L: Lanes`, compiled for every family. The family is
 /// chosen at run time.
+#[macro_export]
 macro_rules! kernel {
     (
         $(#[$meta:meta])*
@@ -415,4 +425,3 @@ macro_rules! kernel {
         }
     };
 }
-pub(crate) use kernel;

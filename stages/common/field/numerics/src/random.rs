@@ -1,13 +1,3 @@
-//! Random numbers as a function of seed, stream (one per use) and counter (Salmon et al. 2011), so
-//! that threads draw them in any order.
-//!
-//! ```
-//! use counter_rng::{CounterRng, uniform};
-//! let mut rng = CounterRng::new(7, 1, 3);
-//! assert_eq!(rng.uniform(), uniform(7, 1, 3));
-//! assert!(rng.below(10) < 10);
-//! ```
-
 /// Scrambles a counter (splitmix64).
 #[inline]
 fn scramble(mut x: u64) -> u64 {
