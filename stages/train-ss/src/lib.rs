@@ -5,6 +5,7 @@
 //!   `supersample: 1` is plain NeRF on the same images.
 //! * `supersample`: the number of sub-pixel rays of an LR pixel, from the parameter to the warm-up.
 //! * `photographs`: LR images and HR references, packed into memory and, beyond a budget, a file.
+//! * `silhouettes`: cells that photographs with alpha show empty.
 //! * `state`: HR cache, exposures and poses, estimated in addition to the field.
 //! * `supervision`: drawn pixels, their rays and their loss: the paper's average (eq. 4), or the
 //!   kernel that made the LR images ([`Supersampling`]).
@@ -12,6 +13,7 @@
 
 mod params;
 mod photographs;
+mod silhouettes;
 mod state;
 mod supersample;
 mod supervision;
@@ -124,7 +126,15 @@ impl Stage for TrainSs {
         // The first member trains twice to choose between given and refined poses.
         let comparison_rays = if params.pose_refinement { params.member(0).rays } else { 0 };
         let progress = context.progress("training", comparison_rays + params.rays);
-        let data = TrainingData { input, references, views: &views, progress: &progress };
+        let cells = params.silhouettes.then(|| silhouettes::cells_within(input, &views));
+        let cells = cells.transpose()?.flatten();
+        if let Some(cells) = &cells {
+            let empty = cells.iter().filter(|is_allowed| !**is_allowed).count();
+            let percent = 100.0 * empty as f64 / cells.len() as f64;
+            context.log_line(format!("silhouettes: {percent:.0} % of the cells are empty"));
+        }
+        let cells = cells.as_deref();
+        let data = TrainingData { input, references, views: &views, cells, progress: &progress };
         let mut rays = comparison_rays;
         for index in 0..params.ensemble {
             let mut member_params = params.member(index);

@@ -39,6 +39,11 @@ pub struct Params {
     /// `nerf-sr run registered` then renders test views from registered cameras.
     #[schemars(extend("x-group" = "data"))]
     pub pose_refinement: bool,
+    /// Keeps cells empty that some photograph shows only through transparent pixels. For
+    /// `field: grid`, photographs with alpha and space `box`, unless `pose_refinement` moves the
+    /// cameras.
+    #[schemars(extend("x-group" = "data"))]
+    pub silhouettes: bool,
     /// Maximum number of HR references: the first ones of input `references` are used.
     #[schemars(extend("x-group" = "data", "x-default" = "all"))]
     pub max_references: Option<u32>,
@@ -67,6 +72,7 @@ impl Default for Params {
             supervision: None,
             exposure: false,
             pose_refinement: false,
+            silhouettes: true,
             max_references: None,
             ensemble: 1,
             combine: None,

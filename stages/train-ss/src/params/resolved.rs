@@ -29,6 +29,8 @@ pub struct Resolved {
     pub exposure: bool,
     /// True if camera poses are optimised.
     pub pose_refinement: bool,
+    /// True if photographs with alpha limit the cells of the grid.
+    pub silhouettes: bool,
     /// Order of pixel draws.
     pub order: Order,
     /// Ratio of the draw rates of detailed and flat pixels.

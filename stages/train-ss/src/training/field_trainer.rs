@@ -35,16 +35,18 @@ pub(crate) trait FieldTrainer {
 #[error("{0}")]
 pub(crate) struct Collapsed(pub(crate) String);
 
-/// Creates a trainer of a new field, or of one initialised from the weights `init`.
+/// Creates a trainer of a new field, or of one initialised from the weights `init`. A grid is
+/// limited to a mask of occupancy cells.
 pub(crate) fn new_trainer(
     params: &Resolved,
     init: Option<&Path>,
     bounds: Bounds,
+    cells: Option<&[bool]>,
     device: &str,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
     match &params.field {
         ResolvedField::Grid { architecture, regularisers, given } => {
-            let field = match init {
+            let mut field = match init {
                 Some(weights) => {
                     let mut field =
                         Field::read(weights, *architecture, bounds).bad_input("input init")?;
@@ -53,6 +55,9 @@ pub(crate) fn new_trainer(
                 }
                 None => Field::new(*architecture, bounds, params.seed),
             };
+            if let Some(cells) = cells {
+                field.limit_to(cells.to_vec());
+            }
             let options = params.grid_training(given, regularisers);
             if device == "cpu" {
                 return Ok(Box::new(Trainer::new(field, options)));

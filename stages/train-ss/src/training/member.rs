@@ -19,6 +19,8 @@ pub(crate) struct TrainingData<'a> {
     pub(crate) input: &'a GivenInput,
     pub(crate) references: Option<&'a GivenInput>,
     pub(crate) views: &'a Views,
+    /// Mask of the occupancy cells that may become occupied; `None` for all.
+    pub(crate) cells: Option<&'a [bool]>,
     pub(crate) progress: &'a Progress,
 }
 
@@ -115,7 +117,7 @@ impl<'a> Member<'a> {
     /// Writes the weights of the latest checkpoint of any member, and returns its log.
     pub(crate) fn write_latest_checkpoint(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
         let work = self.context.work().context("--from-checkpoint needs --work")?;
-        let mut trainer = self.new_trainer(&self.params, bounds)?;
+        let mut trainer = self.new_trainer(&self.params, bounds, None)?;
         let curve = read_latest(work, &mut *trainer).ok_or_else(|| {
             Failure::BadInput(format!("--work {}: no complete checkpoint yet", work.display()))
         })?;
@@ -151,7 +153,7 @@ impl<'a> Member<'a> {
         work: Option<&Path>,
         data: &TrainingData<'_>,
     ) -> anyhow::Result<Training> {
-        let TrainingData { input, references, views, .. } = *data;
+        let TrainingData { input, references, views, cells, .. } = *data;
         let folder = work.unwrap_or_else(|| self.output.parent().unwrap_or(Path::new(".")));
         if let Some(work) = work {
             std::fs::create_dir_all(work)
@@ -167,7 +169,7 @@ impl<'a> Member<'a> {
             );
             return Err(Failure::Usage(message).into());
         }
-        let mut trainer = self.new_trainer(params, views.bounds)?;
+        let mut trainer = self.new_trainer(params, views.bounds, cells)?;
         let checkpoints = Checkpoints::new(work);
         let curve = checkpoints
             .resume(&mut *trainer, &mut supervision, |text| self.context.log_line(text))?;
@@ -229,9 +231,10 @@ impl<'a> Member<'a> {
         &self,
         params: &Resolved,
         bounds: Bounds,
+        cells: Option<&[bool]>,
     ) -> anyhow::Result<Box<dyn FieldTrainer>> {
         let init = self.init.as_ref().map(|(weights, _)| weights.as_path());
-        new_trainer(params, init, bounds, &self.context.device)
+        new_trainer(params, init, bounds, cells, &self.context.device)
     }
 
     /// Writes the trained weights, averaged with the initial ones if requested.
