@@ -76,3 +76,97 @@ impl Pass {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use numerics::CounterRng;
+    use tch::{Kind, Tensor};
+
+    use super::*;
+
+    /// Input channels, hidden channels and outputs.
+    const SHAPE: [usize; 3] = [5, 18, 3];
+    const BLOCKS: usize = 2;
+    const SIZE: (usize, usize) = (21, 17);
+
+    fn numbers(count: usize, stream: u64) -> Vec<f32> {
+        let mut rng = CounterRng::new(3, 1, stream);
+        (0..count).map(|_| 0.4 * (rng.uniform() - 0.5)).collect()
+    }
+
+    /// Returns libtorch's output for the kernels and biases of all layers.
+    fn torch_output(input: &Tensor, parameters: &[(Tensor, Tensor)]) -> Tensor {
+        let layer = |x: &Tensor, i: usize| {
+            let (kernels, bias) = &parameters[i];
+            x.conv2d(&kernels.permute([0, 3, 1, 2]), Some(bias), 1, 0, 1, 1)
+        };
+        let mut x = layer(input, 0);
+        for block in 0..BLOCKS {
+            let inner = layer(&x, 1 + 2 * block).relu();
+            let [_, _, height, width] = x.size()[..] else { unreachable!("four dimensions") };
+            let middle = x.narrow(2, 2, height - 4).narrow(3, 2, width - 4);
+            x = middle + layer(&inner, 2 + 2 * block);
+        }
+        layer(&x, 1 + 2 * BLOCKS)
+    }
+
+    /// Outputs and gradients are those of libtorch's convolutions and autograd.
+    #[test]
+    fn passes_are_those_of_libtorch() {
+        let [inputs, hidden, outputs] = SHAPE;
+        let (width, height) = SIZE;
+        let shapes: Vec<(usize, usize)> = (0..2 * BLOCKS + 2)
+            .map(|i| match i {
+                0 => (inputs, hidden),
+                _ if i == 2 * BLOCKS + 1 => (hidden, outputs),
+                _ => (hidden, hidden),
+            })
+            .collect();
+        let parameters: Vec<(Vec<f32>, Vec<f32>)> = (0..)
+            .zip(&shapes)
+            .map(|(i, (inputs, outputs))| {
+                (numbers(9 * inputs * outputs, 10 + i), numbers(*outputs, 30 + i))
+            })
+            .collect();
+        let samples = numbers(width * height * inputs, 1);
+        let weights_of = |count| numbers(count, 2);
+
+        let layers = parameters.iter().map(|(kernels, bias)| Convolution::new(kernels, bias));
+        let layers = Layers(layers.collect());
+        let (mut pass, mut output) = (Pass::default(), Vec::new());
+        pass.reset(&layers);
+        pass.forward(&layers, SIZE, &samples).copy_samples(outputs, &mut output);
+        let weights = weights_of(output.len());
+        pass.backward(&layers, &weights);
+
+        let tensors: Vec<(Tensor, Tensor)> = parameters
+            .iter()
+            .zip(&shapes)
+            .map(|((kernels, bias), (inputs, outputs))| {
+                let shape = [*outputs, 3, 3, *inputs].map(|d| d as i64);
+                let kernels = Tensor::from_slice(kernels).reshape(shape).set_requires_grad(true);
+                (kernels, Tensor::from_slice(bias).set_requires_grad(true))
+            })
+            .collect();
+        let size = [1, height, width, inputs].map(|d| d as i64);
+        let input = Tensor::from_slice(&samples).reshape(size).permute([0, 3, 1, 2]);
+        let expected = torch_output(&input, &tensors).permute([0, 2, 3, 1]).reshape([-1]);
+        assert_near("outputs", &output, &expected);
+        (expected * Tensor::from_slice(&weights)).sum(Kind::Float).backward();
+        for (i, (kernels, bias)) in tensors.iter().enumerate() {
+            let (inputs, outputs) = shapes[i];
+            let gradients = &pass.gradients[i];
+            assert_near("kernels", &gradients.kernels(inputs, outputs), &kernels.grad());
+            assert_near("biases", &gradients.bias(outputs), &bias.grad());
+        }
+    }
+
+    fn assert_near(name: &str, found: &[f32], expected: &Tensor) {
+        let expected = Vec::<f32>::try_from(expected.reshape([-1])).unwrap();
+        assert_eq!(found.len(), expected.len(), "{name}");
+        let scale = expected.iter().fold(0.0f32, |most, value| most.max(value.abs()));
+        for (found, expected) in found.iter().zip(&expected) {
+            assert!((found - expected).abs() < 1e-5 * scale, "{name}: {found}, not {expected}");
+        }
+    }
+}
