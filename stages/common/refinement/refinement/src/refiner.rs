@@ -382,6 +382,31 @@ mod tests {
         assert!(apart > 0.01, "{apart}");
     }
 
+    /// A tile without any opacity in sight stays as it is; one opaque pixel in sight changes it.
+    #[test]
+    fn transparent_tiles_stay() {
+        let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
+        let mut view = image(2 * TILE_SIDE, 8);
+        for pixel in view.data.chunks_exact_mut(INPUTS) {
+            pixel[3] = 0.0;
+        }
+        let changed_tiles = |view: &Image| {
+            let refined = refiner.refine(view).unwrap();
+            [0, 1].map(|tile| {
+                (0..TILE_SIDE).any(|x| {
+                    let pixel = tile * TILE_SIDE + x;
+                    view.data[pixel * INPUTS..][..OUTPUTS]
+                        != refined.data[pixel * OUTPUTS..][..OUTPUTS]
+                })
+            })
+        };
+        assert_eq!(changed_tiles(&view), [false, false]);
+        view.data[(2 * TILE_SIDE - 1) * INPUTS + 3] = 0.1;
+        assert_eq!(changed_tiles(&view), [false, true]);
+        view.data[(TILE_SIDE + 7) * INPUTS + 3] = 0.1;
+        assert_eq!(changed_tiles(&view), [true, true]);
+    }
+
     fn mirrored(p: &Image) -> Image {
         let data = p
             .data
