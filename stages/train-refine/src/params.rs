@@ -67,7 +67,7 @@ pub struct CompactParams {
 impl Default for CompactParams {
     fn default() -> Self {
         Self {
-            steps: 4_000,
+            steps: 3_500,
             batch_size: 8,
             patch_size: 64,
             learning_rate: 1e-3,

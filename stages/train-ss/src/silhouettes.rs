@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use scene::{Bounds, Camera, Photograph, Space, Views};
 
 /// Distance in pixels from a transparent region within which cells are kept: kernels with negative
-/// lobes may cancel the alpha of thin parts at an object's border (design note 048).
+/// lobes may cancel the alpha of thin parts at an object's border (design note 049).
 const MARGIN_PIXELS: f64 = 1.5;
 /// Highest alpha of a transparent pixel: half a step of 8 bits.
 const MAX_TRANSPARENT_ALPHA: f32 = 0.5 / 255.0;
