@@ -387,9 +387,8 @@ fn training(rows: &mut Rows, folder: &Path, rays: u64) -> anyhow::Result<()> {
     let scene = Scene { input, views };
     // Uniform draws first, for comparison with other implementations; then the defaults.
     let grid = |rays, pixel_importance| {
-        let field =
-            FieldParams::Grid(GridParams { rays, pixel_importance, ..GridParams::default() });
-        Params { field, ..Params::default() }
+        let grid = GridParams { rays: Some(rays), pixel_importance, ..GridParams::default() };
+        Params { field: FieldParams::Grid(grid), ..Params::default() }
     };
     let field = scene.measure(rows, &grid(rays, Some(1.0)), "")?.field;
     scene.measure(rows, &grid(rays, None), "_by_detail")?;

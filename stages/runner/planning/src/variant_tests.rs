@@ -60,7 +60,7 @@ fn trainings(text: &str, arguments: &[&str], names: &[&str]) -> Vec<(String, Vec
     nodes.map(|node| (node.point.clone(), values(node, names))).collect()
 }
 
-fn grid(rays: u64, n_levels: u32) -> Vec<Value> {
+fn grid(rays: Option<u64>, n_levels: u32) -> Vec<Value> {
     vec![json!("grid"), json!(rays), json!(n_levels), json!("absent"), json!(64)]
 }
 
@@ -79,7 +79,7 @@ fn every_form_reaches_a_parameter_of_a_variant() {
     let nested = &PIPELINE.replace("rays: 12000000", "field: {grid: {n_levels: 4}}")[..];
     let beside = &PIPELINE.replace("rays: 12000000", "rays: 12000000\n      n_levels: 4")[..];
     let paper = &PIPELINE.replace("rays: 12000000", "field: mlp\n      layers: 4")[..];
-    let all = 12_000_000;
+    let all = Some(12_000_000);
     for (text, arguments, expected) in [
         (PIPELINE, &[][..], one(grid(all, 8))),
         (PIPELINE, &["n_levels=4"], one(grid(all, 4))),
@@ -107,8 +107,8 @@ fn every_form_reaches_a_parameter_of_a_variant() {
             &["field=mlp", "layers=2,4"],
             pointed(&[("layers=2", mlp(json!(all), 2)), ("layers=4", mlp(json!(all), 4))]),
         ),
-        (nested, &[], one(grid(30_000_000, 4))),
-        (nested, &["n_levels=6"], one(grid(30_000_000, 6))),
+        (nested, &[], one(grid(None, 4))),
+        (nested, &["n_levels=6"], one(grid(None, 6))),
         (beside, &[], one(grid(all, 4))),
         // The variant has its own defaults; the file's parameters for another one don't apply.
         (nested, &["field=mlp"], one(mlp(json!(null), 8))),
@@ -120,7 +120,7 @@ fn every_form_reaches_a_parameter_of_a_variant() {
         ),
         (paper, &[], one(mlp(json!(null), 4))),
         (paper, &["layers=6"], one(mlp(json!(null), 6))),
-        (paper, &["field=grid"], one(grid(30_000_000, 8))),
+        (paper, &["field=grid"], one(grid(None, 8))),
     ] {
         assert_eq!(trainings(text, arguments, &names), expected, "{arguments:?} over {text}");
     }

@@ -101,9 +101,22 @@ impl Default for FieldParams {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GridParams {
-    /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble.
+    /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble. Default:
+    /// from the number of LR pixels by `rays_per_pixel`, `min_rays` and `max_rays`.
+    #[schemars(range(min = 1), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
+    pub rays: Option<u64>,
+    /// Rays for each LR pixel of all views, unless `rays` is given. With `background: opaque`,
+    /// where each ray hits a surface and costs more, 0.6 times as many; fine-tuning (input `init`)
+    /// takes half.
+    #[schemars(range(min = 0.001, max = 100_000.0), extend("x-group" = "sampling"))]
+    pub rays_per_pixel: f64,
+    /// Minimum of the rays that follow from `rays_per_pixel`.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
-    pub rays: u64,
+    pub min_rays: u64,
+    /// Maximum of the rays that follow from `rays_per_pixel`, even if `min_rays` is larger. It limits
+    /// the time of a training on many or large photographs.
+    #[schemars(range(min = 1), extend("x-group" = "sampling"))]
+    pub max_rays: u64,
     /// Maximum number of rays in a step; values below 256 mean 256.
     #[schemars(range(min = 1, max = 1_048_576), extend("x-group" = "sampling"))]
     pub max_rays_per_step: u32,
@@ -189,7 +202,10 @@ impl Default for GridParams {
     fn default() -> Self {
         let grid = Architecture::default();
         Self {
-            rays: 30_000_000,
+            rays: None,
+            rays_per_pixel: 32.0,
+            min_rays: 8_000_000,
+            max_rays: 80_000_000,
             max_rays_per_step: 8_192,
             samples_per_step: 24_576,
             order: Order::Random,

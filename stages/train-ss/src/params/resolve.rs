@@ -22,6 +22,11 @@ const DISTORTION_IN_CONTRACTION: f64 = 0.002;
 const FLOATER_LOSS: f64 = 0.001;
 /// Ratio of the draw rates of detailed and flat pixels with `order: random` (design note 010).
 const PIXEL_IMPORTANCE: f64 = 10.0;
+/// Rays per LR pixel of an opaque scene, whose rays all hit a surface, over those of other scenes.
+/// The protocols for photographs and for objects (`experiments/common.yaml`) have this ratio.
+const OPAQUE_RAYS: f64 = 0.6;
+/// Rays of a fine-tuning over those of the initial field (`experiments/common.yaml`).
+const FINE_TUNING_RAYS: f64 = 0.5;
 /// Cells of the finest level per LR pixel across the field (design note 006).
 const CELLS_PER_PIXEL: f64 = 2.56;
 
@@ -55,7 +60,7 @@ impl Params {
     pub fn resolve(&self, scene: &SceneFacts) -> Resolved {
         let epoch = scene.lr_pixels * whole_supersample(self.supersample).pow(2);
         let mut sampling = match &self.field {
-            FieldParams::Grid(grid) => grid.sampling(),
+            FieldParams::Grid(grid) => grid.sampling(scene),
             FieldParams::Mlp(mlp) => mlp.sampling(scene, epoch),
         };
         if scene.is_fine_tuning {
@@ -102,10 +107,19 @@ struct Sampling {
 }
 
 impl GridParams {
-    fn sampling(&self) -> Sampling {
+    /// Returns the number of rays that follows from the scene's LR pixels.
+    fn rays_of_scene(&self, scene: &SceneFacts) -> u64 {
+        let opaque = if scene.background == Background::Opaque { OPAQUE_RAYS } else { 1.0 };
+        let rays = opaque * self.rays_per_pixel * scene.lr_pixels as f64;
+        let rays = rays.max(self.min_rays as f64).min(self.max_rays as f64);
+        let part = if scene.is_fine_tuning { FINE_TUNING_RAYS } else { 1.0 };
+        (part * rays).round().max(1.0) as u64
+    }
+
+    fn sampling(&self, scene: &SceneFacts) -> Sampling {
         let importance = if self.order == Order::Random { PIXEL_IMPORTANCE } else { 1.0 };
         Sampling {
-            rays: self.rays,
+            rays: self.rays.unwrap_or_else(|| self.rays_of_scene(scene)),
             max_rays_per_step: self.max_rays_per_step,
             order: self.order,
             pixel_importance: self.pixel_importance.unwrap_or(importance),
@@ -319,6 +333,41 @@ mod tests {
             for name in open {
                 assert!(recorded.contains_key(name), "{name} isn't recorded");
             }
+        }
+    }
+
+    /// Rays follow from LR pixels within their limits, unless they are given.
+    #[test]
+    fn rays_follow_from_the_pixels() {
+        let grid = |rays, rays_per_pixel| Params {
+            field: FieldParams::Grid(GridParams {
+                rays,
+                rays_per_pixel,
+                min_rays: 100,
+                max_rays: 1000,
+                ..GridParams::default()
+            }),
+            ..Params::default()
+        };
+        // 25 LR pixels.
+        let white = facts(Space::Box, Background::White);
+        let opaque = facts(Space::Box, Background::Opaque);
+        let fine_tuning = SceneFacts { is_fine_tuning: true, ..white };
+        for (rays, rays_per_pixel, scene, expected) in [
+            (None, 20.0, white, 500),
+            (None, 4.5, white, 113),
+            (None, 20.0, opaque, 300),
+            (None, 20.0, fine_tuning, 250),
+            (None, 0.5, white, 100),
+            (None, 0.5, fine_tuning, 50),
+            (None, 60.0, white, 1000),
+            (None, 60.0, fine_tuning, 500),
+            (Some(7), 20.0, white, 7),
+            (Some(7000), 20.0, fine_tuning, 7000),
+        ] {
+            let params = grid(rays, rays_per_pixel);
+            assert_eq!(value(&params, &scene, "rays"), json!(expected), "{params:?}");
+            assert_eq!(params.resolve(&scene).rays, expected);
         }
     }
 
