@@ -125,7 +125,8 @@ impl Stage for TrainSs {
         };
         // The first member trains twice to choose between given and refined poses.
         let comparison_rays = if params.pose_refinement { params.member(0).rays } else { 0 };
-        let progress = context.progress("training", comparison_rays + params.rays);
+        let total_rays = comparison_rays + params.rays;
+        let progress = context.progress("training", total_rays);
         let cells = params.silhouettes.then(|| silhouettes::cells_within(input, &views));
         let cells = cells.transpose()?.flatten();
         if let Some(cells) = &cells {
@@ -133,8 +134,8 @@ impl Stage for TrainSs {
             let percent = 100.0 * empty as f64 / cells.len() as f64;
             context.log_line(format!("silhouettes: {percent:.0} % of the cells are empty"));
         }
-        let cells = cells.as_deref();
-        let data = TrainingData { input, references, views: &views, cells, progress: &progress };
+        let (cells, progress) = (cells.as_deref(), &progress);
+        let data = TrainingData { input, references, views: &views, cells, progress, total_rays };
         let mut rays = comparison_rays;
         for index in 0..params.ensemble {
             let mut member_params = params.member(index);

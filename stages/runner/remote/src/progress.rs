@@ -54,7 +54,7 @@ impl Progress {
         if self.bar.is_none() && !is_due {
             return Ok(());
         }
-        let left = state.pace.time_left(done, self.total);
+        let left = state.pace.time_left(done, self.total, None);
         let text = format!("{} of {} · {left} left", format_size(done), format_size(self.total));
         if let Some(bar) = &self.bar {
             bar.set_position(done);

@@ -10,6 +10,7 @@ use stage::{Context, Progress};
 
 use super::checkpoint::{Checkpoints, Curve, read_latest};
 use super::field_trainer::{Collapsed, FieldTrainer, average_weights, new_trainer};
+use super::time_left::{TimeLeft, TrainingRays};
 use crate::params::{Combine, Resolved};
 use crate::supervision::{Supersampling, supervision};
 
@@ -22,6 +23,8 @@ pub(crate) struct TrainingData<'a> {
     /// Mask of the occupancy cells that may become occupied; `None` for all.
     pub(crate) cells: Option<&'a [bool]>,
     pub(crate) progress: &'a Progress,
+    /// Number of rays of all trainings.
+    pub(crate) total_rays: u64,
 }
 
 /// Training in progress.
@@ -142,7 +145,7 @@ impl<'a> Member<'a> {
         data: &TrainingData<'_>,
     ) -> anyhow::Result<TrainingLog> {
         let mut training = self.start(params, work, data)?;
-        self.take_steps(&mut training, params.rays, data.progress)?;
+        self.take_steps(&mut training, params.rays, data)?;
         self.finish(training, data.views.bounds)
     }
 
@@ -181,9 +184,10 @@ impl<'a> Member<'a> {
         &self,
         training: &mut Training,
         total: u64,
-        progress: &Progress,
+        data: &TrainingData<'_>,
     ) -> anyhow::Result<()> {
         let Training { trainer, supervision, checkpoints, curve } = training;
+        let mut time_left = TimeLeft::new(&self.params, self.init.is_some());
         loop {
             let is_interrupted = self.context.is_interrupted();
             checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
@@ -200,7 +204,14 @@ impl<'a> Member<'a> {
             let rays = trainer.rays_done();
             supervision.refine_poses(rays as f64 / total as f64, || trainer.field())?;
             curve.add(&report, rays, total);
-            progress.set(self.rays_before + rays, &curve.last_psnr());
+            time_left.add(&report);
+            let rays_left = TrainingRays {
+                total,
+                remaining: total.saturating_sub(rays),
+                further: data.total_rays.saturating_sub(self.rays_before + total),
+            };
+            data.progress.set_seconds_left(time_left.seconds(trainer.steps(), rays_left));
+            data.progress.set(self.rays_before + rays, &curve.last_psnr());
         }
     }
 

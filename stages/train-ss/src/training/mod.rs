@@ -5,6 +5,7 @@ mod field_trainer;
 mod init_field;
 mod member;
 mod pose_choice;
+mod time_left;
 
 pub(crate) use init_field::InitField;
 pub(crate) use member::{Member, TrainingData};

@@ -33,6 +33,9 @@ pub enum Event {
         total: u64,
         /// Current loss, PSNR or the like, as text; may be empty.
         note: String,
+        /// The stage's own estimate of the remaining seconds, for work whose pace changes.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        seconds_left: Option<u64>,
     },
     /// Failure that ends the stage; the exit code tells its kind.
     Failed {
@@ -79,6 +82,7 @@ pub struct Progress {
 struct ProgressState {
     done: u64,
     note: String,
+    seconds_left: Option<f64>,
     pace: Pace,
     /// Time of the latest report, or of creation.
     reported: Instant,
@@ -100,6 +104,7 @@ impl Progress {
         let state = ProgressState {
             done: 0,
             note: String::new(),
+            seconds_left: None,
             pace: Pace::default(),
             reported: Instant::now(),
             has_reported: false,
@@ -130,6 +135,12 @@ impl Progress {
             state.done = done;
             note.clone_into(&mut state.note);
         });
+    }
+
+    /// Sets an estimate of the remaining time, for work whose pace changes. It is reported in place
+    /// of the one that assumes an even pace, with the next finished steps.
+    pub fn set_seconds_left(&self, seconds: f64) {
+        self.lock().seconds_left = Some(seconds);
     }
 
     /// Adds finished steps, for work that finishes in any order.
@@ -163,7 +174,8 @@ impl Progress {
             return;
         }
         (state.reported, state.has_reported) = (Instant::now(), true);
-        let left = state.pace.time_left(done, self.total);
+        let estimate = state.seconds_left;
+        let left = state.pace.time_left(done, self.total, estimate);
         if let Some(bar) = &self.bar {
             bar.set_position(done);
             bar.set_message(format!("{} · {left}", state.note));
@@ -173,6 +185,7 @@ impl Progress {
                 done,
                 total: self.total,
                 note: state.note.clone(),
+                seconds_left: state.seconds_left.map(|seconds| seconds.round() as u64),
             }
             .emit();
         } else {
@@ -202,21 +215,24 @@ impl Pace {
         *self.first.get_or_insert_with(|| (Instant::now(), done))
     }
 
-    /// Estimates the remaining time, as text; `?` before the first finished step.
-    pub fn time_left(&mut self, done: u64, total: u64) -> String {
+    /// Returns the remaining time as text: the `estimate` in seconds if there is one, otherwise
+    /// from an even pace; `?` before the first finished step.
+    pub fn time_left(&mut self, done: u64, total: u64, estimate: Option<f64>) -> String {
         let (start, first) = self.start(done);
+        if let Some(seconds) = estimate {
+            return format_seconds_left(seconds);
+        }
         let steps = done.saturating_sub(first);
         if steps == 0 {
             return "?".to_owned();
         }
         let left = total.saturating_sub(done) as f64;
-        let seconds = start.elapsed().as_secs_f64() * left / steps as f64;
-        if seconds < 90.0 {
-            format!("{seconds:.0} s")
-        } else {
-            format!("{:.1} min", seconds / 60.0)
-        }
+        format_seconds_left(start.elapsed().as_secs_f64() * left / steps as f64)
     }
+}
+
+fn format_seconds_left(seconds: f64) -> String {
+    if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.1} min", seconds / 60.0) }
 }
 
 #[cfg(test)]
@@ -226,12 +242,13 @@ mod tests {
     #[test]
     fn time_left_follows_from_this_run_alone() {
         let mut pace = Pace { first: None };
-        assert_eq!(pace.time_left(900, 1000), "?");
+        assert_eq!(pace.time_left(900, 1000, None), "?");
         let (since, _) = pace.first.unwrap();
         pace.first = Some((since.checked_sub(Duration::from_secs(60)).unwrap(), 900));
         assert_eq!(
-            (pace.time_left(920, 1000).as_str(), pace.time_left(901, 1000).as_str()),
-            ("4.0 min", "99.0 min")
+            [(920, None), (901, None), (901, Some(61.4)), (900, Some(600.0))]
+                .map(|(done, estimate)| pace.time_left(done, 1000, estimate)),
+            ["4.0 min", "99.0 min", "61 s", "10.0 min"]
         );
     }
 }

@@ -244,13 +244,14 @@ impl OutputReader<'_> {
         for line in read_lines(stdout) {
             match serde_json::from_str(&line) {
                 Ok(Event::Failed { message }) => reason = Some(printable(&message).into_owned()),
-                Ok(Event::Progress { label, done, total, note }) => {
+                Ok(Event::Progress { label, done, total, note, seconds_left }) => {
                     let label = printable(&label).into_owned();
                     let note = printable(&note).into_owned();
                     if let Some(line) = filter.line(&label, done, total, &note) {
                         self.log.line(line);
                     }
-                    self.watcher.progress(&Event::Progress { label, done, total, note });
+                    let event = Event::Progress { label, done, total, note, seconds_left };
+                    self.watcher.progress(&event);
                 }
                 Err(_) => self.log.line(line),
             }

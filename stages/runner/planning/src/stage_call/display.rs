@@ -114,13 +114,14 @@ impl StageView<'_> {
 
 impl Watcher for StageView<'_> {
     fn progress(&self, event: &Event) {
-        let Event::Progress { label, done, total, note } = event else { return };
+        let Event::Progress { label, done, total, note, seconds_left } = event else { return };
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         if state.task != *label {
             state.task.clone_from(label);
             state.pace = Pace::default();
         }
-        let left = state.pace.time_left(*done, *total);
+        let estimate = seconds_left.map(|seconds| seconds as f64);
+        let left = state.pace.time_left(*done, *total, estimate);
         if let Some(bar) = &self.bar {
             bar.set_length(*total);
             bar.set_position(*done);
