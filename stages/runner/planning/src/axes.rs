@@ -11,6 +11,7 @@ use crate::arguments;
 use crate::check::known_stages;
 use crate::file::StageBlock;
 use crate::pipeline::Pipeline;
+use crate::quality::{QUALITY, Quality};
 use crate::request::{PlanError, Request};
 use crate::stages::{Programs, StageProgram};
 
@@ -40,6 +41,8 @@ pub(crate) struct Setting {
 pub(crate) enum Kind {
     Parameter,
     Input,
+    /// Quality of all stages, which belongs to no stage.
+    Quality,
 }
 
 /// One value of an axis: its text and its settings. A value on the command line has one setting; a
@@ -53,7 +56,7 @@ pub(crate) struct AxisValue {
 impl Kind {
     fn flag(self) -> &'static str {
         match self {
-            Self::Parameter => "-p",
+            Self::Parameter | Self::Quality => "-p",
             Self::Input => "-i",
         }
     }
@@ -62,6 +65,7 @@ impl Kind {
         match self {
             Self::Parameter => "parameter",
             Self::Input => "input",
+            Self::Quality => QUALITY,
         }
     }
 
@@ -75,6 +79,7 @@ impl Kind {
         match self {
             Self::Parameter => program.is_some_and(|program| program.is_given(block, name)),
             Self::Input => block.inputs.contains_key(name),
+            Self::Quality => false,
         }
     }
 
@@ -82,11 +87,18 @@ impl Kind {
         match self {
             Self::Parameter => program.schema.names(),
             Self::Input => program.description.inputs.keys().map(String::as_str).collect(),
+            Self::Quality => Vec::new(),
         }
     }
 }
 
 impl Setting {
+    /// Creates the setting of a quality.
+    fn quality(value: &Value) -> Result<Self, String> {
+        let value = Value::from(Quality::parse(value)?.name());
+        Ok(Self { stage: String::new(), kind: Kind::Quality, name: QUALITY.to_owned(), value })
+    }
+
     /// Returns the folder of an input.
     pub(crate) fn folder(&self) -> PathBuf {
         PathBuf::from(self.value.as_str().unwrap_or_default())
@@ -164,6 +176,10 @@ impl Scope<'_> {
         name: &str,
         value: &Value,
     ) -> Result<Setting, PlanError> {
+        if kind == Kind::Parameter && name == QUALITY {
+            return Setting::quality(value)
+                .map_err(|e| self.pipeline.error_in_experiment(name, &e).into());
+        }
         let (stage, name) = self.find_owner(kind, name).map_err(|error| match error {
             PlanError::Usage(problem) => {
                 let problem = problem.trim_start_matches(kind.flag()).trim_start();
@@ -174,7 +190,7 @@ impl Scope<'_> {
         let program = self.programs.require(&stage)?;
         let value = match kind {
             Kind::Parameter => program.schema.canonical_value(&name, value),
-            Kind::Input => value.clone(),
+            Kind::Input | Kind::Quality => value.clone(),
         };
         Ok(Setting { stage, kind, name, value })
     }
@@ -190,6 +206,9 @@ impl Scope<'_> {
         let (name, text) = text
             .split_once('=')
             .ok_or_else(|| usage_error(&argument, "expected NAME=VALUE[,VALUE…]"))?;
+        if kind == Kind::Parameter && name == QUALITY {
+            return quality_axis(argument, text, notes);
+        }
         let (stage, name) = self.find_owner(kind, name)?;
         let program = self.programs.require(&stage)?;
         let texts_and_values: Vec<(&str, Value)> = match kind {
@@ -200,22 +219,15 @@ impl Scope<'_> {
                     .map(|(text, value)| (text, program.schema.canonical_value(&name, &value)))
                     .collect()
             }
-            Kind::Input => {
+            Kind::Input | Kind::Quality => {
                 let folders = arguments::folders(text).map_err(|e| usage_error(&argument, e))?;
                 folders.into_iter().map(|text| (text, canonical_folder(text))).collect()
             }
         };
-        let mut values: Vec<AxisValue> = Vec::new();
-        for (text, value) in texts_and_values {
-            let settings = vec![Setting { stage: stage.clone(), kind, name: name.clone(), value }];
-            match values.iter().find(|earlier| earlier.settings == settings) {
-                Some(earlier) => {
-                    let first = &earlier.text;
-                    notes.push(format!("{argument}: {text} equals {first}; it is used once"));
-                }
-                None => values.push(AxisValue { text: text.to_owned(), settings }),
-            }
-        }
+        let settings = texts_and_values.into_iter().map(|(text, value)| {
+            (text, Setting { stage: stage.clone(), kind, name: name.clone(), value })
+        });
+        let values = distinct_values(&argument, settings, notes);
         if program.description.sink && kind == Kind::Input {
             let problem = format!("{stage} is a sink, which shows results of the run, no folder");
             return Err(usage_error(&argument, problem));
@@ -306,6 +318,36 @@ impl Scope<'_> {
         }
         PlanError::Usage(problem)
     }
+}
+
+/// Returns the axis of an argument `quality=WORD[,WORD…]`.
+fn quality_axis(argument: String, text: &str, notes: &mut Vec<String>) -> Result<Axis, PlanError> {
+    let mut settings = Vec::new();
+    for (text, value) in arguments::values(text).map_err(|e| usage_error(&argument, e))? {
+        settings.push((text, Setting::quality(&value).map_err(|e| usage_error(&argument, e))?));
+    }
+    let values = distinct_values(&argument, settings.into_iter(), notes);
+    Ok(Axis { name: QUALITY.to_owned(), is_named: values.len() > 1, values, argument })
+}
+
+/// Returns the values of an axis with one setting each; a repeated setting is noted and used once.
+fn distinct_values<'a>(
+    argument: &str,
+    settings: impl Iterator<Item = (&'a str, Setting)>,
+    notes: &mut Vec<String>,
+) -> Vec<AxisValue> {
+    let mut values: Vec<AxisValue> = Vec::new();
+    for (text, setting) in settings {
+        let settings = vec![setting];
+        match values.iter().find(|earlier| earlier.settings == settings) {
+            Some(earlier) => {
+                let first = &earlier.text;
+                notes.push(format!("{argument}: {text} equals {first}; it is used once"));
+            }
+            None => values.push(AxisValue { text: text.to_owned(), settings }),
+        }
+    }
+    values
 }
 
 fn usage_error(argument: &str, problem: impl std::fmt::Display) -> PlanError {

@@ -15,6 +15,7 @@ use crate::file::{InputSource, Part};
 use crate::left_out::{RequiredFiles, check_show, shown_stages};
 use crate::node::{Node, NodeInput, Origin, Plan, Sink};
 use crate::pipeline::Pipeline;
+use crate::quality::Quality;
 use crate::request::PlanError;
 use crate::stages::{Programs, StageProgram};
 
@@ -135,6 +136,9 @@ impl<'a> Expansion<'a> {
     /// Returns whether a setting applies to a stage: it is the stage's own, or that of the block
     /// that the stage's block extends without a value of its own.
     fn applies(&self, setting: &Setting, stage: &str) -> bool {
+        if setting.kind == Kind::Quality {
+            return self.programs.get(stage).is_some_and(Quality::affects);
+        }
         let block = &self.pipeline.stages[stage];
         setting.stage == stage
             || (block.extends.as_deref() == Some(&setting.stage)
@@ -310,8 +314,16 @@ impl<'a> Expansion<'a> {
         named.map(|(axis, value)| (axis, axis.values[value].text.as_str()))
     }
 
+    /// Returns the quality of a stage at a point.
+    fn quality(&self, stage: &str, point: &Point) -> Quality {
+        let settings = self.settings(stage, point);
+        let last = settings.into_iter().rfind(|setting| setting.kind == Kind::Quality);
+        let given = last.and_then(|setting| Quality::parse(&setting.value).ok());
+        given.or(self.pipeline.quality).unwrap_or_default()
+    }
+
     /// Resolves a stage's parameters at a point. The command line overrides the file, a block
-    /// overrides the block that it extends, and both override defaults.
+    /// overrides the block that it extends, both override the quality, and all override defaults.
     fn resolve(
         &self,
         stage: &str,
@@ -329,6 +341,7 @@ impl<'a> Expansion<'a> {
             }
             program.schema.override_with(&mut given, &settings);
         }
+        self.quality(stage, point).fill(program, &mut given);
         program
             .schema
             .resolve(&given)

@@ -54,6 +54,7 @@ impl Pipeline {
         }
         self.stages.extend(other.stages);
         self.experiment.override_with(&other.experiment);
+        self.quality = self.quality.or(other.quality);
         for file in other.files {
             if !self.files.iter().any(|known| known.canonical_path == file.canonical_path) {
                 self.files.push(file);
@@ -99,6 +100,7 @@ fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline,
         pipeline.stages.entry(name.clone()).or_default().override_with(block);
     }
     pipeline.experiment.override_with(&file.content.experiment);
+    pipeline.quality = file.content.quality.or(pipeline.quality);
     if !file.content.default.is_empty() {
         pipeline.default.clone_from(&file.content.default);
     }

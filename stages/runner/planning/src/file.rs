@@ -9,6 +9,7 @@ use serde_json::{Map, Value};
 use slurm::Resources;
 
 use crate::experiment::Experiment;
+use crate::quality::Quality;
 
 /// A pipeline file: `pipeline.yaml`, or a file of `pipelines/`.
 ///
@@ -26,6 +27,11 @@ pub struct PipelineFile {
     /// Targets of `nerf-sr run` if the command line names none. By default, those of the first
     /// extended file.
     pub default: Vec<String>,
+    /// Quality of all stages: parameters that trade speed for accuracy, unless blocks or the
+    /// command line set them. By default, that of the first extended file that sets one, or else
+    /// `balanced`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub quality: Option<Quality>,
     /// Blocks by stage name.
     pub stages: BTreeMap<String, StageBlock>,
     /// Scenes, protocols and variants of an experiment.

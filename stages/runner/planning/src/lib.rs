@@ -5,6 +5,7 @@
 //!   extends. [`find_targets`] also searches the files in `pipelines/` and `experiments/`.
 //! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several
 //!   parameters and inputs.
+//! * [`Quality`]: trade of speed for accuracy, as one word that sets several parameters.
 //! * [`Programs`]: description of each stage's program, cached in the store.
 //! * [`Plan`]: nodes (stages × swept values) in topological order, and their states: cached, to run
 //!   or waiting. `check` checks the whole pipeline, `arguments` and `axes` parse the command line,
@@ -40,6 +41,7 @@ mod left_out;
 mod node;
 mod pipeline;
 mod plan;
+mod quality;
 mod request;
 mod sources;
 pub mod stage_call;
@@ -58,6 +60,7 @@ pub use key::{explain, key_parts, nearest_changes, nearest_record};
 pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
 pub use pipeline::Pipeline;
 pub use plan::{HashedInputs, hash_inputs, read_source};
+pub use quality::Quality;
 pub use request::{PlanError, Request};
 pub use sources::{Source, SourceError};
 pub use stages::{Describing, ProgramError, Programs, StageProgram, executable};

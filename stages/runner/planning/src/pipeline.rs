@@ -6,6 +6,7 @@ use slurm::Resources;
 
 use crate::experiment::Experiment;
 use crate::file::{InputSource, ParsedFile, Part, PipelineError, StageBlock};
+use crate::quality::Quality;
 
 /// Blocks of a pipeline file and of the files that it extends.
 #[derive(Clone, Debug, Default)]
@@ -16,6 +17,8 @@ pub struct Pipeline {
     pub stages: BTreeMap<String, StageBlock>,
     /// Scenes, protocols and variants.
     pub experiment: Experiment,
+    /// Quality of all stages, if a file sets one.
+    pub quality: Option<Quality>,
     /// The given file and the files that it extends; each file comes before those that it extends.
     pub files: Vec<Arc<ParsedFile>>,
 }

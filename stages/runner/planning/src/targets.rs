@@ -28,6 +28,15 @@ pub fn find_targets(
         };
         joined = Some(match joined {
             None => found,
+            Some(joined)
+                if joined.quality.unwrap_or_default() != found.quality.unwrap_or_default() =>
+            {
+                return Err(PlanError::Usage(format!(
+                    "{target} can't be combined with {}: their files set different qualities; run \
+                    {target} alone",
+                    blocks.join(", ")
+                )));
+            }
             Some(joined) => joined.joined(found).map_err(|problem| {
                 PlanError::Usage(format!(
                     "{target} can't be combined with {}: {problem}; run {target} alone",

@@ -23,8 +23,6 @@ use unposed::UnposedImages;
 pub(crate) const MAX_WIDTH: u32 = 800;
 /// HR width over LR width, chosen by hand.
 const SCALE: u32 = 2;
-/// Number of training rays: chosen by hand for a training of minutes on a CPU.
-const TRAINING_RAYS: u64 = 20_000_000;
 /// File names and texts of the shipped targets (`pipelines/` of the repository).
 const TARGETS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/targets.rs"));
 
@@ -186,7 +184,6 @@ fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {
         .replace("{images}", &image_parameters(set))
         .replace("{lens}", lens)
         .replace("{split}", split)
-        .replace("{rays}", &TRAINING_RAYS.to_string())
         // Last, since a folder's name may contain braces.
         .replace("{dataset}", dataset)
 }

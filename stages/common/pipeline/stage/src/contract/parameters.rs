@@ -118,6 +118,11 @@ impl Schema {
         scene_dependent.collect()
     }
 
+    /// Returns whether parameters select the default variant, or none.
+    pub fn is_default_variant(&self, given: &Map<String, Value>) -> bool {
+        std::ptr::eq(self.selected_variant(&self.flattened(given)), &self.variants[0])
+    }
+
     /// Returns the schema of the selected variant; of the default one if none or an unknown one is
     /// selected.
     fn selected_variant(&self, flat: &Map<String, Value>) -> &VariantSchema {
