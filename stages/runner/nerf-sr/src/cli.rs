@@ -64,7 +64,9 @@ struct PlanArgs {
     targets: Vec<String>,
     /// Set a parameter. Several values run all combinations; stages that don't depend on the
     /// parameter run once. A value is JSON, such as a number, true or null, or plain text; an empty
-    /// value is null. If a parameter is given twice, the last value wins
+    /// value is null. If a parameter is given twice, the last value wins. `quality` sets those
+    /// parameters of training, rendering and refinement that are not set otherwise: `best`,
+    /// `balanced` in a third of its time [default], `fast` in a tenth, or `draft` in a thirtieth
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
     /// Read an input from this folder, not from what the pipeline names, e.g. -i
@@ -166,6 +168,14 @@ enum Verb {
         /// Print JSON
         #[arg(long)]
         json: bool,
+    },
+    /// Describe the scenes, estimate the time of each quality, and print the command that fits
+    Advise {
+        #[command(flatten)]
+        plan: PlanArgs,
+        /// Time that the run may take; the best quality within it is chosen [default: balanced]
+        #[arg(long, value_name = "N")]
+        minutes: Option<f64>,
     },
     /// Explain why a stage is cached, would run, or waits
     Why {
@@ -294,6 +304,10 @@ pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
         Verb::Job { submission, number } => verbs::job(&submission, number),
         Verb::Init { folder } => verbs::init(&folder, &global.pipeline),
         Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json),
+        Verb::Advise { plan, minutes } => {
+            let arguments = global.arguments_of_log(&plan);
+            verbs::advise(&global.open_session()?, &plan.into(), minutes, &arguments)
+        }
         Verb::Why { stage, plan, json } => {
             verbs::why(&global.open_session()?, &stage, &plan.into(), json)
         }

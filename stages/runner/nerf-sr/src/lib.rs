@@ -4,6 +4,7 @@
 //! * `cli`, `session`, `verbs`: the command line, its pipeline and store, and one function a verb.
 //! * `execute`: carries out a plan on this machine or as a cluster's jobs, each node under its
 //!   key's lock. `unchanged` checks that programs and inputs stay the same while a stage runs.
+//! * `estimates`: processor time of the stages to run.
 //! * `identities`: identities of nodes whose keys aren't known yet.
 //! * `node_report`: a plan's nodes as JSON. `state_text`: their states as text. `lineage`: two
 //!   results and their inputs, compared.
@@ -15,6 +16,7 @@
 
 mod archive;
 mod cli;
+mod estimates;
 mod execute;
 mod garbage;
 mod identities;

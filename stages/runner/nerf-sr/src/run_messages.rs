@@ -57,6 +57,12 @@ impl FailureHint {
     }
 }
 
+/// Returns a command of this program as text, for a POSIX shell.
+pub(crate) fn command_text(arguments: &[String]) -> String {
+    let words = arguments.iter().map(|word| shell_quoted(word));
+    [&["nerf-sr".to_owned()], &words.collect::<Vec<_>>()[..]].concat().join(" ")
+}
+
 /// Quotes a word for a POSIX shell where necessary.
 fn shell_quoted(word: &str) -> String {
     let is_plain = word.chars().all(|c| c.is_ascii_alphanumeric() || "_@%+=:,./-".contains(c));

@@ -23,6 +23,11 @@ pub(crate) fn blocking_nodes(states: &[State], index: usize) -> BTreeSet<usize> 
     found
 }
 
+/// Returns a number of processors as text.
+pub(crate) fn processors_text(count: usize) -> String {
+    if count == 1 { "1 processor".to_owned() } else { format!("{count} processors") }
+}
+
 /// Describes a node's state. With records, explains why the node will run.
 pub(crate) fn state_text(
     session: &Session,

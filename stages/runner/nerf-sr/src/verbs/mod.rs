@@ -1,5 +1,6 @@
 //! The verbs of the command line.
 
+mod advise;
 mod diff;
 mod gc;
 mod graph;
@@ -16,6 +17,7 @@ use std::process::ExitCode;
 
 use serde::Serialize;
 
+pub(crate) use advise::advise;
 pub(crate) use diff::diff;
 pub(crate) use gc::{GcOutput, gc};
 pub(crate) use graph::{GraphFormat, graph};
