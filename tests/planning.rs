@@ -258,6 +258,43 @@ fn sinks_are_part_of_the_picture() {
         .fails(2, &["no stage \"evla\" in this plan; did you mean eval? known: demo-scene, eval"]);
 }
 
+/// Times follow from the sizes of images that don't exist yet.
+#[test]
+fn times_are_estimated_before_a_run() {
+    let project = Project::tiny();
+    let plan = project.ok(&["plan"]);
+    // Training, rendering, scoring, and all of them.
+    let times = plan.lines().filter(|line| line.contains("of processor time")).count();
+    assert_eq!(times, 4, "{plan}");
+    let advice = project.ok(&["advise", "-p", "test_views=1", "--minutes", "100"]);
+    for words in ["12 training views", "1 views", "draft ", "fast ", "balanced ", "best "] {
+        assert!(advice.contains(words), "{words}: {advice}");
+    }
+    assert!(advice.trim_end().ends_with("-p test_views=1 -p quality=best"), "{advice}");
+    let advice = project.ok(&["advise", "--minutes", "0"]);
+    assert!(advice.contains("no quality fits into 0 minutes"), "{advice}");
+    assert!(project.ok(&["advise"]).trim_end().ends_with("-p quality=balanced"));
+}
+
+/// What runs with a quality is cached for its parameters, and for no quality on other stages.
+#[test]
+fn a_quality_is_known_by_its_parameters() {
+    let project = Project::tiny();
+    let known = "no quality \"good\"; choose draft, fast, balanced or best";
+    project.run(&["plan", "-p", "quality=good"]).fails(2, &["-p quality=good: ", known]);
+    project.ok(&["run", "-p", "quality=fast"]);
+    let others = [
+        "rays_per_pixel=3",
+        "min_rays=1000000",
+        "max_rays=8000000",
+        "render-depth.samples_per_axis=1",
+    ];
+    let written: Vec<&str> = others.iter().flat_map(|parameter| ["-p", parameter]).collect();
+    let written = project.ok(&[&["status", "eval"], &written[..]].concat());
+    assert!(written.lines().all(|line| line.contains(" cached ")), "{written}");
+    assert!(!project.ok(&["status", "eval"]).lines().all(|line| line.contains(" cached ")));
+}
+
 /// The plan says what a run then does: what will run runs, what is cached doesn't, and what waits
 /// may do either. Equal values are one key.
 #[test]

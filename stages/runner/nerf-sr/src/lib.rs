@@ -1,5 +1,6 @@
 //! `nerf-sr`, the runner: pipeline.yaml → plan → run. The crate `planning` creates plans; this one
-//! carries them out. It knows stages by their `describe` alone and artifacts by their hashes.
+//! carries them out. It knows stages by their `describe` and artifacts by their hashes; `estimates`
+//! also knows what the rays and pixels of some stages cost.
 //!
 //! * `cli`, `session`, `verbs`: the command line, its pipeline and store, and one function a verb.
 //! * `execute`: carries out a plan on this machine or as a cluster's jobs, each node under its

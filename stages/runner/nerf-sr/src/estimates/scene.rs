@@ -36,7 +36,7 @@ impl SceneImages {
                 let size = &view["camera"]["intrinsics"];
                 Some((size["width"].as_f64()?, size["height"].as_f64()?))
             });
-            folders.push((folder, count(sizes.collect::<Option<Vec<_>>>()?)));
+            folders.push((folder, count(&sizes.collect::<Option<Vec<_>>>()?)));
         }
         Some(Self { kind, folders })
     }
@@ -99,7 +99,8 @@ impl SceneImages {
         };
         let max_test = number("test_views").map_or(usize::MAX, |count| count as usize);
         let images = |indices: &[usize], factor: f64| {
-            count(indices.iter().map(|&i| (sizes[i].0 * factor, sizes[i].1 * factor)).collect())
+            let scaled = indices.iter().map(|&i| (sizes[i].0 * factor, sizes[i].1 * factor));
+            count(&scaled.collect::<Vec<_>>())
         };
         let test: Vec<usize> = split.test.iter().copied().take(max_test).collect();
         let references = number("hr_references").unwrap_or(0.0) as usize;
@@ -152,7 +153,7 @@ fn size_of(frame: &Frame) -> (f64, f64) {
     (f64::from(size.width), f64::from(size.height))
 }
 
-fn count(sizes: Vec<(f64, f64)>) -> Images {
+fn count(sizes: &[(f64, f64)]) -> Images {
     let pixels = sizes.iter().map(|(width, height)| width.round() * height.round());
     Images { count: sizes.len() as u64, pixels: pixels.sum::<f64>() as u64 }
 }
