@@ -148,7 +148,7 @@ fn given_parameters_override_a_quality() {
     ] {
         let node = node(&file, arguments, stage);
         let found = ["rays", "min_rays", "rays_per_pixel"].map(|name| &node.parameters[name]);
-        let numbers = found.map(|value| value.as_f64());
+        let numbers = found.map(Value::as_f64);
         assert_eq!(numbers, expected.each_ref().map(Value::as_f64), "{arguments:?}");
     }
 }
