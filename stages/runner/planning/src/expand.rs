@@ -118,8 +118,32 @@ impl<'a> Expansion<'a> {
                 });
             }
         }
-        let nodes = nodes.into_iter().collect();
+        let nodes: Vec<usize> = nodes.into_iter().collect();
+        self.check_sink_rules(stage, &program, &parameters, &nodes)?;
         Ok(Sink { stage: stage.to_owned(), program, parameters, nodes, left_out })
+    }
+
+    /// Checks the rules of a sink's description for each node that it shows.
+    fn check_sink_rules(
+        &self,
+        stage: &str,
+        program: &StageProgram,
+        parameters: &Value,
+        nodes: &[usize],
+    ) -> Result<(), PlanError> {
+        for (input, source) in self.block_inputs(stage) {
+            for node in nodes.iter().map(|&index| &self.nodes[index]) {
+                if source.stage() != Some(node.stage.as_str()) {
+                    continue;
+                }
+                let given = Some(node.parameters.clone());
+                let inputs = GivenInputs::from([(input.to_owned(), given)]);
+                if let Some(problem) = program.description.broken_rule(parameters, &inputs) {
+                    return Err(PlanError::Usage(format!("stage {stage}: {problem}")));
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Returns the inputs of a block, without those that an axis replaces at every point.
