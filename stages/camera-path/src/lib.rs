@@ -1,15 +1,19 @@
 //! `camera-path`: creates cameras along a path through a scene, for `render-depth` and `video`.
 //!
 //! * [`Params`]: [`Kind`] of the path, number of frames, and more.
+//! * `recorded`: reads a path that a viewer has recorded.
 //! * [`poses`]: computes the poses of a path from the scene's cameras and bounds.
+
+mod recorded;
 
 use std::f64::consts::TAU;
 
-use artifact::Failure;
+use artifact::{Failure, GivenInput};
 use glam::{DMat3, DQuat, DVec3};
 use pixels::{DEGRADATION_FILE, Degradation};
 use scene::{
-    Bounds, Camera, Pose, Space, VIEWS_FILE, View, Views, common_direction, looking_at, pose_of,
+    Bounds, Camera, Intrinsics, Pose, Space, VIEWS_FILE, View, Views, common_direction, looking_at,
+    pose_of,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -36,7 +40,7 @@ pub struct Params {
     /// numbers, as in `views.json`.
     pub poses: Vec<Pose>,
     /// Width of the frames in pixels; the height follows from the first camera's aspect. Default:
-    /// the width of the scene's HR images.
+    /// the width of the scene's HR images, or that of input `path`.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by scene"))]
     pub size: Option<u32>,
 }
@@ -73,7 +77,12 @@ impl Stage for CameraPath {
     fn inputs() -> Vec<(&'static str, Input)> {
         let kinds =
             ["scene/train", "scene/cameras", "scene/truth", "scene/references", "cameras", "views"];
-        vec![("cameras", Input::required(&kinds, "folder with views.json: the scene's cameras"))]
+        let path = "folder with camera_path.json, as the viewer or nerfstudio records it; replaces \
+            kind, frames and poses";
+        vec![
+            ("cameras", Input::required(&kinds, "folder with views.json: the scene's cameras")),
+            ("path", Input::optional(&["camera-path"], path)),
+        ]
     }
 
     fn output() -> Output {
@@ -83,37 +92,70 @@ impl Stage for CameraPath {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let input = context.input("cameras")?;
         let scene = Views::read(input)?;
-        let mut first = scene.views[0].camera.clone();
-        // Frames have no lens distortion.
-        first.intrinsics = first.intrinsics.pinhole().unwrap_or(first.intrinsics);
-        let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
-        let hr_width = degradation.map(|degradation| degradation.hr[0]);
-        let width = params.size.or(hr_width).unwrap_or(first.intrinsics.width);
-        let aspect = f64::from(first.intrinsics.height) / f64::from(first.intrinsics.width);
-        let height = (f64::from(width) * aspect).round().max(1.0) as u32;
-        let cameras: Vec<Camera> = scene.views.iter().map(|v| v.camera.clone()).collect();
-        let kind = params.kind.unwrap_or_else(|| default_kind(&cameras, params));
-        let poses = poses(kind, params, &cameras, &scene.bounds);
-        if poses.is_empty() {
-            return Err(Failure::Usage(
-                "parameter poses: kind list needs at least one pose".to_owned(),
-            )
-            .into());
-        }
-        let views = poses.into_iter().enumerate().map(|(i, pose)| {
-            let camera =
-                Camera { name: format!("frame_{i:05}"), camera_to_world: pose, ..first.clone() };
-            View::camera_only(camera.resized(width, height))
-        });
-        let views = Views::new(scene.background, scene.bounds, views.collect());
+        let (cameras, kind) = match context.optional_input("path") {
+            Some(path) => (recorded_cameras(path, params)?, "recorded".to_owned()),
+            None => computed_cameras(input, &scene, params)?,
+        };
+        let views = cameras.into_iter().map(View::camera_only).collect();
+        let views = Views::new(scene.background, scene.bounds, views);
         views.check().map_err(|e| Failure::Usage(format!("parameter poses: {e}")))?;
         context.write_json(VIEWS_FILE, &views)?;
+        let size = views.views[0].camera.intrinsics;
         context.write_summary(&format!(
-            "{} of {width}×{height}, {}",
+            "{} of {}×{}, {kind}",
             artifact::format_count(views.views.len(), "frame"),
-            format!("{kind:?}").to_lowercase()
+            size.width,
+            size.height,
         ))
     }
+}
+
+/// Returns a frame's name by its index.
+pub(crate) fn frame_name(index: usize) -> String {
+    format!("frame_{index:05}")
+}
+
+/// Returns the height of an image with another width and the same aspect.
+fn height_at(width: u32, intrinsics: &Intrinsics) -> u32 {
+    let aspect = f64::from(intrinsics.height) / f64::from(intrinsics.width);
+    (f64::from(width) * aspect).round().max(1.0) as u32
+}
+
+/// Reads the cameras of a recorded path, with the width of the parameters, if given.
+fn recorded_cameras(path: &GivenInput, params: &Params) -> Result<Vec<Camera>, Failure> {
+    let mut cameras = recorded::read_cameras(path)?;
+    if let Some(width) = params.size {
+        for camera in &mut cameras {
+            *camera = camera.resized(width, height_at(width, &camera.intrinsics));
+        }
+    }
+    Ok(cameras)
+}
+
+/// Computes the cameras of a path, and the name of its kind.
+fn computed_cameras(
+    input: &GivenInput,
+    scene: &Views,
+    params: &Params,
+) -> Result<(Vec<Camera>, String), Failure> {
+    let mut first = scene.views[0].camera.clone();
+    // Frames have no lens distortion.
+    first.intrinsics = first.intrinsics.pinhole().unwrap_or(first.intrinsics);
+    let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
+    let hr_width = degradation.map(|degradation| degradation.hr[0]);
+    let width = params.size.or(hr_width).unwrap_or(first.intrinsics.width);
+    let height = height_at(width, &first.intrinsics);
+    let cameras: Vec<Camera> = scene.views.iter().map(|v| v.camera.clone()).collect();
+    let kind = params.kind.unwrap_or_else(|| default_kind(&cameras, params));
+    let poses = poses(kind, params, &cameras, &scene.bounds);
+    if poses.is_empty() {
+        let message = "parameter poses: kind list needs at least one pose";
+        return Err(Failure::Usage(message.to_owned()));
+    }
+    let frames = poses.into_iter().enumerate().map(|(i, camera_to_world)| {
+        Camera { name: frame_name(i), camera_to_world, ..first.clone() }.resized(width, height)
+    });
+    Ok((frames.collect(), format!("{kind:?}").to_lowercase()))
 }
 
 /// Chooses the kind of path if the parameter isn't given.
@@ -228,7 +270,6 @@ fn interpolated_pose(cameras: &[Camera], fraction: f64) -> Pose {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use scene::Intrinsics;
 
     fn camera(name: &str, camera_to_world: Pose) -> Camera {
         let intrinsics = Intrinsics::from_angle_x(40, 30, 0.7);
