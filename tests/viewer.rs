@@ -174,13 +174,61 @@ fn the_page_shows_text_as_the_field_does() {
     }
 }
 
-/// Fields of scenes without end aren't shown wrong, but refused.
+/// Blocks of a demo scene whose field has surfaces: fields of fewer rays are haze.
+fn clear_scene(demo_scene: &str) -> String {
+    format!(
+        "  demo-scene:\n    parameters: {{size: 64, train: 24{demo_scene}}}\n  \
+        prep:\n    parameters: {{lr_width: 32}}\n  \
+        train-ss:\n    parameters: {{rays: 300000, n_levels: 6, hidden_dim: 32}}\n"
+    )
+}
+
+/// Trains a field of the demo scene in a space, and compares the page with rendered views of three
+/// test cameras and of three cameras between them.
+fn compare_space(demo_scene: &str, space: &str) {
+    let blocks = format!(
+        "{}  camera-path:\n    inputs: {{cameras: prep/cameras}}\n    \
+        parameters: {{kind: between, frames: 6, size: 512}}\n  \
+        viewer:\n    parameters: {{resolution: 128}}\n",
+        clear_scene(demo_scene)
+    );
+    let project = Project::shipped(&["viewer", "video"], &blocks);
+    project.ok(&["run", "viewer", "path-views"]);
+    let field = project.json("train-ss", "field.json", &["train-ss"]);
+    let found = &field["bounds"]["space"];
+    assert!(found == space || found.get(space).is_some(), "{found}");
+    let page = project.path("out/viewer/index.html");
+    assert!(page.metadata().unwrap().len() < 25_000_000);
+    let views = project.artifact("path-views", &["path-views"]);
+    let Some(views) = checked(&page, &views, 26.0, 64.0) else { return };
+    assert_eq!(views.len(), 6);
+    for view in &views {
+        let [psnr, mirrored] = ["psnr", "mirrored"].map(|key| view[key].as_f64().unwrap());
+        assert!(mirrored < psnr - 4.0, "{view}");
+    }
+}
+
 #[test]
-fn other_spaces_are_refused() {
-    let blocks = "  demo-scene:\n    parameters: {layout: forward, backdrop: true}\n";
-    let project = Project::shipped(&["viewer"], blocks);
-    project.run(&["run", "viewer", "-p", "rays=4000"]).fails(1, &["viewer", "ndc", "box"]);
-    assert!(!project.path("out/viewer/index.html").exists());
+fn the_page_shows_a_box() {
+    compare_space("", "box");
+}
+
+#[test]
+fn the_page_shows_a_frustum() {
+    compare_space(", layout: forward, backdrop: true", "ndc");
+}
+
+#[test]
+fn the_page_shows_a_contracted_space() {
+    compare_space(", backdrop: true", "contraction");
+}
+
+/// A field that can't be shown is refused before it is trained.
+#[test]
+fn the_papers_field_is_refused_before_anything_runs() {
+    let project = Project::shipped(&["viewer"], "");
+    project.run(&["run", "viewer", "-p", "field=mlp"]).fails(2, &["viewer", "baked", "grid"]);
+    assert!(!project.path(".nerf-sr/actions").exists());
 }
 
 fn distance_from_origin(state: &Value) -> f64 {
@@ -188,20 +236,39 @@ fn distance_from_origin(state: &Value) -> f64 {
     centre.map(|c| c.as_f64().unwrap().powi(2)).sum::<f64>().sqrt()
 }
 
+/// A recorded path has frames between its keys, and `camera-path` reads it: the page and
+/// `render-depth` show the same.
+fn check_recorder(project: &Project, recorded: &Path, second: &Value) {
+    let path: Value = serde_json::from_slice(&std::fs::read(recorded).unwrap()).unwrap();
+    let frames = |path: &Value| path["camera_path"].as_array().unwrap().clone();
+    assert_eq!((frames(&path).len(), frames(second).len()), (1, 49));
+    assert_eq!(frames(&path)[0], frames(second)[0]);
+    for key in ["matrix", "fov", "aspect"] {
+        assert!(second["keyframes"][1].get(key).is_some(), "{key}");
+    }
+    let arguments = ["-i", "camera-path.path=recorded", "-p", "camera-path.size=256"];
+    project.ok(&[&["run", "path-views"], &arguments[..]].concat());
+    let views = project.artifact("path-views", &[&["path-views"], &arguments[..]].concat());
+    let page = project.path("out/viewer/index.html");
+    assert_eq!(checked(&page, &views, 22.0, 64.0).unwrap().len(), 1);
+}
+
 /// What people do with mouse, keys and fingers changes the view as they expect.
 #[test]
 fn people_can_look_around() {
-    let project = Project::shipped(&["viewer"], "");
-    project.ok(&["run", "viewer", "-p", "resolution=64", "-p", "photographs=6"]);
+    let project = Project::shipped(&["viewer", "video"], &clear_scene(""));
+    project.ok(&["run", "viewer", "-p", "viewer.resolution=64", "-p", "photographs=12"]);
     let page = project.path("out/viewer/index.html");
-    let Some(found) = run_in_browser("viewer-controls.mjs", [&page]) else { return };
+    let recorded = project.path("recorded/camera_path.json");
+    let files = [&page, &project.path("shots"), &recorded];
+    let Some(found) = run_in_browser("viewer-controls.mjs", files) else { return };
     let at = |device: &str, when: &str| found[device]["states"][when].clone();
     for device in ["desktop", "phone"] {
         assert_eq!(found[device]["problems"], json!([]), "{device}");
     }
     let desktop = |when: &str| at("desktop", when);
     let (first, next) = (desktop("first"), desktop("next"));
-    assert_eq!(next["camera"], (first["camera"].as_i64().unwrap() + 1) % 12);
+    assert_eq!(next["camera"], (first["camera"].as_i64().unwrap() + 1) % 24);
     // Every other camera has its photograph.
     assert_ne!(first["photograph"], next["photograph"]);
     let steps = ["first", "next", "arrow", "wheel", "drag", "depth", "opacity"];
@@ -214,6 +281,25 @@ fn people_can_look_around() {
         distance_from_origin(&desktop("wheel")) > 1.1 * distance_from_origin(&desktop("arrow")),
         "the wheel moves away"
     );
+    assert_eq!(first["title"], "demo-scene");
+    assert_ne!(desktop("depth")["scale"], "");
+    assert_eq!([&desktop("depth")["dialog"], &desktop("keys")["dialog"]], [false, true]);
+    for pair in [["keys", "angle"], ["angle", "turntable"]] {
+        assert_ne!(desktop(pair[0])["hash"], desktop(pair[1])["hash"], "{pair:?}");
+    }
+    assert_ne!(desktop("angle")["angle"], desktop("keys")["angle"]);
+    // Zooming stops before the surface.
+    let nearest = &desktop("inside")["nearest"];
+    assert!(nearest.as_f64().is_some_and(|found| (0.01..0.1).contains(&found)), "{nearest}");
+    assert_eq!(desktop("flown")["camera"], 3);
+    // The page's own colour is behind the scene, in a dark scheme as well.
+    // Haze changes it a little.
+    let is_about = |state: &Value, expected: f64| {
+        let mut levels = state["corner"].as_array().unwrap().iter().map(|c| c.as_f64().unwrap());
+        levels.all(|level| (level - expected).abs() < 24.0)
+    };
+    assert!(is_about(&first, 255.0) && is_about(&at("phone", "first"), 28.0), "{first}");
+    check_recorder(&project, &recorded, &desktop("second")["path"]);
     for state in ["hash", "camera", "centre", "frusta"] {
         assert_eq!(desktop("reset")[state], first[state], "{state}");
     }

@@ -20,6 +20,13 @@ async function state() {
     hash: sum, camera: viewer.at, frusta: drawn,
     photograph: !document.getElementById("photograph").hidden,
     caption: document.getElementById("photo-name").textContent,
+    title: document.querySelector("h1").textContent,
+    angle: document.getElementById("angle-value").textContent,
+    nearest: Math.min(...viewer.volume.distances(viewer.camera(1), 3, viewer.scene.size)) / viewer.scene.size,
+    dialog: document.getElementById("help").open,
+    scale: document.getElementById("depth-scale").hidden ? "" : document.getElementById("depth-scale").textContent,
+    corner: [...viewer.volume.pixels().slice(0, 3)],
+    path: viewer.path(),
     centre: viewer.pose.map((row) => row[3]),
     right: viewer.pose.map((row) => row[0]),
   };
@@ -47,8 +54,38 @@ const onDesktop = (page) => [
   ["drag", async () => { await page.mouse.down(); await page.mouse.move(260, 310, { steps: 3 }); await page.mouse.up(); }],
   ["depth", () => page.check("[value=depth]")],
   ["opacity", () => page.check("[value=opacity]")],
+  ["keys", () => page.click("#show-help")],
+  ["angle", async () => { await page.keyboard.press("Escape"); await page.focus("#view"); await page.keyboard.press("]"); }],
+  ["turntable", async () => { await page.keyboard.press("t"); await page.waitForTimeout(300); await page.keyboard.press("t"); }],
   ["reset", async () => { await page.check("[value=colour]"); await page.uncheck("#with-frusta"); await page.click("#reset"); }],
+  ["inside", async () => { await page.mouse.move(200, 250); for (let i = 0; i < 40; i++) await page.mouse.wheel(0, -300); }],
+  ["home", () => page.click("#reset")],
+  ["key", async () => {
+    const download = page.waitForEvent("download");
+    await page.click("#add-key");
+    await page.click("#save-path");
+    const target = process.argv[4];
+    if (target) await (await download).saveAs(target);
+  }],
+  ["second", async () => { await page.click("#next"); await page.click("#add-key"); }],
+  ["flown", async () => {
+    await page.check("#with-frusta");
+    const [x, y] = await page.evaluate(frustumOfCamera, 3);
+    await page.mouse.click(x, y);
+  }],
 ];
+
+/** In the page: returns where a training camera's frustum is drawn. */
+async function frustumOfCamera(index) {
+  const viewer = await window.viewer;
+  const box = viewer.canvas.getBoundingClientRect();
+  for (let x = 0; x < box.width; x += 4) {
+    for (let y = 0; y < box.height; y += 4) {
+      if (viewer.frustumAt(box.left + x, box.top + y) === index) return [box.left + x, box.top + y];
+    }
+  }
+  return [0, 0];
+}
 
 /** Moves touch points from one list of positions to another. */
 async function touched(page, from, to) {

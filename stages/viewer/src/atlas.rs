@@ -1,8 +1,9 @@
 //! Encodes the volume as the bytes that the page reads, deflated (zlib).
 //!
 //! First a byte for each grid position of bricks, x fastest: the distance to the nearest brick.
-//! Then one plane per channel, with a byte for every voxel of all bricks: opacity; premultiplied
-//! red, green and blue; premultiplied components of view dependence, 128 for 0.
+//! Then one plane per channel, with a byte for every voxel of all bricks: the square root of the
+//! opacity, so that haze has enough levels; red, green and blue times this root; components of view
+//! dependence times this root, 128 for 0.
 
 use std::io::Write as _;
 
@@ -72,12 +73,14 @@ fn planes(volume: &Volume, bricks: &Bricks, components: &Components) -> Vec<u8> 
     planes.resize(CHANNELS * count, 128);
     for voxel in &volume.voxels {
         let Some(i) = bricks.voxel(voxel.position.map(usize::from)) else { continue };
-        planes[i] = to_byte(voxel.opacity);
+        planes[i] = to_byte(voxel.opacity.sqrt());
+        // Root after rounding, which the page divides by.
+        let root = f32::from(planes[i]) / 255.0;
         for c in 0..3 {
-            planes[(1 + c) * count + i] = to_byte(voxel.opacity * voxel.colour[c]);
+            planes[(1 + c) * count + i] = to_byte(root * voxel.colour[c]);
         }
         for (k, value) in components.project(&voxel.view).enumerate() {
-            planes[(4 + k) * count + i] = (128.0 + 127.0 * voxel.opacity * value).round() as u8;
+            planes[(4 + k) * count + i] = (128.0 + 127.0 * root * value).round() as u8;
         }
     }
     planes
@@ -117,14 +120,15 @@ mod tests {
             let at = bricks.voxel(voxel.position.map(usize::from)).unwrap();
             let byte = |plane: usize| f32::from(planes[plane * count + at]);
             opaque += usize::from(byte(0) > 0.0);
-            assert!((byte(0) / 255.0 - voxel.opacity).abs() < 0.51 / 255.0);
+            assert!((byte(0) / 255.0 - voxel.opacity.sqrt()).abs() < 0.51 / 255.0);
+            let root = byte(0) / 255.0;
             for c in 0..3 {
-                let expected = voxel.opacity * voxel.colour[c];
+                let expected = root * voxel.colour[c];
                 assert!((byte(1 + c) / 255.0 - expected).abs() < 0.51 / 255.0);
             }
             for (k, value) in atlas.components.project(&voxel.view).enumerate() {
                 let found = (byte(4 + k) - 128.0) / 127.0;
-                assert!((found - voxel.opacity * value).abs() < 0.51 / 127.0);
+                assert!((found - root * value).abs() < 0.51 / 127.0);
             }
         }
         assert!(opaque == volume.voxels.len() && opaque > 0);

@@ -8,6 +8,7 @@ use scene::{Bounds, Camera};
 use stage::Progress;
 
 use crate::bricks::{Bricks, SIDE, VOXELS};
+use crate::space::{is_reachable, to_world};
 use crate::view::{COEFFICIENTS, fit};
 use crate::visibility::visible_from;
 
@@ -115,7 +116,8 @@ impl<S: Source> Baker<'_, S> {
             let low = brick.map(|c| (c * SIDE) as f32 / self.resolution as f32);
             // The upper corner itself belongs to the next brick.
             let high = brick.map(|c| ((c + 1) * SIDE) as f32 / self.resolution as f32 - 1e-6);
-            self.sources.iter().any(|source| source.has_occupied_cell(low, high))
+            is_reachable(self.bounds, low, high)
+                && self.sources.iter().any(|source| source.has_occupied_cell(low, high))
         })
     }
 
@@ -318,11 +320,6 @@ fn shade<S: Source>(
         scale * sum
     });
     Shaded { colour, view }
-}
-
-/// Maps a position in the unit cube of a box to the world.
-pub(crate) fn to_world(bounds: &Bounds, position: DVec3) -> DVec3 {
-    DVec3::from(bounds.min) + bounds.longest_side() * position
 }
 
 #[cfg(test)]

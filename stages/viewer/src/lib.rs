@@ -11,15 +11,15 @@
 //! * `page`: the HTML file; script, style and shader are in `src/page/`.
 //! * `overview`: initial camera and centre of rotation.
 //!
-//! Positions are those of the field's unit cube ([`scene::Space`]), and the shader maps its rays
-//! into the cube as the field does for a box. The other spaces are refused, because their fields
-//! are too hazy to be baked (docs/design/042).
+//! Positions are those of the field's unit cube ([`scene::Space`]; `space`), and the shader maps its
+//! rays into the cube as the field does (docs/design/042).
 
 mod atlas;
 mod bake;
 mod bricks;
 mod overview;
 mod page;
+mod space;
 mod view;
 mod visibility;
 
@@ -29,12 +29,16 @@ use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput, RunNode, RunRecord, sink_folders};
 use base64::Engine as _;
 use fields::{FieldFile, FieldModel};
-use pixels::{Filter, Rgba8, encode_png, resize_pillow};
+use pixels::{
+    DEGRADATION_FILE, Degradation, Filter, Image, Rgba8, encode_png, read_premultiplied,
+    resize_pillow,
+};
 use radiance::Field;
 use scene::{Bounds, Camera, Intrinsics, Space, Views, undistort_image};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Input, Output, Stage};
+use serde_json::json;
+use stage::{Context, Input, Output, Rule, Stage};
 
 use crate::atlas::Atlas;
 use crate::bake::{Baker, Shape, Volume};
@@ -62,6 +66,9 @@ impl Default for Params {
     }
 }
 
+/// Message for a field that can't be baked, also before its training.
+const PAPER_FIELD: &str = "the paper's field can't be baked; train with `field: grid` to view it";
+
 /// Remedy for short memory, as a sentence fragment.
 const REMEDY: &str = "choose a smaller resolution, or end other programs";
 
@@ -83,6 +90,10 @@ impl Stage for Viewer {
 
     fn output() -> Output {
         Output::kind("page")
+    }
+
+    fn rules() -> Vec<Rule> {
+        vec![Rule::new(PAPER_FIELD).must("run.field", json!({"not": {"const": "mlp"}}))]
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
@@ -111,7 +122,6 @@ fn write_page(
     prefix: &str,
 ) -> anyhow::Result<()> {
     let (file, fields) = read_fields(&node.folder)?;
-    check_space(&file.bounds)?;
     let folder = node.inputs.get("scene").map(|input| run.folder_of(input));
     let folder = folder.context("the field's training has no input `scene`")?;
     let views = Views::read_folder(&folder)?;
@@ -124,14 +134,16 @@ fn write_page(
     let (centre, size) = overview::centre_and_size(&file.bounds, &volume);
     let up = overview::up_direction(&cameras);
     let scene = PageScene {
+        name: scene_name(run),
         resolution,
         bricks: atlas.bricks,
         components: atlas.components.for_shader(),
         background: file.background.grey_level(),
-        // Only the box's faces limit rays: a viewer may be nearer or farther than the cameras were.
-        bounds: Bounds { near: 0.0, far: 1e30, ..file.bounds },
+        bounds: page_bounds(&file.bounds),
         centre: centre.to_array(),
         size,
+        film_width: film_width(&folder, &cameras)?,
+        frustum_depth: overview::frustum_depth(&cameras, size),
         up: up.to_array(),
         start: overview::start_camera(&cameras, up),
         cameras: page_cameras(params, &folder, &views)?,
@@ -139,6 +151,20 @@ fn write_page(
     let html = page::page(&scene, &atlas)?.into_string();
     let path = context.output_path(&format!("{prefix}index.html"))?;
     std::fs::write(&path, html).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Returns the name of the run's data set: the last part of its path.
+fn scene_name(run: &RunRecord) -> String {
+    let name = run.data_sets.first().and_then(|set| Path::new(set).file_name()?.to_str());
+    name.unwrap_or("scene").to_owned()
+}
+
+/// Returns the width of a recorded film in pixels: that of the scene's HR images, if known.
+fn film_width(folder: &Path, cameras: &[&Camera]) -> anyhow::Result<u32> {
+    let input = GivenInput::open("scene", folder)?;
+    let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
+    let lr_width = cameras.first().map_or(1, |camera| camera.intrinsics.width);
+    Ok(degradation.map_or(lr_width, |degradation| degradation.hr[0]))
 }
 
 /// Bakes a field. Fails if memory is short.
@@ -151,18 +177,11 @@ fn bake(context: &Context, baker: &Baker<'_, Field>) -> anyhow::Result<Volume> {
     Ok(baker.volume(&shape, &progress))
 }
 
-/// Refuses NDC and contraction. Their fields are hazy: a voxel's own view features lack what a ray
-/// through haze composites, and pages look washed out (docs/design/042).
-fn check_space(bounds: &Bounds) -> Result<(), Failure> {
-    let space = match bounds.space {
-        Space::Box => return Ok(()),
-        Space::Ndc(_) => "ndc",
-        Space::Contraction => "contraction",
-    };
-    Err(Failure::BadInput(format!(
-        "field.json: the viewer can't show a field with space {space}; if the scene fits into a \
-        box, set prep.space to box"
-    )))
+/// Returns the bounds of the page's rays. A viewer may be nearer than the cameras were and, where
+/// the space's border limits rays, farther.
+fn page_bounds(bounds: &Bounds) -> Bounds {
+    let far = if bounds.space == Space::Contraction { bounds.far } else { 1e30 };
+    Bounds { near: 0.0, far, ..*bounds }
 }
 
 /// Reads all fields of an artifact.
@@ -170,8 +189,7 @@ fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
     let input = GivenInput::open("field", folder)?;
     let file = fields::read_field_file(&input)?;
     let FieldModel::Grid(architecture) = file.field else {
-        let message = "the paper's field can't be baked; train with `field: grid` to view it";
-        return Err(Failure::BadInput(message.to_owned()).into());
+        return Err(Failure::BadInput(PAPER_FIELD.to_owned()).into());
     };
     let fields = (0..file.members)
         .map(|i| Field::read(&input.path(&FieldFile::member_file(i)), architecture, file.bounds))
@@ -192,7 +210,7 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
         let pinhole = pinhole_of_fisheye(&intrinsics);
         let photograph = match &view.image {
             Some(file) if has_photograph => {
-                let image = views.read_over(&folder.join(file))?.to_rgba8();
+                let image = straight_alpha(&read_premultiplied(&folder.join(file))?);
                 let image = match pinhole {
                     Some(pinhole) => undistort_image(&image, &intrinsics, &pinhole),
                     None => image,
@@ -210,6 +228,19 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
         });
     }
     Ok(cameras)
+}
+
+/// Converts premultiplied RGBA to 8 bits with straight alpha, so that the page's background is
+/// behind the photograph, too.
+fn straight_alpha(image: &Image) -> Rgba8 {
+    let mut data = image.data.clone();
+    for pixel in data.as_chunks_mut::<4>().0 {
+        let [.., alpha] = *pixel;
+        if alpha > 0.0 {
+            pixel[..3].iter_mut().for_each(|level| *level /= alpha);
+        }
+    }
+    Image::new(image.width, image.height, 4, data).to_rgba8()
 }
 
 /// Returns the pinhole camera that the page draws instead of a fisheye camera. The page ignores

@@ -2,33 +2,51 @@
 
 use glam::{DMat3, DVec3};
 use nalgebra::{Matrix3, SymmetricEigen};
-use scene::{Bounds, Camera, common_direction};
+use scene::{Bounds, Camera, Space, common_direction};
 
-use crate::bake::{Volume, to_world};
+use crate::bake::{Volume, Voxel};
+use crate::space::to_world;
 
 /// Sine of the preferred elevation above the horizon; chosen by hand.
 const ELEVATION_SINE: f64 = 0.4;
 
-/// Returns centre and extent of the voxels, in scene units; of the box if there are no voxels.
+/// Returns centre and extent of the voxels, in scene units; of the box if there are no voxels. In a
+/// contracted space only voxels in the ball count, if there are any: the others have no size.
 pub(crate) fn centre_and_size(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
-    let box_centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
-    if volume.voxels.is_empty() {
-        return (box_centre, bounds.longest_side());
-    }
     let resolution = volume.resolution as f64;
-    let points: Vec<DVec3> = volume
-        .voxels
-        .iter()
-        .map(|v| {
-            let position = DVec3::from(v.position.map(|c| (f64::from(c) + 0.5) / resolution));
-            to_world(bounds, position)
-        })
-        .collect();
+    let position = |v: &Voxel| DVec3::from(v.position.map(|c| (f64::from(c) + 0.5) / resolution));
+    let mut positions: Vec<DVec3> = volume.voxels.iter().map(position).collect();
+    let is_in_ball = |p: &DVec3| p.distance(DVec3::splat(0.5)) < 0.25;
+    if bounds.space == Space::Contraction && positions.iter().any(is_in_ball) {
+        positions.retain(is_in_ball);
+    }
+    if positions.is_empty() {
+        return (bounds.middle(), bounds.longest_side());
+    }
     // The median ignores floaters and distant background.
-    let centre =
-        DVec3::from([0, 1, 2].map(|axis| quantile(points.iter().map(|p| p[axis]).collect(), 0.5)));
-    let reach = quantile(points.iter().map(|p| p.distance(centre)).collect(), 0.9);
-    (centre, (2.0 * reach).max(f64::MIN_POSITIVE))
+    let median = [0, 1, 2].map(|axis| quantile(positions.iter().map(|p| p[axis]).collect(), 0.5));
+    let centre = to_world(bounds, DVec3::from(median));
+    let distances = positions.iter().map(|&p| to_world(bounds, p).distance(centre)).collect();
+    // Half of a frustum's voxels may lie in the far background.
+    let fraction = if matches!(bounds.space, Space::Ndc(_)) { 0.5 } else { 0.9 };
+    (centre, (2.0 * quantile(distances, fraction)).max(f64::MIN_POSITIVE))
+}
+
+/// Depth of a drawn frustum over the distance to the nearest camera; chosen by hand.
+const FRUSTUM_SHARE: f64 = 0.4;
+/// Maximum depth of a drawn frustum over the scene's size; chosen by hand.
+const MAX_FRUSTUM_SHARE: f64 = 0.06;
+
+/// Returns the depth at which frusta are drawn, in scene units: small enough that they are apart.
+pub(crate) fn frustum_depth(cameras: &[&Camera], size: f64) -> f64 {
+    let centres: Vec<DVec3> = cameras.iter().map(|camera| camera.centre()).collect();
+    let mut spacings = Vec::with_capacity(centres.len());
+    for a in &centres {
+        let distances = centres.iter().map(|b| a.distance(*b)).filter(|&distance| distance > 0.0);
+        spacings.extend(distances.min_by(f64::total_cmp));
+    }
+    let largest = MAX_FRUSTUM_SHARE * size;
+    if spacings.is_empty() { largest } else { largest.min(FRUSTUM_SHARE * quantile(spacings, 0.5)) }
 }
 
 /// Returns the value below which the given fraction of values is.
@@ -70,7 +88,6 @@ pub(crate) fn start_camera(cameras: &[&Camera], up: DVec3) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bake::Voxel;
     use crate::view::COEFFICIENTS;
     use scene::Intrinsics;
 
@@ -104,6 +121,18 @@ mod tests {
         assert!((-start.forward().dot(up_is) - ELEVATION_SINE).abs() < 0.1);
         // A single camera has its own up direction.
         assert!(up_direction(&cameras[..1]).dot(cameras[0].rotation().y_axis) > 0.9999);
+    }
+
+    /// Frusta of near cameras are small, those of distant or single ones no larger than the scene
+    /// allows.
+    #[test]
+    fn frusta_stay_apart() {
+        let at = |x: f64| camera(DVec3::new(x, 1.0, 1.0), DVec3::Z);
+        let cameras = [0.0, 0.1, 0.2, 0.2, 9.0].map(at);
+        let cameras: Vec<&Camera> = cameras.iter().collect();
+        assert!((frustum_depth(&cameras, 10.0) - 0.04).abs() < 1e-9);
+        assert!((frustum_depth(&cameras, 0.1) - 0.006).abs() < 1e-9);
+        assert!((frustum_depth(&cameras[..1], 10.0) - 0.6).abs() < 1e-9);
     }
 
     #[test]

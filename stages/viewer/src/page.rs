@@ -10,9 +10,10 @@ use crate::atlas::Atlas;
 const STYLE: &str = include_str!("page/viewer.css");
 const VERTEX_SHADER: &str = include_str!("page/shader.vert");
 const FRAGMENT_SHADER: &str = include_str!("page/shader.frag");
-const SCRIPTS: [&str; 3] = [
+const SCRIPTS: [&str; 4] = [
     include_str!("page/volume.js"),
     include_str!("page/camera.js"),
+    include_str!("page/recorder.js"),
     include_str!("page/viewer.js"),
 ];
 /// Content security policy: the page's own scripts and styles, and embedded images.
@@ -22,6 +23,8 @@ const POLICY: &str =
 /// Description of the scene for the page's script, in addition to the volume's bytes.
 #[derive(Debug, Serialize)]
 pub(crate) struct PageScene {
+    /// Name of the data set.
+    pub(crate) name: String,
     /// Voxels along each side of the unit cube.
     pub(crate) resolution: usize,
     /// Number of bricks.
@@ -35,6 +38,10 @@ pub(crate) struct PageScene {
     pub(crate) centre: [f64; 3],
     /// Extent of the scene, in scene units.
     pub(crate) size: f64,
+    /// Width in pixels of a film along a recorded path.
+    pub(crate) film_width: u32,
+    /// Depth at which the training cameras' frusta are drawn, in scene units.
+    pub(crate) frustum_depth: f64,
     /// Up direction, unit length.
     pub(crate) up: [f64; 3],
     /// Index of the camera that is shown first.
@@ -73,14 +80,16 @@ pub(crate) fn page(scene: &PageScene, atlas: &Atlas) -> anyhow::Result<Markup> {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
                 meta http-equiv="Content-Security-Policy" content=(POLICY);
-                title { "nerf-sr viewer" }
+                title { (scene.name) " – nerf-sr viewer" }
                 style { (PreEscaped(STYLE)) }
             }
             body {
+                header { h1 { (scene.name) } span id="distance" {} }
                 main {
                     div id="stage" {
                         canvas id="view" tabindex="0" role="application" aria-label=(LABEL) {}
                         canvas id="frusta" aria-hidden="true" {}
+                        div id="depth-scale" hidden { span id="nearest" {} i {} span id="farthest" {} }
                         p id="message" role="status" { "Loading the scene …" }
                     }
                     figure id="photograph" hidden {
@@ -89,6 +98,7 @@ pub(crate) fn page(scene: &PageScene, atlas: &Atlas) -> anyhow::Result<Markup> {
                     }
                 }
                 (controls(scene))
+                (help())
                 noscript { p { "The view needs JavaScript." } }
                 script id="scene" type="application/json" { (PreEscaped(scene_json)) }
                 script id="vertex-shader" type="text/plain" { (PreEscaped(VERTEX_SHADER)) }
@@ -101,7 +111,36 @@ pub(crate) fn page(scene: &PageScene, atlas: &Atlas) -> anyhow::Result<Markup> {
 }
 
 const LABEL: &str = "View of the scene. Arrow keys turn it, with Shift they move it; plus and \
-    minus zoom; N and P go to the next and previous training camera.";
+    minus zoom; N and P go to the next and previous training camera; question mark lists all keys.";
+
+/// Keys and their effects.
+const KEYS: [(&str, &str); 14] = [
+    ("drag, arrow keys", "orbit"),
+    ("Shift and drag or arrow keys", "pan"),
+    ("wheel, + and -", "zoom"),
+    ("[ and ]", "narrower or wider angle of view"),
+    ("n, p", "next or previous training camera"),
+    ("Home", "first camera"),
+    ("1, 2, 3", "colour, depth, opacity"),
+    ("c", "show training cameras; click one to fly to it"),
+    ("v", "show the photograph"),
+    ("t", "turntable"),
+    ("f", "full screen"),
+    ("s", "save the image"),
+    ("k", "add a key to the camera path"),
+    ("?", "this list"),
+];
+
+/// List of keys, in a dialog.
+fn help() -> Markup {
+    html! {
+        dialog id="help" aria-labelledby="help-heading" {
+            h2 id="help-heading" { "Mouse and keys" }
+            dl { @for (keys, effect) in KEYS { dt { (keys) } dd { (effect) } } }
+            form method="dialog" { button { "Close" } }
+        }
+    }
+}
 
 /// Contents of the view, with their labels.
 const MODES: [(&str, &str); 3] = [("colour", "Colour"), ("depth", "Depth"), ("opacity", "Opacity")];
@@ -131,7 +170,22 @@ fn controls(scene: &PageScene) -> Markup {
             }
             label { input id="with-frusta" type="checkbox"; "Cameras" }
             label { input id="compare" type="checkbox" checked; "Photograph" }
-            span class="help" { "Drag to turn, Shift-drag to move, wheel to zoom" }
+            label {
+                "Angle of view" input id="angle" type="range" min="10" max="110" step="1";
+                output id="angle-value" {}
+            }
+            span class="buttons" {
+                button id="turntable" type="button" aria-pressed="false" { "Turntable" }
+                button id="full-screen" type="button" { "Full screen" }
+                button id="save-image" type="button" { "Save image" }
+                button id="show-help" type="button" { "Keys" }
+            }
+            span class="buttons" role="group" aria-label="Camera path" {
+                button id="add-key" type="button" { "Add key" }
+                button id="save-path" type="button" disabled { "Save path" }
+                button id="clear-path" type="button" disabled { "Clear" }
+                span id="path-length" role="status" {}
+            }
         }
     }
 }
@@ -145,6 +199,9 @@ mod tests {
     fn names_cannot_leave_their_place() {
         let name = "</script><b onclick=\"x\">";
         let scene = PageScene {
+            name: name.to_owned(),
+            film_width: 64,
+            frustum_depth: 0.1,
             resolution: 64,
             bricks: 0,
             components: Vec::new(),

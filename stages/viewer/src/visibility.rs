@@ -9,6 +9,7 @@ use scene::{Bounds, Camera};
 use stage::Progress;
 
 use crate::bricks::{Bricks, SIDE};
+use crate::space::{leap_along, step_along};
 
 /// Maximum number of observing cameras: one bit each (docs/design/042).
 pub(crate) const MAX_CAMERAS: usize = 64;
@@ -71,19 +72,21 @@ impl March<'_> {
     /// [`MIN_STOPPED_LIGHT`] of the ray's light.
     fn trace(&self, bounds: &Bounds, ray: &Ray, mut visit: impl FnMut(usize)) {
         let ray = clip(bounds, ray);
-        let step = 1.0 / self.bricks.resolution as f32;
-        let per_brick = SIDE as f32 * step;
-        let mut t = ray.enter + 0.5 * step;
+        let voxel = 1.0 / self.bricks.resolution as f32;
+        let per_brick = SIDE as f32 * voxel;
+        let mut t = ray.enter + 0.5 * voxel;
         let mut transmittance = 1.0f32;
         while t < ray.leave && transmittance > MIN_STOPPED_LIGHT {
             let position = ray.position(t).map(|x| x * self.bricks.resolution as f32 - 0.5);
             let distance = self.distance(position);
+            let step = step_along(&ray, t, voxel);
             if distance > 1 {
-                t += (f32::from(distance - 1) * per_brick).max(step);
+                t += leap_along(&ray, f32::from(distance - 1) * per_brick).max(step);
                 continue;
             }
             let corners = self.corners(position);
-            let stopped: f32 = corners.iter().map(|(_, alpha)| alpha).sum();
+            let alpha: f32 = corners.iter().map(|(_, alpha)| alpha).sum();
+            let stopped = 1.0 - (1.0 - alpha.min(1.0)).powf(step / voxel);
             if transmittance * stopped >= MIN_STOPPED_LIGHT {
                 for (voxel, _) in corners.into_iter().filter(|(_, alpha)| *alpha > 0.0) {
                     visit(voxel);
@@ -126,7 +129,7 @@ impl March<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use scene::Intrinsics;
+    use scene::{Intrinsics, Space};
 
     fn camera_at(z: f64) -> Camera {
         Camera {
@@ -145,14 +148,17 @@ mod tests {
             let [.., z] = bricks.position(voxel);
             opacity[voxel] = if z == 10 || z == 20 { 1.0 } else { 0.0 };
         }
-        let bounds = Bounds::cube(1.0, 0.0, 9.0);
-        let cameras = [camera_at(4.0), camera_at(-4.0)];
-        let look = || visible_from(&bricks, &opacity, (&cameras, &bounds), &Progress::silent());
-        let seen = look();
-        let at = |z: usize| seen[bricks.voxel([16, 16, z]).unwrap()];
-        assert_eq!([at(20), at(10), at(15)], [0b01, 0b10, 0]);
-        let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-        assert!(alone.install(look) == seen);
+        // Both walls are in the ball that a contraction leaves unchanged.
+        for space in [Space::Box, Space::Contraction] {
+            let bounds = Bounds { space, ..Bounds::cube(1.0, 0.0, 9.0) };
+            let cameras = [camera_at(4.0), camera_at(-4.0)];
+            let look = || visible_from(&bricks, &opacity, (&cameras, &bounds), &Progress::silent());
+            let seen = look();
+            let at = |z: usize| seen[bricks.voxel([16, 16, z]).unwrap()];
+            assert_eq!([at(20), at(10), at(15)], [0b01, 0b10, 0], "{space:?}");
+            let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+            assert!(alone.install(look) == seen);
+        }
     }
 
     fn camera(i: usize) -> Camera {

@@ -67,3 +67,52 @@ function frustumOf({ camera_to_world: pose, intrinsics: k }, depth) {
   };
   return [column(pose, 3), ...[[0, 0], [k.width, 0], [k.width, k.height], [0, k.height]].map(corner)];
 }
+
+/** Returns intrinsics with another vertical angle of view, in degrees, and the principal point in the middle. */
+function withAngle({ width, height }, degrees) {
+  const f = height / 2 / Math.tan((degrees * Math.PI) / 360);
+  return { width, height, fx: f, fy: f, cx: width / 2, cy: height / 2 };
+}
+
+/** Returns the vertical angle of view of intrinsics, in degrees. */
+const angleOf = ({ height, fy }) => (360 / Math.PI) * Math.atan(height / 2 / fy);
+
+/** Returns a pose's rotation as a unit quaternion [x, y, z, w]. */
+function quaternionOf(m) {
+  const [[a, b, c], [d, e, f], [g, h, i]] = m;
+  const all = [
+    [1 + a - e - i, b + d, c + g, h - f], [b + d, 1 - a + e - i, f + h, c - g],
+    [c + g, f + h, 1 - a - e + i, d - b], [h - f, c - g, d - b, 1 + a + e + i]];
+  // Of four equal vectors, the longest has the smallest error.
+  const best = all.reduce((x, y, k) => (y[k] > x[0] ? [y[k], y] : x), [0, all[3]])[1];
+  const size = Math.hypot(...best);
+  return best.map((x) => x / size);
+}
+
+/** Returns the columns of a quaternion's rotation. */
+function axesOf([x, y, z, w]) {
+  return [
+    [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
+    [2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)],
+    [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)]];
+}
+
+/** Interpolates two poses: the centre along `centre`, or straight, and the rotation along the shorter arc. */
+function between(from, to, share, centre) {
+  const p = quaternionOf(from);
+  let q = quaternionOf(to);
+  let cosine = p.reduce((sum, x, i) => sum + x * q[i], 0);
+  if (cosine < 0) [q, cosine] = [q.map((x) => -x), -cosine];
+  const angle = Math.acos(Math.min(cosine, 1));
+  const part = (x) => (angle < 1e-6 ? x : Math.sin(x * angle) / Math.sin(angle));
+  const mixed = p.map((x, i) => part(1 - share) * x + part(share) * q[i]);
+  const size = Math.hypot(...mixed);
+  const [a, b] = [column(from, 3), column(to, 3)];
+  return poseOf([...axesOf(mixed.map((x) => x / size)), centre ?? plus(a, plus(b, a, -1), share)]);
+}
+
+/** Returns the point of the Catmull-Rom curve through b and c at a share of the way between them. */
+function onCurve([a, b, c, d], t) {
+  return b.map((x, i) => 0.5 * (2 * x + (c[i] - a[i]) * t + (2 * a[i] - 5 * x + 4 * c[i] - d[i]) * t * t
+    + (3 * (x - c[i]) + d[i] - a[i]) * t ** 3));
+}

@@ -8,6 +8,24 @@ const SMOOTH_MS = 40;
 // Milliseconds after the last motion at which all pixels are drawn.
 const STILL_MS = 180;
 const MAX_PIXEL_RATIO = 2;
+// The page's colour (viewer.css).
+const PAPER = { light: [244, 244, 245].map((byte) => byte / 255), dark: [28, 28, 30].map((byte) => byte / 255) };
+// Milliseconds of a flight to a training camera, and of a turn of the turntable.
+const FLIGHT_MS = 700;
+const TURN_MS = 24000;
+// Minimum distance of the camera from surfaces, over the scene's size.
+const SURFACE_MARGIN = 0.02;
+// Rays along each side of the view that look for surfaces ahead.
+const PROBES = 3;
+// Pixels between a click and a frustum's centre that still hit the frustum.
+const CLICK_PIXELS = 24;
+// Pixels of motion from which a press is no click.
+const DRAG_PIXELS = 4;
+
+// Controls that a key operates.
+const KEYS = {
+  c: "with-frusta", v: "compare", t: "turntable", f: "full-screen", s: "save-image", k: "add-key", "?": "show-help",
+};
 
 class Viewer {
   constructor(scene, bytes) {
@@ -16,6 +34,8 @@ class Viewer {
     this.volume = new Volume(this.canvas, scene, bytes);
     this.mode = "colour";
     this.showsFrusta = false;
+    this.recorder = new Recorder();
+    this.isDark = matchMedia("(prefers-color-scheme: dark)");
     // Milliseconds per drawn pixel.
     this.cost = 0;
     this.listen();
@@ -24,6 +44,7 @@ class Viewer {
 
   /** Moves the view to a training camera. */
   goTo(index) {
+    this.flight = null;
     const count = this.scene.cameras.length;
     this.at = (index + count) % count;
     this.lens = this.scene.cameras[this.at].intrinsics;
@@ -35,6 +56,7 @@ class Viewer {
 
   /** Moves away from the training cameras. */
   move(pose, distance = this.distance) {
+    this.flight = null;
     this.at = -1;
     this.pose = pose;
     this.distance = distance;
@@ -48,7 +70,103 @@ class Viewer {
     this.move(panned(this.pose, -right * unit, up * unit));
   }
 
-  zoom(factor) { this.move(zoomed(this.pose, this.distance, factor), this.distance * factor); }
+  /** Zooms: towards the surface in the middle of the view, if there is one, and no farther than just before the nearest one. */
+  zoom(factor) {
+    const { size } = this.scene;
+    const distances = this.volume.distances(this.camera(1), PROBES, size);
+    const middle = distances[(distances.length - 1) / 2];
+    const ahead = factor < 1 && middle < Infinity ? middle : this.distance;
+    const room = Math.max(0, Math.min(...distances) - SURFACE_MARGIN * size);
+    const way = Math.min(ahead * (1 - factor), room);
+    this.move(zoomed(this.pose, ahead, 1 - way / ahead), Math.max(ahead - way, SURFACE_MARGIN * size));
+  }
+
+  /** Flies to a training camera; without motion where the user prefers none. */
+  fly(index) {
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) return this.goTo(index);
+    const [from, lens, begin] = [this.pose, this.lens, performance.now()];
+    const { camera_to_world: to, intrinsics } = this.scene.cameras[index];
+    const flight = {};
+    const frame = () => {
+      if (this.flight !== flight) return;
+      const share = Math.min(1, (performance.now() - begin) / FLIGHT_MS);
+      if (share === 1) return this.goTo(index);
+      const eased = share * share * (3 - 2 * share);
+      const angle = angleOf(lens) + eased * (angleOf(intrinsics) - angleOf(lens));
+      this.move(between(from, to, eased));
+      this.lens = withAngle(intrinsics, angle);
+      this.flight = flight;
+      requestAnimationFrame(frame);
+    };
+    this.flight = flight;
+    frame();
+  }
+
+  /** Starts or stops the turntable, which orbits around the up direction. */
+  turn() {
+    const isTurning = part("turntable").getAttribute("aria-pressed") !== "true";
+    part("turntable").setAttribute("aria-pressed", isTurning);
+    let before = performance.now();
+    const frame = () => {
+      if (part("turntable").getAttribute("aria-pressed") !== "true") return;
+      const now = performance.now();
+      this.orbit((2 * Math.PI * (now - before)) / TURN_MS, 0);
+      before = now;
+      requestAnimationFrame(frame);
+    };
+    if (isTurning) requestAnimationFrame(frame);
+  }
+
+  /** Sets the vertical angle of view in degrees. */
+  setAngle(degrees) {
+    this.lens = withAngle(this.lens, Math.max(10, Math.min(110, degrees)));
+    this.move(this.pose);
+  }
+
+  /** Returns the colour behind the scene on the page: the page's own, unless the scene's is white in a light scheme, or black. */
+  background() {
+    const { background } = this.scene;
+    if (background < 0.25 || (background > 0.75 && !this.isDark.matches)) return Array(3).fill(background);
+    return this.isDark.matches ? PAPER.dark : PAPER.light;
+  }
+
+  /** Adds the view to the camera path. */
+  addKey() {
+    this.recorder.add(this.pose, angleOf(this.lens));
+    this.sayPath();
+  }
+
+  sayPath() {
+    const { length: count } = this.recorder.keys;
+    part("save-path").disabled = part("clear-path").disabled = count === 0;
+    part("path-length").textContent = count === 0 ? "" : `${count} ${count === 1 ? "key" : "keys"}`;
+  }
+
+  /** Returns the recorded camera path as the content of camera_path.json. */
+  path() {
+    const { film_width: width, cameras, start } = this.scene;
+    const { intrinsics: k } = cameras[start];
+    return this.recorder.file(width, Math.max(1, Math.round((width * k.height) / k.width)));
+  }
+
+  savePath() {
+    const file = new Blob([JSON.stringify(this.path(), null, 1)], { type: "application/json" });
+    const url = URL.createObjectURL(file);
+    saved("camera_path.json", url);
+    setTimeout(() => URL.revokeObjectURL(url), 10_000);
+  }
+
+  /** Saves the displayed view with all pixels. */
+  saveImage() {
+    const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
+    saved(`${this.scene.name}.png`, this.image(this.camera(ratio), this.mode, this.background()));
+    this.changed(false);
+  }
+
+  fullScreen() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else part("stage").requestFullscreen?.();
+  }
 
   /** Returns the view's camera, with `ratio` pixels per pixel of the page. */
   camera(ratio) {
@@ -76,7 +194,7 @@ class Viewer {
       const less = this.isMoving && time > SMOOTH_MS ? Math.max(Math.sqrt(SMOOTH_MS / time), 0.15) : 1;
       this.drawFrusta();
       this.say();
-      await this.show(this.camera(ratio * less), this.mode);
+      await this.show(this.camera(ratio * less), this.mode, this.background());
     }
     this.isBusy = false;
   }
@@ -98,7 +216,7 @@ class Viewer {
     context.lineWidth = ratio;
     this.scene.cameras.forEach((other, i) => {
       if (i === this.at) return;
-      const points = frustumOf(other, 0.06 * this.scene.size).map((p) => projected(camera, p));
+      const points = frustumOf(other, this.scene.frustum_depth).map((p) => projected(camera, p));
       if (points.some(([, , depth]) => depth < 1e-3 * this.scene.size)) return;
       const [apex, ...corners] = points;
       context.strokeStyle = i === this.last ? "#d22" : "#2a6fdb";
@@ -112,11 +230,29 @@ class Viewer {
     });
   }
 
+  /** Returns the training camera whose drawn frustum is at a point of the page, or -1. */
+  frustumAt(x, y) {
+    const box = this.canvas.getBoundingClientRect();
+    const camera = this.camera(1);
+    let [best, nearest] = [-1, CLICK_PIXELS];
+    this.scene.cameras.forEach((other, i) => {
+      if (i === this.at) return;
+      const points = frustumOf(other, this.scene.frustum_depth).map((p) => projected(camera, p));
+      if (points.some(([, , depth]) => depth <= 0)) return;
+      const middle = [0, 1].map((c) => points.reduce((sum, p) => sum + p[c], 0) / points.length);
+      const away = Math.hypot(middle[0] - (x - box.left), middle[1] - (y - box.top));
+      if (away < nearest) [best, nearest] = [i, away];
+    });
+    return best;
+  }
+
   /** Updates the camera's name, and shows the photograph of this or of the last camera that has one. */
   say() {
     if (this.at >= 0) this.last = this.at;
+    this.sayScales();
     const { name, photograph, photograph_size: size } = this.scene.cameras[this.last];
     part("camera").value = this.at >= 0 ? String(this.at) : "";
+    part("photograph").style.background = `rgb(${this.background().map((level) => 255 * level)})`;
     part("photograph").hidden = !photograph || !part("compare").checked;
     part("photograph").classList.toggle("past", this.at < 0);
     document.body.classList.toggle("compares", !part("photograph").hidden);
@@ -127,8 +263,28 @@ class Viewer {
     part("photo-name").textContent = `LR photograph ${name}, ${size.width}×${size.height}`;
   }
 
+  /** Updates angle of view, distance and the scale of depths. */
+  sayScales() {
+    const angle = Math.round(angleOf(this.lens));
+    part("angle").value = angle;
+    part("angle-value").textContent = `${angle}°`;
+    const short = (x) => Number(x.toPrecision(3)).toString();
+    part("distance").textContent = `${short(this.distance)} to the centre of rotation`;
+    part("depth-scale").hidden = this.mode !== "depth";
+    const [near, far] = this.depths(this.camera(1));
+    [part("nearest").textContent, part("farthest").textContent] = [short(near), short(far)];
+  }
+
   listen() {
     const { canvas } = this;
+    this.isDark.addEventListener("change", () => this.changed(false));
+    const buttons = {
+      turntable: () => this.turn(), "full-screen": () => this.fullScreen(), "save-image": () => this.saveImage(),
+      "show-help": () => part("help").showModal(), "add-key": () => this.addKey(), "save-path": () => this.savePath(),
+      "clear-path": () => { this.recorder.clear(); this.sayPath(); },
+    };
+    for (const [id, act] of Object.entries(buttons)) part(id).addEventListener("click", act);
+    part("angle").addEventListener("input", ({ target }) => this.setAngle(Number(target.value)));
     new ResizeObserver(() => this.changed(false)).observe(canvas);
     for (const radio of document.getElementsByName("mode")) {
       radio.addEventListener("change", () => { this.mode = radio.value; this.changed(false); });
@@ -158,6 +314,10 @@ class Viewer {
     else if (arrows) this.orbit(-0.08 * arrows[0], -0.08 * arrows[1]);
     else if (event.key === "+" || event.key === "=") this.zoom(0.9);
     else if (event.key === "-") this.zoom(1 / 0.9);
+    else if (event.key === "[") this.setAngle(angleOf(this.lens) - 2);
+    else if (event.key === "]") this.setAngle(angleOf(this.lens) + 2);
+    else if ("123".includes(event.key)) document.getElementsByName("mode")[Number(event.key) - 1].click();
+    else if (KEYS[event.key]) part(KEYS[event.key]).click();
     else if (event.key === "n") this.step(1);
     else if (event.key === "p") this.step(-1);
     else if (event.key === "Home") this.goTo(this.scene.start);
@@ -169,6 +329,7 @@ class Viewer {
   listenToPointers() {
     const { canvas } = this;
     const pointers = new Map();
+    let pressed = null;
     const middle = () => {
       const all = [...pointers.values()];
       const mean = (i) => all.reduce((sum, p) => sum + p[i], 0) / all.length;
@@ -177,6 +338,12 @@ class Viewer {
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
+      pressed = [event.clientX, event.clientY];
+    });
+    canvas.addEventListener("click", ({ clientX: x, clientY: y }) => {
+      const isClick = pressed && Math.hypot(x - pressed[0], y - pressed[1]) < DRAG_PIXELS;
+      const found = this.showsFrusta && isClick ? this.frustumAt(x, y) : -1;
+      if (found >= 0) this.fly(found);
     });
     canvas.addEventListener("pointermove", (event) => {
       if (!pointers.has(event.pointerId)) return;
@@ -198,9 +365,9 @@ class Viewer {
   // Interface for scripts, such as tests.
 
   /** Draws the view of a camera, `{camera_to_world, intrinsics}` as in views.json; returns the milliseconds taken. */
-  async show(camera, mode = "colour") {
+  async show(camera, mode = "colour", background) {
     const from = performance.now();
-    this.volume.draw(camera, mode, this.depths(camera));
+    this.volume.draw(camera, mode, this.depths(camera), background);
     await this.volume.finished();
     const time = performance.now() - from;
     this.cost = time / (this.canvas.width * this.canvas.height);
@@ -208,8 +375,8 @@ class Viewer {
   }
 
   /** Returns the view of a camera as a PNG's data URL. */
-  image(camera, mode = "colour") {
-    this.volume.draw(camera, mode, this.depths(camera));
+  image(camera, mode = "colour", background) {
+    this.volume.draw(camera, mode, this.depths(camera), background);
     return this.canvas.toDataURL("image/png");
   }
 

@@ -3,7 +3,8 @@
 const BRICK = 8;
 // Side of a tile: a brick and its upper neighbours' first voxels, for interpolation.
 const TILE = BRICK + 1;
-const MODES = { colour: 0, depth: 1, opacity: 2, reads: 3 };
+const SPACES = { box: 0, ndc: 1, contraction: 2 };
+const MODES = { colour: 0, depth: 1, opacity: 2, reads: 3, probe: 4 };
 
 /** Decodes and inflates a base64 text. */
 async function inflated(text) {
@@ -21,12 +22,37 @@ function tilesOf(count, most) {
   return [x, y, Math.max(1, Math.ceil(count / (x * y)))];
 }
 
+/** Returns the bits of a small number in half precision. */
+function half(value) {
+  const size = Math.abs(value);
+  const exponent = Math.max(Math.floor(Math.log2(Math.max(size, 1e-9))), -14);
+  // A mantissa that rounds up to the next power of two carries into the exponent.
+  const bits = Math.round((size / 2 ** exponent - (size >= 2 ** -14 ? 1 : 0)) * 1024);
+  return (value < 0 ? 0x8000 : 0) + (size >= 2 ** -14 ? (exponent + 15) * 1024 : 0) + bits;
+}
+
+/**
+ * Returns, for each opacity code times 256 plus byte, a level of colour and one of view dependence, both times opacity, in half
+ * precision. The code is 255 times the square root of the opacity, and so are the bytes' ranges.
+ */
+function levels() {
+  const [colours, views] = [new Uint16Array(65536), new Uint16Array(65536)];
+  for (let code = 1; code < 256; code++) {
+    const opacity = (code / 255) ** 2;
+    for (let byte = 0; byte < 256; byte++) {
+      colours[256 * code + byte] = half(opacity * Math.min(1, byte / code));
+      views[256 * code + byte] = half(opacity * Math.max(-1, Math.min(1, ((byte - 128) / 127) * (255 / code))));
+    }
+  }
+  return { colours, views };
+}
+
 /** Splits the volume's bytes into three textures: bricks' positions in the atlas, colours, and view components. */
 function unpacked(bytes, resolution, count, most) {
   const side = resolution / BRICK;
   const distances = bytes.subarray(0, side ** 3);
   const plane = (k) => bytes.subarray(side ** 3 + k * count * 512, side ** 3 + (k + 1) * count * 512);
-  const planes = [1, 2, 3, 0, 4, 5, 6, 7].map(plane);
+  const planes = [0, 1, 2, 3, 4, 5, 6, 7].map(plane);
   const tiles = tilesOf(count, most);
   const slots = new Int32Array(side ** 3).fill(-1);
   const places = [];
@@ -41,7 +67,8 @@ function unpacked(bytes, resolution, count, most) {
   }
   const size = tiles.map((n) => n * TILE);
   const texels = size[0] * size[1] * size[2];
-  const [colours, views] = [new Uint8Array(4 * texels), new Uint8Array(4 * texels).fill(128)];
+  const [colours, views] = [new Uint16Array(4 * texels), new Uint16Array(4 * texels)];
+  const level = levels();
   // Source of a tile's voxel: the tile's own brick, or an upper neighbour.
   places.forEach((place, slot) => {
     const at = [place % side, Math.floor(place / side) % side, Math.floor(place / side ** 2)];
@@ -58,10 +85,11 @@ function unpacked(bytes, resolution, count, most) {
           if (source < 0) continue;
           const from = source * 512 + (x & 7) + 8 * (y & 7) + 64 * (z & 7);
           const to = 4 * (cx + x + size[0] * (cy + y + size[1] * (cz + z)));
-          for (let c = 0; c < 4; c++) {
-            colours[to + c] = planes[c][from];
-            views[to + c] = planes[4 + c][from];
-          }
+          const code = 256 * planes[0][from];
+          if (code === 0) continue;
+          for (let c = 0; c < 3; c++) colours[to + c] = level.colours[code + planes[1 + c][from]];
+          colours[to + 3] = level.colours[code + 255];
+          for (let c = 0; c < 4; c++) views[to + c] = level.views[code + planes[4 + c][from]];
         }
       }
     }
@@ -93,27 +121,26 @@ class Volume {
     gl.useProgram(program);
     this.at = (name) => gl.getUniformLocation(program, name);
     this.setVolume(unpacked(bytes, scene.resolution, scene.bricks, most));
-    this.setBox(scene.bounds);
+    this.setSpace(scene.bounds);
   }
 
   setVolume({ side, size, bricks, colours, views }) {
     const { gl, scene } = this;
     const cube = [side, side, side];
-    this.texture(0, "bricks", gl.RGBA8UI, gl.RGBA_INTEGER, gl.NEAREST, cube, bricks);
-    this.texture(1, "colours", gl.RGBA8, gl.RGBA, gl.LINEAR, size, colours);
-    this.texture(2, "views", gl.RGBA8, gl.RGBA, gl.LINEAR, size, views);
+    this.texture(0, "bricks", [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE], gl.NEAREST, cube, bricks);
+    this.texture(1, "colours", [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT], gl.LINEAR, size, colours);
+    this.texture(2, "views", [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT], gl.LINEAR, size, views);
     gl.uniform3fv(this.at("atlas_size"), size);
     gl.uniform1f(this.at("resolution"), scene.resolution);
     gl.uniform3fv(this.at("components"), scene.components);
-    gl.uniform3fv(this.at("background"), [1, 1, 1].map(() => scene.background));
   }
 
-  texture(unit, name, kept, format, filter, [width, height, depth], bytes) {
+  texture(unit, name, [kept, format, type], filter, [width, height, depth], data) {
     const { gl } = this;
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_3D, gl.createTexture());
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    gl.texImage3D(gl.TEXTURE_3D, 0, kept, width, height, depth, 0, format, gl.UNSIGNED_BYTE, bytes);
+    gl.texImage3D(gl.TEXTURE_3D, 0, kept, width, height, depth, 0, format, type, data);
     for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R]) {
       gl.texParameteri(gl.TEXTURE_3D, side, gl.CLAMP_TO_EDGE);
     }
@@ -122,31 +149,88 @@ class Volume {
     gl.uniform1i(this.at(name), unit);
   }
 
-  /** Lengths on the GPU are relative to the box's longest side and corner: world coordinates may be too large for floats. */
-  setBox({ min, max, near, far }) {
+  /**
+   * Sets the field's space. Lengths on the GPU are relative to the space's unit and origin: world coordinates may be too large for
+   * floats.
+   */
+  setSpace({ min, max, near, far, space }) {
     const { gl } = this;
     const sides = plus(max, min, -1);
-    this.corner = min;
-    this.side = Math.max(...sides);
-    gl.uniform3fv(this.at("extent"), scaled(sides, 1 / this.side));
-    gl.uniform2f(this.at("range"), near / this.side, Math.min(far / this.side, 1e30));
+    const side = Math.max(...sides);
+    const set = (kind, origin, unit) => {
+      Object.assign(this, { origin, unit });
+      gl.uniform1i(this.at("space"), kind);
+    };
+    if (space.ndc) {
+      const { camera_to_world: m, min: low, max: high, near: front, far: back } = space.ndc;
+      set(SPACES.ndc, column(m, 3), front);
+      // Rows of the camera's axes; depth is along the negative z axis.
+      this.axes = [column(m, 0), column(m, 1), scaled(column(m, 2), -1)];
+      gl.uniformMatrix3fv(this.at("turn"), false, [0, 1, 2].flatMap((i) => this.axes.map((axis) => axis[i])));
+      gl.uniform4f(this.at("slopes"), ...low, ...high);
+      gl.uniform1f(this.at("far"), back / front);
+    } else if (space === "contraction") set(SPACES.contraction, scaled(plus(min, max), 0.5), 0.5 * side);
+    else {
+      set(SPACES.box, min, side);
+      gl.uniform3fv(this.at("extent"), scaled(sides, 1 / side));
+    }
+    gl.uniform2f(this.at("range"), near / this.unit, Math.min(far / this.unit, 1e30));
+  }
+
+  /** Returns a world point in the coordinates of the GPU. */
+  centreOf(point) {
+    const from = scaled(plus(point, this.origin, -1), 1 / this.unit);
+    return this.axes ? this.axes.map((axis) => dot(axis, from)) : from;
   }
 
   /**
    * Draws the view of a pinhole camera, with `camera_to_world` (three rows of four numbers) and `intrinsics` as in
-   * views.json, into `width` × `height` pixels of the canvas.
+   * views.json, into `width` × `height` pixels of the canvas, over `background`: red, green and blue from 0 to 1.
    */
-  draw({ camera_to_world: m, intrinsics: k }, mode, depths) {
+  draw({ camera_to_world: m, intrinsics: k }, mode, depths, background = Array(3).fill(this.scene.background)) {
     const { gl, canvas } = this;
-    if (canvas.width !== k.width || canvas.height !== k.height) [canvas.width, canvas.height] = [k.width, k.height];
+    if (mode !== "probe" && (canvas.width !== k.width || canvas.height !== k.height)) [canvas.width, canvas.height] = [k.width, k.height];
     gl.viewport(0, 0, k.width, k.height);
     gl.uniformMatrix3fv(this.at("rotation"), false, [0, 1, 2].flatMap((c) => m.map((row) => row[c])));
-    gl.uniform3fv(this.at("centre"), scaled(plus(column(m, 3), this.corner, -1), 1 / this.side));
+    gl.uniform3fv(this.at("centre"), this.centreOf(column(m, 3)));
     gl.uniform4f(this.at("intrinsics"), k.fx, k.fy, k.cx, k.cy);
     gl.uniform1f(this.at("height"), k.height);
     gl.uniform1i(this.at("mode"), MODES[mode]);
-    gl.uniform2fv(this.at("depth_range"), scaled(depths, 1 / this.side));
+    gl.uniform3fv(this.at("background"), background);
+    gl.uniform2fv(this.at("depth_range"), scaled(depths, 1 / this.unit));
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** Returns the distances of the surfaces along a few rays of a camera; Infinity where there is none. */
+  distances({ camera_to_world, intrinsics: k }, count, unit) {
+    const { gl } = this;
+    const ratio = [count / k.width, count / k.height];
+    const intrinsics = {
+      width: count, height: count, fx: k.fx * ratio[0], fy: k.fy * ratio[1], cx: k.cx * ratio[0], cy: k.cy * ratio[1],
+    };
+    this.probe ??= this.newProbe(count);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.probe);
+    this.draw({ camera_to_world, intrinsics }, "probe", [unit, unit]);
+    const bytes = new Uint8Array(4 * count * count);
+    gl.readPixels(0, 0, count, count, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    const found = [];
+    for (let i = 0; i < bytes.length; i += 4) {
+      const share = (bytes[i] * 65536 + bytes[i + 1] * 256 + bytes[i + 2]) / 16711680;
+      found.push(share > 0 ? unit * (1 / share - 1) : Infinity);
+    }
+    return found;
+  }
+
+  /** Creates a target of a few pixels. */
+  newProbe(count) {
+    const { gl } = this;
+    const [target, pixels] = [gl.createFramebuffer(), gl.createRenderbuffer()];
+    gl.bindRenderbuffer(gl.RENDERBUFFER, pixels);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.RGBA8, count, count);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, pixels);
+    return target;
   }
 
   /** Waits until drawing has finished. Reading a pixel would wait, too, but blocks the page. */
