@@ -174,12 +174,15 @@ fn the_page_shows_text_as_the_field_does() {
     }
 }
 
-/// Blocks of a demo scene whose field has surfaces: fields of fewer rays are haze.
+/// Blocks of a demo scene with a field of the default size: smaller fields and fewer rays give
+/// haze.
 fn clear_scene(demo_scene: &str) -> String {
     format!(
-        "  demo-scene:\n    parameters: {{size: 64, train: 24{demo_scene}}}\n  \
+        "  demo-scene:\n    parameters: {{size: 64, train: 40{demo_scene}}}\n  \
         prep:\n    parameters: {{lr_width: 32}}\n  \
-        train-ss:\n    parameters: {{rays: 300000, n_levels: 6, hidden_dim: 32}}\n"
+        train-ss:\n    parameters: {{rays: 300000, n_levels: 8, max_resolution: null, \
+        log2_hashmap_size: null, hidden_dim: 64, march_steps: null, max_rays_per_step: 8192, \
+        samples_per_step: 24576}}\n"
     )
 }
 
@@ -228,7 +231,8 @@ fn the_page_shows_a_contracted_space() {
 fn the_papers_field_is_refused_before_anything_runs() {
     let project = Project::shipped(&["viewer"], "");
     project.run(&["run", "viewer", "-p", "field=mlp"]).fails(2, &["viewer", "baked", "grid"]);
-    assert!(!project.path(".nerf-sr/actions").exists());
+    let actions = std::fs::read_dir(project.path(".nerf-sr/actions"));
+    assert_eq!(actions.map_or(0, Iterator::count), 0);
 }
 
 fn distance_from_origin(state: &Value) -> f64 {
@@ -242,7 +246,10 @@ fn check_recorder(project: &Project, recorded: &Path, second: &Value) {
     let path: Value = serde_json::from_slice(&std::fs::read(recorded).unwrap()).unwrap();
     let frames = |path: &Value| path["camera_path"].as_array().unwrap().clone();
     assert_eq!((frames(&path).len(), frames(second).len()), (1, 49));
-    assert_eq!(frames(&path)[0], frames(second)[0]);
+    let pose = |path: &Value| frames(path)[0]["camera_to_world"].as_array().unwrap().clone();
+    for (a, b) in pose(&path).iter().zip(&pose(second)) {
+        assert!((a.as_f64().unwrap() - b.as_f64().unwrap()).abs() < 1e-9, "{a} {b}");
+    }
     for key in ["matrix", "fov", "aspect"] {
         assert!(second["keyframes"][1].get(key).is_some(), "{key}");
     }
@@ -257,7 +264,7 @@ fn check_recorder(project: &Project, recorded: &Path, second: &Value) {
 #[test]
 fn people_can_look_around() {
     let project = Project::shipped(&["viewer", "video"], &clear_scene(""));
-    project.ok(&["run", "viewer", "-p", "viewer.resolution=64", "-p", "photographs=12"]);
+    project.ok(&["run", "viewer", "-p", "viewer.resolution=64", "-p", "photographs=20"]);
     let page = project.path("out/viewer/index.html");
     let recorded = project.path("recorded/camera_path.json");
     let files = [&page, &project.path("shots"), &recorded];
@@ -268,7 +275,7 @@ fn people_can_look_around() {
     }
     let desktop = |when: &str| at("desktop", when);
     let (first, next) = (desktop("first"), desktop("next"));
-    assert_eq!(next["camera"], (first["camera"].as_i64().unwrap() + 1) % 24);
+    assert_eq!(next["camera"], (first["camera"].as_i64().unwrap() + 1) % 40);
     // Every other camera has its photograph.
     assert_ne!(first["photograph"], next["photograph"]);
     let steps = ["first", "next", "arrow", "wheel", "drag", "depth", "opacity"];
@@ -290,8 +297,8 @@ fn people_can_look_around() {
     assert_ne!(desktop("angle")["angle"], desktop("keys")["angle"]);
     // Zooming stops before the surface.
     let nearest = &desktop("inside")["nearest"];
-    assert!(nearest.as_f64().is_some_and(|found| (0.01..0.1).contains(&found)), "{nearest}");
-    assert_eq!(desktop("flown")["camera"], 3);
+    assert!(nearest.as_f64().is_some_and(|found| (0.01..0.2).contains(&found)), "{nearest}");
+    assert_eq!(desktop("flown")["camera"], desktop("flown")["clicked"]);
     // The page's own colour is behind the scene, in a dark scheme as well.
     // Haze changes it a little.
     let is_about = |state: &Value, expected: f64| {

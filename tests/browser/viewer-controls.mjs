@@ -26,7 +26,7 @@ async function state() {
     dialog: document.getElementById("help").open,
     scale: document.getElementById("depth-scale").hidden ? "" : document.getElementById("depth-scale").textContent,
     corner: [...viewer.volume.pixels().slice(0, 3)],
-    path: viewer.path(),
+    path: viewer.path(), clicked: window.clicked,
     centre: viewer.pose.map((row) => row[3]),
     right: viewer.pose.map((row) => row[0]),
   };
@@ -70,21 +70,22 @@ const onDesktop = (page) => [
   ["second", async () => { await page.click("#next"); await page.click("#add-key"); }],
   ["flown", async () => {
     await page.check("#with-frusta");
-    const [x, y] = await page.evaluate(frustumOfCamera, 3);
+    const [x, y] = await page.evaluate(visibleFrustum);
     await page.mouse.click(x, y);
   }],
 ];
 
-/** In the page: returns where a training camera's frustum is drawn. */
-async function frustumOfCamera(index) {
+/** In the page: returns a point at which a training camera's frustum is drawn, and remembers the camera. */
+async function visibleFrustum() {
   const viewer = await window.viewer;
   const box = viewer.canvas.getBoundingClientRect();
-  for (let x = 0; x < box.width; x += 4) {
-    for (let y = 0; y < box.height; y += 4) {
-      if (viewer.frustumAt(box.left + x, box.top + y) === index) return [box.left + x, box.top + y];
+  for (let x = 40; x < box.width - 40; x += 4) {
+    for (let y = 40; y < box.height - 40; y += 4) {
+      window.clicked = viewer.frustumAt(box.left + x, box.top + y);
+      if (window.clicked >= 0) return [box.left + x, box.top + y];
     }
   }
-  return [0, 0];
+  throw new Error("no frustum is in view");
 }
 
 /** Moves touch points from one list of positions to another. */

@@ -13,8 +13,9 @@ const PAPER = { light: [244, 244, 245].map((byte) => byte / 255), dark: [28, 28,
 // Milliseconds of a flight to a training camera, and of a turn of the turntable.
 const FLIGHT_MS = 700;
 const TURN_MS = 24000;
-// Minimum distance of the camera from surfaces, over the scene's size.
+// Minimum distance of the camera from surfaces, over the scene's size and in voxels: nearer, it would be in them.
 const SURFACE_MARGIN = 0.02;
+const SURFACE_VOXELS = 3;
 // Rays along each side of the view that look for surfaces ahead.
 const PROBES = 3;
 // Pixels between a click and a frustum's centre that still hit the frustum.
@@ -76,9 +77,10 @@ class Viewer {
     const distances = this.volume.distances(this.camera(1), PROBES, size);
     const middle = distances[(distances.length - 1) / 2];
     const ahead = factor < 1 && middle < Infinity ? middle : this.distance;
-    const room = Math.max(0, Math.min(...distances) - SURFACE_MARGIN * size);
+    const margin = Math.max(SURFACE_MARGIN * size, SURFACE_VOXELS * this.volume.voxel);
+    const room = Math.max(0, Math.min(...distances) - margin);
     const way = Math.min(ahead * (1 - factor), room);
-    this.move(zoomed(this.pose, ahead, 1 - way / ahead), Math.max(ahead - way, SURFACE_MARGIN * size));
+    this.move(zoomed(this.pose, ahead, 1 - way / ahead), Math.max(ahead - way, margin));
   }
 
   /** Flies to a training camera; without motion where the user prefers none. */

@@ -157,21 +157,22 @@ class Volume {
     const { gl } = this;
     const sides = plus(max, min, -1);
     const side = Math.max(...sides);
-    const set = (kind, origin, unit) => {
-      Object.assign(this, { origin, unit });
+    // `cube` is the length of the unit cube's side, near the cameras.
+    const set = (kind, origin, unit, cube) => {
+      Object.assign(this, { origin, unit, voxel: cube / this.scene.resolution });
       gl.uniform1i(this.at("space"), kind);
     };
     if (space.ndc) {
       const { camera_to_world: m, min: low, max: high, near: front, far: back } = space.ndc;
-      set(SPACES.ndc, column(m, 3), front);
+      set(SPACES.ndc, column(m, 3), front, front * Math.max(high[0] - low[0], high[1] - low[1]));
       // Rows of the camera's axes; depth is along the negative z axis.
       this.axes = [column(m, 0), column(m, 1), scaled(column(m, 2), -1)];
       gl.uniformMatrix3fv(this.at("turn"), false, [0, 1, 2].flatMap((i) => this.axes.map((axis) => axis[i])));
       gl.uniform4f(this.at("slopes"), ...low, ...high);
       gl.uniform1f(this.at("far"), back / front);
-    } else if (space === "contraction") set(SPACES.contraction, scaled(plus(min, max), 0.5), 0.5 * side);
+    } else if (space === "contraction") set(SPACES.contraction, scaled(plus(min, max), 0.5), 0.5 * side, 2 * side);
     else {
-      set(SPACES.box, min, side);
+      set(SPACES.box, min, side, side);
       gl.uniform3fv(this.at("extent"), scaled(sides, 1 / side));
     }
     gl.uniform2f(this.at("range"), near / this.unit, Math.min(far / this.unit, 1e30));
