@@ -4,6 +4,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 use crate::text::printable;
+use crate::type_words::in_words;
 
 /// Error, by the user's next step; each kind has its exit code.
 #[derive(Debug, thiserror::Error)]
@@ -39,7 +40,8 @@ pub fn exit_code(error: &anyhow::Error) -> u8 {
     error.chain().find_map(|cause| cause.downcast_ref::<Failure>()).map_or(1, Failure::exit_code)
 }
 
-/// Formats an error and its causes on one line, with control characters escaped.
+/// Formats an error and its causes on one line, with types in English and control characters
+/// escaped.
 pub fn one_line(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
@@ -49,7 +51,7 @@ pub fn one_line(error: &anyhow::Error) -> String {
             text = if text.is_empty() { cause } else { format!("{text}: {cause}") };
         }
     }
-    printable(&text.replace('\n', " ")).into_owned()
+    printable(&in_words(&text.replace('\n', " "))).into_owned()
 }
 
 /// Conversion of any error to a [`Failure`].

@@ -31,6 +31,7 @@ mod listing;
 mod manifest;
 mod run_record;
 mod text;
+mod type_words;
 
 pub use failure::{Failure, FailureExt, exit_code, one_line, permission_advice};
 pub use fsio::{

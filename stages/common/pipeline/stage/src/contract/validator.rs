@@ -175,9 +175,8 @@ impl<'a> Check<'a> {
                 one => one.as_str().into_iter().collect(),
             };
             if !names.iter().any(|name| is_of_type(value, name)) {
-                let s = if names.len() > 1 { "s" } else { "" };
-                let names: Vec<String> = names.iter().map(|name| format!("{name:?}")).collect();
-                self.report(value, format!("{value} is not of type{s} {}", names.join(", ")));
+                let names: Vec<&str> = names.into_iter().map(type_words).collect();
+                self.report(value, format!("{value} is not {}", names.join(" or ")));
             }
         }
         if let Some(constant) = keywords.get("const").filter(|constant| !are_equal(constant, value))
@@ -317,6 +316,19 @@ fn is_of_type(value: &Value, name: &str) -> bool {
         Value::Number(number) => {
             name == "number" || (name == "integer" && exact_integer(number).is_some())
         }
+    }
+}
+
+/// Returns the English name of a JSON type.
+fn type_words(name: &str) -> &str {
+    match name {
+        "boolean" => "true or false",
+        "integer" => "a whole number",
+        "number" => "a number",
+        "string" => "text",
+        "array" => "a list",
+        "object" => "a mapping",
+        other => other,
     }
 }
 

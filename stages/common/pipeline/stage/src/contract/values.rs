@@ -16,7 +16,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Converts a value, including nested values, to the schema's form: for type `number` 2 becomes
-    /// 2.0, otherwise 2.0 becomes 2. Invalid values stay unchanged; the validator reports them.
+    /// 2.0, otherwise 2.0 becomes 2, and for type `integer` "2k" becomes 2000. Invalid values stay unchanged; the validator reports them.
     pub(crate) fn read(&self, schema: &'a Value, value: &Value) -> Value {
         self.read_by(&self.alternatives(&[schema]), value)
     }
@@ -29,6 +29,12 @@ impl<'a> Reader<'a> {
                 as_float(number, is_f32).unwrap_or_else(|| value.clone())
             }
             Value::Number(number) => as_integer(number).unwrap_or_else(|| value.clone()),
+            Value::String(text)
+                if schemas.iter().any(|s| has_type(s, "integer"))
+                    && !schemas.iter().any(|s| has_type(s, "string")) =>
+            {
+                with_suffix(text).map_or_else(|| value.clone(), Value::from)
+            }
             Value::Array(items) => {
                 let items = items.iter().enumerate().map(|(index, item)| {
                     self.read_by(&self.inner_schemas(schemas, |s| item_schema(s, index)), item)
@@ -140,10 +146,50 @@ fn as_integer(number: &Number) -> Option<Value> {
     Some(if value < 0.0 { Value::from(value as i64) } else { Value::from(value as u64) })
 }
 
+/// Converts a number with the suffix k, M or G, such as `1.5M`; `None` if the result isn't whole.
+fn with_suffix(text: &str) -> Option<u64> {
+    let (digits, zeros) = [("k", 3), ("M", 6), ("G", 9)]
+        .into_iter()
+        .find_map(|(suffix, zeros)| Some((text.strip_suffix(suffix)?, zeros)))?;
+    let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
+    let is_written = |part: &str| part.bytes().all(|digit| digit.is_ascii_digit());
+    // As JSON does, a number starts with a digit, and a dot is followed by one.
+    if whole.is_empty() || digits.ends_with('.') || !is_written(whole) || !is_written(fraction) {
+        return None;
+    }
+    let fraction = fraction.trim_end_matches('0');
+    if fraction.len() > zeros {
+        return None;
+    }
+    format!("{whole}{fraction:0<zeros$}").parse().ok()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use serde_json::json;
+
+    #[test]
+    fn suffixes_multiply_whole_numbers() {
+        let root = json!({});
+        let whole = json!({"type": ["integer", "null"]});
+        for (text, expected) in [
+            ("30M", json!(30_000_000)),
+            ("1.5M", json!(1_500_000)),
+            ("4.250k", json!(4250)),
+            ("2G", json!(2_000_000_000)),
+            ("0k", json!(0)),
+        ] {
+            assert_eq!(Reader::new(&root).read(&whole, &json!(text)), expected);
+        }
+        let same = ["M", ".5M", "5.M", "-5M", "1.23456k", "30m", "30 M", "1e3k", "99999999999G"];
+        for text in same {
+            assert_eq!(Reader::new(&root).read(&whole, &json!(text)), json!(text));
+        }
+        for other in [json!({"type": "number"}), json!({"type": ["integer", "string"]})] {
+            assert_eq!(Reader::new(&root).read(&other, &json!("30M")), json!("30M"), "{other}");
+        }
+    }
 
     #[test]
     fn equal_numbers_are_written_alike() {
