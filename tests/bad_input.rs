@@ -65,7 +65,7 @@ fn datasets_that_cannot_be_used() {
         |_, d| std::fs::remove_dir_all(d).unwrap(),
         &[],
         3,
-        &["input dataset", "data", "name an existing folder"],
+        &["input dataset", "data", "no such folder; name an existing one"],
     );
     refused(
         |_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(),

@@ -28,7 +28,7 @@ use rayon::prelude::*;
 use scene::{Background, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Input, Output, Stage};
+use stage::{Context, Input, Output, Rule, Stage};
 
 use derived::{least_gain, near_references};
 use metric::{Metric, mean_of};
@@ -36,7 +36,7 @@ use scored_view::{ScoredScene, ScoredView};
 #[cfg(feature = "torch")]
 pub use scoring::Lpips;
 pub use scoring::{DepthError, LpipsNetwork, Ssim, WarpScore, depth_error, psnr, ssim};
-use scoring::{Perceptual, metrics};
+use scoring::{Perceptual, metrics, weights_rule};
 
 /// Parameters of `eval`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -92,6 +92,10 @@ impl Stage for Eval {
 
     fn output() -> Output {
         Output::kind("metrics")
+    }
+
+    fn rules() -> Vec<Rule> {
+        vec![weights_rule()]
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {

@@ -22,7 +22,7 @@ mod params;
 mod steps;
 
 use refinement::RefinerFile;
-use stage::{Context, Input, Output, Stage};
+use stage::{Context, Input, Output, Rule, Stage};
 
 pub use params::{CompactParams, Net, PaperParams, Params};
 
@@ -74,6 +74,10 @@ impl Stage for TrainRefine {
 
     fn output() -> Output {
         Output::kind("refiner")
+    }
+
+    fn rules() -> Vec<Rule> {
+        vec![paper::weights_rule()]
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {

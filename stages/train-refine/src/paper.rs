@@ -4,7 +4,8 @@ use paper_refiner::{
 };
 use pixels::{Image, psnr_of};
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
-use stage::Context;
+use serde_json::json;
+use stage::{Context, Rule};
 
 use crate::examples::Examples;
 use crate::params::PaperParams;
@@ -41,7 +42,9 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     let width = params.features;
     let network = PaperRefiner::new(width, seed)?;
     let mut trainer = PaperTrainer::new(network, options, perceptual)?;
-    train(context, options.steps, &mut trainer, &known, |error| format!("L1 {error:.4}"))?;
+    train(context, options.steps, &mut trainer, &known, |error| {
+        format!("L1 of training patches {error:.4}")
+    })?;
     trainer.network().write(&context.output_path(WEIGHTS_FILE)?)?;
     let (mut rendered, mut refined) = (0.0, 0.0);
     let share = 1.0 / known.len() as f64;
@@ -66,6 +69,13 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     };
     context.write_json(REFINER_FILE, &file)?;
     report_gain(context, "training references", &file)
+}
+
+/// Returns the rule that the folder of weights must contain VGG-19.
+pub(crate) fn weights_rule() -> Rule {
+    let rule = Rule::new(&format!("no file {}", VGG_FILES.join(" or ")));
+    let rule = rule.when("net", json!({"const": "paper"}));
+    VGG_FILES.iter().fold(rule, |rule, file| rule.or_files("weights", &[file]))
 }
 
 /// Reads the first existing file of VGG-19's weights.

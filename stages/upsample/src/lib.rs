@@ -105,11 +105,17 @@ impl Stage for Upsample {
             "input weights is missing: methods imdn, liif and swinir need a folder with their \
             network's safetensors file; {REMEDY}"
         );
-        vec![
-            Rule::new(&message)
-                .when("method", json!({"enum": ["imdn", "liif", "swinir"]}))
-                .needs("weights"),
-        ]
+        let needs_weights = Rule::new(&message)
+            .when("method", json!({"enum": ["imdn", "liif", "swinir"]}))
+            .needs("weights");
+        let named = missing_file_rule("{file}").when("file", json!({"type": "string"}));
+        let liif = missing_file_rule("liif.safetensors")
+            .when("method", json!({"const": "liif"}))
+            .when("file", json!({"type": "null"}));
+        let mut rules = vec![needs_weights, named, liif];
+        rules.extend(scale_rules("imdn", &[2, 3, 4]));
+        rules.extend(scale_rules("swinir", &[2, 3, 4, 8]));
+        rules
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
@@ -157,6 +163,34 @@ impl Stage for Upsample {
             artifact::format_count(hr.views.len(), "view")
         ))
     }
+}
+
+/// Returns the rule that the folder of weights must contain a file.
+fn missing_file_rule(file: &str) -> Rule {
+    Rule::new(&format!("no file {file}; {REMEDY}")).or_files("weights", &[file])
+}
+
+/// Returns rules for a method whose networks have one scale each: `scales` are those of the
+/// published networks.
+fn scale_rules(method: &str, scales: &[u32]) -> Vec<Rule> {
+    let words: Vec<String> = scales.iter().map(u32::to_string).collect();
+    let message = format!(
+        "parameter method: {method} has networks for scales {} only; choose one of these scales, \
+        or method bicubic or liif",
+        words.join(", ")
+    );
+    let of_method = |rule: Rule| {
+        rule.when("method", json!({"const": method})).when("file", json!({"type": "null"}))
+    };
+    let mut rules = vec![
+        of_method(Rule::new(&message))
+            .must("cameras.scale", json!({"anyOf": [{"type": "null"}, {"enum": scales}]})),
+    ];
+    for scale in scales {
+        let rule = missing_file_rule(&format!("{method}_x{scale}.safetensors"));
+        rules.push(of_method(rule).when("cameras.scale", json!({"const": scale})));
+    }
+    rules
 }
 
 /// Constructor of a network from its weights.

@@ -1,6 +1,7 @@
 use artifact::{Failure, GivenInput};
 use metrics::{Score, ScoreFormat, Scores};
 use pixels::Image;
+use stage::Rule;
 
 #[cfg(feature = "torch")]
 use super::lpips::Lpips;
@@ -103,6 +104,13 @@ impl Perceptual {
     fn distances(&self, _: &Image, _: &Image) -> anyhow::Result<[Option<f64>; 3]> {
         Ok([None; 3])
     }
+}
+
+/// Returns the rule that the folder of weights must contain a complete network.
+pub(crate) fn weights_rule() -> Rule {
+    let message = format!("no network found; {}", missing_files(&LpipsNetwork::ALL));
+    let rule = Rule::new(&message);
+    LpipsNetwork::ALL.iter().fold(rule, |rule, network| rule.or_files("weights", &network.files()))
 }
 
 /// Text in place of an unknown LPIPS.

@@ -6,12 +6,12 @@ use std::sync::Arc;
 
 use artifact::FailedPoint;
 use serde_json::{Map, Value};
-use stage::GivenInputs;
 
 use crate::axes::{Axis, Kind, Setting};
 use crate::check::dependencies;
 use crate::experiment::Selection;
 use crate::file::{InputSource, Part};
+use crate::given_folders::given_inputs;
 use crate::left_out::{RequiredFiles, check_show, shown_stages};
 use crate::node::{Node, NodeInput, Origin, Plan, Sink};
 use crate::pipeline::Pipeline;
@@ -215,11 +215,7 @@ impl<'a> Expansion<'a> {
 
     /// Checks the rules of a stage's description, which may refer to the parameters of its parents.
     fn check_rules(&self, node: &Node) -> Result<(), PlanError> {
-        let mut inputs = GivenInputs::new();
-        for input in &node.inputs {
-            let parameters = input.node().map(|index| self.nodes[index].parameters.clone());
-            inputs.insert(input.name.clone(), parameters);
-        }
+        let inputs = given_inputs(node, &self.nodes);
         match node.program.description.broken_rule(&node.parameters, &inputs) {
             Some(problem) => Err(PlanError::Usage(format!("stage {}: {problem}", node.label()))),
             None => Ok(()),

@@ -36,6 +36,7 @@ mod experiment_axes;
 mod extend;
 mod file;
 mod frozen;
+mod given_folders;
 mod key;
 mod left_out;
 mod node;

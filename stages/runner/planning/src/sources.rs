@@ -27,9 +27,12 @@ const NOTICE_AFTER: Duration = Duration::from_secs(2);
 /// Error returned when a folder outside the store can't be hashed.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// The folder doesn't exist or can't be accessed.
-    #[error("{folder:?}: {problem}; name an existing folder")]
-    NotFound {
+    /// The folder doesn't exist.
+    #[error("{0:?}: no such folder; name an existing one")]
+    Missing(PathBuf),
+    /// The folder can't be accessed.
+    #[error("{folder:?}: {problem}; name another folder")]
+    NotAccessible {
         /// Path of the folder.
         folder: PathBuf,
         /// Error of the system.
@@ -38,6 +41,14 @@ pub enum SourceError {
     /// The path is that of a file.
     #[error("{0:?}: not a folder")]
     NotFolder(PathBuf),
+    /// The folder lacks files that the stage will need.
+    #[error("{folder:?}: {problem}")]
+    Incomplete {
+        /// Path of the folder.
+        folder: PathBuf,
+        /// Problem and remedy, as the stage's rule states them.
+        problem: String,
+    },
     /// A file in the folder can't be read.
     #[error("{folder:?}: {problem}")]
     Unreadable {
@@ -81,12 +92,7 @@ impl Source {
         folder: &Path,
         stop: Option<&AtomicBool>,
     ) -> Result<Self, SourceError> {
-        let absolute = folder
-            .canonicalize()
-            .map_err(|problem| SourceError::NotFound { folder: folder.to_path_buf(), problem })?;
-        if !absolute.is_dir() {
-            return Err(SourceError::NotFolder(folder.to_path_buf()));
-        }
+        let absolute = check_folder(folder)?;
         let cache = CacheFile::new(store, &absolute);
         let progress = Arc::new(HashProgress::default());
         let (sender, receiver) = mpsc::channel();
@@ -141,6 +147,15 @@ impl Source {
             now.stamp.is_untouched_since(&before.stamp) && now.blake3 == before.blake3
         })
     }
+}
+
+/// Returns the absolute path of a folder. Fails if the folder doesn't exist or can't be accessed.
+pub(crate) fn check_folder(folder: &Path) -> Result<PathBuf, SourceError> {
+    let absolute = folder.canonicalize().map_err(|problem| match problem.kind() {
+        io::ErrorKind::NotFound => SourceError::Missing(folder.to_path_buf()),
+        _ => SourceError::NotAccessible { folder: folder.to_path_buf(), problem },
+    })?;
+    if absolute.is_dir() { Ok(absolute) } else { Err(SourceError::NotFolder(folder.to_path_buf())) }
 }
 
 /// Returns the first difference between two maps of files, as text.

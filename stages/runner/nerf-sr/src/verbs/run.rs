@@ -22,6 +22,7 @@ pub(crate) fn run(
     let stop = stop_on_signals()?;
     let plan = session.new_plan(request, Describing::Needed(&stop))?;
     check_not_in_input(&plan, "the folder of pages", out)?;
+    plan.check_folders()?;
     let file = match begin_run(&session.store, &plan, &stop) {
         Ok(file) => file,
         Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),

@@ -1,5 +1,5 @@
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use artifact::{PathError, relative_path};
 use schemars::JsonSchema;
@@ -167,6 +167,17 @@ impl Description {
             .find(|rule| !rule.is_satisfied(parameters, inputs))
             .map(|rule| rule.message.clone())
     }
+
+    /// Returns the first input whose folder lacks files that a rule requires, with the rule's
+    /// message. `folders` are the inputs' folders outside the store.
+    pub fn missing_files(
+        &self,
+        parameters: &Value,
+        inputs: &GivenInputs,
+        folders: &BTreeMap<String, PathBuf>,
+    ) -> Option<(&str, String)> {
+        self.rules.iter().find_map(|rule| rule.missing_files(parameters, inputs, folders))
+    }
 }
 
 #[cfg(test)]
@@ -230,6 +241,34 @@ mod tests {
                 "{parameters} {inputs:?}"
             );
         }
+    }
+
+    #[test]
+    fn folders_must_contain_what_a_rule_names() {
+        let folder = tempfile::tempdir().unwrap();
+        for file in ["a_x2", "b", "b.heads"] {
+            std::fs::write(folder.path().join(file), "").unwrap();
+        }
+        let folders = BTreeMap::from([("weights".to_owned(), folder.path().to_path_buf())]);
+        let lacking = |rule: Rule, parameters: Value| {
+            let rule = rule.when("method", json!({"const": "imdn"}));
+            let description = Description { rules: vec![rule], ..description() };
+            description.check().unwrap();
+            assert_eq!(
+                description.missing_files(&parameters, &GivenInputs::new(), &BTreeMap::new()),
+                None
+            );
+            let found = description.missing_files(&parameters, &GivenInputs::new(), &folders);
+            found.map(|(input, message)| format!("{input}: {message}"))
+        };
+        let one = || Rule::new("no a_x{scale}").or_files("weights", &["a_x{scale}"]);
+        let imdn = |scale: u32| json!({"method": "imdn", "scale": scale});
+        assert_eq!(lacking(one(), imdn(2)), None);
+        assert_eq!(lacking(one(), imdn(3)).unwrap(), "weights: no a_x3");
+        assert_eq!(lacking(one(), json!({"method": "liif", "scale": 3})), None);
+        let heads = Rule::new("no b").or_files("weights", &["c", "c.heads"]);
+        assert!(lacking(heads.clone(), imdn(2)).is_some());
+        assert_eq!(lacking(heads.or_files("weights", &["b", "b.heads"]), imdn(2)), None);
     }
 
     #[test]

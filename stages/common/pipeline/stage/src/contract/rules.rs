@@ -1,10 +1,12 @@
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::contract::describe::Input;
+use crate::contract::documented::plain;
 use crate::contract::error::KeywordError;
 use crate::contract::validator::Validator;
 
@@ -23,7 +25,13 @@ pub struct Rule {
     /// Parameters with JSON Schemas that their values must match if the rule applies.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub must: BTreeMap<String, Value>,
-    /// Message if the rule is violated: the problem and the remedy.
+    /// Files that the folder of an input must contain if the rule applies: by input, alternative
+    /// lists, of which one must be complete. A parameter's name in braces stands for its value. The
+    /// runner checks the folders that the pipeline file or the command line names.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub files: BTreeMap<String, Vec<Vec<String>>>,
+    /// Message if the rule is violated: the problem and the remedy. With `files`, a parameter's
+    /// name in braces stands for its value.
     pub message: String,
 }
 
@@ -56,6 +64,7 @@ impl Rule {
             when: BTreeMap::new(),
             needs: Vec::new(),
             must: BTreeMap::new(),
+            files: BTreeMap::new(),
             message: message.to_owned(),
         }
     }
@@ -81,13 +90,23 @@ impl Rule {
         self
     }
 
+    /// Requires that the folder of an input, if given, contains a list of files, or those of an
+    /// earlier call.
+    #[must_use]
+    pub fn or_files(mut self, input: &str, files: &[&str]) -> Self {
+        let files = files.iter().map(ToString::to_string).collect();
+        self.files.entry(input.to_owned()).or_default().push(files);
+        self
+    }
+
     /// Checks that the rule refers to existing names and that its schemas can be used.
     pub(crate) fn check(
         &self,
         parameters: &[&str],
         inputs: &BTreeMap<String, Input>,
     ) -> Result<(), RuleError> {
-        if let Some(input) = self.needs.iter().find(|input| !inputs.contains_key(*input)) {
+        let mut named = self.needs.iter().chain(self.files.keys());
+        if let Some(input) = named.find(|input| !inputs.contains_key(*input)) {
             return Err(RuleError::UnknownInput(input.clone()));
         }
         for (name, schema) in self.when.iter().chain(&self.must) {
@@ -104,11 +123,32 @@ impl Rule {
         Ok(())
     }
 
+    fn applies(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
+        self.when.iter().all(|entry| value_matches(entry, parameters, inputs) == Some(true))
+    }
+
+    /// Returns the first input whose folder lacks files, with the rule's message.
+    pub(crate) fn missing_files(
+        &self,
+        parameters: &Value,
+        inputs: &GivenInputs,
+        folders: &BTreeMap<String, PathBuf>,
+    ) -> Option<(&str, String)> {
+        if !self.applies(parameters, inputs) {
+            return None;
+        }
+        let (input, _) = self.files.iter().find(|(input, alternatives)| {
+            folders.get(*input).is_some_and(|folder| {
+                let exists = |file: &String| folder.join(filled(file, parameters)).is_file();
+                !alternatives.iter().any(|files| files.iter().all(exists))
+            })
+        })?;
+        Some((input, filled(&self.message, parameters)))
+    }
+
     /// Returns whether parameters and inputs satisfy the rule.
     pub(crate) fn is_satisfied(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
-        let applies =
-            self.when.iter().all(|entry| value_matches(entry, parameters, inputs) == Some(true));
-        !applies
+        !self.applies(parameters, inputs)
             || (self.needs.iter().all(|input| inputs.contains_key(input))
                 && self
                     .must
@@ -128,4 +168,13 @@ fn value_matches(
         None => parameters.get(name.as_str()),
     };
     Some(Validator::new(schema).ok()?.is_valid(value?))
+}
+
+/// Replaces names of parameters in braces by their values.
+fn filled(text: &str, parameters: &Value) -> String {
+    let mut filled = text.to_owned();
+    for (name, value) in parameters.as_object().into_iter().flatten() {
+        filled = filled.replace(&format!("{{{name}}}"), &plain(value));
+    }
+    filled
 }
