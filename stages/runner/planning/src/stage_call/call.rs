@@ -6,6 +6,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use artifact::{format_count, format_duration, format_size, format_utc, printable, unix_time};
@@ -37,6 +38,9 @@ const ENVIRONMENT: [&str; 12] = [
 /// Maximum number of last stderr lines that are searched for the reason of a failure, chosen by
 /// hand.
 const MAX_TAIL_LINES: usize = 8;
+/// Time for which a stage's last line is held, since it may be the reason of a failure: a stage
+/// ends soon after it has printed the reason. Chosen by hand.
+const MAX_HOLD_TIME: Duration = Duration::from_millis(500);
 /// Interval between two checks of a running stage.
 const POLL_INTERVAL: Duration = Duration::from_millis(10);
 /// Time that a stopped stage has for its checkpoint after the end of the wrapper script that
@@ -152,16 +156,15 @@ impl Call<'_> {
         let kills_before = memory_kills();
         let (group, (stdout, stderr)) =
             self.start().map_err(|e| StageFailure::at(self.program, &e))?;
-        let output = OutputReader { log, watcher };
+        let output = OutputReader::new(log, watcher, &self.description.name);
         let (exit, stated_reason, tail) = std::thread::scope(|scope| {
             let stdout = scope.spawn(|| output.read_stdout(stdout));
             let stderr = scope.spawn(|| output.read_stderr(stderr));
             let are_closed = || stdout.is_finished() && stderr.is_finished();
-            let exit = wait(group, stop, watcher, &are_closed);
+            let exit = wait(group, stop, &|| output.tick(), &are_closed);
             (exit, stdout.join().ok().flatten(), stderr.join().unwrap_or_default())
         });
         let ResUse { status, rusage } = exit.map_err(|e| StageFailure::at(self.program, &e))?;
-        let last_line = tail.last().cloned();
         let result = if status.success() {
             let processor_seconds = (rusage.utime + rusage.stime).as_secs_f64();
             Ok(Usage { peak_memory: rusage.maxrss, processor_seconds })
@@ -175,13 +178,11 @@ impl Call<'_> {
             };
             Err(exit.failure(&self.description.name))
         };
-        if let Some(line) = last_line {
-            // The caller prints the reason: the same line must not appear twice.
-            let is_reason = result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
-            if !is_reason {
-                watcher.stderr_line(&line);
-            }
-        }
+        // The caller prints the reason: the same line must not appear twice.
+        output.release(|held| match &result {
+            Ok(_) => true,
+            Err(failure) => !held.text.ends_with(&failure.message),
+        });
         result
     }
 
@@ -233,9 +234,45 @@ impl Call<'_> {
 struct OutputReader<'a> {
     log: &'a StageLog,
     watcher: &'a dyn Watcher,
+    /// Beginning of the line with which a stage reports its failure.
+    failure_prefix: String,
+    /// Last line of stderr, unless it was forwarded.
+    held: Mutex<Option<HeldLine>>,
 }
 
-impl OutputReader<'_> {
+/// Line of stderr that may be the reason of a failure, which the caller prints.
+struct HeldLine {
+    text: String,
+    since: Instant,
+}
+
+impl<'a> OutputReader<'a> {
+    fn new(log: &'a StageLog, watcher: &'a dyn Watcher, stage: &str) -> Self {
+        let failure_prefix = format!("{stage}: ");
+        Self { log, watcher, failure_prefix, held: Mutex::default() }
+    }
+
+    fn held(&self) -> MutexGuard<'_, Option<HeldLine>> {
+        self.held.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Forwards the held line if `is_due` returns true.
+    fn release(&self, is_due: impl FnOnce(&HeldLine) -> bool) {
+        let mut held = self.held();
+        if let Some(line) = held.take_if(|line| is_due(line)) {
+            self.watcher.stderr_line(&line.text);
+        }
+    }
+
+    /// Runs every few milliseconds until the stage ends: forwards a line that is no reason of a
+    /// failure, since the stage still runs.
+    fn tick(&self) {
+        self.release(|line| {
+            line.since.elapsed() >= MAX_HOLD_TIME && !line.text.starts_with(&self.failure_prefix)
+        });
+        self.watcher.tick();
+    }
+
     /// Reads stdout: progress events, and other lines, which are for the log alone. Returns the
     /// reason of a failure if the stage states one.
     fn read_stdout(&self, stdout: Option<impl Read>) -> Option<String> {
@@ -259,8 +296,8 @@ impl OutputReader<'_> {
         reason
     }
 
-    /// Reads stderr, and forwards all lines but the last, which may be the reason of a failure.
-    /// Returns the last lines.
+    /// Reads stderr, and forwards each line when the next one comes; [`Self::tick`] forwards it
+    /// earlier if it is no reason of a failure. Returns the last lines.
     fn read_stderr(&self, stderr: Option<impl Read>) -> Vec<String> {
         let mut tail: VecDeque<String> = VecDeque::new();
         for line in read_lines(stderr) {
@@ -268,9 +305,8 @@ impl OutputReader<'_> {
             if is_noise(&line) {
                 continue;
             }
-            if let Some(last) = tail.back() {
-                self.watcher.stderr_line(last);
-            }
+            self.release(|_| true);
+            *self.held() = Some(HeldLine { text: line.clone(), since: Instant::now() });
             if tail.len() == MAX_TAIL_LINES {
                 tail.pop_front();
             }
@@ -280,12 +316,12 @@ impl OutputReader<'_> {
     }
 }
 
-/// Waits for the end of a stage, then kills the processes that it has left running. `are_closed`
-/// returns whether all processes have closed the stage's pipes.
+/// Waits for the end of a stage, then kills the processes that it has left running. `tick` runs
+/// every few milliseconds. `are_closed` returns whether all processes have closed the stage's pipes.
 fn wait(
     group: Group,
     stop: &AtomicBool,
-    watcher: &dyn Watcher,
+    tick: &dyn Fn(),
     are_closed: &dyn Fn() -> bool,
 ) -> std::io::Result<ResUse> {
     let mut is_stopped = false;
@@ -294,12 +330,12 @@ fn wait(
             group.terminate();
             is_stopped = true;
         }
-        watcher.tick();
+        tick();
         std::thread::sleep(POLL_INTERVAL);
     }
     let exited = Instant::now();
     while is_stopped && !are_closed() && exited.elapsed() < MAX_CHECKPOINT_TIME {
-        watcher.tick();
+        tick();
         std::thread::sleep(POLL_INTERVAL);
     }
     group.kill()
@@ -324,3 +360,7 @@ pub fn read_summary(output: &Path) -> Option<String> {
     file.metadata().ok().filter(std::fs::Metadata::is_file)?;
     std::fs::read_to_string(file).ok()
 }
+
+#[cfg(test)]
+#[path = "call_tests.rs"]
+mod tests;

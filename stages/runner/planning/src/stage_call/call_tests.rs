@@ -1,0 +1,86 @@
+//! Lines of a stage on stderr, as they reach the caller.
+
+use std::sync::Mutex;
+
+use serde_json::json;
+
+use super::*;
+
+/// Watcher that collects lines, and creates a file at the first one.
+struct Lines {
+    lines: Mutex<Vec<String>>,
+    seen: PathBuf,
+}
+
+impl Watcher for Lines {
+    fn progress(&self, _: &Event) {}
+
+    fn stderr_line(&self, line: &str) {
+        self.lines.lock().unwrap().push(line.to_owned());
+        std::fs::write(&self.seen, "").unwrap();
+    }
+}
+
+/// Runs a stage, a shell script in which `$SEEN` is the file that the first line creates. Returns
+/// the lines and the reason of the failure.
+fn lines_of(script: &str) -> (Vec<String>, Option<String>) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    let seen = file("seen");
+    let text = format!("#!/bin/sh\nSEEN='{}'\n{script}\n", seen.display());
+    std::fs::write(file("source"), text).unwrap();
+    // Written by another process: a file that this one has open can't be run.
+    let mut install = Command::new("install");
+    assert!(
+        install
+            .args(["-m", "755"])
+            .args([file("source"), file("stage")])
+            .status()
+            .unwrap()
+            .success()
+    );
+    let description = json!({"name": "make", "version": "", "code": "", "summary": "",
+        "parameters": {}, "inputs": {}, "output": {"kind": "x"}});
+    let description: Description = serde_json::from_value(description).unwrap();
+    let call = Call {
+        label: "make",
+        program: &file("stage"),
+        description: &description,
+        params: &file("params.json"),
+        inputs: &[],
+        hashes: &[],
+        output: &file("output"),
+        work: None,
+        from_checkpoint: false,
+        device: "cpu",
+        threads: 1,
+        lock: None,
+    };
+    let watcher = Lines { lines: Mutex::default(), seen };
+    let failure = call.run(&file("log"), &watcher, &AtomicBool::new(false)).err();
+    (watcher.lines.into_inner().unwrap(), failure.map(|failure| failure.message))
+}
+
+/// The stage waits for its only line to be seen, as a long training would work on.
+#[test]
+fn a_line_appears_when_it_is_printed() {
+    let wait = "for i in $(seq 600); do [ -e $SEEN ] && exit 0; sleep 0.1; done; exit 9";
+    let (lines, failure) = lines_of(&format!("echo resumed at step 5 >&2; {wait}"));
+    assert_eq!((lines, failure), (vec!["resumed at step 5".to_owned()], None));
+}
+
+/// The caller prints the reason, so it isn't a line as well, however long the stage takes to end.
+#[test]
+fn the_reason_of_a_failure_is_printed_once() {
+    for (script, lines, reason) in [
+        ("echo one >&2; echo make: bad >&2; sleep 1; exit 3", vec!["one"], "bad"),
+        ("echo one >&2; echo ValueError: bad >&2; exit 1", vec!["one"], "ValueError: bad"),
+        ("echo one >&2; echo two >&2", vec!["one", "two"], ""),
+    ] {
+        let (found, failure) = lines_of(script);
+        assert_eq!(
+            (found, failure.unwrap_or_default().as_str()),
+            (lines.iter().map(|l| (*l).to_owned()).collect(), reason)
+        );
+    }
+}
