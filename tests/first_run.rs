@@ -50,6 +50,10 @@ fn what_init_writes_runs_as_it_is() {
         std::fs::create_dir(project.path(&format!("of-{folder}"))).unwrap();
         let said = project.ok(&["--pipeline", &pipeline, "init", folder]);
         assert!(said.contains(&format!("found: {found} of {WIDTH}×{WIDTH}\n")), "{said}");
+        assert!(
+            said.contains(&format!("sizes: photographs {WIDTH}×{WIDTH}; training at")),
+            "{said}"
+        );
         let text = std::fs::read_to_string(project.path(&pipeline)).unwrap();
         assert!(text.contains(&format!("lr_source: {lr_source}")), "{text}");
         let run = [&["--pipeline", pipeline.as_str(), "run"][..], &SHORT].concat();
@@ -108,7 +112,7 @@ fn folders_that_init_refuses() {
         .unwrap();
     }
     project.run(&["init", "nothing"]).fails(3, &["nothing: no data set; expected"]);
-    project.run(&["init", "nowhere"]).fails(3, &["nowhere: no data set; expected"]);
+    project.run(&["init", "nowhere"]).fails(3, &["nowhere: no such folder"]);
     project
         .run(&["init", "loose"])
         .fails(3, &["loose: 1 image, but no cameras", "move them to 'loose/images'", "colmap"]);

@@ -14,11 +14,6 @@ pub(crate) fn frame_label(frame: &Frame) -> String {
 pub(crate) enum ParameterError {
     #[error("parameter split: the data set has no split of its own; choose holdout or paper")]
     NoSplit,
-    #[error(
-        "parameter lr_width: with lr_source photographs, the LR width is that of the photographs; \
-        omit lr_width"
-    )]
-    LrWidthOfPhotographs,
     #[error("parameter kernel: photographs cannot have kernel average; choose box")]
     AssumedAverage,
     /// Kernel `average` with a fractional scale: it averages whole pixels only.

@@ -27,9 +27,6 @@ impl ImagePlan {
             Some(source) => source == LrSource::Downscaled,
             None => set.format.is_benchmark() || params.lr_width.is_some(),
         };
-        if !has_truth && params.lr_width.is_some() {
-            return Err(ParameterError::LrWidthOfPhotographs.into());
-        }
         if !has_truth && params.kernel == Some(Kernel::Average) {
             return Err(ParameterError::AssumedAverage.into());
         }

@@ -94,6 +94,9 @@ impl Stage for Prep {
         let images = ImagePlan::new(&set, &split, params)?;
         let mut notes = set.notes.clone();
         notes.push(images.note(&split));
+        if let Some(lr_width) = params.lr_width.filter(|_| !images.has_truth) {
+            notes.push(format!("lr_width {lr_width} has no effect with lr_source photographs"));
+        }
         notes.extend(warnings);
         for note in &notes {
             context.log_line(note);

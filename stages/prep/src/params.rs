@@ -9,8 +9,8 @@ use crate::bounds::SpaceKind;
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the LR images in pixels; the height follows the aspect ratio. Default: the HR width
-    /// divided by `scale`.
+    /// Width of the LR images in pixels; the height follows the aspect ratio. Has no effect with
+    /// `lr_source: photographs`. Default: the HR width divided by `scale`.
     #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub lr_width: Option<u32>,
     /// Width of the HR images in pixels. Default: `lr_width` times `scale`, or the width of the

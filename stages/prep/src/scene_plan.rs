@@ -258,18 +258,24 @@ mod tests {
         planned(&ring(format, 8), params, Background::White).unwrap_err().to_string()
     }
 
+    /// The pipeline of `init` has `lr_width`, which `-p lr_source=photographs` overrides.
+    #[test]
+    fn photographs_override_the_lr_width() {
+        let params = |lr_width| Params {
+            lr_source: Some(crate::params::LrSource::Photographs),
+            lr_width,
+            ..Params::default()
+        };
+        let sizes = |lr_width| {
+            let set = ring(Format::Transforms, 8);
+            planned(&set, &params(lr_width), Background::White).unwrap().0.sizes
+        };
+        assert_eq!(sizes(Some(40)), sizes(None));
+    }
+
     /// What can't be is said by the parameter's name.
     #[test]
     fn what_cannot_be_is_refused() {
-        let width = refused(
-            Format::Transforms,
-            &Params {
-                lr_source: Some(crate::params::LrSource::Photographs),
-                lr_width: Some(40),
-                ..Params::default()
-            },
-        );
-        assert!(width.starts_with("parameter lr_width: with lr_source photographs"), "{width}");
         let kernel =
             Params { kernel: Some(pixels::Kernel::Average), scale: Some(2.7), ..Params::default() };
         let kernel = refused(Format::Blender, &kernel);

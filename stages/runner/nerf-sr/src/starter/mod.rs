@@ -30,6 +30,7 @@ const TARGETS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/targets.rs"
 #[derive(Clone, Debug)]
 pub(crate) struct Starter {
     summary: String,
+    sizes: String,
     notes: Vec<String>,
     text: String,
     file: PathBuf,
@@ -38,6 +39,9 @@ pub(crate) struct Starter {
 /// Error returned when the pipeline can't be composed or written.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum StarterError {
+    /// The folder doesn't exist.
+    #[error("{}: no such folder", .0.display())]
+    Missing(PathBuf),
     /// The folder contains no data set.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
@@ -91,17 +95,25 @@ pub(crate) enum StarterError {
 impl Starter {
     /// Reads a folder of posed photographs and composes the pipeline `file` for it.
     pub(crate) fn new(folder: &Path, file: &Path) -> Result<Self, StarterError> {
+        if !folder.exists() {
+            return Err(StarterError::Missing(folder.to_path_buf()));
+        }
         let set = Dataset::read(folder).map_err(|error| read_error(folder, error))?;
         let parent = file.parent().filter(|parent| !parent.as_os_str().is_empty());
         let dataset = data_path(folder, parent.unwrap_or(Path::new(".")))?;
-        let summary = summarize(&set);
-        let text = pipeline_text(&set, &summary, &dataset);
-        Ok(Self { summary, notes: set.notes, text, file: file.to_path_buf() })
+        let (summary, sizes) = (summarize(&set), sizes(&set));
+        let text = pipeline_text(&set, &format!("{summary}\n# {sizes}"), &dataset);
+        Ok(Self { summary, sizes, notes: set.notes, text, file: file.to_path_buf() })
     }
 
     /// Returns the format of the data set, and number and size of its photographs.
     pub(crate) fn summary(&self) -> &str {
         &self.summary
+    }
+
+    /// Returns the widths of photographs, training images and views as text.
+    pub(crate) fn sizes(&self) -> &str {
+        &self.sizes
     }
 
     /// Returns the data set's notes, such as lens distortion, one line each.
@@ -158,12 +170,71 @@ fn data_path(folder: &Path, parent: &Path) -> Result<String, StarterError> {
 
 /// Returns the format of a data set, and number and size of its photographs, as text.
 fn summarize(set: &Dataset) -> String {
-    let mut sizes = set.frames.iter().map(Frame::intrinsics).map(|i| (i.width, i.height));
-    let size = match sizes.next() {
-        Some(first) if sizes.all(|size| size == first) => format!(" of {}×{}", first.0, first.1),
-        _ => " of several sizes".to_owned(),
+    let size = match common_size(set) {
+        Some((width, height)) => format!(" of {width}×{height}"),
+        None => " of several sizes".to_owned(),
     };
     format!("{}: {}{size}", set.format.title(), format_count(set.frames.len(), "photograph"))
+}
+
+/// Returns the size of the photographs if all have the same.
+fn common_size(set: &Dataset) -> Option<(u32, u32)> {
+    let mut sizes = set.frames.iter().map(Frame::intrinsics).map(|i| (i.width, i.height));
+    let first = sizes.next()?;
+    sizes.all(|size| size == first).then_some(first)
+}
+
+/// Returns the widths of photographs, training images and views as text, and the width of views
+/// from photographs that aren't shrunk.
+fn sizes(set: &Dataset) -> String {
+    let size = common_size(set);
+    let photographs = match size {
+        Some((width, height)) => format!("photographs {width}×{height}"),
+        None => "photographs of several sizes".to_owned(),
+    };
+    let unshrunk = match size {
+        Some((width, _)) => format!("{}", width * SCALE),
+        None => format!("views {SCALE} times as wide as each photograph"),
+    };
+    let training = match (ImageSource::of(set), size) {
+        (ImageSource::Shrunk, _) => Some((MAX_WIDTH / SCALE, MAX_WIDTH)),
+        (ImageSource::Benchmark, Some((width, _))) => Some((width / SCALE, width)),
+        (ImageSource::Benchmark, None) => None,
+        (ImageSource::Photographs, _) => {
+            let views = if size.is_some() { format!("views at {unshrunk}") } else { unshrunk };
+            return format!("{photographs}; training at this size, {views}");
+        }
+    };
+    let training = match training {
+        Some((training, views)) => format!("training at {training}, views at {views}"),
+        None => format!("training at 1/{SCALE} of this size, views at this size"),
+    };
+    format!("{photographs}; {training}; `-p lr_source=photographs` gives {unshrunk}")
+}
+
+/// Source of LR images that [`image_parameters`] selects.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum ImageSource {
+    /// Photographs wider than [`MAX_WIDTH`], shrunk to it.
+    Shrunk,
+    /// Images of a benchmark, downscaled.
+    Benchmark,
+    /// Unmodified photographs.
+    Photographs,
+}
+
+impl ImageSource {
+    fn of(set: &Dataset) -> Self {
+        // The narrowest image decides, since images are never enlarged.
+        let width = set.frames.iter().map(|frame| frame.intrinsics().width).min().unwrap_or(0);
+        if width > MAX_WIDTH {
+            Self::Shrunk
+        } else if set.format.is_benchmark() {
+            Self::Benchmark
+        } else {
+            Self::Photographs
+        }
+    }
 }
 
 fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {
@@ -190,22 +261,25 @@ fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {
 
 /// Returns the YAML lines of the parameters that select the source of LR images.
 fn image_parameters(set: &Dataset) -> String {
-    let width = set.frames.iter().map(|frame| frame.intrinsics().width).min().unwrap_or(0);
-    if width > MAX_WIDTH {
-        let lr_width = MAX_WIDTH / SCALE;
-        format!(
-            "      lr_width: {lr_width} # photographs are shrunk to {MAX_WIDTH} pixels for scoring \
-            and to {lr_width} for training, which takes minutes on a CPU\n      \
-            # lr_source: photographs # instead of lr_width: trains on the unmodified photographs"
-        )
-    } else if set.format.is_benchmark() {
-        "      lr_source: downscaled # LR images are made from the data set's images; \
-        `photographs` trains on the unmodified images"
-            .to_owned()
-    } else {
-        "      lr_source: photographs # trains on the unmodified photographs; `downscaled` makes \
-        LR images from them first, so that views can be scored"
-            .to_owned()
+    match ImageSource::of(set) {
+        ImageSource::Shrunk => {
+            let lr_width = MAX_WIDTH / SCALE;
+            format!(
+                "      lr_width: {lr_width} # photographs are shrunk to {MAX_WIDTH} pixels for \
+                scoring and to {lr_width} for training, which takes minutes on a CPU\n      \
+                # lr_source: photographs # overrides lr_width: trains on the unmodified photographs"
+            )
+        }
+        ImageSource::Benchmark => {
+            "      lr_source: downscaled # LR images are made from the data set's images; \
+            `photographs` trains on the unmodified images"
+                .to_owned()
+        }
+        ImageSource::Photographs => {
+            "      lr_source: photographs # trains on the unmodified photographs; `downscaled` \
+            makes LR images from them first, so that views can be scored"
+                .to_owned()
+        }
     }
 }
 

@@ -46,6 +46,38 @@ fn what_was_found_is_said() {
     }
 }
 
+/// Pixels of photographs, training and views, and what the unmodified photographs would give.
+#[test]
+fn the_sizes_are_said() {
+    for (format, sizes_of_photographs, words) in [
+        (
+            Format::Colmap,
+            vec![(1080, 1920); 2],
+            "photographs 1080×1920; training at 400, views at 800; `-p lr_source=photographs` \
+            gives 2160",
+        ),
+        (
+            Format::Blender,
+            vec![(800, 800)],
+            "photographs 800×800; training at 400, views at 800; `-p lr_source=photographs` \
+            gives 1600",
+        ),
+        (
+            Format::Colmap,
+            vec![(640, 480)],
+            "photographs 640×480; training at this size, views at 1280",
+        ),
+        (
+            Format::Colmap,
+            vec![(640, 480), (480, 640)],
+            "photographs of several sizes; training at this size, views 2 times as wide as each \
+            photograph",
+        ),
+    ] {
+        assert_eq!(sizes(&set(format, &sizes_of_photographs)), words);
+    }
+}
+
 /// Every file of `pipelines/` is shipped.
 #[test]
 fn no_target_is_missing() {

@@ -13,6 +13,7 @@ use planning::{Pipeline, PlanError, executable};
 pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
     let starter = Starter::new(folder, file).map_err(starter_failure)?;
     print_line!("found: {}", starter.summary());
+    print_line!("sizes: {}", starter.sizes());
     for note in starter.notes() {
         print_line!("  {note}");
     }
@@ -25,7 +26,7 @@ pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
 
 fn starter_failure(error: StarterError) -> anyhow::Error {
     match error {
-        StarterError::Dataset(_) | StarterError::NoCameras { .. } => {
+        StarterError::Missing(_) | StarterError::Dataset(_) | StarterError::NoCameras { .. } => {
             Failure::BadInput(error.to_string()).into()
         }
         StarterError::Io { .. } => error.into(),
