@@ -49,7 +49,9 @@ impl Stage for Table {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
         run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
         let mut figures = Figures::default();
-        let rows = rows::rows(&run, params, &mut figures)?;
+        let scored = run.nodes.iter().filter(|node| node.is_shown).count();
+        let progress = context.progress("reading scores", scored as u64);
+        let rows = rows::rows(&run, params, &mut figures, &progress)?;
         if rows.is_empty() && run.failed.is_empty() {
             return Err(Failure::BadInput("run.json has no scored results".to_owned()).into());
         }

@@ -260,9 +260,9 @@ fn rows_follow_the_groups() {
     let params = params(json!({"methods": {"eval-ss": "ours"}, "group_by": "seen",
         "groups": [{"name": "LR", "methods": ["eval-ss", "eval-liif"]},
         {"name": "HR", "methods": ["eval-hr"]}]}));
-    let rows =
-        crate::rows::rows(&serde_json::from_value(run).unwrap(), &params, &mut Figures::default())
-            .unwrap();
+    let run = serde_json::from_value(run).unwrap();
+    let silent = stage::Progress::silent();
+    let rows = crate::rows::rows(&run, &params, &mut Figures::default(), &silent).unwrap();
     let told: Vec<[&str; 3]> = rows
         .iter()
         .map(|row| {

@@ -7,6 +7,7 @@ use metrics::AnyMetrics;
 use radiance::{TRAINING_FILE, TrainingLog};
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
+use stage::Progress;
 
 use crate::figures::Figures;
 use crate::params::Params;
@@ -21,6 +22,7 @@ pub(crate) fn rows(
     run: &RunRecord,
     params: &Params,
     figures: &mut Figures,
+    progress: &Progress,
 ) -> anyhow::Result<Vec<Row>> {
     let commit = run.commit().unwrap_or_default();
     let mut scored: Vec<(usize, &RunNode)> =
@@ -28,7 +30,8 @@ pub(crate) fn rows(
     // Blocks with fewer stages before them come first: rendered views before refined ones.
     scored.sort_by_key(|(_, node)| depth(run, &node.stage));
     let mut rows: Vec<(usize, Row)> = Vec::new();
-    for (index, node) in scored {
+    for (finished, (index, node)) in scored.into_iter().enumerate() {
+        progress.set(finished as u64, "");
         let mut row = keys(params, &node.stage, &node.values);
         row.extend(scores(node, figures)?);
         row.extend(times(run, index)?);

@@ -45,7 +45,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     };
     let mut trainer = RefinerTrainer::new(Refiner::new(architecture, seed)?, options)?;
     train(context, options.steps, &mut trainer, &examples.training, |error| {
-        format!("{:.2} dB", psnr_of(error))
+        format!("PSNR of training patches {:.2} dB", psnr_of(error))
     })?;
     let scores = trainer.score(&examples.left_out, &examples.training)?;
     trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?)?;

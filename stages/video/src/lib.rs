@@ -3,7 +3,7 @@
 //! The stage is a sink. It writes a PNG per frame and, if `ffmpeg` is installed, `video.mp4`. Each
 //! point of a sweep has its own folder.
 
-use std::io::{self, Read as _};
+use std::io::{self, BufRead, BufReader, Read as _};
 use std::path::Path;
 use std::process::{self, Command, Stdio};
 use std::time::Duration;
@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use scene::{View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Input, Output, Stage};
+use stage::{Context, Input, Output, Progress, Stage};
 
 /// Parameters of `video`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -103,7 +103,9 @@ fn make_film(
         anyhow::Ok(())
     })?;
     let frames = context.output_path(&format!("{prefix}frames/%05d.png"))?;
-    encode(context, params, &frames, &context.output_path(&format!("{prefix}video.mp4"))?)
+    let film = context.output_path(&format!("{prefix}video.mp4"))?;
+    let progress = context.progress("encoding", views.views.len() as u64);
+    encode(context, params, &frames, &film, &progress)
 }
 
 fn size_of_view(view: &View) -> (u32, u32) {
@@ -153,13 +155,20 @@ fn with_even_size(image: &Rgba8) -> Rgba8 {
 }
 
 /// Encodes the film by ffmpeg; without ffmpeg, or if it fails, logs that only the frames exist.
-fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> anyhow::Result<()> {
+fn encode(
+    context: &Context,
+    params: &Params,
+    frames: &Path,
+    film: &Path,
+    progress: &Progress,
+) -> anyhow::Result<()> {
     let rate = params.frames_per_second.to_string();
     let mut command = Command::new("ffmpeg");
     command.args(["-loglevel", "error", "-nostdin", "-y", "-framerate", &rate, "-i"]).arg(frames);
-    command.args(["-pix_fmt", "yuv420p", "-movflags", "+faststart"]).arg(film).stdin(Stdio::null());
+    command.args(["-pix_fmt", "yuv420p", "-movflags", "+faststart"]);
+    command.args(["-progress", "pipe:1"]).arg(film).stdin(Stdio::null());
     let folder = frames.parent().unwrap_or(frames).display();
-    let output = output_of(context, &mut command);
+    let output = output_of(context, &mut command, progress);
     context.check_interrupt()?;
     match output {
         Ok(output) if output.status.success() => Ok(()),
@@ -183,30 +192,59 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
     }
 }
 
-/// Runs a program and collects its stderr; kills the program if the stage is interrupted.
-fn output_of(context: &Context, command: &mut Command) -> io::Result<process::Output> {
-    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn()?;
-    let pipe = child.stderr.take();
-    let reader = std::thread::spawn(|| {
-        let mut bytes = Vec::new();
-        pipe.map_or(Ok(0), |mut pipe| pipe.read_to_end(&mut bytes)).map(|_| bytes)
-    });
-    let status = loop {
-        if let Some(status) = child.try_wait()? {
-            break status;
-        }
-        if context.is_interrupted() {
-            child.kill()?;
-        }
-        std::thread::sleep(POLL_INTERVAL);
-    };
-    let stderr = reader.join().unwrap_or_else(|_| Ok(Vec::new()))?;
-    Ok(process::Output { status, stdout: Vec::new(), stderr })
+/// Runs ffmpeg and collects its stderr; kills ffmpeg if the stage is interrupted. `progress` gets
+/// the frames that ffmpeg reports on stdout.
+fn output_of(
+    context: &Context,
+    command: &mut Command,
+    progress: &Progress,
+) -> io::Result<process::Output> {
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+    let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
+    std::thread::scope(|scope| {
+        let stderr = scope.spawn(|| {
+            let mut bytes = Vec::new();
+            stderr.map_or(Ok(0), |mut pipe| pipe.read_to_end(&mut bytes)).map(|_| bytes)
+        });
+        scope.spawn(|| {
+            let lines = stdout.map(BufReader::new).into_iter().flat_map(BufRead::lines);
+            for line in lines.map_while(Result::ok) {
+                if let Some(frame) = encoded_frames(&line) {
+                    progress.set(frame, "");
+                }
+            }
+        });
+        let status = loop {
+            if let Some(status) = child.try_wait()? {
+                break status;
+            }
+            if context.is_interrupted() {
+                child.kill()?;
+            }
+            std::thread::sleep(POLL_INTERVAL);
+        };
+        let stderr = stderr.join().unwrap_or_else(|_| Ok(Vec::new()))?;
+        Ok(process::Output { status, stdout: Vec::new(), stderr })
+    })
+}
+
+/// Returns the number of encoded frames in a line of ffmpeg's `-progress`.
+fn encoded_frames(line: &str) -> Option<u64> {
+    line.strip_prefix("frame=")?.trim().parse().ok()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn ffmpeg_reports_frames() {
+        assert_eq!(encoded_frames("frame=12"), Some(12));
+        assert_eq!(encoded_frames("frame=  7"), Some(7));
+        assert!(
+            ["frame=", "fps=3", "progress=end"].into_iter().all(|l| encoded_frames(l).is_none())
+        );
+    }
 
     #[test]
     fn frames_have_even_sizes_and_both_images() {

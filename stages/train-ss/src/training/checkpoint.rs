@@ -40,9 +40,10 @@ impl Curve {
         }
     }
 
-    /// Returns the last PSNR as text for the progress bar.
+    /// Returns the last PSNR of the training pixels as text for the progress bar.
     pub(crate) fn last_psnr(&self) -> String {
-        self.points.last().map(|p| format!("{:.2} dB", p.psnr)).unwrap_or_default()
+        let last = self.points.last();
+        last.map(|p| format!("PSNR of training pixels {:.2} dB", p.psnr)).unwrap_or_default()
     }
 
     pub(crate) fn finish(self, steps: u64, rays: u64) -> TrainingLog {

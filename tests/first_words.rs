@@ -1,0 +1,112 @@
+//! What a new user is told, and when: problems before anything runs, and progress of every stage.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::Path;
+
+use common::{Project, stage_command};
+use serde_json::{Value, json};
+
+/// A project whose photographs are enlarged by a network.
+fn enlarging() -> Project {
+    let project = Project::tiny();
+    let blocks = "
+  upsample:
+    inputs: {views: render-depth, cameras: prep/cameras}
+  eval-upsampled:
+    extends: eval
+    inputs: {views: upsample, truth: prep/truth}
+";
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    project.write("pipeline.yaml", &(text + blocks));
+    std::fs::create_dir(project.path("weights")).unwrap();
+    project
+}
+
+/// Weights, scales and folders that a later stage can't use are known before the first stage runs.
+#[test]
+fn every_input_is_checked_before_anything_runs() {
+    let project = enlarging();
+    let weights = ["-i", "upsample.weights=weights"];
+    for (arguments, code, words) in [
+        (
+            [&weights[..], &["-p", "method=imdn"]].concat(),
+            3,
+            &["upsample", "weights", "no file imdn_x2.safetensors"][..],
+        ),
+        ([&weights[..], &["-p", "method=liif"]].concat(), 3, &["no file liif.safetensors"]),
+        (
+            [&weights[..], &["-p", "method=swinir", "-p", "upsample.file=mine.st"]].concat(),
+            3,
+            &["no file mine.st"],
+        ),
+        (
+            [&weights[..], &["-p", "method=imdn", "-p", "scale=5"]].concat(),
+            2,
+            &["imdn has networks for scales 2, 3, 4 only"],
+        ),
+        (vec!["-i", "eval.weights=weights"], 3, &["eval", "weights", "no network found"]),
+        (vec!["-i", "eval.weights=nowhere"], 3, &["nowhere", "no such folder"]),
+    ] {
+        let run = [&["run", "eval-upsampled"], &arguments[..]].concat();
+        project.run(&run).fails(code, words);
+        assert_eq!(project.store_listing(), Vec::<String>::new(), "{arguments:?}");
+    }
+}
+
+/// `12k` is 12000, on the command line and in a file, and has its key.
+#[test]
+fn whole_numbers_may_have_a_suffix() {
+    let project = Project::tiny();
+    let keys = |arguments: &[&str]| -> Vec<Value> {
+        let nodes = project.nodes(&[&["-p", "demo-scene.seed=1"], arguments].concat());
+        nodes.into_iter().map(|mut node| node["key"].take()).collect()
+    };
+    let expected = keys(&["-p", "size=64000"]);
+    assert_eq!(keys(&["-p", "size=64k"]), expected);
+    assert_ne!(keys(&["-p", "size=65k"]), expected);
+    project.run(&["plan", "-p", "rays=30X"]).fails(2, &["\"30X\" is not a whole number"]);
+}
+
+/// A node of a run's record that a sink shows.
+fn node(project: &Project, stage: &str, kind: &str) -> Value {
+    let folder = project.artifact(stage, &[]);
+    json!({"stage": stage, "point": "", "is_shown": true, "program": stage, "kind": kind,
+        "key": "k", "output": folder.file_name().unwrap().to_str().unwrap(), "folder": folder,
+        "parameters": {}, "inputs": {}, "started_unix": 1_790_000_000, "seconds": 3.5,
+        "threads": 2})
+}
+
+/// Runs a stage by itself, slowed, until it has reported a percentage.
+#[track_caller]
+fn shows_a_percentage(project: &Project, name: &str, inputs: &[(&str, &Path)]) {
+    let output = project.path(&format!("{name}.out"));
+    let mut command = stage_command(name, "{}", inputs, &output, &["--progress", "json"]);
+    command.env("NERF_SR_SLOW_UNTIL", format!("0 {}", project.path("never").display()));
+    command.env("NERF_SR_STOP_AFTER", "2");
+    let finished = common::Finished::of(command.output().unwrap());
+    assert!(finished.stdout.contains(r#""event":"progress""#), "{name}: {}", finished.stderr);
+}
+
+#[test]
+fn sinks_and_export_show_a_percentage() {
+    let project = Project::fast();
+    project.ok(&["run"]);
+    for (sink, kind, stage) in [
+        ("report", "metrics", "eval"),
+        ("table", "metrics", "eval"),
+        ("video", "views", "render-depth"),
+    ] {
+        let run = project.path(&format!("{sink}.run"));
+        std::fs::create_dir(&run).unwrap();
+        let nodes: Vec<Value> = (0..4).map(|_| node(&project, stage, kind)).collect();
+        let record = json!({"home": project.path("out"), "command": ["nerf-sr", "run"],
+            "data_sets": ["demo-scene"], "nodes": nodes});
+        std::fs::write(run.join("run.json"), record.to_string()).unwrap();
+        shows_a_percentage(&project, sink, &[("run", &run)]);
+    }
+    let [field, scene] = ["train-ss", "prep"].map(|stage| project.artifact(stage, &[]));
+    let cameras = scene.join("cameras");
+    shows_a_percentage(&project, "export", &[("field", &field), ("cameras", &cameras)]);
+}
