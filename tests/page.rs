@@ -101,7 +101,15 @@ fn a_page_shows_a_sweep_as_eval_scored_it() {
     assert!(said.contains("out/report/index.html"), "{said}");
     let page = project.path("out/report/index.html");
     let text = std::fs::read_to_string(&page).unwrap();
-    for words in ["run -p supersample=1,2", "weights not given", " UTC", "<h1>demo-scene</h1>"] {
+    for words in [
+        "run -p supersample=1,2",
+        "weights not given",
+        " UTC",
+        "<h1>demo-scene</h1>",
+        "LR 16×16 → HR 32×32",
+        " per LR pixel",
+        "href=\"#definition-psnr\" title=\"",
+    ] {
         assert!(text.contains(words), "the page lacks {words:?}");
     }
     // Originals lie beside it, and what the page says of each stage is the run's.
@@ -170,17 +178,58 @@ fn page_of(folder: &Path, record: &Value) -> PathBuf {
     page.join("index.html")
 }
 
+/// Labels of a page's layers of one kind.
+fn layers(page: &str, kind: &str) -> Vec<String> {
+    let data = page.split_once("id=\"data\">").unwrap().1.split_once("</script>").unwrap().0;
+    let data: Value = serde_json::from_str(data).unwrap();
+    let layers = data["layers"].as_array().unwrap().iter().filter(|layer| layer["kind"] == kind);
+    layers.map(|layer| layer["label"].as_str().unwrap().to_owned()).collect()
+}
+
+/// Scores fail, but the views are rendered: the page shows them and their ground truth.
+#[test]
+fn a_failed_run_shows_the_renders_that_it_finished() {
+    let project = Project::fast();
+    project.ok(&["run"]);
+    let mut record = record(&project, 1);
+    record["nodes"].as_array_mut().unwrap().pop();
+    record["failed"] = json!([{"stage": "eval", "point": ""}]);
+    record["unfinished"] = json!([{"stage": "eval", "point": "", "kind": "metrics",
+        "parameters": {}, "needs": [3, 1], "message": "out of memory"}]);
+    let folder = tempfile::tempdir().unwrap();
+    let page = page_of(folder.path(), &record);
+    let text = std::fs::read_to_string(&page).unwrap();
+    assert!(text.contains("This run failed") && text.contains("There are no scores"));
+    assert_eq!(layers(&text, "render"), ["rendered, not scored"]);
+    assert_eq!(layers(&text, "ground-truth"), ["Ground truth"]);
+    assert_eq!(std::fs::read_dir(folder.path().join("page/views")).unwrap().count(), 2);
+    glance(&page);
+}
+
+/// Names of photographs may be long: plots and tables have room for them, or shorten them.
+#[test]
+fn long_view_names_have_room() {
+    let dir = tempfile::tempdir().unwrap();
+    let metrics = photographs(dir.path(), 12, 64, "photograph_of_the_garden_behind_the_house_");
+    let page = page_of(dir.path(), &photographs_record(dir.path(), &metrics));
+    look(&page);
+}
+
 #[test]
 fn one_result_and_a_hundred_have_readable_pages() {
     let project = Project::fast();
     project.ok(&["run"]);
     let metrics = project.json("eval", "metrics.json", &[]);
-    for (results, last) in [(1, "default"), (12, "rays=1011"), (100, "rays=1099")] {
+    for (results, last) in [(1, "rendered"), (12, "rays=1011"), (100, "rays=1099")] {
         let folder = tempfile::tempdir().unwrap();
         let page = page_of(folder.path(), &record(&project, results));
         let text = std::fs::read_to_string(&page).unwrap();
         assert_eq!(text.matches("★</span>").count() > 0, results > 1, "{results}");
         assert!(text.len() as u64 <= PAGE_BYTES, "{} bytes", text.len());
+        // All results have equal pictures, which the page lists once.
+        let renders: Vec<String> = layers(&text, "render");
+        assert_eq!(renders.len(), 1, "{renders:?}");
+        assert_eq!(renders[0].ends_with(&format!("and {} more", results - 1)), results > 1);
         let Some(looks) = glance(&page) else { return };
         looks.iter().for_each(|look| says(look, last, &metrics));
     }
@@ -199,10 +248,10 @@ fn write_image(folder: &Path, file: &str, image: &pixels::Rgba8) {
 }
 
 /// Views of photographs, which no filter shrinks to nothing: detail at every size, and noise.
-fn photographs(folder: &Path, count: usize, side: usize) -> Value {
+fn photographs(folder: &Path, count: usize, side: usize, prefix: &str) -> Value {
     let (mut truths, mut renders, mut scores) = (vec![], vec![], vec![]);
     for number in 0..count {
-        let name = format!("r_{number}");
+        let name = format!("{prefix}{number}");
         let sharp = texture(side, number as u64, 1.0);
         write_image(folder, &format!("truth/images/{name}.png"), &sharp);
         write_image(
@@ -278,23 +327,23 @@ fn folder_node(dir: &Path, stage: &str, kind: &str, folder: &str, inputs: &Value
         "started_unix": 1, "seconds": 1.0, "threads": 1})
 }
 
+/// The record of scored [`photographs`].
+fn photographs_record(dir: &Path, metrics: &Value) -> Value {
+    std::fs::write(dir.join("metrics/metrics.json"), metrics.to_string()).unwrap();
+    let inputs = json!({"views": {"node": 1}, "truth": {"node": 0}});
+    let nodes = [
+        folder_node(dir, "truth", "views", "truth", &json!({})),
+        folder_node(dir, "views", "views", "views", &json!({})),
+        folder_node(dir, "eval", "metrics", "metrics", &inputs),
+    ];
+    json!({"nodes": nodes})
+}
+
 #[test]
 fn fifty_views_of_800_pixels_have_room() {
     let dir = tempfile::tempdir().unwrap();
-    let metrics = photographs(dir.path(), 50, 800);
-    std::fs::write(dir.path().join("metrics/metrics.json"), metrics.to_string()).unwrap();
-    let nodes = [
-        folder_node(dir.path(), "truth", "views", "truth", &json!({})),
-        folder_node(dir.path(), "views", "views", "views", &json!({})),
-        folder_node(
-            dir.path(),
-            "eval",
-            "metrics",
-            "metrics",
-            &json!({"views": {"node": 1}, "truth": {"node": 0}}),
-        ),
-    ];
-    let page = page_of(dir.path(), &json!({"nodes": nodes}));
+    let metrics = photographs(dir.path(), 50, 800, "r_");
+    let page = page_of(dir.path(), &photographs_record(dir.path(), &metrics));
     let bytes = page.metadata().unwrap().len();
     println!("{bytes} bytes");
     assert!(bytes <= PAGE_BYTES, "{bytes} bytes");

@@ -44,7 +44,7 @@ fn refined_views_stand_beside_rendered_ones() {
     assert!(run.contains("out/refined/index.html"), "{run}");
     let page = std::fs::read_to_string(project.path("out/refined/index.html")).unwrap();
     assert!(
-        ["refined", "eval"].iter().all(|row| page.contains(&format!("scope=\"row\">{row}<"))),
+        ["refined", "rendered"].iter().all(|row| page.contains(&format!("scope=\"row\">{row}<"))),
         "the page lacks one of both"
     );
     let rows: serde_json::Value =

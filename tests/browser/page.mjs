@@ -16,8 +16,12 @@ async function look(browser, size) {
   const found = { size, problems, summary: await page.locator(".summary dd").allTextContents() };
   found.title = await page.locator("h1").textContent();
   if (await page.locator("#viewer").isVisible()) {
+    const top = (await page.locator("#stage .pane").boundingBox()).y;
+    expect(top < 0.55 * size.height, `the first picture begins at ${top} of ${size.height} pixels`);
+    await thumbnails(page, expect);
     found.numbers = await compare(page, expect);
     await zoom(page, expect);
+    await link(browser, page, size, expect);
     await arrange(page, expect);
     await pick(page, expect);
   }
@@ -25,6 +29,8 @@ async function look(browser, size) {
   const isWide = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
   expect(!isWide, "the page scrolls sideways");
   for (const details of await page.locator("details").all()) await details.evaluate((element) => (element.open = true));
+  await tables(page, expect);
+  await plots(page, expect);
   problems.push(...(await accessibilityFindings(page)));
   expect(
     !(await page.evaluate(() => document.documentElement.scrollWidth > innerWidth)),
@@ -85,6 +91,96 @@ async function compare(page, expect) {
     expect(!isBroken, `a picture of ${name} can't be decoded`);
   }
   return numbers;
+}
+
+/** Checks that each view has a thumbnail, which shows the view. */
+async function thumbnails(page, expect) {
+  const views = await options(page, "view");
+  const all = page.locator("#thumbnails button");
+  expect((await all.count()) === views.length, `${await all.count()} thumbnails of ${views.length} views`);
+  if (views.length < 2) return;
+  await all.last().click();
+  expect((await page.locator("#view").inputValue()) === views.at(-1), "a thumbnail doesn't show its view");
+  expect((await all.last().getAttribute("aria-pressed")) === "true", "the view's thumbnail isn't marked");
+  await all.first().click();
+}
+
+/** Checks that the page's address shows the same view and zoom again. */
+async function link(browser, page, size, expect) {
+  await page.locator("#view").selectOption({ index: (await options(page, "view")).length - 1 });
+  await page.locator("#stage").press("+");
+  const state = (one) =>
+    one.evaluate(() => [
+      document.getElementById("view").value,
+      document.getElementById("zoom").textContent,
+      document.querySelector("#stage .tag.right").textContent,
+    ]);
+  const before = await state(page);
+  const { page: other } = await open(browser, PAGE, size);
+  // The address follows after a moment without changes.
+  await page.waitForTimeout(600);
+  await other.goto(await page.evaluate(() => location.href));
+  await other.reload();
+  const after = await state(other);
+  expect(JSON.stringify(before) === JSON.stringify(after), `a link shows ${after}, not ${before}`);
+  await other.context().close();
+  await page.locator("#fit").click();
+}
+
+/** Checks that wide tables show that they scroll, and that no word is broken. */
+async function tables(page, expect) {
+  const problems = await page.locator(".wide").evaluateAll((all) =>
+    all.flatMap((region) => {
+      const found = [];
+      const hint = region.previousElementSibling;
+      const isHinted = hint?.matches(".scroll-hint:not([hidden])") ?? false;
+      if (isHinted !== region.scrollWidth - region.clientWidth >= 2) found.push("a wide table without a hint");
+      for (const cell of region.querySelectorAll("th, td")) {
+        for (const node of textNodes(cell)) {
+          for (const { 0: word, index } of node.textContent.matchAll(/[^\s_\-=,/.…]+/g)) {
+            const range = document.createRange();
+            range.setStart(node, index);
+            range.setEnd(node, index + word.length);
+            const lines = new Set([...range.getClientRects()].map((rectangle) => Math.round(rectangle.top)));
+            if (lines.size > 1) found.push(`${word} is broken`);
+          }
+        }
+      }
+      return found;
+
+      function textNodes(cell) {
+        const nodes = [];
+        const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
+        while (walker.nextNode()) nodes.push(walker.currentNode);
+        return nodes;
+      }
+    }),
+  );
+  for (const problem of problems) expect(false, problem);
+}
+
+/** Checks that texts of plots are neither clipped nor overlapping, and that whole numbers have whole ticks. */
+async function plots(page, expect) {
+  const problems = await page.locator(".plot").evaluateAll((all) =>
+    all.flatMap((plot) => {
+      const box = plot.getBoundingClientRect();
+      const texts = [...plot.querySelectorAll("svg text")].map((text) => [text, text.getBoundingClientRect()]);
+      const clipped = texts.filter(([, { left, right }]) => left < box.left - 1 || right > box.right + 1);
+      const overlap = (a, b) =>
+        Math.min(a.right, b.right) - Math.max(a.left, b.left) > 1 &&
+        Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 4;
+      const pairs = texts.flatMap(([one, a], i) =>
+        texts.slice(i + 1).filter(([, b]) => overlap(a, b)).map(([other]) => [one, other]),
+      );
+      return [
+        ...clipped.map(([text]) => `${text.textContent} is clipped`),
+        ...pairs.map((pair) => `${pair.map((text) => text.textContent).join(" and ")} overlap`),
+      ];
+    }),
+  );
+  for (const problem of problems) expect(false, problem);
+  const ticks = await page.evaluate("axis([1, 2], {}).ticks.map(({ value }) => value)");
+  expect(ticks.every(Number.isInteger), `ticks ${ticks} of whole numbers`);
 }
 
 /** Checks that zoom and pan are kept when the view changes. */

@@ -15,6 +15,9 @@ const MARKS = [
 const MAX_COLOURS = MARKS.length;
 const MARGIN = { left: 54, right: 14, top: 12, bottom: 42 };
 const HEIGHT = 270;
+/** Maximum width of a name on an axis, and least distance between two names, in pixels. */
+const MAX_NAME_WIDTH = 110;
+const NAME_GAP = 10;
 /** Maximum distance in pixels at which a pointer reads a point. */
 const REACH = 44;
 
@@ -26,6 +29,11 @@ function element(name, attributes, parent, text) {
   return made;
 }
 
+/** Appends text that may be broken after punctuation, so that no word is cut. */
+function breakable(parent, text) {
+  for (const part of text.split(/(?<=[_\-=,/.])/)) parent.append(part, document.createElement("wbr"));
+}
+
 function shape(name, attributes, parent, text) {
   const made = document.createElementNS(SVG, name);
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -34,22 +42,25 @@ function shape(name, attributes, parent, text) {
   return made;
 }
 
-/** Returns about `count` round numbers from `low` to `high`. */
-function roundNumbers(low, high, count) {
+/** Returns about `count` round numbers from `low` to `high`; whole ones if `isWhole`. */
+function roundNumbers(low, high, count, isWhole) {
   const span = high - low;
   const power = 10 ** Math.floor(Math.log10(span / count));
-  const step = power * [1, 2, 5, 10].find((factor) => span / (factor * power) <= count);
+  const found = power * [1, 2, 5, 10].find((factor) => span / (factor * power) <= count);
+  const step = isWhole ? Math.max(1, found) : found;
   const first = Math.ceil(low / step - 1e-9);
   const last = Math.floor(high / step + 1e-9);
   return Array.from({ length: last - first + 1 }, (_, i) => (first + i) * step);
 }
 
-function roundPowers(low, high) {
+function roundPowers(low, high, isWhole) {
   const numbers = [];
   for (let power = 10 ** Math.floor(Math.log10(low)); power <= high; power *= 10) {
     numbers.push(...[1, 2, 5].map((factor) => factor * power));
   }
-  const within = numbers.filter((number) => number >= low * 0.999 && number <= high * 1.001);
+  const within = numbers.filter(
+    (number) => number >= low * 0.999 && number <= high * 1.001 && (!isWhole || Number.isInteger(number)),
+  );
   const isPower = (number) => Math.abs(Math.log10(number) % 1) < 1e-9;
   return within.length > 7 ? within.filter(isPower) : within;
 }
@@ -61,24 +72,31 @@ function shortNumber(value) {
   return String(Number(value.toPrecision(4)));
 }
 
+/** Sets a label's text, shortened in the middle to at most `limit` pixels. Returns its width. */
+function fitText(label, text, limit) {
+  label.textContent = text;
+  for (let kept = text.length - 1; kept > 2 && label.getComputedTextLength() > limit; kept -= 1)
+    label.textContent = `${text.slice(0, Math.ceil(kept / 2))}…${text.slice(text.length - Math.floor(kept / 2))}`;
+  return label.getComputedTextLength();
+}
+
 /** Axis: maps values to 0..1, and has round numbers. */
 function axis(values, { log = false, names = null, count = 5 }) {
   if (names) {
     const place = (value) => (names.length < 2 ? 0.5 : 0.04 + (0.92 * value) / (names.length - 1));
-    const every = Math.ceil(names.length / count);
-    const ticks = names.map((name, value) => ({ value, text: name })).filter((_, i) => i % every === 0);
-    return { place, ticks };
+    return { place, ticks: names.map((name, value) => ({ value, text: name })) };
   }
+  const isWhole = values.every(Number.isInteger);
   let [low, high] = [Math.min(...values), Math.max(...values)];
   if (log) {
     [low, high] = [low / 1.15, high * 1.15];
     const place = (value) => Math.log(value / low) / Math.log(high / low);
-    const powers = roundPowers(low, high);
+    const powers = roundPowers(low, high, isWhole);
     return { place, ticks: powers.map((value) => ({ value, text: shortNumber(value) })) };
   }
   const room = (high - low) * 0.06 || Math.abs(high) * 0.05 || 1;
   [low, high] = [low - room, high + room];
-  const ticks = roundNumbers(low, high, count).map((value) => ({ value, text: shortNumber(value) }));
+  const ticks = roundNumbers(low, high, count, isWhole).map((value) => ({ value, text: shortNumber(value) }));
   return { place: (value) => (value - low) / (high - low), ticks };
 }
 
@@ -152,11 +170,7 @@ class Chart {
       shape("path", { class: "grid", d: `M${left} ${at}h${width}` }, this.svg);
       shape("text", { x: left - 8, y: at + 4, "text-anchor": "end" }, this.svg, text);
     }
-    for (const { value, text } of x.ticks) {
-      const at = left + x.place(value) * width;
-      shape("path", { class: "grid", d: `M${at} ${bottom}v4` }, this.svg);
-      shape("text", { x: at, y: bottom + 18, "text-anchor": "middle" }, this.svg, text);
-    }
+    this.drawNumbers(x, [left, bottom], width);
     shape("path", { class: "axis", d: `M${left} ${bottom}h${width}` }, this.svg);
     shape(
       "text",
@@ -166,6 +180,24 @@ class Chart {
     );
     const turned = `translate(13 ${MARGIN.top + height / 2}) rotate(-90)`;
     shape("text", { class: "label", transform: turned, "text-anchor": "middle" }, this.svg, this.spec.y.label);
+  }
+
+  /** Labels the horizontal axis: long names are shortened in the middle, and names without room are left out. */
+  drawNumbers(x, [left, bottom], width) {
+    let free = 0;
+    for (const { value, text } of x.ticks) {
+      const at = left + x.place(value) * width;
+      const label = shape("text", { y: bottom + 18, "text-anchor": "middle" }, this.svg);
+      const half = fitText(label, text, MAX_NAME_WIDTH) / 2;
+      const middle = Math.min(Math.max(at, half), this.width - half);
+      if (middle - half < free) {
+        label.remove();
+        continue;
+      }
+      label.setAttribute("x", middle);
+      free = middle + half + NAME_GAP;
+      shape("path", { class: "grid", d: `M${at} ${bottom}v4` }, this.svg);
+    }
   }
 
   drawSeries(series, colour, index) {

@@ -11,6 +11,7 @@ use crate::gather::{Report, Row, has_values};
 use crate::layers::{Group, Layer, layers, max_pixels};
 use crate::pictures::{Picture, Request, write_pictures};
 use crate::scale::Scale;
+use crate::tables::definition;
 
 /// Parameters of `report`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -67,6 +68,8 @@ struct FigureData {
     label: String,
     digits: usize,
     higher_is_better: Option<bool>,
+    /// Definition of the figure; empty if unknown.
+    definition: String,
 }
 
 #[derive(Serialize)]
@@ -88,7 +91,7 @@ struct LayerData {
     group: String,
     kind: String,
     scene: usize,
-    row: Option<usize>,
+    rows: Vec<usize>,
     scale: Option<usize>,
 }
 
@@ -201,7 +204,7 @@ fn layer_data(
     let mut data = Vec::with_capacity(layers.len());
     let mut scales: Vec<Scale> = Vec::new();
     for layer in layers {
-        let scale = match (&layer.group, layer.row.map(|row| &report.rows[row])) {
+        let scale = match (&layer.group, layer.rows.first().map(|&row| &report.rows[row])) {
             (Group::Depth, _) => Some(Scale::depth(depths[layer.scene])),
             (Group::Error, Some(row)) => Some(error_scale(row)),
             _ => None,
@@ -217,7 +220,7 @@ fn layer_data(
             group: layer.group.heading().to_owned(),
             kind: layer.group.kind(),
             scene: layer.scene,
-            row: layer.row,
+            rows: layer.rows.clone(),
             scale: index,
         });
     }
@@ -237,6 +240,9 @@ fn figures(report: &Report<'_>) -> Vec<FigureData> {
             label: figure.label.clone(),
             digits: figure.digits,
             higher_is_better: figure.higher_is_better,
+            definition: definition(report, figure)
+                .map(|(_, text)| text.to_owned())
+                .unwrap_or_default(),
         })
         .collect()
 }

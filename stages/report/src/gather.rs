@@ -3,6 +3,7 @@ use metrics::{AnyMetrics, ScoreFormat};
 use serde_json::Value;
 
 use crate::results::scored_nodes;
+use crate::unscored::{UnscoredViews, unscored_nodes};
 
 /// Content of a page: results, data sets and figures of a run.
 pub(crate) struct Report<'a> {
@@ -13,6 +14,8 @@ pub(crate) struct Report<'a> {
     pub(crate) scenes: Vec<SceneViews>,
     /// Figures of the results.
     pub(crate) figures: Vec<ScoreFormat>,
+    /// Views that a failed run has made but not scored.
+    pub(crate) unscored: Vec<UnscoredViews>,
     /// Reasons why results can't be read.
     pub(crate) unreadable: Vec<String>,
 }
@@ -62,51 +65,82 @@ impl Row<'_> {
 impl<'a> Report<'a> {
     /// Reads the scores of a run.
     pub(crate) fn new(run: &'a RunRecord) -> Self {
-        let mut report =
-            Self { run, rows: vec![], scenes: vec![], figures: vec![], unreadable: vec![] };
+        let mut report = Self {
+            run,
+            rows: vec![],
+            scenes: vec![],
+            figures: vec![],
+            unscored: vec![],
+            unreadable: vec![],
+        };
         for (index, node) in scored_nodes(run) {
             match AnyMetrics::read(&node.folder) {
                 Ok(metrics) => report.add(index, node, metrics),
                 Err(error) => report.unreadable.push(error.to_string()),
             }
         }
+        for index in unscored_nodes(run) {
+            let scene = report.scene(index);
+            let method = views_label(&run.nodes[index]);
+            let Some(views) = UnscoredViews::read(run, index, &method, scene) else { continue };
+            report.add_views(scene, views.names.iter().map(String::as_str));
+            report.unscored.push(views);
+        }
         report.figures = figures(&report.rows);
         report.label_rows();
         report
     }
 
-    /// Adds a result, and its data set and views if they are new.
-    fn add(&mut self, index: usize, node: &'a RunNode, metrics: AnyMetrics) {
-        let data_set = data_set(self.run, index);
+    /// Returns the index of a node's data set, which is added if it is new.
+    fn scene(&mut self, node: usize) -> usize {
+        let data_set = data_set(self.run, node);
         let scene = self.scenes.iter().position(|scene| scene.data_set == data_set);
-        let scene = scene.unwrap_or_else(|| {
+        scene.unwrap_or_else(|| {
             self.scenes.push(SceneViews { data_set, views: Vec::new() });
             self.scenes.len() - 1
-        });
+        })
+    }
+
+    /// Adds the views of a data set that are new.
+    fn add_views<'v>(&mut self, scene: usize, names: impl Iterator<Item = &'v str>) {
         let views = &mut self.scenes[scene].views;
-        for name in metrics.views().iter().filter_map(|view| view["name"].as_str()) {
+        for name in names {
             if !views.iter().any(|view| view == name) {
                 views.push(name.to_owned());
             }
         }
+    }
+
+    /// Adds a result, and its data set and views if they are new.
+    fn add(&mut self, index: usize, node: &'a RunNode, metrics: AnyMetrics) {
+        let scene = self.scene(index);
+        self.add_views(scene, metrics.views().iter().filter_map(|view| view["name"].as_str()));
         let [training, rendering] = times(self.run, node, index);
         let label = String::new();
         self.rows.push(Row { node, index, metrics, label, scene, training, rendering });
     }
 
-    /// Labels rows by their values in the sweep and, if several blocks score, by the scored method
-    /// (`eval-refined`: refined).
+    /// Labels rows by their values in the sweep and, without a sweep or if several blocks score, by
+    /// the scored method.
     fn label_rows(&mut self) {
         let Some(first) = self.rows.first() else { return };
         let stage = &first.node.stage;
         let has_blocks = self.rows.iter().any(|row| row.node.stage != *stage);
+        let methods: Vec<(String, String)> = self
+            .rows
+            .iter()
+            .map(|row| (method(self.run, row.node), row.node.stage.clone()))
+            .collect();
         for row in &mut self.rows {
-            let (stage, point) = (row.node.stage.as_str(), row.node.point.as_str());
-            let method = stage.strip_prefix("eval-").unwrap_or(stage);
+            let own = method(self.run, row.node);
+            // Two blocks may score views of one kind.
+            let is_shared =
+                methods.iter().any(|(other, stage)| *other == own && *stage != row.node.stage);
+            let method = if is_shared { row.node.stage.clone() } else { own };
+            let point = row.node.point.as_str();
             row.label = match (has_blocks, point) {
-                (false, "") => "default".to_owned(),
+                (_, "") => method,
                 (false, point) => point.to_owned(),
-                (true, "") => method.to_owned(),
                 (true, point) => format!("{method}, {point}"),
             };
         }
@@ -181,6 +215,26 @@ fn numbers(mean: &Value) -> Vec<ScoreFormat> {
             missing: None,
         })
         .collect()
+}
+
+/// Names the method that a block scores: by the block (`eval-hr`: hr), or as the work of the stage
+/// that made the views (`render-depth`: rendered).
+fn method(run: &RunRecord, scored: &RunNode) -> String {
+    if let Some(method) = scored.stage.strip_prefix("eval-") {
+        return method.to_owned();
+    }
+    let views = scored.inputs.get("views").and_then(|input| run.nodes.get(input.node?));
+    views.map_or_else(|| scored.stage.clone(), views_label)
+}
+
+/// Returns what a stage has done with the views of its artifact, such as "rendered".
+fn views_label(node: &RunNode) -> String {
+    match node.program.as_str() {
+        "render-depth" => "rendered".to_owned(),
+        "refine" => "refined".to_owned(),
+        "upsample" => "enlarged".to_owned(),
+        _ => node.stage.clone(),
+    }
 }
 
 /// Names the data sets that a node was made from: their folders, or the blocks that made them.

@@ -1,6 +1,8 @@
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use artifact::Manifest;
 use pixels::{DepthMap, ExrImage, Rgba8, common_range, read_exr, read_png};
 use scene::{View, Views};
 use serde_json::Value;
@@ -13,8 +15,11 @@ pub(crate) struct Layer<'a> {
     pub(crate) group: Group,
     /// Index of the data set in the report.
     pub(crate) scene: usize,
-    /// Index of the row that made the pictures; `None` for observations.
-    pub(crate) row: Option<usize>,
+    /// Indices of the rows that made the pictures: several if their pictures are equal, none for
+    /// observations.
+    pub(crate) rows: Vec<usize>,
+    /// Identity of the pictures: equal if all of them are equal.
+    identity: String,
     source: Source<'a>,
 }
 
@@ -57,6 +62,13 @@ impl Folder {
         Ok(Arc::new(Self { path, views }))
     }
 
+    /// Returns the identity of the files that `file` returns for the views.
+    fn identity(&self, file: impl Fn(&View) -> Option<&String>) -> String {
+        let views = self.views.views.iter();
+        let files = views.map(|view| (view.camera.name.as_str(), file(view).map(String::as_str)));
+        format!("{:?} {}", self.views.background, files_identity(&self.path, files))
+    }
+
     fn view(&self, name: &str) -> Option<&View> {
         self.views.views.iter().find(|view| view.camera.name == name)
     }
@@ -72,6 +84,33 @@ impl Folder {
         let file = self.view(name).and_then(|view| view.depth.as_ref());
         Ok(file.map(|file| read_exr(&self.path.join(file))).transpose()?)
     }
+}
+
+/// Returns the identity of named files in a folder: their hashes, if the folder is an artifact or a
+/// part of one, otherwise their paths.
+fn files_identity<'a>(
+    folder: &Path,
+    files: impl Iterator<Item = (&'a str, Option<&'a str>)>,
+) -> String {
+    let whole = Manifest::read(folder).ok();
+    let part = || {
+        let name = folder.file_name()?.to_str()?;
+        Some(Manifest::read(folder.parent()?).ok()?.subtree(name))
+    };
+    let manifest = whole.or_else(part);
+    let entries = manifest.iter().flat_map(|manifest| &manifest.files);
+    let hashes: BTreeMap<&str, &str> =
+        entries.map(|entry| (entry.path.as_str(), entry.blake3.as_str())).collect();
+    let mut identity = String::new();
+    for (view, file) in files {
+        let hash = file.map(|file| {
+            hashes
+                .get(file)
+                .map_or_else(|| folder.join(file).display().to_string(), |hash| (*hash).to_owned())
+        });
+        identity += &format!("{view}: {hash:?}\n");
+    }
+    identity
 }
 
 impl Layer<'_> {
@@ -138,33 +177,108 @@ pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>
     }
     for (path, scene, folder) in &truths {
         let Some(folder) = folder else { continue };
-        let is_alone = truths.iter().filter(|(_, other, _)| other == scene).count() == 1;
-        let suffix =
-            if is_alone { String::new() } else { format!(" of {}", scored_on(report, path)) };
-        add_observations(&mut layers, *scene, folder, &suffix);
+        add_observations(&mut layers, *scene, folder, &scored_on(report, path));
     }
+    for views in &report.unscored {
+        let has_truth = truths.iter().any(|(_, scene, _)| *scene == views.scene);
+        if let Some(truth) = views.truth.clone().filter(|_| !has_truth) {
+            add_observations(&mut layers, views.scene, &Folder::read(truth)?, &views.label);
+        }
+    }
+    let mut layers = without_equal(layers);
+    name_observations(&mut layers);
+    let mut made = Vec::new();
     for index in 0..report.rows.len() {
-        add_method(&mut layers, report, index)?;
+        add_method(&mut made, report, index)?;
     }
+    for views in &report.unscored {
+        let folder = Folder::read(views.folder.clone())?;
+        add_views(&mut made, &folder, &views.label, views.scene, &[]);
+    }
+    let mut made = without_equal(made);
+    for layer in made.iter_mut().filter(|layer| layer.rows.len() > 1) {
+        layer.label = format!("{} and {} more", layer.label, layer.rows.len() - 1);
+    }
+    layers.extend(made);
     Ok(layers)
 }
 
-/// Adds photographs, ground truth and true depth, if available.
-fn add_observations(layers: &mut Vec<Layer<'_>>, scene: usize, folder: &Arc<Folder>, suffix: &str) {
+/// Merges layers of one kind with equal pictures, such as those of a sweep over a parameter of the
+/// scores.
+fn without_equal(layers: Vec<Layer<'_>>) -> Vec<Layer<'_>> {
+    let mut different: Vec<Layer<'_>> = Vec::new();
+    for layer in layers {
+        let same = different.iter_mut().find(|other| {
+            (other.scene, &other.group) == (layer.scene, &layer.group)
+                && other.identity == layer.identity
+        });
+        match same {
+            Some(same) => same.rows.extend(layer.rows),
+            None => different.push(layer),
+        }
+    }
+    different
+}
+
+/// Names observations, whose labels are the results that they belong to: by their kind alone if the
+/// data set has one of the kind.
+fn name_observations(layers: &mut [Layer<'_>]) {
+    let kinds: Vec<(usize, Group)> =
+        layers.iter().map(|layer| (layer.scene, layer.group.clone())).collect();
+    for layer in layers {
+        let name = match layer.group {
+            Group::LowResolution => "LR photograph",
+            _ => "Ground truth",
+        };
+        let same = kinds.iter().filter(|kind| **kind == (layer.scene, layer.group.clone()));
+        layer.label =
+            if same.count() == 1 { name.to_owned() } else { format!("{name} of {}", layer.label) };
+    }
+}
+
+/// Adds photographs, ground truth and true depth, if available. `label` names the results that they
+/// belong to.
+fn add_observations(layers: &mut Vec<Layer<'_>>, scene: usize, folder: &Arc<Folder>, label: &str) {
     let views = &folder.views.views;
     let mut found = Vec::new();
     if views.iter().any(|view| view.low_resolution.is_some()) {
-        let source = Source::LowResolution(Arc::clone(folder));
-        found.push(("LR photograph", Group::LowResolution, source));
+        let identity = folder.identity(|view| view.low_resolution.as_ref());
+        found.push((Group::LowResolution, identity, Source::LowResolution(Arc::clone(folder))));
     }
     if views.iter().any(|view| view.image.is_some()) {
-        found.push(("Ground truth", Group::Truth, Source::Image(Arc::clone(folder))));
+        let identity = folder.identity(|view| view.image.as_ref());
+        found.push((Group::Truth, identity, Source::Image(Arc::clone(folder))));
     }
     if views.iter().any(|view| view.depth.is_some()) {
-        found.push(("Ground truth", Group::Depth, Source::Depth(Arc::clone(folder))));
+        let identity = folder.identity(|view| view.depth.as_ref());
+        found.push((Group::Depth, identity, Source::Depth(Arc::clone(folder))));
     }
-    for (name, group, source) in found {
-        layers.push(Layer { label: format!("{name}{suffix}"), group, scene, row: None, source });
+    for (group, identity, source) in found {
+        let (label, rows) = (label.to_owned(), Vec::new());
+        layers.push(Layer { label, group, scene, rows, identity, source });
+    }
+}
+
+/// Adds views and their depths, if available. `rows` are the results that made them.
+fn add_views(
+    layers: &mut Vec<Layer<'_>>,
+    folder: &Arc<Folder>,
+    label: &str,
+    scene: usize,
+    rows: &[usize],
+) {
+    let mut found = vec![(
+        Group::Render,
+        folder.identity(|view| view.image.as_ref()),
+        Source::Image(Arc::clone(folder)),
+    )];
+    if folder.views.views.iter().any(|view| view.depth.is_some()) {
+        let identity = folder.identity(|view| view.depth.as_ref());
+        found.push((Group::Depth, identity, Source::Depth(Arc::clone(folder))));
+    }
+    for (group, identity, source) in found {
+        let (label, rows) = (label.to_owned(), rows.to_vec());
+        layers.push(Layer { label, group, scene, rows, identity, source });
     }
 }
 
@@ -175,14 +289,13 @@ fn add_method<'a>(
     index: usize,
 ) -> anyhow::Result<()> {
     let row = &report.rows[index];
+    let label = if report.rows.len() == 1 && report.unscored.is_empty() {
+        ONLY_RENDER.to_owned()
+    } else {
+        row.label.clone()
+    };
     if let Some(path) = folder_of(report, row, "views").filter(|path| has_views(path)) {
-        let folder = Folder::read(path)?;
-        let has_depth = folder.views.views.iter().any(|view| view.depth.is_some());
-        let render = Source::Image(Arc::clone(&folder));
-        layers.push(method_layer(report, index, Group::Render, render));
-        if has_depth {
-            layers.push(method_layer(report, index, Group::Depth, Source::Depth(folder)));
-        }
+        add_views(layers, &Folder::read(path)?, &label, row.scene, &[index]);
     }
     let mut scored = vec![(Group::Error, "/error_map".to_owned())];
     for (name, title) in row.metrics.picture_titles() {
@@ -191,21 +304,24 @@ fn add_method<'a>(
     }
     for (group, pointer) in scored {
         if has_files(row, &pointer) {
-            layers.push(method_layer(report, index, group, Source::Scored(row, pointer)));
+            let views = row.metrics.views().iter();
+            let files = views
+                .map(|view| (view["name"].as_str().unwrap_or_default(), view.pointer(&pointer)));
+            let files = files.map(|(view, file)| (view, file.and_then(Value::as_str)));
+            let identity = files_identity(&row.node.folder, files);
+            let source = Source::Scored(row, pointer);
+            let label = label.clone();
+            layers.push(Layer {
+                label,
+                group,
+                scene: row.scene,
+                rows: vec![index],
+                identity,
+                source,
+            });
         }
     }
     Ok(())
-}
-
-fn method_layer<'a>(
-    report: &Report<'_>,
-    index: usize,
-    group: Group,
-    source: Source<'a>,
-) -> Layer<'a> {
-    let row = &report.rows[index];
-    let label = if report.rows.len() == 1 { ONLY_RENDER.to_owned() } else { row.label.clone() };
-    Layer { label, group, scene: row.scene, row: Some(index), source }
 }
 
 /// True if the scores of some view name a file at `pointer`.

@@ -8,6 +8,7 @@
 //! * `layers`: available pictures of each view. `pictures`: originals, and copies within the page's
 //!   byte budget. `scale`: colour scales of error and depth maps.
 //! * `data`: input of the page's script, as JSON.
+//! * `heading`: facts in the heading. `unscored`: views of a failed run.
 //! * `page`: the page's frame. `tables`, `viewer`, `pipeline`, `commands`: its parts. `layout`:
 //!   drawing of the pipeline's graph.
 //! * `page.css`; `chart.js`: charts as SVG; `viewer.js`: the comparison; `plots.js`: choice of
@@ -25,6 +26,7 @@
 mod commands;
 mod data;
 mod gather;
+mod heading;
 mod layers;
 mod layout;
 mod page;
@@ -33,6 +35,7 @@ mod pipeline;
 mod results;
 mod scale;
 mod tables;
+mod unscored;
 mod viewer;
 
 use artifact::{Failure, RunRecord, format_count, format_size};

@@ -16,9 +16,26 @@ function copyButtons() {
   }
 }
 
+/** Shows above each table that is wider than its window that it scrolls. */
+function scrollHints() {
+  for (const region of document.querySelectorAll(".wide")) {
+    const hint = element("p", { class: "note scroll-hint" }, null, "Scroll sideways for more columns →");
+    region.before(hint);
+    const update = () => {
+      const rest = region.scrollWidth - region.clientWidth;
+      hint.hidden = rest < 2;
+      region.classList.toggle("cut", rest - region.scrollLeft >= 2);
+    };
+    region.addEventListener("scroll", update, { passive: true });
+    const observer = new ResizeObserver(update);
+    for (const observed of [region, ...region.children]) observer.observe(observed);
+    update();
+  }
+}
+
 /** Opens the folded part that a link leads to. */
 function openTargets() {
-  for (const link of document.querySelectorAll(".graph a")) {
+  for (const link of document.querySelectorAll(".graph a, a.term")) {
     link.addEventListener("click", () => {
       const details = document.querySelector(link.getAttribute("href")).closest("details");
       details.open = true;
@@ -28,12 +45,13 @@ function openTargets() {
 
 function startPage() {
   copyButtons();
+  scrollHints();
   openTargets();
   const text = document.getElementById("data").textContent;
   if (!text) return;
   const data = JSON.parse(text);
   let plots = null;
-  const rowsOf = ({ left, right }) => [left, right].map((layer) => data.layers[layer]?.row ?? -1);
+  const rowsOf = ({ left, right }) => [left, right].map((layer) => data.layers[layer]?.rows[0] ?? -1);
   const viewer = data.pictures.length ? new Viewer(data, (state) => plots?.choose(rowsOf(state))) : null;
   if (!data.rows.length) return;
   plots = new Plots(data, (view) => {

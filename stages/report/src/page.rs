@@ -4,6 +4,7 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use crate::commands::{commands, file_name};
 use crate::data::Data;
 use crate::gather::Report;
+use crate::heading::facts;
 use crate::pipeline::pipeline;
 use crate::results::warnings_by_node;
 use crate::tables::{conventions, scores, summary, view_figures};
@@ -101,9 +102,9 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
     ];
     html! {
         header class="top" {
-            p class="eyebrow" { "nerf-sr report" }
             h1 { (title) }
             dl class="about" {
+                @for (name, text) in facts(run) { div { dt { (name) } dd { (text) } } }
                 div {
                     dt { "Data set" }
                     dd {

@@ -242,11 +242,12 @@ fn file_names(layers: &[Layer<'_>], requests: &[Request<'_>]) -> Vec<String> {
 
 /// Returns the path of a view's original without extension, which needn't be unique.
 fn stem(layer: &Layer<'_>, view: &str) -> String {
-    let suffix = match (layer.row, &layer.group) {
-        (None, _) => String::new(),
-        (Some(_), Group::Render) if layer.label == ONLY_RENDER => String::new(),
-        (Some(_), _) => format!("-{}", plain(&layer.label.to_lowercase())),
+    let is_plain = match layer.group {
+        Group::Render => layer.label == ONLY_RENDER,
+        _ => layer.rows.is_empty(),
     };
+    let suffix =
+        if is_plain { String::new() } else { format!("-{}", plain(&layer.label.to_lowercase())) };
     format!("views/{}/{}{suffix}", plain(view), plain(layer.group.file_name()))
 }
 

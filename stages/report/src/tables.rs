@@ -60,7 +60,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
                         tr {
                             th scope="col" { "Result" }
                             @if with_data_sets { th scope="col" { "Data set" } }
-                            @for figure in &known { th scope="col" class="n" { (figure.label) } }
+                            @for figure in &known { (figure_head(report, figure)) }
                             th scope="col" class="n" { "Views" }
                             th scope="col" class="n" { "Training time" }
                             th scope="col" class="n" { "Rendering time" }
@@ -69,7 +69,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
                     tbody {
                         @for row in rows {
                             tr {
-                                th scope="row" { (row.label) }
+                                th scope="row" { (breakable(&row.label)) }
                                 @if with_data_sets { td { (report.scenes[row.scene].data_set) } }
                                 @for figure in &known { (mean(figure, row, rows)) }
                                 td class="n" { (row.view_count()) }
@@ -82,6 +82,43 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
             }
             (missing(report))
         }
+    }
+}
+
+/// Head of a figure's column, with the definition of the figure if the metrics state one.
+fn figure_head(report: &Report<'_>, figure: &ScoreFormat) -> Markup {
+    let Some((name, definition)) = definition(report, figure) else {
+        return html! { th scope="col" class="n" { (figure.label) } };
+    };
+    html! {
+        th scope="col" class="n" {
+            a class="term" href={ "#definition-" (name) } title=(definition) { (figure.label) }
+        }
+    }
+}
+
+/// Returns the name of a figure's metric and its definition.
+pub(crate) fn definition<'a>(
+    report: &'a Report<'_>,
+    figure: &ScoreFormat,
+) -> Option<(&'a str, &'a str)> {
+    let metric = figure.path.split('/').next().unwrap_or_default();
+    let conventions = report.rows.first()?.metrics.conventions().as_object()?;
+    // Networks of LPIPS share a definition.
+    let (name, text) =
+        conventions.iter().find(|(name, _)| metric == *name || is_variant(metric, name))?;
+    Some((name, text.as_str()?))
+}
+
+/// True if a metric's name is another one's with a suffix, such as `lpips_vgg`.
+fn is_variant(metric: &str, name: &str) -> bool {
+    metric.strip_prefix(name).is_some_and(|suffix| suffix.starts_with('_'))
+}
+
+/// Text that may be broken after punctuation, so that no word is cut.
+pub(crate) fn breakable(text: &str) -> Markup {
+    html! {
+        @for part in text.split_inclusive(['_', '-', '=', ',', '/', '.']) { (part) wbr; }
     }
 }
 
@@ -140,15 +177,17 @@ pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
                         tr {
                             th scope="col" { "View" }
                             @if report.rows.len() > 1 { th scope="col" { "Result" } }
-                            @for figure in &known { th scope="col" class="n" { (figure.label) } }
+                            @for figure in &known { (figure_head(report, figure)) }
                         }
                     }
                     tbody {
                         @for row in &report.rows {
                             @for view in row.metrics.views() {
                                 tr {
-                                    th scope="row" { (view["name"].as_str().unwrap_or_default()) }
-                                    @if report.rows.len() > 1 { td { (row.label) } }
+                                    th scope="row" {
+                                        (breakable(view["name"].as_str().unwrap_or_default()))
+                                    }
+                                    @if report.rows.len() > 1 { td { (breakable(&row.label)) } }
                                     @for figure in &known {
                                         @let value = figure.value_in(&view["scores"]);
                                         @let text = value.map(|value| figure.format_value(value));
@@ -174,7 +213,8 @@ pub(crate) fn conventions(report: &Report<'_>) -> Markup {
                 summary { "Definitions of the figures" }
                 dl class="facts" {
                     @for (name, text) in conventions {
-                        dt { (name.replace('_', " ")) } dd { (text.as_str().unwrap_or_default()) }
+                        dt id={ "definition-" (name) } { (name.replace('_', " ")) }
+                        dd { (text.as_str().unwrap_or_default()) }
                     }
                 }
             }

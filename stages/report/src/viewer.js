@@ -7,6 +7,8 @@ const MAX_PANES = 24;
 /** Maximum distance in screen pixels at which a drag moves the division instead of panning. */
 const GRIP = 18;
 const MAX_ZOOM = 40;
+/** Time after the last change until the address is written: browsers ignore more than some 20 writes a second. */
+const LINK_DELAY_MS = 250;
 
 class Viewer {
   constructor(data, changed) {
@@ -31,9 +33,12 @@ class Viewer {
     this.stage = this.part("stage");
     this.part("viewer").hidden = false;
     this.fillViews();
+    this.fillThumbnails();
     this.listen();
     this.show({});
     if (data.crop) this.showCrop(data.crop);
+    this.openLink();
+    addEventListener("hashchange", () => this.openLink());
   }
 
   // Choices.
@@ -44,6 +49,23 @@ class Viewer {
     for (const view of this.views) element("option", { value: view }, groups[views[view].scene], views[view].name);
     const shown = groups.filter((group) => group.children.length);
     this.part("view").replaceChildren(...(shown.length > 1 ? shown : [...shown[0].children]));
+  }
+
+  /** One small picture of each view: the best render, or else its first picture. */
+  fillThumbnails() {
+    const { views, rows, layers, best, pictures } = this.data;
+    const isBest = ({ layer }) => layers[layer].kind === "render" && layers[layer].rows.includes(best);
+    this.thumbnails = this.views.map((view) => {
+      const own = pictures.filter((picture) => picture.view === view);
+      const isRender = ({ layer }) => layers[layer].kind === "render";
+      const picture = (rows.length ? own.find(isBest) : null) ?? own.find(isRender) ?? own[0];
+      const button = element("button", { type: "button", title: views[view].name });
+      element("img", { src: picture.uri, alt: `View ${views[view].name}`, loading: "lazy" }, button);
+      button.addEventListener("click", () => this.show({ view }));
+      return button;
+    });
+    this.part("thumbnails").replaceChildren(...this.thumbnails);
+    this.part("thumbnails").hidden = this.views.length < 2;
   }
 
   /** Returns the layers with a picture of the view. */
@@ -67,7 +89,7 @@ class Viewer {
     const like = (index) =>
       layers.find(({ kind, label }) => kind === old[index]?.kind && label === old[index]?.label)?.index;
     const first = (...kinds) => kinds.map((kind) => layers.find((layer) => layer.kind === kind)).find(Boolean)?.index;
-    const best = layers.find(({ kind, row }) => kind === "render" && row === this.data.best)?.index;
+    const best = layers.find(({ kind, rows }) => kind === "render" && rows.includes(this.data.best))?.index;
     if (!has(state.left)) state.left = like(state.left) ?? first("low-resolution", "ground-truth") ?? layers[0].index;
     if (!has(state.right)) state.right = like(state.right) ?? best ?? first("render", "error") ?? layers.at(-1).index;
     const groups = new Map(layers.map(({ group }) => [group, []]));
@@ -113,7 +135,74 @@ class Viewer {
     this.showScales();
     this.showNumbers();
     this.showOriginals();
+    this.showThumbnail();
     this.changed(state);
+  }
+
+  showThumbnail() {
+    const shown = this.views.indexOf(this.state.view);
+    this.thumbnails.forEach((button, i) => button.setAttribute("aria-pressed", String(i === shown)));
+    const [button, strip] = [this.thumbnails[shown], this.part("thumbnails")];
+    strip.scrollLeft = button.offsetLeft - (strip.clientWidth - button.offsetWidth) / 2;
+  }
+
+  // Links.
+
+  /** Returns the state as the fragment of a link: names, so that it fits a page of a later run. */
+  linkText() {
+    const { state, data } = this;
+    const name = (layer) => `${data.layers[layer].kind}/${data.layers[layer].label}`;
+    const link = new URLSearchParams({ view: data.views[state.view].name });
+    if (data.scenes.length > 1) link.set("set", data.scenes[data.views[state.view].scene]);
+    if (state.grid) link.set("pictures", state.kind);
+    else for (const side of ["left", "right"]) link.set(side, name(state[side]));
+    for (const key of ["zoom", "x", "y", "split"]) link.set(key, String(Number(state[key].toFixed(4))));
+    return `#${link}`;
+  }
+
+  /** Writes the link of the state to the address soon, which a reader may copy or bookmark. */
+  keepLink() {
+    if (!this.isReady) return;
+    clearTimeout(this.linkTimer);
+    this.linkTimer = setTimeout(() => {
+      try {
+        history.replaceState(null, "", this.linkText());
+      } catch {
+        // Some browsers refuse this for files.
+      }
+    }, LINK_DELAY_MS);
+  }
+
+  /** Shows what the address' fragment names. */
+  openLink() {
+    this.isReady = true;
+    const link = new URLSearchParams(location.hash.slice(1));
+    const { views, scenes, layers } = this.data;
+    const isNamed = (view) =>
+      views[view].name === link.get("view") && (!link.has("set") || scenes[views[view].scene] === link.get("set"));
+    const view = this.views.find(isNamed);
+    if (view === undefined) return;
+    this.show({ view, grid: link.has("pictures"), ...(link.has("pictures") && { kind: link.get("pictures") }) });
+    const layer = (side) =>
+      this.layers().find(({ kind, label }) => `${kind}/${label}` === link.get(side))?.index ?? this.state[side];
+    const number = (key, otherwise) => {
+      const value = Number.parseFloat(link.get(key));
+      return Number.isFinite(value) ? value : otherwise;
+    };
+    this.show({ left: layer("left"), right: layer("right") });
+    const split = Math.min(Math.max(number("split", 0.5), 0), 1);
+    this.move({ zoom: number("zoom", 1), x: number("x", 0.5), y: number("y", 0.5), split });
+    this.part("compare").scrollIntoView({ block: "start" });
+  }
+
+  async copyLink() {
+    const link = location.href.split("#")[0] + this.linkText();
+    try {
+      await navigator.clipboard.writeText(link);
+      this.part("link").textContent = "Copied";
+    } catch {
+      this.part("link").textContent = "In the address";
+    }
   }
 
   /** Creates the window of one picture within a pane. */
@@ -159,7 +248,7 @@ class Viewer {
       const pane = this.pane(layer.index);
       this.panes.push({ pane, windows: [this.window(layer.index, pane)] });
       const made = element("figure", {});
-      const score = this.data.rows[layer.row]?.scores[this.state.view]?.[0];
+      const score = this.data.rows[layer.rows[0]]?.scores[this.state.view]?.[0];
       const words =
         score == null
           ? ""
@@ -207,6 +296,7 @@ class Viewer {
     const per = (first.pane.clientWidth * state.zoom) / first.windows[0].picture.width;
     this.part("zoom").textContent = `${Math.round(100 * per)} %`;
     this.stage.classList.toggle("zoomed", state.zoom > 1);
+    this.keepLink();
   }
 
   limit() {
@@ -262,20 +352,20 @@ class Viewer {
 
   showNumbers() {
     const { figures, rows, views } = this.data;
-    const of = this.shown()
-      .map(({ row }) => row)
-      .filter((row) => row !== null);
+    const of = this.shown().flatMap((layer) => layer.rows);
     const shown = [...new Set(of.length ? of : [this.data.best])].filter((row) => rows[row]?.scores[this.state.view]);
     const table = this.part("numbers");
     table.replaceChildren(element("caption", {}, null, `Numbers of view ${views[this.state.view].name}`));
     if (!shown.length) return;
     const head = element("tr", {}, element("thead", {}, table));
     element("th", { scope: "col" }, head, "Result");
-    figures.forEach(({ label }) => element("th", { scope: "col", class: "n" }, head, label));
+    figures.forEach(({ label, definition }) =>
+      element("th", { scope: "col", class: "n", title: definition }, head, label),
+    );
     const body = element("tbody", {}, table);
     for (const row of shown) {
       const line = element("tr", {}, body);
-      element("th", { scope: "row" }, line, rows[row].label);
+      breakable(element("th", { scope: "row" }, line), rows[row].label);
       rows[row].scores[this.state.view].forEach((value, i) =>
         element("td", { class: "n" }, line, value === null ? "–" : value.toFixed(figures[i].digits)),
       );
@@ -312,6 +402,7 @@ class Viewer {
       "zoom-out": () => this.zoomBy(1 / 1.5),
       "slider-mode": () => this.show({ grid: false }),
       "grid-mode": () => this.show({ grid: true }),
+      link: () => this.copyLink(),
     };
     for (const [id, act] of Object.entries(clicks)) this.part(id).addEventListener("click", act);
     this.stage.addEventListener("keydown", (event) => this.key(event));

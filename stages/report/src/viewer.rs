@@ -18,7 +18,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
             h2 id="compare-heading" { "Compare" }
             noscript { (static_pictures(data)) }
             div id="viewer" hidden {
-                div class="controls" {
+                div class="controls over" {
                     div class="field" {
                         label for="view" { "View" }
                         div class="stepper" {
@@ -36,6 +36,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                     }
                 }
                 div id="stage" tabindex="0" role="group" aria-describedby="stage-help" {}
+                div id="thumbnails" role="group" aria-label="Views" {}
                 div class="controls under" {
                     label class="split" { span { "Divide" }
                         input type="range" id="split" min="0" max="100" step="0.5" value="50"
@@ -47,6 +48,9 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                         button type="button" id="zoom-in" aria-label="Zoom in" { "+" }
                         button type="button" id="fit" { "Fit" }
                         button type="button" id="one-to-one" { "1:1" }
+                    }
+                    div class="field" {
+                        button type="button" id="link" { "Copy link" }
                     }
                 }
                 p id="stage-help" class="note" {

@@ -24,7 +24,7 @@ pub use depth::{DepthError, depth_error};
 #[cfg(feature = "torch")]
 pub use lpips::Lpips;
 pub use lpips_network::LpipsNetwork;
-pub(crate) use perceptual::Perceptual;
+pub(crate) use perceptual::{Perceptual, weights_rule};
 pub use ssim::{Ssim, ssim};
 pub use warp::WarpScore;
 
@@ -182,7 +182,8 @@ impl Metric for WarpMetric {
     fn convention(&self, _: &ScoredScene<'_>) -> String {
         "the nearest view's ground truth, warped by both rendered depths, is compared with the \
         view's own over pixels whose surface both views observe (depths within 2 %, or \
-        reprojection error of at most half a pixel; opacity at least one half)"
+        reprojection error of at most half a pixel; opacity at least one half); left out where the \
+        views are more than 20° apart"
             .to_owned()
     }
 

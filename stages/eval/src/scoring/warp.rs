@@ -15,6 +15,10 @@ pub struct WarpScore {
     pub seen: f64,
 }
 
+/// Maximum distance between two cameras over the median depth of a view: 20° of parallax, 2·tan 10°,
+/// chosen by hand. From farther apart, reflections and occlusions differ more than wrong depths do.
+const MAX_DISTANCE_PER_DEPTH: f64 = 0.3527;
+
 /// Returns the other view whose centre is nearest to a camera's.
 fn neighbour<'a>(camera: &Camera, views: &'a [View]) -> Option<&'a View> {
     let others = views.iter().filter(|view| view.camera.name != camera.name);
@@ -23,6 +27,18 @@ fn neighbour<'a>(camera: &Camera, views: &'a [View]) -> Option<&'a View> {
 
 fn squared_distance(camera: &Camera, view: &View) -> f64 {
     (view.camera.centre() - camera.centre()).length_squared()
+}
+
+/// True if two cameras are near enough for a comparison of their views, by [`MAX_DISTANCE_PER_DEPTH`].
+/// `depth` is the surface in the first one's view.
+fn are_near(camera: &Camera, other: &Camera, depth: &ExrImage) -> bool {
+    let (Some(z), Some(opacity)) = (depth.channel("Z"), depth.channel("A")) else { return false };
+    let mut depths: Vec<f32> =
+        z.iter().zip(opacity).filter(|(_, a)| **a >= 0.5).map(|(z, _)| *z).collect();
+    depths.sort_by(f32::total_cmp);
+    let Some(median) = depths.get(depths.len() / 2) else { return false };
+    let distance = (other.centre() - camera.centre()).length();
+    distance <= MAX_DISTANCE_PER_DEPTH * f64::from(*median)
 }
 
 /// Reads depth and opacity of a rendered view; `None` if missing or of another size.
@@ -70,7 +86,8 @@ fn warp(
     Some((WarpScore { psnr, seen }, Rgba8::new(truth.width, truth.height, data)))
 }
 
-/// Scores a view against its nearest neighbour's true image, warped by the rendered depths.
+/// Scores a view against its nearest neighbour's true image, warped by the rendered depths. `None`
+/// also if the neighbour is too far away.
 pub(super) fn score_view(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
     let (scene, own_camera) = (view.scene, &view.view.camera);
     let Some(truth) = &view.truth else { return Ok(None) };
@@ -80,6 +97,9 @@ pub(super) fn score_view(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpSc
         return Ok(None);
     };
     let Some(depth) = read_surface(scene.views_input, view.view)? else { return Ok(None) };
+    if !are_near(own_camera, &other.camera, &depth) {
+        return Ok(None);
+    }
     let Some(other_depth) = read_surface(scene.views_input, other)? else { return Ok(None) };
     let image = read_image(scene.truth_input, scene.truth, other_view, file)?;
     if (image.width, image.height) != (other_depth.width, other_depth.height) {
@@ -134,6 +154,16 @@ mod tests {
         assert_eq!(picture.data[..3], [120, 20, 30]);
         let (wrong, _) = walls_warped(3.0);
         assert!(wrong.psnr < 25.0, "{wrong:?}");
+    }
+
+    /// Views 10° apart are compared, views 30° apart are not: their surfaces look different.
+    #[test]
+    fn far_apart_views_are_not_compared() {
+        for (angle, is_compared) in [(10.0_f64, true), (30.0, false)] {
+            let baseline = 2.0 * 2.0 * (angle / 2.0).to_radians().tan();
+            let (a, b) = (camera("a", 0.0), camera("b", baseline));
+            assert_eq!(are_near(&a, &b, &image(2.0)), is_compared, "{angle}");
+        }
     }
 
     #[test]

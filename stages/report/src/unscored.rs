@@ -1,0 +1,52 @@
+//! Views that a failed run has made but not scored.
+
+use std::path::PathBuf;
+
+use artifact::{RunNode, RunRecord};
+use scene::Views;
+
+/// Views without scores.
+pub(crate) struct UnscoredViews {
+    pub(crate) label: String,
+    /// Folder of the views.
+    pub(crate) folder: PathBuf,
+    /// Folder of the views' ground truth, which the scene of the views has.
+    pub(crate) truth: Option<PathBuf>,
+    /// Names of the views.
+    pub(crate) names: Vec<String>,
+    /// Index of the data set in [`Report::scenes`](crate::gather::Report::scenes).
+    pub(crate) scene: usize,
+}
+
+/// Returns the indices of finished views that an unfinished stage needs, and that no finished stage
+/// has scored.
+pub(crate) fn unscored_nodes(run: &RunRecord) -> Vec<usize> {
+    let is_scored = |index: usize| {
+        let mut scored = run.nodes.iter().filter(|node| node.kind == "metrics");
+        scored.any(|node| node.inputs.values().any(|input| input.node == Some(index)))
+    };
+    let is_needed = |index: usize| run.unfinished.iter().any(|node| node.needs.contains(&index));
+    let views = (0..run.nodes.len()).filter(|&index| run.nodes[index].kind == "views");
+    views.filter(|&index| is_needed(index) && !is_scored(index)).collect()
+}
+
+impl UnscoredViews {
+    /// Reads the list of views; `None` if the list can't be read.
+    pub(crate) fn read(run: &RunRecord, index: usize, method: &str, scene: usize) -> Option<Self> {
+        let node: &RunNode = &run.nodes[index];
+        let views = Views::read_folder(&node.folder).ok()?;
+        let names: Vec<String> = views.views.into_iter().map(|view| view.camera.name).collect();
+        let ancestors = run.ancestors(index).into_iter().map(|index| &run.nodes[index]);
+        let scenes = ancestors.filter(|node| node.kind == "scene");
+        let mut truths = scenes.map(|node| node.folder.join("truth"));
+        let truth = truths.find(|folder| folder.join(scene::VIEWS_FILE).is_file());
+        let label = artifact::label(method, &node.point);
+        Some(Self {
+            label: format!("{label}, not scored"),
+            folder: node.folder.clone(),
+            truth,
+            names,
+            scene,
+        })
+    }
+}
