@@ -1,4 +1,5 @@
-//! Archiving of pages that a new one replaces.
+//! Archiving of pages that a new one replaces, by one rule: a page is archived if it shows a result
+//! that the new page lacks. A result is a stage's point for a data set.
 
 use std::ffi::OsStr;
 use std::io;
@@ -7,15 +8,13 @@ use std::path::{Path, PathBuf};
 use crate::page::{PageMark, check_ownership};
 
 impl PageMark {
-    /// True if the page should be archived before a page with the mark `newer` replaces it.
-    fn is_worth_archiving(&self, newer: &Self) -> bool {
-        let is_of_other_data = !self.data_sets.is_empty() && self.data_sets != newer.data_sets;
-        is_of_other_data || (self.is_complete && !newer.is_complete)
-    }
-
-    /// True if the page may replace an archived page with the mark `archived`.
-    fn can_replace(&self, archived: &Self) -> bool {
-        self.data_sets == archived.data_sets && (self.is_complete || !archived.is_complete)
+    /// True if the page shows each result that another page shows. An earlier version's page, whose
+    /// results are unknown, counts as showing others.
+    fn has_results_of(&self, other: &Self) -> bool {
+        match (&self.results, &other.results) {
+            (Some(own), Some(others)) => others.is_subset(own),
+            _ => false,
+        }
     }
 }
 
@@ -28,7 +27,7 @@ pub(crate) fn archive_path(
     target: &Path,
     kind: &str,
 ) -> io::Result<Option<PathBuf>> {
-    let old = PageMark::read(page)?.filter(|old| old.is_worth_archiving(newer));
+    let old = PageMark::read(page)?.filter(|old| !newer.has_results_of(old));
     let (Some(old), Some(name)) = (old, target.file_name().and_then(OsStr::to_str)) else {
         return Ok(None);
     };
@@ -45,7 +44,7 @@ pub(crate) fn archive_path(
 /// True if a page with the mark `old` may be archived as `path`.
 fn is_free(path: &Path, old: &PageMark, kind: &str) -> bool {
     match PageMark::read(path) {
-        Ok(Some(mark)) => old.can_replace(&mark) && check_ownership(path, kind).is_ok(),
+        Ok(Some(mark)) => old.has_results_of(&mark) && check_ownership(path, kind).is_ok(),
         _ => path.symlink_metadata().is_err(),
     }
 }

@@ -1,5 +1,6 @@
 //! Folders of published pages: their marks, and whether a folder may be replaced.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -15,10 +16,12 @@ pub(crate) const MARK_FILE: &str = ".shows";
 pub(crate) struct PageMark {
     /// Hash of the run's record and of the sink.
     pub(crate) identity: String,
-    /// True if no shown node failed.
-    #[serde(rename = "is_whole")]
-    pub(crate) is_complete: bool,
+    /// Shown results, each a stage with its point and its data sets; `None` in the mark of an
+    /// earlier version.
+    #[serde(default)]
+    pub(crate) results: Option<BTreeSet<String>>,
     /// Data sets of the run; empty if unknown.
+    #[serde(default)]
     pub(crate) data_sets: Vec<String>,
 }
 
@@ -32,7 +35,7 @@ impl PageMark {
         };
         Ok(Some(serde_json::from_str(&text).unwrap_or_else(|_| Self {
             identity: text,
-            is_complete: true,
+            results: None,
             data_sets: Vec::new(),
         })))
     }

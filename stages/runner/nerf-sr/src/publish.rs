@@ -1,7 +1,7 @@
 //! Publishing of a sink's page: the page is copied next to the old one, then exchanged for it
 //! atomically. A folder is replaced only if a sink wrote all of it and nobody has changed it
-//! ([`crate::page`]). A page of another data set, or a complete page that a partial one
-//! replaces, is archived ([`crate::archive`]).
+//! ([`crate::page`]). A page that shows a result which the new one lacks is archived
+//! ([`crate::archive`]).
 //!
 //! A kill may leave one of these next to a target `NAME`; the next publishing finishes the work:
 //!

@@ -3,6 +3,7 @@
 use super::*;
 use crate::page::MARK_FILE;
 use artifact::{MANIFEST_FILE, write_json};
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 
 /// A folder as a sink leaves it.
@@ -14,7 +15,8 @@ fn made(dir: &Path, text: &str) -> PathBuf {
     fs::write(folder.join("views/a.png"), "png").unwrap();
     write_json(&folder.join(MANIFEST_FILE), &Manifest::of_folder("page", &folder).unwrap())
         .unwrap();
-    let mark = PageMark { identity: text.to_owned(), is_complete: true, data_sets: Vec::new() };
+    let results = Some(BTreeSet::new());
+    let mark = PageMark { identity: text.to_owned(), results, data_sets: Vec::new() };
     mark.write(&folder).unwrap();
     folder
 }
@@ -42,11 +44,16 @@ fn a_page_replaces_a_page() {
     published(dir.path(), "three").unwrap();
 }
 
-/// A page of a data set as a sink leaves it.
+/// A page of a data set as a sink leaves it, with one result if it is complete.
 fn page(dir: &Path, text: &str, data_set: &str, is_complete: bool) -> PathBuf {
+    page_of(dir, text, data_set, if is_complete { &["eval"] } else { &[] })
+}
+
+fn page_of(dir: &Path, text: &str, data_set: &str, results: &[&str]) -> PathBuf {
     let folder = made(dir, text);
     let data_sets = vec![data_set.to_owned()];
-    let mark = PageMark { identity: text.to_owned(), is_complete, data_sets };
+    let results = Some(results.iter().map(|result| format!("{data_set}: {result}")).collect());
+    let mark = PageMark { identity: text.to_owned(), results, data_sets };
     mark.write(&folder).unwrap();
     folder
 }
@@ -80,18 +87,39 @@ fn pages_of_other_data_sets_are_archived() {
     );
     assert_eq!(publish_page(dir.path(), "lego broken", "data/lego", false).unwrap(), "report-lego");
     assert_eq!(page_text(dir.path(), "report-lego"), "lego 3");
+    // A page without a result has nothing that another page lacks.
+    assert_eq!(publish_page(dir.path(), "other 1", "more/lego", true), None);
     // Another folder of that name has its own place, and so has what isn't ours.
-    assert_eq!(publish_page(dir.path(), "other 1", "more/lego", true).unwrap(), "report-lego-2");
+    assert_eq!(publish_page(dir.path(), "chair 2", "data/chair", true).unwrap(), "report-lego-2");
     fs::write(dir.path().join("out/report-lego-2/notes.txt"), "precious").unwrap();
-    assert_eq!(publish_page(dir.path(), "chair 2", "data/chair", true).unwrap(), "report-lego-3");
+    publish_page(dir.path(), "other 2", "more/lego", true);
+    assert_eq!(publish_page(dir.path(), "chair 3", "data/chair", true).unwrap(), "report-lego-3");
     assert_eq!(
         (page_text(dir.path(), "report-lego"), page_text(dir.path(), "report-lego-2")),
-        ("lego 3".into(), "lego broken".into())
+        ("lego 3".into(), "other 1".into())
     );
     assert_eq!(
         (page_text(dir.path(), "report-lego-3"), page_text(dir.path(), "report")),
-        ("other 1".into(), "chair 2".into())
+        ("other 2".into(), "chair 3".into())
     );
+}
+
+/// A sweep's page is kept when a page of one of its points comes, but not the other way round.
+#[test]
+fn a_page_with_more_results_is_archived() {
+    let dir = tempfile::tempdir().unwrap();
+    let target = dir.path().join("out/report");
+    for (text, results, archived) in [
+        ("one", &["eval"][..], None),
+        ("both", &["eval", "eval-refined"], None),
+        ("one again", &["eval"], Some("report-lego")),
+        ("sweep", &["eval [rays=1]"], Some("report-lego-2")),
+    ] {
+        let folder = page_of(dir.path(), text, "lego", results);
+        let found = publish(&folder, &target, "page", &AtomicBool::new(false)).unwrap();
+        let found = found.first().map(|path| path.file_name().unwrap().to_str().unwrap());
+        assert_eq!(found, archived, "{text}");
+    }
 }
 
 /// Folders of `out` with the text of each one's page, sorted.

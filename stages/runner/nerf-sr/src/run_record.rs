@@ -170,6 +170,26 @@ fn data_sets(plan: &Plan, sink: &Sink) -> Vec<String> {
     found.into_iter().collect()
 }
 
+/// Returns the shown results, each as its data sets, stage and point.
+pub(crate) fn shown_results(record: &RunRecord) -> BTreeSet<String> {
+    let mut results = BTreeSet::new();
+    for (index, node) in record.nodes.iter().enumerate().filter(|(_, node)| node.is_shown) {
+        let mut data_sets = BTreeSet::new();
+        for ancestor in record.ancestors(index).into_iter().map(|index| &record.nodes[index]) {
+            let folders = ancestor.inputs.values().filter_map(|input| input.folder.as_ref());
+            let folders: Vec<String> = folders.map(|folder| folder.display().to_string()).collect();
+            match ancestor.kind.as_str() {
+                "dataset" if folders.is_empty() => _ = data_sets.insert(ancestor.stage.clone()),
+                "dataset" | "scene" => data_sets.extend(folders),
+                _ => {}
+            }
+        }
+        let data_sets = data_sets.into_iter().collect::<Vec<_>>().join(", ");
+        results.insert(format!("{data_sets}: {}", artifact::label(&node.stage, &node.point)));
+    }
+    results
+}
+
 /// Adds the values that the scene decides, read from the artifacts, and this run's own data.
 pub(crate) fn add_details(record: &mut RunRecord, plan: &Plan, progress: &RunProgress<'_>) {
     for node in &mut record.nodes {

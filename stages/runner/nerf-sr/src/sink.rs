@@ -1,10 +1,12 @@
 //! Sinks show a run: each gets the run's record and writes a folder of its own. Sinks are never
 //! cached, but a sink whose page shows the same record already isn't called again.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use artifact::{
-    MANIFEST_FILE, Manifest, RunRecord, hash_json, list_output_files, print_line, write_json,
+    MANIFEST_FILE, Manifest, RunRecord, format_count, format_size, hash_json, list_output_files,
+    print_line, write_json,
 };
 use planning::Sink;
 use planning::stage_call::{Call, Display, StageFailure};
@@ -14,7 +16,7 @@ use store::Record;
 use crate::failure;
 use crate::page::PageMark;
 use crate::publish::{has_current_page, publish};
-use crate::run_record::{RunProgress, add_details, run_record};
+use crate::run_record::{RunProgress, add_details, run_record, shown_results};
 use crate::session::Run;
 use crate::unchanged::ConfirmedProgram;
 
@@ -52,6 +54,9 @@ impl SinkResult {
                     print_line!("{stage}: moved the earlier page to {}", page_path(folder));
                 }
                 print_line!("{stage}: {}", page_path(folder));
+                for entry in listing(folder) {
+                    print_line!("{stage}: {entry}");
+                }
             }
             Self::UpToDate(folder) => print_line!("{stage}: {} (up to date)", page_path(folder)),
             Self::Incomplete => print_line!("{stage}: nothing to show"),
@@ -63,6 +68,31 @@ impl SinkResult {
 fn page_path(folder: &Path) -> String {
     let page = folder.join("index.html");
     if page.exists() { page.display().to_string() } else { folder.display().to_string() }
+}
+
+/// Returns path and size of each file and folder that a sink without a page has written.
+fn listing(folder: &Path) -> Vec<String> {
+    let has_page = folder.join("index.html").exists();
+    let Some(manifest) = Manifest::read(folder).ok().filter(|_| !has_page) else {
+        return Vec::new();
+    };
+    let mut entries: BTreeMap<&str, (usize, u64)> = BTreeMap::new();
+    for file in &manifest.files {
+        // Files of a subfolder are counted together.
+        let end = file.path.find('/').map_or(file.path.len(), |slash| slash + 1);
+        let (count, bytes) = entries.entry(&file.path[..end]).or_default();
+        *count += 1;
+        *bytes += file.size;
+    }
+    let lines = entries.into_iter().map(|(name, (count, bytes))| {
+        let count = if name.ends_with('/') {
+            format!("{}, ", format_count(count, "file"))
+        } else {
+            String::new()
+        };
+        format!("{}, {count}{}", folder.join(name).display(), format_size(bytes))
+    });
+    lines.collect()
 }
 
 /// Calls a sink and publishes its page as `out/STAGE`.
@@ -92,11 +122,8 @@ pub(crate) fn run_sink(
             Manifest::of_folder(kind, &output).map_err(|e| StageFailure::at(&output, &e))?;
         write_json(&manifest, &found).map_err(|e| StageFailure::at(&manifest, &e))?;
     }
-    let mark = PageMark {
-        identity,
-        is_complete: record.failed.iter().all(|point| point.reason.is_some()),
-        data_sets: record.data_sets,
-    };
+    let mark =
+        PageMark { identity, results: Some(shown_results(&record)), data_sets: record.data_sets };
     mark.write(&output).map_err(|e| StageFailure::at(&output, &e))?;
     let archived = publish(&output, &target, kind, run.stop)?;
     // Leftovers of a sink have no value.
