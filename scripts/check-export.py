@@ -56,6 +56,9 @@ def main():
     found["mesh"]["triangles"] = len(mesh.faces)
     found["mesh"]["vertices_outward"] = outward(mesh.vertices, mesh.vertex_normals, tree, truth_normals)
     found["mesh"]["has_colours"] = len(mesh.visual.vertex_attributes["color"]) == len(mesh.vertices)
+    coloured = trimesh.load(export / "mesh.ply", process=False)
+    found["mesh"]["kind"] = coloured.visual.kind
+    found["mesh"]["is_white"] = bool((coloured.visual.vertex_colors[:, :3] > 250).all())
     points, normals, vertex = read_points(export / "points.ply")
     found["points"] = figures(points, normals, cKDTree(points).query(seen)[0])
     found["points"]["properties"] = [p.name for p in vertex.properties]

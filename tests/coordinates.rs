@@ -240,10 +240,13 @@ fn exported_points_return_to_the_inputs_coordinates() {
     assert!(!here.join("offset.json").exists() && !said.contains("offset"), "{said}");
     let placement = Placement { scale: 64.0, ..moved(UTM) };
     let (there, said, made) = exported("there", &placement);
-    assert!(said.contains("points.ply, splats.ply, mesh.glb lack the offset (5"), "{said}");
+    assert!(
+        said.contains("points.ply, splats.ply, mesh.glb, mesh.ply lack the offset (5"),
+        "{said}"
+    );
     let size = trained_in(&made).0.longest_side();
     let offset = read(&there.join("offset.json"));
-    assert_eq!(offset["files"], json!(["points.ply", "splats.ply", "mesh.glb"]));
+    assert_eq!(offset["files"], json!(["points.ply", "splats.ply", "mesh.glb", "mesh.ply"]));
     let offset = DVec3::from([0, 1, 2].map(|i| offset["offset"][i].as_f64().unwrap()));
     let xyz = ["x", "y", "z"];
     let ply = |folder: &Path, file: &str| vectors(&read_ply(&folder.join(file)), xyz);
@@ -252,6 +255,7 @@ fn exported_points_return_to_the_inputs_coordinates() {
         ("points.ply", [&there, &here].map(|folder| ply(folder, "points.ply"))),
         ("splats.ply", [&there, &here].map(|folder| ply(folder, "splats.ply"))),
         ("mesh.glb", [&there, &here].map(|folder| glb(folder))),
+        ("mesh.ply", [&there, &here].map(|folder| ply(folder, "mesh.ply"))),
         ("points3D.txt", [colmap_points(&there, offset), colmap_points(&here, DVec3::ZERO)]),
     ] {
         assert!(local.len() == expected.len() && local.len() > 100, "{file}");

@@ -47,8 +47,19 @@ fn short_training() -> Project {
 #[test]
 fn exported_files_show_the_demo_scene() {
     let project = short_training();
-    project.ok(&["run", "export"]);
+    let said = project.ok(&["run", "export"]);
+    for words in [
+        "export: out/export\n",
+        "export: out/export/mesh.glb, ",
+        "export: out/export/colmap/, 3 files, ",
+    ] {
+        assert!(said.contains(words), "{said}");
+    }
     let exported = exported_by(&project, &["export"]);
+    assert_eq!(
+        std::fs::read(project.path("out/export/mesh.ply")).unwrap(),
+        std::fs::read(exported.files.join("mesh.ply")).unwrap()
+    );
     assert_near("mesh", exported.mesh());
     assert_near("points", exported.points());
     // By the reference renderer, over the field's background.
@@ -65,7 +76,7 @@ fn exported_files_show_the_demo_scene() {
 fn exported_by(project: &Project, arguments: &[&str]) -> Exported {
     let folder = |stage: &str| project.artifact(stage, arguments);
     Exported {
-        files: folder("export"),
+        files: folder("exported"),
         cameras: folder("prep").join("train-cameras"),
         truth: folder("prep").join("truth"),
     }
@@ -228,6 +239,10 @@ fn assert_same_files(exported: &Exported, read: &Value) {
     }
     assert_eq!(read["mesh"]["triangles"], summary["triangles"]);
     assert_eq!(read["mesh"]["has_colours"], true);
+    assert_eq!(
+        (&read["mesh"]["kind"], &read["mesh"]["is_white"]),
+        (&"vertex".into(), &false.into())
+    );
     assert_eq!(read["points"]["count"], summary["points"]);
     assert_eq!(read["splats"]["count"], summary["splats"]);
 }

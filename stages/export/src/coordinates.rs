@@ -8,8 +8,10 @@ use serde::{Deserialize, Serialize};
 /// Name of the file with an offset, next to the files that it belongs to.
 pub const OFFSET_FILE: &str = "offset.json";
 
-/// Files whose coordinates have single precision.
-const SINGLE_FILES: [&str; 3] = ["points.ply", "splats.ply", "mesh.glb"];
+/// Files whose coordinates have single precision, each with its index among points, splats and
+/// mesh.
+const SINGLE_FILES: [(&str, usize); 4] =
+    [("points.ply", 0), ("splats.ply", 1), ("mesh.glb", 2), ("mesh.ply", 2)];
 
 /// Maximum distance of a scene's middle from the origin, in scene sizes, for files without an
 /// offset: single precision moves a point by less than a millionth of the size (design note 043).
@@ -54,12 +56,13 @@ impl Coordinates {
         self.offset != DVec3::ZERO
     }
 
-    /// Returns the content of [`OFFSET_FILE`] for the files that are written.
+    /// Returns the content of [`OFFSET_FILE`]; `is_written` is true for points, splats and mesh that
+    /// are written.
     pub(crate) fn offset_file(&self, is_written: [bool; 3]) -> ExportOffset {
         let mut files = Vec::new();
-        for (i, file) in SINGLE_FILES.iter().enumerate() {
-            if is_written[i] {
-                files.push((*file).to_owned());
+        for (file, index) in SINGLE_FILES {
+            if is_written[index] {
+                files.push(file.to_owned());
             }
         }
         ExportOffset {
@@ -77,7 +80,7 @@ impl fmt::Display for Coordinates {
         if self.is_moved() {
             let [x, y, z] = self.offset.to_array();
             write!(f, ", less the offset ({x}, {y}, {z}) of {OFFSET_FILE} where single precision")?;
-            f.write_str(" can't hold them (points.ply, splats.ply, mesh.glb)")?;
+            f.write_str(" can't hold them (points.ply, splats.ply, mesh.glb, mesh.ply)")?;
         }
         Ok(())
     }

@@ -5,7 +5,7 @@
 //!
 //! * `points.ply`: coloured points with normals.
 //! * `splats.ply`: 3D Gaussians in the layout of 3DGS viewers.
-//! * `mesh.glb`: triangles with vertex colours, by fusing the views' depth.
+//! * `mesh.glb`, `mesh.ply`: triangles with vertex colours, by fusing the views' depth.
 //! * `transforms.json`, `colmap/sparse/0/`: the cameras for instant-ngp, nerfstudio and COLMAP.
 //! * [`EXPORT_FILE`]: counts, and a description of the coordinates.
 //! * [`OFFSET_FILE`]: for scenes far from the origin, the offset of points, splats and mesh.
@@ -73,7 +73,7 @@ pub struct Params {
     pub points: bool,
     /// Writes 3D Gaussians, `splats.ply`.
     pub splats: bool,
-    /// Writes a mesh with vertex colours, `mesh.glb`.
+    /// Writes a mesh with vertex colours: `mesh.glb`, with an unlit material, and `mesh.ply`.
     pub mesh: bool,
     /// Writes the cameras as `transforms.json` and as COLMAP's text files.
     pub cameras: bool,
@@ -115,9 +115,9 @@ pub struct ExportSummary {
     pub points: usize,
     /// Number of Gaussians in `splats.ply`; 0 without this file.
     pub splats: usize,
-    /// Number of vertices in `mesh.glb`; 0 without this file.
+    /// Number of vertices in `mesh.glb` and `mesh.ply`; 0 without these files.
     pub vertices: usize,
-    /// Number of triangles in `mesh.glb`; 0 without this file.
+    /// Number of triangles in `mesh.glb` and `mesh.ply`; 0 without these files.
     pub triangles: usize,
 }
 
@@ -325,6 +325,7 @@ impl ExportJob<'_> {
         let offset = self.coordinates.offset;
         let colours = colour::vertex_colours(&self.field, &self.views, &mesh, lattice, offset)?;
         self.write("mesh.glb", |file| glb::write(file, &mesh, &colours, &self.coordinates))?;
+        self.write("mesh.ply", |file| ply::write_mesh(file, &mesh, &colours, &self.coordinates))?;
         summary.vertices = mesh.positions.len();
         summary.triangles = mesh.triangles.len();
         Ok(())

@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use glam::{DQuat, DVec3};
 
 use crate::coordinates::Coordinates;
+use crate::mesh::Mesh;
 use crate::surfel::Surfel;
 
 /// PLY's name of the type `f32`.
@@ -49,6 +50,39 @@ pub(crate) fn write_points(
         write_floats(file, &surfel.position.as_vec3().to_array())?;
         write_floats(file, &surfel.normal.as_vec3().to_array())?;
         file.write_all(&colour_bytes(surfel.colour))?;
+    }
+    Ok(())
+}
+
+/// Writes a mesh with normals and 8-bit vertex colours, display-encoded sRGB, for programs that
+/// don't display vertex colours below a material, as those of `mesh.glb` are.
+pub(crate) fn write_mesh(
+    file: &mut impl Write,
+    mesh: &Mesh,
+    colours: &[[f32; 3]],
+    coordinates: &Coordinates,
+) -> io::Result<()> {
+    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
+    writeln!(file, "comment {coordinates}")?;
+    writeln!(file, "element vertex {}", mesh.positions.len())?;
+    for name in ["x", "y", "z", "nx", "ny", "nz"] {
+        writeln!(file, "property {FLOAT} {name}")?;
+    }
+    for name in ["red", "green", "blue"] {
+        writeln!(file, "property {BYTE} {name}")?;
+    }
+    writeln!(file, "element face {}", mesh.triangles.len())?;
+    writeln!(file, "property list {BYTE} int vertex_indices\nend_header")?;
+    for (i, colour) in colours.iter().enumerate() {
+        write_floats(file, &mesh.positions[i].to_array())?;
+        write_floats(file, &mesh.normals[i].to_array())?;
+        file.write_all(&colour_bytes(*colour))?;
+    }
+    for triangle in &mesh.triangles {
+        file.write_all(&[3])?;
+        for vertex in triangle {
+            file.write_all(&vertex.to_le_bytes())?;
+        }
     }
     Ok(())
 }

@@ -368,7 +368,7 @@ fn offsets_are_short_and_only_where_they_are_needed() {
     let file = Coordinates { offset: DVec3::X }.offset_file([true, false, true]);
     assert_eq!(
         (file.offset, file.files),
-        ([1.0, 0.0, 0.0], vec!["points.ply".into(), "mesh.glb".into()])
+        ([1.0, 0.0, 0.0], vec!["points.ply".into(), "mesh.glb".into(), "mesh.ply".into()])
     );
 }
 

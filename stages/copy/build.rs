@@ -1,0 +1,5 @@
+//! Hashes the stage's sources into `STAGE_FINGERPRINT`.
+
+fn main() {
+    fingerprint::emit();
+}

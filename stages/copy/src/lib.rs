@@ -1,0 +1,91 @@
+//! `copy`: a run's artifacts as a folder next to its pages, for files that other programs open.
+//!
+//! The stage is a sink: it gets the run's record. Each point of a sweep has its own folder.
+
+use std::io::{self, Read as _, Write as _};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use artifact::{Failure, MANIFEST_FILE, Manifest, RunNode, RunRecord, sink_folders};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use stage::{Context, Input, Output, Progress, SUMMARY_FILE, Stage};
+
+/// Parameters of `copy`: none.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {}
+
+/// Number of bytes copied between two reports of progress; chosen by hand.
+const CHUNK_BYTES: usize = 1 << 20;
+
+/// The stage.
+pub struct Copy;
+
+impl Stage for Copy {
+    type Params = Params;
+    const NAME: &'static str = "copy";
+    const SUMMARY: &'static str = "Copies artifacts to the folder of pages, for other programs.";
+    const SINK: bool = true;
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        vec![(
+            "run",
+            Input::required(&["run"], "folder with run.json, the record of the artifacts"),
+        )]
+    }
+
+    fn output() -> Output {
+        Output::kind("files")
+    }
+
+    fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
+        let run: RunRecord = context.input("run")?.read_json("run.json")?;
+        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let shown: Vec<&RunNode> = run.nodes.iter().filter(|node| node.is_shown).collect();
+        let mut files: Vec<(PathBuf, String)> = Vec::new();
+        let mut bytes = 0;
+        for (node, prefix) in shown.iter().zip(sink_folders(&shown)) {
+            let manifest = Manifest::read(&node.folder).map_err(|e| {
+                Failure::BadInput(format!("{}: {e}", node.folder.join(MANIFEST_FILE).display()))
+            })?;
+            for file in manifest.files.iter().filter(|file| file.path != SUMMARY_FILE) {
+                bytes += file.size;
+                files.push((node.folder.join(&file.path), format!("{prefix}{}", file.path)));
+            }
+        }
+        if files.is_empty() {
+            return Err(Failure::BadInput("run.json has no artifact with files".to_owned()).into());
+        }
+        let progress = context.progress("copying", bytes);
+        for (source, name) in files {
+            let target = context.output_path(&name)?;
+            copy_file(context, &source, &target, &progress)
+                .with_context(|| format!("cannot copy {}", source.display()))?;
+        }
+        Ok(())
+    }
+}
+
+/// Copies a file's content.
+fn copy_file(
+    context: &Context,
+    source: &Path,
+    target: &Path,
+    progress: &Progress,
+) -> anyhow::Result<()> {
+    let (mut from, mut to) = (std::fs::File::open(source)?, std::fs::File::create(target)?);
+    let mut buffer = vec![0; CHUNK_BYTES];
+    loop {
+        context.check_interrupt()?;
+        let count = match from.read(&mut buffer) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            count => count?,
+        };
+        if count == 0 {
+            return Ok(());
+        }
+        to.write_all(&buffer[..count])?;
+        progress.add(count as u64);
+    }
+}
