@@ -70,7 +70,8 @@ struct PlanArgs {
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
     /// Read an input from this folder, not from what the pipeline names, e.g. -i
-    /// dataset=scenes/lego
+    /// dataset=scenes/lego. A stage's name stands for its artifact: -i init=train-ss continues a
+    /// training
     #[arg(short = 'i', long = "input", value_name = "[STAGE.]NAME=DIR[,DIR…]")]
     inputs: Vec<String>,
     #[command(flatten)]

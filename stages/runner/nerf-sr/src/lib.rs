@@ -29,6 +29,7 @@ mod run_messages;
 mod run_record;
 mod session;
 mod sink;
+mod stage_inputs;
 mod starter;
 mod state_text;
 mod unchanged;

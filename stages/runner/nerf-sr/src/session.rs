@@ -10,6 +10,7 @@ use stage::check_device;
 use store::{RunFile, Store};
 
 use crate::identities::node_identities;
+use crate::stage_inputs;
 
 /// Pipeline, store and devices of a verb.
 pub(crate) struct Session {
@@ -63,6 +64,7 @@ impl Session {
     ) -> anyhow::Result<Plan> {
         let (pipeline, targets) = planning::find_targets(&self.pipeline, &request.targets)?;
         let request = Request { targets, ..request.clone() };
+        let request = stage_inputs::with_folders(&pipeline, &self.store, &request, describing)?;
         let plan = Plan::new(&pipeline, &self.store, &request, describing)?;
         let plan = Plan { devices: self.devices.clone(), ..plan };
         check_not_in_input(&plan, "the store", self.store.root())?;
