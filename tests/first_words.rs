@@ -110,3 +110,20 @@ fn sinks_and_export_show_a_percentage() {
     let cameras = scene.join("cameras");
     shows_a_percentage(&project, "export", &[("field", &field), ("cameras", &cameras)]);
 }
+
+/// `-i init=train-ss` is the field of the same command, without the parameters of `train-ss`.
+#[test]
+fn a_stages_name_continues_its_training() {
+    let project = Project::tiny();
+    let more =
+        ["train-ss", "-i", "init=train-ss", "-p", "rays=2k", "-p", "combine=average_weights"];
+    let words = "train-ss has no artifact yet; run it first";
+    project.run(&[&["run"], &more[..]].concat()).fails(2, &[words]);
+    project.ok(&["run", "train-ss"]);
+    let first = project.artifact("train-ss", &["train-ss"]);
+    project.ok(&[&["run"], &more[..]].concat());
+    let second = project.artifact("train-ss", &more);
+    let log = std::fs::read(second.join("training.json")).unwrap();
+    let log: Value = serde_json::from_slice(&log).unwrap();
+    assert!(log["rays"].as_u64().is_some_and(|rays| rays < 10_000) && first != second, "{log}");
+}

@@ -64,7 +64,7 @@ impl Session {
     ) -> anyhow::Result<Plan> {
         let (pipeline, targets) = planning::find_targets(&self.pipeline, &request.targets)?;
         let request = Request { targets, ..request.clone() };
-        let request = stage_inputs::with_folders(&pipeline, &self.store, &request, describing)?;
+        let request = stage_inputs::with_folders(&pipeline, self, &request, describing)?;
         let plan = Plan::new(&pipeline, &self.store, &request, describing)?;
         let plan = Plan { devices: self.devices.clone(), ..plan };
         check_not_in_input(&plan, "the store", self.store.root())?;

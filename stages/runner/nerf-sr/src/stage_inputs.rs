@@ -3,14 +3,15 @@
 
 use artifact::known_names;
 use planning::{Describing, Pipeline, Plan, PlanError, Request, State};
-use store::Store;
+
+use crate::session::Session;
 
 /// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts. The artifact is that
 /// of the same command line, without the argument and without the stage's own parameters, which are
 /// those of the training that continues.
 pub(crate) fn with_folders(
     pipeline: &Pipeline,
-    store: &Store,
+    session: &Session,
     request: &Request,
     describing: Describing<'_>,
 ) -> Result<Request, PlanError> {
@@ -20,7 +21,7 @@ pub(crate) fn with_folders(
         if !pipeline.stages.contains_key(stage) || std::path::Path::new(stage).exists() {
             continue;
         }
-        let folder = folder_of(pipeline, store, request, describing, (index, stage))?;
+        let folder = folder_of(pipeline, session, request, describing, (index, stage))?;
         resolved.inputs[index] = format!("{name}={folder}");
     }
     Ok(resolved)
@@ -29,22 +30,23 @@ pub(crate) fn with_folders(
 /// Returns the folder of a stage's artifact in the plan without the argument `index`.
 fn folder_of(
     pipeline: &Pipeline,
-    store: &Store,
+    session: &Session,
     request: &Request,
     describing: Describing<'_>,
     (index, stage): (usize, &str),
 ) -> Result<String, PlanError> {
     let mut earlier = Request { targets: vec![stage.to_owned()], ..request.clone() };
     earlier.inputs.remove(index);
-    let names = parameter_names(pipeline, store, &earlier, describing, stage)?;
+    let names = parameter_names(pipeline, session, &earlier, describing, stage)?;
     earlier.parameters.retain(|text| !is_of_stage(text, stage, &names));
-    let plan = Plan::new(pipeline, store, &earlier, describing)?;
-    let states = plan.states(store, None)?;
+    let plan = Plan::new(pipeline, &session.store, &earlier, describing)?;
+    let plan = Plan { devices: session.devices.clone(), ..plan };
+    let states = plan.states(&session.store, None)?;
     let mut found = plan.nodes.iter().zip(states).filter(|(node, _)| node.stage == stage);
     let argument = &request.inputs[index];
     match (found.next(), found.next()) {
         (Some((_, State::Cached(record))), None) => {
-            Ok(store.object(&record.output).display().to_string())
+            Ok(session.store.object(&record.output).display().to_string())
         }
         (Some(_), None) => Err(PlanError::Usage(format!(
             "-i {argument}: {stage} has no artifact yet; run it first: nerf-sr run {stage}"
@@ -58,13 +60,13 @@ fn folder_of(
 /// Returns the names of a stage's parameters.
 fn parameter_names(
     pipeline: &Pipeline,
-    store: &Store,
+    session: &Session,
     request: &Request,
     describing: Describing<'_>,
     stage: &str,
 ) -> Result<Vec<String>, PlanError> {
     let request = Request { parameters: Vec::new(), ..request.clone() };
-    let plan = Plan::new(pipeline, store, &request, describing)?;
+    let plan = Plan::new(pipeline, &session.store, &request, describing)?;
     let node = plan.nodes.iter().find(|node| node.stage == stage).ok_or_else(|| {
         let stages = plan.nodes.iter().map(|node| node.stage.as_str());
         PlanError::Usage(format!("{stage} has no artifact; {}", known_names(stage, stages)))
