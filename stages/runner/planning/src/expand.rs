@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use artifact::FailedPoint;
 use serde_json::{Map, Value};
+use stage::GivenInputs;
 
 use crate::axes::{Axis, Kind, Setting};
 use crate::check::dependencies;
