@@ -180,7 +180,7 @@ mod tests {
             let mask = Mask { width: size, height: size, counts: vec![false; size * size] };
             photograph.mask = Some(mask);
         };
-        assert!(carved(&[far.clone()], masked).into_iter().all(|kept| kept));
+        assert!(carved(std::slice::from_ref(&far), masked).into_iter().all(|kept| kept));
         let aside =
             Camera { camera_to_world: looking_at(3.0 * DVec3::X, 9.0 * DVec3::Z, DVec3::Y), ..far };
         assert!(carved(&[aside], |_| ()).into_iter().all(|kept| kept));
@@ -198,7 +198,7 @@ mod tests {
     #[test]
     fn rectangles_are_transparent_if_all_their_pixels_are() {
         let (width, height) = (7, 5);
-        let is_opaque = |x: usize, y: usize| (x * 5 + y * 3) % 11 == 0;
+        let is_opaque = |x: usize, y: usize| (x * 5 + y * 3).is_multiple_of(11);
         let pixels = (0..width * height).flat_map(|i| {
             let alpha = if is_opaque(i % width, i / width) { 1.0 } else { 0.0 };
             [0.0, 0.0, 0.0, alpha]
