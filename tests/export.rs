@@ -49,9 +49,9 @@ fn exported_files_show_the_demo_scene() {
     let project = short_training();
     let said = project.ok(&["run", "export"]);
     for words in [
-        "export: out/export\n",
-        "export: out/export/mesh.glb, ",
-        "export: out/export/colmap/, 3 files, ",
+        "export: ./out/export\n",
+        "export: ./out/export/mesh.glb, ",
+        "export: ./out/export/colmap/, 3 files, ",
     ] {
         assert!(said.contains(words), "{said}");
     }

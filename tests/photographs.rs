@@ -433,12 +433,6 @@ fn contradictions_are_refused() {
     refused(
         &folder,
         &out,
-        r#"{"lr_source": "photographs", "lr_width": 16}"#,
-        &["parameter lr_width", "omit lr_width"],
-    );
-    refused(
-        &folder,
-        &out,
         r#"{"lr_source": "photographs", "kernel": "average"}"#,
         &["parameter kernel", "choose box"],
     );

@@ -13,7 +13,7 @@ const MARKS = [
 ];
 /** Maximum number of series with distinct colours and marks; of more series, only chosen ones are distinct. */
 const MAX_COLOURS = MARKS.length;
-const MARGIN = { left: 54, right: 14, top: 12, bottom: 42 };
+const MARGIN = { left: 60, right: 14, top: 12, bottom: 42 };
 const HEIGHT = 270;
 /** Maximum width of a name on an axis, and least distance between two names, in pixels. */
 const MAX_NAME_WIDTH = 110;
