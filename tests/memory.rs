@@ -32,7 +32,7 @@ const CASES: [Case; 3] = [
         "viewer",
         r#"{"resolution": 512}"#,
         &[("run", "field-run")],
-        "baking needs 2.7 GB of memory, and 100.0 MB are free; choose a smaller resolution, or end other programs",
+        "baking needs 2.1 GB of memory, and 100.0 MB are free; choose a smaller resolution, or end other programs",
     ),
 ];
 

@@ -107,6 +107,10 @@ fn every_command_plans() {
                 "diff" => words = ["plan"].into_iter().chain(words[1].split_whitespace()).collect(),
                 _ => {}
             }
+            // Nor can it be an input.
+            if let Some(at) = words.iter().position(|word| *word == "init=train-ss") {
+                words.drain(at - 1..=at);
+            }
             // `run` would train for minutes; the plan is the same code up to running. It has no use
             // for run's own options.
             if words[0] == "run" {

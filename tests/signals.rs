@@ -86,6 +86,7 @@ const CASES: &[Case] = &[
     },
     Case { stage: "report", inputs: &[("run", "large-report")], ..CASE },
     Case { stage: "table", inputs: &[("run", "many-results")], ..CASE },
+    Case { stage: "copy", inputs: &[("run", "large-film")], is_short: true, ..CASE },
     Case {
         stage: "train-refine",
         params: r#"{"steps": 1000000000, "patch_size": 16, "features": 8, "blocks": 1}"#,
@@ -379,7 +380,7 @@ fn large_calls(verb: &String) -> Vec<String> {
         "pin" => vec!["pin mine prep".to_owned()],
         "gc" => vec!["gc --keep-days 0 prep".to_owned()],
         "diff" => vec!["diff prep prep".to_owned()],
-        "verify" => vec![verb.clone()],
+        "verify" | "advise" => vec![verb.clone()],
         "init" | "cancel" | "unpin" | "describe" | "completions" => Vec::new(),
         other => panic!("verb {other} has no case"),
     }

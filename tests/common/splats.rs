@@ -15,14 +15,18 @@ pub fn read_ply(path: &Path) -> BTreeMap<String, Vec<f64>> {
     let text = std::str::from_utf8(&bytes[..header]).unwrap();
     assert!(text.starts_with("ply\nformat binary_little_endian 1.0\n"), "{text}");
     let words: Vec<Vec<&str>> = text.lines().map(|l| l.split_whitespace().collect()).collect();
+    // Vertices come first; a mesh has faces after them.
+    let element = words.iter().find(|line| line.first() == Some(&"element")).unwrap();
+    let count: usize = element[2].parse().unwrap();
     let properties: Vec<(&str, &str)> = words
         .iter()
-        .filter(|line| line.first() == Some(&"property"))
+        .skip_while(|line| line.first() != Some(&"property"))
+        .take_while(|line| line.first() == Some(&"property"))
         .map(|line| (line[1], line[2]))
         .collect();
     let mut columns: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     let mut rest = &bytes[header..];
-    while !rest.is_empty() {
+    for _ in 0..count {
         for (kind, name) in &properties {
             let (value, length) = match *kind {
                 "float" => (f64::from(f32::from_le_bytes(rest[..4].try_into().unwrap())), 4),

@@ -81,7 +81,7 @@ impl Params {
             supervision: self.supervision.unwrap_or(supervision),
             exposure: self.exposure,
             pose_refinement: self.pose_refinement,
-            silhouettes: self.silhouettes && is_grid && !self.pose_refinement,
+            silhouettes: self.silhouettes && is_grid,
             order: sampling.order,
             pixel_importance: sampling.pixel_importance,
             precrop_steps: sampling.precrop_steps,

@@ -172,6 +172,8 @@ impl<'a> Member<'a> {
             );
             return Err(Failure::Usage(message).into());
         }
+        // Moving cameras would carve wrongly.
+        let cells = cells.filter(|_| !params.pose_refinement);
         let mut trainer = self.new_trainer(params, views.bounds, cells)?;
         let checkpoints = Checkpoints::new(work);
         let curve = checkpoints
