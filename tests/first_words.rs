@@ -60,13 +60,13 @@ fn every_input_is_checked_before_anything_runs() {
 fn whole_numbers_may_have_a_suffix() {
     let project = Project::tiny();
     let keys = |arguments: &[&str]| -> Vec<Value> {
-        let nodes = project.nodes(&[&["-p", "demo-scene.seed=1"], arguments].concat());
+        let nodes = project.nodes(arguments);
         nodes.into_iter().map(|mut node| node["key"].take()).collect()
     };
-    let expected = keys(&["-p", "size=64000"]);
-    assert_eq!(keys(&["-p", "size=64k"]), expected);
-    assert_ne!(keys(&["-p", "size=65k"]), expected);
-    project.run(&["plan", "-p", "rays=30X"]).fails(2, &["\"30X\" is not a whole number"]);
+    let expected = keys(&["-p", "demo-scene.seed=64000"]);
+    assert_eq!(keys(&["-p", "demo-scene.seed=64k"]), expected);
+    assert_ne!(keys(&["-p", "demo-scene.seed=65k"]), expected);
+    project.run(&["plan", "-p", "train-ss.rays=30X"]).fails(2, &["\"30X\" is not a whole number"]);
 }
 
 /// A node of a run's record that a sink shows.
