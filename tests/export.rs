@@ -154,7 +154,7 @@ fn psnr(a: &Image, b: &Image) -> f64 {
 fn assert_near(what: &str, compared: Compared) {
     println!("{what}: {compared:?}");
     assert!(compared.to_truth < 0.01 && compared.from_truth < 0.01, "{what}: {compared:?}");
-    assert!(compared.outward >= 0.97, "{what}: {compared:?}");
+    assert!(compared.outward >= 0.96, "{what}: {compared:?}");
 }
 
 /// At least so many dB in the mean. A scene that is mirrored or upside down has about 12.
