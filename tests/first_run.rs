@@ -76,7 +76,9 @@ fn what_init_leaves_commented_out_is_right() {
     let parameters = text.lines().filter_map(|line| line.strip_prefix(commented)).count();
     assert!(parameters >= 4, "{text}");
     std::fs::create_dir(project.path("weights")).unwrap();
-    project.write("weights/x", "");
+    for file in ["squeezenet1_1.safetensors", "lpips_linear_squeeze_v0.1.safetensors"] {
+        project.write(&format!("weights/{file}"), "");
+    }
     project.write("pipeline.yaml", &text.replace(commented, "      "));
     project.ok(&["plan"]);
 }
@@ -219,7 +221,9 @@ fn a_build_without_libtorch_makes_what_the_whole_one_makes() {
     project.ok(&["--store", "other", "run"]);
     assert_eq!(outputs(&[]), outputs(&["--store", "other"]));
     // What needs libtorch is refused, with the command that builds it.
-    project.write("weights/x", "");
+    for file in ["squeezenet1_1.safetensors", "lpips_linear_squeeze_v0.1.safetensors"] {
+        project.write(&format!("weights/{file}"), "");
+    }
     for arguments in [
         &["run", "-i", "weights=weights"][..],
         &["run", "-p", "train-ss.field=mlp"],
