@@ -6,7 +6,7 @@ use glam::DVec3;
 use pixels::Mask;
 use radiance::spec::OCCUPANCY_CELLS;
 use rayon::prelude::*;
-use scene::{Bounds, Camera, Photograph, Space, Views};
+use scene::{Background, Bounds, Camera, Photograph, Space, Views};
 
 /// Distance in pixels from a transparent region within which cells are kept: kernels with negative
 /// lobes may cancel the alpha of thin parts at an object's border (design note 049).
@@ -17,7 +17,8 @@ const MAX_TRANSPARENT_ALPHA: f32 = 0.5 / 255.0;
 /// Returns a mask of the occupancy cells without those that some view sees only through transparent
 /// pixels. Returns `None` if no photograph has alpha, or if the space isn't a box.
 pub(crate) fn cells_within(input: &GivenInput, views: &Views) -> anyhow::Result<Option<Vec<bool>>> {
-    if views.bounds.space != Space::Box {
+    // Opaque photographs have no alpha, and reading them takes time.
+    if views.bounds.space != Space::Box || views.background == Background::Opaque {
         return Ok(None);
     }
     let mut cells = vec![true; OCCUPANCY_CELLS.pow(3)];
