@@ -59,18 +59,18 @@ impl Pass {
         slope.fill(output.width, output.height, output_gradients);
         for i in (0..=last).rev() {
             let (layer, x, gradients) = (&layers.0[i], &maps[i], &mut gradients[i]);
-            below.reset_like(x);
             if i == 0 {
                 convolve_back(layer, x, slope, None, gradients, None, scratch);
-            } else if i == last {
-                convolve_back(layer, x, slope, None, gradients, Some(below), scratch);
-            } else if i % 2 == 0 {
-                convolve_back(layer, x, slope, None, gradients, Some(below), scratch);
-                std::mem::swap(block, slope);
-            } else {
-                let gate = Some(&maps[i + 1]);
-                convolve_back(layer, x, slope, gate, gradients, Some(below), scratch);
+                return;
+            }
+            below.reset_like(x);
+            let begins_block = i < last && i % 2 == 1;
+            let gate = begins_block.then_some(&maps[i + 1]);
+            convolve_back(layer, x, slope, gate, gradients, Some(below), scratch);
+            if begins_block {
                 below.add_to_middle(block);
+            } else if i < last {
+                std::mem::swap(block, slope);
             }
             std::mem::swap(slope, below);
         }
