@@ -43,7 +43,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         learning_rate: net.learning_rate,
         seed,
     };
-    let mut trainer = RefinerTrainer::new(Refiner::new(architecture, seed)?, options)?;
+    let mut trainer = RefinerTrainer::new(Refiner::new(architecture, seed), options);
     train(context, options.steps, &mut trainer, &examples.training, |error| {
         format!("PSNR of training patches {:.2} dB", psnr_of(error))
     })?;

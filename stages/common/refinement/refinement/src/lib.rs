@@ -27,13 +27,14 @@
 //! use pixels::Image;
 //! use refinement::{Refiner, RefinerArchitecture};
 //! nets::deterministic();
-//! let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance: None }, 7)?;
+//! let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance: None }, 7);
 //! let view = Image::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
 //! // An untrained network adds nothing.
 //! assert_eq!(refiner.refine(&view)?.data, vec![0.5; 9 * 5 * 3]);
 //! # Ok::<(), refinement::RefinementError>(())
 //! ```
 
+mod adam;
 mod align;
 mod consistency;
 mod convolution;

@@ -88,8 +88,8 @@ pub struct RefinerFile {
 #[derive(Debug)]
 pub struct Refiner {
     architecture: RefinerArchitecture,
-    /// Kernel and bias of each layer.
-    parameters: Vec<Tensor>,
+    /// Kernel (outputs × rows × columns × inputs) and bias of each layer.
+    pub(crate) parameters: Vec<Vec<f32>>,
 }
 
 /// Side of a tile in pixels. A tile with its receptive field fits in the cache, and little of the
@@ -104,7 +104,7 @@ const WEIGHTS: u64 = 300;
 
 impl Refiner {
     /// Creates an untrained network, whose residual is 0.
-    pub fn new(architecture: RefinerArchitecture, seed: u64) -> Result<Self, RefinementError> {
+    pub fn new(architecture: RefinerArchitecture, seed: u64) -> Self {
         let mut rng = CounterRng::new(seed, WEIGHTS, 0);
         let layers = layers(architecture);
         let mut parameters = Vec::with_capacity(2 * layers.len());
@@ -113,17 +113,12 @@ impl Refiner {
             // starts at 0.
             let range =
                 if i + 1 == layers.len() { 0.0 } else { (1.0 / (9 * inputs) as f64).sqrt() };
-            let kernel: Vec<f32> = (0..outputs * 9 * inputs)
-                .map(|_| (range * (2.0 * f64::from(rng.uniform()) - 1.0)) as f32)
-                .collect();
-            parameters.push(
-                Tensor::f_from_slice(&kernel)?
-                    .f_reshape(kernel_shape(*inputs, *outputs))?
-                    .set_requires_grad(true),
-            );
-            parameters.push(Tensor::f_from_slice(&vec![0.0f32; *outputs])?.set_requires_grad(true));
+            let kernel = (0..outputs * 9 * inputs)
+                .map(|_| (range * (2.0 * f64::from(rng.uniform()) - 1.0)) as f32);
+            parameters.push(kernel.collect());
+            parameters.push(vec![0.0; *outputs]);
         }
-        Ok(Self { architecture, parameters })
+        Self { architecture, parameters }
     }
 
     /// Reads weights that [`Refiner::write`] wrote.
@@ -133,16 +128,24 @@ impl Refiner {
         if !(1..=MAX_CHANNELS).contains(&channels) || blocks > MAX_BLOCKS {
             return Err(RefinementError::Architecture { channels, blocks });
         }
-        let weights = nets::Weights::read(path)?;
-        let tensors = parameter_shapes(architecture)
-            .into_iter()
-            .map(|(name, shape)| weights.tensor(&name, &shape));
-        Ok(Self { architecture, parameters: tensors.collect::<Result<_, _>>()? })
+        Self::from_weights(&nets::Weights::read(path)?, architecture)
+    }
+
+    /// Takes the weights of a network of this architecture.
+    pub(crate) fn from_weights(
+        weights: &nets::Weights,
+        architecture: RefinerArchitecture,
+    ) -> Result<Self, RefinementError> {
+        let mut parameters = Vec::new();
+        for (name, shape) in parameter_shapes(architecture) {
+            parameters.push(Vec::<f32>::try_from(weights.tensor(&name, &shape)?.f_view([-1])?)?);
+        }
+        Ok(Self { architecture, parameters })
     }
 
     /// Writes the weights.
     pub fn write(&self, path: &Path) -> Result<(), RefinementError> {
-        Ok(nets::write(path, &self.named_parameters())?)
+        Ok(nets::write(path, &self.named_parameters()?)?)
     }
 
     /// Returns the network's size and inputs.
@@ -150,27 +153,20 @@ impl Refiner {
         self.architecture
     }
 
-    /// Returns the parameters with their names.
-    pub(crate) fn named_parameters(&self) -> Vec<(String, Tensor)> {
-        parameter_shapes(self.architecture)
-            .into_iter()
-            .map(|(name, _)| name)
-            .zip(self.parameters())
+    /// Returns the parameters as tensors with their names.
+    pub(crate) fn named_parameters(&self) -> Result<Vec<(String, Tensor)>, TchError> {
+        let parameters = parameter_shapes(self.architecture).into_iter().zip(&self.parameters);
+        parameters
+            .map(|((name, shape), parameter)| {
+                Ok((name, Tensor::f_from_slice(parameter)?.f_reshape(shape)?))
+            })
             .collect()
     }
 
-    /// Returns handles to the parameters.
-    pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
-        self.parameters.iter().map(Tensor::shallow_clone)
-    }
-
     /// Returns the layers, transformed for convolution.
-    pub(crate) fn layers(&self) -> Result<Layers, TchError> {
-        let parameters =
-            self.parameters.iter().map(|p| Vec::<f32>::try_from(&p.f_detach()?.f_view([-1])?));
-        let parameters = parameters.collect::<Result<Vec<_>, _>>()?;
-        let layers = parameters.par_chunks_exact(2);
-        Ok(Layers(layers.map(|layer| Convolution::new(&layer[0], &layer[1])).collect()))
+    pub(crate) fn layers(&self) -> Layers {
+        let layers = self.parameters.par_chunks_exact(2);
+        Layers(layers.map(|layer| Convolution::new(&layer[0], &layer[1])).collect())
     }
 
     /// Adds `residual_weight` times the network's residual to a view, and clamps colours to 0..1. A
@@ -195,7 +191,7 @@ impl Refiner {
             .step_by(TILE_SIDE)
             .flat_map(|y| (0..width).step_by(TILE_SIDE).map(move |x| (x, y)))
             .collect();
-        let layers = self.layers()?;
+        let layers = self.layers();
         let residuals: Vec<(Window, Vec<f32>)> = tiles
             .into_par_iter()
             .map_init(Pass::default, |pass, (x, y)| {
@@ -281,7 +277,7 @@ pub(crate) fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, u
 }
 
 /// Returns the shape of a layer's kernel: outputs × rows × columns × inputs.
-pub(crate) fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
+fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
     [outputs as i64, 3, 3, inputs as i64]
 }
 
@@ -312,12 +308,10 @@ mod tests {
 
     /// A network with no zero weights.
     fn random(architecture: RefinerArchitecture) -> Refiner {
-        let mut refiner = Refiner::new(architecture, 5).unwrap();
+        let mut refiner = Refiner::new(architecture, 5);
         let mut rng = CounterRng::new(5, 6, 7);
         for parameter in &mut refiner.parameters {
-            let values: Vec<f32> =
-                (0..parameter.numel()).map(|_| 0.2 * (rng.uniform() - 0.5)).collect();
-            *parameter = Tensor::from_slice(&values).reshape(parameter.size());
+            parameter.fill_with(|| 0.2 * (rng.uniform() - 0.5));
         }
         refiner
     }
@@ -339,7 +333,7 @@ mod tests {
             let mut input = Vec::new();
             around.fold(|x, y| input.extend_from_slice(around.pixel(&view, x, y)));
             let mut pass = Pass::default();
-            let output = pass.forward(&refiner.layers().unwrap(), around.folds(), &input);
+            let output = pass.forward(&refiner.layers(), around.folds(), &input);
             let mut added = Vec::new();
             output.copy_samples(OUTPUTS * FOLD * FOLD, &mut added);
             let refined = refiner.refine(&view).unwrap();
@@ -361,7 +355,7 @@ mod tests {
 
     fn added_to(refiner: &Refiner, view: &Image) -> Vec<f32> {
         let window = Window { x: 4, y: 4, size: (8, 8) };
-        let layers = refiner.layers().unwrap();
+        let layers = refiner.layers();
         let (architecture, mut pass) = (refiner.architecture, Pass::default());
         predict_residual(architecture, &layers, &mut pass, view, window, &Orientation::ALL[..1])
     }
@@ -372,7 +366,7 @@ mod tests {
     fn a_network_does_not_fall_silent() {
         nets::deterministic();
         let mut refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
-        refiner.parameters[1] = Tensor::from_slice(&[-10f32; 6]);
+        refiner.parameters[1] = vec![-10.0; 6];
         let (dark, view) = (Image::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), image(16, 16));
         let apart = added_to(&refiner, &dark)
             .iter()
@@ -440,13 +434,7 @@ mod tests {
         let refiner = random(architecture);
         refiner.write(&path).unwrap();
         let again = Refiner::read(&path, architecture).unwrap();
-        assert!(
-            refiner
-                .named_parameters()
-                .iter()
-                .zip(again.named_parameters())
-                .all(|((a, s), (b, t))| *a == b && *s == t)
-        );
+        assert_eq!(refiner.parameters, again.parameters);
         for other in [
             RefinerArchitecture { channels: 7, ..architecture },
             RefinerArchitecture { blocks: 2, ..architecture },

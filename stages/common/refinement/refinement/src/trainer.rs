@@ -1,16 +1,15 @@
 use std::ops::Range;
 use std::path::Path;
 
-use nets::Adam;
 use numerics::CounterRng;
 use pixels::{Image, psnr_of};
 use rayon::prelude::*;
-use tch::{TchError, Tensor};
 
+use crate::adam::Adam;
 use crate::error::RefinementError;
 use crate::folded::{FOLD, Orientation, Window};
 use crate::network::{Layers, Pass};
-use crate::refiner::{Refiner, RefinerArchitecture, kernel_shape, layers};
+use crate::refiner::{Refiner, RefinerArchitecture, layers};
 use crate::view::{KnownView, OUTPUTS, REFERENCE_INPUTS};
 use crate::warped_reference::{ReferenceStatistics, WarpOptions, with_references};
 
@@ -138,10 +137,10 @@ pub struct RefinerScores {
 
 impl RefinerTrainer {
     /// Creates a trainer of `refiner`.
-    pub fn new(refiner: Refiner, options: RefinerTraining) -> Result<Self, RefinementError> {
-        let adam = Adam::new(refiner.parameters())?;
+    pub fn new(refiner: Refiner, options: RefinerTraining) -> Self {
+        let adam = Adam::new(&refiner);
         let shards = (0..SHARDS).map(|_| Shard::default()).collect();
-        Ok(Self { refiner, options, adam, pool: None, shards })
+        Self { refiner, options, adam, pool: None, shards }
     }
 
     /// Returns the refiner in its current state.
@@ -257,30 +256,31 @@ impl Training for RefinerTrainer {
         self.update_pool(examples);
         let mut shards = std::mem::take(&mut self.shards);
         let views = self.views(examples);
-        let layers = self.refiner.layers()?;
+        let layers = self.refiner.layers();
         let architecture = self.refiner.architecture();
         shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let range = batch_size * i / SHARDS..batch_size * (i + 1) / SHARDS;
             shard.run(architecture, &layers, &options, step, range, &views);
         });
         let loss: f64 = shards.iter().map(|shard| shard.loss).sum();
-        let gradients = merge_gradients(&mut shards, architecture)?;
+        let gradients = merge_gradients(&mut shards, architecture);
         self.shards = shards;
-        if !loss.is_finite() || !nets::all_finite(&gradients)? {
+        if !loss.is_finite() || !gradients.iter().flatten().all(|g| g.is_finite()) {
             return Err(RefinementError::NotFinite { step });
         }
         let warm_up = ((step + 1) as f64 / WARM_UP_STEPS as f64).min(1.0);
         let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
-        self.adam.step(self.refiner.parameters(), &gradients, learning_rate * warm_up * cosine)?;
+        let rate = learning_rate * warm_up * cosine;
+        self.adam.step(&mut self.refiner, &gradients, rate);
         Ok(Some(loss))
     }
 
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
-        Ok(self.adam.write_checkpoint(path, self.refiner.named_parameters(), &[])?)
+        self.adam.write_checkpoint(&self.refiner, path)
     }
 
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
-        (self.adam, []) = Adam::resume(path, &self.refiner.named_parameters())?;
+        (self.refiner, self.adam) = Adam::resume(path, &self.refiner)?;
         Ok(())
     }
 }
@@ -343,28 +343,18 @@ fn residual_samples(options: &RefinerTraining) -> usize {
 }
 
 /// Adds the shards' gradients in order, and returns those of the parameters.
-fn merge_gradients(
-    shards: &mut [Shard],
-    architecture: RefinerArchitecture,
-) -> Result<Vec<Tensor>, TchError> {
-    let [first, others @ ..] = shards else { return Ok(Vec::new()) };
+fn merge_gradients(shards: &mut [Shard], architecture: RefinerArchitecture) -> Vec<Vec<f32>> {
+    let [first, others @ ..] = shards else { return Vec::new() };
     let layers = layers(architecture);
     let sums = first.pass.gradients.par_iter_mut().enumerate();
-    let gradients: Vec<(Vec<f32>, Vec<f32>)> = sums
-        .map(|(i, sum)| {
-            for other in &*others {
-                sum.add(&other.pass.gradients[i]);
-            }
-            let (_, inputs, outputs) = layers[i];
-            (sum.kernels(inputs, outputs), sum.bias(outputs).to_vec())
-        })
-        .collect();
-    let mut tensors = Vec::with_capacity(2 * layers.len());
-    for ((kernels, bias), (_, inputs, outputs)) in gradients.iter().zip(&layers) {
-        tensors.push(Tensor::f_from_slice(kernels)?.f_reshape(kernel_shape(*inputs, *outputs))?);
-        tensors.push(Tensor::f_from_slice(bias)?);
-    }
-    Ok(tensors)
+    let gradients = sums.map(|(i, sum)| {
+        for other in &*others {
+            sum.add(&other.pass.gradients[i]);
+        }
+        let (_, inputs, outputs) = layers[i];
+        [sum.kernels(inputs, outputs), sum.bias(outputs)]
+    });
+    gradients.collect::<Vec<_>>().into_iter().flatten().collect()
 }
 
 /// Input view of the network with its ground truth.
@@ -530,9 +520,8 @@ mod tests {
             learning_rate: 5e-3,
             seed: 3,
         };
-        let refiner =
-            Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance }, 3).unwrap();
-        let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
+        let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance }, 3);
+        let mut trainer = RefinerTrainer::new(refiner, options);
         let examples: Vec<KnownView> = (0..4).map(example).collect();
         while trainer.step(&examples).unwrap().is_some() {}
         (trainer, examples)
