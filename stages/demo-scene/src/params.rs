@@ -38,6 +38,8 @@ pub struct Params {
     pub layout: Layout,
     /// Adds an unbounded background: ground, distant towers, and sky.
     pub backdrop: bool,
+    /// Replaces the objects by random ones, as a prior for refinement is trained on.
+    pub generated: bool,
     /// Format of the data set.
     pub form: Form,
     /// Seed of the objects' positions and textures.
@@ -94,6 +96,7 @@ impl Default for Params {
             angle: None,
             layout: Layout::Around,
             backdrop: false,
+            generated: false,
             form: Form::Blender,
             seed: 0,
         }

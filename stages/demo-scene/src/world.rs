@@ -2,11 +2,12 @@ use std::f64::consts::TAU;
 
 use glam::{DMat3, DVec3};
 
+use crate::generated::SceneDraws;
 use crate::material::Material;
 
 /// Shape in its own space.
 #[derive(Clone, Copy, Debug)]
-enum Shape {
+pub(crate) enum Shape {
     /// Ball: radius.
     Ball(f64),
     /// Box: half sides.
@@ -19,12 +20,12 @@ enum Shape {
 
 /// Shape with a pose and a material.
 #[derive(Clone, Copy, Debug)]
-struct Object {
-    shape: Shape,
-    centre: DVec3,
+pub(crate) struct Object {
+    pub(crate) shape: Shape,
+    pub(crate) centre: DVec3,
     /// Rotation from world axes to the object's own axes.
-    to_local: DMat3,
-    material: Material,
+    pub(crate) to_local: DMat3,
+    pub(crate) material: Material,
 }
 
 impl Object {
@@ -106,6 +107,13 @@ impl World {
         ];
         clusters.extend(spring(foot(3, 0.60)));
         clusters.push(sign(foot(4, 0.66)));
+        Self { clusters, seed, has_sky: false }
+    }
+
+    /// Creates a scene of random objects, for training networks.
+    pub fn generated(seed: u32) -> Self {
+        let groups = SceneDraws::new(seed).groups();
+        let clusters = groups.into_iter().map(Cluster::new).collect();
         Self { clusters, seed, has_sky: false }
     }
 

@@ -1,4 +1,4 @@
-use artifact::Failure;
+use artifact::{Failure, FailureExt as _, GivenInput};
 use pixels::psnr_of;
 use refinement::{
     Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer,
@@ -29,12 +29,11 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         )
         .into());
     }
-    let architecture = RefinerArchitecture {
-        channels: net.features,
-        blocks: net.blocks,
-        guidance: (net.references_per_view > 0)
-            .then_some(WarpOptions { occlusion: net.occlusion, alignment: net.alignment }),
+    let refiner = match context.optional_input("prior") {
+        Some(prior) => read_prior(prior, net)?,
+        None => Refiner::new(architecture(net), seed),
     };
+    let architecture = refiner.architecture();
     let options = RefinerTraining {
         steps: net.steps,
         batch_size: net.batch_size as usize,
@@ -43,7 +42,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         learning_rate: net.learning_rate,
         seed,
     };
-    let mut trainer = RefinerTrainer::new(Refiner::new(architecture, seed), options);
+    let mut trainer = RefinerTrainer::new(refiner, options);
     train(context, options.steps, &mut trainer, &examples.training, |error| {
         format!("PSNR of training patches {:.2} dB", psnr_of(error))
     })?;
@@ -59,4 +58,30 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     };
     context.write_json(REFINER_FILE, &file)?;
     report_gain(context, "views left out of training", &file)
+}
+
+/// Returns the size and inputs of a network that the parameters describe.
+fn architecture(net: &CompactParams) -> RefinerArchitecture {
+    RefinerArchitecture {
+        channels: net.features,
+        blocks: net.blocks,
+        guidance: (net.references_per_view > 0)
+            .then_some(WarpOptions { occlusion: net.occlusion, alignment: net.alignment }),
+    }
+}
+
+/// Reads the network that training starts from.
+fn read_prior(prior: &GivenInput, net: &CompactParams) -> Result<Refiner, Failure> {
+    let file: RefinerFile = prior.read_json(REFINER_FILE)?;
+    let guidance = architecture(net).guidance;
+    match file.network {
+        Network::Compact(architecture) if architecture.guidance == guidance => {
+            Refiner::read(&prior.path(WEIGHTS_FILE), architecture).bad_input("input prior")
+        }
+        _ => Err(Failure::BadInput(
+            "input prior: a network of other inputs; give one that was trained with the same \
+            net and references_per_view"
+                .to_owned(),
+        )),
+    }
 }

@@ -63,6 +63,14 @@ impl Stage for TrainRefine {
                 ),
             ),
             (
+                "prior",
+                Input::optional(
+                    &["refiner"],
+                    "net: compact: network that training starts from; its size replaces features \
+                    and blocks",
+                ),
+            ),
+            (
                 "weights",
                 Input::optional(
                     &["weights"],

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use nets::Weights;
-use tch::{TchError, Tensor};
+use tch::Tensor;
 
 use crate::error::RefinementError;
 use crate::refiner::Refiner;
