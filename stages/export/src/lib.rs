@@ -42,6 +42,7 @@ use scene::{Bounds, Camera, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Stage};
+use workload::ExportViews;
 
 use cameras::CameraFormat;
 use coordinates::Coordinates;
@@ -54,14 +55,6 @@ use surfel::Surfel;
 /// Name of the summary in the artifact.
 pub const EXPORT_FILE: &str = "export.json";
 
-/// Maximum number of pixels of all rendered views together, unless `size` is given; chosen by hand.
-const MAX_PIXELS: f64 = 16e6;
-/// Maximum size of the rendered views relative to the cameras: a supersampled field has more detail
-/// than the cameras' pixels (design note 043).
-const MAX_SCALE: f64 = 2.0;
-
-/// Number of bytes per node of the lattice: a signed distance.
-const BYTES_PER_NODE: u64 = size_of::<f32>() as u64;
 /// Remedy for short memory, as a sentence fragment.
 const REMEDY: &str = "choose a smaller resolution or size, or end other programs";
 
@@ -211,11 +204,7 @@ fn summary_text(summary: &ExportSummary) -> String {
 
 /// Resizes cameras to `width`, or to the default size at which the field is rendered.
 fn resize_cameras(cameras: &[Camera], width: Option<u32>) -> Vec<Camera> {
-    let pixels: f64 = cameras
-        .iter()
-        .map(|c| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height))
-        .sum();
-    let default_scale = (MAX_PIXELS / pixels).sqrt().min(MAX_SCALE);
+    let default_scale = ExportViews::default_scale(cameras.iter().map(pixel_count).sum());
     let mut resized = Vec::with_capacity(cameras.len());
     for camera in cameras {
         let k = &camera.intrinsics;
@@ -249,12 +238,10 @@ fn render_views(
     Ok(views)
 }
 
-/// Returns the peak memory of an export in bytes: all pixels, and the larger of the merged samples
-/// and the mesh's lattice.
+/// Returns the peak memory of an export in bytes.
 fn memory_need(cameras: &[Camera], lattice: Option<&Lattice>) -> u64 {
-    let pixels: u64 = cameras.iter().map(pixel_count).sum();
-    let values = lattice.map_or(0, |lattice| BYTES_PER_NODE * lattice.len() as u64);
-    SurfaceView::BYTES_PER_PIXEL * pixels + values.max(surfel::BYTES_PER_PIXEL * pixels)
+    let views = ExportViews { pixels: cameras.iter().map(pixel_count).sum() };
+    views.bytes(lattice.map_or(0, |lattice| lattice.len() as u64))
 }
 
 /// Inputs and rendered views of an export.

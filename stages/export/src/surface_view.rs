@@ -50,6 +50,9 @@ pub(crate) struct SurfacePixel {
     pub(crate) margin: u8,
 }
 
+// Estimates before a run rely on this size.
+const _: () = assert!(size_of::<SurfacePixel>() as u64 == workload::SURFACE_PIXEL_BYTES);
+
 /// State of a world point in one view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum PointState {
@@ -69,9 +72,6 @@ pub(crate) enum PointState {
 }
 
 impl SurfaceView {
-    /// Number of bytes per pixel.
-    pub(crate) const BYTES_PER_PIXEL: u64 = size_of::<SurfacePixel>() as u64;
-
     /// Renders one ray per pixel of a camera without its lens distortion. The view is in the frame
     /// of the exported files, whose origin in the world is `offset`.
     pub(crate) fn render(

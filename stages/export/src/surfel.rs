@@ -23,9 +23,8 @@ pub(crate) struct Surfel {
 
 /// Surface pixel: cell of its point, then indices of view and pixel, which make the order unique.
 type Sample = ([u32; 3], u32, u32);
-/// Maximum number of bytes per pixel that [`merge`] needs: two copies of each sample exist while
-/// samples are collected.
-pub(crate) const BYTES_PER_PIXEL: u64 = 2 * size_of::<Sample>() as u64;
+// Estimates before a run rely on this size.
+const _: () = assert!(size_of::<Sample>() as u64 == workload::SURFEL_SAMPLE_BYTES);
 
 /// Merges the surface pixels of all views into one surfel per cell of a grid over the field's unit
 /// cube. Cells are half as wide as the median pixel, or wider to limit the number of surfels to

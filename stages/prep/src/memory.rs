@@ -4,15 +4,10 @@ use artifact::{Failure, FailureExt as _, format_size};
 use dataset::Frame;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use stage::{Context, MEMORY_REMEDY, available_memory};
+use workload::preparation_bytes;
 
 use crate::error::frame_label;
 use crate::image_plan::ImagePlan;
-
-/// Bytes per pixel of a photograph while it is resized: RGBA, premultiplied RGBA, and RGBA resized
-/// along one axis.
-const PHOTOGRAPH_BYTES: u64 = 12;
-/// Bytes per pixel of the HR image: RGBA, and its encoded file.
-const HR_BYTES: u64 = 8;
 
 /// Peak memory of preparing one view.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -28,7 +23,7 @@ impl MemoryNeed {
         let size = (frame.stored_intrinsics.width, frame.stored_intrinsics.height);
         let hr_size = images.sizes_of(&frame.intrinsics()).hr;
         let hr_pixels = if images.has_truth { pixel_count(hr_size) } else { 0 };
-        let bytes = reading.max(PHOTOGRAPH_BYTES * pixel_count(size) + HR_BYTES * hr_pixels);
+        let bytes = preparation_bytes(reading, pixel_count(size), hr_pixels);
         Ok(Self { bytes, frame: frame_label(frame), size })
     }
 

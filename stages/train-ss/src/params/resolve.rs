@@ -1,6 +1,7 @@
-use radiance::Architecture;
+use radiance::{Architecture, GivenSizes};
 use scene::{Background, Space};
 use torch_field::MlpArchitecture;
+use workload::RayBudget;
 
 use super::{
     Combine, FieldParams, GridParams, MlpParams, Order, Params, Resolved, ResolvedField,
@@ -22,14 +23,6 @@ const DISTORTION_IN_CONTRACTION: f64 = 0.002;
 const FLOATER_LOSS: f64 = 0.001;
 /// Ratio of the draw rates of detailed and flat pixels with `order: random` (design note 010).
 const PIXEL_IMPORTANCE: f64 = 10.0;
-/// Rays per LR pixel of an opaque scene, whose rays all hit a surface, over those of other scenes.
-/// The protocols for photographs and for objects (`experiments/common.yaml`) have this ratio.
-const OPAQUE_RAYS: f64 = 0.6;
-/// Rays of a fine-tuning over those of the initial field (`experiments/common.yaml`).
-const FINE_TUNING_RAYS: f64 = 0.5;
-/// Cells of the finest level per LR pixel across the field (design note 006).
-const CELLS_PER_PIXEL: f64 = 2.56;
-
 /// Error returned for parameters that contradict each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ParamsError {
@@ -107,19 +100,21 @@ struct Sampling {
 }
 
 impl GridParams {
-    /// Returns the number of rays that follows from the scene's LR pixels.
-    fn rays_of_scene(&self, scene: &SceneFacts) -> u64 {
-        let opaque = if scene.background == Background::Opaque { OPAQUE_RAYS } else { 1.0 };
-        let rays = opaque * self.rays_per_pixel * scene.lr_pixels as f64;
-        let rays = rays.max(self.min_rays as f64).min(self.max_rays as f64);
-        let part = if scene.is_fine_tuning { FINE_TUNING_RAYS } else { 1.0 };
-        (part * rays).round().max(1.0) as u64
+    fn total_rays(&self, scene: &SceneFacts) -> u64 {
+        let budget = RayBudget {
+            rays: self.rays,
+            rays_per_pixel: self.rays_per_pixel,
+            min_rays: self.min_rays,
+            max_rays: self.max_rays,
+        };
+        let is_opaque = scene.background == Background::Opaque;
+        budget.total(scene.lr_pixels, is_opaque, scene.is_fine_tuning)
     }
 
     fn sampling(&self, scene: &SceneFacts) -> Sampling {
         let importance = if self.order == Order::Random { PIXEL_IMPORTANCE } else { 1.0 };
         Sampling {
-            rays: self.rays.unwrap_or_else(|| self.rays_of_scene(scene)),
+            rays: self.total_rays(scene),
             max_rays_per_step: self.max_rays_per_step,
             order: self.order,
             pixel_importance: self.pixel_importance.unwrap_or(importance),
@@ -129,27 +124,16 @@ impl GridParams {
     }
 
     fn architecture(&self, scene: &SceneFacts) -> Architecture {
-        // Both ranges are chosen by hand.
-        let by_width = (CELLS_PER_PIXEL * scene.pixels_across).round().clamp(64.0, 2048.0) as u32;
-        let finest = self.max_resolution.unwrap_or(by_width.max(self.base_resolution));
-        // The number of cells at surfaces grows with the square of the resolution.
-        let by_finest =
-            (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
-        let steps = self.march_steps.unwrap_or(if scene.is_ndc() { 256 } else { 512 });
-        let mut finest_z = Architecture::default().finest_z;
-        if scene.is_ndc() {
-            // Samples along z across the cube: more cells would get none (design note 027).
-            finest_z = finest_z.min((f64::from(steps) / 3.0f64.sqrt()).round() as u32);
-        }
-        Architecture {
+        let given = GivenSizes {
             n_levels: self.n_levels,
             base_resolution: self.base_resolution,
-            max_resolution: finest,
-            finest_z: self.finest_z.unwrap_or(finest_z),
-            log2_hashmap_size: self.log2_hashmap_size.unwrap_or(by_finest),
+            max_resolution: self.max_resolution,
+            finest_z: self.finest_z,
+            log2_hashmap_size: self.log2_hashmap_size,
             hidden_dim: self.hidden_dim,
-            march_steps: steps,
-        }
+            march_steps: self.march_steps,
+        };
+        given.for_scene(scene.pixels_across, scene.is_ndc())
     }
 
     fn regularisers(&self, scene: &SceneFacts) -> ResolvedRegularisers {
@@ -336,36 +320,27 @@ mod tests {
         }
     }
 
-    /// Rays follow from LR pixels within their limits, unless they are given.
+    /// Rays follow from LR pixels, unless they are given.
     #[test]
     fn rays_follow_from_the_pixels() {
-        let grid = |rays, rays_per_pixel| Params {
-            field: FieldParams::Grid(GridParams {
-                rays,
-                rays_per_pixel,
-                min_rays: 100,
-                max_rays: 1000,
-                ..GridParams::default()
-            }),
-            ..Params::default()
-        };
         // 25 LR pixels.
         let white = facts(Space::Box, Background::White);
         let opaque = facts(Space::Box, Background::Opaque);
         let fine_tuning = SceneFacts { is_fine_tuning: true, ..white };
-        for (rays, rays_per_pixel, scene, expected) in [
-            (None, 20.0, white, 500),
-            (None, 4.5, white, 113),
-            (None, 20.0, opaque, 300),
-            (None, 20.0, fine_tuning, 250),
-            (None, 0.5, white, 100),
-            (None, 0.5, fine_tuning, 50),
-            (None, 60.0, white, 1000),
-            (None, 60.0, fine_tuning, 500),
-            (Some(7), 20.0, white, 7),
-            (Some(7000), 20.0, fine_tuning, 7000),
+        for (rays, scene, expected) in [
+            (None, white, 500),
+            (None, opaque, 300),
+            (None, fine_tuning, 250),
+            (Some(7000), fine_tuning, 7000),
         ] {
-            let params = grid(rays, rays_per_pixel);
+            let grid = GridParams {
+                rays,
+                rays_per_pixel: 20.0,
+                min_rays: 100,
+                max_rays: 1000,
+                ..GridParams::default()
+            };
+            let params = Params { field: FieldParams::Grid(grid), ..Params::default() };
             assert_eq!(value(&params, &scene, "rays"), json!(expected), "{params:?}");
             assert_eq!(params.resolve(&scene).rays, expected);
         }

@@ -7,7 +7,7 @@ use scene::{Background, Views};
 use stage::available_memory;
 
 use super::Supersampling;
-use super::memory::MemoryNeed;
+use super::memory::{memory_text, pixel_memory, training_memory};
 use super::options::SupersamplingOptions;
 use crate::params::{Resolved, Supervision};
 use crate::photographs::{NO_SPACE, PackedPhotograph, Photographs, check_references};
@@ -54,9 +54,9 @@ pub fn supervision(
     }
     let kernel = kernel(input, params, views.background)?;
     let options = SupersamplingOptions { params: params.clone(), filter: kernel.filter() };
-    let need = MemoryNeed::of(&options, &views, &reference_views, has_checkpoints);
-    let mut memory = need.plan(available_memory()?, folder.to_path_buf())?;
-    log(need.describe(memory.left()));
+    let need = training_memory(&options, &views, &reference_views, has_checkpoints);
+    let mut memory = pixel_memory(&need, available_memory()?, folder.to_path_buf())?;
+    log(memory_text(&need, memory.left()));
     let photographs = Photographs::read(input, usize::MAX, &mut memory)?;
     if !photographs.images.iter().any(PackedPhotograph::has_valid_pixels) {
         let message = "scene: masks exclude every pixel of every photograph; white pixels count";

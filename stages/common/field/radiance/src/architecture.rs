@@ -72,6 +72,61 @@ impl Architecture {
     }
 }
 
+/// Sizes of a grid field as given by a user; a scene decides the others. Deserialised from the
+/// parameters of `train-ss`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+pub struct GivenSizes {
+    /// Number of grid levels.
+    pub n_levels: u32,
+    /// Cells along an axis of the coarsest level.
+    pub base_resolution: u32,
+    /// Cells along an axis of the finest level.
+    pub max_resolution: Option<u32>,
+    /// Maximum number of cells along z, of any level.
+    pub finest_z: Option<u32>,
+    /// Base-2 logarithm of the maximum number of entries per level.
+    pub log2_hashmap_size: Option<u32>,
+    /// Width of the hidden layers.
+    pub hidden_dim: u32,
+    /// Number of samples along the diagonal of the unit cube.
+    pub march_steps: Option<u32>,
+}
+
+/// Cells of the finest level per LR pixel across the field (design note 006).
+const CELLS_PER_PIXEL: f64 = 2.56;
+/// Range of the finest level's cells along an axis by this rule; chosen by hand.
+const MAX_RESOLUTION_RANGE: (f64, f64) = (64.0, 2048.0);
+/// Range of the base-2 logarithm of a level's entries by rule; chosen by hand.
+const LOG2_HASHMAP_RANGE: (f64, f64) = (14.0, 20.0);
+
+impl GivenSizes {
+    /// Sets every size for a scene with `pixels_across` LR pixels across the field's cube.
+    pub fn for_scene(&self, pixels_across: f64, is_ndc: bool) -> Architecture {
+        let (low, high) = MAX_RESOLUTION_RANGE;
+        let by_width = (CELLS_PER_PIXEL * pixels_across).round().clamp(low, high) as u32;
+        let finest = self.max_resolution.unwrap_or(by_width.max(self.base_resolution));
+        // The number of cells at surfaces grows with the square of the resolution.
+        let (low, high) = LOG2_HASHMAP_RANGE;
+        let by_finest =
+            (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(low, high) as u32;
+        let steps = self.march_steps.unwrap_or(if is_ndc { 256 } else { 512 });
+        let mut finest_z = Architecture::default().finest_z;
+        if is_ndc {
+            // Samples along z across the cube: more cells would get none (design note 027).
+            finest_z = finest_z.min((f64::from(steps) / 3.0f64.sqrt()).round() as u32);
+        }
+        Architecture {
+            n_levels: self.n_levels,
+            base_resolution: self.base_resolution,
+            max_resolution: finest,
+            finest_z: self.finest_z.unwrap_or(finest_z),
+            log2_hashmap_size: self.log2_hashmap_size.unwrap_or(by_finest),
+            hidden_dim: self.hidden_dim,
+            march_steps: steps,
+        }
+    }
+}
+
 /// Error returned when a number is out of range.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{name} = {value} is not in {low}..={high}")]

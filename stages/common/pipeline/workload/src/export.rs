@@ -1,0 +1,35 @@
+/// Maximum number of pixels of all rendered views together, unless their width is given; chosen by
+/// hand.
+const MAX_PIXELS: f64 = 16e6;
+/// Maximum size of the rendered views relative to the cameras: a supersampled field has more detail
+/// than the cameras' pixels (design note 043).
+const MAX_SCALE: f64 = 2.0;
+/// Bytes per node of the mesh's lattice: a signed distance.
+const BYTES_PER_NODE: u64 = size_of::<f32>() as u64;
+/// Bytes of a rendered pixel.
+pub const SURFACE_PIXEL_BYTES: u64 = 24;
+/// Bytes of a sample that is merged to a surfel.
+pub const SURFEL_SAMPLE_BYTES: u64 = 20;
+
+/// Views from which `export` derives surfaces.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ExportViews {
+    /// Number of pixels of all views.
+    pub pixels: u64,
+}
+
+impl ExportViews {
+    /// Returns the size of rendered views without a given width, relative to cameras with
+    /// `camera_pixels` in all.
+    pub fn default_scale(camera_pixels: u64) -> f64 {
+        (MAX_PIXELS / camera_pixels as f64).sqrt().min(MAX_SCALE)
+    }
+
+    /// Returns the peak memory: all pixels, and the larger of the merged samples and the lattice of
+    /// a mesh.
+    pub fn bytes(&self, lattice_nodes: u64) -> u64 {
+        // Two copies of each sample exist while samples are collected.
+        let merged = 2 * SURFEL_SAMPLE_BYTES * self.pixels;
+        SURFACE_PIXEL_BYTES * self.pixels + merged.max(BYTES_PER_NODE * lattice_nodes)
+    }
+}

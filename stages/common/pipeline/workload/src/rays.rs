@@ -1,0 +1,81 @@
+use serde::Deserialize;
+
+/// Rays per LR pixel of an opaque scene, whose rays all hit a surface, over those of other scenes.
+/// The protocols for photographs and for objects (`experiments/common.yaml`) have this ratio.
+const OPAQUE_RAYS: f64 = 0.6;
+/// Rays of a fine-tuning over those of the initial field (`experiments/common.yaml`).
+const FINE_TUNING_RAYS: f64 = 0.5;
+
+/// Parameters from which the rays of a training follow. Deserialised from the parameters of
+/// `train-ss`.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+pub struct RayBudget {
+    /// Given number of rays, which overrides the other fields.
+    pub rays: Option<u64>,
+    /// Rays for each LR pixel of all views.
+    pub rays_per_pixel: f64,
+    /// Minimum number of rays.
+    pub min_rays: u64,
+    /// Maximum number of rays, even below the minimum.
+    pub max_rays: u64,
+}
+
+impl RayBudget {
+    /// Returns the number of rays of a training on views with `lr_pixels` in all.
+    ///
+    /// ```
+    /// let budget =
+    ///     workload::RayBudget { rays: None, rays_per_pixel: 10.0, min_rays: 50, max_rays: 900 };
+    /// assert_eq!(budget.total(30, false, false), 300);
+    /// assert_eq!(budget.total(30, true, true), 90);
+    /// ```
+    pub fn total(&self, lr_pixels: u64, is_opaque: bool, is_fine_tuning: bool) -> u64 {
+        if let Some(rays) = self.rays {
+            return rays;
+        }
+        let opaque = if is_opaque { OPAQUE_RAYS } else { 1.0 };
+        let rays = opaque * self.rays_per_pixel * lr_pixels as f64;
+        let rays = rays.max(self.min_rays as f64).min(self.max_rays as f64);
+        let part = if is_fine_tuning { FINE_TUNING_RAYS } else { 1.0 };
+        (part * rays).round().max(1.0) as u64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    /// Rays follow from LR pixels within their limits, unless they are given.
+    #[test]
+    fn rays_follow_from_the_pixels() {
+        for (rays, rays_per_pixel, is_opaque, is_fine_tuning, expected) in [
+            (None, 20.0, false, false, 500),
+            (None, 4.5, false, false, 113),
+            (None, 20.0, true, false, 300),
+            (None, 20.0, false, true, 250),
+            (None, 0.5, false, false, 100),
+            (None, 0.5, false, true, 50),
+            (None, 60.0, false, false, 1000),
+            (None, 60.0, false, true, 500),
+            (Some(7), 20.0, false, false, 7),
+            (Some(7000), 20.0, true, true, 7000),
+        ] {
+            let budget = RayBudget { rays, rays_per_pixel, min_rays: 100, max_rays: 1000 };
+            assert_eq!(budget.total(25, is_opaque, is_fine_tuning), expected, "{budget:?}");
+        }
+        let nothing = RayBudget { rays: None, rays_per_pixel: 0.1, min_rays: 0, max_rays: 9 };
+        assert_eq!(nothing.total(0, false, false), 1);
+    }
+
+    /// Other parameters of the stage are ignored.
+    #[test]
+    fn a_budget_is_read_from_a_stages_parameters() {
+        let parameters =
+            json!({"rays": null, "rays_per_pixel": 2, "min_rays": 3, "max_rays": 4, "seed": 1});
+        let expected = RayBudget { rays: None, rays_per_pixel: 2.0, min_rays: 3, max_rays: 4 };
+        assert_eq!(serde_json::from_value::<RayBudget>(parameters).unwrap(), expected);
+        assert!(serde_json::from_value::<RayBudget>(json!({"rays": null})).is_err());
+    }
+}

@@ -1,0 +1,133 @@
+/// Peak memory of a training, in bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TrainingMemory {
+    /// Field, optimiser state, and the copy that a checkpoint is written from.
+    pub field: u64,
+    /// Packed photographs and cached HR pixels, in memory or in the pixel file.
+    pub pixels: u64,
+    /// Photographs in the form that pose refinement compares.
+    pub poses: u64,
+    /// Buffers for reading the largest photograph, which are freed before the field is created.
+    pub reading: u64,
+}
+
+/// Width and height in pixels.
+pub type ImageSize = (u64, u64);
+
+/// Form in which a training stores pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PixelStorage {
+    /// True if photographs have no alpha.
+    pub is_opaque: bool,
+    /// True if the HR pixels of LR photographs are cached.
+    pub has_cache: bool,
+    /// True if poses are refined.
+    pub refines_poses: bool,
+}
+
+/// Maximum bytes of pixels in memory, so that a stage with many photographs leaves memory to other
+/// programs (design note 038).
+const MAX_PIXEL_BYTES: u64 = 4_000_000_000;
+/// Floats per parameter of the grid: value, gradient, two moments, moving average.
+const FLOATS_PER_PARAMETER: u64 = 5;
+/// Floats per parameter that a checkpoint copies: all but the gradient.
+const COPIED_FLOATS_PER_PARAMETER: u64 = 4;
+/// Bytes per RGBA pixel of a photograph in floats.
+const BYTES_PER_RGBA_PIXEL: u64 = 16;
+/// Bytes per RGB pixel of a photograph in floats.
+const BYTES_PER_RGB_PIXEL: u64 = 12;
+/// Bytes per pixel of a photograph's pyramid (RGB floats, 1 + 1/4 + 1/16 + …) and of the photograph
+/// for the final comparison of poses.
+const BYTES_PER_PYRAMID_PIXEL: u64 = 16 + BYTES_PER_RGB_PIXEL;
+
+impl TrainingMemory {
+    /// Maximum bytes of pixels in memory; further pixels are in a file.
+    pub const MAX_PIXEL_BYTES: u64 = MAX_PIXEL_BYTES;
+
+    /// Adds an LR photograph, with the size of its HR image.
+    pub fn add_photograph(&mut self, storage: PixelStorage, size: ImageSize, hr_size: ImageSize) {
+        let cached = if storage.has_cache { hr_size.0 * hr_size.1 } else { 0 };
+        // Enlarged along one axis, then along both, in floats and in 8 bits.
+        let enlarged = if storage.has_cache {
+            BYTES_PER_RGB_PIXEL * hr_size.0 * size.1 + (BYTES_PER_RGB_PIXEL + 3) * cached
+        } else {
+            0
+        };
+        self.pixels += 3 * cached;
+        self.add(storage, size, enlarged);
+    }
+
+    /// Adds an HR reference.
+    pub fn add_reference(&mut self, storage: PixelStorage, size: ImageSize) {
+        self.add(storage, size, 0);
+    }
+
+    fn add(&mut self, storage: PixelStorage, (width, height): ImageSize, enlarged: u64) {
+        let pixels = width * height;
+        let packed = if storage.is_opaque { 3 } else { 4 };
+        // One bit per pixel for the mask and one for its detail.
+        self.pixels += packed * pixels + pixels / 4;
+        let reading = (BYTES_PER_RGBA_PIXEL + BYTES_PER_RGB_PIXEL) * pixels + enlarged;
+        self.reading = self.reading.max(reading);
+        if storage.refines_poses {
+            self.poses += BYTES_PER_PYRAMID_PIXEL * pixels;
+        }
+    }
+
+    /// Returns the need of a program of `program` bytes with all pixels in the file.
+    pub fn minimum(&self, program: u64) -> u64 {
+        program + self.poses + self.field.max(self.reading)
+    }
+
+    /// Returns the need of a program of `program` bytes with unlimited memory.
+    pub fn total(&self, program: u64) -> u64 {
+        self.minimum(program) + self.pixels.min(MAX_PIXEL_BYTES)
+    }
+}
+
+/// Returns the bytes of a training's program itself, with or without libtorch.
+pub const fn program_bytes(has_torch: bool) -> u64 {
+    if has_torch { 150_000_000 } else { 30_000_000 }
+}
+
+/// Returns the bytes of a grid of `floats` in training.
+pub fn grid_training_bytes(floats: u64, has_checkpoints: bool) -> u64 {
+    let copied = if has_checkpoints { COPIED_FLOATS_PER_PARAMETER } else { 0 };
+    4 * (FLOATS_PER_PARAMETER + copied) * floats
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Images of three megapixels: three bytes a pixel and two bits, and twelve more bytes if HR
+    /// pixels are cached.
+    #[test]
+    fn pixels_take_what_their_kernel_asks_for() {
+        for (has_cache, bytes) in [(false, 3), (true, 15)] {
+            for refines_poses in [false, true] {
+                let storage = PixelStorage { is_opaque: true, has_cache, refines_poses };
+                let mut memory = TrainingMemory::default();
+                for count in 1..=10 {
+                    memory.add_photograph(storage, (2000, 1500), (4000, 3000));
+                    assert_eq!(memory.pixels, count * (3_000_000 * bytes + 750_000));
+                    let poses = if refines_poses { 3_000_000 * BYTES_PER_PYRAMID_PIXEL } else { 0 };
+                    assert_eq!(memory.poses, count * poses);
+                }
+                let reading = memory.reading;
+                memory.add_reference(storage, (100, 10));
+                assert_eq!(memory.reading, reading, "the largest image counts");
+                assert_eq!(memory.pixels, 10 * (3_000_000 * bytes + 750_000) + 3250);
+            }
+        }
+    }
+
+    #[test]
+    fn the_larger_of_field_and_reading_counts() {
+        let memory = TrainingMemory { field: 7, pixels: 100, poses: 3, reading: 9 };
+        assert_eq!((memory.minimum(10), memory.total(10)), (22, 122));
+        let many = TrainingMemory { pixels: 2 * MAX_PIXEL_BYTES, ..memory };
+        assert_eq!(many.total(10), 22 + MAX_PIXEL_BYTES);
+        assert_eq!([false, true].map(|copied| grid_training_bytes(10, copied)), [200, 360]);
+    }
+}
