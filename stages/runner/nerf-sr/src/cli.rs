@@ -14,7 +14,7 @@ use slurm::{Memory, Site};
 use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
 use crate::run_messages::FailureHint;
 use crate::session::Session;
-use crate::verbs::{self, GcOutput, GraphFormat};
+use crate::verbs::{self, GcOutput, GraphFormat, Limits};
 use crate::watch::Watch;
 
 const DEFAULT_PIPELINE: &str = "pipeline.yaml";
@@ -170,13 +170,17 @@ enum Verb {
         #[arg(long)]
         json: bool,
     },
-    /// Describe the scenes, estimate the time of each quality, and print the command that fits
+    /// Describe the scenes, estimate time and memory of each quality, and print the command that
+    /// fits
     Advise {
         #[command(flatten)]
         plan: PlanArgs,
         /// Time that the run may take; the best quality within it is chosen [default: balanced]
         #[arg(long, value_name = "N")]
         minutes: Option<f64>,
+        /// Memory that a stage may use, such as 8G; the best quality within it is chosen
+        #[arg(long, value_name = "AMOUNT")]
+        memory: Option<Memory>,
     },
     /// Explain why a stage is cached, would run, or waits
     Why {
@@ -305,9 +309,10 @@ pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
         Verb::Job { submission, number } => verbs::job(&submission, number),
         Verb::Init { folder } => verbs::init(&folder, &global.pipeline),
         Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json),
-        Verb::Advise { plan, minutes } => {
+        Verb::Advise { plan, minutes, memory } => {
             let arguments = global.arguments_of_log(&plan);
-            verbs::advise(&global.open_session()?, &plan.into(), minutes, &arguments)
+            let limits = Limits { minutes, memory };
+            verbs::advise(&global.open_session()?, &plan.into(), limits, &arguments)
         }
         Verb::Why { stage, plan, json } => {
             verbs::why(&global.open_session()?, &stage, &plan.into(), json)

@@ -9,6 +9,7 @@ use slurm::{Job, Queue, Slurm};
 use stage::check_device;
 use store::{RunFile, Store};
 
+use crate::estimates::Estimates;
 use crate::identities::node_identities;
 use crate::stage_inputs;
 
@@ -101,6 +102,8 @@ pub(crate) struct Run<'a> {
     pub(crate) file: &'a RunFile,
     /// Folder of pages.
     pub(crate) out: &'a Path,
+    /// Expected costs of the nodes, as far as known.
+    pub(crate) estimates: &'a Estimates,
     pub(crate) stop: &'a AtomicBool,
 }
 

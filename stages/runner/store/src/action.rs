@@ -42,12 +42,24 @@ pub struct Record {
     /// Processor time of all threads in seconds; missing in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub processor_seconds: Option<f64>,
+    /// Cost by the runner's model; missing for stages without a model.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub model: Option<ModelCost>,
     /// Name of the machine.
     pub host: String,
     /// Content of the artifact's `summary.txt`, so that displaying it doesn't read the artifact;
     /// missing in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub summary: Option<String>,
+}
+
+/// Cost of an action by the runner's model, without a correction for the machine.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct ModelCost {
+    /// Processor time of all threads in seconds.
+    pub processor_seconds: f64,
+    /// Peak resident memory of the process in bytes.
+    pub peak_memory: u64,
 }
 
 impl Record {

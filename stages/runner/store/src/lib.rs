@@ -47,7 +47,7 @@ mod runs;
 #[cfg(test)]
 mod testing;
 
-pub use action::{KEY_VERSION, KEY_VERSION_PART, Record, Unfinished};
+pub use action::{KEY_VERSION, KEY_VERSION_PART, ModelCost, Record, Unfinished};
 pub use arrivals::Arrival;
 pub use attempt::{Attempt, CheckedOutput};
 pub use error::{StoreError, is_lock_acquired};

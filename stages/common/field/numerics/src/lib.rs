@@ -4,6 +4,7 @@
 //!   counter (Salmon et al. 2011), so that threads draw them in any order.
 //! * [`kernel!`]: a function on sixteen logical lanes ([`simd::Lanes`]), compiled for AVX-512, AVX2
 //!   and the compilation target. The family is chosen at run time.
+//! * [`SpeedTest`]: a fixed piece of work, whose time compares machines.
 //!
 //! ```
 //! use numerics::{CounterRng, uniform};
@@ -14,5 +15,7 @@
 
 mod random;
 pub mod simd;
+mod speed;
 
 pub use random::{CounterRng, uniform};
+pub use speed::SpeedTest;

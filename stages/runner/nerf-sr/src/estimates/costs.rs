@@ -1,51 +1,20 @@
+//! Models of the stages' processor time and peak memory.
+
+use radiance::GivenSizes;
+use serde::Deserialize as _;
 use serde_json::Value;
+use store::ModelCost;
+use workload::{
+    ExportViews, PixelStorage, RayBudget, TrainingMemory, grid_training_bytes, program_bytes,
+};
 
-/// Kind of scene, on which the cost of a ray depends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum SceneKind {
-    /// Object before a background of one colour: most rays miss it.
-    Object,
-    /// Opaque scene in NDC.
-    Frustum,
-    /// Opaque scene all around the cameras.
-    Unbounded,
-}
-
-impl SceneKind {
-    /// Returns whether every ray hits a surface.
-    pub(crate) fn is_opaque(self) -> bool {
-        self != Self::Object
-    }
-}
-
-/// Number and total pixels of the images of a folder.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Images {
-    pub(crate) count: u64,
-    pub(crate) pixels: u64,
-}
-
-/// Properties of a stage's inputs, on which its time depends.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Work {
-    pub(crate) kind: SceneKind,
-    /// Images that the stage reads or renders.
-    pub(crate) images: Images,
-    /// Number of fields of the ensemble that is rendered.
-    pub(crate) fields: u64,
-    /// True if a training is initialised from a field.
-    pub(crate) is_fine_tuning: bool,
-}
+use super::work::{Images, SceneKind, Work};
 
 /// Seconds per training ray late in a training: lego 100×2, fern 252×2 and the demo scene with
 /// backdrop (docs/results/engine.md).
 const OBJECT_RAY_SECONDS: f64 = 12e-6;
 const FRUSTUM_RAY_SECONDS: f64 = 27e-6;
 const UNBOUNDED_RAY_SECONDS: f64 = 22e-6;
-/// Default of `march_steps` in NDC and in other spaces, and of `hidden_dim`, as in `train-ss`.
-const FRUSTUM_STEPS: f64 = 256.0;
-const OTHER_STEPS: f64 = 512.0;
-const HIDDEN_DIM: f64 = 64.0;
 /// Exponents by which a ray's cost grows with `march_steps` and `hidden_dim`: 0.58 and 0.68 of the
 /// time at half of either (docs/design/008).
 const STEPS_EXPONENT: f64 = 0.8;
@@ -55,66 +24,211 @@ const FIRST_STEPS_RAYS: f64 = 1.1e6;
 /// Seconds per training ray of the paper's field (docs/results/engine.md: 369 rays a second on two
 /// cores).
 const MLP_RAY_SECONDS: f64 = 5.4e-3;
+/// Minimum bytes of the paper's field, as in `train-ss`.
+const MLP_BYTES: u64 = 500_000_000;
 /// Seconds per rendered ray, and part of the pixels that get all rays at the default tolerance, of
 /// objects and opaque scenes (docs/results/engine.md).
 const OBJECT_RENDERED_RAY_SECONDS: f64 = 4.4e-6;
 const OPAQUE_RENDERED_RAY_SECONDS: f64 = 8e-6;
 const OBJECT_DETAILED_PIXELS: f64 = 0.31;
 const OPAQUE_DETAILED_PIXELS: f64 = 0.39;
-/// Seconds per pixel of `eval` without LPIPS: lego 100×2, 12 views.
-const SCORED_PIXEL_SECONDS: f64 = 2e-6;
+/// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
+const RENDERED_BYTES_PER_FLOAT: u64 = 7;
+/// Bytes of a program with libtorch, without data.
+const PROGRAM_BYTES: u64 = 130_000_000;
+/// Seconds per pixel of `eval` without and with LPIPS: lego 100×2, 12 views.
+const SCORED_PIXEL_SECONDS: f64 = 1.4e-6;
+const LPIPS_PIXEL_SECONDS: f64 = 2.2e-6;
+/// Bytes per pixel of a view that `eval` scores, without and with LPIPS.
+const SCORED_PIXEL_BYTES: u64 = 125;
+const LPIPS_PIXEL_BYTES: u64 = 580;
+/// Seconds per photograph's pixel of `prep`.
+const PREPARED_PIXEL_SECONDS: f64 = 30e-9;
+/// Bytes of `prep` without data.
+const PREP_BYTES: u64 = 9_000_000;
+/// Seconds per pixel of a training step's patches of `train-refine`, and per pixel of a version of a
+/// view of `refine` (docs/results/engine.md).
+const PATCH_PIXEL_SECONDS: f64 = 1.4e-6;
+const REFINED_PIXEL_SECONDS: f64 = 0.47e-6;
+/// Bytes per pixel of a network's training views, and of a view that is refined.
+const EXAMPLE_PIXEL_BYTES: u64 = 50;
+const REFINED_PIXEL_BYTES: u64 = 110;
 /// Seconds of a start of a stage; chosen by hand.
 const START_SECONDS: f64 = 0.3;
-/// Rays of an opaque scene and of a fine-tuning, as in `train-ss`.
-const OPAQUE_RAYS: f64 = 0.6;
-const FINE_TUNING_RAYS: f64 = 0.5;
 
-/// Returns the processor seconds of a stage, without a correction for the machine; `None` for
-/// stages without a model.
-pub(crate) fn processor_seconds(program: &str, parameters: &Value, work: &Work) -> Option<f64> {
-    let number = |name: &str| parameters[name].as_f64();
-    let pixels = work.images.pixels as f64;
-    let seconds = match program {
-        "train-ss" if parameters["field"] == "mlp" => number("rays")? * MLP_RAY_SECONDS,
-        "train-ss" => {
-            let fields = number("ensemble")?;
-            let first_steps = if work.is_fine_tuning { 0.0 } else { fields * FIRST_STEPS_RAYS };
-            let (ray, steps) = match work.kind {
-                SceneKind::Object => (OBJECT_RAY_SECONDS, OTHER_STEPS),
-                SceneKind::Frustum => (FRUSTUM_RAY_SECONDS, FRUSTUM_STEPS),
-                SceneKind::Unbounded => (UNBOUNDED_RAY_SECONDS, OTHER_STEPS),
-            };
-            let more_steps = number("march_steps").map_or(1.0, |given| given / steps);
-            let wider = number("hidden_dim").map_or(1.0, |given| given / HIDDEN_DIM);
-            let ray = ray * more_steps.powf(STEPS_EXPONENT) * wider.powf(HIDDEN_EXPONENT);
-            ray * (rays(parameters, work)? + first_steps)
-        }
-        "render-depth" => {
-            let (ray, detailed) = if work.kind.is_opaque() {
-                (OPAQUE_RENDERED_RAY_SECONDS, OPAQUE_DETAILED_PIXELS)
-            } else {
-                (OBJECT_RENDERED_RAY_SECONDS, OBJECT_DETAILED_PIXELS)
-            };
-            let detailed = if number("tolerance")? > 0.0 { detailed } else { 1.0 };
-            let further = number("samples_per_axis")?.powi(2) - 1.0;
-            work.fields as f64 * pixels * (1.0 + detailed * further) * ray
-        }
-        "eval" => pixels * SCORED_PIXEL_SECONDS,
+/// Returns the cost of a stage on the machine of these figures; `None` for stages without a model.
+pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Option<ModelCost> {
+    let (seconds, peak_memory) = match program {
+        "prep" => (work.images.pixels as f64 * PREPARED_PIXEL_SECONDS, prep_memory(work)),
+        "train-ss" => (training_seconds(parameters, work)?, training_memory(parameters, work)?),
+        "render-depth" => (rendering_seconds(parameters, work)?, rendering_memory(work)?),
+        "eval" => scoring(work),
+        "train-refine" => refiner_training(parameters, work)?,
+        "refine" => refinement(parameters, work)?,
+        "export" => export(parameters, work)?,
         _ => return None,
     };
-    Some(START_SECONDS + seconds)
+    let start = if program == "prep" { 0.0 } else { START_SECONDS };
+    Some(ModelCost { processor_seconds: start + seconds, peak_memory })
 }
 
-/// Returns the number of rays of a training: the given one, or that which follows from the pixels.
-fn rays(parameters: &Value, work: &Work) -> Option<f64> {
-    let number = |name: &str| parameters[name].as_f64();
-    if let Some(rays) = number("rays") {
-        return Some(rays);
+/// Returns the memory below which a stage fails. A training stores pixels in a file if there is no
+/// memory for them.
+pub(crate) fn min_memory(program: &str, parameters: &Value, work: &Work) -> Option<u64> {
+    match program {
+        "train-ss" => Some(training_need(parameters, work)?.minimum(program_bytes(true))),
+        _ => Some(model_cost(program, parameters, work)?.peak_memory),
     }
-    let opaque = if work.kind.is_opaque() { OPAQUE_RAYS } else { 1.0 };
-    let rays = opaque * number("rays_per_pixel")? * work.images.pixels as f64;
-    let rays = rays.max(number("min_rays")?).min(number("max_rays")?);
-    Some(if work.is_fine_tuning { FINE_TUNING_RAYS * rays } else { rays })
+}
+
+fn number(parameters: &Value, name: &str) -> Option<f64> {
+    parameters[name].as_f64()
+}
+
+/// Returns the bytes of data of the views that are processed at a time, one by each thread.
+fn concurrent_bytes(work: &Work, images: &Images, bytes_per_pixel: u64) -> u64 {
+    images.count.min(work.threads) * bytes_per_pixel * images.largest()
+}
+
+fn prep_memory(work: &Work) -> u64 {
+    PREP_BYTES + work.images.count.min(work.threads) * work.preparation_bytes
+}
+
+/// Returns the factor of a ray's cost over that of a field with the default sizes.
+fn field_factor(field: &Value, kind: SceneKind) -> Option<f64> {
+    let by_default = GivenSizes {
+        max_resolution: None,
+        finest_z: None,
+        log2_hashmap_size: None,
+        march_steps: None,
+        ..GivenSizes::deserialize(field).ok()?
+    };
+    let is_ndc = kind == SceneKind::Frustum;
+    let by_default = by_default.for_scene(1.0, is_ndc);
+    let own = GivenSizes::deserialize(field).ok()?.for_scene(1.0, is_ndc);
+    let steps = f64::from(own.march_steps) / f64::from(by_default.march_steps);
+    let hidden =
+        f64::from(own.hidden_dim) / f64::from(radiance::Architecture::default().hidden_dim);
+    Some(steps.powf(STEPS_EXPONENT) * hidden.powf(HIDDEN_EXPONENT))
+}
+
+fn training_seconds(parameters: &Value, work: &Work) -> Option<f64> {
+    if parameters["field"] == "mlp" {
+        return Some(number(parameters, "rays")? * MLP_RAY_SECONDS);
+    }
+    let budget = RayBudget::deserialize(parameters).ok()?;
+    let is_opaque = work.kind.is_opaque();
+    let rays = budget.total(work.images.pixels, is_opaque, work.is_fine_tuning) as f64;
+    let fields = number(parameters, "ensemble")?;
+    let first_steps = if work.is_fine_tuning { 0.0 } else { fields * FIRST_STEPS_RAYS };
+    let ray = match work.kind {
+        SceneKind::Object => OBJECT_RAY_SECONDS,
+        SceneKind::Frustum => FRUSTUM_RAY_SECONDS,
+        SceneKind::Unbounded => UNBOUNDED_RAY_SECONDS,
+    };
+    Some(ray * field_factor(parameters, work.kind)? * (rays + first_steps))
+}
+
+fn training_memory(parameters: &Value, work: &Work) -> Option<u64> {
+    Some(training_need(parameters, work)?.total(program_bytes(true)))
+}
+
+/// Returns the memory of a training as `train-ss` computes it, with the largest image for each.
+fn training_need(parameters: &Value, work: &Work) -> Option<TrainingMemory> {
+    let field = if parameters["field"] == "mlp" {
+        MLP_BYTES
+    } else {
+        // The runner gives every stage a folder for checkpoints.
+        grid_training_bytes(work.grid_floats(parameters)?, true)
+    };
+    let has_kernel = match parameters["supervision"].as_str() {
+        Some(supervision) => supervision == "kernel",
+        None => parameters["field"] != "mlp",
+    };
+    let supersample = number(parameters, "supersample")?;
+    let storage = PixelStorage {
+        is_opaque: work.kind.is_opaque(),
+        has_cache: has_kernel && !(work.has_box_kernel && supersample.fract() == 0.0),
+        refines_poses: parameters["pose_refinement"] == true,
+    };
+    let mut memory = TrainingMemory { field, ..TrainingMemory::default() };
+    let size = work.images.largest;
+    let hr_size = [size.0, size.1].map(|side| (side as f64 * supersample).round() as u64);
+    for _ in 0..work.images.count {
+        memory.add_photograph(storage, size, (hr_size[0], hr_size[1]));
+    }
+    for _ in 0..work.references.count {
+        memory.add_reference(storage, work.references.largest);
+    }
+    Some(memory)
+}
+
+fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
+    let (ray, detailed) = if work.kind.is_opaque() {
+        (OPAQUE_RENDERED_RAY_SECONDS, OPAQUE_DETAILED_PIXELS)
+    } else {
+        (OBJECT_RENDERED_RAY_SECONDS, OBJECT_DETAILED_PIXELS)
+    };
+    let field = work.field.as_ref()?;
+    if field["field"] == "mlp" {
+        return None;
+    }
+    let detailed = if number(parameters, "tolerance")? > 0.0 { detailed } else { 1.0 };
+    let further = number(parameters, "samples_per_axis")?.powi(2) - 1.0;
+    let rays = work.images.pixels as f64 * (1.0 + detailed * further);
+    Some(number(field, "ensemble")? * rays * ray * field_factor(field, work.kind)?)
+}
+
+fn rendering_memory(work: &Work) -> Option<u64> {
+    let field = work.field.as_ref()?;
+    let floats = number(field, "ensemble")? as u64 * work.grid_floats(field)?;
+    Some(PROGRAM_BYTES + RENDERED_BYTES_PER_FLOAT * floats)
+}
+
+fn scoring(work: &Work) -> (f64, u64) {
+    let (seconds, bytes) = if work.has_weights {
+        (LPIPS_PIXEL_SECONDS, LPIPS_PIXEL_BYTES)
+    } else {
+        (SCORED_PIXEL_SECONDS, SCORED_PIXEL_BYTES)
+    };
+    let memory = PROGRAM_BYTES + concurrent_bytes(work, &work.images, bytes);
+    (work.images.pixels as f64 * seconds, memory)
+}
+
+fn refiner_training(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
+    if parameters["net"] != "compact" {
+        return None;
+    }
+    let patch = number(parameters, "patch_size")?.powi(2) * number(parameters, "batch_size")?;
+    let seconds = number(parameters, "steps")? * patch * PATCH_PIXEL_SECONDS;
+    Some((seconds, PROGRAM_BYTES + EXAMPLE_PIXEL_BYTES * work.images.pixels))
+}
+
+fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
+    let versions = number(parameters, "self_ensemble")?;
+    let seconds = versions * work.images.pixels as f64 * REFINED_PIXEL_SECONDS;
+    Some((seconds, PROGRAM_BYTES + REFINED_PIXEL_BYTES * work.images.largest()))
+}
+
+/// Returns the cost of an export: the time of its rendering, and the memory as `export` computes
+/// it, with a lattice that is a cube.
+fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
+    let scale = match number(parameters, "size") {
+        Some(width) => width / work.images.largest.0.max(1) as f64,
+        None => ExportViews::default_scale(work.images.pixels),
+    };
+    let pixels = (work.images.pixels as f64 * scale.powi(2)) as u64;
+    let has_mesh = parameters["mesh"] == true;
+    let nodes = if has_mesh { (number(parameters, "resolution")? + 1.0).powi(3) } else { 0.0 };
+    let bytes = ExportViews { pixels }.bytes(nodes as u64);
+    let ray = if work.kind.is_opaque() {
+        OPAQUE_RENDERED_RAY_SECONDS
+    } else {
+        OBJECT_RENDERED_RAY_SECONDS
+    };
+    let field = work.field.as_ref()?;
+    let seconds = number(field, "ensemble")? * pixels as f64 * ray;
+    Some((seconds, rendering_memory(work)? + bytes))
 }
 
 #[cfg(test)]
@@ -123,58 +237,85 @@ mod tests {
 
     use super::*;
 
-    fn work(kind: SceneKind, pixels: u64) -> Work {
-        let images = Images { count: 1, pixels };
-        Work { kind, images, fields: 1, is_fine_tuning: false }
+    /// Returns square images, whose LR width is that of the field.
+    fn work(kind: SceneKind, count: u64, width: u64) -> Work {
+        let images = Images { count, pixels: count * width * width, largest: (width, width) };
+        Work {
+            kind,
+            pixels_across: width as f64,
+            has_box_kernel: false,
+            images,
+            references: Images::default(),
+            preparation_bytes: 0,
+            field: Some(training(1)),
+            is_fine_tuning: false,
+            has_weights: false,
+            threads: 2,
+        }
+    }
+
+    /// Returns the default parameters of a training.
+    fn training(rays: u64) -> Value {
+        json!({
+            "field": "grid", "rays": rays, "rays_per_pixel": 1, "min_rays": 1, "max_rays": 1,
+            "ensemble": 1, "supersample": 2.0, "supervision": null, "pose_refinement": false,
+            "n_levels": 8, "base_resolution": 16, "max_resolution": null, "finest_z": null,
+            "log2_hashmap_size": null, "hidden_dim": 64, "march_steps": null,
+        })
     }
 
     /// Published times (docs/results/engine.md), twice the minutes of two cores.
     #[test]
     fn published_times_are_estimated_within_30_percent() {
-        let training = |rays: u64| json!({"field": "grid", "rays": rays, "ensemble": 1});
         let rendering = |samples: u32| json!({"samples_per_axis": samples, "tolerance": 0.005});
         let (object, opaque) = (SceneKind::Object, SceneKind::Frustum);
-        let unbounded = SceneKind::Unbounded;
+        let (lego, fern) = (work(object, 100, 100), work(opaque, 17, 218));
+        let views = |kind, count| work(kind, count, 200);
+        let backdrop = work(SceneKind::Unbounded, 80, 100);
         for (name, program, parameters, work, seconds) in [
-            ("lego 100×2", "train-ss", training(32_000_000), work(object, 1_000_000), 408.0),
-            ("lego 100×2, short", "train-ss", training(2_000_000), work(object, 1_000_000), 46.8),
-            ("lego 200×2", "train-ss", training(80_000_000), work(object, 4_000_000), 1056.0),
-            ("lego 200×4", "train-ss", training(66_000_000), work(object, 4_000_000), 648.0),
-            ("fern 252×2", "train-ss", training(15_000_000), work(opaque, 809_676), 420.0),
-            ("fern 252×4", "train-ss", training(17_500_000), work(opaque, 809_676), 408.0),
-            ("backdrop 100×2", "train-ss", training(1_500_000), work(unbounded, 800_000), 58.8),
-            ("lego, rendered", "render-depth", rendering(2), work(object, 480_000), 4.06),
-            ("lego, one ray", "render-depth", rendering(1), work(object, 480_000), 2.06),
-            ("opaque, rendered", "render-depth", rendering(2), work(opaque, 400_000), 6.7),
-            ("opaque, one ray", "render-depth", rendering(1), work(opaque, 400_000), 4.1),
+            ("lego 100×2", "train-ss", training(32_000_000), &lego, 408.0),
+            ("lego 100×2, short", "train-ss", training(2_000_000), &lego, 46.8),
+            ("lego 200×2", "train-ss", training(80_000_000), &lego, 1056.0),
+            ("lego 200×4", "train-ss", training(66_000_000), &lego, 648.0),
+            ("fern 252×2", "train-ss", training(15_000_000), &fern, 420.0),
+            ("fern 252×4", "train-ss", training(17_500_000), &fern, 408.0),
+            ("backdrop 100×2", "train-ss", training(1_500_000), &backdrop, 58.8),
+            ("lego, rendered", "render-depth", rendering(2), &views(object, 12), 4.06),
+            ("lego, one ray", "render-depth", rendering(1), &views(object, 12), 2.06),
+            ("opaque, rendered", "render-depth", rendering(2), &views(opaque, 10), 6.7),
+            ("opaque, one ray", "render-depth", rendering(1), &views(opaque, 10), 4.1),
         ] {
-            let estimate = processor_seconds(program, &parameters, &work).unwrap();
+            let estimate = model_cost(program, &parameters, work).unwrap().processor_seconds;
             let ratio = estimate / seconds;
             println!("{name}: {estimate:.1} s for {seconds} s");
             assert!((0.7..1.3).contains(&ratio), "{name}: {estimate} s for {seconds} s");
         }
     }
 
+    /// Half of the steps and of the width make rays cheaper, by the measured exponents.
     #[test]
-    fn rays_follow_from_pixels_as_in_training() {
-        let by_pixel = json!({"rays": null, "rays_per_pixel": 10, "min_rays": 50, "max_rays": 900});
-        let of = |kind, pixels, is_fine_tuning| {
-            rays(&by_pixel, &Work { is_fine_tuning, ..work(kind, pixels) }).unwrap()
+    fn smaller_networks_and_fewer_steps_are_cheaper() {
+        let factor = |march_steps: Value, hidden_dim: u32, kind| {
+            let mut field = training(1);
+            field["march_steps"] = march_steps;
+            field["hidden_dim"] = hidden_dim.into();
+            field_factor(&field, kind).unwrap()
         };
-        assert_eq!(of(SceneKind::Object, 30, false), 300.0);
-        assert_eq!(of(SceneKind::Unbounded, 30, false), 180.0);
-        assert_eq!(of(SceneKind::Unbounded, 30, true), 90.0);
-        assert_eq!([1, 1000].map(|pixels| of(SceneKind::Object, pixels, false)), [50.0, 900.0]);
-        let given = json!({"rays": 7, "rays_per_pixel": 10});
-        assert_eq!(rays(&given, &work(SceneKind::Unbounded, 30)), Some(7.0));
+        for kind in [SceneKind::Object, SceneKind::Unbounded] {
+            assert_eq!(factor(Value::Null, 64, kind), 1.0);
+            assert!((factor(json!(256), 64, kind) - 0.574).abs() < 1e-3);
+            assert!((factor(Value::Null, 32, kind) - 0.683).abs() < 1e-3);
+        }
+        assert_eq!(factor(json!(256), 64, SceneKind::Frustum), 1.0);
     }
 
     #[test]
     fn unknown_stages_have_no_estimate() {
-        let work = work(SceneKind::Object, 1);
-        for program in ["prep", "report", "mine"] {
-            assert_eq!(processor_seconds(program, &json!({}), &work), None);
+        let work = work(SceneKind::Object, 1, 1);
+        for program in ["demo-scene", "report", "mine"] {
+            assert_eq!(model_cost(program, &json!({}), &work), None);
         }
-        assert_eq!(processor_seconds("train-ss", &json!({}), &work), None, "no parameters");
+        assert_eq!(model_cost("train-ss", &json!({}), &work), None, "no parameters");
+        assert_eq!(min_memory("train-ss", &json!({}), &work), None, "no parameters");
     }
 }

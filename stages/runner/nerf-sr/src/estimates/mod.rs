@@ -1,44 +1,117 @@
-//! Estimates of the processor time that stages will take (docs/design/048).
+//! Estimates of the processor time and peak memory of stages (docs/design/048).
 //!
 //! * `costs`: models of the stages, from numbers of rays and pixels.
-//! * `scene`: number and size of the images, from an artifact of `prep` or from the data set.
+//! * `work`, `scene`: number and size of the images, from an artifact of `prep` or from the data
+//!   set.
+//! * `machine`: speed of this machine, by a measurement of a few milliseconds.
+//! * `text`: estimates as text, before and after a run.
 //!
-//! An earlier run of the stage on equal inputs corrects the model's estimate for the machine and
-//! the scene.
+//! The nearest earlier run of the stage on this machine corrects the model's estimate.
 
 mod costs;
+mod machine;
 mod scene;
+mod text;
+mod work;
 
 use std::collections::BTreeMap;
 
-use planning::{Node, Origin, Plan, State};
-use serde_json::{Map, Value};
-use store::{Record, Store};
+use planning::{Node, Origin, Plan, State, nearest_record};
+use serde_json::{Map, Value, json};
+use store::{ModelCost, Record, Store, host_name};
 
-use costs::{Work, processor_seconds};
+pub(crate) use text::{check_memory, comparison_text, run_text, total_comparison_text};
+
+use costs::{min_memory, model_cost};
 use scene::SceneImages;
+use work::{Images, Work};
 
-/// Prefixes of parts of keys.
-const PARAMETER_PART: &str = "parameter ";
-const INPUT_PART: &str = "input ";
+/// Minimum processor seconds of an earlier run that corrects an estimate, and maximum factor
+/// between the model's times of the two runs: shorter runs depend on other costs. Both are chosen by
+/// hand.
+const MIN_RECORD_SECONDS: f64 = 1.0;
+const MAX_TIME_FACTOR: f64 = 10.0;
+/// Maximum factor by which an earlier run corrects an estimate; chosen by hand.
+const MAX_CORRECTION: f64 = 4.0;
 
-/// Estimates for the nodes of a plan.
-pub(crate) struct Estimates<'a> {
-    plan: &'a Plan,
-    states: &'a [State],
-    records: Vec<Record>,
-    /// Images by index of the node of `prep`.
-    scenes: BTreeMap<usize, SceneImages>,
+/// Expected cost of a node.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Estimate {
+    /// Processor seconds on this machine.
+    pub(crate) processor_seconds: f64,
+    /// Peak memory in bytes.
+    pub(crate) memory: u64,
+    /// Memory below which the stage fails.
+    pub(crate) min_memory: u64,
+    /// Cost by the model alone, for the record.
+    pub(crate) model: ModelCost,
 }
 
-impl<'a> Estimates<'a> {
-    /// Collects what is known of the scenes of a plan. `records` are those of earlier runs.
-    pub(crate) fn new(
-        plan: &'a Plan,
-        states: &'a [State],
-        records: Vec<Record>,
-        store: &Store,
-    ) -> Self {
+/// Estimates for the nodes of a plan that aren't cached.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Estimates {
+    /// Estimates by node index; `None` for cached nodes, stages without a model, and scenes that
+    /// aren't known yet.
+    nodes: Vec<Option<Estimate>>,
+    /// Number of nodes that aren't cached and have no estimate.
+    pub(crate) unknown: usize,
+    /// Descriptions of the plan's scenes.
+    pub(crate) scenes: Vec<String>,
+}
+
+impl Estimates {
+    /// Estimates the nodes of a plan.
+    pub(crate) fn new(plan: &Plan, states: &[State], store: &Store) -> Self {
+        let is_cached = |state: &State| matches!(state, State::Cached(_));
+        let mut estimator = Estimator::new(plan, states, store);
+        let mut found = Self {
+            nodes: vec![None; plan.nodes.len()],
+            unknown: 0,
+            scenes: estimator.scenes.values().map(SceneImages::summary).collect(),
+        };
+        for (index, state) in states.iter().enumerate().filter(|(_, state)| !is_cached(state)) {
+            found.nodes[index] = estimator.estimate(&plan.nodes[index], state);
+            found.unknown += usize::from(found.nodes[index].is_none());
+        }
+        found
+    }
+
+    /// Returns the estimate of a node.
+    pub(crate) fn get(&self, index: usize) -> Option<&Estimate> {
+        self.nodes.get(index)?.as_ref()
+    }
+
+    /// Returns all estimates, with node indices.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (usize, &Estimate)> {
+        self.nodes.iter().enumerate().filter_map(|(index, node)| Some((index, node.as_ref()?)))
+    }
+
+    /// Returns the processor seconds of all nodes.
+    pub(crate) fn processor_seconds(&self) -> f64 {
+        self.iter().map(|(_, estimate)| estimate.processor_seconds).sum()
+    }
+
+    /// Returns the largest memory of a node.
+    pub(crate) fn memory(&self) -> u64 {
+        self.iter().map(|(_, estimate)| estimate.memory).max().unwrap_or(0)
+    }
+}
+
+/// Data that estimates are computed from.
+struct Estimator<'a> {
+    plan: &'a Plan,
+    /// Images by index of the node of `prep`.
+    scenes: BTreeMap<usize, SceneImages>,
+    /// Earlier runs on this machine with a model's cost.
+    records: Vec<Record>,
+    /// Number of threads of a stage.
+    threads: u64,
+    /// Slowness of this machine, measured when the first estimate needs it.
+    slowness: Option<f64>,
+}
+
+impl<'a> Estimator<'a> {
+    fn new(plan: &'a Plan, states: &[State], store: &Store) -> Self {
         let mut scenes = BTreeMap::new();
         for (index, node) in plan.nodes.iter().enumerate() {
             if node.program.description.name == "prep"
@@ -47,74 +120,131 @@ impl<'a> Estimates<'a> {
                 scenes.insert(index, images);
             }
         }
-        Self { plan, states, records, scenes }
+        let host = host_name();
+        // Without readable records, the models' estimates are not corrected.
+        let mut records = store.records().unwrap_or_default();
+        records.retain(|record| record.host == host && record.model.is_some());
+        let threads = stage::processors().count as u64;
+        Self { plan, scenes, records, threads, slowness: None }
     }
 
-    /// Returns the images of each scene of the plan.
-    pub(crate) fn scenes(&self) -> impl Iterator<Item = &SceneImages> {
-        self.scenes.values()
-    }
-
-    /// Returns the expected processor seconds of a node; `None` for stages without a model, and for
-    /// scenes that aren't known yet.
-    pub(crate) fn processor_seconds(&self, index: usize) -> Option<f64> {
-        let node = &self.plan.nodes[index];
+    fn estimate(&mut self, node: &Node, state: &State) -> Option<Estimate> {
         let program = &node.program.description.name;
         let work = self.work(node)?;
-        let expected = processor_seconds(program, &node.parameters, &work)?;
-        let correction = match &self.states[index] {
-            State::WillRun { key_parts } => self.correction(node, key_parts, &work),
-            _ => None,
+        let model = model_cost(program, &node.parameters, &work)?;
+        let (time, memory) = match self.nearest(node, state, model) {
+            Some(record) => corrections(record)?,
+            None => (*self.slowness.get_or_insert_with(machine::slowness), 1.0),
         };
-        Some(expected * correction.unwrap_or(1.0))
-    }
-
-    /// Returns what a node's time depends on.
-    fn work(&self, node: &Node) -> Option<Work> {
-        let images_input = match node.program.description.name.as_str() {
-            "train-ss" => "scene",
-            "render-depth" => "cameras",
-            "eval" => "truth",
-            _ => return None,
-        };
-        let (index, subtree) = parent(node, images_input)?;
-        let scene = self.scenes.get(&index)?;
-        let fields = match parent(node, "field") {
-            Some((field, _)) => self.plan.nodes[field].parameters["ensemble"].as_u64().unwrap_or(1),
-            None => 1,
-        };
-        Some(Work {
-            kind: scene.kind,
-            images: scene.images(subtree?)?,
-            fields,
-            is_fine_tuning: node.inputs.iter().any(|input| input.name == "init"),
+        let min_memory = min_memory(program, &node.parameters, &work)?;
+        Some(Estimate {
+            processor_seconds: time * model.processor_seconds,
+            memory: (memory * model.peak_memory as f64) as u64,
+            min_memory: (memory.min(1.0) * min_memory as f64) as u64,
+            model,
         })
     }
 
-    /// Returns the measured time of the newest run of a stage on equal inputs, over the model's.
-    fn correction(&self, node: &Node, key_parts: &Map<String, Value>, work: &Work) -> Option<f64> {
-        let has_equal_inputs = |record: &&Record| {
-            let mut inputs = key_parts.iter().filter(|(part, _)| part.starts_with(INPUT_PART));
-            record.stage == node.stage
-                && record.processor_seconds.is_some()
-                && inputs.all(|(part, hash)| record.key_parts.get(part) == Some(hash))
+    /// Returns the record of the nearest earlier run of a stage's program that has about the same
+    /// size.
+    fn nearest(&self, node: &Node, state: &State, model: ModelCost) -> Option<&Record> {
+        let program = node.program.description.name.as_str();
+        let known_parts = match state {
+            State::WillRun { key_parts } => key_parts.clone(),
+            _ => partial_key_parts(node),
         };
-        let record = self
-            .records
-            .iter()
-            .filter(has_equal_inputs)
-            .max_by_key(|record| record.started_unix)?;
-        let parameters: Map<String, Value> = record
-            .key_parts
-            .iter()
-            .filter_map(|(part, value)| {
-                Some((part.strip_prefix(PARAMETER_PART)?.to_owned(), value.clone()))
-            })
-            .collect();
-        let program = &node.program.description.name;
-        let expected = processor_seconds(program, &Value::Object(parameters), work)?;
-        Some(record.processor_seconds? / expected)
+        let similar = self.records.iter().filter(|record| {
+            let Some(other) = record.model else { return false };
+            let factor = other.processor_seconds / model.processor_seconds;
+            record.key_parts.get("stage").and_then(Value::as_str) == Some(program)
+                && record.processor_seconds.is_some_and(|seconds| seconds >= MIN_RECORD_SECONDS)
+                && (1.0 / MAX_TIME_FACTOR..MAX_TIME_FACTOR).contains(&factor)
+        });
+        nearest_record(&known_parts, similar)
     }
+
+    /// Returns what a node's cost depends on.
+    fn work(&self, node: &Node) -> Option<Work> {
+        let program = node.program.description.name.as_str();
+        let has_input = |name: &str| node.inputs.iter().any(|input| input.name == name);
+        let (index, images) = match program {
+            "prep" => {
+                let found = self.plan.nodes.iter().position(|other| std::ptr::eq(other, node))?;
+                (found, self.scenes.get(&found)?.photographs)
+            }
+            _ => self.images(node)?,
+        };
+        let scene = self.scenes.get(&index)?;
+        let training = match program {
+            "train-ss" => Some(node),
+            _ => self.field(node),
+        };
+        let lr_images = training.and_then(|training| self.images(training)).map(|(_, lr)| lr);
+        let lr_width = lr_images.unwrap_or_default().largest.0;
+        let references = has_input("references").then(|| scene.images("references")).flatten();
+        Some(Work {
+            kind: scene.kind,
+            pixels_across: scene.widths_across * lr_width as f64,
+            has_box_kernel: scene.has_box_kernel,
+            images,
+            references: references.unwrap_or_default(),
+            preparation_bytes: scene.preparation_bytes,
+            field: training.map(|training| training.parameters.clone()),
+            is_fine_tuning: has_input("init"),
+            has_weights: has_input("weights"),
+            threads: self.threads,
+        })
+    }
+
+    /// Returns the node of `prep` and the images that a stage reads or renders.
+    fn images(&self, node: &Node) -> Option<(usize, Images)> {
+        let input = match node.program.description.name.as_str() {
+            "train-ss" => "scene",
+            "render-depth" | "export" => "cameras",
+            "eval" => "truth",
+            "train-refine" | "refine" => "views",
+            _ => return None,
+        };
+        let (index, subtree) = parent(node, input)?;
+        let Some(scene) = self.scenes.get(&index) else {
+            // Views are as many and as large as the cameras that they were rendered from.
+            return self.images(&self.plan.nodes[index]).filter(|_| input == "views");
+        };
+        let mut images = scene.images(subtree?)?;
+        if input == "cameras"
+            && node.program.description.name == "render-depth"
+            && let Some(width) = node.parameters["size"].as_f64()
+        {
+            images = images.resized(width);
+        }
+        Some((index, images))
+    }
+
+    /// Returns the node that trains the field which a node renders.
+    fn field(&self, node: &Node) -> Option<&'a Node> {
+        let (index, _) = parent(node, "field")?;
+        Some(&self.plan.nodes[index])
+    }
+}
+
+/// Returns the known parts of a key whose inputs are unknown.
+fn partial_key_parts(node: &Node) -> Map<String, Value> {
+    let partial = node.partial_key();
+    let parameters = partial.parameters.into_iter();
+    let mut parts: Map<String, Value> =
+        parameters.map(|(name, value)| (format!("parameter {name}"), value)).collect();
+    parts.insert("stage".to_owned(), json!(partial.program));
+    parts
+}
+
+/// Returns the factors from the model's time and memory to the measured ones.
+fn corrections(record: &Record) -> Option<(f64, f64)> {
+    let model = record.model?;
+    let limited = |factor: f64| factor.max(1.0 / MAX_CORRECTION).min(MAX_CORRECTION);
+    let time = record.processor_seconds? / model.processor_seconds;
+    let memory = record.peak_memory? as f64 / model.peak_memory as f64;
+    // The time's factor contains the speed of the machine.
+    Some((time, limited(memory)))
 }
 
 /// Returns the index of the node that produces an input, and the input's subtree.
@@ -138,5 +268,24 @@ fn scene_images(plan: &Plan, state: &State, prep: &Node, store: &Store) -> Optio
             let demo = &plan.nodes[*index];
             SceneImages::of_demo(&demo.parameters, &prep.parameters)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_earlier_run_corrects_the_model() {
+        let model = ModelCost { processor_seconds: 10.0, peak_memory: 1000 };
+        let record = |seconds, memory| Record {
+            processor_seconds: Some(seconds),
+            peak_memory: Some(memory),
+            model: Some(model),
+            ..Record::default()
+        };
+        assert_eq!(corrections(&record(15.0, 500)), Some((1.5, 0.5)));
+        assert_eq!(corrections(&record(100.0, 9000)), Some((10.0, MAX_CORRECTION)));
+        assert_eq!(corrections(&Record { model: None, ..record(15.0, 500) }), None);
     }
 }

@@ -1,17 +1,34 @@
+//! Images of a scene, from an artifact of `prep` or from the data set that `prep` will read.
+
 use std::path::Path;
 
 use dataset::{Dataset, Format, Frame, Split};
 use serde_json::Value;
+use workload::preparation_bytes;
 
-use super::costs::{Images, SceneKind};
+use super::work::{Images, SceneKind};
 
 /// Test views of a data set without a split: every eighth (`prep`'s `split: holdout`).
 const HOLDOUT: usize = 8;
+/// LR pixels across the field's cube over the width of an LR image: in NDC before the frustum is
+/// known (fern: 1.35), and in a contraction, as in `train-ss`.
+const NDC_WIDTHS: f64 = 1.35;
+const CONTRACTION_WIDTHS: f64 = 2.0;
+/// Bytes per pixel of reading an 8-bit image, as in `dataset`.
+const READING_BYTES: u64 = 14;
 
 /// Images of a scene, by the folders of the artifact that `prep` creates.
 #[derive(Clone, Debug)]
 pub(crate) struct SceneImages {
     pub(crate) kind: SceneKind,
+    /// LR pixels across the field's cube over the width of an LR image.
+    pub(crate) widths_across: f64,
+    /// True if the kernel of the LR images is a mean.
+    pub(crate) has_box_kernel: bool,
+    /// Photographs that `prep` will read.
+    pub(crate) photographs: Images,
+    /// Peak memory of preparing a photograph.
+    pub(crate) preparation_bytes: u64,
     /// Images by folder, such as `train`.
     folders: Vec<(&'static str, Images)>,
 }
@@ -20,45 +37,74 @@ pub(crate) struct SceneImages {
 const FOLDERS: [&str; 6] =
     ["train", "downscaled", "train-cameras", "cameras", "truth", "references"];
 
+/// Scene that `prep` will read.
+struct Planned {
+    kind: SceneKind,
+    widths_across: f64,
+    /// Sizes of all photographs.
+    sizes: Vec<(f64, f64)>,
+    split: Split,
+    is_benchmark: bool,
+}
+
 impl SceneImages {
     /// Reads the images of an existing artifact.
     pub(crate) fn of_artifact(artifact: &Path) -> Option<Self> {
-        let mut kind = SceneKind::Object;
-        let mut folders = Vec::new();
+        let mut scene = Self {
+            kind: SceneKind::Object,
+            widths_across: 1.0,
+            has_box_kernel: false,
+            photographs: Images::default(),
+            preparation_bytes: 0,
+            folders: Vec::new(),
+        };
         for folder in FOLDERS {
             let Ok(bytes) = std::fs::read(artifact.join(folder).join("views.json")) else {
                 continue;
             };
             let views: Value = serde_json::from_slice(&bytes).ok()?;
-            let is_ndc = views["bounds"]["space"].get("ndc").is_some();
-            kind = kind_of(views["background"] == "opaque", is_ndc);
-            let sizes = views["views"].as_array()?.iter().map(|view| {
+            let (space, list) = (&views["bounds"]["space"], views["views"].as_array()?);
+            scene.kind = kind_of(views["background"] == "opaque", space.get("ndc").is_some());
+            scene.widths_across = widths_across(space, list).unwrap_or(1.0);
+            let sizes = list.iter().map(|view| {
                 let size = &view["camera"]["intrinsics"];
                 Some((size["width"].as_f64()?, size["height"].as_f64()?))
             });
-            folders.push((folder, count(&sizes.collect::<Option<Vec<_>>>()?)));
+            scene.folders.push((folder, count(&sizes.collect::<Option<Vec<_>>>()?)));
         }
-        Some(Self { kind, folders })
+        if let Ok(bytes) = std::fs::read(artifact.join("train").join("degradation.json")) {
+            let degradation: Value = serde_json::from_slice(&bytes).ok()?;
+            scene.has_box_kernel = is_box(&degradation["kernel"], false);
+        }
+        Some(scene)
     }
 
     /// Predicts the images that `prep` makes of a data set.
     pub(crate) fn of_dataset(folder: &Path, parameters: &Value) -> Option<Self> {
         let set = Dataset::read(folder).ok()?;
-        let sizes: Vec<(f64, f64)> = set.frames.iter().map(size_of).collect();
-        let all = sizes.len();
+        let all = set.frames.len();
         let split = match (parameters["split"].as_str(), set.split) {
             (Some("paper"), _) => Split::all(all),
             (Some("holdout"), _) | (_, None) => Split::hold_out(all, HOLDOUT),
             (_, Some(split)) => split,
         };
-        let is_benchmark = set.format.is_benchmark();
         let background = parameters["background"].as_str();
         // LLFF's photographs have no background of one colour.
         let is_object = set.format == Format::Blender;
         let is_opaque = background.map_or(!is_object, |background| background == "opaque");
         let space = parameters["space"].as_str();
         let is_ndc = space.map_or(set.format == Format::Llff, |space| space == "ndc");
-        Some(Self::planned(kind_of(is_opaque, is_ndc), &sizes, &split, is_benchmark, parameters))
+        let kind = kind_of(is_opaque, is_ndc);
+        let planned = Planned {
+            kind,
+            widths_across: planned_widths_across(kind, space),
+            sizes: set.frames.iter().map(size_of).collect(),
+            split,
+            is_benchmark: set.format.is_benchmark(),
+        };
+        // A file that can't be read is reported by `prep`.
+        let reading = |index: usize| set.frames[index].reading_bytes().unwrap_or(0);
+        Some(Self::planned(&planned, parameters, reading))
     }
 
     /// Predicts the images that `prep` makes of the demo scene.
@@ -68,24 +114,29 @@ impl SceneImages {
         let size = (width, (width / number("aspect")?).round());
         let train = train as usize;
         let all = train + test as usize;
-        let is_opaque = demo["backdrop"].as_bool()?;
-        let kind = kind_of(is_opaque, false);
-        let split = Split { train: (0..train).collect(), test: (train..all).collect() };
-        Some(Self::planned(kind, &vec![size; all], &split, true, parameters))
+        let kind = kind_of(demo["backdrop"].as_bool()?, false);
+        let planned = Planned {
+            kind,
+            widths_across: planned_widths_across(kind, parameters["space"].as_str()),
+            sizes: vec![size; all],
+            split: Split { train: (0..train).collect(), test: (train..all).collect() },
+            is_benchmark: true,
+        };
+        let reading = READING_BYTES * (size.0 * size.1) as u64;
+        Some(Self::planned(&planned, parameters, |_| reading))
     }
 
     fn planned(
-        kind: SceneKind,
-        sizes: &[(f64, f64)],
-        split: &Split,
-        is_benchmark: bool,
+        planned: &Planned,
         parameters: &Value,
+        reading_bytes: impl Fn(usize) -> u64,
     ) -> Self {
+        let Planned { kind, widths_across, sizes, split, is_benchmark } = planned;
         let number = |name: &str| parameters[name].as_f64();
         let (lr_width, hr_width) = (number("lr_width"), number("hr_width"));
         let is_downscaled = match parameters["lr_source"].as_str() {
             Some(source) => source == "downscaled",
-            None => is_benchmark || lr_width.is_some(),
+            None => *is_benchmark || lr_width.is_some(),
         };
         let width = sizes.first().map_or(1.0, |size| size.0);
         let given = lr_width.zip(hr_width).map(|(lr, hr)| hr / lr);
@@ -105,15 +156,30 @@ impl SceneImages {
         let test: Vec<usize> = split.test.iter().copied().take(max_test).collect();
         let references = number("hr_references").unwrap_or(0.0) as usize;
         let references = &split.train[..references.min(split.train.len())];
-        let folders = vec![
-            ("train", images(&split.train, lr)),
-            ("downscaled", images(&split.train, lr / scale)),
-            ("train-cameras", images(&split.train, hr)),
-            ("cameras", images(&test, hr)),
-            ("truth", images(&test, hr)),
-            ("references", images(references, hr)),
-        ];
-        Self { kind, folders }
+        let mut read = [&split.train[..], &test].concat();
+        // Both parts of the paper's split are all views.
+        read.sort_unstable();
+        read.dedup();
+        let preparation = read.iter().map(|&i| {
+            let pixels = sizes[i].0 * sizes[i].1;
+            let hr_pixels = if is_downscaled { pixels * hr.powi(2) } else { 0.0 };
+            preparation_bytes(reading_bytes(i), pixels as u64, hr_pixels as u64)
+        });
+        Self {
+            kind: *kind,
+            widths_across: *widths_across,
+            has_box_kernel: is_box(&parameters["kernel"], !is_downscaled),
+            photographs: images(&read, 1.0),
+            preparation_bytes: preparation.max().unwrap_or(0),
+            folders: vec![
+                ("train", images(&split.train, lr)),
+                ("downscaled", images(&split.train, lr / scale)),
+                ("train-cameras", images(&split.train, hr)),
+                ("cameras", images(&test, hr)),
+                ("truth", images(&test, hr)),
+                ("references", images(references, hr)),
+            ],
+        }
     }
 
     /// Describes the scene in a line.
@@ -148,14 +214,43 @@ fn kind_of(is_opaque: bool, is_ndc: bool) -> SceneKind {
     }
 }
 
+/// Returns the LR pixels across the field's cube over the width of a view, as in `train-ss`.
+fn widths_across(space: &Value, views: &[Value]) -> Option<f64> {
+    if space == "contraction" {
+        return Some(CONTRACTION_WIDTHS);
+    }
+    let frustum = space.get("ndc")?;
+    let side = |axis: usize| Some(frustum["max"][axis].as_f64()? - frustum["min"][axis].as_f64()?);
+    let intrinsics = &views.first()?["camera"]["intrinsics"];
+    let focal_lengths = intrinsics["fx"].as_f64()? / intrinsics["width"].as_f64()?;
+    Some(side(0)?.max(side(1)?) * focal_lengths)
+}
+
+fn planned_widths_across(kind: SceneKind, space: Option<&str>) -> f64 {
+    match kind {
+        SceneKind::Frustum => NDC_WIDTHS,
+        SceneKind::Unbounded if space != Some("box") => CONTRACTION_WIDTHS,
+        SceneKind::Unbounded | SceneKind::Object => 1.0,
+    }
+}
+
+/// Returns whether a kernel is a mean; without a given kernel, the default.
+fn is_box(kernel: &Value, by_default: bool) -> bool {
+    kernel.as_str().map_or(by_default, |kernel| kernel != "lanczos" && kernel != "bicubic")
+}
+
 fn size_of(frame: &Frame) -> (f64, f64) {
     let size = frame.intrinsics();
     (f64::from(size.width), f64::from(size.height))
 }
 
 fn count(sizes: &[(f64, f64)]) -> Images {
-    let pixels = sizes.iter().map(|(width, height)| width.round() * height.round());
-    Images { count: sizes.len() as u64, pixels: pixels.sum::<f64>() as u64 }
+    let sizes = sizes.iter().map(|(width, height)| (width.round() as u64, height.round() as u64));
+    Images {
+        count: sizes.len() as u64,
+        pixels: sizes.clone().map(|(width, height)| width * height).sum(),
+        largest: sizes.max_by_key(|(width, height)| width * height).unwrap_or_default(),
+    }
 }
 
 #[cfg(test)]
@@ -185,21 +280,39 @@ mod tests {
 
         let smaller = json!({"scale": 4, "lr_width": 30, "test_views": 3, "hr_references": 0});
         let scene = SceneImages::of_demo(&demo, &smaller).unwrap();
-        assert_eq!(scene.images("train"), Some(Images { count: 80, pixels: 80 * 900 }));
-        assert_eq!(scene.images("cameras"), Some(Images { count: 3, pixels: 3 * 14_400 }));
+        let images = |count, side| {
+            Some(Images { count, pixels: count * side * side, largest: (side, side) })
+        };
+        assert_eq!(scene.images("train"), images(80, 30));
+        assert_eq!(scene.images("cameras"), images(3, 120));
+        assert_eq!(scene.photographs, images(83, 200).unwrap());
+        assert_eq!(scene.preparation_bytes, 12 * 40_000 + 8 * 14_400);
         assert_eq!(scene.images("other"), None);
     }
 
     /// Photographs keep their size for training, and views are larger.
     #[test]
     fn photographs_are_the_lr_images() {
-        let split = Split::hold_out(9, HOLDOUT);
-        let sizes = vec![(640.0, 480.0); 9];
-        let scene =
-            SceneImages::planned(SceneKind::Unbounded, &sizes, &split, false, &json!({"scale": 2}));
-        let pixels = 640 * 480;
-        assert_eq!(scene.images("train"), Some(Images { count: 7, pixels: 7 * pixels }));
-        assert_eq!(scene.images("truth"), Some(Images { count: 2, pixels: 2 * 4 * pixels }));
+        let planned = Planned {
+            kind: SceneKind::Unbounded,
+            widths_across: 2.0,
+            sizes: vec![(640.0, 480.0); 9],
+            split: Split::hold_out(9, HOLDOUT),
+            is_benchmark: false,
+        };
+        let scene = SceneImages::planned(&planned, &json!({"scale": 2}), |_| 7);
+        let images = |count, factor: u64| {
+            let largest = (factor * 640, factor * 480);
+            Some(Images { count, pixels: count * largest.0 * largest.1, largest })
+        };
+        assert_eq!(scene.images("train"), images(7, 1));
+        assert_eq!(scene.images("truth"), images(2, 2));
+        assert_eq!(scene.preparation_bytes, preparation_bytes(7, 640 * 480, 0));
+        assert!(scene.has_box_kernel);
+        let lanczos = json!({"scale": 2, "kernel": "lanczos", "lr_width": 320});
+        let scene = SceneImages::planned(&planned, &lanczos, |_| 7);
+        assert_eq!(scene.preparation_bytes, preparation_bytes(7, 640 * 480, 640 * 480));
+        assert!(!scene.has_box_kernel);
     }
 
     #[test]
@@ -208,12 +321,20 @@ mod tests {
         assert!(SceneImages::of_artifact(folder.path()).unwrap().images("train").is_none());
         let train = folder.path().join("train");
         std::fs::create_dir(&train).unwrap();
-        let size = json!({"camera": {"intrinsics": {"width": 30, "height": 20}}});
-        let views = json!({"background": "opaque", "views": [size, size]});
-        std::fs::write(train.join("views.json"), views.to_string()).unwrap();
-        let scene = SceneImages::of_artifact(folder.path()).unwrap();
-        assert_eq!(scene.kind, SceneKind::Unbounded);
-        assert_eq!(scene.images("train"), Some(Images { count: 2, pixels: 1200 }));
+        let size = json!({"camera": {"intrinsics": {"width": 30, "height": 20, "fx": 45.0}}});
+        let write = |space: Value| {
+            let views = json!({
+                "background": "opaque", "bounds": {"space": space}, "views": [size, size],
+            });
+            std::fs::write(train.join("views.json"), views.to_string()).unwrap();
+            SceneImages::of_artifact(folder.path()).unwrap()
+        };
+        let scene = write(json!("contraction"));
+        assert_eq!((scene.kind, scene.widths_across), (SceneKind::Unbounded, 2.0));
+        let images = Images { count: 2, pixels: 1200, largest: (30, 20) };
+        assert_eq!(scene.images("train"), Some(images));
+        let scene = write(json!({"ndc": {"min": [-0.5, -0.25], "max": [0.5, 0.25]}}));
+        assert_eq!((scene.kind, scene.widths_across), (SceneKind::Frustum, 1.5));
         std::fs::write(train.join("views.json"), "{").unwrap();
         assert!(SceneImages::of_artifact(folder.path()).is_none());
     }

@@ -10,12 +10,13 @@ use anyhow::{Context as _, anyhow};
 use artifact::{Failure, print_line, print_lines, report_line, report_text};
 use planning::stage_call::{Display, StageFailure};
 use planning::{Node, Sink};
-use stage::SUMMARY_FILE;
+use stage::{SUMMARY_FILE, available_memory};
 use store::Record;
 
 use super::Executor;
 use super::budget::{Admission, Budget, Demand};
 use super::node::{Lookup, NodeJob, PendingAction, input_folder};
+use crate::estimates::{check_memory, run_text, total_comparison_text};
 use crate::failure;
 use crate::run_messages::{FailureHint, end_message};
 use crate::run_record::RunProgress;
@@ -38,6 +39,11 @@ pub(crate) struct Local {
 impl Executor for Local {
     fn carry_out(&self, run: &Run<'_>) -> anyhow::Result<ExitCode> {
         let plan = run.plan;
+        let free = available_memory()?.into_iter().chain([self.budget.memory]).min();
+        check_memory(plan, run.estimates, free)?;
+        if let Some(text) = run_text(plan, run.estimates, self.budget.threads) {
+            report_text(&format!("nerf-sr: {text}"));
+        }
         let outcome = run_nodes(run, self);
         if run.stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
@@ -59,7 +65,11 @@ impl Executor for Local {
         }
         print_summaries(run, &outcome)?;
         let has_written = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
-        print_line!("{}", end_message(outcome.ran.len(), plan.nodes.len(), has_written));
+        let ran = outcome.ran.iter();
+        let ran = ran.filter_map(|&index| Some((index, outcome.records[index].as_ref()?)));
+        let comparison = total_comparison_text(run.estimates, ran);
+        let end = end_message(outcome.ran.len(), plan.nodes.len(), has_written);
+        print_line!("{end}{}", comparison.map_or_else(String::new, |text| format!("; {text}")));
         Ok(ExitCode::SUCCESS)
     }
 }
@@ -191,7 +201,9 @@ impl<'a> Schedule<'a> {
             .filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?)))
             .collect();
         let threads = self.options.budget.threads;
-        NodeJob { run: self.run, node, parents, threads, display: self.display, watch: None }
+        let (run, display) = (self.run, self.display);
+        let estimate = run.estimates.get(index).copied();
+        NodeJob { run, node, parents, threads, display, estimate, watch: None }
     }
 
     /// Finds the stages that render and score a node's checkpoints, if `--watch` is given.

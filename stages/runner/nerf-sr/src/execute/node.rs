@@ -11,6 +11,7 @@ use planning::{HashedInputs, Node, Origin, hash_inputs};
 use serde_json::{Map, Value};
 use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
 
+use crate::estimates::{Estimate, comparison_text};
 use crate::failure;
 use crate::session::Run;
 use crate::unchanged::{ConfirmedProgram, Inputs, input_failure};
@@ -37,6 +38,8 @@ pub(crate) struct NodeJob<'a> {
     pub(crate) parents: BTreeMap<usize, Record>,
     pub(crate) threads: usize,
     pub(crate) display: &'a Display,
+    /// Expected cost.
+    pub(crate) estimate: Option<Estimate>,
     /// Stages that render and score the node's checkpoints, if the node is watched.
     pub(crate) watch: Option<(&'a Watch, Chain)>,
 }
@@ -138,16 +141,19 @@ impl NodeJob<'_> {
             threads: self.threads,
             peak_memory: Some(usage.peak_memory),
             processor_seconds: Some(round_to_milliseconds(usage.processor_seconds)),
+            model: self.estimate.map(|estimate| estimate.model),
             host: host_name(),
             summary: read_summary(&attempt.output),
         };
         let kind = &self.node.program.description.output.kind;
         let checked = self.run.store.check(attempt, kind).map_err(failure)?;
         let record = self.run.store.publish(&self.enter()?, checked, record).map_err(failure)?;
+        let estimate = self.estimate.and_then(|estimate| comparison_text(&estimate, &record));
         self.report(&format!(
-            "done in {} → {}",
+            "done in {} → {}{}",
             format_duration(record.seconds),
-            &record.output[..10]
+            &record.output[..10],
+            estimate.map_or_else(String::new, |text| format!(" ({text})"))
         ));
         Ok(record)
     }

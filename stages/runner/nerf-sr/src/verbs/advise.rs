@@ -1,91 +1,233 @@
-//! `advise` estimates the time of each quality.
+//! `advise` estimates time and memory of each quality.
 
 use std::process::ExitCode;
 
-use artifact::{format_count, format_duration, print_line};
-use planning::{Quality, Request, State};
+use artifact::{format_count, format_duration, format_size, print_line};
+use planning::{Node, Plan, Quality, Request};
+use slurm::Memory;
 
 use crate::estimates::Estimates;
 use crate::run_messages::command_text;
 use crate::session::Session;
 use crate::state_text::processors_text;
 
-/// Processor time of a plan's stages.
+/// Target that refines views, in a project's pipelines/.
+const REFINING_TARGET: &str = "refined";
+
+/// Limits within which a quality is chosen.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Limits {
+    pub(crate) minutes: Option<f64>,
+    pub(crate) memory: Option<Memory>,
+}
+
+/// Processor time and memory of some stages.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Cost {
-    quality: Quality,
-    /// Processor seconds of all stages with an estimate.
+    /// Processor seconds of all stages.
     seconds: f64,
+    /// Largest memory of a stage in bytes.
+    memory: u64,
+}
+
+/// Costs of a quality.
+struct QualityCosts {
+    quality: Quality,
+    /// Costs by column of [`COLUMNS`].
+    parts: [Cost; COLUMNS.len()],
+    /// Cost of all stages of the plan, those of no column, too.
+    total: Cost,
+    /// Memory below which a stage of the plan fails.
+    min_memory: u64,
     /// Number of stages that would run without an estimate.
     unknown: usize,
 }
 
+/// Columns of the table, and the programs whose cost is in each.
+const COLUMNS: [(&str, &[&str]); 4] = [
+    ("training", &["train-ss"]),
+    ("rendering", &["render-depth"]),
+    ("scoring", &["eval"]),
+    ("refining", &["train-refine", "refine"]),
+];
+/// Index of refining among the columns.
+const REFINING: usize = COLUMNS.len() - 1;
+
+impl Cost {
+    fn add(&mut self, seconds: f64, memory: u64) {
+        self.seconds += seconds;
+        self.memory = self.memory.max(memory);
+    }
+
+    /// Returns the time on some processors, and the memory.
+    fn text(self, processors: usize) -> String {
+        if self == Self::default() {
+            return "–".to_owned();
+        }
+        let time = format_duration(self.seconds / processors as f64);
+        format!("{time}, {}", format_size(self.memory))
+    }
+}
+
 /// Prints what the scenes are, what each quality costs, and the command of the best quality within
-/// `minutes`; without `minutes`, of the default. `arguments` are those of the plan.
+/// the limits; without limits, of the default. `arguments` are those of the plan.
 pub(crate) fn advise(
     session: &Session,
     request: &Request,
-    minutes: Option<f64>,
+    limits: Limits,
     arguments: &[String],
 ) -> anyhow::Result<ExitCode> {
     let processors = stage::processors().count;
-    let mut costs = Vec::new();
+    let mut all = Vec::new();
     for quality in Quality::ALL {
-        costs.push(cost(session, request, quality)?);
+        all.push(costs(session, request, quality)?);
     }
-    print_line!("{:<10} {:>14}   on {}", "quality", "processor time", processors_text(processors));
-    for cost in &costs {
-        print_line!(
-            "{:<10} {:>14}   {}",
-            cost.quality.name(),
-            format_duration(cost.seconds),
-            format_duration(cost.seconds / processors as f64)
-        );
-    }
-    let unknown = costs[0].unknown;
-    if unknown > 0 {
-        print_line!("without {}, whose time isn't known", format_count(unknown, "stage"));
-    }
-    let chosen = match minutes {
-        None => Quality::default(),
-        Some(minutes) => {
-            let fits = |cost: &&Cost| cost.seconds / processors as f64 <= 60.0 * minutes;
-            match costs.iter().rfind(fits) {
-                Some(cost) => cost.quality,
-                None => {
-                    print_line!("no quality fits into {minutes} minutes; the fastest is draft");
-                    Quality::Draft
-                }
-            }
-        }
-    };
+    print_table(&all, processors);
+    let chosen = choose(&all, limits, processors);
     let mut words = vec!["run".to_owned()];
     words.extend(arguments.iter().cloned());
     words.extend(["-p".to_owned(), format!("quality={}", chosen.name())]);
+    if let Some(memory) = limits.memory {
+        words.extend(["--memory".to_owned(), memory.to_string()]);
+    }
     print_line!("{}", command_text(&words));
     Ok(ExitCode::SUCCESS)
 }
 
-/// Returns the cost of the stages that would run with a quality. Prints the scenes with the first
+fn print_table(all: &[QualityCosts], processors: usize) {
+    let columns = COLUMNS.map(|(name, _)| format!("{name:<20}"));
+    let on = processors_text(processors);
+    print_line!("{:<9} {} in all, on {on}", "quality", columns.join(" "));
+    for costs in all {
+        let parts = costs.parts.map(|part| format!("{:<20}", part.text(processors)));
+        let (name, total) = (costs.quality.name(), costs.total.text(processors));
+        print_line!("{name:<9} {} {total}", parts.join(" "));
+    }
+    let unknown = all[0].unknown;
+    if unknown > 0 {
+        print_line!("without {}, whose cost isn't known", format_count(unknown, "stage"));
+    }
+}
+
+/// Chooses the best quality within the limits, or the fastest; without limits the default.
+fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> Quality {
+    let Limits { minutes, memory } = limits;
+    if minutes.is_none() && memory.is_none() {
+        return Quality::default();
+    }
+    let fits_time = |costs: &QualityCosts| {
+        minutes.is_none_or(|minutes| costs.total.seconds / processors as f64 <= 60.0 * minutes)
+    };
+    let fits_memory =
+        |costs: &QualityCosts| memory.is_none_or(|memory| costs.min_memory <= memory.bytes());
+    if let Some(costs) = all.iter().rfind(|costs| fits_time(costs) && fits_memory(costs)) {
+        return costs.quality;
+    }
+    let fastest = &all[0];
+    if let Some(minutes) = minutes.filter(|_| !fits_time(fastest)) {
+        print_line!("no quality fits into {minutes} minutes; the fastest is draft");
+    }
+    if let Some(memory) = memory.filter(|_| !fits_memory(fastest)) {
+        let need = format_size(fastest.min_memory);
+        print_line!("no quality fits into {memory} of memory; draft needs {need}");
+    }
+    fastest.quality
+}
+
+/// Returns the costs of the stages that would run with a quality. Prints the scenes with the first
 /// quality.
-fn cost(session: &Session, request: &Request, quality: Quality) -> anyhow::Result<Cost> {
+fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Result<QualityCosts> {
     let mut request = request.clone();
     request.parameters.push(format!("quality={}", quality.name()));
     let (plan, states) = session.plan_with_states(&request)?;
-    let estimates = Estimates::new(&plan, &states, session.store.records()?, &session.store);
+    let estimates = Estimates::new(&plan, &states, &session.store);
     if quality == Quality::ALL[0] {
-        for scene in estimates.scenes() {
-            print_line!("{}", scene.summary());
+        for scene in &estimates.scenes {
+            print_line!("{scene}");
         }
     }
-    let mut cost = Cost { quality, seconds: 0.0, unknown: 0 };
-    for (index, state) in states.iter().enumerate() {
-        if matches!(state, State::Cached(_)) {
-            continue;
-        }
-        match estimates.processor_seconds(index) {
-            Some(seconds) => cost.seconds += seconds,
-            None => cost.unknown += 1,
+    let mut costs = QualityCosts {
+        quality,
+        parts: [Cost::default(); COLUMNS.len()],
+        total: Cost::default(),
+        min_memory: 0,
+        unknown: estimates.unknown,
+    };
+    for (index, estimate) in estimates.iter() {
+        let program = plan.nodes[index].program.description.name.as_str();
+        costs.total.add(estimate.processor_seconds, estimate.memory);
+        costs.min_memory = costs.min_memory.max(estimate.min_memory);
+        if let Some(column) = COLUMNS.iter().position(|(_, names)| names.contains(&program)) {
+            costs.parts[column].add(estimate.processor_seconds, estimate.memory);
         }
     }
-    Ok(cost)
+    if costs.parts[REFINING] == Cost::default()
+        && let Some(refining) = refining_cost(session, &request, &plan)
+    {
+        costs.parts[REFINING] = refining;
+    }
+    Ok(costs)
+}
+
+/// Returns the additional cost of refining the views of a plan; `None` if the pipeline has no such
+/// target, or if the request names targets.
+fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Cost> {
+    if !request.targets.is_empty() {
+        return None;
+    }
+    let targets = vec![REFINING_TARGET.to_owned()];
+    let request = Request { targets, ..request.clone() };
+    let (refined, refined_states) = session.plan_with_states(&request).ok()?;
+    let estimates = Estimates::new(&refined, &refined_states, &session.store);
+    let mut cost = Cost::default();
+    for (index, estimate) in estimates.iter() {
+        let own = &refined.nodes[index];
+        let is_own = |node: &Node| (&node.stage, &node.point) == (&own.stage, &own.point);
+        if !plan.nodes.iter().any(is_own) {
+            cost.add(estimate.processor_seconds, estimate.memory);
+        }
+    }
+    Some(cost)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn all() -> Vec<QualityCosts> {
+        let sizes = Quality::ALL.into_iter().zip([1u32, 3, 10, 30]);
+        sizes
+            .map(|(quality, size)| QualityCosts {
+                quality,
+                parts: [Cost::default(); COLUMNS.len()],
+                total: Cost { seconds: 60.0 * f64::from(size), memory: 200_000_000 },
+                min_memory: 100_000_000 * u64::from(size),
+                unknown: 0,
+            })
+            .collect()
+    }
+
+    /// Two processors need half of the processor time.
+    #[test]
+    fn the_best_quality_within_the_limits_is_chosen() {
+        for (minutes, memory, expected) in [
+            (None, None, Quality::Balanced),
+            (Some(100.0), None, Quality::Best),
+            (Some(5.0), None, Quality::Balanced),
+            (Some(0.1), None, Quality::Draft),
+            (None, Some("1G"), Quality::Balanced),
+            (None, Some("300M"), Quality::Fast),
+            (None, Some("1M"), Quality::Draft),
+            (Some(0.6), Some("1G"), Quality::Draft),
+        ] {
+            let memory = memory.map(|amount| amount.parse().unwrap());
+            assert_eq!(choose(&all(), Limits { minutes, memory }, 2), expected, "{minutes:?}");
+        }
+    }
+
+    #[test]
+    fn stages_that_do_not_run_have_no_cost() {
+        assert_eq!(Cost::default().text(2), "–");
+        assert_eq!(Cost { seconds: 30.0, memory: 5_000_000 }.text(2), "15.0 s, 5.0 MB");
+    }
 }

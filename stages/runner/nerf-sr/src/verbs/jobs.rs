@@ -14,6 +14,7 @@ use slurm::{Queue, Slurm, Submission};
 use store::{Record, Store};
 
 use super::run::begin_run;
+use crate::estimates::Estimates;
 use crate::execute::NodeJob;
 use crate::run_record::RunProgress;
 use crate::session::Run;
@@ -49,10 +50,13 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let store = Store::open(root)?;
     let frozen = FrozenPlan::read(&Submission::plan_path(folder))?;
     let plan = frozen.task_plan(number)?;
-    let result = begin_run(&store, &plan, &stop).and_then(|file| {
+    let result = begin_run(&store, &plan, &stop).and_then(|(file, _)| {
         let command = submission_command(&store, folder);
         let (plan, store, out) = (&plan, &store, frozen.out.as_path());
-        let result = run_task(&Run { plan, store, file: &file, out, stop: &stop }, &command);
+        // The submitting machine may differ from this one.
+        let estimates = &Estimates::default();
+        let run = Run { plan, store, file: &file, out, estimates, stop: &stop };
+        let result = run_task(&run, &command);
         file.end().ok();
         result
     });
@@ -110,7 +114,8 @@ fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
     let parents =
         node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
     let display = &Display::new();
-    NodeJob { run, node, parents, threads, display, watch: None }.find_or_run().map(drop)
+    let job = NodeJob { run, node, parents, threads, display, estimate: None, watch: None };
+    job.find_or_run().map(drop)
 }
 
 /// Fails if a parent has no record. A job may start without its parents, because Slurm treats a

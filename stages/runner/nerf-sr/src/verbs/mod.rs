@@ -17,7 +17,7 @@ use std::process::ExitCode;
 
 use serde::Serialize;
 
-pub(crate) use advise::advise;
+pub(crate) use advise::{Limits, advise};
 pub(crate) use diff::diff;
 pub(crate) use gc::{GcOutput, gc};
 pub(crate) use graph::{GraphFormat, graph};

@@ -7,6 +7,7 @@ use planning::stage_call::{StageFailure, stop_on_signals};
 use planning::{Describing, Plan, Request, State};
 use store::{RunFile, Store};
 
+use crate::estimates::Estimates;
 use crate::execute::Executor;
 use crate::failure;
 use crate::session::{Run, Session, check_not_in_input, command_line};
@@ -23,24 +24,27 @@ pub(crate) fn run(
     let plan = session.new_plan(request, Describing::Needed(&stop))?;
     check_not_in_input(&plan, "the folder of pages", out)?;
     plan.check_folders()?;
-    let file = match begin_run(&session.store, &plan, &stop) {
-        Ok(file) => file,
+    let (file, states) = match begin_run(&session.store, &plan, &stop) {
+        Ok(begun) => begun,
         Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),
         Err(error) => return Err(error.into()),
     };
     let store = &session.store;
-    let code = executor.carry_out(&Run { plan: &plan, store, file: &file, out, stop: &stop });
+    let estimates = &Estimates::new(&plan, &states, store);
+    let run = Run { plan: &plan, store, file: &file, out, estimates, stop: &stop };
+    let code = executor.carry_out(&run);
     // If the end can't be recorded, as on a full disk, the run's age is counted from its start.
     file.end().ok();
     code
 }
 
-/// Creates the run's file and writes the actions that the run needs, as far as known.
+/// Creates the run's file and writes the actions that the run needs, as far as known. Returns the
+/// file and the states of the nodes; no states if an input can't be read.
 pub(super) fn begin_run(
     store: &Store,
     plan: &Plan,
     stop: &AtomicBool,
-) -> Result<RunFile, StageFailure> {
+) -> Result<(RunFile, Vec<State>), StageFailure> {
     let entered = enter_store(store, stop, &|text| report_line!("nerf-sr: {text}"))?;
     let file = store.begin_run(&entered, command_line()).map_err(failure)?;
     // An unreadable input folder is reported when its stage is due: other stages may not need it.
@@ -52,5 +56,5 @@ pub(super) fn begin_run(
         }
         .map_err(failure)?;
     }
-    Ok(file)
+    Ok((file, states))
 }

@@ -11,9 +11,7 @@ use super::print_json;
 use crate::estimates::Estimates;
 use crate::node_report::PlanReport;
 use crate::session::{Session, nodes_of_stage};
-use crate::state_text::{
-    age_text, blocking_nodes, by_scene_text, processors_text, sink_text, state_text,
-};
+use crate::state_text::{age_text, blocking_nodes, by_scene_text, sink_text, state_text};
 
 /// Prints what `run` would do.
 pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::Result<ExitCode> {
@@ -21,15 +19,12 @@ pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::
     if json {
         return print_json(&PlanReport::new(session, &plan, &states, &[])?);
     }
-    let estimates = Estimates::new(&plan, &states, session.store.records()?, &session.store);
-    let mut seconds = 0.0;
+    let estimates = Estimates::new(&plan, &states, &session.store);
     for (index, state) in states.iter().enumerate() {
         let node = &plan.nodes[index];
         let mut text = state_text(session, &plan, index, state, None);
-        let is_cached = matches!(state, State::Cached(_));
-        if let Some(estimate) = estimates.processor_seconds(index).filter(|_| !is_cached) {
-            seconds += estimate;
-            text += &format!("; about {} of processor time", format_duration(estimate));
+        if let Some(estimate) = estimates.get(index) {
+            text += &format!("; about {}", estimate.text());
         }
         print_line!("{:<40} {text}", node.label());
         if let Some(line) = by_scene_text(session, node, state) {
@@ -39,10 +34,8 @@ pub(crate) fn plan(session: &Session, request: &Request, json: bool) -> anyhow::
     for sink in &plan.sinks {
         print_line!("{:<40} {}", sink.stage, sink_text(&plan, sink, &states));
     }
-    if seconds > 0.0 {
-        let count = stage::processors().count;
-        let (all, each) = (format_duration(seconds), format_duration(seconds / count as f64));
-        print_line!("about {all} of processor time: {each} on {}", processors_text(count));
+    if let Some(text) = estimates.total_text(stage::processors().count) {
+        print_line!("{text}");
     }
     Ok(ExitCode::SUCCESS)
 }

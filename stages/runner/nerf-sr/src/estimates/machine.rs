@@ -1,0 +1,40 @@
+//! Speed of this machine compared with that of the models' figures.
+
+use std::time::Instant;
+
+use numerics::SpeedTest;
+
+/// Seconds of a piece of work on the machine of the models' figures: two cores with AVX-512.
+const REFERENCE_SECONDS: f64 = 1e-3;
+/// Number of measurements, of which the fastest counts: others may have been interrupted by other
+/// programs. All together take a twentieth of a second.
+const MEASUREMENTS: u32 = 24;
+
+/// Returns the time that this machine takes for a piece of work, over that of the models' machine.
+pub(crate) fn slowness() -> f64 {
+    let mut test = SpeedTest::default();
+    let mut fastest = f64::INFINITY;
+    let mut sum = 0.0;
+    for _ in 0..MEASUREMENTS {
+        let start = Instant::now();
+        sum += test.work();
+        fastest = fastest.min(start.elapsed().as_secs_f64());
+    }
+    // The compiler must not leave the work out.
+    std::hint::black_box(sum);
+    fastest / REFERENCE_SECONDS
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A machine in the last twenty years is within a factor of fifty, even in a busy test.
+    #[test]
+    fn this_machine_has_a_speed() {
+        let start = Instant::now();
+        let slowness = slowness();
+        println!("{slowness:.2} in {:.3} s", start.elapsed().as_secs_f64());
+        assert!((0.02..50.0).contains(&slowness), "{slowness}");
+    }
+}

@@ -1,0 +1,85 @@
+//! Properties of a node's inputs, on which its cost depends.
+
+use radiance::GivenSizes;
+use serde::Deserialize as _;
+use serde_json::Value;
+
+/// Kind of scene, on which the cost of a ray depends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum SceneKind {
+    /// Object before a background of one colour: most rays miss it.
+    Object,
+    /// Opaque scene in NDC.
+    Frustum,
+    /// Opaque scene all around the cameras.
+    Unbounded,
+}
+
+impl SceneKind {
+    /// Returns whether every ray hits a surface.
+    pub(crate) fn is_opaque(self) -> bool {
+        self != Self::Object
+    }
+}
+
+/// Number and sizes of the images of a folder.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Images {
+    pub(crate) count: u64,
+    /// Pixels of all images.
+    pub(crate) pixels: u64,
+    /// Width and height of the largest image.
+    pub(crate) largest: (u64, u64),
+}
+
+impl Images {
+    /// Returns the number of pixels of the largest image.
+    pub(crate) fn largest(&self) -> u64 {
+        self.largest.0 * self.largest.1
+    }
+
+    /// Returns as many images of another width.
+    pub(crate) fn resized(&self, width: f64) -> Self {
+        let factor = width / self.largest.0.max(1) as f64;
+        let scaled = |side: u64| (side as f64 * factor).round() as u64;
+        let pixels = (self.pixels as f64 * factor.powi(2)) as u64;
+        let largest = (scaled(self.largest.0), scaled(self.largest.1));
+        Self { count: self.count, pixels, largest }
+    }
+}
+
+/// Properties of a stage's inputs, on which its cost depends.
+#[derive(Clone, Debug)]
+pub(crate) struct Work {
+    pub(crate) kind: SceneKind,
+    /// Number of LR pixels across the field's cube.
+    pub(crate) pixels_across: f64,
+    /// True if the kernel of the LR images is a mean.
+    pub(crate) has_box_kernel: bool,
+    /// Images that the stage reads or renders.
+    pub(crate) images: Images,
+    /// HR references of a training.
+    pub(crate) references: Images,
+    /// Peak memory of preparing a view.
+    pub(crate) preparation_bytes: u64,
+    /// Parameters of the training of the field that is rendered.
+    pub(crate) field: Option<Value>,
+    /// True if a training is initialised from a field.
+    pub(crate) is_fine_tuning: bool,
+    /// True if views are scored by LPIPS.
+    pub(crate) has_weights: bool,
+    /// Number of threads.
+    pub(crate) threads: u64,
+}
+
+impl Work {
+    /// Returns the number of floats of a grid that is trained with some parameters.
+    pub(crate) fn grid_floats(&self, training: &Value) -> Option<u64> {
+        let sizes = GivenSizes::deserialize(training).ok()?;
+        let is_ndc = self.kind == SceneKind::Frustum;
+        let architecture = sizes.for_scene(self.pixels_across, is_ndc);
+        // A plan may contain sizes that the stage will refuse.
+        architecture.check().ok()?;
+        Some(architecture.grid_len() as u64)
+    }
+}
