@@ -263,17 +263,61 @@ fn sinks_are_part_of_the_picture() {
 fn times_are_estimated_before_a_run() {
     let project = Project::tiny();
     let plan = project.ok(&["plan"]);
-    // Training, rendering, scoring, and all of them.
+    // Preparation, training, rendering, scoring, and all of them.
     let times = plan.lines().filter(|line| line.contains("of processor time")).count();
-    assert_eq!(times, 4, "{plan}");
+    assert_eq!(times, 5, "{plan}");
+    let total = plan.lines().last().unwrap();
+    for words in ["about ", " on ", "at most ", "MB of memory for a stage, without 1 other stage"] {
+        assert!(total.contains(words), "{words}: {total}");
+    }
     let advice = project.ok(&["advise", "-p", "test_views=1", "--minutes", "100"]);
-    for words in ["12 training views", "1 views", "draft ", "fast ", "balanced ", "best "] {
+    for words in ["12 training views", "1 views", "training ", "rendering ", "scoring "] {
         assert!(advice.contains(words), "{words}: {advice}");
+    }
+    for quality in ["draft ", "fast ", "balanced ", "best "] {
+        let line = advice.lines().find(|line| line.starts_with(quality)).unwrap();
+        // The project has no refinement, so its column is empty.
+        assert_eq!((line.matches(" MB").count(), line.matches('–').count()), (4, 1), "{line}");
     }
     assert!(advice.trim_end().ends_with("-p test_views=1 -p quality=best"), "{advice}");
     let advice = project.ok(&["advise", "--minutes", "0"]);
     assert!(advice.contains("no quality fits into 0 minutes"), "{advice}");
+    let advice = project.ok(&["advise", "--memory", "20M"]);
+    assert!(advice.contains("no quality fits into 20M of memory; draft needs "), "{advice}");
+    assert!(advice.trim_end().ends_with("-p quality=draft --memory 20M"), "{advice}");
     assert!(project.ok(&["advise"]).trim_end().ends_with("-p quality=balanced"));
+}
+
+/// A run states its estimate before and after; its records correct the next estimate's memory.
+#[test]
+fn a_run_is_compared_with_its_estimate() {
+    let project = Project::tiny();
+    let run = project.run(&["run"]);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let mut lines = run.stderr.lines();
+    let before = lines.find(|line| line.starts_with("nerf-sr: about ")).unwrap();
+    assert!(before.contains("(prep ") && before.contains(", train-ss "), "{before}");
+    for stage in ["prep", "train-ss", "render-depth", "eval"] {
+        let done = format!("{stage}: done in ");
+        let line = run.stderr.lines().find(|line| line.starts_with(&done)).unwrap();
+        assert!(line.contains("; estimated ") && line.contains(" MB"), "{line}");
+    }
+    let end = run.stdout.lines().last().unwrap();
+    assert!(end.contains("5 of 5 stages ran") && end.contains(", estimated "), "{end}");
+    let again = project.run(&["run"]);
+    assert!(!again.stderr.contains("about "), "{}", again.stderr);
+}
+
+/// Without memory for one of its stages, nothing runs.
+#[test]
+fn a_run_beyond_the_memory_is_refused_before_its_start() {
+    let project = Project::tiny();
+    let refused = project.run(&["run", "--memory", "50M"]);
+    refused.fails(2, &["train-ss needs about ", "and 52.4 MB are free, so nothing was run"]);
+    assert!(!refused.stderr.contains("done in"), "{}", refused.stderr);
+    let limited = project.command(&["run"]).env("NERF_SR_MEMORY", "40000000").output().unwrap();
+    common::Finished::of(limited).fails(2, &["and 40.0 MB are free, so nothing was run"]);
+    assert_eq!(project.store_listing(), Vec::<String>::new());
 }
 
 /// What runs with a quality is cached for its parameters, and for no quality on other stages.

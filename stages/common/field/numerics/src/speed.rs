@@ -39,8 +39,8 @@ impl Default for SpeedTest {
 }
 
 impl SpeedTest {
-    /// Carries out one piece of work, of about a millisecond. Returns a number that depends on all
-    /// of it.
+    /// Carries out one piece of work, of less than a millisecond. Returns a number that depends on
+    /// all of it.
     pub fn work(&mut self) -> f32 {
         for _ in 0..LAYERS {
             layer(&self.weights, &self.samples, &mut self.outputs);

@@ -85,9 +85,10 @@ impl TrainingMemory {
     }
 }
 
-/// Returns the bytes of a training's program itself, with or without libtorch.
+/// Returns the bytes of a training's program and of the samples of a step, with or without
+/// libtorch: the rest of the peak memory of small scenes.
 pub const fn program_bytes(has_torch: bool) -> u64 {
-    if has_torch { 150_000_000 } else { 30_000_000 }
+    if has_torch { 175_000_000 } else { 35_000_000 }
 }
 
 /// Returns the bytes of a grid of `floats` in training.

@@ -34,8 +34,10 @@ const OBJECT_DETAILED_PIXELS: f64 = 0.31;
 const OPAQUE_DETAILED_PIXELS: f64 = 0.39;
 /// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
 const RENDERED_BYTES_PER_FLOAT: u64 = 7;
-/// Bytes of a program with libtorch, without data.
-const PROGRAM_BYTES: u64 = 130_000_000;
+/// Bytes of `render-depth`, with the rays of a band of rows, and of other programs with libtorch,
+/// without data; as in the tests below.
+const RENDERER_BYTES: u64 = 143_000_000;
+const PROGRAM_BYTES: u64 = 120_000_000;
 /// Seconds per pixel of `eval` without and with LPIPS: lego 100×2, 12 views.
 const SCORED_PIXEL_SECONDS: f64 = 1.4e-6;
 const LPIPS_PIXEL_SECONDS: f64 = 2.2e-6;
@@ -44,15 +46,17 @@ const SCORED_PIXEL_BYTES: u64 = 125;
 const LPIPS_PIXEL_BYTES: u64 = 580;
 /// Seconds per photograph's pixel of `prep`.
 const PREPARED_PIXEL_SECONDS: f64 = 30e-9;
-/// Bytes of `prep` without data.
+/// Bytes of `prep` without data, and peak memory of each further thread over that of the first:
+/// threads have their peaks at different times (fern and lego, two threads).
 const PREP_BYTES: u64 = 9_000_000;
-/// Seconds per pixel of a training step's patches of `train-refine`, and per pixel of a version of a
-/// view of `refine` (docs/results/engine.md).
+const FURTHER_THREAD: f64 = 0.3;
+/// Seconds per pixel of a training step's patches of `train-refine`, and per pixel of a version of
+/// a view of `refine` (docs/results/engine.md).
 const PATCH_PIXEL_SECONDS: f64 = 1.4e-6;
 const REFINED_PIXEL_SECONDS: f64 = 0.47e-6;
 /// Bytes per pixel of a network's training views, and of a view that is refined.
 const EXAMPLE_PIXEL_BYTES: u64 = 50;
-const REFINED_PIXEL_BYTES: u64 = 110;
+const REFINED_PIXEL_BYTES: u64 = 128;
 /// Seconds of a start of a stage; chosen by hand.
 const START_SECONDS: f64 = 0.3;
 
@@ -72,10 +76,11 @@ pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Opti
     Some(ModelCost { processor_seconds: start + seconds, peak_memory })
 }
 
-/// Returns the memory below which a stage fails. A training stores pixels in a file if there is no
-/// memory for them.
+/// Returns the memory below which a stage fails. If memory is short, a training stores pixels in a
+/// file, and `prep` uses fewer threads.
 pub(crate) fn min_memory(program: &str, parameters: &Value, work: &Work) -> Option<u64> {
     match program {
+        "prep" => Some(work.preparation_bytes),
         "train-ss" => Some(training_need(parameters, work)?.minimum(program_bytes(true))),
         _ => Some(model_cost(program, parameters, work)?.peak_memory),
     }
@@ -91,7 +96,9 @@ fn concurrent_bytes(work: &Work, images: &Images, bytes_per_pixel: u64) -> u64 {
 }
 
 fn prep_memory(work: &Work) -> u64 {
-    PREP_BYTES + work.images.count.min(work.threads) * work.preparation_bytes
+    let threads = work.images.count.min(work.threads).max(1) as f64;
+    let views = 1.0 + FURTHER_THREAD * (threads - 1.0);
+    PREP_BYTES + (views * work.preparation_bytes as f64) as u64
 }
 
 /// Returns the factor of a ray's cost over that of a field with the default sizes.
@@ -182,7 +189,7 @@ fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
 fn rendering_memory(work: &Work) -> Option<u64> {
     let field = work.field.as_ref()?;
     let floats = number(field, "ensemble")? as u64 * work.grid_floats(field)?;
-    Some(PROGRAM_BYTES + RENDERED_BYTES_PER_FLOAT * floats)
+    Some(RENDERER_BYTES + RENDERED_BYTES_PER_FLOAT * floats)
 }
 
 fn scoring(work: &Work) -> (f64, u64) {
@@ -289,6 +296,39 @@ mod tests {
             let ratio = estimate / seconds;
             println!("{name}: {estimate:.1} s for {seconds} s");
             assert!((0.7..1.3).contains(&ratio), "{name}: {estimate} s for {seconds} s");
+        }
+    }
+
+    /// Peak memory in the records of runs, in MB.
+    #[test]
+    fn measured_memory_is_estimated_within_20_percent() {
+        let (object, opaque) = (SceneKind::Object, SceneKind::Frustum);
+        let fern = Work { pixels_across: 170.7, ..work(opaque, 17, 109) };
+        let fern_field = Work { pixels_across: 170.7, ..work(opaque, 3, 218) };
+        let lego = work(object, 50, 800);
+        let scored = Work { has_weights: true, ..lego.clone() };
+        let photographs = |bytes| Work { preparation_bytes: bytes, ..work(object, 20, 1) };
+        let refiner = json!({
+            "net": "compact", "patch_size": 64, "batch_size": 8, "steps": 1, "self_ensemble": 1,
+        });
+        let render = json!({"samples_per_axis": 1, "tolerance": 0.005});
+        for (name, program, parameters, work, measured) in [
+            ("fern, trained", "train-ss", training(500_000), &fern, 476.0),
+            ("demo 32, trained", "train-ss", training(150_000), &work(object, 80, 32), 183.0),
+            ("demo 100, trained", "train-ss", training(150_000), &work(object, 80, 100), 272.0),
+            ("fern, rendered", "render-depth", render.clone(), &fern_field, 212.0),
+            ("demo 32, rendered", "render-depth", render, &work(object, 12, 32), 144.0),
+            ("lego 800, LPIPS", "eval", json!({}), &scored, 865.0),
+            ("demo 200, no LPIPS", "eval", json!({}), &work(object, 10, 200), 130.0),
+            ("lego 800, refined", "refine", refiner.clone(), &lego, 202.0),
+            ("lego 200, refiner", "train-refine", refiner, &work(object, 100, 200), 329.0),
+            ("fern, prepared", "prep", json!({}), &photographs(158_000_000), 202.0),
+            ("lego, prepared", "prep", json!({}), &photographs(12_800_000), 24.0),
+        ] {
+            let peak_memory = model_cost(program, &parameters, work).unwrap().peak_memory as f64;
+            println!("{name}: {:.0} MB for {measured} MB", peak_memory / 1e6);
+            let ratio = peak_memory / 1e6 / measured;
+            assert!((0.8..1.2).contains(&ratio), "{name}: {peak_memory} B for {measured} MB");
         }
     }
 

@@ -27,8 +27,8 @@ use scene::SceneImages;
 use work::{Images, Work};
 
 /// Minimum processor seconds of an earlier run that corrects an estimate, and maximum factor
-/// between the model's times of the two runs: shorter runs depend on other costs. Both are chosen by
-/// hand.
+/// between the model's times of the two runs: shorter runs depend on other costs. Both are chosen
+/// by hand.
 const MIN_RECORD_SECONDS: f64 = 1.0;
 const MAX_TIME_FACTOR: f64 = 10.0;
 /// Maximum factor by which an earlier run corrects an estimate; chosen by hand.
@@ -63,6 +63,10 @@ impl Estimates {
     /// Estimates the nodes of a plan.
     pub(crate) fn new(plan: &Plan, states: &[State], store: &Store) -> Self {
         let is_cached = |state: &State| matches!(state, State::Cached(_));
+        if states.iter().all(is_cached) {
+            // A run with nothing to do reads nothing.
+            return Self::default();
+        }
         let mut estimator = Estimator::new(plan, states, store);
         let mut found = Self {
             nodes: vec![None; plan.nodes.len()],
