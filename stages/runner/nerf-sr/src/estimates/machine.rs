@@ -1,5 +1,6 @@
 //! Speed of this machine compared with that of the models' figures.
 
+use std::sync::OnceLock;
 use std::time::Instant;
 
 use numerics::SpeedTest;
@@ -11,7 +12,13 @@ const REFERENCE_SECONDS: f64 = 0.42e-3;
 const MEASUREMENTS: u32 = 24;
 
 /// Returns the time that this machine takes for a piece of work, over that of the models' machine.
+/// The first call measures it.
 pub(crate) fn slowness() -> f64 {
+    static SLOWNESS: OnceLock<f64> = OnceLock::new();
+    *SLOWNESS.get_or_init(measure)
+}
+
+fn measure() -> f64 {
     let mut test = SpeedTest::default();
     let mut fastest = f64::INFINITY;
     let mut sum = 0.0;
@@ -33,7 +40,7 @@ mod tests {
     #[test]
     fn this_machine_has_a_speed() {
         let start = Instant::now();
-        let slowness = slowness();
+        let slowness = measure();
         println!("{slowness:.2} in {:.3} s", start.elapsed().as_secs_f64());
         assert!((0.02..50.0).contains(&slowness), "{slowness}");
     }

@@ -67,7 +67,7 @@ impl Estimates {
             // A run with nothing to do reads nothing.
             return Self::default();
         }
-        let mut estimator = Estimator::new(plan, states, store);
+        let estimator = Estimator::new(plan, states, store);
         let mut found = Self {
             nodes: vec![None; plan.nodes.len()],
             unknown: 0,
@@ -110,8 +110,6 @@ struct Estimator<'a> {
     records: Vec<Record>,
     /// Number of threads of a stage.
     threads: u64,
-    /// Slowness of this machine, measured when the first estimate needs it.
-    slowness: Option<f64>,
 }
 
 impl<'a> Estimator<'a> {
@@ -129,16 +127,16 @@ impl<'a> Estimator<'a> {
         let mut records = store.records().unwrap_or_default();
         records.retain(|record| record.host == host && record.model.is_some());
         let threads = stage::processors().count as u64;
-        Self { plan, scenes, records, threads, slowness: None }
+        Self { plan, scenes, records, threads }
     }
 
-    fn estimate(&mut self, node: &Node, state: &State) -> Option<Estimate> {
+    fn estimate(&self, node: &Node, state: &State) -> Option<Estimate> {
         let program = &node.program.description.name;
         let work = self.work(node)?;
         let model = model_cost(program, &node.parameters, &work)?;
         let (time, memory) = match self.nearest(node, state, model) {
             Some(record) => corrections(record)?,
-            None => (*self.slowness.get_or_insert_with(machine::slowness), 1.0),
+            None => (machine::slowness(), 1.0),
         };
         let min_memory = min_memory(program, &node.parameters, &work)?;
         Some(Estimate {

@@ -31,6 +31,7 @@ struct Cost {
 }
 
 /// Costs of a quality.
+#[derive(Debug)]
 struct QualityCosts {
     quality: Quality,
     /// Costs by column of [`COLUMNS`].
@@ -86,8 +87,8 @@ pub(crate) fn advise(
     let chosen = choose(&all, limits, processors);
     let mut words = vec!["run".to_owned()];
     words.extend(arguments.iter().cloned());
-    words.extend(["-p".to_owned(), format!("quality={}", chosen.name())]);
-    if let Some(memory) = limits.memory {
+    words.extend(["-p".to_owned(), format!("quality={}", chosen.quality.name())]);
+    if let Some(memory) = limits.memory.filter(|memory| chosen.min_memory <= memory.bytes()) {
         words.extend(["--memory".to_owned(), memory.to_string()]);
     }
     print_line!("{}", command_text(&words));
@@ -110,10 +111,11 @@ fn print_table(all: &[QualityCosts], processors: usize) {
 }
 
 /// Chooses the best quality within the limits, or the fastest; without limits the default.
-fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> Quality {
+fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> &QualityCosts {
     let Limits { minutes, memory } = limits;
+    let fastest = &all[0];
     if minutes.is_none() && memory.is_none() {
-        return Quality::default();
+        return all.iter().find(|costs| costs.quality == Quality::default()).unwrap_or(fastest);
     }
     let fits_time = |costs: &QualityCosts| {
         minutes.is_none_or(|minutes| costs.total.seconds / processors as f64 <= 60.0 * minutes)
@@ -121,9 +123,8 @@ fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> Quality {
     let fits_memory =
         |costs: &QualityCosts| memory.is_none_or(|memory| costs.min_memory <= memory.bytes());
     if let Some(costs) = all.iter().rfind(|costs| fits_time(costs) && fits_memory(costs)) {
-        return costs.quality;
+        return costs;
     }
-    let fastest = &all[0];
     if let Some(minutes) = minutes.filter(|_| !fits_time(fastest)) {
         print_line!("no quality fits into {minutes} minutes; the fastest is draft");
     }
@@ -131,7 +132,7 @@ fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> Quality {
         let need = format_size(fastest.min_memory);
         print_line!("no quality fits into {memory} of memory; draft needs {need}");
     }
-    fastest.quality
+    fastest
 }
 
 /// Returns the costs of the stages that would run with a quality. Prints the scenes with the first
@@ -221,7 +222,9 @@ mod tests {
             (Some(0.6), Some("1G"), Quality::Draft),
         ] {
             let memory = memory.map(|amount| amount.parse().unwrap());
-            assert_eq!(choose(&all(), Limits { minutes, memory }, 2), expected, "{minutes:?}");
+            let all = all();
+            let chosen = choose(&all, Limits { minutes, memory }, 2).quality;
+            assert_eq!(chosen, expected, "{minutes:?}, {memory:?}");
         }
     }
 
