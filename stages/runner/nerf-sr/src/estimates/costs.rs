@@ -49,7 +49,7 @@ const PREPARED_PIXEL_SECONDS: f64 = 30e-9;
 /// Bytes of `prep` without data, and peak memory of each further thread over that of the first:
 /// threads have their peaks at different times (fern and lego, two threads).
 const PREP_BYTES: u64 = 9_000_000;
-const FURTHER_THREAD: f64 = 0.3;
+const FURTHER_THREAD: f64 = 0.45;
 /// Seconds per pixel of a training step's patches of `train-refine`, and per pixel of a version of
 /// a view of `refine` (docs/results/engine.md).
 const PATCH_PIXEL_SECONDS: f64 = 1.4e-6;
