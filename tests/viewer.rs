@@ -250,8 +250,10 @@ fn check_recorder(project: &Project, recorded: &Path, second: &Value) {
     for (a, b) in pose(&path).iter().zip(&pose(second)) {
         assert!((a.as_f64().unwrap() - b.as_f64().unwrap()).abs() < 1e-9, "{a} {b}");
     }
-    for key in ["matrix", "fov", "aspect"] {
-        assert!(second["keyframes"][1].get(key).is_some(), "{key}");
+    let (key, last) = (&second["keyframes"][1], &frames(second)[48]);
+    let fields = [("matrix", "camera_to_world"), ("fov", "fov"), ("aspect", "aspect")];
+    for (field, of_frame) in fields {
+        assert_eq!(key[field], last[of_frame], "{field}");
     }
     let arguments = ["-i", "camera-path.path=recorded", "-p", "camera-path.size=256"];
     project.ok(&[&["run", "path-views"], &arguments[..]].concat());

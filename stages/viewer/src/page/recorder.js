@@ -35,7 +35,6 @@ class Recorder {
   /** Returns the path in nerfstudio's format, for images of a width and height in pixels. */
   file(width, height) {
     const rows = (pose) => [...pose.flat(), 0, 0, 0, 1];
-    const columns = (pose) => [0, 1, 2, 3].flatMap((c) => [...column(pose, c), c === 3 ? 1 : 0]);
     const aspect = width / height;
     const frames = this.frames();
     return {
@@ -49,7 +48,7 @@ class Recorder {
       default_fov: frames[0]?.angle ?? 50,
       default_transition_sec: SECONDS_PER_KEY,
       keyframes: this.keys.map(({ pose, angle }) => ({
-        matrix: JSON.stringify(columns(pose)), fov: angle, aspect,
+        matrix: rows(pose), fov: angle, aspect,
         override_transition_enabled: false, override_transition_sec: null,
       })),
       camera_path: frames.map(({ pose, angle }) => ({ camera_to_world: rows(pose), fov: angle, aspect })),

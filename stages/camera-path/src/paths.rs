@@ -1,0 +1,304 @@
+//! Poses of paths, from the scene's cameras and bounds.
+
+use std::f64::consts::TAU;
+
+use glam::{DMat3, DQuat, DVec3};
+use scene::{Bounds, Camera, Pose, Space, looking_at, pose_of};
+
+use crate::coverage::Coverage;
+use crate::{Kind, Params};
+
+/// Disparity of the point that a spiral's frames look at, relative to the way from far to near: a
+/// quarter from near, where most of a scene is; chosen by hand.
+const FOCUS_FRACTION: f64 = 0.75;
+/// Shares of the focus's disparity that are tried; with 0 all frames look in one direction.
+const FOCUS_STEPS: [f64; 5] = [1.0, 0.75, 0.5, 0.25, 0.0];
+/// Maximum share of a frame's tested points that no camera observes. In frames of fern these are
+/// points in corners at its nearest depth, where the scene has no surface; with 0 its spiral would be
+/// 0.35 of the cameras' width instead of 0.95.
+const MAX_UNSEEN_FRACTION: f64 = 0.01;
+/// Number of sizes that are tried for a spiral; chosen by hand.
+const SIZE_STEPS: u32 = 20;
+/// Number of frames of a spiral that are tested; chosen by hand.
+const TESTED_FRAMES: u32 = 32;
+
+/// Computes the poses of a path: `camera_to_world` of each frame. `frame` has the frames' image
+/// size and lens.
+pub fn poses(
+    kind: Kind,
+    params: &Params,
+    frame: &Camera,
+    cameras: &[Camera],
+    bounds: &Bounds,
+) -> Vec<Pose> {
+    let fractions = (0..params.frames).map(|i| f64::from(i) / f64::from(params.frames));
+    match kind {
+        Kind::Spiral => {
+            let spiral = Spiral::fit(cameras, frame, bounds, params.turns);
+            fractions.map(|fraction| spiral.pose(params, fraction)).collect()
+        }
+        Kind::Orbit => orbit_poses(cameras, bounds, params, fractions),
+        Kind::Between => fractions.map(|fraction| interpolated_pose(cameras, fraction)).collect(),
+        Kind::List => params.poses.clone(),
+    }
+}
+
+/// Returns the mean of a vector over the cameras.
+fn mean(cameras: &[Camera], vector: impl Fn(&Camera) -> DVec3) -> DVec3 {
+    cameras.iter().map(vector).sum::<DVec3>() / cameras.len().max(1) as f64
+}
+
+/// Returns the minimum and maximum depth of the scene.
+fn depth_range(bounds: &Bounds) -> (f64, f64) {
+    let (near, far) = match bounds.space {
+        Space::Ndc(frustum) => (frustum.near, frustum.far),
+        _ => (bounds.near, bounds.far),
+    };
+    (near.max(1e-3 * far), far)
+}
+
+/// Spiral around the mean camera.
+#[derive(Clone, Copy)]
+struct Spiral {
+    centre: DVec3,
+    forward: DVec3,
+    up: DVec3,
+    /// Largest offsets to the right, up and forward.
+    axes: [DVec3; 3],
+    /// 1 / depth of the point that all frames look at; 0 for frames that look in one direction.
+    disparity: f64,
+}
+
+impl Spiral {
+    /// Creates a spiral as wide as the positions of most cameras, whose frames look at one point of
+    /// the scene.
+    fn around(cameras: &[Camera], (near, far): (f64, f64)) -> Self {
+        let centre = mean(cameras, Camera::centre);
+        let forward = mean(cameras, Camera::forward).normalize_or(DVec3::NEG_Z);
+        let right = forward.cross(mean(cameras, |c| c.rotation().y_axis)).normalize_or(DVec3::X);
+        let up = right.cross(forward);
+        let axes = [right, up, forward].map(|axis| spread(cameras, centre, axis) * axis);
+        let disparity = (1.0 - FOCUS_FRACTION) / far + FOCUS_FRACTION / near;
+        Self { centre, forward, up, axes, disparity }
+    }
+
+    /// Creates the largest spiral that stays where the cameras looked: at most
+    /// [`MAX_UNSEEN_FRACTION`] of a frame is unobserved, or as much as at the mean camera. A farther
+    /// focus is preferred to a smaller spiral.
+    fn fit(cameras: &[Camera], frame: &Camera, bounds: &Bounds, turns: f64) -> Self {
+        let (near, far) = depth_range(bounds);
+        let whole = Self::around(cameras, (near, far));
+        let coverage = Coverage::new(cameras, frame, near, far);
+        let at_mean = coverage.count_unseen(whole.scaled(0.0, 0.0).pose_at(1.0, 0.0));
+        let allowed = at_mean.max((MAX_UNSEEN_FRACTION * coverage.point_count() as f64) as usize);
+        let angles = |i: u32| TAU * turns.min(2.0) * f64::from(i) / f64::from(TESTED_FRAMES);
+        for step in (1..=SIZE_STEPS).rev() {
+            for focus in FOCUS_STEPS {
+                let spiral = whole.scaled(f64::from(step) / f64::from(SIZE_STEPS), focus);
+                let stays = (0..TESTED_FRAMES)
+                    .all(|i| coverage.count_unseen(spiral.pose_at(1.0, angles(i))) <= allowed);
+                if stays {
+                    return spiral;
+                }
+            }
+        }
+        whole.scaled(0.0, 0.0)
+    }
+
+    /// Returns the spiral with scaled offsets and disparity.
+    fn scaled(self, size: f64, focus: f64) -> Self {
+        Self { axes: self.axes.map(|axis| size * axis), disparity: focus * self.disparity, ..self }
+    }
+
+    /// Returns the pose at a fraction of the path.
+    fn pose(&self, params: &Params, fraction: f64) -> Pose {
+        self.pose_at(params.radius, TAU * params.turns * fraction)
+    }
+
+    /// Returns the pose at an angle, with offsets multiplied by `radius`.
+    fn pose_at(&self, radius: f64, angle: f64) -> Pose {
+        let [right, up, forward] = self.axes;
+        let offset =
+            radius * (angle.cos() * right + angle.sin() * up + (0.5 * angle).sin() * forward);
+        let position = self.centre + offset;
+        // Towards `centre + forward / disparity`, which is infinitely far at disparity 0.
+        looking_at(position, position + self.forward - self.disparity * offset, self.up)
+    }
+}
+
+/// Returns the 90th percentile of the cameras' distances from a point along an axis (as in LLFF's
+/// spirals).
+fn spread(cameras: &[Camera], centre: DVec3, axis: DVec3) -> f64 {
+    let mut offsets: Vec<f64> =
+        cameras.iter().map(|c| (c.centre() - centre).dot(axis).abs()).collect();
+    offsets.sort_by(f64::total_cmp);
+    offsets[(offsets.len() - 1) * 9 / 10]
+}
+
+/// Computes the poses of an orbit at fractions of its length.
+fn orbit_poses(
+    cameras: &[Camera],
+    bounds: &Bounds,
+    params: &Params,
+    fractions: impl Iterator<Item = f64>,
+) -> Vec<Pose> {
+    let up = mean(cameras, |c| c.rotation().y_axis).normalize_or(DVec3::Z);
+    let middle = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
+    let height = mean(cameras, |c| c.centre() - middle).dot(up);
+    let distance = cameras.iter().map(|c| (c.centre() - middle).length()).sum::<f64>()
+        / cameras.len().max(1) as f64;
+    let radius = (distance * distance - height * height).max(0.0).sqrt();
+    let offset = cameras[0].centre() - middle;
+    let first = (offset - offset.dot(up) * up).normalize_or(up.any_orthonormal_vector());
+    fractions
+        .map(|fraction| {
+            let rotation = DQuat::from_axis_angle(up, TAU * params.turns * fraction);
+            let offset = params.radius * (rotation * first * radius + height * up);
+            looking_at(middle + offset, middle, up)
+        })
+        .collect()
+}
+
+/// Interpolates the pose at a fraction of the closed curve through all cameras: centres by a
+/// Catmull-Rom spline, rotations along the shorter arc.
+fn interpolated_pose(cameras: &[Camera], fraction: f64) -> Pose {
+    let count = cameras.len();
+    let position = fraction * count as f64;
+    let (i, t) = (position as usize % count, position.fract());
+    let [before, from, to, after] = [count - 1, 0, 1, 2].map(|k| &cameras[(i + k) % count]);
+    let [a, b, c, d] = [before, from, to, after].map(Camera::centre);
+    let centre = 0.5
+        * (2.0 * b
+            + (c - a) * t
+            + (2.0 * a - 5.0 * b + 4.0 * c - d) * t * t
+            + (3.0 * (b - c) + d - a) * t * t * t);
+    let from = DQuat::from_mat3(&from.rotation());
+    let to = DQuat::from_mat3(&to.rotation());
+    pose_of(DMat3::from_quat(from.slerp(to, t).normalize()), centre)
+}
+
+#[cfg(test)]
+mod tests {
+    use scene::Intrinsics;
+
+    use super::*;
+    use crate::default_kind;
+
+    fn camera(name: &str, camera_to_world: Pose) -> Camera {
+        let intrinsics = Intrinsics::from_angle_x(40, 30, 0.7);
+        Camera { name: name.to_owned(), intrinsics, camera_to_world }
+    }
+
+    fn cameras(places: &[DVec3], at: impl Fn(DVec3) -> DVec3) -> Vec<Camera> {
+        let poses = places.iter().map(|&place| looking_at(place, at(place), DVec3::Z));
+        poses.enumerate().map(|(i, pose)| camera(&i.to_string(), pose)).collect()
+    }
+
+    fn ring() -> Vec<Camera> {
+        let places: Vec<DVec3> = (0..7)
+            .map(|i| {
+                DVec3::new(
+                    4.0 * f64::from(i).cos(),
+                    4.0 * f64::from(i).sin(),
+                    1.0 + 0.1 * f64::from(i),
+                )
+            })
+            .collect();
+        cameras(&places, |_| DVec3::ZERO)
+    }
+
+    fn row() -> Vec<Camera> {
+        let places: Vec<DVec3> = (0..9)
+            .map(|i| DVec3::new(f64::from(i % 3) - 1.0, 0.0, 0.5 * f64::from(i / 3)))
+            .collect();
+        cameras(&places, |p| p + DVec3::Y)
+    }
+
+    const BOX: Bounds = Bounds::cube(1.0, 2.0, 6.0);
+
+    fn whole(poses: &[Pose]) -> Vec<Camera> {
+        let cameras: Vec<Camera> = poses.iter().map(|&pose| camera("c", pose)).collect();
+        cameras.iter().for_each(|c| c.check().unwrap());
+        cameras
+    }
+
+    #[test]
+    fn an_orbit_goes_around_the_middle() {
+        let params = Params { frames: 24, ..Params::default() };
+        let cameras = ring();
+        assert_eq!(default_kind(&cameras, &params), Kind::Orbit);
+        let path = whole(&poses(Kind::Orbit, &params, &cameras[0], &cameras, &BOX));
+        assert_eq!(path.len(), 24);
+        for camera in &path {
+            assert!((camera.centre().length() - 4.2).abs() < 0.3, "{}", camera.centre());
+            assert!(camera.forward().dot(-camera.centre().normalize()) > 0.999);
+        }
+        // No jump, not from the last to the first either.
+        for (a, b) in path.iter().zip(path.iter().cycle().skip(1)) {
+            assert!((a.centre() - b.centre()).length() < 1.2);
+        }
+    }
+
+    #[test]
+    fn a_spiral_stays_among_the_cameras_and_looks_their_way() {
+        let params = Params { frames: 30, ..Params::default() };
+        let cameras = row();
+        assert_eq!(default_kind(&cameras, &params), Kind::Spiral);
+        for camera in whole(&poses(Kind::Spiral, &params, &cameras[0], &cameras, &BOX)) {
+            let off = camera.centre() - DVec3::new(0.0, 0.0, 0.5);
+            assert!(
+                off.x.abs() <= 1.0 + 1e-9 && off.z.abs() <= 0.5 + 1e-9 && camera.forward().y > 0.8,
+                "{off}"
+            );
+        }
+    }
+
+    /// A spiral of a grid of parallel cameras stays where they looked, at every depth; one around a
+    /// near point doesn't.
+    #[test]
+    fn frames_of_a_spiral_show_what_cameras_saw() {
+        let cameras = row();
+        let bounds = Bounds::cube(20.0, 4.0, 40.0);
+        let range = depth_range(&bounds);
+        let coverage = Coverage::new(&cameras, &cameras[0], range.0, range.1);
+        let unseen = |poses: &[Pose]| {
+            let counts = poses.iter().map(|&pose| coverage.count_unseen(pose));
+            counts.max().unwrap_or(0)
+        };
+        let params = Params { frames: 50, ..Params::default() };
+        let around = Spiral::around(&cameras, range);
+        let poses_around: Vec<Pose> = (0..8).map(|i| around.pose_at(1.0, f64::from(i))).collect();
+        assert!(unseen(&poses_around) > 15, "{}", unseen(&poses_around));
+        let path = poses(Kind::Spiral, &params, &cameras[0], &cameras, &bounds);
+        let widest = whole(&path).iter().map(|c| c.centre().x).fold(0.0, f64::max);
+        assert!(unseen(&path) <= 4 && widest > 0.9, "{} {widest}", unseen(&path));
+        // A larger spiral by the parameter isn't cut.
+        let params = Params { radius: 3.0, ..params };
+        let path = poses(Kind::Spiral, &params, &cameras[0], &cameras, &bounds);
+        assert!(whole(&path).iter().any(|c| c.centre().x > 2.7));
+        assert!(unseen(&path) > 15);
+    }
+
+    #[test]
+    fn between_passes_every_camera() {
+        let cameras = ring();
+        let params = Params { frames: 70, ..Params::default() };
+        let path = whole(&poses(Kind::Between, &params, &cameras[0], &cameras, &BOX));
+        for (i, camera) in cameras.iter().enumerate() {
+            let frame = &path[10 * i];
+            assert!(
+                (frame.centre() - camera.centre()).length() < 1e-9
+                    && frame.forward().dot(camera.forward()) > 1.0 - 1e-9
+            );
+        }
+    }
+
+    #[test]
+    fn one_camera_and_straight_down_are_paths_too() {
+        let one = cameras(&[DVec3::new(0.0, 0.0, 4.0)], |_| DVec3::ZERO);
+        let params = Params { frames: 5, ..Params::default() };
+        for kind in [Kind::Spiral, Kind::Orbit, Kind::Between] {
+            whole(&poses(kind, &params, &one[0], &one, &BOX));
+        }
+    }
+}
