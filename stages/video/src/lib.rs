@@ -1,39 +1,50 @@
 //! `video`: rendered views as a film, colour and depth side by side.
 //!
-//! The stage is a sink. It writes a PNG per frame and, if `ffmpeg` is installed, `video.mp4`. Each
-//! point of a sweep has its own folder.
+//! The stage is a sink. It writes a PNG per frame and a film: `video.mp4` if `ffmpeg` is installed,
+//! otherwise `video.png`. Each point of a sweep has its own folder.
 
-use std::io::{self, BufRead, BufReader, Read as _};
+mod animation;
+mod film;
+
 use std::path::Path;
-use std::process::{self, Command, Stdio};
-use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::{Failure, RunNode, RunRecord, label, sink_folders};
+use artifact::{Failure, FailureExt as _, RunNode, RunRecord, label, sink_folders};
 use pixels::{DepthMap, Rgba8, common_range, read_exr, write_png};
 use rayon::prelude::*;
 use scene::{View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{Context, Input, Output, Progress, Stage};
+use stage::{Context, Input, Output, Stage};
+
+use crate::film::Film;
 
 /// Parameters of `video`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Frames per second.
-    #[schemars(range(min = 1, max = 240))]
-    pub frames_per_second: u32,
+    /// Frames per second. Default: those of the camera path, otherwise 30.
+    #[schemars(range(min = 1, max = 240), extend("x-default" = "by camera path"))]
+    pub frames_per_second: Option<u32>,
+    /// Draw depth to the right of colour.
+    pub depth: bool,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { frames_per_second: 30 }
+        Self { frames_per_second: None, depth: true }
     }
 }
 
-/// Interval at which ffmpeg and interruptions are checked; chosen by hand.
-const POLL_INTERVAL: Duration = Duration::from_millis(20);
+/// Frames per second of views whose camera path is unknown; chosen by hand.
+const DEFAULT_FRAMES_PER_SECOND: f64 = 30.0;
+
+/// Part of a camera path, `camera_path.json`.
+#[derive(Deserialize)]
+struct CameraPath {
+    /// Frames per second.
+    fps: f64,
+}
 
 /// The stage.
 pub struct Video;
@@ -41,7 +52,8 @@ pub struct Video;
 impl Stage for Video {
     type Params = Params;
     const NAME: &'static str = "video";
-    const SUMMARY: &'static str = "Makes a film of rendered views, colour and depth side by side.";
+    const SUMMARY: &'static str =
+        "Makes a film of rendered or refined views, colour and depth side by side.";
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
@@ -58,24 +70,48 @@ impl Stage for Video {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
         run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
-        let rendered: Vec<&RunNode> = run.nodes.iter().filter(|n| n.kind == "views").collect();
+        let rendered: Vec<&RunNode> =
+            run.nodes.iter().filter(|n| n.is_shown && n.kind == "views").collect();
         if rendered.is_empty() {
             return Err(Failure::BadInput("run.json has no rendered views".to_owned()).into());
         }
         for (node, prefix) in rendered.iter().zip(sink_folders(&rendered)) {
-            make_film(context, params, &node.folder, &prefix)
+            let rate = match params.frames_per_second {
+                Some(rate) => f64::from(rate),
+                None => path_rate(&run, node)?.unwrap_or(DEFAULT_FRAMES_PER_SECOND),
+            };
+            make_film(context, params.depth, &node.folder, &prefix, rate)
                 .with_context(|| label(&node.stage, &node.point))?;
         }
         Ok(())
     }
 }
 
-/// Writes the frames, and the film if ffmpeg is available.
+/// Returns the rate of the camera path from which a node's views were rendered; `None` if their
+/// cameras are no path.
+fn path_rate(run: &RunRecord, node: &RunNode) -> Result<Option<f64>, Failure> {
+    let parents = node.inputs.values().filter_map(|input| run.nodes.get(input.node?));
+    for parent in parents {
+        if parent.kind == "views" {
+            return path_rate(run, parent);
+        }
+        let file = parent.folder.join("camera_path.json");
+        if parent.kind == "cameras" && file.is_file() {
+            let bytes = std::fs::read(&file).bad_input(file.display())?;
+            let path: CameraPath = serde_json::from_slice(&bytes).bad_input(file.display())?;
+            return Ok(Some(path.fps));
+        }
+    }
+    Ok(None)
+}
+
+/// Writes the frames and the film.
 fn make_film(
     context: &Context,
-    params: &Params,
+    with_depth: bool,
     folder: &Path,
     prefix: &str,
+    rate: f64,
 ) -> anyhow::Result<()> {
     let views = Views::read_folder(folder)?;
     if views.views.iter().any(|view| size_of_view(view) != size_of_view(&views.views[0])) {
@@ -88,24 +124,21 @@ fn make_film(
     // All frames have one range of depths: with a range per frame, colours would flicker.
     let ranges = views.views.par_iter().map(|view| -> anyhow::Result<Option<(f32, f32)>> {
         progress.add(1);
-        let Some(file) = &view.depth else { return Ok(None) };
+        let Some(file) = view.depth.as_ref().filter(|_| with_depth) else { return Ok(None) };
         let image = read_exr(&folder.join(file))?;
         Ok(DepthMap::of(&image).and_then(|map| map.range()))
     });
     let ranges = ranges.collect::<anyhow::Result<Vec<_>>>()?;
     let range = common_range(ranges.into_iter().flatten());
+    let film = Film { prefix, frames: views.views.len(), rate };
     views.views.par_iter().enumerate().try_for_each(|(i, view)| {
         context.check_interrupt()?;
         let frame = draw_frame(&views, view, folder, range)?;
-        let path = context.output_path(&format!("{prefix}frames/{i:05}.png"))?;
-        write_png(&path, &with_even_size(&frame))?;
+        write_png(&film.frame(context, &format!("{i:05}"))?, &with_even_size(&frame))?;
         progress.add(1);
         anyhow::Ok(())
     })?;
-    let frames = context.output_path(&format!("{prefix}frames/%05d.png"))?;
-    let film = context.output_path(&format!("{prefix}video.mp4"))?;
-    let progress = context.progress("encoding", views.views.len() as u64);
-    encode(context, params, &frames, &film, &progress)
+    film.write(context)
 }
 
 fn size_of_view(view: &View) -> (u32, u32) {
@@ -154,97 +187,9 @@ fn with_even_size(image: &Rgba8) -> Rgba8 {
     Rgba8::new(width, height, data)
 }
 
-/// Encodes the film by ffmpeg; without ffmpeg, or if it fails, logs that only the frames exist.
-fn encode(
-    context: &Context,
-    params: &Params,
-    frames: &Path,
-    film: &Path,
-    progress: &Progress,
-) -> anyhow::Result<()> {
-    let rate = params.frames_per_second.to_string();
-    let mut command = Command::new("ffmpeg");
-    command.args(["-loglevel", "error", "-nostdin", "-y", "-framerate", &rate, "-i"]).arg(frames);
-    command.args(["-pix_fmt", "yuv420p", "-movflags", "+faststart"]);
-    command.args(["-progress", "pipe:1"]).arg(film).stdin(Stdio::null());
-    let folder = frames.parent().unwrap_or(frames).display();
-    let output = output_of(context, &mut command, progress);
-    context.check_interrupt()?;
-    match output {
-        Ok(output) if output.status.success() => Ok(()),
-        Ok(output) => {
-            let message = String::from_utf8_lossy(&output.stderr);
-            context.log_line(format!(
-                "no video.mp4: ffmpeg failed: {}; only frames are written",
-                message.lines().next().unwrap_or("no message")
-            ));
-            // A partial film can't be played.
-            std::fs::remove_file(film).or_else(|e| {
-                if e.kind() == std::io::ErrorKind::NotFound { Ok(()) } else { Err(e) }
-            })?;
-            Ok(())
-        }
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-            context.log_line("no video.mp4: ffmpeg isn't installed; only frames are written");
-            Ok(())
-        }
-        Err(e) => Err(e).with_context(|| format!("cannot run ffmpeg for {folder}")),
-    }
-}
-
-/// Runs ffmpeg and collects its stderr; kills ffmpeg if the stage is interrupted. `progress` gets
-/// the frames that ffmpeg reports on stdout.
-fn output_of(
-    context: &Context,
-    command: &mut Command,
-    progress: &Progress,
-) -> io::Result<process::Output> {
-    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
-    let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
-    std::thread::scope(|scope| {
-        let stderr = scope.spawn(|| {
-            let mut bytes = Vec::new();
-            stderr.map_or(Ok(0), |mut pipe| pipe.read_to_end(&mut bytes)).map(|_| bytes)
-        });
-        scope.spawn(|| {
-            let lines = stdout.map(BufReader::new).into_iter().flat_map(BufRead::lines);
-            for line in lines.map_while(Result::ok) {
-                if let Some(frame) = encoded_frames(&line) {
-                    progress.set(frame, "");
-                }
-            }
-        });
-        let status = loop {
-            if let Some(status) = child.try_wait()? {
-                break status;
-            }
-            if context.is_interrupted() {
-                child.kill()?;
-            }
-            std::thread::sleep(POLL_INTERVAL);
-        };
-        let stderr = stderr.join().unwrap_or_else(|_| Ok(Vec::new()))?;
-        Ok(process::Output { status, stdout: Vec::new(), stderr })
-    })
-}
-
-/// Returns the number of encoded frames in a line of ffmpeg's `-progress`.
-fn encoded_frames(line: &str) -> Option<u64> {
-    line.strip_prefix("frame=")?.trim().parse().ok()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn ffmpeg_reports_frames() {
-        assert_eq!(encoded_frames("frame=12"), Some(12));
-        assert_eq!(encoded_frames("frame=  7"), Some(7));
-        assert!(
-            ["frame=", "fps=3", "progress=end"].into_iter().all(|l| encoded_frames(l).is_none())
-        );
-    }
 
     #[test]
     fn frames_have_even_sizes_and_both_images() {

@@ -1,0 +1,162 @@
+//! Films of frames: MP4 by ffmpeg, otherwise an animated PNG.
+
+use std::io::{self, BufRead, BufReader, Read as _};
+use std::path::{Path, PathBuf};
+use std::process::{self, Command, Stdio};
+use std::time::Duration;
+
+use anyhow::Context as _;
+use pixels::{Filter, read_png, resize_pillow};
+use stage::{Context, Progress};
+
+use crate::animation::AnimatedPng;
+
+/// Interval at which ffmpeg and interruptions are checked; chosen by hand.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+/// Constant rate factor of the H.264 encoder, from 0 (lossless) to 51. x264's documentation calls 17
+/// or 18 visually lossless or nearly so.
+const H264_RATE_FACTOR: &str = "18";
+
+/// Maximum width of an animated PNG, in pixels: its compression is lossless. Chosen by hand.
+const MAX_ANIMATION_WIDTH: usize = 640;
+/// Rate above which an animated PNG has every other frame only; chosen by hand.
+const MAX_ANIMATION_RATE: f64 = 20.0;
+
+/// Frames of a film.
+pub(crate) struct Film<'a> {
+    /// Folder of the film and of `frames/`, relative to the output: empty, or ending in `/`.
+    pub(crate) prefix: &'a str,
+    /// Number of frames.
+    pub(crate) frames: usize,
+    /// Frames per second.
+    pub(crate) rate: f64,
+}
+
+impl Film<'_> {
+    /// Returns the path of a frame, by its number as text.
+    pub(crate) fn frame(&self, context: &Context, number: &str) -> anyhow::Result<PathBuf> {
+        context.output_path(&format!("{}frames/{number}.png", self.prefix))
+    }
+
+    /// Writes `video.mp4` by ffmpeg; without ffmpeg, or if it fails, `video.png`.
+    pub(crate) fn write(&self, context: &Context) -> anyhow::Result<()> {
+        let progress = context.progress("encoding", self.frames as u64);
+        let path = context.output_path(&format!("{}video.mp4", self.prefix))?;
+        let output = output_of(context, &mut self.ffmpeg(context, &path)?, &progress);
+        context.check_interrupt()?;
+        let reason = match output {
+            Ok(output) if output.status.success() => {
+                let (rate, seconds) = (self.rate, self.frames as f64 / self.rate);
+                context.log_line(format!(
+                    "video.mp4: H.264, quality CRF {H264_RATE_FACTOR}, {rate} frames per second, \
+                    {seconds:.1} s"
+                ));
+                return Ok(());
+            }
+            Ok(output) => {
+                let message = String::from_utf8_lossy(&output.stderr);
+                format!("ffmpeg failed: {}", message.lines().next().unwrap_or("no message"))
+            }
+            Err(e) if e.kind() == io::ErrorKind::NotFound => "ffmpeg isn't installed".to_owned(),
+            Err(e) => return Err(e).context("cannot run ffmpeg"),
+        };
+        // A partial film can't be played.
+        std::fs::remove_file(&path)
+            .or_else(|e| if e.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(e) })?;
+        context.log_line(format!("no video.mp4: {reason}; video.png is an animated PNG instead"));
+        self.write_animation(context, &progress)
+    }
+
+    /// Returns the call of ffmpeg.
+    fn ffmpeg(&self, context: &Context, film: &Path) -> anyhow::Result<Command> {
+        let rate = self.rate.to_string();
+        let mut command = Command::new("ffmpeg");
+        command.args(["-loglevel", "error", "-nostdin", "-y", "-framerate", &rate, "-i"]);
+        command.arg(self.frame(context, "%05d")?);
+        command.args(["-c:v", "libx264", "-crf", H264_RATE_FACTOR, "-pix_fmt", "yuv420p"]);
+        command.args(["-movflags", "+faststart", "-progress", "pipe:1"]);
+        command.arg(film).stdin(Stdio::null());
+        Ok(command)
+    }
+
+    /// Writes `video.png`, an animated PNG, with narrower and, at a high rate, fewer frames.
+    fn write_animation(&self, context: &Context, progress: &Progress) -> anyhow::Result<()> {
+        let path = context.output_path(&format!("{}video.png", self.prefix))?;
+        let step = if self.rate > MAX_ANIMATION_RATE { 2 } else { 1 };
+        let delay = step as f64 / self.rate;
+        let mut animation = None;
+        for index in (0..self.frames).step_by(step) {
+            context.check_interrupt()?;
+            let frame = read_png(&self.frame(context, &format!("{index:05}"))?)?;
+            let width = frame.width.min(MAX_ANIMATION_WIDTH);
+            let height = (frame.height * width).div_ceil(frame.width);
+            let frame = resize_pillow(&frame, width, height, Filter::Lanczos);
+            let animation = match &mut animation {
+                Some(animation) => animation,
+                None => {
+                    let frames = self.frames.div_ceil(step) as u32;
+                    animation.insert(AnimatedPng::create(&path, (width, height), frames, delay)?)
+                }
+            };
+            animation.add(&frame)?;
+            progress.set(index as u64, "");
+        }
+        animation.map_or(Ok(()), AnimatedPng::finish)
+    }
+}
+
+/// Runs ffmpeg and collects its stderr; kills ffmpeg if the stage is interrupted. `progress` gets
+/// the frames that ffmpeg reports on stdout.
+fn output_of(
+    context: &Context,
+    command: &mut Command,
+    progress: &Progress,
+) -> io::Result<process::Output> {
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+    let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
+    std::thread::scope(|scope| {
+        let stderr = scope.spawn(|| {
+            let mut bytes = Vec::new();
+            stderr.map_or(Ok(0), |mut pipe| pipe.read_to_end(&mut bytes)).map(|_| bytes)
+        });
+        scope.spawn(|| {
+            let lines = stdout.map(BufReader::new).into_iter().flat_map(BufRead::lines);
+            for line in lines.map_while(Result::ok) {
+                if let Some(frame) = encoded_frames(&line) {
+                    progress.set(frame, "");
+                }
+            }
+        });
+        let status = loop {
+            if let Some(status) = child.try_wait()? {
+                break status;
+            }
+            if context.is_interrupted() {
+                child.kill()?;
+            }
+            std::thread::sleep(POLL_INTERVAL);
+        };
+        let stderr = stderr.join().unwrap_or_else(|_| Ok(Vec::new()))?;
+        Ok(process::Output { status, stdout: Vec::new(), stderr })
+    })
+}
+
+/// Returns the number of encoded frames in a line of ffmpeg's `-progress`.
+fn encoded_frames(line: &str) -> Option<u64> {
+    line.strip_prefix("frame=")?.trim().parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ffmpeg_reports_frames() {
+        assert_eq!(encoded_frames("frame=12"), Some(12));
+        assert_eq!(encoded_frames("frame=  7"), Some(7));
+        assert!(
+            ["frame=", "fps=3", "progress=end"].into_iter().all(|l| encoded_frames(l).is_none())
+        );
+    }
+}
