@@ -65,6 +65,32 @@ fn what_init_writes_runs_as_it_is() {
     }
 }
 
+/// Experiments run on the scene of `init`, also where the pipeline trains on the photographs.
+#[test]
+fn experiments_run_in_a_folder_of_init() {
+    let project = empty();
+    as_colmap(&project);
+    let said = project.ok(&["init", "colmap"]);
+    assert!(said.contains("wrote: pipeline.yaml, pipelines/ (") && said.contains("experiments/ ("));
+    for name in
+        ["quality", "ablation", "tradeoff", "refine-table", "refine-ablation", "paper-table"]
+    {
+        project.ok(&["plan", name]);
+    }
+    project.ok(&[&["run", "seeds", "-p", "train-ss.seed=1,2"][..], &SHORT].concat());
+    let table = std::fs::read_to_string(project.path("out/seeds/table.md")).unwrap();
+    assert_eq!(table.lines().filter(|line| line.starts_with("| ")).count(), 4, "{table}");
+    project.run(&["plan", "quality", "--scene", "lego"]).fails(2, &["no scene lego", "--data"]);
+    // Protocols downscale the photographs.
+    let prep = || {
+        let nodes = project.nodes(&["quality", "--protocol", "24x2"]);
+        nodes.into_iter().find(|node| node["stage"] == "prep").unwrap()["key"].clone()
+    };
+    let key = prep();
+    project.replace("lr_source: photographs", "lr_source: null");
+    assert_eq!(prep(), key);
+}
+
 /// Commented parameters are right, too: whoever takes a `#` away gets a pipeline that works.
 #[test]
 fn what_init_leaves_commented_out_is_right() {
@@ -140,7 +166,8 @@ fn folders_with_odd_names() {
             [(home.clone(), format!("./{name}")), (home.join("x"), format!("../{name}"))]
         {
             std::fs::create_dir_all(&at).unwrap();
-            for verb in [&["init", folder.as_str()][..], &["plan"]] {
+            let verbs = [&["init", folder.as_str()][..], &["plan"], &["plan", "paper-table"]];
+            for verb in verbs {
                 let output = project.command(verb).current_dir(&at).output().unwrap();
                 let finished = Finished::of(output);
                 assert_eq!(finished.code, 0, "{name}: {}", finished.stderr);

@@ -1,8 +1,8 @@
 //! First pipeline for a folder of posed photographs, as `nerf-sr init` writes it (docs/design/040).
 //!
 //! * [`Starter`]: summary of the folder, and a complete, commented pipeline file for it.
-//! * [`Starter::write`]: writes the pipeline file and, next to it, `pipelines/` with the shipped
-//!   targets. Existing files are never overwritten.
+//! * [`Starter::write`]: writes the pipeline file and, next to it, `pipelines/` and `experiments/`
+//!   with the shipped targets. Existing files are never overwritten.
 //!
 //! Images up to [`MAX_WIDTH`] pixels wide keep their size. Larger ones are shrunk first: on a CPU,
 //! training on photographs of twelve million pixels takes hours.
@@ -23,8 +23,9 @@ use unposed::UnposedImages;
 pub(crate) const MAX_WIDTH: u32 = 800;
 /// HR width over LR width, chosen by hand.
 const SCALE: u32 = 2;
-/// File names and texts of the shipped targets (`pipelines/` of the repository).
-const TARGETS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/targets.rs"));
+/// Folders, file names and texts of the shipped targets (`pipelines/` and `experiments/` of the
+/// repository).
+const TARGETS: &[(&str, &str, &str)] = include!(concat!(env!("OUT_DIR"), "/targets.rs"));
 
 /// Pipeline for a data set, not written yet.
 #[derive(Clone, Debug)]
@@ -33,6 +34,8 @@ pub(crate) struct Starter {
     sizes: String,
     notes: Vec<String>,
     text: String,
+    /// Path of the data set as YAML.
+    dataset: String,
     file: PathBuf,
 }
 
@@ -103,7 +106,7 @@ impl Starter {
         let dataset = data_path(folder, parent.unwrap_or(Path::new(".")))?;
         let (summary, sizes) = (summarize(&set), sizes(&set));
         let text = pipeline_text(&set, &format!("{summary}\n# {sizes}"), &dataset);
-        Ok(Self { summary, sizes, notes: set.notes, text, file: file.to_path_buf() })
+        Ok(Self { summary, sizes, notes: set.notes, text, dataset, file: file.to_path_buf() })
     }
 
     /// Returns the format of the data set, and number and size of its photographs.
@@ -121,27 +124,45 @@ impl Starter {
         &self.notes
     }
 
-    /// Writes the pipeline file and, in `pipelines/` next to it, the shipped targets. Returns the
-    /// written files. Writes nothing if any of them exists.
+    /// Writes the pipeline file and, in folders next to it, the shipped targets. Returns the written
+    /// files. Writes nothing if any of them exists.
     pub(crate) fn write(&self) -> Result<Vec<PathBuf>, StarterError> {
-        let shelf = self.file.with_file_name("pipelines");
         let name = self.file.file_name().unwrap_or_default().to_string_lossy();
         let mut files = vec![(self.file.clone(), self.text.clone())];
-        for (target, text) in TARGETS {
+        for (folder, target, text) in TARGETS {
             let text = text.replace("../pipeline.yaml", &format!("../{name}"));
-            files.push((shelf.join(target), text));
+            let text = own_scene(&text, &self.dataset);
+            files.push((self.file.with_file_name(folder).join(target), text));
         }
         if let Some((file, _)) = files.iter().find(|(file, _)| fs::symlink_metadata(file).is_ok()) {
             return Err(StarterError::Exists { file: file.clone() });
         }
-        fs::create_dir_all(&shelf).map_err(|e| io_error(&shelf, e))?;
         for (file, text) in &files {
+            let folder = file.parent().unwrap_or(Path::new(""));
+            fs::create_dir_all(folder).map_err(|e| io_error(folder, e))?;
             fs::File::create_new(file)
                 .and_then(|mut created| created.write_all(text.as_bytes()))
                 .map_err(|e| io_error(file, e))?;
         }
         Ok(files.into_iter().map(|(file, _)| file).collect())
     }
+}
+
+/// Returns a shipped target's text for the pipeline's own data set: experiments run on this scene by
+/// default.
+fn own_scene(text: &str, dataset: &str) -> String {
+    // Paths in the file start from its folder.
+    let path = serde_json::from_str(dataset).unwrap_or_else(|_| dataset.to_owned());
+    let path = path.strip_prefix("./").map_or(path.clone(), |inside| format!("./../{inside}"));
+    let path = serde_json::json!(path).to_string();
+    let lines = text.lines().map(|line| {
+        if line.starts_with("  scenes: [") {
+            "  scenes: [demo] # the pipeline's own; others with --data DIR --scene NAME".to_owned()
+        } else {
+            line.replace("dataset: demo-scene", &format!("dataset: {path}"))
+        }
+    });
+    lines.map(|line| line + "\n").collect()
 }
 
 fn io_error(file: &Path, source: io::Error) -> StarterError {

@@ -78,15 +78,30 @@ fn the_sizes_are_said() {
     }
 }
 
-/// Every file of `pipelines/` is shipped.
+/// Every file of `pipelines/` and `experiments/` is shipped.
 #[test]
 fn no_target_is_missing() {
-    let shelf = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../pipelines");
-    let mut names: Vec<String> = fs::read_dir(shelf)
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
-    names.sort();
-    let targets: Vec<&str> = TARGETS.iter().map(|(name, _)| *name).collect();
-    assert_eq!(names, targets);
+    for folder in ["pipelines", "experiments"] {
+        let shelf = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..").join(folder);
+        let mut names: Vec<String> = fs::read_dir(shelf)
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .collect();
+        names.sort();
+        let inside = TARGETS.iter().filter(|target| target.0 == folder);
+        let targets: Vec<&str> = inside.map(|target| target.1).collect();
+        assert_eq!(names, targets);
+    }
+}
+
+#[test]
+fn experiments_run_on_the_pipelines_own_scene() {
+    let text = "experiment:\n  scenes: [lego, chair]\n    inputs: {dataset: demo-scene}\n";
+    for (dataset, expected) in
+        [("./a", "./../a"), (r#""./a \"b\"""#, r#"./../a \"b\""#), ("/data/a", "/data/a")]
+    {
+        let written = own_scene(text, dataset);
+        assert!(written.contains(&format!("dataset: \"{expected}\"}}")), "{written}");
+        assert!(written.contains("\n  scenes: [demo] #"), "{written}");
+    }
 }

@@ -6,7 +6,7 @@ use std::process::{Command, ExitCode};
 
 use crate::starter::{Starter, StarterError};
 use anyhow::Context as _;
-use artifact::{Failure, print_line};
+use artifact::{Failure, format_count, print_line};
 use planning::{Pipeline, PlanError, executable};
 
 /// Writes a pipeline for a folder of posed photographs, and prints what was found.
@@ -18,8 +18,17 @@ pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
         print_line!("  {note}");
     }
     let written = starter.write().map_err(starter_failure)?;
-    let names: Vec<String> = written.iter().map(|file| file.display().to_string()).collect();
-    print_line!("wrote: {}", names.join(", "));
+    let count = |folder: &str| {
+        let inside =
+            written.iter().filter(|file| file.parent().is_some_and(|p| p.ends_with(folder)));
+        format_count(inside.count(), "file")
+    };
+    print_line!(
+        "wrote: {}, pipelines/ ({}), experiments/ ({})",
+        file.display(),
+        count("pipelines"),
+        count("experiments")
+    );
     print_line!("`nerf-sr run` renders the views; `nerf-sr plan` shows the stages for this");
     Ok(ExitCode::SUCCESS)
 }
