@@ -5,8 +5,9 @@
 mod common;
 
 use std::path::Path;
+use std::process::Command;
 
-use common::Project;
+use common::{Finished, Project, bin};
 
 /// Documents whose commands and blocks are checked, and folders that hold more of them.
 const DOCUMENTS: [&str; 2] = ["README.md", "ARCHITECTURE.md"];
@@ -168,6 +169,33 @@ fn pipeline_blocks_are_valid() {
             project.ok(&["run"]);
         }
         project.ok(&["plan"]);
+    }
+}
+
+/// The guide's programs run one after the other, next to a finished run.
+#[test]
+fn programs_of_the_python_guide_run() {
+    let modules = ["-c", "import numpy, pandas, OpenEXR"];
+    let has = Command::new("python3").args(modules).output();
+    if !has.is_ok_and(|output| output.status.success()) {
+        eprintln!("skipped: no numpy, pandas or OpenEXR (python3 -m pip install them)");
+        return;
+    }
+    let project = Project::shipped(&["video"], "  report:\n    inputs: {run: eval}\n");
+    project.ok(&["run", "report"]);
+    let programs = bin("nerf-sr").parent().unwrap().to_owned();
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let path = std::env::join_paths([programs].into_iter().chain(std::env::split_paths(&path)));
+    let path = path.unwrap();
+    let blocks = blocks(&read("docs/guide/python.md"), "python");
+    let words = [&["eval", "psnr", "seconds"][..], &["view_0 (48, 48, 4)", "view_2 (48, 48, 4)"]];
+    assert_eq!(blocks.len(), words.len());
+    for (block, words) in blocks.iter().zip(words) {
+        assert!(block.lines().count() <= 30);
+        let mut python = project.command_of(Path::new("python3"), &["-c", block]);
+        let finished = Finished::of(python.env("PATH", &path).output().unwrap());
+        assert_eq!(finished.code, 0, "{}", finished.stderr);
+        assert!(words.iter().all(|word| finished.stdout.contains(word)), "{}", finished.stdout);
     }
 }
 

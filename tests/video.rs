@@ -90,7 +90,10 @@ fn a_written_path_is_a_path() {
     for name in ["camera_path.json", "views.json"] {
         assert_eq!(file(name, &again), file(name, &[]), "{name}");
     }
-    project.write("slow/camera_path.json", &file("camera_path.json", &[]).replace("30", "12.5"));
+    project.write(
+        "slow/camera_path.json",
+        &file("camera_path.json", &[]).replace("\"fps\": 30", "\"fps\": 12.5"),
+    );
     let slow =
         ["-i", "camera-path.path=slow", "-p", "samples_per_axis=1", "-p", "video.depth=false"];
     let run = project.run(&[&["run", "video"], &slow[..]].concat());
@@ -104,7 +107,7 @@ fn a_written_path_is_a_path() {
 #[test]
 fn a_film_of_refined_views() {
     let blocks = "  camera-path:\n    parameters: {frames: 2}\n  downscaled-field:\n    \
-        parameters: {rays: 40000}\n  train-refine:\n    parameters: {steps: 60, batch_size: 4, \
+        parameters: {rays: 80000}\n  train-refine:\n    parameters: {steps: 60, batch_size: 4, \
         patch_size: 16, features: 8, blocks: 1}\n";
     let project = Project::shipped(&["refined-video"], blocks);
     project.ok(&["run", "video", "refined-video"]);
