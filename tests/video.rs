@@ -51,7 +51,7 @@ fn a_flight_is_rendered_and_filmed() {
 fn without_ffmpeg_the_film_is_an_animated_png() {
     let project = project();
     let programs = tempfile::tempdir().unwrap();
-    let arguments = ["run", "video", "-p", "samples_per_axis=1", "-p", "video.depth=false"];
+    let arguments = ["run", "video", "-p", "samples_per_axis=1", "-p", "show_depth=false"];
     let size = ["-p", "camera-path.size=700"];
     let output = project
         .command(&[&arguments[..], &size].concat())
@@ -95,7 +95,7 @@ fn a_written_path_is_a_path() {
         &file("camera_path.json", &[]).replace("\"fps\": 30", "\"fps\": 12.5"),
     );
     let slow =
-        ["-i", "camera-path.path=slow", "-p", "samples_per_axis=1", "-p", "video.depth=false"];
+        ["-i", "camera-path.path=slow", "-p", "samples_per_axis=1", "-p", "show_depth=false"];
     let run = project.run(&[&["run", "video"], &slow[..]].concat());
     assert_eq!(run.code, 0, "{}", run.stderr);
     if Command::new("ffmpeg").arg("-version").output().is_ok() {

@@ -27,12 +27,12 @@ pub struct Params {
     #[schemars(range(min = 1, max = 240), extend("x-default" = "by camera path"))]
     pub frames_per_second: Option<u32>,
     /// Draw depth to the right of colour.
-    pub depth: bool,
+    pub show_depth: bool,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { frames_per_second: None, depth: true }
+        Self { frames_per_second: None, show_depth: true }
     }
 }
 
@@ -80,7 +80,7 @@ impl Stage for Video {
                 Some(rate) => f64::from(rate),
                 None => path_rate(&run, node)?.unwrap_or(DEFAULT_FRAMES_PER_SECOND),
             };
-            make_film(context, params.depth, &node.folder, &prefix, rate)
+            make_film(context, params.show_depth, &node.folder, &prefix, rate)
                 .with_context(|| label(&node.stage, &node.point))?;
         }
         Ok(())
