@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 # Folder with real scenes and network weights, read by the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build-demo build remote install setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean reference goldens
+.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean reference goldens
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -54,6 +54,12 @@ install: $(if $(wildcard $(HOME)/.cargo/bin/cargo)$(shell command -v cargo),buil
 test: build remote ## Run all doctests and tests, list skipped and slowest tests; FILTER=TEXT selects tests by name
 	cargo test --release --workspace --exclude $(REMOTE) --doc --quiet
 	@python3 scripts/run-tests.py $(FILTER)
+
+dist: build remote ## Pack programs, libtorch, completions, man pages and all licences into an archive in target/dist
+	@scripts/dist.sh $(LIBTORCH_DIR)
+
+check-dist: dist ## Make the demo's page from the archive on a bare Debian 12 without network (root and debootstrap)
+	@scripts/check-dist.sh target/dist/nerf-sr-$$($(NERF_SR) --version | cut -d' ' -f2)-$$(uname -m)-linux.tar.gz $(LIBTORCH_DIR)
 
 KILLS ?= 200
 RUNNERS ?= 10

@@ -2,6 +2,7 @@
 # Installs a CPU libtorch for tch 0.26 into .libtorch/ (425 MB; linking and running need no GPU).
 #
 # The files come from Python wheels, which pip downloads into .libtorch/wheels and which are checked against the sizes and hashes below.
+# .libtorch/licenses gets their licences, for `make dist`.
 # Safe to run again: intact wheels are kept, an interrupted download starts over, and a finished installation returns at once.
 # If LIBTORCH or LIBTORCH_USE_PYTORCH=1 is set, nothing is installed.
 set -euo pipefail
@@ -63,6 +64,11 @@ for prefix, members in wanted.items():
     wheel = next((home / "wheels").glob(prefix + "*.whl"))
     with zipfile.ZipFile(wheel) as archive:
         for info in archive.infolist():
+            package, in_licences, file = info.filename.partition(".dist-info/licenses/")
+            if in_licences and not info.is_dir():
+                target = home / "licenses" / package / file
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(archive.read(info))
             for name, folder in members:
                 if name.endswith("/"):
                     if not info.filename.startswith(name) or info.is_dir():

@@ -318,6 +318,37 @@ fn installed_programs_run_from_any_folder() {
 }
 
 /// Has a tool check a file, where the tool is there; it finds nothing.
+/// The archive of `make dist` has a licence text for each linked crate, for Rust and for libtorch.
+#[test]
+fn every_linked_crate_has_its_licence() {
+    let project = Project::tiny();
+    let folder = project.path("licences");
+    let libtorch = root().join(".libtorch");
+    if !libtorch.join("licenses").is_dir() {
+        eprintln!("skipped: no licences in {}", libtorch.display());
+        return;
+    }
+    let mut command = Command::new("python3");
+    command.arg(root().join("scripts/licences.py")).arg(&folder).arg(libtorch);
+    let copied = Finished::of(command.output().unwrap());
+    assert_eq!(copied.code, 0, "{}", copied.stderr);
+    let files = |path: &str| -> Vec<PathBuf> {
+        let found = std::fs::read_dir(folder.join(path)).unwrap();
+        found.map(|entry| entry.unwrap().path()).collect()
+    };
+    let list = std::fs::read_to_string(folder.join("crates.txt")).unwrap();
+    assert!(list.contains("\nblake3 ") && list.contains("\ntch "), "{list}");
+    assert!(!list.contains("\nproptest "), "only tests use it");
+    assert_eq!(files("crates").len(), list.lines().count());
+    for line in list.lines() {
+        let (name, _) = line.split_once(": ").unwrap();
+        let texts = files(&format!("crates/{}", name.replace(' ', "-")));
+        let bytes = |path: &PathBuf| std::fs::metadata(path).unwrap().len();
+        assert!(texts.iter().any(|text| text.is_dir() || bytes(text) > 100), "{name}");
+    }
+    assert!(files("libtorch").len() >= 3 && files("rust").len() >= 2);
+}
+
 fn checked(tool: &[&str], file: &Path) {
     match Command::new(tool[0]).args(&tool[1..]).arg(file).output() {
         Ok(output) => {
