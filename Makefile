@@ -68,13 +68,19 @@ faults: build remote ## Inject faults: kills at random moments and at every call
 	NERF_SR_KILLS=$(KILLS) NERF_SR_ROUNDS=$(ROUNDS) NERF_SR_REPEAT=$(RUNNERS) NERF_SR_CALL_STEP=1 $(if $(SEED),NERF_SR_SEED=$(SEED)) \
 	  cargo test --release -p end-to-end --test kills --test random_changes --test sharing --test every_call -- --nocapture random_moments eight_runners every_call
 
-lint: setup ## Run rustfmt, clippy (with and without libtorch, fuzz targets included), and cargo-deny and typos if installed
+# libtorch of `make setup` is for x86-64 only, so that crates that can't do without libtorch aren't checked for aarch64.
+ARM := aarch64-unknown-linux-gnu
+NEED_LIBTORCH := nets refinement paper-refiner train-refine refine upsample end-to-end
+lint: setup ## Run rustfmt, clippy (with and without libtorch, fuzz targets included), and where installed a check for aarch64, cargo-deny and typos
 	cargo fmt --all --check
 	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
 	cargo clippy --release -p train-ss -p render-depth -p register -p eval -p export --no-default-features --all-targets -- -D warnings
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
 	$(IN_FUZZ) cargo clippy --release -- -D warnings
+	@if [ -d "$$(rustc --print sysroot)/lib/rustlib/$(ARM)/lib" ] && command -v aarch64-linux-gnu-gcc >/dev/null; then \
+	  cargo check --release --workspace $(NEED_LIBTORCH:%=--exclude %) --no-default-features --target $(ARM); \
+	  else echo "$(ARM) (rustup target add) or gcc-aarch64-linux-gnu is not installed: skipped"; fi
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
 	@if command -v typos >/dev/null; then typos; else echo "typos is not installed: skipped"; fi
 
