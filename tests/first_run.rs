@@ -303,7 +303,8 @@ fn installed_programs_run_from_any_folder() {
     let is_there = |file: &str| assert!(prefix.join("share").join(file).is_file(), "{file}");
     let remote = bin("nerf-sr").with_file_name("nerf-sr-remote").exists();
     for name in ["nerf-sr"].into_iter().chain(remote.then_some("nerf-sr-remote")) {
-        assert_eq!(run_bare(&prefix, &project, &format!("bin/{name}"), &["--version"]).code, 0);
+        let version = run_bare(&prefix, &project, &format!("bin/{name}"), &["--version"]);
+        assert_eq!(version.stdout, format!("{name} {}\n", env!("CARGO_PKG_VERSION")));
         is_there(&format!("bash-completion/completions/{name}"));
         is_there(&format!("zsh/site-functions/_{name}"));
         is_there(&format!("fish/vendor_completions.d/{name}.fish"));
@@ -317,7 +318,6 @@ fn installed_programs_run_from_any_folder() {
     );
 }
 
-/// Has a tool check a file, where the tool is there; it finds nothing.
 /// The archive of `make dist` has a licence text for each linked crate, for Rust and for libtorch.
 #[test]
 fn every_linked_crate_has_its_licence() {
@@ -349,6 +349,7 @@ fn every_linked_crate_has_its_licence() {
     assert!(files("libtorch").len() >= 3 && files("rust").len() >= 2);
 }
 
+/// Has a tool check a file, where the tool is there; it finds nothing.
 fn checked(tool: &[&str], file: &Path) {
     match Command::new(tool[0]).args(&tool[1..]).arg(file).output() {
         Ok(output) => {

@@ -212,3 +212,10 @@ fn links_lead_somewhere() {
         }
     }
 }
+
+#[test]
+fn the_changelog_begins_with_this_version() {
+    let changelog = read("CHANGELOG.md");
+    let first = changelog.lines().find_map(|line| line.strip_prefix("## ")).unwrap();
+    assert_eq!(first.split(' ').next(), Some(env!("CARGO_PKG_VERSION")));
+}
