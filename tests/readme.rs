@@ -4,6 +4,7 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Command;
 
@@ -16,6 +17,22 @@ const FOLDERS: [&str; 2] = ["docs/guide", "docs/results"];
 const LINKED: [&str; 4] =
     ["CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md", "docs/comparison.md"];
 const LINKED_FOLDERS: [&str; 1] = ["docs/design"];
+
+/// Documents that measure nothing themselves.
+const GUIDES: &str = "docs/guide";
+const RESULTS: &str = "docs/results";
+/// Units of measured figures, and how results may spell each.
+const UNITS: [&[&str]; 9] = [
+    &["dB"],
+    &["ms", "milliseconds", "millisecond"],
+    &["s", "seconds", "second"],
+    &["min", "minutes", "minute"],
+    &["h", "hours", "hour"],
+    &["KB", "kB"],
+    &["MB"],
+    &["GB"],
+    &["%"],
+];
 
 fn read(path: impl AsRef<Path>) -> String {
     std::fs::read_to_string(common::root().join(path)).unwrap()
@@ -218,4 +235,74 @@ fn the_changelog_begins_with_this_version() {
     let changelog = read("CHANGELOG.md");
     let first = changelog.lines().find_map(|line| line.strip_prefix("## ")).unwrap();
     assert_eq!(first.split(' ').next(), Some(env!("CARGO_PKG_VERSION")));
+}
+
+fn is_number(word: &str) -> bool {
+    word.starts_with(|c: char| c.is_ascii_digit())
+        && word.chars().all(|c| c.is_ascii_digit() || c == '.')
+}
+
+/// Splits a text at everything that belongs to no number and no unit.
+fn tokens(text: &str) -> Vec<&str> {
+    text.split(|c: char| !c.is_alphanumeric() && c != '.' && c != '%')
+        .map(|token| token.trim_end_matches('.'))
+        .filter(|token| !token.is_empty())
+        .collect()
+}
+
+/// Numbers with a unit outside code, such as `4.5 GB`, with the unit's first spelling.
+fn with_unit(text: &str) -> BTreeSet<String> {
+    let prose: String = text.split("```").step_by(2).collect();
+    let words = tokens(&prose);
+    let mut found = BTreeSet::new();
+    for (i, word) in words.iter().enumerate() {
+        // Number and unit may be one word: 90s.
+        let split = word.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(word.len());
+        let (number, glued) = word.split_at(split);
+        let unit = if glued.is_empty() { words.get(i + 1).unwrap_or(&"") } else { glued };
+        if is_number(number)
+            && let Some(unit) = UNITS.iter().find(|spellings| spellings.contains(&unit))
+        {
+            found.insert(format!("{number} {}", unit[0]));
+        }
+    }
+    found
+}
+
+/// Numbers with two or more decimals in a text's tables: scores.
+fn scores(text: &str) -> BTreeSet<String> {
+    let rows = text.lines().filter(|line| line.starts_with('|'));
+    rows.flat_map(tokens)
+        .filter(|word| is_number(word))
+        .filter(|word| word.split_once('.').is_some_and(|(_, decimals)| decimals.len() >= 2))
+        .map(str::to_owned)
+        .collect()
+}
+
+/// Figures of `text` that are not in `results`. A number with decimals may be anywhere in them, a
+/// whole number must have its unit.
+fn unmeasured(text: &str, results: &str) -> Vec<String> {
+    let (numbers, measured) = (BTreeSet::from_iter(tokens(results)), with_unit(results));
+    let is_measured = |figure: &String| {
+        let number = figure.split(' ').next().unwrap();
+        measured.contains(figure) || number.contains('.') && numbers.contains(number)
+    };
+    with_unit(text).into_iter().chain(scores(text)).filter(|figure| !is_measured(figure)).collect()
+}
+
+#[test]
+fn figures_are_those_of_the_results() {
+    let results: String = paths(&[], &[RESULTS]).iter().map(|path| read(path) + "\n").collect();
+    for document in paths(&DOCUMENTS, &[GUIDES]) {
+        let unknown = unmeasured(&read(&document), &results);
+        assert!(unknown.is_empty(), "{document}: not in {RESULTS}: {unknown:?}");
+    }
+}
+
+#[test]
+fn a_figure_without_a_result_is_found() {
+    let results = "| lego | 31.20 |\nIt takes 12 minutes and 4.5 GB.\n";
+    let text = "It takes 12 minutes, 12 s, 4.5 GB (1.5 GB for `s: 3`), 90s.\n```\n7 s\n```\n\
+                | 31.20 | **31.34** | 200×4 | 0.5 |\n";
+    assert_eq!(unmeasured(text, results), ["1.5 GB", "12 s", "90 s", "31.34"]);
 }
