@@ -823,6 +823,30 @@ fn wrong_views_are_refused_in_a_line() {
         .fails(3, &["no view has an image in input truth with the same name and pose"]);
 }
 
+/// A training starts from the network of input `prior`, whose size replaces that of the parameters.
+#[test]
+fn a_training_starts_from_a_prior() {
+    let project = project();
+    let (views, truth, _) = training(&project);
+    let inputs = [("views", views.as_path()), ("truth", truth.as_path())];
+    let weights = |name: &str, params: &str, prior: Option<&Path>| {
+        let inputs: Vec<_> = inputs.into_iter().chain(prior.map(|path| ("prior", path))).collect();
+        let output = project.path(name);
+        let trained = stage("train-refine", params, &inputs, &output, &[]);
+        assert_eq!(trained.code, 0, "{}", trained.stderr);
+        std::fs::read(output.join("refiner.safetensors")).unwrap()
+    };
+    let small = r#""batch_size": 4, "patch_size": 16, "blocks": 1"#;
+    let trained = weights("prior", &format!(r#"{{{small}, "features": 8, "steps": 20}}"#), None);
+    let prior = project.path("prior");
+    // A step that changes nothing.
+    let still = format!(r#"{{{small}, "features": 5, "steps": 1, "learning_rate": 0}}"#);
+    assert!(weights("from-prior", &still, Some(&prior)) == trained);
+    assert!(weights("from-nothing", &still, None) != trained);
+    let inputs = [inputs[0], inputs[1], ("prior", prior.as_path())];
+    fails_to_train(&project, &inputs, r#"{"references_per_view": 1}"#, &["input prior:"]);
+}
+
 #[track_caller]
 fn fails_to_train(project: &Project, inputs: &[(&str, &Path)], params: &str, words: &[&str]) {
     stage("train-refine", params, inputs, &project.path("failed"), &[]).fails(3, words);
