@@ -23,7 +23,7 @@ unshare --net --mount --pid --fork true 2>/dev/null || skip "unshare isn't permi
 debian=$PWD/target/debian-12
 if [ ! -e "$debian/complete" ]; then
   rm -rf "$debian"
-  debootstrap --variant=minbase bookworm "$debian" http://deb.debian.org/debian >target/debootstrap.log 2>&1 ||
+  debootstrap --variant=minbase bookworm "$debian" >target/debootstrap.log 2>&1 ||
     skip "debootstrap failed; target/debootstrap.log has the reason"
   touch "$debian/complete"
 fi
