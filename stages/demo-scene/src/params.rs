@@ -38,7 +38,7 @@ pub struct Params {
     pub layout: Layout,
     /// Adds an unbounded background: ground, distant towers, and sky.
     pub backdrop: bool,
-    /// Replaces the objects by random ones, as a prior for refinement is trained on.
+    /// Replaces the objects by random ones, for training networks on many scenes.
     pub generated: bool,
     /// Format of the data set.
     pub form: Form,
