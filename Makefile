@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 # Folder with real scenes and network weights, read by the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean reference goldens
+.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean reference prior goldens
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -190,6 +190,11 @@ compare-engines: build ## Compare training and rendering of this build and of AG
 
 reference: build ## Regenerate schemas/ and docs/reference/ from the types and the built programs
 	UPDATE=1 cargo test --release --workspace --exclude $(REMOTE) --test schemas
+
+prior: build ## Train upsample's own network again (45 minutes of a processor)
+	rm -rf out/prior && mkdir -p out
+	target/release/train-prior --output out/prior
+	cp out/prior/prior_x4.safetensors stages/upsample/src/prior/
 
 goldens: ## Regenerate the golden files with pinned versions of Pillow, scikit-image and PyTorch
 	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens/requirements.txt && .venv/bin/python scripts/goldens

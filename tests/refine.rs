@@ -256,6 +256,27 @@ fn views_are_means_with_their_enlarged_photographs() {
         .fails(3, &["input enlarged: view", "24×24 pixels, but the view to refine has 48×48"]);
 }
 
+/// A second field, trained on images that the prior enlarges, changes the refined views. Other
+/// scales are refused before anything runs.
+#[test]
+fn a_prior_enlarges_images_for_a_second_field() {
+    let (blocks, _) = REFINED.split_once("  upsample:").unwrap();
+    let project = Project::shipped(&["prior-refine"], blocks);
+    project.run(&["run", "prior-refine"]).fails(2, &["the program's own prior enlarges 4 times"]);
+    let sizes = ["-p", "scale=4", "-p", "lr_width=12", "-p", "enlarged-field.rays=40000"];
+    let target = [&["prior-refine"], &sizes[..]].concat();
+    project.ok(&[&["run"], &target[..]].concat());
+    let folder = |stage: &str| project.artifact(stage, &target);
+    let summary = std::fs::read_to_string(folder("refine-by-prior").join("summary.txt")).unwrap();
+    assert!(summary.contains("averaged with"), "{summary}");
+    let [refined, enlarged, mean] = ["refine", "enlarged-views", "refine-by-prior"]
+        .map(|stage| green_over_white(&folder(stage), "r_0"));
+    for (i, mean) in mean.iter().enumerate() {
+        let expected = 0.5 * (refined[i] + enlarged[i]);
+        assert!((mean - expected).abs() < 2e-3, "pixel {i}: {mean} instead of {expected}");
+    }
+}
+
 fn refine_with(
     project: &Project,
     views: &Path,

@@ -47,7 +47,13 @@ impl Stage for TrainSs {
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
-            ("scene", Input::required(&["scene/train"], "LR images with cameras and bounds")),
+            (
+                "scene",
+                Input::required(
+                    &["scene/train", "views"],
+                    "LR images with cameras and bounds, or enlarged images of upsample",
+                ),
+            ),
             (
                 "references",
                 Input::optional(

@@ -202,7 +202,7 @@ impl<'a> Estimator<'a> {
     fn images(&self, node: &Node) -> Option<(usize, Images)> {
         let input = match node.program.description.name.as_str() {
             "train-ss" => "scene",
-            "render-depth" | "export" => "cameras",
+            "render-depth" | "export" | "upsample" => "cameras",
             "eval" => "truth",
             "train-refine" | "refine" => "views",
             _ => return None,
@@ -210,7 +210,8 @@ impl<'a> Estimator<'a> {
         let (index, subtree) = parent(node, input)?;
         let Some(scene) = self.scenes.get(&index) else {
             // Views are as many and as large as the cameras that they were rendered from.
-            return self.images(&self.plan.nodes[index]).filter(|_| input == "views");
+            let has_views = matches!(input, "views" | "scene");
+            return self.images(&self.plan.nodes[index]).filter(|_| has_views);
         };
         let mut images = scene.images(subtree?)?;
         if input == "cameras"
