@@ -3,9 +3,11 @@
 //! * [`Params`]: [`Kind`] of the path, number of frames, and more.
 //! * [`poses`]: computes the poses of a path from the scene's cameras and bounds.
 //! * `coverage`: finds what the scene's cameras observe of a frame.
+//! * `orbit`: finds the part of a circle along which the scene's cameras are.
 //! * `path_file`: reads and writes a path in nerfstudio's format.
 
 mod coverage;
+mod orbit;
 mod path_file;
 mod paths;
 
@@ -30,7 +32,7 @@ pub struct Params {
     /// Number of frames. A `list` has one frame per pose.
     #[schemars(range(min = 1, max = 10000))]
     pub frames: u32,
-    /// Number of turns of a spiral or orbit.
+    /// Number of turns of a spiral or orbit. A turn of an orbit along an arc leads there and back.
     #[schemars(range(min = 0.01, max = 100.0))]
     pub turns: f64,
     /// Radius of a spiral or orbit relative to the default: an orbit's is that of the input cameras,
@@ -59,7 +61,8 @@ pub enum Kind {
     /// Spiral around the mean camera, up to as wide as the positions of most cameras, for
     /// forward-facing photographs. Its frames stay where the cameras looked.
     Spiral,
-    /// Circle around the middle of the scene's box, at the cameras' mean distance and height.
+    /// Circle around the middle of the scene's box, at the cameras' mean distance and height, or the
+    /// arc along which cameras are.
     Orbit,
     /// Closed curve through all cameras, in their order.
     Between,

@@ -6,6 +6,7 @@ use glam::{DMat3, DQuat, DVec3};
 use scene::{Bounds, Camera, Pose, Space, looking_at, pose_of};
 
 use crate::coverage::Coverage;
+use crate::orbit::Orbit;
 use crate::{Kind, Params};
 
 /// Disparity of the point that a spiral's frames look at, relative to the way from far to near: a
@@ -37,14 +38,17 @@ pub fn poses(
             let spiral = Spiral::fit(cameras, frame, bounds, params.turns);
             fractions.map(|fraction| spiral.pose(params, fraction)).collect()
         }
-        Kind::Orbit => orbit_poses(cameras, bounds, params, fractions),
+        Kind::Orbit => {
+            let orbit = Orbit::fit(cameras, bounds);
+            fractions.map(|fraction| orbit.pose(params, fraction)).collect()
+        }
         Kind::Between => fractions.map(|fraction| interpolated_pose(cameras, fraction)).collect(),
         Kind::List => params.poses.clone(),
     }
 }
 
 /// Returns the mean of a vector over the cameras.
-fn mean(cameras: &[Camera], vector: impl Fn(&Camera) -> DVec3) -> DVec3 {
+pub(crate) fn mean(cameras: &[Camera], vector: impl Fn(&Camera) -> DVec3) -> DVec3 {
     cameras.iter().map(vector).sum::<DVec3>() / cameras.len().max(1) as f64
 }
 
@@ -133,30 +137,6 @@ fn spread(cameras: &[Camera], centre: DVec3, axis: DVec3) -> f64 {
         cameras.iter().map(|c| (c.centre() - centre).dot(axis).abs()).collect();
     offsets.sort_by(f64::total_cmp);
     offsets[(offsets.len() - 1) * 9 / 10]
-}
-
-/// Computes the poses of an orbit at fractions of its length.
-fn orbit_poses(
-    cameras: &[Camera],
-    bounds: &Bounds,
-    params: &Params,
-    fractions: impl Iterator<Item = f64>,
-) -> Vec<Pose> {
-    let up = mean(cameras, |c| c.rotation().y_axis).normalize_or(DVec3::Z);
-    let middle = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
-    let height = mean(cameras, |c| c.centre() - middle).dot(up);
-    let distance = cameras.iter().map(|c| (c.centre() - middle).length()).sum::<f64>()
-        / cameras.len().max(1) as f64;
-    let radius = (distance * distance - height * height).max(0.0).sqrt();
-    let offset = cameras[0].centre() - middle;
-    let first = (offset - offset.dot(up) * up).normalize_or(up.any_orthonormal_vector());
-    fractions
-        .map(|fraction| {
-            let rotation = DQuat::from_axis_angle(up, TAU * params.turns * fraction);
-            let offset = params.radius * (rotation * first * radius + height * up);
-            looking_at(middle + offset, middle, up)
-        })
-        .collect()
 }
 
 /// Interpolates the pose at a fraction of the closed curve through all cameras: centres by a
