@@ -15,7 +15,7 @@ use stage::{Event, SUMMARY_FILE};
 use wait4::ResUse;
 
 use crate::stage_call::failure::{Exit, StageFailure, is_noise, memory_kills};
-use crate::stage_call::group::{Group, Pipes};
+use crate::stage_call::group::{Group, Pipes, peak_memory};
 use crate::stage_call::log::{ProgressFilter, StageLog};
 
 /// Environment variables that every stage gets. A description declares the further variables that
@@ -164,10 +164,11 @@ impl Call<'_> {
             let exit = wait(group, stop, &|| output.tick(), &are_closed);
             (exit, stdout.join().ok().flatten(), stderr.join().unwrap_or_default())
         });
-        let ResUse { status, rusage } = exit.map_err(|e| StageFailure::at(self.program, &e))?;
+        let (ResUse { status, rusage }, peak_memory) =
+            exit.map_err(|e| StageFailure::at(self.program, &e))?;
         let result = if status.success() {
             let processor_seconds = (rusage.utime + rusage.stime).as_secs_f64();
-            Ok(Usage { peak_memory: rusage.maxrss, processor_seconds })
+            Ok(Usage { peak_memory, processor_seconds })
         } else {
             let exit = Exit {
                 status,
@@ -318,14 +319,22 @@ impl<'a> OutputReader<'a> {
 
 /// Waits for the end of a stage, then kills the processes that it has left running. `tick` runs
 /// every few milliseconds. `are_closed` returns whether all processes have closed the stage's pipes.
+/// Returns the peak memory as well.
 fn wait(
     group: Group,
     stop: &AtomicBool,
     tick: &dyn Fn(),
     are_closed: &dyn Fn() -> bool,
-) -> std::io::Result<ResUse> {
+) -> std::io::Result<(ResUse, u64)> {
+    // Linux counts the runner's memory as the stage's, since a new process shares it until it runs
+    // the program: a smaller peak is known only while the stage runs.
+    let runner_peak = peak_memory("self");
+    let mut stage_peak = None;
     let mut is_stopped = false;
     while !group.has_exited()? {
+        if stage_peak <= runner_peak {
+            stage_peak = group.peak_memory().or(stage_peak);
+        }
         if stop.load(Ordering::Relaxed) && !is_stopped {
             group.terminate();
             is_stopped = true;
@@ -338,7 +347,12 @@ fn wait(
         tick();
         std::thread::sleep(POLL_INTERVAL);
     }
-    group.kill()
+    let usage = group.kill()?;
+    let peak = match (stage_peak, runner_peak) {
+        (Some(stage), Some(runner)) if usage.rusage.maxrss <= runner => stage,
+        _ => usage.rusage.maxrss,
+    };
+    Ok((usage, peak))
 }
 
 /// Returns the non-blank lines of a pipe. Bytes that aren't UTF-8 are replaced, control characters

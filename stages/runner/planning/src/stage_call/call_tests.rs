@@ -24,6 +24,12 @@ impl Watcher for Lines {
 /// Runs a stage, a shell script in which `$SEEN` is the file that the first line creates. Returns
 /// the lines and the reason of the failure.
 fn lines_of(script: &str) -> (Vec<String>, Option<String>) {
+    let (lines, result) = run(script);
+    (lines, result.err().map(|failure| failure.message))
+}
+
+/// Runs a stage, a shell script. Returns its lines and its result.
+fn run(script: &str) -> (Vec<String>, Result<Usage, StageFailure>) {
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name);
     let seen = file("seen");
@@ -57,8 +63,20 @@ fn lines_of(script: &str) -> (Vec<String>, Option<String>) {
         lock: None,
     };
     let watcher = Lines { lines: Mutex::default(), seen };
-    let failure = call.run(&file("log"), &watcher, &AtomicBool::new(false)).err();
-    (watcher.lines.into_inner().unwrap(), failure.map(|failure| failure.message))
+    let result = call.run(&file("log"), &watcher, &AtomicBool::new(false));
+    (watcher.lines.into_inner().unwrap(), result)
+}
+
+/// A small stage of a large runner has its own peak memory; a program that the stage calls counts.
+#[test]
+fn memory_of_the_runner_is_not_the_stages() {
+    let large = std::hint::black_box(vec![1u8; 100_000_000]);
+    let peak_of = |script: &str| run(script).1.unwrap().peak_memory;
+    let small = peak_of("sleep 0.3");
+    assert!((100_000..20_000_000).contains(&small), "{small}");
+    drop(large);
+    let called = peak_of("tail -c 200000000 /dev/zero | head -c 200000000 | tail -n 1 >/dev/null");
+    assert!(called > 150_000_000, "{called}");
 }
 
 /// The stage waits for its only line to be seen, as a long training would work on.

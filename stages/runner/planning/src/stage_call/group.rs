@@ -2,6 +2,7 @@
 //! runner alone: the first one makes it terminate its stages, the second one kills them.
 
 use std::collections::BTreeSet;
+use std::fmt::Display;
 use std::io::{self, Read as _};
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt as _;
@@ -51,6 +52,12 @@ impl Group {
         Ok(waitid(WaitId::Pid(self.id), options)?.is_some())
     }
 
+    /// Returns the peak resident memory of the leader's program so far, in bytes; `None` after its
+    /// end or without `/proc`.
+    pub(crate) fn peak_memory(&self) -> Option<u64> {
+        peak_memory(self.id.as_raw_pid())
+    }
+
     /// Sends SIGTERM to all processes of the group: a wrapper script would not forward the signal.
     pub(crate) fn terminate(&self) {
         // An error means that all of them have ended.
@@ -71,6 +78,15 @@ impl Drop for Group {
             kill_and_wait(self.id, leader).ok();
         }
     }
+}
+
+/// Returns the peak resident memory of a process, a number or `self`, in bytes; `None` without
+/// `/proc`.
+pub(crate) fn peak_memory(process: impl Display) -> Option<u64> {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kibibytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(1024 * kibibytes)
 }
 
 fn kill_and_wait(id: Pid, leader: Child) -> io::Result<ResUse> {
