@@ -5,7 +5,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{Project, stage_command};
+use common::{Project, demo_train, stage, stage_command};
 use serde_json::{Value, json};
 
 /// A project whose photographs are enlarged by a network.
@@ -109,6 +109,18 @@ fn sinks_and_export_show_a_percentage() {
     let [field, scene] = ["train-ss", "prep"].map(|stage| project.artifact(stage, &[]));
     let cameras = scene.join("cameras");
     shows_a_percentage(&project, "export", &[("field", &field), ("cameras", &cameras)]);
+}
+
+/// A training's progress says what its PSNR is of: not of test views.
+#[test]
+fn progress_says_what_its_psnr_is_of() {
+    let project = Project::tiny();
+    let train = demo_train(&project, 6);
+    let (inputs, field) = ([("scene", train.as_path())], project.path("field"));
+    let parameters = r#"{"rays": 20000}"#;
+    let training = stage("train-ss", parameters, &inputs, &field, &["--progress", "json"]);
+    assert_eq!(training.code, 0, "{}", training.stderr);
+    assert!(training.stdout.contains("PSNR of training pixels "), "{}", training.stdout);
 }
 
 /// `-i init=train-ss` is the field of the same command, without the parameters of `train-ss`.

@@ -204,8 +204,25 @@ async function zoom(page, expect) {
 async function arrange(page, expect) {
   await page.locator("#grid-mode").click();
   expect((await page.locator("#stage .pane").count()) > 1, "the grid has fewer than two panes");
+  await marked(page, expect, "#grid-mode", "#slider-mode");
   await page.locator("#slider-mode").click();
+  await marked(page, expect, "#slider-mode", "#grid-mode");
   expect((await page.locator("#stage .pane").count()) === 1, "the slider has more than one pane");
+}
+
+/** Checks that the button of the active mode stands out, and that neither button looks disabled. */
+async function marked(page, expect, active, other) {
+  const styles = await Promise.all(
+    [active, other].map((id) =>
+      page.locator(id).evaluate((button) => {
+        const { backgroundColor, opacity } = getComputedStyle(button);
+        return { backgroundColor, opacity, isDisabled: button.disabled };
+      }),
+    ),
+  );
+  const isPlain = styles.every(({ opacity, isDisabled }) => opacity === "1" && !isDisabled);
+  expect(isPlain, `${active} or ${other} looks disabled`);
+  expect(styles[0].backgroundColor !== styles[1].backgroundColor, `${active} isn't marked`);
 }
 
 /** Checks that selecting a point in a plot of all views selects its view. */
