@@ -128,13 +128,20 @@ async function link(browser, page, size, expect) {
   await page.locator("#fit").click();
 }
 
-/** Checks that wide tables show that they scroll, and that no word is broken. */
+/** Checks that wide tables show that they scroll, and that no word is broken and no caption cut. */
 async function tables(page, expect) {
   const problems = await page.locator(".wide").evaluateAll((all) =>
     all.flatMap((region) => {
       const found = [];
       const hint = region.previousElementSibling;
       const isHinted = hint?.matches(".scroll-hint:not([hidden])") ?? false;
+      const caption = region.querySelector("caption");
+      if (caption) {
+        const range = document.createRange();
+        range.selectNodeContents(caption);
+        const isCut = range.getBoundingClientRect().right > region.getBoundingClientRect().right + 1;
+        if (isCut) found.push(`${caption.textContent} is cut`);
+      }
       if (isHinted !== region.scrollWidth - region.clientWidth >= 2) found.push("a wide table without a hint");
       for (const cell of region.querySelectorAll("th, td")) {
         for (const node of textNodes(cell)) {
