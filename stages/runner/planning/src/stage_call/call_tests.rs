@@ -1,4 +1,4 @@
-//! Lines of a stage on stderr, as they reach the caller.
+//! Lines and memory of a stage, as they reach the caller.
 
 use std::sync::Mutex;
 
