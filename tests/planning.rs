@@ -263,12 +263,12 @@ fn sinks_are_part_of_the_picture() {
 fn times_are_estimated_before_a_run() {
     let project = Project::tiny();
     let plan = project.ok(&["plan"]);
-    // Preparation, training, rendering, scoring, and all of them.
+    // The demo scene, preparation, training, rendering, scoring, and all of them.
     let times = plan.lines().filter(|line| line.contains("of processor time")).count();
-    assert_eq!(times, 5, "{plan}");
+    assert_eq!(times, 6, "{plan}");
     let total = plan.lines().last().unwrap();
-    for words in ["about ", " on ", "at most ", "MB of memory for a stage, without 1 other stage"] {
-        assert!(total.contains(words), "{words}: {total}");
+    for words in ["about ", " on ", "at most ", "MB of memory for a stage"] {
+        assert!(total.contains(words) && !total.contains("without"), "{words}: {total}");
     }
     let advice = project.ok(&["advise", "-p", "test_views=1", "--minutes", "100"]);
     for words in ["12 training views", "1 views", "training ", "rendering ", "scoring "] {
@@ -290,6 +290,25 @@ fn times_are_estimated_before_a_run() {
     assert!(project.ok(&["advise"]).trim_end().ends_with("-p quality=balanced"));
 }
 
+/// Frames along a path are as many and as large as the path's parameters, or its file, say.
+#[test]
+fn views_along_a_path_are_estimated() {
+    let project = Project::shipped(&["video"], "");
+    let line = |arguments: &[&str]| {
+        let plan = project.ok(&[&["plan", "video"], arguments].concat());
+        let line = plan.lines().find(|line| line.starts_with("path-views ")).unwrap();
+        line.rsplit_once("; about ").unwrap_or_else(|| panic!("{plan}")).1.to_owned()
+    };
+    let computed = line(&[]);
+    assert!(computed.contains(" of processor time, "), "{computed}");
+    assert_ne!(line(&["-p", "frames=1200"]), computed);
+    project.write(
+        "path/camera_path.json",
+        r#"{"render_width": 4000, "render_height": 3000, "camera_path": [{}]}"#,
+    );
+    assert_ne!(line(&["-i", "camera-path.path=path"]), computed);
+}
+
 /// A run states its estimate before and after; its records correct the next estimate's memory.
 #[test]
 fn a_run_is_compared_with_its_estimate() {
@@ -298,8 +317,8 @@ fn a_run_is_compared_with_its_estimate() {
     assert_eq!(run.code, 0, "{}", run.stderr);
     let mut lines = run.stderr.lines();
     let before = lines.find(|line| line.starts_with("nerf-sr: about ")).unwrap();
-    assert!(before.contains("(prep ") && before.contains(", train-ss "), "{before}");
-    for stage in ["prep", "train-ss", "render-depth", "eval"] {
+    assert!(before.contains("(demo-scene ") && before.contains(", train-ss "), "{before}");
+    for stage in ["demo-scene", "prep", "train-ss", "render-depth", "eval"] {
         let done = format!("{stage}: done in ");
         let line = run.stderr.lines().find(|line| line.starts_with(&done)).unwrap();
         assert!(line.contains("; estimated ") && line.contains(" MB"), "{line}");

@@ -22,6 +22,9 @@ const HIDDEN_EXPONENT: f64 = 0.55;
 /// Late rays of the default sizes that cost as much as the higher cost of the first steps
 /// (docs/design/048), of any size: a draft of lego 100×2 takes 16.3 s.
 const FIRST_STEPS_RAYS: f64 = 1.1e6;
+/// Rays in which this cost falls to its e-th part: a draft of the demo scene with 200,000 rays takes
+/// 6.4 s.
+const FIRST_STEPS_LENGTH: f64 = 330e3;
 /// Seconds per training ray of the paper's field (docs/results/engine.md: 369 rays a second on two
 /// cores).
 const MLP_RAY_SECONDS: f64 = 5.4e-3;
@@ -60,6 +63,15 @@ const EXAMPLE_PIXEL_BYTES: u64 = 50;
 const REFINED_PIXEL_BYTES: u64 = 128;
 /// Seconds of a start of a stage; chosen by hand.
 const START_SECONDS: f64 = 0.3;
+/// Seconds of `demo-scene` per pixel, for its file, and per ray, without and with a backdrop: the
+/// default scene, a backdrop, and one ray per pixel.
+const DEMO_PIXEL_SECONDS: f64 = 0.2e-6;
+const DEMO_RAY_SECONDS: f64 = 0.165e-6;
+const BACKDROP_RAY_SECONDS: f64 = 0.32e-6;
+/// Bytes of `demo-scene` without data and per pixel of a view, as there, and of `camera-path`.
+const DEMO_BYTES: u64 = 5_000_000;
+const DEMO_PIXEL_BYTES: u64 = 16;
+const CAMERA_PATH_BYTES: u64 = 5_000_000;
 
 /// Returns the cost of a stage on the machine of these figures; `None` for stages without a model.
 pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Option<ModelCost> {
@@ -71,9 +83,11 @@ pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Opti
         "train-refine" => refiner_training(parameters, work)?,
         "refine" => refinement(parameters, work)?,
         "export" => export(parameters, work)?,
+        "demo-scene" => demo_scene(parameters, work)?,
+        "camera-path" => (0.0, CAMERA_PATH_BYTES),
         _ => return None,
     };
-    let start = if program == "prep" { 0.0 } else { START_SECONDS };
+    let start = if matches!(program, "prep" | "demo-scene") { 0.0 } else { START_SECONDS };
     Some(ModelCost { processor_seconds: start + seconds, peak_memory })
 }
 
@@ -94,6 +108,13 @@ fn number(parameters: &Value, name: &str) -> Option<f64> {
 /// Returns the bytes of data of the views that are processed at a time, one by each thread.
 fn concurrent_bytes(work: &Work, images: &Images, bytes_per_pixel: u64) -> u64 {
     images.count.min(work.threads) * bytes_per_pixel * images.largest()
+}
+
+fn demo_scene(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
+    let ray = if work.kind.is_opaque() { BACKDROP_RAY_SECONDS } else { DEMO_RAY_SECONDS };
+    let pixel = DEMO_PIXEL_SECONDS + ray * number(parameters, "samples_per_axis")?.powi(2);
+    let memory = DEMO_BYTES + concurrent_bytes(work, &work.images, DEMO_PIXEL_BYTES);
+    Some((work.images.pixels as f64 * pixel, memory))
 }
 
 fn prep_memory(work: &Work) -> u64 {
@@ -128,13 +149,18 @@ fn training_seconds(parameters: &Value, work: &Work) -> Option<f64> {
     let is_opaque = work.kind.is_opaque();
     let rays = budget.total(work.images.pixels, is_opaque, work.is_fine_tuning) as f64;
     let fields = number(parameters, "ensemble")?;
-    let first_steps = if work.is_fine_tuning { 0.0 } else { fields * FIRST_STEPS_RAYS };
+    let first_steps = if work.is_fine_tuning { 0.0 } else { fields * first_steps(rays / fields) };
     let ray = match work.kind {
         SceneKind::Object => OBJECT_RAY_SECONDS,
         SceneKind::Frustum => FRUSTUM_RAY_SECONDS,
         SceneKind::Unbounded => UNBOUNDED_RAY_SECONDS,
     };
     Some(ray * (field_factor(parameters, work.kind)? * rays + first_steps))
+}
+
+/// Returns the higher cost of the first steps of a training of one field, in late rays.
+fn first_steps(rays: f64) -> f64 {
+    FIRST_STEPS_RAYS * (1.0 - (-rays / FIRST_STEPS_LENGTH).exp())
 }
 
 fn training_memory(parameters: &Value, work: &Work) -> Option<u64> {
@@ -282,11 +308,18 @@ mod tests {
         let mut draft = training(1_000_000);
         draft["march_steps"] = json!(256);
         draft["hidden_dim"] = json!(32);
-        let backdrop = work(SceneKind::Unbounded, 80, 100);
+        let short = |rays: u64| {
+            let mut short = draft.clone();
+            short["rays"] = json!(rays);
+            short
+        };
+        let (demo, backdrop) = (work(object, 80, 100), work(SceneKind::Unbounded, 80, 100));
         for (name, program, parameters, work, seconds) in [
             ("lego 100×2", "train-ss", training(32_000_000), &lego, 408.0),
             ("lego 100×2, short", "train-ss", training(2_000_000), &lego, 46.8),
-            ("lego 100×2, draft", "train-ss", draft, &lego, 16.3),
+            ("lego 100×2, draft", "train-ss", draft.clone(), &lego, 16.3),
+            ("demo, 200,000 rays", "train-ss", short(200_000), &demo, 6.4),
+            ("demo, 50,000 rays", "train-ss", short(50_000), &demo, 2.8),
             ("lego 200×2", "train-ss", training(80_000_000), &lego, 1056.0),
             ("lego 200×4", "train-ss", training(66_000_000), &lego, 648.0),
             ("fern 252×2", "train-ss", training(15_000_000), &fern, 420.0),
@@ -302,6 +335,35 @@ mod tests {
             println!("{name}: {estimate:.1} s for {seconds} s");
             assert!((0.7..1.3).contains(&ratio), "{name}: {estimate} s for {seconds} s");
         }
+    }
+
+    /// Processor time of `demo-scene` on two busy cores: 90 views of 200 pixels, and others.
+    #[test]
+    fn the_demo_scene_is_estimated_within_30_percent() {
+        for (changes, seconds) in [
+            (json!({}), 10.30),
+            (json!({"size": 100}), 2.62),
+            (json!({"size": 400, "train": 20, "test": 5}), 11.04),
+            (json!({"backdrop": true, "train": 40}), 10.71),
+            (json!({"generated": true, "train": 40}), 6.19),
+            (json!({"generated": true, "backdrop": true, "train": 20}), 8.39),
+            (json!({"form": "transforms", "train": 40}), 5.66),
+            (json!({"samples_per_axis": 1}), 1.39),
+        ] {
+            let mut parameters = json!({
+                "size": 200, "aspect": 1.0, "train": 80, "test": 10, "backdrop": false,
+                "samples_per_axis": 4,
+            });
+            for (name, value) in changes.as_object().unwrap() {
+                parameters[name] = value.clone();
+            }
+            let work = Work::of_demo(&parameters, 2).unwrap();
+            let cost = model_cost("demo-scene", &parameters, &work).unwrap();
+            let ratio = cost.processor_seconds / seconds;
+            println!("{changes}: {:.2} s for {seconds} s", cost.processor_seconds);
+            assert!((0.7..1.3).contains(&ratio), "{changes}: {ratio}");
+        }
+        assert!(Work::of_demo(&json!({"size": 200}), 2).is_none());
     }
 
     /// Peak memory in the records of runs, in MB.
@@ -327,8 +389,10 @@ mod tests {
             ("demo 200, no LPIPS", "eval", json!({}), &work(object, 10, 200), 130.0),
             ("lego 800, refined", "refine", refiner.clone(), &lego, 202.0),
             ("lego 200, refiner", "train-refine", refiner, &work(object, 100, 200), 329.0),
-            ("fern, prepared", "prep", json!({}), &photographs(158_000_000), 202.0),
-            ("lego, prepared", "prep", json!({}), &photographs(12_800_000), 24.0),
+            ("fern, prepared", "prep", json!({}), &photographs(158_000_000), 205.0),
+            ("lego, prepared", "prep", json!({}), &photographs(8_960_000), 19.8),
+            ("demo 200, prepared", "prep", json!({}), &photographs(800_000), 9.2),
+            ("demo 400, prepared", "prep", json!({}), &photographs(3_200_000), 13.3),
         ] {
             let peak_memory = model_cost(program, &parameters, work).unwrap().peak_memory as f64;
             println!("{name}: {:.0} MB for {measured} MB", peak_memory / 1e6);
@@ -357,10 +421,12 @@ mod tests {
     #[test]
     fn unknown_stages_have_no_estimate() {
         let work = work(SceneKind::Object, 1, 1);
-        for program in ["demo-scene", "report", "mine"] {
+        for program in ["report", "mine"] {
             assert_eq!(model_cost(program, &json!({}), &work), None);
         }
-        assert_eq!(model_cost("train-ss", &json!({}), &work), None, "no parameters");
+        for program in ["train-ss", "demo-scene"] {
+            assert_eq!(model_cost(program, &json!({}), &work), None, "no parameters");
+        }
         assert_eq!(min_memory("train-ss", &json!({}), &work), None, "no parameters");
     }
 }

@@ -3,6 +3,7 @@
 //! * `costs`: models of the stages, from numbers of rays and pixels.
 //! * `work`, `scene`: number and size of the images, from an artifact of `prep` or from the data
 //!   set.
+//! * `path`: number and size of the frames along a `camera-path`.
 //! * `machine`: speed of this machine, by a measurement of a few milliseconds.
 //! * `text`: estimates as text, before and after a run.
 //!
@@ -10,6 +11,7 @@
 
 mod costs;
 mod machine;
+mod path;
 mod scene;
 mod text;
 mod work;
@@ -169,6 +171,11 @@ impl<'a> Estimator<'a> {
     fn work(&self, node: &Node) -> Option<Work> {
         let program = node.program.description.name.as_str();
         let has_input = |name: &str| node.inputs.iter().any(|input| input.name == name);
+        match program {
+            "demo-scene" => return Work::of_demo(&node.parameters, self.threads),
+            "camera-path" => return Some(Work::default()),
+            _ => {}
+        }
         let (index, images) = match program {
             "prep" => {
                 let found = self.plan.nodes.iter().position(|other| std::ptr::eq(other, node))?;
@@ -208,12 +215,16 @@ impl<'a> Estimator<'a> {
             _ => return None,
         };
         let (index, subtree) = parent(node, input)?;
-        let Some(scene) = self.scenes.get(&index) else {
+        let parent = &self.plan.nodes[index];
+        let (index, mut images) = match self.scenes.get(&index) {
+            Some(scene) => (index, scene.images(subtree?)?),
+            None if parent.program.description.name == "camera-path" => self.frames(parent)?,
             // Views are as many and as large as the cameras that they were rendered from.
-            let has_views = matches!(input, "views" | "scene");
-            return self.images(&self.plan.nodes[index]).filter(|_| has_views);
+            None => {
+                let has_views = matches!(input, "views" | "scene");
+                return self.images(parent).filter(|_| has_views);
+            }
         };
-        let mut images = scene.images(subtree?)?;
         if input == "cameras"
             && node.program.description.name == "render-depth"
             && let Some(width) = node.parameters["size"].as_f64()
@@ -221,6 +232,18 @@ impl<'a> Estimator<'a> {
             images = images.resized(width);
         }
         Some((index, images))
+    }
+
+    /// Returns the node of `prep` and the frames of a `camera-path`.
+    fn frames(&self, path: &Node) -> Option<(usize, Images)> {
+        let (index, _) = parent(path, "cameras")?;
+        let recorded = path.inputs.iter().find(|input| input.name == "path");
+        let frames = match recorded.map(|input| &input.from) {
+            None => path::computed(&path.parameters, self.scenes.get(&index)?),
+            Some(Origin::Folder(folder)) => path::recorded(&path.parameters, folder),
+            Some(Origin::Node { .. }) => None,
+        };
+        Some((index, frames?))
     }
 
     /// Returns the node that trains the field which a node renders.

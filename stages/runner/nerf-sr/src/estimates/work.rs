@@ -5,9 +5,10 @@ use serde::Deserialize as _;
 use serde_json::Value;
 
 /// Kind of scene, on which the cost of a ray depends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum SceneKind {
     /// Object before a background of one colour: most rays miss it.
+    #[default]
     Object,
     /// Opaque scene in NDC.
     Frustum,
@@ -49,7 +50,7 @@ impl Images {
 }
 
 /// Properties of a stage's inputs, on which its cost depends.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct Work {
     pub(crate) kind: SceneKind,
     /// Number of LR pixels across the field's cube.
@@ -73,6 +74,18 @@ pub(crate) struct Work {
 }
 
 impl Work {
+    /// Returns the work of rendering the demo scene.
+    pub(crate) fn of_demo(demo: &Value, threads: u64) -> Option<Self> {
+        let number = |name: &str| demo[name].as_f64();
+        let (width, count) = (number("size")?, number("train")? + number("test")?);
+        let largest = (width as u64, (width / number("aspect")?).round() as u64);
+        let kind =
+            if demo["backdrop"].as_bool()? { SceneKind::Unbounded } else { SceneKind::Object };
+        let count = count as u64;
+        let images = Images { count, pixels: count * largest.0 * largest.1, largest };
+        Some(Self { kind, images, threads, ..Self::default() })
+    }
+
     /// Returns the number of floats of a grid that is trained with some parameters.
     pub(crate) fn grid_floats(&self, training: &Value) -> Option<u64> {
         let sizes = GivenSizes::deserialize(training).ok()?;
