@@ -59,6 +59,8 @@ mod samples;
 mod shading;
 pub mod spec;
 mod specks;
+#[cfg(test)]
+mod stability;
 mod tensors;
 mod trainer;
 mod training_log;

@@ -204,6 +204,11 @@ pub fn clip(bounds: &Bounds, ray: &Ray) -> NormalizedRay {
     })
 }
 
+/// Maximum distance of a ray's origin from the box it enters, in box sides; farther rays start where
+/// they enter. In single precision, positions along a ray from this distance are exact to a
+/// millionth of a side (`stability.rs`).
+const MAX_ORIGIN_DISTANCE: f64 = 16.0;
+
 fn clip_to_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
     let side = bounds.longest_side();
     let origin = (origin - DVec3::from(bounds.min)) / side;
@@ -212,12 +217,17 @@ fn clip_to_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<Norma
     let faces =
         (0..3).flat_map(|i| [(origin[i], direction[i]), (extent[i] - origin[i], -direction[i])]);
     let (enter, leave) = clip_to_halfspaces(faces, [bounds.near / side, bounds.far / side])?;
+    let start = if enter > MAX_ORIGIN_DISTANCE { enter } else { 0.0 };
     Some(NormalizedRay {
-        origin: origin.as_vec3().to_array(),
+        origin: (origin + start * direction).as_vec3().to_array(),
         direction: direction.as_vec3().to_array(),
-        enter: enter as f32,
-        leave: leave as f32,
-        map: RayMap::Straight { start: 0.0, scale: side as f32, perspective: 0.0 },
+        enter: (enter - start) as f32,
+        leave: (leave - start) as f32,
+        map: RayMap::Straight {
+            start: (start * side) as f32,
+            scale: side as f32,
+            perspective: 0.0,
+        },
         view: [0.0; 3],
     })
 }

@@ -20,10 +20,10 @@ use crate::spec::{
 };
 
 /// Parameters in f64.
-struct Judge<'a> {
-    field: &'a Field,
-    grid: Vec<f64>,
-    network: Vec<f64>,
+pub(crate) struct Judge<'a> {
+    pub(crate) field: &'a Field,
+    pub(crate) grid: Vec<f64>,
+    pub(crate) network: Vec<f64>,
 }
 
 fn colour_of(outputs: &[f64], view_colour: &[f64]) -> [f64; 3] {
@@ -116,7 +116,7 @@ impl Judge<'_> {
     }
 
     /// Colour of a ray over its background.
-    fn ray(&self, ray: &Ray, samples: &[Sample]) -> [f64; 3] {
+    pub(crate) fn ray(&self, ray: &Ray, samples: &[Sample]) -> [f64; 3] {
         let (shaded, transmittance) = self.shaded(ray, samples);
         let sum = |c: usize| shaded.iter().map(|(weight, colour)| weight * colour[c]).sum::<f64>();
         std::array::from_fn(|c| transmittance.mul_add(f64::from(ray.background[c]), sum(c)))
@@ -125,7 +125,7 @@ impl Judge<'_> {
 
 /// A sample of a ray.
 #[derive(Clone, Copy, Debug)]
-struct Sample {
+pub(crate) struct Sample {
     position: [f32; 3],
     /// Steps that it stands for.
     length: f32,
@@ -134,7 +134,7 @@ struct Sample {
 }
 
 /// Returns all samples of each ray; each ray is marched alone, by a single call.
-fn samples(
+pub(crate) fn samples(
     field: &Field,
     rays: &[NormalizedRay],
     offsets: &[f32],
@@ -186,7 +186,7 @@ fn fused_gradients(
     (grid, network, features.positions.len())
 }
 
-fn example() -> (Field, Vec<Ray>) {
+pub(crate) fn example() -> (Field, Vec<Ray>) {
     let architecture = Architecture {
         n_levels: 5,
         base_resolution: 4,
