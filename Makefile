@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 # Folder with real scenes and network weights, read by the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean reference prior goldens
+.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds stability bench bench-runner compare-engines fuzz clean reference prior goldens
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -169,6 +169,11 @@ tradeoff: build held-out ## Measure PSNR against training time, on withheld trai
 
 seeds: build ## Measure the spread of the PSNR over ten seeds of the demo scene
 	@$(call experiment,seeds)
+
+stability: build ## Run the programs at the extremes of their inputs and parameters: docs/results/stability.md
+	@mkdir -p out
+	@cargo test --release -p radiance --lib --quiet errors_of_single_precision -- --nocapture > out/precision.txt || { cat out/precision.txt; exit 1; }
+	UPDATE=1 cargo test --release -p end-to-end --test stability --quiet -- --nocapture table
 
 bench-runner: build ## Measure the runner's overhead against DVC and Snakemake (installed by pip): out/bench-runner/table.md
 	@python3 scripts/bench-runner.py
