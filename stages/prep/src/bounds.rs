@@ -7,6 +7,8 @@ use scene::{
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::pose_warnings::{MIN_OUTLIER_RATIO, median};
+
 /// Space of a field's unit cube.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
@@ -263,7 +265,9 @@ const MIN_FOCUS_DETERMINANT: f64 = 1e-9;
 /// Returns a box around the region that all cameras face, from the cameras alone if possible.
 ///
 /// The centre is the point nearest to all optical axes; the half side is the half width of the
-/// widest view at that distance, so that a scene that fits into its views fits into the box. If the
+/// widest view at that distance, so that a scene that fits into its views fits into the box. Views
+/// [`MIN_OUTLIER_RATIO`] times as wide as the median, of which `prep` warns, don't count: in a box as
+/// wide as theirs the scene would be a few cells large (docs/results/stability.md). If the
 /// axes don't cross (one view, a forward-facing row), the box surrounds the views between their
 /// known depths or, without depths, a point at distance 4 before the mean camera, the convention of
 /// the Blender scenes.
@@ -277,9 +281,11 @@ fn box_bounds(views: &[CameraDepths]) -> Bounds {
         let forward = mean(views, Camera::forward).normalize_or(DVec3::NEG_Z);
         mean(views, Camera::centre) + 4.0 * forward
     };
-    let widest = cameras.iter().map(|camera| half_width(camera, centre)).fold(0.0, f64::max);
+    let widths: Vec<f64> = cameras.iter().map(|camera| half_width(camera, centre)).collect();
+    let limit = MIN_OUTLIER_RATIO * median(widths.iter().copied());
+    let widest = widths.into_iter().filter(|width| *width <= limit).fold(0.0, f64::max);
     // A twentieth more, for silhouettes that touch the image border.
-    let half = 1.05 * widest.max(f64::MIN_POSITIVE.sqrt());
+    let half = if widest > 0.0 { 1.05 * widest } else { UNKNOWN_HALF_SIDE };
     let box_only = Bounds {
         min: (centre - DVec3::splat(half)).to_array(),
         max: (centre + DVec3::splat(half)).to_array(),
@@ -289,6 +295,9 @@ fn box_bounds(views: &[CameraDepths]) -> Bounds {
     };
     with_ray_range(box_only, &cameras)
 }
+
+/// Half side of the box around cameras at one position, from which no depth follows; chosen by hand.
+const UNKNOWN_HALF_SIDE: f64 = 1.0;
 
 /// Maximum slope of a fisheye view's border from which a box's size is computed: 45° from the axis.
 /// Larger slopes would yield boxes that contain the cameras (docs/design/005).
@@ -394,6 +403,16 @@ mod tests {
     fn one_camera_has_a_box_too() {
         let bounds = box_bounds(&[(looking_at(DVec3::new(4.0, 0.0, 0.5), DVec3::ZERO), None)]);
         assert!(bounds.near > 0.0 && bounds.far > bounds.near && bounds.far.is_finite());
+    }
+
+    #[test]
+    fn a_camera_far_away_does_not_enlarge_the_box() {
+        let ring = circle(DVec3::ZERO, 4.0);
+        let far = looking_at(DVec3::new(0.0, 400.0, 50.0), DVec3::ZERO);
+        let [alone, joined] = [ring.clone(), [ring, vec![far]].concat()]
+            .map(|cameras| box_bounds(&sights(&cameras, None)));
+        assert!((joined.longest_side() / alone.longest_side() - 1.0).abs() < 1e-6, "{joined:?}");
+        assert!(joined.far > 400.0 && joined.near == alone.near, "{joined:?}");
     }
 
     /// Whatever a camera of a row sees between its depths lies in the box, and between near and

@@ -26,7 +26,10 @@ pub(crate) enum ParameterError {
     Sizes(SizeError),
     #[error(transparent)]
     Space(#[from] SpaceError),
-    #[error("parameter {name}: {} is not a valid distance", format_number(*value))]
+    #[error(
+        "parameter {name}: {} is not a valid distance; choose at most 1e18",
+        format_number(*value)
+    )]
     InvalidDistance { name: &'static str, value: f64 },
     #[error(
         "parameter near: {} is not less than far = {}",

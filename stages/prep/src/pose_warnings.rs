@@ -8,7 +8,7 @@ use crate::error::SamePose;
 
 /// Distance of an outlier camera from the centre, relative to the median distance. Walks through a
 /// room have 2 to 5; the threshold is chosen by hand.
-const MIN_OUTLIER_RATIO: f64 = 20.0;
+pub(crate) const MIN_OUTLIER_RATIO: f64 = 20.0;
 /// Minimum number of cameras whose median distance is meaningful; chosen by hand.
 const MIN_CAMERAS: usize = 4;
 /// Maximum offset of a plausible principal point from the image centre, relative to the image side.
@@ -111,14 +111,14 @@ fn outliers(all: &[LabelledCamera]) -> Option<String> {
     let more = if far.len() > 1 { format!(" (and {} more)", far.len() - 1) } else { String::new() };
     Some(format!(
         "{} is {:.0} times as far from the cameras' centre as the median camera{more}; check its \
-        pose: the scene's bounds depend on all poses",
+        pose",
         all[first],
         distances[first] / usual
     ))
 }
 
 /// Returns the upper median; 0 for no values.
-fn median(values: impl Iterator<Item = f64>) -> f64 {
+pub(crate) fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut sorted: Vec<f64> = values.collect();
     sorted.sort_unstable_by(f64::total_cmp);
     sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)

@@ -43,6 +43,10 @@ impl<'a> ScenePlan<'a> {
 /// Message about a bounding box whose sides vanish in f64.
 const EMPTY_BOX: &str =
     "dataset: the scene's bounding box has no volume; check the poses and their unit";
+/// Minimum side of a scene, and maximum of `far`, in scene units: the product of two distances must
+/// be representable in single precision.
+const MIN_SIDE: f64 = 1e-18;
+const MAX_FAR: f64 = 1e18;
 
 /// Returns the scene's bounds from cameras, depths and parameters.
 fn bounds(
@@ -64,11 +68,19 @@ fn bounds(
     if !bounds.is_valid() {
         return Err(Failure::BadInput(EMPTY_BOX.to_owned()));
     }
+    let side = bounds.longest_side();
+    if side < MIN_SIDE {
+        return Err(Failure::BadInput(format!(
+            "dataset: the scene is {} units wide, less than {MIN_SIDE:e}; multiply all camera \
+            centres by a constant",
+            format_length(side, 3)
+        )));
+    }
     for (name, given, bound) in
         [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)]
     {
         if let Some(value) = given {
-            if !value.is_finite() {
+            if !value.is_finite() || value > MAX_FAR {
                 return Err(ParameterError::InvalidDistance { name, value }.into());
             }
             *bound = value;
@@ -214,7 +226,7 @@ mod tests {
         );
         assert_eq!(
             near_and_far(&set, None, Some(f64::INFINITY)).unwrap_err().to_string(),
-            "parameter far: inf is not a valid distance"
+            "parameter far: inf is not a valid distance; choose at most 1e18"
         );
     }
 
