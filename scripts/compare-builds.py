@@ -16,11 +16,11 @@ import sys
 import tempfile
 
 # Targets and arguments, with today's names. Budgets are small because bytes are compared, not quality.
-SMALL = "-p lr_width=100 -p prep.test_views=2 -p train-ss.rays=400000 -p train-ss.precrop_steps=20"
+SMALL = "-p lr_width=100 -p prep.test_views=2 -p train-ss.rays=400000"
 EXPERIMENTS = {
     "demo": "-p demo-scene.size=64 -p demo-scene.train=12 -p demo-scene.test=2 -p train-ss.rays=300000",
     "lego": f"-i dataset=DATA/nerf_synthetic/lego {SMALL} -p supervision=kernel,average -i weights=DATA/weights",
-    "ensemble": "-p demo-scene.size=64 -p demo-scene.train=12 -p demo-scene.test=2 -p train-ss.rays=200000 -p ensemble=2 -p train-ss.order=epochs",
+    "ensemble": "-p demo-scene.size=64 -p demo-scene.train=12 -p demo-scene.test=2 -p train-ss.rays=200000 -p ensemble=2",
     "mlp": "-p demo-scene.size=32 -p demo-scene.train=6 -p demo-scene.test=1 -p field=mlp -p layers=2 -p hidden_dim=16 -p train-ss.rays=4000 -p max_rays_per_step=256",
     "fern": "-i dataset=DATA/nerf_llff_data/fern -p lr_width=252 -p prep.test_views=1 -p train-ss.rays=300000 -p render-depth.samples_per_axis=1",
     "refined": "refined -p demo-scene.size=64 -p demo-scene.train=12 -p demo-scene.test=2 -p train-ss.rays=300000 -p downscaled-field.rays=200000 -p train-refine.steps=40",

@@ -119,7 +119,7 @@ def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build:
     tree = getattr(options, build)
     own = protocol(tree, name) if options.budgets else {"train-ss": {"rays": int(rays * factor)}}
     rays = own["train-ss"].pop("rays")
-    params = {"field": {"grid": {"rays": rays}}, "supersample": scale, "seed": seed} | own["train-ss"]
+    params = {"rays": rays, "supersample": scale, "seed": seed} | own["train-ss"]
     at = f"{build}-{seed}-{rays}"
     training = run(tree, "train-ss", folder, f"{at}/field", {"scene": "scene/train"}, params)
     rendering = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, own.get("render-depth", {}))

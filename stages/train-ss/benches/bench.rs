@@ -387,12 +387,13 @@ fn training(rows: &mut Rows, folder: &Path, rays: u64) -> anyhow::Result<()> {
     let scene = Scene { input, views };
     // Uniform draws first, for comparison with other implementations; then the defaults.
     let grid = |rays, pixel_importance| {
-        let grid = GridParams { rays: Some(rays), pixel_importance, ..GridParams::default() };
-        Params { field: FieldParams::Grid(grid), ..Params::default() }
+        let grid = GridParams { pixel_importance, ..GridParams::default() };
+        Params { field: FieldParams::Grid(grid), rays: Some(rays), ..Params::default() }
     };
-    let field = scene.measure(rows, &grid(rays, Some(1.0)), "")?.field;
-    scene.measure(rows, &grid(rays, None), "_by_detail")?;
-    let short = grid(rays / 6, Some(1.0));
+    let by_detail = GridParams::default().pixel_importance;
+    let field = scene.measure(rows, &grid(rays, 1.0), "")?.field;
+    scene.measure(rows, &grid(rays, by_detail), "_by_detail")?;
+    let short = grid(rays / 6, 1.0);
     scene.measure(rows, &short, "_first_sixth")?;
     let one_core = one_core(|| scene.measure(rows, &short, "_first_sixth_one_core"))?;
     add_phases(rows, &one_core);
@@ -441,14 +442,11 @@ fn rendering(rows: &mut Rows, folder: &Path, field: &Field) -> anyhow::Result<()
 #[cfg(feature = "torch")]
 fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()> {
     const STEPS: u64 = 3;
-    let mlp = MlpParams {
-        rays: Some((STEPS + 1) * 2048),
-        precrop_steps: Some(0),
-        ..MlpParams::default()
-    };
-    let params = Params { field: FieldParams::Mlp(mlp), ..Params::default() };
+    let mlp = MlpParams { precrop_steps: Some(0), ..MlpParams::default() };
+    let rays = Some((STEPS + 1) * 2048);
+    let params = Params { field: FieldParams::Mlp(mlp), rays, ..Params::default() };
     let params = params.resolve(&SceneFacts::of(views, true));
-    let ResolvedField::Mlp { architecture, density_noise_std, given } = &params.field else {
+    let ResolvedField::Mlp { architecture, density_noise_std } = &params.field else {
         anyhow::bail!("MLPs are measured here");
     };
     nets::deterministic();
@@ -457,8 +455,7 @@ fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()>
     let field =
         torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
     let weights = field.parameter_count() / 2;
-    let mut trainer =
-        torch_field::MlpTrainer::new(field, params.mlp_training(given, *density_noise_std))?;
+    let mut trainer = torch_field::MlpTrainer::new(field, params.mlp_training(*density_noise_std))?;
     trainer.step(&mut supervision)?;
     let (start, mut samples) = (Instant::now(), 0);
     while let Some(report) = trainer.step(&mut supervision)? {

@@ -19,7 +19,7 @@ mod supersample;
 mod supervision;
 mod training;
 
-use artifact::{Failure, WARNING, format_amount, with_warnings};
+use artifact::{WARNING, format_amount, with_warnings};
 use fields::{FIELD_FILE, FIELD_FORMAT, FieldFile};
 use pixels::DEGRADATION_FILE;
 use radiance::{TRAINING_FILE, TrainingLog};
@@ -28,8 +28,8 @@ use serde_json::json;
 use stage::{Context, Input, Output, Rule, Stage};
 
 pub use params::{
-    Combine, FieldParams, GridParams, MlpParams, Order, Params, ParamsError, RateSchedule,
-    Resolved, ResolvedField, ResolvedRegularisers, SceneFacts, Supervision,
+    Combine, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
+    ResolvedRegularisers, SceneFacts, Supervision,
 };
 use supervision::transparent_background;
 pub use supervision::{Supersampling, supervision};
@@ -88,16 +88,10 @@ impl Stage for TrainSs {
                 .when("scene.background", json!({"const": "alpha"}))
                 .must(parameter, json!({"not": {"const": value}}))
         });
-        let message = "parameter pixel_importance: epochs draw all pixels equally often; \
-            choose order random";
-        let importance = Rule::new(message)
-            .when("order", json!({"const": "epochs"}))
-            .must("pixel_importance", json!({"anyOf": [{"type": "null"}, {"maximum": 1}]}));
-        conflicts.into_iter().chain([importance]).collect()
+        conflicts.to_vec()
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        params.check().map_err(|e| Failure::Usage(e.to_string()))?;
         let input = context.input("scene")?;
         let references = context.optional_input("references");
         let mut views = Views::read(input)?;

@@ -217,7 +217,8 @@ fn training_key(text: &str, arguments: &[&str]) -> String {
 /// The key contains the selected variant's parameters by name, in every notation.
 #[test]
 fn one_choice_is_one_key() {
-    let nested = PIPELINE.replace("rays: 12000000", "field: {grid: {rays: 12000000, n_levels: 4}}");
+    let nested =
+        PIPELINE.replace("rays: 12000000", "rays: 12000000\n      field: {grid: {n_levels: 4}}");
     assert_eq!(training_key(&nested, &[]), training_key(PIPELINE, &["n_levels=4"]));
     assert_eq!(training_key(PIPELINE, &["field=grid"]), training_key(PIPELINE, &[]));
     assert_ne!(training_key(PIPELINE, &["field=mlp"]), training_key(PIPELINE, &[]));

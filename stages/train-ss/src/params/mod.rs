@@ -9,7 +9,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use torch_field::MlpArchitecture;
 
-pub use resolve::ParamsError;
 pub use resolved::{Resolved, ResolvedField, ResolvedRegularisers};
 pub use scene_facts::SceneFacts;
 
@@ -26,6 +25,27 @@ pub struct Params {
     /// of an LR pixel, and may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "sampling"))]
     pub supersample: f64,
+    /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
+    /// per side at first, then 2, 4 and so on, up to `supersample`. Default: 0.3, or 0 with
+    /// `field: mlp` and in fine-tuning (input `init`).
+    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(extend("x-group" = "sampling", "x-default" = BY_SCENE))]
+    pub supersample_warmup: Option<f64>,
+    /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble. Default:
+    /// from the number of LR pixels by `rays_per_pixel`, `min_rays` and `max_rays`. With
+    /// `field: mlp`, 20 epochs, or 30 in NDC; an epoch is one pass over all pixels.
+    #[schemars(range(min = 1), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
+    pub rays: Option<u64>,
+    /// Maximum number of rays in a step; with `field: grid`, values below 256 mean 256. Default:
+    /// 8192, or 2048 with `field: mlp`.
+    #[schemars(range(min = 1, max = 1_048_576))]
+    #[schemars(extend("x-group" = "sampling", "x-default" = "by `field`"))]
+    pub max_rays_per_step: Option<u32>,
+    /// Highest learning rate: of the grid's coarsest level, or of the paper's MLPs. Default: 0.06, or
+    /// 0.0005 with `field: mlp`.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(extend("x-group" = "optimiser", "x-default" = "by `field`"))]
+    pub learning_rate: Option<f64>,
     /// Comparison of an LR pixel with its rays. Default: `kernel` for `field: grid` if the scene
     /// states the kernel of the LR images and `background` isn't `alpha`; otherwise `average`.
     #[schemars(extend("x-group" = "loss", "x-default" = BY_SCENE))]
@@ -69,6 +89,10 @@ impl Default for Params {
         Self {
             field: FieldParams::default(),
             supersample: 2.0,
+            supersample_warmup: None,
+            rays: None,
+            max_rays_per_step: None,
+            learning_rate: None,
             supervision: None,
             exposure: false,
             pose_refinement: false,
@@ -101,10 +125,6 @@ impl Default for FieldParams {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GridParams {
-    /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble. Default:
-    /// from the number of LR pixels by `rays_per_pixel`, `min_rays` and `max_rays`.
-    #[schemars(range(min = 1), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
-    pub rays: Option<u64>,
     /// Rays for each LR pixel of all views, unless `rays` is given. With `background: opaque`,
     /// where each ray hits a surface and costs more, 0.6 times as many; fine-tuning (input `init`)
     /// takes half.
@@ -117,30 +137,15 @@ pub struct GridParams {
     /// the time of a training on many or large photographs.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
     pub max_rays: u64,
-    /// Maximum number of rays in a step; values below 256 mean 256.
-    #[schemars(range(min = 1, max = 1_048_576), extend("x-group" = "sampling"))]
-    pub max_rays_per_step: u32,
     /// Target number of samples in the first steps. The last steps have 8/3 times as many. Steps
     /// have fewer rays while space is full of semi-transparent density.
     #[schemars(range(min = 1024, max = 16_777_216), extend("x-group" = "sampling"))]
     pub samples_per_step: u32,
-    /// Order in which pixels are drawn.
-    #[schemars(extend("x-group" = "sampling"))]
-    pub order: Order,
-    /// Factor by which pixels with detail around them are drawn more often than flat pixels, with
-    /// `order: random`. In the loss, flat pixels have a weight larger by this factor, which keeps
-    /// the expected loss unchanged. Default: 10 with `order: random`, otherwise 1.
+    /// Factor by which pixels with detail around them are drawn more often than flat pixels. In the
+    /// loss, flat pixels have a weight larger by this factor, which keeps the expected loss
+    /// unchanged.
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
-    #[schemars(extend("x-default" = "by `order`"))]
-    pub pixel_importance: Option<f64>,
-    /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
-    /// per side at first, then 2, 4 and so on, up to `supersample`.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "sampling"))]
-    pub supersample_warmup: f64,
-    /// Number of steps at the start that draw pixels only from the middle half of each image's
-    /// width and height.
-    #[schemars(extend("x-group" = "sampling"))]
-    pub precrop_steps: u32,
+    pub pixel_importance: f64,
     /// Samples along the diagonal of the unit cube. Default: 256 in NDC, where every ray crosses
     /// the whole cube; otherwise 512.
     #[schemars(range(min = 16, max = 8192), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
@@ -155,13 +160,6 @@ pub struct GridParams {
     /// or black background, otherwise 0.
     #[schemars(range(min = 0.0, max = 10.0), extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub floater_loss: Option<f64>,
-    /// Highest learning rate of the grid's coarsest level.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
-    pub learning_rate: f64,
-    /// Ratio of a level's learning rate to that of the next coarser level. Below 1, coarse levels
-    /// fit the images first.
-    #[schemars(range(min = 0.01, max = 2.0), extend("x-group" = "optimiser"))]
-    pub level_rate: f64,
     /// Highest learning rate of the MLPs.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
     pub mlp_learning_rate: f64,
@@ -172,23 +170,13 @@ pub struct GridParams {
     /// weights without averaging.
     #[schemars(range(min = 0.0, max = 0.999), extend("x-group" = "optimiser"))]
     pub ema_decay: f64,
-    /// Weight decay of the MLPs.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
-    pub network_decay: f64,
     /// Levels of the grid.
     #[schemars(range(min = 1, max = 16), extend("x-group" = "field"))]
     pub n_levels: u32,
-    /// Cells along an axis of the coarsest level.
-    #[schemars(range(min = 2, max = 512), extend("x-group" = "field"))]
-    pub base_resolution: u32,
     /// Cells along an axis of the finest level. Default: 2.56 cells for each LR pixel across the
-    /// unit cube, at least `base_resolution`.
-    #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
+    /// unit cube.
+    #[schemars(range(min = 16, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub max_resolution: Option<u32>,
-    /// Maximum number of cells along z at every level. Default: in NDC, where rays run along z, the
-    /// number of samples along the cube's z axis; otherwise no limit.
-    #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
-    pub finest_z: Option<u32>,
     /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at a
     /// `max_resolution` of 256, plus 2 for each doubling of `max_resolution`.
     #[schemars(range(min = 8, max = 22), extend("x-group" = "field", "x-default" = BY_SCENE))]
@@ -202,29 +190,20 @@ impl Default for GridParams {
     fn default() -> Self {
         let grid = Architecture::default();
         Self {
-            rays: None,
             rays_per_pixel: 32.0,
             min_rays: 8_000_000,
             max_rays: 80_000_000,
-            max_rays_per_step: 8_192,
             samples_per_step: 24_576,
-            order: Order::Random,
-            pixel_importance: None,
-            supersample_warmup: 0.3,
-            precrop_steps: 0,
+            // Design note 010.
+            pixel_importance: 10.0,
             march_steps: None,
             distortion: None,
             floater_loss: None,
-            learning_rate: 6e-2,
-            level_rate: 0.8,
             mlp_learning_rate: 1e-2,
             learning_rate_decay: 0.16,
             ema_decay: 0.97,
-            network_decay: 1e-6,
             n_levels: grid.n_levels,
-            base_resolution: grid.base_resolution,
             max_resolution: None,
-            finest_z: None,
             log2_hashmap_size: None,
             hidden_dim: grid.hidden_dim,
         }
@@ -235,25 +214,6 @@ impl Default for GridParams {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MlpParams {
-    /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble. Default: 20
-    /// epochs, or 30 in NDC. An epoch is one pass over all pixels.
-    #[schemars(range(min = 1), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
-    pub rays: Option<u64>,
-    /// Maximum number of rays in a step.
-    #[schemars(range(min = 1, max = 1_048_576), extend("x-group" = "sampling"))]
-    pub max_rays_per_step: u32,
-    /// Order in which pixels are drawn.
-    #[schemars(extend("x-group" = "sampling"))]
-    pub order: Order,
-    /// Factor by which pixels with detail around them are drawn more often than flat pixels, with
-    /// `order: random`. In the loss, flat pixels have a weight larger by this factor, which keeps
-    /// the expected loss unchanged.
-    #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
-    pub pixel_importance: f64,
-    /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
-    /// per side at first, then 2, 4 and so on, up to `supersample`.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "sampling"))]
-    pub supersample_warmup: f64,
     /// Number of steps at the start that draw pixels only from the middle half of each image's
     /// width and height. Default: 0 in NDC, otherwise 1000.
     #[schemars(extend("x-group" = "sampling", "x-default" = BY_SCENE))]
@@ -264,33 +224,6 @@ pub struct MlpParams {
     /// Additional samples along a ray, for the fine MLP.
     #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
     pub fine_samples: u32,
-    /// Standard deviation of the noise on raw densities. Default: 1 in NDC, otherwise 0.
-    #[schemars(range(min = 0.0, max = 100.0), extend("x-group" = "loss", "x-default" = BY_SCENE))]
-    pub density_noise_std: Option<f64>,
-    /// Highest learning rate.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
-    pub learning_rate: f64,
-    /// Final learning rate as a fraction of the highest one.
-    #[schemars(range(min = 1e-6, max = 1.0), extend("x-group" = "optimiser"))]
-    pub learning_rate_decay: f64,
-    /// Schedule of the learning rate, according to the paper's `code` or to the text of the
-    /// `paper`. A training run shorter than the published one passes through the whole schedule.
-    #[schemars(extend("x-group" = "optimiser"))]
-    pub schedule: RateSchedule,
-    /// Maximum number of restarts, each with the next seed, of an MLP that has collapsed to the
-    /// background or to a wall in front of every camera.
-    #[schemars(range(min = 0, max = 100), extend("x-group" = "optimiser"))]
-    pub restarts: u32,
-    /// Octaves of the encoding of positions.
-    #[schemars(range(min = 0, max = 16), extend("x-group" = "field"))]
-    pub position_frequencies: u32,
-    /// Octaves of the encoding of directions.
-    #[schemars(range(min = 0, max = 16), extend("x-group" = "field"))]
-    pub direction_frequencies: u32,
-    /// In NDC, makes colours depend on the ray's direction in NDC, as in the paper's code, instead
-    /// of its direction in the world.
-    #[schemars(extend("x-group" = "field"))]
-    pub ndc_directions: bool,
     /// Number of layers that density and colour share.
     #[schemars(range(min = 1, max = 32), extend("x-group" = "field"))]
     pub layers: u32,
@@ -303,22 +236,9 @@ impl Default for MlpParams {
     fn default() -> Self {
         let mlp = MlpArchitecture::default();
         Self {
-            rays: None,
-            max_rays_per_step: 2_048,
-            order: Order::Epochs,
-            pixel_importance: 1.0,
-            supersample_warmup: 0.0,
             precrop_steps: None,
             coarse_samples: mlp.coarse_samples,
             fine_samples: mlp.fine_samples,
-            density_noise_std: None,
-            learning_rate: 5e-4,
-            learning_rate_decay: 0.01,
-            schedule: RateSchedule::Code,
-            restarts: 0,
-            position_frequencies: mlp.position_frequencies,
-            direction_frequencies: mlp.direction_frequencies,
-            ndc_directions: mlp.ndc_directions,
             layers: mlp.layers,
             hidden_dim: mlp.hidden_dim,
         }
@@ -335,16 +255,6 @@ pub enum Supervision {
     Kernel,
 }
 
-/// Order of pixel draws.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum Order {
-    /// Draws pixels independently.
-    Random,
-    /// Draws each pixel once in random order, then again in another order.
-    Epochs,
-}
-
 /// Combination of the initial with the fine-tuned field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -353,14 +263,4 @@ pub enum Combine {
     AverageWeights,
     /// Averages the rendered images: better, and as slow as two fields.
     Ensemble,
-}
-
-/// Schedule of the learning rate of the paper's MLPs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum RateSchedule {
-    /// Constant until the last ten epochs, then a decay per epoch, as in the paper's code.
-    Code,
-    /// Exponential decay throughout, as in the paper's text.
-    Paper,
 }

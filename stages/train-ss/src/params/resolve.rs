@@ -4,7 +4,7 @@ use torch_field::MlpArchitecture;
 use workload::RayBudget;
 
 use super::{
-    Combine, FieldParams, GridParams, MlpParams, Order, Params, Resolved, ResolvedField,
+    Combine, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
     ResolvedRegularisers, SceneFacts, Supervision,
 };
 use crate::supersample::whole_supersample;
@@ -15,50 +15,31 @@ const EPOCHS: u64 = 20;
 const EPOCHS_IN_NDC: u64 = 30;
 /// Precrop steps of the published training runs of Blender scenes (design note 022).
 const PRECROP_STEPS: u32 = 1000;
+/// Standard deviation of the noise on raw densities in published training runs of photographs in
+/// NDC (NeRF-SR).
+const DENSITY_NOISE_STD_IN_NDC: f64 = 1.0;
+/// Fraction of a grid's rays that are cast before each LR pixel gets all of its sub-pixel rays
+/// (design note 008).
+const SUPERSAMPLE_WARMUP: f64 = 0.3;
 /// Weight of the distortion loss with an opaque background in NDC (design note 012).
 const DISTORTION_IN_NDC: f64 = 0.004;
 /// Weight of the distortion loss with an opaque background in a contraction (design note 012).
 const DISTORTION_IN_CONTRACTION: f64 = 0.002;
 /// Weight of the floater loss with a background of one colour (design note 013).
 const FLOATER_LOSS: f64 = 0.001;
-/// Ratio of the draw rates of detailed and flat pixels with `order: random` (design note 010).
-const PIXEL_IMPORTANCE: f64 = 10.0;
-/// Error returned for parameters that contradict each other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum ParamsError {
-    /// The coarsest level of a grid has more cells than the finest.
-    #[error("parameter base_resolution: {base} is above max_resolution = {max}")]
-    BaseAboveMax {
-        /// Cells along an axis of the coarsest level.
-        base: u32,
-        /// Cells along an axis of the finest level.
-        max: u32,
-    },
-}
-
 impl Params {
-    /// Fails if parameters contradict each other.
-    pub fn check(&self) -> Result<(), ParamsError> {
-        match self.field {
-            FieldParams::Grid(GridParams {
-                base_resolution: base,
-                max_resolution: Some(max),
-                ..
-            }) if max < base => Err(ParamsError::BaseAboveMax { base, max }),
-            _ => Ok(()),
-        }
-    }
-
     /// Sets every default for a scene.
     pub fn resolve(&self, scene: &SceneFacts) -> Resolved {
         let epoch = scene.lr_pixels * whole_supersample(self.supersample).pow(2);
-        let mut sampling = match &self.field {
-            FieldParams::Grid(grid) => grid.sampling(scene),
-            FieldParams::Mlp(mlp) => mlp.sampling(scene, epoch),
+        let mut defaults = match &self.field {
+            FieldParams::Grid(grid) => grid.training_defaults(self.rays, scene),
+            FieldParams::Mlp(mlp) => mlp.training_defaults(self.rays, scene, epoch),
         };
+        defaults.supersample_warmup =
+            self.supersample_warmup.unwrap_or(defaults.supersample_warmup);
         if scene.is_fine_tuning {
             // The initial field already has the scene's rough shape.
-            (sampling.supersample_warmup, sampling.precrop_steps) = (0.0, 0);
+            (defaults.supersample_warmup, defaults.precrop_steps) = (0.0, 0);
         }
         let is_grid = matches!(self.field, FieldParams::Grid(_));
         let supervision = if is_grid && scene.has_kernel && scene.background != Background::Alpha {
@@ -70,17 +51,18 @@ impl Params {
         Resolved {
             field: self.field.resolve(scene),
             supersample: self.supersample,
-            supersample_warmup: sampling.supersample_warmup,
+            supersample_warmup: defaults.supersample_warmup,
             supervision: self.supervision.unwrap_or(supervision),
             exposure: self.exposure,
             pose_refinement: self.pose_refinement,
             silhouettes: self.silhouettes && is_grid,
-            order: sampling.order,
-            pixel_importance: sampling.pixel_importance,
-            precrop_steps: sampling.precrop_steps,
+            in_epochs: !is_grid,
+            pixel_importance: defaults.pixel_importance,
+            precrop_steps: defaults.precrop_steps,
             ensemble: self.ensemble,
-            rays: sampling.rays,
-            max_rays_per_step: sampling.max_rays_per_step,
+            rays: defaults.rays,
+            max_rays_per_step: self.max_rays_per_step.unwrap_or(defaults.max_rays_per_step),
+            learning_rate: self.learning_rate.unwrap_or(defaults.learning_rate),
             epoch,
             max_references: self.max_references.map_or(usize::MAX, |count| count as usize),
             combine: self.combine.unwrap_or(combine),
@@ -89,46 +71,40 @@ impl Params {
     }
 }
 
-/// Parameters of ray sampling that both kinds of field have.
-struct Sampling {
+/// Parameters of a training that follow from the kind of field.
+struct TrainingDefaults {
     rays: u64,
     max_rays_per_step: u32,
-    order: Order,
+    learning_rate: f64,
     pixel_importance: f64,
     supersample_warmup: f64,
     precrop_steps: u32,
 }
 
 impl GridParams {
-    fn total_rays(&self, scene: &SceneFacts) -> u64 {
+    fn training_defaults(&self, rays: Option<u64>, scene: &SceneFacts) -> TrainingDefaults {
         let budget = RayBudget {
-            rays: self.rays,
+            rays,
             rays_per_pixel: self.rays_per_pixel,
             min_rays: self.min_rays,
             max_rays: self.max_rays,
         };
         let is_opaque = scene.background == Background::Opaque;
-        budget.total(scene.lr_pixels, is_opaque, scene.is_fine_tuning)
-    }
-
-    fn sampling(&self, scene: &SceneFacts) -> Sampling {
-        let importance = if self.order == Order::Random { PIXEL_IMPORTANCE } else { 1.0 };
-        Sampling {
-            rays: self.total_rays(scene),
-            max_rays_per_step: self.max_rays_per_step,
-            order: self.order,
-            pixel_importance: self.pixel_importance.unwrap_or(importance),
-            supersample_warmup: self.supersample_warmup,
-            precrop_steps: self.precrop_steps,
+        TrainingDefaults {
+            rays: budget.total(scene.lr_pixels, is_opaque, scene.is_fine_tuning),
+            // Design note 007.
+            max_rays_per_step: 8_192,
+            learning_rate: 6e-2,
+            pixel_importance: self.pixel_importance,
+            supersample_warmup: SUPERSAMPLE_WARMUP,
+            precrop_steps: 0,
         }
     }
 
     fn architecture(&self, scene: &SceneFacts) -> Architecture {
         let given = GivenSizes {
             n_levels: self.n_levels,
-            base_resolution: self.base_resolution,
             max_resolution: self.max_resolution,
-            finest_z: self.finest_z,
             log2_hashmap_size: self.log2_hashmap_size,
             hidden_dim: self.hidden_dim,
             march_steps: self.march_steps,
@@ -154,29 +130,33 @@ impl GridParams {
 }
 
 impl MlpParams {
-    fn sampling(&self, scene: &SceneFacts, epoch: u64) -> Sampling {
+    fn training_defaults(
+        &self,
+        rays: Option<u64>,
+        scene: &SceneFacts,
+        epoch: u64,
+    ) -> TrainingDefaults {
         let (epochs, precrop_steps) =
             if scene.is_ndc() { (EPOCHS_IN_NDC, 0) } else { (EPOCHS, PRECROP_STEPS) };
-        Sampling {
-            rays: self.rays.unwrap_or(epochs * epoch),
-            max_rays_per_step: self.max_rays_per_step,
-            order: self.order,
-            pixel_importance: self.pixel_importance,
-            supersample_warmup: self.supersample_warmup,
+        TrainingDefaults {
+            rays: rays.unwrap_or(epochs * epoch),
+            // As in the paper's code.
+            max_rays_per_step: 2_048,
+            learning_rate: 5e-4,
+            pixel_importance: 1.0,
+            supersample_warmup: 0.0,
             precrop_steps: self.precrop_steps.unwrap_or(precrop_steps),
         }
     }
 
     fn architecture(&self) -> MlpArchitecture {
         MlpArchitecture {
-            position_frequencies: self.position_frequencies,
-            direction_frequencies: self.direction_frequencies,
-            ndc_directions: self.ndc_directions,
             scaled_positions: true,
             layers: self.layers,
             hidden_dim: self.hidden_dim,
             coarse_samples: self.coarse_samples,
             fine_samples: self.fine_samples,
+            ..MlpArchitecture::default()
         }
     }
 }
@@ -191,12 +171,7 @@ impl FieldParams {
             },
             Self::Mlp(mlp) => ResolvedField::Mlp {
                 architecture: mlp.architecture(),
-                density_noise_std: mlp.density_noise_std.unwrap_or(if scene.is_ndc() {
-                    1.0
-                } else {
-                    0.0
-                }),
-                given: mlp.clone(),
+                density_noise_std: if scene.is_ndc() { DENSITY_NOISE_STD_IN_NDC } else { 0.0 },
             },
         }
     }
@@ -244,13 +219,8 @@ mod tests {
         );
         let with_grid =
             |field: GridParams| Params { field: FieldParams::Grid(field), ..Params::default() };
-        let own = GridParams {
-            distortion: Some(0.5),
-            march_steps: Some(999),
-            finest_z: Some(60),
-            order: Order::Epochs,
-            ..GridParams::default()
-        };
+        let own =
+            GridParams { distortion: Some(0.5), march_steps: Some(999), ..GridParams::default() };
         let forward = facts(ndc(), Background::Opaque);
         let boxed = facts(Space::Box, Background::White);
         let open = facts(Space::Box, Background::Alpha);
@@ -258,7 +228,6 @@ mod tests {
             (&grid, forward, "distortion", json!(0.004)),
             (&grid, forward, "floater_loss", json!(0.0)),
             (&grid, forward, "march_steps", json!(256)),
-            (&grid, forward, "finest_z", json!(148)),
             (&grid, forward, "combine", json!("average_weights")),
             (&grid, boxed, "distortion", json!(0.0)),
             (&grid, boxed, "floater_loss", json!(0.001)),
@@ -269,10 +238,8 @@ mod tests {
             (&grid, facts(Space::Box, Background::Opaque), "distortion", json!(0.0)),
             (&grid, facts(Space::Box, Background::Black), "floater_loss", json!(0.001)),
             (&grid, boxed, "march_steps", json!(512)),
-            (&grid, boxed, "finest_z", json!(Architecture::default().finest_z)),
             (&grid, boxed, "max_resolution", json!(870)),
             (&grid, boxed, "log2_hashmap_size", json!(20)),
-            (&grid, boxed, "pixel_importance", json!(10.0)),
             (&grid, boxed, "supersample_warmup", json!(0.3)),
             (&grid, boxed, "supervision", json!("kernel")),
             (&grid, boxed, "combine", json!("ensemble")),
@@ -280,17 +247,14 @@ mod tests {
             (&grid, SceneFacts { has_kernel: false, ..boxed }, "supervision", json!("average")),
             (&grid, SceneFacts { is_fine_tuning: true, ..boxed }, "supersample_warmup", json!(0.0)),
             (&with_grid(own.clone()), forward, "distortion", json!(0.5)),
-            (&with_grid(own.clone()), forward, "march_steps", json!(999)),
-            (&with_grid(own.clone()), forward, "finest_z", json!(60)),
-            (&with_grid(own), forward, "pixel_importance", json!(1.0)),
+            (&with_grid(own), forward, "march_steps", json!(999)),
+            (&mlp, boxed, "supersample_warmup", json!(0.0)),
             (&mlp, forward, "rays", json!(3000)),
             (&mlp, forward, "precrop_steps", json!(0)),
-            (&mlp, forward, "density_noise_std", json!(1.0)),
             (&mlp, forward, "distortion", json!(null)),
             (&mlp, forward, "supervision", json!("average")),
             (&mlp, boxed, "rays", json!(2000)),
             (&mlp, boxed, "precrop_steps", json!(1000)),
-            (&mlp, boxed, "density_noise_std", json!(0.0)),
             (&mlp, SceneFacts { is_fine_tuning: true, ..boxed }, "precrop_steps", json!(0)),
         ] {
             assert_eq!(value(params, &scene, name), expected, "{name} of {params:?} for {scene:?}");
@@ -334,31 +298,15 @@ mod tests {
             (Some(7000), fine_tuning, 7000),
         ] {
             let grid = GridParams {
-                rays,
                 rays_per_pixel: 20.0,
                 min_rays: 100,
                 max_rays: 1000,
                 ..GridParams::default()
             };
-            let params = Params { field: FieldParams::Grid(grid), ..Params::default() };
+            let params = Params { field: FieldParams::Grid(grid), rays, ..Params::default() };
             assert_eq!(value(&params, &scene, "rays"), json!(expected), "{params:?}");
             assert_eq!(params.resolve(&scene).rays, expected);
         }
-    }
-
-    fn with_resolutions(base_resolution: u32, max_resolution: Option<u32>) -> Params {
-        let grid = GridParams { base_resolution, max_resolution, ..GridParams::default() };
-        Params { field: FieldParams::Grid(grid), ..Params::default() }
-    }
-
-    #[test]
-    fn the_coarsest_level_is_no_finer_than_the_finest() {
-        assert_eq!(with_resolutions(64, Some(64)).check(), Ok(()));
-        assert_eq!(with_resolutions(64, None).check(), Ok(()));
-        let problem = with_resolutions(64, Some(32)).check().unwrap_err();
-        assert_eq!(problem, ParamsError::BaseAboveMax { base: 64, max: 32 });
-        let words = "parameter base_resolution: 64 is above max_resolution = 32";
-        assert_eq!(problem.to_string(), words);
     }
 
     fn bundles(resolved: &Resolved, supersample_warmup: f64, supersample: f64) -> u64 {

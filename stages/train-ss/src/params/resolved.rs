@@ -5,7 +5,7 @@ use radiance::{Architecture, Regularisers, TrainingOptions};
 use serde_json::{Value, json};
 use torch_field::MlpArchitecture;
 
-use super::{Combine, GridParams, MlpParams, Order, Supervision};
+use super::{Combine, GridParams, Supervision};
 use crate::supersample::{warmup_stages, whole_supersample};
 
 /// Steps over which a grid's learning rates rise to their maximum; chosen by hand.
@@ -13,6 +13,9 @@ const LEARNING_RATE_WARMUP_STEPS: u64 = 100;
 /// Gradient norm, relative to the mean, below which gradients go through Russian roulette (design
 /// note 037).
 const ROULETTE: f32 = 0.25;
+/// Final learning rate of the MLPs over the initial one (NeRF-SR's code).
+#[cfg(feature = "torch")]
+const MLP_LEARNING_RATE_DECAY: f64 = 0.01;
 
 /// Parameters with every default set.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,8 +34,9 @@ pub struct Resolved {
     pub pose_refinement: bool,
     /// True if photographs with alpha limit the cells of the grid.
     pub silhouettes: bool,
-    /// Order of pixel draws.
-    pub order: Order,
+    /// True if each pixel is drawn once per epoch, as in the paper's code; if false, pixels are drawn
+    /// independently.
+    pub in_epochs: bool,
     /// Ratio of the draw rates of detailed and flat pixels.
     pub pixel_importance: f64,
     /// Number of steps that draw pixels only from the middle of the images.
@@ -43,6 +47,8 @@ pub struct Resolved {
     pub rays: u64,
     /// Maximum number of rays in a step.
     pub max_rays_per_step: u32,
+    /// Highest learning rate.
+    pub learning_rate: f64,
     /// Number of rays in an epoch: one through every sub-pixel of every view.
     pub epoch: u64,
     /// Maximum number of HR references.
@@ -71,8 +77,6 @@ pub enum ResolvedField {
         architecture: MlpArchitecture,
         /// Standard deviation of the noise on raw densities.
         density_noise_std: f64,
-        /// Parameters as given.
-        given: MlpParams,
     },
 }
 
@@ -91,8 +95,8 @@ impl Resolved {
     pub fn record(&self) -> BTreeMap<String, Value> {
         let common = json!({
             "combine": self.combine,
-            "pixel_importance": self.pixel_importance,
-            "precrop_steps": self.precrop_steps,
+            "learning_rate": self.learning_rate,
+            "max_rays_per_step": self.max_rays_per_step,
             "rays": self.rays,
             "supersample_warmup": self.supersample_warmup,
             "supervision": self.supervision,
@@ -100,15 +104,12 @@ impl Resolved {
         let own = match &self.field {
             ResolvedField::Grid { architecture, regularisers, .. } => json!({
                 "distortion": regularisers.distortion,
-                "finest_z": architecture.finest_z,
                 "floater_loss": regularisers.floater_loss,
                 "log2_hashmap_size": architecture.log2_hashmap_size,
                 "march_steps": architecture.march_steps,
                 "max_resolution": architecture.max_resolution,
             }),
-            ResolvedField::Mlp { density_noise_std, .. } => {
-                json!({ "density_noise_std": density_noise_std })
-            }
+            ResolvedField::Mlp { .. } => json!({ "precrop_steps": self.precrop_steps }),
         };
         let entries = [common, own].into_iter().filter_map(|values| values.as_object().cloned());
         entries.flatten().collect()
@@ -119,14 +120,6 @@ impl Resolved {
         match &self.field {
             ResolvedField::Grid { architecture, .. } => FieldModel::Grid(*architecture),
             ResolvedField::Mlp { architecture, .. } => FieldModel::Mlp(*architecture),
-        }
-    }
-
-    /// Returns the maximum number of restarts of a collapsed training.
-    pub(crate) fn max_restarts(&self) -> u32 {
-        match &self.field {
-            ResolvedField::Grid { .. } => 0,
-            ResolvedField::Mlp { given, .. } => given.restarts,
         }
     }
 
@@ -175,8 +168,7 @@ impl Resolved {
             rays: self.rays,
             max_rays_per_step: self.max_rays_per_step as usize,
             samples_per_step: grid.samples_per_step as usize,
-            learning_rate: grid.learning_rate,
-            level_rate: grid.level_rate,
+            learning_rate: self.learning_rate,
             mlp_learning_rate: grid.mlp_learning_rate,
             learning_rate_decay: grid.learning_rate_decay,
             warm_up: LEARNING_RATE_WARMUP_STEPS,
@@ -185,7 +177,6 @@ impl Resolved {
                 distortion: regularisers.distortion as f32,
                 floater_loss: regularisers.floater_loss as f32,
             },
-            network_decay: grid.network_decay as f32,
             roulette: ROULETTE,
             seed: self.seed,
         }
@@ -193,21 +184,13 @@ impl Resolved {
 
     /// Returns the training options of the paper's MLPs.
     #[cfg(feature = "torch")]
-    pub fn mlp_training(
-        &self,
-        mlp: &MlpParams,
-        density_noise_std: f64,
-    ) -> torch_field::MlpTraining {
-        let epochs = self.rays.div_ceil(self.epoch.max(1));
+    pub fn mlp_training(&self, density_noise_std: f64) -> torch_field::MlpTraining {
         torch_field::MlpTraining {
             rays: self.rays,
             max_rays_per_step: self.max_rays_per_step as usize,
-            learning_rate: mlp.learning_rate,
-            learning_rate_decay: mlp.learning_rate_decay,
-            schedule: match mlp.schedule {
-                super::RateSchedule::Code => torch_field::Schedule::Epochs { epochs },
-                super::RateSchedule::Paper => torch_field::Schedule::Exponential,
-            },
+            learning_rate: self.learning_rate,
+            learning_rate_decay: MLP_LEARNING_RATE_DECAY,
+            epochs: self.rays.div_ceil(self.epoch.max(1)),
             density_noise_std,
             seed: self.seed,
         }

@@ -40,7 +40,7 @@ impl Supersampling {
         }
         let Assembly { supersample, views, numbers, count, detailed, cache, memory, .. } = assembly;
         let importance = Importance::new(params.pixel_importance, count, detailed);
-        let order = (params.order, params.precrop_bundles());
+        let order = (params.in_epochs, params.precrop_bundles());
         Ok(Self {
             sampler: PixelSampler::new(numbers, count, importance, order, params.seed),
             state: TrainingState {

@@ -341,7 +341,7 @@ mod tests {
     use super::assembly::{REFERENCE_DRAWS, block_means};
     use super::options::SupersamplingOptions;
     use super::*;
-    use crate::params::{Order, Params, Resolved, SceneFacts};
+    use crate::params::{Params, Resolved, SceneFacts};
     use crate::photographs::Photographs;
 
     fn record_colours(supersampling: &mut Supersampling, first_bundle: u64, colours: &[[f32; 3]]) {
@@ -555,7 +555,7 @@ mod tests {
     #[test]
     fn epochs_draw_without_replacement() {
         let (mut supersampling, _) = example(Supervision::Average, 1.0, None);
-        (supersampling.sampler.order, supersampling.sampler.precrop_bundles) = (Order::Epochs, 50);
+        (supersampling.sampler.in_epochs, supersampling.sampler.precrop_bundles) = (true, 50);
         // 5 × 4 pixels.
         assert!(
             drawn(&supersampling, 0..50)

@@ -2,7 +2,6 @@ use numerics::CounterRng;
 use pixels::Image;
 use rayon::prelude::*;
 
-use crate::params::Order;
 use crate::photographs::PixelSet;
 
 /// Sampler of the pixel that a bundle trains on. Pixels are numbered over all views in order; a
@@ -12,7 +11,8 @@ pub(crate) struct PixelSampler {
     /// Total number of pixel numbers.
     count: u64,
     importance: Importance,
-    pub(crate) order: Order,
+    /// True if each pixel number is drawn once per epoch.
+    pub(crate) in_epochs: bool,
     /// Number of bundles at the start that come from the middle half of each image's width and
     /// height.
     pub(crate) precrop_bundles: u64,
@@ -43,10 +43,10 @@ impl PixelSampler {
         views: Vec<PixelNumbers>,
         count: u64,
         importance: Importance,
-        (order, precrop_bundles): (Order, u64),
+        (in_epochs, precrop_bundles): (bool, u64),
         seed: u64,
     ) -> Self {
-        Self { views, count, importance, order, precrop_bundles, seed }
+        Self { views, count, importance, in_epochs, precrop_bundles, seed }
     }
 
     /// Returns the view and pixel that a bundle trains on. `counts` returns whether a view's pixel
@@ -58,7 +58,7 @@ impl PixelSampler {
     ) -> (usize, usize) {
         let mut rng = CounterRng::new(self.seed, PIXEL_STREAM, bundle);
         let is_precrop = bundle < self.precrop_bundles;
-        if self.order == Order::Epochs && !is_precrop {
+        if self.in_epochs && !is_precrop {
             let bundle = bundle - self.precrop_bundles;
             let (epoch, index) = (bundle / self.count, bundle % self.count);
             return self.pixel(permuted(self.seed, epoch, index, self.count));

@@ -30,11 +30,6 @@ pub(crate) trait FieldTrainer {
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()>;
 }
 
-/// Error of a training run that can't make progress; another seed may succeed.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub(crate) struct Collapsed(pub(crate) String);
-
 /// Creates a trainer of a new field, or of one initialised from the weights `init`. A grid is
 /// limited to a mask of occupancy cells.
 pub(crate) fn new_trainer(
@@ -72,14 +67,14 @@ pub(crate) fn new_trainer(
             Err(fields::needs_libtorch(&format!("--device {device}")).into())
         }
         #[cfg(feature = "torch")]
-        ResolvedField::Mlp { architecture, density_noise_std, given } => {
+        ResolvedField::Mlp { architecture, density_noise_std } => {
             let device = fields::torch_device(device)?;
             let field = match init {
                 Some(weights) => torch_field::Mlp::read(weights, *architecture, bounds, device)
                     .bad_input("input init")?,
                 None => torch_field::Mlp::new(*architecture, bounds, params.seed, device)?,
             };
-            let options = params.mlp_training(given, *density_noise_std);
+            let options = params.mlp_training(*density_noise_std);
             Ok(Box::new(torch_field::MlpTrainer::new(field, options)?))
         }
         #[cfg(not(feature = "torch"))]
@@ -191,10 +186,10 @@ impl FieldTrainer for torch_field::GridTrainer {
 #[cfg(feature = "torch")]
 fn torch_failure(error: torch_field::TorchFieldError) -> anyhow::Error {
     match error {
-        torch_field::TorchFieldError::NotFinite { .. } => {
+        torch_field::TorchFieldError::NotFinite { .. }
+        | torch_field::TorchFieldError::Collapsed { .. } => {
             Failure::Numerical(error.to_string()).into()
         }
-        torch_field::TorchFieldError::Collapsed { .. } => Collapsed(error.to_string()).into(),
         _ => error.into(),
     }
 }

@@ -9,7 +9,7 @@ use scene::{Bounds, Views};
 use stage::{Context, Progress};
 
 use super::checkpoint::{Checkpoints, Curve, read_latest};
-use super::field_trainer::{Collapsed, FieldTrainer, average_weights, new_trainer};
+use super::field_trainer::{FieldTrainer, average_weights, new_trainer};
 use super::time_left::{TimeLeft, TrainingRays};
 use crate::params::{Combine, Resolved};
 use crate::supervision::{Supersampling, supervision};
@@ -84,43 +84,19 @@ impl<'a> Member<'a> {
         }
     }
 
-    /// Trains the field unless an earlier run has. A collapsed training restarts with the next
-    /// seed, as often as the parameters allow.
+    /// Trains the field unless an earlier run has.
     pub(crate) fn run(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         if let Some(log) = self.copy_finished() {
             self.context.log_line("using the field that an earlier run trained");
             return Ok(log);
         }
-        let mut collapse = String::new();
-        for restart in 0..=self.params.max_restarts() {
-            let params = Resolved {
-                seed: self.params.seed.wrapping_add(u64::from(restart)),
-                ..self.params.clone()
-            };
-            let mut work = self.work.clone();
-            if restart > 0 {
-                self.context.log_line(format!(
-                    "starting over with seed {}, since training failed: {collapse}",
-                    params.seed
-                ));
-                // A folder per restart: a checkpoint resumes with the seed it began with.
-                work = work.map(|work| work.join(format!("restart-{restart}")));
-            }
-            match self.train(&params, work.as_deref(), data) {
-                Err(error) => match error.downcast_ref() {
-                    Some(Collapsed(message)) => collapse.clone_from(message),
-                    None => return Err(error),
-                },
-                done => return done,
-            }
-        }
-        Err(Failure::Numerical(format!("{collapse}, or increase parameter restarts")).into())
+        self.train(data)
     }
 
     /// Writes the weights of the latest checkpoint of any member, and returns its log.
     pub(crate) fn write_latest_checkpoint(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
         let work = self.context.work().context("--from-checkpoint needs --work")?;
-        let mut trainer = self.new_trainer(&self.params, bounds, None)?;
+        let mut trainer = self.new_trainer(bounds, None)?;
         let curve = read_latest(work, &mut *trainer).ok_or_else(|| {
             Failure::BadInput(format!("--work {}: no complete checkpoint yet", work.display()))
         })?;
@@ -138,24 +114,15 @@ impl<'a> Member<'a> {
     }
 
     /// Trains the field to the end, with checkpoints, progress and a curve.
-    fn train(
-        &self,
-        params: &Resolved,
-        work: Option<&Path>,
-        data: &TrainingData<'_>,
-    ) -> anyhow::Result<TrainingLog> {
-        let mut training = self.start(params, work, data)?;
-        self.take_steps(&mut training, params.rays, data)?;
+    fn train(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
+        let mut training = self.start(data)?;
+        self.take_steps(&mut training, data)?;
         self.finish(training, data.views.bounds)
     }
 
-    /// Starts training, or resumes from the last checkpoint in `work`.
-    fn start(
-        &self,
-        params: &Resolved,
-        work: Option<&Path>,
-        data: &TrainingData<'_>,
-    ) -> anyhow::Result<Training> {
+    /// Starts training, or resumes from the last checkpoint in the work folder.
+    fn start(&self, data: &TrainingData<'_>) -> anyhow::Result<Training> {
+        let (params, work) = (&self.params, self.work.as_deref());
         let TrainingData { input, references, views, cells, .. } = *data;
         let folder = work.unwrap_or_else(|| self.output.parent().unwrap_or(Path::new(".")));
         if let Some(work) = work {
@@ -174,20 +141,16 @@ impl<'a> Member<'a> {
         }
         // Moving cameras would carve wrongly.
         let cells = cells.filter(|_| !params.pose_refinement);
-        let mut trainer = self.new_trainer(params, views.bounds, cells)?;
+        let mut trainer = self.new_trainer(views.bounds, cells)?;
         let checkpoints = Checkpoints::new(work);
         let curve = checkpoints
             .resume(&mut *trainer, &mut supervision, |text| self.context.log_line(text))?;
         Ok(Training { trainer, supervision, checkpoints, curve })
     }
 
-    /// Takes steps until `total` rays are cast, with checkpoints and progress.
-    fn take_steps(
-        &self,
-        training: &mut Training,
-        total: u64,
-        data: &TrainingData<'_>,
-    ) -> anyhow::Result<()> {
+    /// Takes steps until all rays are cast, with checkpoints and progress.
+    fn take_steps(&self, training: &mut Training, data: &TrainingData<'_>) -> anyhow::Result<()> {
+        let total = self.params.rays;
         let Training { trainer, supervision, checkpoints, curve } = training;
         let mut time_left = TimeLeft::new(&self.params, self.init.is_some());
         loop {
@@ -242,12 +205,11 @@ impl<'a> Member<'a> {
 
     fn new_trainer(
         &self,
-        params: &Resolved,
         bounds: Bounds,
         cells: Option<&[bool]>,
     ) -> anyhow::Result<Box<dyn FieldTrainer>> {
         let init = self.init.as_ref().map(|(weights, _)| weights.as_path());
-        new_trainer(params, init, bounds, cells, &self.context.device)
+        new_trainer(&self.params, init, bounds, cells, &self.context.device)
     }
 
     /// Writes the trained weights, averaged with the initial ones if requested.

@@ -78,12 +78,8 @@ impl Architecture {
 pub struct GivenSizes {
     /// Number of grid levels.
     pub n_levels: u32,
-    /// Cells along an axis of the coarsest level.
-    pub base_resolution: u32,
     /// Cells along an axis of the finest level.
     pub max_resolution: Option<u32>,
-    /// Maximum number of cells along z, of any level.
-    pub finest_z: Option<u32>,
     /// Base-2 logarithm of the maximum number of entries per level.
     pub log2_hashmap_size: Option<u32>,
     /// Width of the hidden layers.
@@ -104,22 +100,22 @@ impl GivenSizes {
     pub fn for_scene(&self, pixels_across: f64, is_ndc: bool) -> Architecture {
         let (low, high) = MAX_RESOLUTION_RANGE;
         let by_width = (CELLS_PER_PIXEL * pixels_across).round().clamp(low, high) as u32;
-        let finest = self.max_resolution.unwrap_or(by_width.max(self.base_resolution));
+        let finest = self.max_resolution.unwrap_or(by_width);
         // The number of cells at surfaces grows with the square of the resolution.
         let (low, high) = LOG2_HASHMAP_RANGE;
         let by_finest =
             (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(low, high) as u32;
         let steps = self.march_steps.unwrap_or(if is_ndc { 256 } else { 512 });
-        let mut finest_z = Architecture::default().finest_z;
+        let Architecture { base_resolution, mut finest_z, .. } = Architecture::default();
         if is_ndc {
             // Samples along z across the cube: more cells would get none (design note 027).
             finest_z = finest_z.min((f64::from(steps) / 3.0f64.sqrt()).round() as u32);
         }
         Architecture {
             n_levels: self.n_levels,
-            base_resolution: self.base_resolution,
+            base_resolution,
             max_resolution: finest,
-            finest_z: self.finest_z.unwrap_or(finest_z),
+            finest_z,
             log2_hashmap_size: self.log2_hashmap_size.unwrap_or(by_finest),
             hidden_dim: self.hidden_dim,
             march_steps: steps,

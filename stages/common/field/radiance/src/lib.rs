@@ -78,8 +78,8 @@ pub use render::{Pixel, RayField, RenderError};
 pub use spec::Strides;
 pub use tensors::{FieldError, FieldProblem};
 pub use trainer::{
-    Phase, PhaseClock, PhaseTimes, RenderedBundles, StepReport, Supervisor, Trainer, TrainingError,
-    TrainingOptions,
+    NETWORK_DECAY, Phase, PhaseClock, PhaseTimes, RenderedBundles, StepReport, Supervisor, Trainer,
+    TrainingError, TrainingOptions,
 };
 pub use training_log::{CurvePoint, TRAINING_FILE, TrainingLog};
 pub use training_state::TrainingState;

@@ -18,7 +18,7 @@ use crate::spec::{BRICK, FEATURES};
 use crate::training_state::TrainingState;
 use numerics::simd::LANES;
 
-pub use options::{RenderedBundles, Supervisor, TrainingOptions};
+pub use options::{NETWORK_DECAY, RenderedBundles, Supervisor, TrainingOptions};
 pub use phases::{Phase, PhaseClock, PhaseTimes};
 
 use shard::{Shard, StepWork, Worker};
@@ -278,8 +278,7 @@ impl Trainer {
     fn apply_gradients(&mut self, clock: &PhaseClock) {
         let options = &self.options;
         let (schedule, step) = (options.schedule(&self.state), self.state.steps + 1);
-        let network_step =
-            AdamStep::new(step, options.mlp_learning_rate * schedule, options.network_decay);
+        let network_step = AdamStep::new(step, options.mlp_learning_rate * schedule, NETWORK_DECAY);
         adam(
             &network_step,
             &mut self.network_gradients,
@@ -465,13 +464,11 @@ mod tests {
             max_rays_per_step: 256,
             samples_per_step: 1 << 20,
             learning_rate: 1e-2,
-            level_rate: 0.8,
             mlp_learning_rate: 1e-2,
             learning_rate_decay: 0.25,
             warm_up: 5,
             ema_decay: 0.0,
             regularisers: Regularisers::default(),
-            network_decay: 0.0,
             roulette: 1.0,
             seed: 9,
         }

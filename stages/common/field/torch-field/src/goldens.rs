@@ -12,7 +12,6 @@ use crate::mlp_trainer::{MlpTrainer, MlpTraining};
 use crate::network::MlpNetwork;
 use crate::network::encode;
 use crate::sampling::{importance, midpoints, stratified};
-use crate::step::Schedule;
 
 const GOLDENS: &[u8] = include_bytes!("../tests/goldens/mlp.safetensors");
 
@@ -135,7 +134,7 @@ fn gradients_and_three_steps_in_f64() {
         max_rays_per_step: 8,
         learning_rate: 5e-4,
         learning_rate_decay: 1.0,
-        schedule: Schedule::Exponential,
+        epochs: 20,
         density_noise_std: 0.0,
         seed: 0,
     };

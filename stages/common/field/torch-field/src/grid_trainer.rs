@@ -197,7 +197,7 @@ impl GridTrainer {
             lazy_adam(
                 t,
                 options.mlp_learning_rate * schedule,
-                options.network_decay,
+                radiance::NETWORK_DECAY,
                 layer.shallow_clone(),
                 &gradients[i + 1],
                 [self.first[i + 1].shallow_clone(), self.second[i + 1].shallow_clone()],
@@ -417,13 +417,11 @@ mod tests {
             max_rays_per_step: 256,
             samples_per_step: 1 << 20,
             learning_rate: 1e-2,
-            level_rate: 0.8,
             mlp_learning_rate: 1e-2,
             learning_rate_decay: 0.25,
             warm_up: 5,
             ema_decay: 0.9,
             regularisers: crate::regularisers::ALL,
-            network_decay: 1e-4,
             roulette: 0.0,
             seed: 9,
         }

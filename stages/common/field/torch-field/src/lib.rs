@@ -4,8 +4,8 @@
 //!   positional encoding, a coarse and a fine network of eight layers, stratified and importance
 //!   sampling. [`Mlp::render`] returns colour, opacity and depth of rays.
 //! * [`MlpArchitecture`]: sizes of the paper's field; the only item without feature `torch`.
-//! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: training of the paper's field, driven by the
-//!   same [`radiance::Supervisor`] as the hash-grid field's.
+//! * [`MlpTrainer`], [`MlpTraining`]: training of the paper's field, driven by the same
+//!   [`radiance::Supervisor`] as the hash-grid field's.
 //! * [`TorchGrid`], [`GridTrainer`]: the hash-grid field of `radiance` and its training, on the
 //!   same parameters: a check of the hand-written engine, and its way to CUDA.
 //!
@@ -56,5 +56,5 @@ pub use architecture::MlpArchitecture;
 #[cfg(feature = "torch")]
 pub use {
     error::TorchFieldError, grid::TorchGrid, grid_trainer::GridTrainer, mlp::Mlp,
-    mlp_trainer::MlpTrainer, mlp_trainer::MlpTraining, step::Schedule,
+    mlp_trainer::MlpTrainer, mlp_trainer::MlpTraining,
 };

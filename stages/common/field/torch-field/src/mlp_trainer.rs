@@ -9,7 +9,7 @@ use tch::{Device, Kind, TchError, Tensor};
 use crate::architecture::MlpArchitecture;
 use crate::error::TorchFieldError;
 use crate::mlp::{Batch, Mlp, SampleDraws};
-use crate::step::{Schedule, Step};
+use crate::step::{Step, learning_rate};
 
 /// Options for training an [`Mlp`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -22,8 +22,8 @@ pub struct MlpTraining {
     pub learning_rate: f64,
     /// Final learning rate as a fraction of the initial one.
     pub learning_rate_decay: f64,
-    /// Learning rate between the start and the end.
-    pub schedule: Schedule,
+    /// Number of epochs.
+    pub epochs: u64,
     /// Standard deviation of the noise on raw densities.
     pub density_noise_std: f64,
     /// Seed of all random numbers.
@@ -232,9 +232,9 @@ impl MlpTrainer {
         gradients: &[Tensor],
         done: f64,
     ) -> Result<(), TchError> {
-        let MlpTraining { schedule, learning_rate, learning_rate_decay, .. } = self.options;
+        let MlpTraining { epochs, learning_rate: highest, learning_rate_decay, .. } = self.options;
         let learning_rate = self.state.learning_rate_scale
-            * schedule.learning_rate(learning_rate, learning_rate_decay, done);
+            * learning_rate(highest, learning_rate_decay, epochs, done);
         self.adam.step(self.field.parameters(), gradients, learning_rate)
     }
 
@@ -396,7 +396,7 @@ mod tests {
             max_rays_per_step: 8,
             learning_rate: 5e-4,
             learning_rate_decay: 0.1,
-            schedule: Schedule::Exponential,
+            epochs: 20,
             density_noise_std: 0.0,
             seed: 0,
         };

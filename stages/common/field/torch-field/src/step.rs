@@ -6,37 +6,19 @@ use tch::{TchError, Tensor};
 use crate::error::TorchFieldError;
 use crate::ray_maps::to_host;
 
-/// Learning rate over a training run.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Schedule {
-    /// Exponential decay with every step, as in the paper's text.
-    Exponential,
-    /// Decay by epochs, as in the reference implementation: constant until the last ten epochs,
-    /// each of which multiplies the rate by the eleventh root of the decay. The final rate is never
-    /// quite reached. Fewer than twenty epochs pass through the same schedule faster.
-    Epochs {
-        /// Number of epochs of the training run.
-        epochs: u64,
-    },
-}
+/// Number of final epochs during which the learning rate decays.
+const FALLING_EPOCHS: u64 = 10;
 
-impl Schedule {
-    /// Number of final epochs during which [`Schedule::Epochs`] decays.
-    const FALLING_EPOCHS: u64 = 10;
-
-    /// Returns the learning rate when a fraction `done` of the training run is over.
-    pub fn learning_rate(self, highest: f64, decay: f64, done: f64) -> f64 {
-        let progress = match self {
-            Self::Exponential => done,
-            Self::Epochs { epochs } => {
-                let epochs = epochs.max(2 * Self::FALLING_EPOCHS);
-                let epoch = ((done * epochs as f64) as u64).min(epochs - 1);
-                (epoch + 1 + Self::FALLING_EPOCHS).saturating_sub(epochs) as f64
-                    / (Self::FALLING_EPOCHS + 1) as f64
-            }
-        };
-        highest * decay.powf(progress)
-    }
+/// Returns the learning rate when a fraction `done` of a training run of `epochs` is over, as in the
+/// reference implementation: constant until the last ten epochs, each of which multiplies the rate
+/// by the eleventh root of the decay. The final rate is never quite reached. Fewer than twenty
+/// epochs pass through the same schedule faster.
+pub(crate) fn learning_rate(highest: f64, decay: f64, epochs: u64, done: f64) -> f64 {
+    let epochs = epochs.max(2 * FALLING_EPOCHS);
+    let epoch = ((done * epochs as f64) as u64).min(epochs - 1);
+    let progress =
+        (epoch + 1 + FALLING_EPOCHS).saturating_sub(epochs) as f64 / (FALLING_EPOCHS + 1) as f64;
+    highest * decay.powf(progress)
 }
 
 /// One training step: `bundles` bundles of rays, numbered after those of all earlier steps.
@@ -189,8 +171,7 @@ mod tests {
     /// The rates are those in the reference implementation's log for 20 epochs.
     #[test]
     fn epochs_are_the_references() {
-        let schedule = Schedule::Epochs { epochs: 20 };
-        let rate = |epoch: u64| schedule.learning_rate(5e-4, 1e-2, (epoch as f64 + 0.5) / 20.0);
+        let rate = |epoch: u64| learning_rate(5e-4, 1e-2, 20, (epoch as f64 + 0.5) / 20.0);
         assert!((0..10).all(|e| rate(e) == 5e-4));
         let falling = [
             3.29e-4, 2.16e-4, 1.42e-4, 9.37e-5, 6.16e-5, 4.06e-5, 2.67e-5, 1.76e-5, 1.16e-5,
@@ -199,16 +180,9 @@ mod tests {
         for (e, expected) in (10..).zip(falling) {
             assert!((rate(e) / expected - 1.0).abs() < 5e-3, "{e}: {}", rate(e));
         }
-        assert_eq!(schedule.learning_rate(5e-4, 1e-2, 1.0), rate(19));
-        let short = Schedule::Epochs { epochs: 3 };
-        assert!(
-            (0u32..20).all(|e| short.learning_rate(5e-4, 1e-2, (f64::from(e) + 0.5) / 20.0)
-                == rate(u64::from(e)))
-        );
-        let text = Schedule::Exponential;
-        assert!(
-            (text.learning_rate(5e-4, 1e-2, 0.5) - 5e-5).abs() < 1e-9
-                && (text.learning_rate(5e-4, 1e-2, 1.0) - 5e-6).abs() < 1e-12
-        );
+        assert_eq!(learning_rate(5e-4, 1e-2, 20, 1.0), rate(19));
+        assert!((0u32..20).all(
+            |e| learning_rate(5e-4, 1e-2, 3, (f64::from(e) + 0.5) / 20.0) == rate(u64::from(e))
+        ));
     }
 }

@@ -127,7 +127,6 @@ fn prep_memory(work: &Work) -> u64 {
 fn field_factor(field: &Value, kind: SceneKind) -> Option<f64> {
     let by_default = GivenSizes {
         max_resolution: None,
-        finest_z: None,
         log2_hashmap_size: None,
         march_steps: None,
         ..GivenSizes::deserialize(field).ok()?
@@ -293,8 +292,8 @@ mod tests {
         json!({
             "field": "grid", "rays": rays, "rays_per_pixel": 1, "min_rays": 1, "max_rays": 1,
             "ensemble": 1, "supersample": 2.0, "supervision": null, "pose_refinement": false,
-            "n_levels": 8, "base_resolution": 16, "max_resolution": null, "finest_z": null,
-            "log2_hashmap_size": null, "hidden_dim": 64, "march_steps": null,
+            "n_levels": 8, "max_resolution": null, "log2_hashmap_size": null,
+            "hidden_dim": 64, "march_steps": null,
         })
     }
 

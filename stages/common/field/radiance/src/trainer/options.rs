@@ -18,6 +18,11 @@ const STEP_GROWTH: f64 = 8.0 / 3.0;
 /// Minimum number of rays of a step while rays have many samples; chosen by hand.
 const MIN_RAYS_PER_STEP: usize = 256;
 
+/// Ratio of a level's learning rate to that of the next coarser level; chosen by hand.
+const LEVEL_RATE: f64 = 0.8;
+/// Weight decay of the networks; chosen by hand.
+pub const NETWORK_DECAY: f32 = 1e-6;
+
 /// Options of a training run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrainingOptions {
@@ -30,8 +35,6 @@ pub struct TrainingOptions {
     pub samples_per_step: usize,
     /// Maximum learning rate of the grid's coarsest level.
     pub learning_rate: f64,
-    /// Ratio of a level's learning rate to that of the next coarser level.
-    pub level_rate: f64,
     /// Maximum learning rate of the MLPs.
     pub mlp_learning_rate: f64,
     /// Final learning rate over the maximum.
@@ -42,8 +45,6 @@ pub struct TrainingOptions {
     pub ema_decay: f32,
     /// Weights of the losses other than the colour error.
     pub regularisers: Regularisers,
-    /// Weight decay of the networks.
-    pub network_decay: f32,
     /// Threshold of Russian roulette, as a multiple m of the mean gradient norm in a chunk; 0
     /// propagates all gradients. A sample whose norm g is below m propagates its gradient with
     /// probability g/m, multiplied by m/g, so the expected gradient is unchanged.
@@ -82,7 +83,7 @@ impl TrainingOptions {
 
     /// Returns the learning rate of a level, given [`TrainingOptions::schedule`].
     pub fn rate_of_level(&self, level: usize, schedule: f64) -> f64 {
-        self.learning_rate * schedule * self.level_rate.powi(level as i32)
+        self.learning_rate * schedule * LEVEL_RATE.powi(level as i32)
     }
 
     /// Returns whether the averaged weights are updated after this step.
