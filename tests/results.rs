@@ -11,8 +11,7 @@ use std::process::Command;
 use common::{Project, data, root};
 
 /// Columns that say what a row is of.
-const KEYS: [&str; 7] =
-    ["protocol", "method", "supervision", "scene", "references", "has seen", "gain"];
+const KEYS: [&str; 6] = ["protocol", "method", "supervision", "scene", "has seen", "gain"];
 /// Protocols as they are named, on images of 48 pixels.
 const SMALL: &str = "  presets:
     100x2: {lr_width: 24, prep.scale: 2}

@@ -5,11 +5,13 @@ use stage::plain;
 
 use crate::figures::Figures;
 use crate::params::Params;
-use crate::rows::MISSING;
+use crate::rows::{GROUP, MISSING};
 use crate::values::{Row, distinct, listed, mean, select};
 
 /// Names of a result's provenance, which aren't keys.
 pub(crate) const PROVENANCE: [&str; 2] = ["commit", "machine"];
+/// Key of a result's scene; results of several scenes also get a table for each.
+pub(crate) const SCENE: &str = "scene";
 
 /// Lines and columns of a table.
 pub(crate) struct Layout<'a> {
@@ -22,12 +24,11 @@ pub(crate) struct Layout<'a> {
 }
 
 impl Layout<'_> {
-    /// Returns the table of some results; `is_part` if they have one value of parameter `each`.
+    /// Returns the table of some results; `is_part` if they are of one scene among several.
     pub(crate) fn table(&self, rows: &[Row], is_part: bool) -> String {
         let params = self.params;
         let columns = distinct(rows, &params.columns);
-        let further =
-            params.extra_rows.iter().filter(|row| !is_part || row.contains_key(&params.split_by));
+        let further = params.extra_rows.iter().filter(|row| !is_part || row.contains_key(SCENE));
         let further: Vec<Row> = further.filter(|row| self.matches(row, rows)).cloned().collect();
         let all = [rows, &further[..]].concat();
         let values: Vec<&String> = params
@@ -105,10 +106,9 @@ impl Layout<'_> {
 
     /// Returns the rows with values in the same group.
     fn rivals(&self, rows: &[Row], mine: &[Row]) -> Vec<Row> {
-        let by = &self.params.group_by;
-        let group = mine.first().and_then(|row| row.get(by));
+        let group = mine.first().and_then(|row| row.get(GROUP));
         rows.iter()
-            .filter(|row| row.get(by) == group && !row.contains_key(MISSING))
+            .filter(|row| row.get(GROUP) == group && !row.contains_key(MISSING))
             .cloned()
             .collect()
     }
@@ -149,7 +149,7 @@ impl Layout<'_> {
 
     /// True if an entry of a row is a key that results may share.
     fn is_key(&self, name: &str, value: &Value) -> bool {
-        value.is_string() && name != "method" && name != self.params.group_by
+        value.is_string() && name != "method" && name != GROUP
     }
 }
 

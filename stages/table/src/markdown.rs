@@ -1,12 +1,12 @@
-//! The Markdown document: a table of all rows, a table for each value of the key `split_by`, gains,
-//! spreads, and failed points.
+//! The Markdown document: a table of all rows, a table for each scene, gains, the spread over seeds,
+//! and failed points.
 
 use artifact::{FailedPoint, Failure, label};
 
 use crate::figures::Figures;
-use crate::grid::{Layout, NO_VALUE, PROVENANCE, markdown_table};
+use crate::grid::{Layout, NO_VALUE, PROVENANCE, SCENE, markdown_table};
 use crate::params::Params;
-use crate::rows::MISSING;
+use crate::rows::{GROUP, MISSING};
 use crate::values::{Row, distinct, mean, select};
 
 /// Returns the document. Fails if parameters name keys or values that no result has.
@@ -17,37 +17,38 @@ pub(crate) fn markdown(
     failed: &[FailedPoint],
 ) -> Result<String, Failure> {
     let keys = row_keys(params, rows)?;
-    let layout = Layout { params, figures, keys, reference: reference(params, rows)? };
-    let each = std::slice::from_ref(&params.split_by);
-    let mut parts =
-        if params.split_by.is_empty() { Vec::new() } else { distinct(rows, each).concat() };
+    let reference = reference(params, rows)?;
+    let is_by_seed = keys == ["seed"];
+    let scene = SCENE.to_owned();
+    let is_averaged = !keys.contains(&scene) && !params.columns.contains(&scene);
+    // With a reference, the tables of scenes would compare with the mean over scenes.
+    let mut parts = if is_averaged && reference.is_none() {
+        distinct(rows, std::slice::from_ref(&scene)).concat()
+    } else {
+        Vec::new()
+    };
     if parts.len() < 2 {
         parts.clear();
     }
+    let layout = Layout { params, figures, keys, reference };
     let mut text = format!("# {}\n\n", params.title);
     if !parts.is_empty() {
         text += &format!("Means over {}:\n\n", parts.join(", "));
     }
     text += &layout.table(rows, false);
     for part in parts {
-        let selected = select(rows, each, std::slice::from_ref(&part));
+        let selected = select(rows, std::slice::from_ref(&scene), std::slice::from_ref(&part));
         text += &format!("\n## {part}\n\n{}", layout.table(&selected, true));
     }
     text += &gains(params, rows);
-    for name in &params.spread {
-        text += &spread(rows, figures, name).unwrap_or_default();
+    if is_by_seed {
+        text += &spread(rows, figures, params.compared_value()).unwrap_or_default();
     }
     let failed: Vec<&FailedPoint> = failed.iter().filter(|point| point.reason.is_none()).collect();
     if !failed.is_empty() {
         text += "\nFailed, or waiting for a failed stage:\n\n";
         for point in failed {
             text += &format!("* {}\n", label(&point.stage, &point.point));
-        }
-    }
-    if !params.notes.is_empty() {
-        text += "\n";
-        for note in &params.notes {
-            text += &format!("* {note}\n");
         }
     }
     Ok(text)
@@ -64,23 +65,18 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, Failure> {
     }
     check_keys("rows", &params.rows, rows, &known)?;
     check_keys("columns", &params.columns, rows, &known)?;
-    if !params.split_by.is_empty() {
-        check_keys("split_by", std::slice::from_ref(&params.split_by), rows, &known)?;
-    }
     let mut keys = params.rows.clone();
     if keys.is_empty() {
         for name in known {
             let differs = distinct(rows, std::slice::from_ref(name)).len() > 1;
-            if differs && name != "scene" && !params.columns.contains(name) {
+            if differs && name != SCENE && !params.columns.contains(name) {
                 keys.push(name.clone());
             }
         }
     }
-    if !params.groups.is_empty()
-        && !keys.contains(&params.group_by)
-        && !params.columns.contains(&params.group_by)
-    {
-        keys.push(params.group_by.clone());
+    let group = GROUP.to_owned();
+    if !params.groups.is_empty() && !keys.contains(&group) && !params.columns.contains(&group) {
+        keys.push(group);
     }
     Ok(keys)
 }

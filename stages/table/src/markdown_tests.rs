@@ -119,9 +119,14 @@ fn keys_that_no_result_has_are_refused() {
         let problem = markdown(&params, &rows(), &figures(), &[]).unwrap_err();
         assert!(matches!(&problem, Failure::Usage(said) if said == words), "{problem}");
     }
-    let spread = Params { spread: vec!["psnr".to_owned()], ..Params::default() };
-    let text = markdown(&spread, &rows(), &figures(), &[]).unwrap();
-    assert!(text.ends_with("\nPSNR over 4 results: 30.94 ± 1.39, from 29.50 to 32.25\n"), "{text}");
+    let seeds = [30.0, 32.0].map(|psnr| row("lego", &psnr.to_string(), "100x2", psnr, None, 1.0));
+    let by_seed = seeds.map(|mut row| {
+        let seed = row.remove("variant").unwrap();
+        row.insert("seed".to_owned(), seed);
+        row
+    });
+    let text = markdown(&Params::default(), &by_seed, &figures(), &[]).unwrap();
+    assert!(text.ends_with("\nPSNR over 2 results: 31.00 ± 1.41, from 30.00 to 32.00\n"), "{text}");
     let nothing = markdown(
         &Params::default(),
         &[],
@@ -181,8 +186,6 @@ fn groups_further_rows_and_gains() {
         ],
         ..params(json!({
             "rows": ["method"], "columns": ["protocol"], "values": ["psnr"],
-            "group_by": "has seen", "split_by": "scene",
-            "notes": ["One."],
             "extra_rows": [
                 {"method": "paper: NeRF", "protocol": "100x2", "psnr": 27.5},
                 {"method": "paper: SS", "protocol": "100x2", "psnr": 29.75},
@@ -229,17 +232,8 @@ Means over lego, chair:
 | --- | --- | --- |
 | ours | +1.25 | -1.00 |
 | theirs | +2.25 | – |
-
-* One.
 ";
     assert_eq!(markdown(&params, &methods(), &figures(), &[]).unwrap(), expected);
-    let unknown = Params { split_by: "scena".to_owned(), ..Params::default() };
-    let problem = markdown(&unknown, &methods(), &figures(), &[]).unwrap_err().to_string();
-    assert!(
-        problem
-            .starts_with("parameter split_by: no result has a key \"scena\"; did you mean scene?"),
-        "{problem}"
-    );
 }
 
 fn node(stage: &str) -> Value {
@@ -257,7 +251,7 @@ fn rows_follow_the_groups() {
     let failed = json!({"stage": "eval-nerf", "point": ""});
     let nodes = ["eval", "eval-hr", "eval-ss"].map(node);
     let run = json!({"nodes": nodes, "failed": [failed, left_out]});
-    let params = params(json!({"methods": {"eval-ss": "ours"}, "group_by": "seen",
+    let params = params(json!({"methods": {"eval-ss": "ours, {protocol}"},
         "groups": [{"name": "LR", "methods": ["eval-ss", "eval-liif"]},
         {"name": "HR", "methods": ["eval-hr"]}]}));
     let run = serde_json::from_value(run).unwrap();
@@ -266,14 +260,14 @@ fn rows_follow_the_groups() {
     let told: Vec<[&str; 3]> = rows
         .iter()
         .map(|row| {
-            ["method", "seen", "missing"]
+            ["method", "has seen", "missing"]
                 .map(|key| row.get(key).map_or("", |v| v.as_str().unwrap()))
         })
         .collect();
     assert_eq!(
         told,
         [
-            ["ours", "LR", ""],
+            ["ours, 100x2", "LR", ""],
             ["eval-liif", "LR", "no liif"],
             ["eval-hr", "HR", ""],
             ["eval", "", ""]

@@ -2,7 +2,6 @@ use std::collections::BTreeMap;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value};
 
 use crate::values::Row;
 
@@ -27,39 +26,24 @@ pub struct Params {
     /// the first of `values`.
     #[schemars(extend("x-default" = "no comparison"))]
     pub relative_to: BTreeMap<String, String>,
-    /// Values whose mean, standard deviation, minimum and maximum over all results are stated.
-    #[schemars(extend("x-default" = "none of them"))]
-    pub spread: Vec<String>,
-    /// Names of methods, by scored block: `{eval: rendered, eval-refined: refined}`.
+    /// Names of methods, by scored block: `{eval: rendered, eval-refined: refined}`. `{variant}` in
+    /// a name is replaced by the value of that key.
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
-    /// Additional fields of rows in `rows.json` and `rows.csv`, by scored block: `{eval: {refined:
-    /// false}}`. `"{variant}"` is replaced by the value of that key.
-    #[schemars(extend("x-default" = "none"))]
-    pub fields: BTreeMap<String, Map<String, Value>>,
     /// Groups of comparable methods, in the order of the table: `[{name: LR images, methods:
-    /// [eval]}]`, with methods by scored block. A column names the group, and the best value is
-    /// marked in each.
+    /// [eval]}]`, with methods by scored block. Column `has seen` names the group, and the best value
+    /// is marked in each.
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
-    /// Heading and key of the groups' column.
-    pub group_by: String,
     /// Rows from other sources, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:
-    /// 29.77}]`. An extra row appears in tables whose results have the values of the row's keys,
-    /// and is never marked as the best.
+    /// 29.77}]`. An extra row appears in tables whose results have the values of the row's keys, in
+    /// a single scene's only if it has key `scene`, and is never marked as the best.
     #[schemars(extend("x-default" = "none"))]
     pub extra_rows: Vec<Row>,
     /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over:
     /// eval-nerf}]`. Methods are blocks, or methods of `extra_rows`.
     #[schemars(extend("x-default" = "none"))]
     pub gains: Vec<Gain>,
-    /// Key that splits the results: each of its values gets an additional table, if there are
-    /// several. Of `extra_rows`, these tables contain only rows with this key.
-    #[schemars(extend("x-default" = "one table of all"))]
-    pub split_by: String,
-    /// Remarks below the table.
-    #[schemars(extend("x-default" = "none"))]
-    pub notes: Vec<String>,
 }
 
 /// A group of comparable methods.
@@ -100,15 +84,10 @@ impl Default for Params {
             columns: Vec::new(),
             values: values.map(str::to_owned).into(),
             relative_to: BTreeMap::new(),
-            spread: Vec::new(),
             methods: BTreeMap::new(),
-            fields: BTreeMap::new(),
             groups: Vec::new(),
-            group_by: "group".to_owned(),
             extra_rows: Vec::new(),
             gains: Vec::new(),
-            split_by: String::new(),
-            notes: Vec::new(),
         }
     }
 }

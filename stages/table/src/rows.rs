@@ -15,6 +15,8 @@ use crate::values::Row;
 
 /// Name of the reason why a row has no values.
 pub(crate) const MISSING: &str = "missing";
+/// Key of a method's group: the images that its training has seen.
+pub(crate) const GROUP: &str = "has seen";
 
 /// Returns a row for every result of a run and for every left-out one, in the order of the groups
 /// and then of the run. Figures of their metrics are added to `figures`.
@@ -56,26 +58,19 @@ fn depth(run: &RunRecord, stage: &str) -> Option<usize> {
     nodes.map(|(index, _)| run.ancestors(index).len()).max()
 }
 
-/// Returns the keys of a result (values of axes, method and group) and its additional fields.
+/// Returns the keys of a result: values of axes, method and group.
 fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> Row {
     let mut row: Row = values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
-    row.insert("method".to_owned(), json!(params.methods.get(stage).unwrap_or(stage)));
+    let mut method = params.methods.get(stage).unwrap_or(stage).clone();
+    for (name, value) in values {
+        method = method.replace(&format!("{{{name}}}"), value);
+    }
+    row.insert("method".to_owned(), json!(method));
     if !params.groups.is_empty() {
         let group = params.groups.iter().find(|group| group.methods.contains(stage));
-        row.insert(params.group_by.clone(), json!(group.map_or("", |group| group.name.as_str())));
-    }
-    for (name, value) in params.fields.get(stage).into_iter().flatten() {
-        let value = substituted(&row, value);
-        row.insert(name.clone(), value);
+        row.insert(GROUP.to_owned(), json!(group.map_or("", |group| group.name.as_str())));
     }
     row
-}
-
-/// Returns the value of a field; `{key}` is replaced by the key's value, as a number if possible.
-fn substituted(row: &Row, value: &Value) -> Value {
-    let named = value.as_str().and_then(|text| text.strip_prefix('{')?.strip_suffix('}'));
-    let Some(text) = named.and_then(|name| row.get(name)?.as_str()) else { return value.clone() };
-    text.parse::<u64>().map_or_else(|_| json!(text), |number| json!(number))
 }
 
 /// Returns the rank of a method in the table; methods without a group are last.
