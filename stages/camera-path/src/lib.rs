@@ -13,7 +13,7 @@ mod paths;
 
 use artifact::{Failure, GivenInput};
 use pixels::{DEGRADATION_FILE, Degradation};
-use scene::{Camera, Intrinsics, Pose, VIEWS_FILE, View, Views, common_direction};
+use scene::{Camera, Intrinsics, VIEWS_FILE, View, Views, common_direction};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Stage};
@@ -25,23 +25,12 @@ pub use crate::paths::poses;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Kind of path. Default: `list` if `poses` are given, `spiral` for cameras that look in one
-    /// direction, otherwise `orbit`.
+    /// Kind of path. Default: `spiral` for cameras that look in one direction, otherwise `orbit`.
     #[schemars(extend("x-default" = "by cameras"))]
     pub kind: Option<Kind>,
-    /// Number of frames. A `list` has one frame per pose.
+    /// Number of frames.
     #[schemars(range(min = 1, max = 10000))]
     pub frames: u32,
-    /// Number of turns of a spiral or orbit. A turn of an orbit along an arc leads there and back.
-    #[schemars(range(min = 0.01, max = 100.0))]
-    pub turns: f64,
-    /// Radius of a spiral or orbit relative to the default: an orbit's is that of the input cameras,
-    /// a spiral's the largest, up to theirs, whose frames stay where they looked.
-    #[schemars(range(min = 0.0, max = 10.0))]
-    pub radius: f64,
-    /// Poses of `kind: list`: for each frame a `camera_to_world` matrix of three rows of four
-    /// numbers, as in `views.json`.
-    pub poses: Vec<Pose>,
     /// Width of the frames in pixels; the height follows from the first camera's aspect. Default:
     /// the width of the scene's HR images, or that of input `path`.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by scene"))]
@@ -50,7 +39,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { kind: None, frames: 120, turns: 1.0, radius: 1.0, poses: Vec::new(), size: None }
+        Self { kind: None, frames: 120, size: None }
     }
 }
 
@@ -66,8 +55,6 @@ pub enum Kind {
     Orbit,
     /// Closed curve through all cameras, in their order.
     Between,
-    /// Poses of the parameter `poses`.
-    List,
 }
 
 /// The stage.
@@ -82,7 +69,7 @@ impl Stage for CameraPath {
         let kinds =
             ["scene/train", "scene/cameras", "scene/truth", "scene/references", "cameras", "views"];
         let path = "folder with camera_path.json, as the viewer, nerfstudio or this stage writes it; \
-            replaces kind, frames and poses";
+            replaces kind and frames";
         vec![
             ("cameras", Input::required(&kinds, "folder with views.json: the scene's cameras")),
             ("path", Input::optional(&["cameras"], path)),
@@ -102,7 +89,6 @@ impl Stage for CameraPath {
         };
         let views = path.cameras().into_iter().map(View::camera_only).collect();
         let views = Views::new(scene.background, scene.bounds, views);
-        views.check().map_err(|e| Failure::Usage(format!("parameter poses: {e}")))?;
         context.write_json(PATH_FILE, &path)?;
         context.write_json(VIEWS_FILE, &views)?;
         let size = views.views[0].camera.intrinsics;
@@ -144,28 +130,13 @@ fn computed_path(
     let width = params.size.or(hr_width).unwrap_or(frame.intrinsics.width);
     let frame = frame.resized(width, height_at(width, &frame.intrinsics));
     let cameras: Vec<Camera> = scene.views.iter().map(|v| v.camera.clone()).collect();
-    let kind = params.kind.unwrap_or_else(|| default_kind(&cameras, params));
-    let poses = poses(kind, params, &frame, &cameras, &scene.bounds);
-    if poses.is_empty() {
-        let message = "parameter poses: kind list needs at least one pose";
-        return Err(Failure::Usage(message.to_owned()));
-    }
-    let is_cycle = match kind {
-        Kind::Spiral | Kind::Orbit => params.turns.fract() == 0.0,
-        Kind::Between => true,
-        Kind::List => false,
-    };
-    let path = PathFile::new(&frame.intrinsics, &poses, is_cycle);
+    let kind = params.kind.unwrap_or_else(|| default_kind(&cameras));
+    let poses = poses(kind, params.frames, &frame, &cameras, &scene.bounds);
+    let path = PathFile::new(&frame.intrinsics, &poses, true);
     Ok((path, format!("{kind:?}").to_lowercase()))
 }
 
 /// Chooses the kind of path if the parameter isn't given.
-fn default_kind(cameras: &[Camera], params: &Params) -> Kind {
-    if !params.poses.is_empty() {
-        Kind::List
-    } else if common_direction(cameras.iter()).is_some() {
-        Kind::Spiral
-    } else {
-        Kind::Orbit
-    }
+fn default_kind(cameras: &[Camera]) -> Kind {
+    if common_direction(cameras.iter()).is_some() { Kind::Spiral } else { Kind::Orbit }
 }

@@ -5,7 +5,6 @@ use std::f64::consts::TAU;
 use glam::{DQuat, DVec3};
 use scene::{Bounds, Camera, Pose, looking_at};
 
-use crate::Params;
 use crate::paths::mean;
 
 /// Minimum angle without cameras that an orbit leaves out, in radians, and its minimum over the
@@ -64,11 +63,11 @@ impl Orbit {
     }
 
     /// Returns the pose at a fraction of the path.
-    pub(crate) fn pose(&self, params: &Params, fraction: f64) -> Pose {
-        let turn = TAU * params.turns * fraction;
+    pub(crate) fn pose(&self, fraction: f64) -> Pose {
+        let turn = TAU * fraction;
         let angle = self.half_arc.map_or(turn, |half_arc| half_arc * turn.sin());
         let rotation = DQuat::from_axis_angle(self.up, angle);
-        let offset = params.radius * (rotation * self.first * self.radius + self.height * self.up);
+        let offset = rotation * self.first * self.radius + self.height * self.up;
         looking_at(self.middle + offset, self.middle, self.up)
     }
 }
@@ -123,10 +122,9 @@ mod tests {
     }
 
     /// Returns the angles of an orbit's frames in degrees.
-    fn frames(cameras: &[Camera], turns: f64) -> Vec<f64> {
+    fn frames(cameras: &[Camera]) -> Vec<f64> {
         let orbit = Orbit::fit(cameras, &BOX);
-        let params = Params { turns, ..Params::default() };
-        let poses = (0..64).map(|i| orbit.pose(&params, f64::from(i) / 64.0));
+        let poses = (0..64).map(|i| orbit.pose(f64::from(i) / 64.0));
         poses.map(|pose| pose[1][3].atan2(pose[0][3]).to_degrees()).collect()
     }
 
@@ -137,7 +135,7 @@ mod tests {
         for (start, step) in [(10.0, 8.0), (130.0, 6.0), (0.0, 18.0)] {
             let arc = cameras((0..16).map(|i| start + step * f64::from(i)), 1.0);
             let (middle, half) = (start + 7.5 * step, 7.5 * step);
-            let offsets: Vec<f64> = frames(&arc, 1.0)
+            let offsets: Vec<f64> = frames(&arc)
                 .iter()
                 .map(|angle| (angle - middle + 540.0).rem_euclid(360.0) - 180.0)
                 .collect();
@@ -157,7 +155,7 @@ mod tests {
         let few = (0..4).map(|i| 90.0 * f64::from(i)).collect::<Vec<_>>();
         let gap = (0..41).map(|i| 8.0 * f64::from(i)).collect();
         for angles in [few, gap, vec![30.0]] {
-            let frames = frames(&cameras(angles.clone(), 1.0), 1.0);
+            let frames = frames(&cameras(angles.clone(), 1.0));
             assert!(frames.iter().any(|a| *a < -170.0) && frames.iter().any(|a| *a > 170.0));
             // As many frames in each quarter.
             let quarter =
@@ -185,6 +183,6 @@ mod tests {
         let above = DVec3::new(-0.3, -0.3, 4.0);
         let pose = looking_at(above, DVec3::ZERO, DVec3::Z);
         arc.push(Camera { camera_to_world: pose, ..arc[0].clone() });
-        assert!(frames(&arc, 1.0).iter().all(|a| (-10.0..130.0).contains(a)));
+        assert!(frames(&arc).iter().all(|a| (-10.0..130.0).contains(a)));
     }
 }

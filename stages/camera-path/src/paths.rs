@@ -5,9 +5,9 @@ use std::f64::consts::TAU;
 use glam::{DMat3, DQuat, DVec3};
 use scene::{Bounds, Camera, Pose, Space, looking_at, pose_of};
 
+use crate::Kind;
 use crate::coverage::Coverage;
 use crate::orbit::Orbit;
-use crate::{Kind, Params};
 
 /// Disparity of the point that a spiral's frames look at, relative to the way from far to near: a
 /// quarter from near, where most of a scene is; chosen by hand.
@@ -23,27 +23,26 @@ const SIZE_STEPS: u32 = 20;
 /// Number of frames of a spiral that are tested; chosen by hand.
 const TESTED_FRAMES: u32 = 32;
 
-/// Computes the poses of a path: `camera_to_world` of each frame. `frame` has the frames' image
+/// Computes the poses of a closed path: `camera_to_world` of each frame. `frame` has the frames' image
 /// size and lens.
 pub fn poses(
     kind: Kind,
-    params: &Params,
+    frames: u32,
     frame: &Camera,
     cameras: &[Camera],
     bounds: &Bounds,
 ) -> Vec<Pose> {
-    let fractions = (0..params.frames).map(|i| f64::from(i) / f64::from(params.frames));
+    let fractions = (0..frames).map(|i| f64::from(i) / f64::from(frames));
     match kind {
         Kind::Spiral => {
-            let spiral = Spiral::fit(cameras, frame, bounds, params.turns);
-            fractions.map(|fraction| spiral.pose(params, fraction)).collect()
+            let spiral = Spiral::fit(cameras, frame, bounds);
+            fractions.map(|fraction| spiral.pose(TAU * fraction)).collect()
         }
         Kind::Orbit => {
             let orbit = Orbit::fit(cameras, bounds);
-            fractions.map(|fraction| orbit.pose(params, fraction)).collect()
+            fractions.map(|fraction| orbit.pose(fraction)).collect()
         }
         Kind::Between => fractions.map(|fraction| interpolated_pose(cameras, fraction)).collect(),
-        Kind::List => params.poses.clone(),
     }
 }
 
@@ -89,18 +88,18 @@ impl Spiral {
     /// Creates the largest spiral that stays where the cameras looked: at most
     /// [`MAX_UNSEEN_FRACTION`] of a frame is unobserved, or as much as at the mean camera. A farther
     /// focus is preferred to a smaller spiral.
-    fn fit(cameras: &[Camera], frame: &Camera, bounds: &Bounds, turns: f64) -> Self {
+    fn fit(cameras: &[Camera], frame: &Camera, bounds: &Bounds) -> Self {
         let (near, far) = depth_range(bounds);
         let whole = Self::around(cameras, (near, far));
         let coverage = Coverage::new(cameras, frame, near, far);
-        let at_mean = coverage.count_unseen(whole.scaled(0.0, 0.0).pose_at(1.0, 0.0));
+        let at_mean = coverage.count_unseen(whole.scaled(0.0, 0.0).pose(0.0));
         let allowed = at_mean.max((MAX_UNSEEN_FRACTION * coverage.point_count() as f64) as usize);
-        let angles = |i: u32| TAU * turns.min(2.0) * f64::from(i) / f64::from(TESTED_FRAMES);
+        let angle = |i: u32| TAU * f64::from(i) / f64::from(TESTED_FRAMES);
         for step in (1..=SIZE_STEPS).rev() {
             for focus in FOCUS_STEPS {
                 let spiral = whole.scaled(f64::from(step) / f64::from(SIZE_STEPS), focus);
                 let stays = (0..TESTED_FRAMES)
-                    .all(|i| coverage.count_unseen(spiral.pose_at(1.0, angles(i))) <= allowed);
+                    .all(|i| coverage.count_unseen(spiral.pose(angle(i))) <= allowed);
                 if stays {
                     return spiral;
                 }
@@ -114,16 +113,10 @@ impl Spiral {
         Self { axes: self.axes.map(|axis| size * axis), disparity: focus * self.disparity, ..self }
     }
 
-    /// Returns the pose at a fraction of the path.
-    fn pose(&self, params: &Params, fraction: f64) -> Pose {
-        self.pose_at(params.radius, TAU * params.turns * fraction)
-    }
-
-    /// Returns the pose at an angle, with offsets multiplied by `radius`.
-    fn pose_at(&self, radius: f64, angle: f64) -> Pose {
+    /// Returns the pose at an angle.
+    fn pose(&self, angle: f64) -> Pose {
         let [right, up, forward] = self.axes;
-        let offset =
-            radius * (angle.cos() * right + angle.sin() * up + (0.5 * angle).sin() * forward);
+        let offset = angle.cos() * right + angle.sin() * up + (0.5 * angle).sin() * forward;
         let position = self.centre + offset;
         // Towards `centre + forward / disparity`, which is infinitely far at disparity 0.
         looking_at(position, position + self.forward - self.disparity * offset, self.up)
@@ -204,10 +197,9 @@ mod tests {
 
     #[test]
     fn an_orbit_goes_around_the_middle() {
-        let params = Params { frames: 24, ..Params::default() };
         let cameras = ring();
-        assert_eq!(default_kind(&cameras, &params), Kind::Orbit);
-        let path = whole(&poses(Kind::Orbit, &params, &cameras[0], &cameras, &BOX));
+        assert_eq!(default_kind(&cameras), Kind::Orbit);
+        let path = whole(&poses(Kind::Orbit, 24, &cameras[0], &cameras, &BOX));
         assert_eq!(path.len(), 24);
         for camera in &path {
             assert!((camera.centre().length() - 4.2).abs() < 0.3, "{}", camera.centre());
@@ -221,10 +213,9 @@ mod tests {
 
     #[test]
     fn a_spiral_stays_among_the_cameras_and_looks_their_way() {
-        let params = Params { frames: 30, ..Params::default() };
         let cameras = row();
-        assert_eq!(default_kind(&cameras, &params), Kind::Spiral);
-        for camera in whole(&poses(Kind::Spiral, &params, &cameras[0], &cameras, &BOX)) {
+        assert_eq!(default_kind(&cameras), Kind::Spiral);
+        for camera in whole(&poses(Kind::Spiral, 30, &cameras[0], &cameras, &BOX)) {
             let off = camera.centre() - DVec3::new(0.0, 0.0, 0.5);
             assert!(
                 off.x.abs() <= 1.0 + 1e-9 && off.z.abs() <= 0.5 + 1e-9 && camera.forward().y > 0.8,
@@ -245,25 +236,18 @@ mod tests {
             let counts = poses.iter().map(|&pose| coverage.count_unseen(pose));
             counts.max().unwrap_or(0)
         };
-        let params = Params { frames: 50, ..Params::default() };
         let around = Spiral::around(&cameras, range);
-        let poses_around: Vec<Pose> = (0..8).map(|i| around.pose_at(1.0, f64::from(i))).collect();
+        let poses_around: Vec<Pose> = (0..8).map(|i| around.pose(f64::from(i))).collect();
         assert!(unseen(&poses_around) > 15, "{}", unseen(&poses_around));
-        let path = poses(Kind::Spiral, &params, &cameras[0], &cameras, &bounds);
+        let path = poses(Kind::Spiral, 50, &cameras[0], &cameras, &bounds);
         let widest = whole(&path).iter().map(|c| c.centre().x).fold(0.0, f64::max);
         assert!(unseen(&path) <= 4 && widest > 0.9, "{} {widest}", unseen(&path));
-        // A larger spiral by the parameter isn't cut.
-        let params = Params { radius: 3.0, ..params };
-        let path = poses(Kind::Spiral, &params, &cameras[0], &cameras, &bounds);
-        assert!(whole(&path).iter().any(|c| c.centre().x > 2.7));
-        assert!(unseen(&path) > 15);
     }
 
     #[test]
     fn between_passes_every_camera() {
         let cameras = ring();
-        let params = Params { frames: 70, ..Params::default() };
-        let path = whole(&poses(Kind::Between, &params, &cameras[0], &cameras, &BOX));
+        let path = whole(&poses(Kind::Between, 70, &cameras[0], &cameras, &BOX));
         for (i, camera) in cameras.iter().enumerate() {
             let frame = &path[10 * i];
             assert!(
@@ -276,9 +260,8 @@ mod tests {
     #[test]
     fn one_camera_and_straight_down_are_paths_too() {
         let one = cameras(&[DVec3::new(0.0, 0.0, 4.0)], |_| DVec3::ZERO);
-        let params = Params { frames: 5, ..Params::default() };
         for kind in [Kind::Spiral, Kind::Orbit, Kind::Between] {
-            whole(&poses(kind, &params, &one[0], &one, &BOX));
+            whole(&poses(kind, 5, &one[0], &one, &BOX));
         }
     }
 }

@@ -22,8 +22,7 @@ struct PathFile {
 /// Returns the frames of a path that `camera-path` computes: as large as the scene's HR images,
 /// unless their width is given.
 pub(super) fn computed(parameters: &Value, scene: &SceneImages) -> Option<Images> {
-    let poses = parameters["poses"].as_array().map_or(0, Vec::len) as u64;
-    let count = if poses > 0 { poses } else { parameters["frames"].as_u64()? };
+    let count = parameters["frames"].as_u64()?;
     Some(frames(count, scene.images("train-cameras")?.largest, parameters))
 }
 
@@ -57,9 +56,9 @@ mod tests {
         let images = |count, largest: (u64, u64)| {
             Some(Images { count, pixels: count * largest.0 * largest.1, largest })
         };
-        let parameters = json!({"frames": 120, "poses": []});
+        let parameters = json!({"frames": 120});
         assert_eq!(computed(&parameters, &scene), images(120, (200, 100)));
-        let parameters = json!({"frames": 120, "poses": [[], [], []], "size": 50});
+        let parameters = json!({"frames": 3, "size": 50});
         assert_eq!(computed(&parameters, &scene), images(3, (50, 25)));
 
         let folder = tempfile::tempdir().unwrap();
