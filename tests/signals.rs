@@ -73,7 +73,6 @@ const CASES: &[Case] = &[
     },
     Case {
         stage: "register",
-        params: r#"{"pyramid_levels": 0, "max_renders": 100}"#,
         inputs: &[("field", "field"), ("photographs", "photographs")],
         ..CASE
     },

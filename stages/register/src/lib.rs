@@ -14,24 +14,17 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Stage};
 
-/// Parameters of `register`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Parameters of `register`: none.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Params {
-    /// Number of times that a photograph is halved at the start. With more halvings, cameras with
-    /// larger errors can be registered.
-    #[schemars(range(min = 0, max = 8))]
-    pub pyramid_levels: u32,
-    /// Maximum number of times that the field is rendered for a photograph, at each of its sizes.
-    #[schemars(range(min = 2, max = 100))]
-    pub max_renders: u32,
-}
+pub struct Params {}
 
-impl Default for Params {
-    fn default() -> Self {
-        Self { pyramid_levels: 3, max_renders: 8 }
-    }
-}
+/// Number of times that a photograph is halved at the start; more halvings register cameras with
+/// larger errors; chosen by hand.
+const PYRAMID_LEVELS: u32 = 3;
+/// Maximum number of times that the field is rendered for a photograph, at each of its sizes; chosen
+/// by hand.
+const MAX_RENDERS: u32 = 8;
 
 /// Stage `register`.
 pub struct Register;
@@ -54,7 +47,7 @@ impl Stage for Register {
         Output::kind("cameras")
     }
 
-    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+    fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
         let members = fields::Members::read(context.input("field")?, &context.device)?;
         let input = context.input("photographs")?;
         let given = Views::read(input)?;
@@ -67,7 +60,7 @@ impl Stage for Register {
             registered.push(match read_photograph(view, input).bad_input(&name)? {
                 Some(photograph) => {
                     let image = photograph.over(background).masked_image();
-                    Registered::from_image(&members, &view.camera, &image, params, background)
+                    Registered::from_image(&members, &view.camera, &image, background)
                         .map_err(|e| anyhow::anyhow!("{name}: {e}"))?
                 }
                 None => Registered::unchanged(&view.camera),
@@ -109,11 +102,10 @@ impl Registered {
         field: &dyn RayField,
         camera: &Camera,
         image: &Image,
-        params: &Params,
         background: f32,
     ) -> Result<Self, RenderError> {
-        let pyramid = Pyramid::new(image, params.pyramid_levels);
-        let options = Options { max_renders: params.max_renders, background, ..Options::default() };
+        let pyramid = Pyramid::new(image, PYRAMID_LEVELS);
+        let options = Options { max_renders: MAX_RENDERS, background, ..Options::default() };
         let given = refine(field, camera, &pyramid, 0, &Options { max_renders: 1, ..options })?;
         let mut to = camera.clone();
         for level in (1..=pyramid.smaller_levels()).rev() {

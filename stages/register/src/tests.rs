@@ -49,7 +49,7 @@ fn photograph() -> Image {
 }
 
 fn registered(field: &Wall, from: f64) -> Registered {
-    Registered::from_image(field, &camera(from), &photograph(), &Params::default(), 1.0).unwrap()
+    Registered::from_image(field, &camera(from), &photograph(), 1.0).unwrap()
 }
 
 #[test]
