@@ -229,7 +229,7 @@ const OPTIONS: [(f64, &str); 11] = [
     (22.63, "background=alpha"),
     (23.55, "background=black kernel=bicubic"),
     (21.81, "kernel=average supersample_warmup=0.2"),
-    (21.83, "supersample=3 depth=expected ray_distance=true"),
+    (21.83, "supersample=3"),
     (25.00, "lr_width=20 scale=1.5 prep.hr_references=2 test_views=2"),
     (26.16, "lr_width=24 scale=1 supersample=1"),
     (21.78, "supervision=kernel"),

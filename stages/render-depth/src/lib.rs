@@ -41,33 +41,12 @@ pub struct Params {
     /// where the image is locally quadratic. 0 casts all rays everywhere.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub tolerance: f64,
-    /// Kind of depth in channel `Z`. `median` lies on a surface; `expected`, the mean over the ray,
-    /// lies between the surface and floaters in front of it.
-    pub depth: Depth,
-    /// Also writes the distance along the ray, as channel `distance`.
-    pub ray_distance: bool,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self {
-            size: None,
-            samples_per_axis: 2,
-            tolerance: 0.005,
-            depth: Depth::Median,
-            ray_distance: false,
-        }
+        Self { size: None, samples_per_axis: 2, tolerance: 0.005 }
     }
-}
-
-/// Kind of depth.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum Depth {
-    /// Mean distance of the samples, weighted by their share of the pixel's colour.
-    Expected,
-    /// Distance at which half of the light is absorbed; the far end if less is.
-    Median,
 }
 
 /// Stage `render-depth`.
@@ -140,6 +119,8 @@ fn resize(camera: &Camera, width: Option<u32>) -> Camera {
     camera.resized(width, height as u32)
 }
 
+/// Number of a view's channels.
+const CHANNELS: usize = 5;
 /// Minimum number of pixels whose rays a task combines; chosen by hand.
 const MIN_PIXELS_PER_TASK: usize = 64;
 
@@ -161,7 +142,7 @@ impl RenderJob<'_> {
     ) -> anyhow::Result<()> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
-        let channels = &VIEW_CHANNELS[..if self.params.ray_distance { 6 } else { 5 }];
+        let channels = &VIEW_CHANNELS[..CHANNELS];
         let exr = context.output_path(image)?;
         let mut png = PngRows::create(&context.output_path(preview)?, width, height)?;
         let mut centres = CentreRows::default();
@@ -176,7 +157,7 @@ impl RenderJob<'_> {
             })?;
             written?;
             for (i, sample) in samples.chunks_exact_mut(channels.len()).enumerate() {
-                sample.copy_from_slice(&pixels[i].channels[..channels.len()]);
+                sample.copy_from_slice(&pixels[i].channels);
             }
             preview.clear();
             preview.extend(pixels.iter().flat_map(|pixel| pixel.colour.map(to_u8)));
@@ -225,14 +206,13 @@ impl RenderJob<'_> {
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
         let rendered = rendered.map_err(fields::rendering_failure)?;
         let pixels = (0..positions.len()).into_par_iter().with_min_len(MIN_PIXELS_PER_TASK);
-        let depth = self.params.depth;
         let combined = pixels.map_init(Vec::new, |samples, i| {
             let rays = i * n * n..(i + 1) * n * n;
             samples.clear();
             for member in &rendered {
                 samples.extend(member[rays.clone()].iter().zip(&z_per_distance[rays.clone()]));
             }
-            combine(depth, samples)
+            combine(samples)
         });
         Ok(combined.collect())
     }
@@ -240,24 +220,14 @@ impl RenderJob<'_> {
 
 /// Combines the samples of a pixel's rays, each with its z-depth per distance: means of colour and
 /// opacity, middle depth. A mean depth would lie between two surfaces.
-fn combine(depth: Depth, samples: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
+fn combine(samples: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
     let [r, g, b] = std::array::from_fn(|c| mean(samples, |(p, _)| p.premultiplied[c]));
     let mut distances: Vec<(f32, f32)> =
-        samples.iter().map(|(pixel, to_z)| (depth.distance(pixel), **to_z)).collect();
+        samples.iter().map(|(pixel, to_z)| (pixel.median_depth, **to_z)).collect();
     let (distance, to_z) = lower_median(&mut distances, |d| d.0).copied().unwrap_or_default();
     ViewPixel {
-        channels: [r, g, b, mean(samples, |(p, _)| p.opacity), distance * to_z, distance],
+        channels: [r, g, b, mean(samples, |(p, _)| p.opacity), distance * to_z],
         colour: std::array::from_fn(|c| mean(samples, |(p, _)| p.colour[c])),
-    }
-}
-
-impl Depth {
-    /// Returns the distance along the ray by this kind of depth.
-    fn distance(self, pixel: &radiance::Pixel) -> f32 {
-        match self {
-            Self::Expected => pixel.depth,
-            Self::Median => pixel.median_depth,
-        }
     }
 }
 
@@ -269,8 +239,8 @@ fn pixel_positions(rows: Range<usize>, width: usize) -> Vec<[usize; 2]> {
 /// Pixel of a rendered view.
 #[derive(Clone, Copy)]
 struct ViewPixel {
-    /// Channels of the EXR: premultiplied colour, opacity, z-depth and distance.
-    channels: [f32; 6],
+    /// Channels of the EXR: premultiplied colour, opacity and z-depth.
+    channels: [f32; CHANNELS],
     /// Colour over the background, for the preview.
     colour: [f32; 3],
 }
@@ -407,14 +377,14 @@ mod tests {
         }
     }
 
-    /// Wall at a z-depth; its expected depth is twice that, and its opacity grows with the depth.
+    /// Wall at a z-depth; its opacity grows with the depth.
     struct Wall(f32);
 
     impl Wall {
         fn pixel(&self, ray: &Ray) -> radiance::Pixel {
             let median_depth = self.0 / -ray.direction[2] as f32;
-            let (depth, opacity) = (2.0 * median_depth, 0.25 * self.0);
-            radiance::Pixel { opacity, depth, median_depth, ..radiance::Pixel::default() }
+            let opacity = 0.25 * self.0;
+            radiance::Pixel { opacity, median_depth, ..radiance::Pixel::default() }
         }
     }
 
@@ -424,34 +394,25 @@ mod tests {
         }
     }
 
-    /// Both depths are those of one ray of one member, the middle one of all by distance. Opacity
-    /// is the mean.
+    /// The depth is that of one ray of one member, the middle one of all by distance. Opacity is
+    /// the mean.
     #[test]
     fn a_pixel_has_the_depth_of_one_ray_of_one_member() {
         let camera = &camera();
-        // The four rays of the pixel pass the plane z = -1 in these distances from the camera.
-        let [x, y] = [[2.25f32, 2.75], [0.25, 0.75]];
-        let away = |i: usize, j: usize| (1.0 + x[i] * x[i] + y[j] * y[j]).sqrt();
-        // Walls of the members, then wall and distance of the middle one, then opacity.
-        let cases: [(&[f32], f32, f32, f32); 3] = [
-            (&[1.0], 1.0, away(0, 1), 0.25),
-            (&[1.0, 3.0], 1.0, away(1, 1), 0.5),
-            (&[3.0, 1.0, 3.0], 3.0, 3.0 * away(0, 0), 7.0 / 12.0),
-        ];
-        for (walls, wall, distance, opacity) in cases {
+        // Walls of the members, then the middle one, then opacity.
+        let cases: [(&[f32], f32, f32); 3] =
+            [(&[1.0], 1.0, 0.25), (&[1.0, 3.0], 1.0, 0.5), (&[3.0, 1.0, 3.0], 3.0, 7.0 / 12.0)];
+        for (walls, wall, opacity) in cases {
             let members: Vec<Box<dyn RayField>> =
                 walls.iter().map(|wall| Box::new(Wall(*wall)) as Box<dyn RayField>).collect();
-            for (depth, times) in [(Depth::Median, 1.0), (Depth::Expected, 2.0)] {
-                let (params, members) = (&Params { depth, ..Params::default() }, &members[..]);
-                let job = RenderJob { params, members, background: Background::White, camera };
-                let shown = job.cast(&[[14, 12]], 2).unwrap()[0].channels;
-                let expected = [opacity, times * wall, times * distance];
-                let is_near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-4;
-                assert!(
-                    shown[3..].iter().zip(&expected).all(is_near),
-                    "walls {walls:?}: {shown:?} where {expected:?} is right"
-                );
-            }
+            let (params, members) = (&Params::default(), &members[..]);
+            let job = RenderJob { params, members, background: Background::White, camera };
+            let shown = job.cast(&[[14, 12]], 2).unwrap()[0].channels;
+            let is_near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-4;
+            assert!(
+                shown[3..].iter().zip(&[opacity, wall]).all(is_near),
+                "walls {walls:?}: {shown:?} where {opacity} and {wall} are right"
+            );
         }
     }
 }
