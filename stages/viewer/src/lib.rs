@@ -55,16 +55,16 @@ pub struct Params {
     /// Maximum number of LR photographs in the page, spread evenly over the training views.
     #[schemars(range(min = 0, max = 1000))]
     pub photographs: u32,
-    /// Maximum width in pixels of the LR photographs in the page; wider ones are shrunk.
-    #[schemars(range(min = 16, max = 4096))]
-    pub photograph_width: u32,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { resolution: 256, photographs: 100, photograph_width: 400 }
+        Self { resolution: 256, photographs: 100 }
     }
 }
+
+/// Maximum width in pixels of the LR photographs in the page; wider ones are shrunk; chosen by hand.
+const MAX_PHOTOGRAPH_WIDTH: usize = 400;
 
 /// Message for a field that can't be baked, also before its training.
 const PAPER_FIELD: &str = "the paper's field can't be baked; train with `field: grid` to view it";
@@ -215,7 +215,7 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
                     Some(pinhole) => undistort_image(&image, &intrinsics, &pinhole),
                     None => image,
                 };
-                Some(shrunk(image, params.photograph_width as usize))
+                Some(shrunk(image, MAX_PHOTOGRAPH_WIDTH))
             }
             _ => None,
         };
