@@ -296,16 +296,14 @@ fn any_number_of_threads_gives_the_same_files() {
 }
 
 #[test]
-fn files_may_be_left_out_but_not_all() {
+fn the_mesh_may_be_left_out() {
     let project = Project::tiny();
-    let some = r#"{"splats": false, "mesh": false, "max_points": 500}"#;
+    let some = r#"{"mesh": false, "max_points": 500}"#;
     assert_eq!(tiny(&project, some, "some", &[]).code, 0);
     let manifest = common::manifest(&project.path("some"));
-    assert!(manifest.contains("points.ply") && !manifest.contains("splats.ply"), "{manifest}");
+    assert!(manifest.contains("points.ply") && !manifest.contains("mesh.glb"), "{manifest}");
     let count = read_ply(&project.path("some/points.ply"))["x"].len();
     assert!((100..=500).contains(&count), "{count} points");
-    let none = r#"{"points": false, "splats": false, "mesh": false, "cameras": false}"#;
-    tiny(&project, none, "none", &[]).fails(2, &["no files are enabled", "mesh"]);
 }
 
 /// Measures an artifact of `export`, `EXPORT`, that was made by the training cameras of a scene of

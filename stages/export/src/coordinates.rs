@@ -8,10 +8,8 @@ use serde::{Deserialize, Serialize};
 /// Name of the file with an offset, next to the files that it belongs to.
 pub const OFFSET_FILE: &str = "offset.json";
 
-/// Files whose coordinates have single precision, each with its index among points, splats and
-/// mesh.
-const SINGLE_FILES: [(&str, usize); 4] =
-    [("points.ply", 0), ("splats.ply", 1), ("mesh.glb", 2), ("mesh.ply", 2)];
+/// Files whose coordinates have single precision; the last two are the mesh.
+const SINGLE_FILES: [&str; 4] = ["points.ply", "splats.ply", "mesh.glb", "mesh.ply"];
 
 /// Maximum distance of a scene's middle from the origin, in scene sizes, for files without an
 /// offset: single precision moves a point by less than a millionth of the size (design note 043).
@@ -56,20 +54,14 @@ impl Coordinates {
         self.offset != DVec3::ZERO
     }
 
-    /// Returns the content of [`OFFSET_FILE`]; `is_written` is true for points, splats and mesh that
-    /// are written.
-    pub(crate) fn offset_file(&self, is_written: [bool; 3]) -> ExportOffset {
-        let mut files = Vec::new();
-        for (file, index) in SINGLE_FILES {
-            if is_written[index] {
-                files.push(file.to_owned());
-            }
-        }
+    /// Returns the content of [`OFFSET_FILE`].
+    pub(crate) fn offset_file(&self, has_mesh: bool) -> ExportOffset {
+        let files = &SINGLE_FILES[..if has_mesh { 4 } else { 2 }];
         ExportOffset {
             note: "add the offset to the coordinates of these files for the input's coordinates"
                 .to_owned(),
             offset: self.offset.to_array(),
-            files,
+            files: files.iter().map(|file| (*file).to_owned()).collect(),
         }
     }
 }

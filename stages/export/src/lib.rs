@@ -62,14 +62,8 @@ const REMEDY: &str = "choose a smaller resolution or size, or end other programs
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Writes points with normals and colours, `points.ply`.
-    pub points: bool,
-    /// Writes 3D Gaussians, `splats.ply`.
-    pub splats: bool,
     /// Writes a mesh with vertex colours: `mesh.glb`, with an unlit material, and `mesh.ply`.
     pub mesh: bool,
-    /// Writes the cameras as `transforms.json` and as COLMAP's text files.
-    pub cameras: bool,
     /// Width in pixels at which the field is rendered from each camera. Default: twice the cameras'
     /// width, or less if all views together would have more than 16 million pixels.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by cameras"))]
@@ -84,15 +78,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self {
-            points: true,
-            splats: true,
-            mesh: true,
-            cameras: true,
-            size: None,
-            max_points: 500_000,
-            resolution: 256,
-        }
+        Self { mesh: true, size: None, max_points: 500_000, resolution: 256 }
     }
 }
 
@@ -104,9 +90,9 @@ pub struct ExportSummary {
     pub coordinates: String,
     /// Number of cameras.
     pub cameras: usize,
-    /// Number of points in `points.ply`; 0 without this file.
+    /// Number of points in `points.ply`.
     pub points: usize,
-    /// Number of Gaussians in `splats.ply`; 0 without this file.
+    /// Number of Gaussians in `splats.ply`.
     pub splats: usize,
     /// Number of vertices in `mesh.glb` and `mesh.ply`; 0 without these files.
     pub vertices: usize,
@@ -137,14 +123,10 @@ impl Stage for Export {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        if !(params.points || params.splats || params.mesh || params.cameras) {
-            let message = "no files are enabled; set points, splats, mesh or cameras to true";
-            return Err(Failure::Usage(message.to_owned()).into());
-        }
         let field = Members::read(context.input("field")?, &context.device)?;
         let views = Views::read(context.input("cameras")?)?;
         let cameras: Vec<Camera> = views.views.into_iter().map(|view| view.camera).collect();
-        for note in lens_notes(&cameras, params) {
+        for note in lens_notes(&cameras) {
             context.log_line(note);
         }
         let coordinates = Coordinates::new(&field.file.bounds);
@@ -173,19 +155,17 @@ impl Stage for Export {
 }
 
 /// Returns notes on lenses that files can't describe, a line each.
-fn lens_notes(cameras: &[Camera], params: &Params) -> Vec<&'static str> {
+fn lens_notes(cameras: &[Camera]) -> Vec<&'static str> {
     let mut notes = Vec::new();
     let is_fisheye = |camera: &Camera| camera.intrinsics.distortion.is_fisheye();
-    if (params.points || params.splats || params.mesh) && cameras.iter().any(is_fisheye) {
+    if cameras.iter().any(is_fisheye) {
         notes.push(
             "fisheye lenses: points, splats and mesh cover only the field of view of pinhole \
             cameras, at most 100°",
         );
     }
-    if params.cameras {
-        let formats = [CameraFormat::Transforms, CameraFormat::Colmap];
-        notes.extend(formats.into_iter().filter_map(|format| format.lens_problem(cameras)));
-    }
+    let formats = [CameraFormat::Transforms, CameraFormat::Colmap];
+    notes.extend(formats.into_iter().filter_map(|format| format.lens_problem(cameras)));
     notes
 }
 
@@ -265,26 +245,18 @@ impl ExportJob<'_> {
             return Err(no_surface());
         }
         let points = ply::select_points(&surfels);
-        if self.params.points {
-            self.write("points.ply", |file| ply::write_points(file, &points, &self.coordinates))?;
-            summary.points = points.len();
-        }
-        if self.params.splats {
-            self.write("splats.ply", |file| ply::write_splats(file, &surfels, &self.coordinates))?;
-            summary.splats = surfels.len();
-        }
-        if self.params.cameras {
-            self.write_cameras(&points)?;
-        }
-        Ok(())
+        self.write("points.ply", |file| ply::write_points(file, &points, &self.coordinates))?;
+        summary.points = points.len();
+        self.write("splats.ply", |file| ply::write_splats(file, &surfels, &self.coordinates))?;
+        summary.splats = surfels.len();
+        self.write_cameras(&points)
     }
 
     /// Writes the cameras in each format that supports their lenses.
     fn write_cameras(&self, points: &[Surfel]) -> anyhow::Result<()> {
         if CameraFormat::Transforms.lens_problem(&self.cameras).is_none() {
             // Programs assume that the cameras and this file have the same frame.
-            let is_same_frame = self.params.points && !self.coordinates.is_moved();
-            let points_file = is_same_frame.then_some("points.ply");
+            let points_file = (!self.coordinates.is_moved()).then_some("points.ply");
             let file = cameras::transforms_json(&self.cameras, points_file);
             self.context.write_json("transforms.json", &file)?;
         }
@@ -329,11 +301,10 @@ impl ExportJob<'_> {
 
     /// Writes and logs the offset of files with single precision, if there is one.
     fn write_offset(&self) -> anyhow::Result<()> {
-        let Params { points, splats, mesh, .. } = *self.params;
-        let offset = self.coordinates.offset_file([points, splats, mesh]);
-        if !self.coordinates.is_moved() || offset.files.is_empty() {
+        if !self.coordinates.is_moved() {
             return Ok(());
         }
+        let offset = self.coordinates.offset_file(self.params.mesh);
         let ([x, y, z], files) = (offset.offset, offset.files.join(", "));
         self.context.log_line(format!(
             "the scene is far from the origin: coordinates of {files} lack the offset ({x}, {y}, \

@@ -365,10 +365,10 @@ fn offsets_are_short_and_only_where_they_are_needed() {
     assert_eq!(boxed([16.3, -3.2, -0.1], 1.0), [16.0, -3.0, 0.0]);
     assert_eq!(boxed([499_999.97, 4_649_776.21, 120.4], 0.02), [499_999.97, 4_649_776.21, 120.4]);
     assert_eq!(boxed([1e9, 0.0, 0.0], 3e7), [1e9, 0.0, 0.0]);
-    let file = Coordinates { offset: DVec3::X }.offset_file([true, false, true]);
+    let file = Coordinates { offset: DVec3::X }.offset_file(false);
     assert_eq!(
         (file.offset, file.files),
-        ([1.0, 0.0, 0.0], vec!["points.ply".into(), "mesh.glb".into(), "mesh.ply".into()])
+        ([1.0, 0.0, 0.0], vec!["points.ply".into(), "splats.ply".into()])
     );
 }
 
@@ -435,7 +435,7 @@ fn lenses_are_in_the_formats_that_have_them() {
         assert_eq!(found, formats, "{lens}");
     }
     let cameras = with(Distortion { radial: [0.0, 0.0, 0.0, 0.01], ..Distortion::default() });
-    let words = crate::lens_notes(&cameras, &crate::Params::default());
+    let words = crate::lens_notes(&cameras);
     assert!(words.len() == 1 && words[0].contains("fourth radial term"), "{words:?}");
 }
 
