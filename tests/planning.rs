@@ -175,7 +175,7 @@ fn a_missing_program_is_missed_where_it_is_needed() {
     project.replace("lr_width: 24", "ir_width: 24");
     run_installed(&project, &["plan", "demo-secne"]).fails(
         2,
-        &["pipeline.yaml:8: stage prep: parameter ir_width: unknown; did you mean hr_width?"],
+        &["pipeline.yaml:8: stage prep: parameter ir_width: unknown; did you mean lr_width?"],
     );
 }
 
@@ -386,7 +386,7 @@ fn a_run_does_what_the_plan_says() {
         ),
         (&["-p", "prep.scale=3", "-p", "prep.scale=2", "-p", "near=", "-p", "lens=follow"], 0),
         // Equal output ends what waits.
-        (&["-p", "hr_width=48"], 1),
+        (&["-p", "lr_source=downscaled"], 1),
         (&["-p", "demo-scene.train=11", "-p", "demo-scene.train=12"], 0),
         (&["-p", "kernel=box,bicubic"], 1),
         (&["-p", "demo-scene.samples_per_axis=1", "-p", "kernel=box,bicubic"], 3),

@@ -34,11 +34,12 @@ impl ImagePlan {
         let first = set.frames[split.train[0]].intrinsics();
         let native = (first.width, first.height);
         let sizes = if has_truth {
-            downscaled_sizes(native, params.lr_width, params.hr_width, params.scale)
+            downscaled_sizes(native, params.lr_width, params.scale)
+                .map_err(ParameterError::Sizes)?
         } else {
-            enlarged_sizes(native, params.hr_width, params.scale)
+            enlarged_sizes(native, params.scale)
         };
-        let plan = Self { has_truth, kernel, sizes: sizes.map_err(ParameterError::Sizes)?, native };
+        let plan = Self { has_truth, kernel, sizes, native };
         if kernel == Kernel::Average {
             for &i in split.train.iter().chain(&split.test) {
                 let sizes = plan.sizes_of(&set.frames[i].intrinsics());

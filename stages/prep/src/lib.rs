@@ -4,7 +4,7 @@
 //! * [`Params`]; `split`: training views, test views, references; `image_plan`: image sizes and
 //!   kernel; `scene_plan`: all decisions before anything is written; `writer`: writes the scene,
 //!   one function per subtree; `summary`: human-readable `scene.json`.
-//! * `sizes`: LR and HR size from `lr_width`, `hr_width`, `scale`.
+//! * `sizes`: LR and HR size from `lr_width` and `scale`.
 //! * `degrade`: HR and LR images of one photograph, by Pillow's exact kernels.
 //! * `bounds`: the scene's extent and space, from cameras and depths.
 //! * `memory`: number of images that are prepared at a time.
@@ -134,7 +134,6 @@ fn read_dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
             set.with_lens_mask_note()
         }
         LensHandling::Undo => set.undistorted().bad_input("dataset")?,
-        LensHandling::Ignore => set.without_distortion(),
     };
     let needs_merge = matches!(params.split, Some(SplitKind::Holdout | SplitKind::Paper));
     Ok(if needs_merge { set.without_split() } else { set })

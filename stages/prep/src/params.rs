@@ -10,16 +10,12 @@ use crate::bounds::SpaceKind;
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
     /// Width of the LR images in pixels; the height follows the aspect ratio. Has no effect with
-    /// `lr_source: photographs`. Default: the HR width divided by `scale`.
+    /// `lr_source: photographs`. Default: the width of the data set's images divided by `scale`.
     #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub lr_width: Option<u32>,
-    /// Width of the HR images in pixels. Default: `lr_width` times `scale`, or the width of the
-    /// data set's images.
-    #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
-    pub hr_width: Option<u32>,
-    /// HR width over LR width. Optional if both widths are given.
-    #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "output", "x-default" = "2"))]
-    pub scale: Option<f64>,
+    /// HR width over LR width.
+    #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "output"))]
+    pub scale: f64,
     /// Source of the LR images: the `photographs` themselves, without HR ground truth, or images
     /// `downscaled` from HR images by `kernel`. Default: `downscaled` for benchmark formats
     /// (Blender, LLFF) and with `lr_width`, otherwise `photographs`.
@@ -66,8 +62,7 @@ impl Default for Params {
     fn default() -> Self {
         Self {
             lr_width: None,
-            hr_width: None,
-            scale: None,
+            scale: 2.0,
             lr_source: None,
             kernel: None,
             lens: LensHandling::Follow,
@@ -92,9 +87,6 @@ pub enum LensHandling {
     /// Photographs are resampled to pinhole cameras, which crops their border. The field of view in
     /// place of a fisheye lens is at most 100° along the longer side.
     Undo,
-    /// Photographs are treated as those of pinhole cameras, as is customary for LLFF scenes, whose
-    /// files don't describe lenses. For comparison with published results.
-    Ignore,
 }
 
 /// Source of the LR images.

@@ -289,7 +289,7 @@ mod tests {
     #[test]
     fn what_cannot_be_is_refused() {
         let kernel =
-            Params { kernel: Some(pixels::Kernel::Average), scale: Some(2.7), ..Params::default() };
+            Params { kernel: Some(pixels::Kernel::Average), scale: 2.7, ..Params::default() };
         let kernel = refused(Format::Blender, &kernel);
         assert!(
             kernel.starts_with("parameter kernel: average requires an integer scale"),

@@ -94,21 +94,6 @@ impl Dataset {
         Ok(self)
     }
 
-    /// Treats all lenses as free of distortion.
-    #[must_use]
-    pub fn without_distortion(mut self) -> Self {
-        let mut ignored = 0;
-        for frame in self.frames.iter_mut().filter(|f| f.has_distortion()) {
-            frame.stored_intrinsics.distortion = scene::Distortion::default();
-            ignored += 1;
-        }
-        if ignored > 0 {
-            let count = format_count(ignored, "photograph");
-            self.notes.push(format!("lens distortion of {count} is ignored"));
-        }
-        self
-    }
-
     /// Removes a uniform scale from the rotations of poses, with a warning. Centres are unchanged:
     /// the program that wrote the poses placed the cameras there.
     pub(crate) fn remove_scales(&mut self) {

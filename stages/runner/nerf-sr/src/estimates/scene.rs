@@ -133,17 +133,16 @@ impl SceneImages {
     ) -> Self {
         let Planned { kind, widths_across, sizes, split, is_benchmark } = planned;
         let number = |name: &str| parameters[name].as_f64();
-        let (lr_width, hr_width) = (number("lr_width"), number("hr_width"));
+        let lr_width = number("lr_width");
         let is_downscaled = match parameters["lr_source"].as_str() {
             Some(source) => source == "downscaled",
             None => *is_benchmark || lr_width.is_some(),
         };
         let width = sizes.first().map_or(1.0, |size| size.0);
-        let given = lr_width.zip(hr_width).map(|(lr, hr)| hr / lr);
-        let scale = number("scale").or(given).unwrap_or(2.0);
+        let scale = number("scale").unwrap_or(2.0);
         // Factors from the data set's images to the LR and to the HR images.
         let (lr, hr) = if is_downscaled {
-            let hr = hr_width.or(lr_width.map(|lr| lr * scale)).map_or(1.0, |hr| hr / width);
+            let hr = lr_width.map_or(1.0, |lr| lr * scale / width);
             (hr / scale, hr)
         } else {
             (1.0, scale)
