@@ -146,7 +146,7 @@ impl ReferenceJudge<'_> {
     /// True if confidence in a reference is clearly lower with smaller and with larger depths.
     fn has_correct_depth(&self, reference: &KnownView) -> anyhow::Result<bool> {
         // With shifted depths, the reference's own depth would hide every point.
-        let warp_options = WarpOptions { occlusion: false, ..self.warp_options };
+        let warp_options = WarpOptions { occlusion: false };
         let reference = std::slice::from_ref(reference);
         let unshifted = self.confidence(reference, warp_options, 1.0)?[0];
         let nearer = self.confidence(reference, warp_options, 1.0 - DEPTH_SHIFT)?[0];

@@ -65,8 +65,7 @@ fn architecture(net: &CompactParams) -> RefinerArchitecture {
     RefinerArchitecture {
         channels: net.features,
         blocks: net.blocks,
-        guidance: (net.references_per_view > 0)
-            .then_some(WarpOptions { occlusion: net.occlusion, alignment: net.alignment }),
+        guidance: (net.references_per_view > 0).then_some(WarpOptions::default()),
     }
 }
 

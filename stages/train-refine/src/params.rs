@@ -55,13 +55,6 @@ pub struct CompactParams {
     /// trains a network without references.
     #[schemars(range(min = 0, max = 64), extend("x-group" = "data"))]
     pub references_per_view: u32,
-    /// Uses only those points of a view that are visible in the reference, according to the
-    /// reference's depth map. `false` also uses hidden points, and is meant for comparisons.
-    #[schemars(extend("x-group" = "data"))]
-    pub occlusion: bool,
-    /// Shifts warped references by up to two pixels to fit the render; for comparisons.
-    #[schemars(extend("x-group" = "data"))]
-    pub alignment: bool,
 }
 
 impl Default for CompactParams {
@@ -74,8 +67,6 @@ impl Default for CompactParams {
             features: 32,
             blocks: 4,
             references_per_view: 0,
-            occlusion: true,
-            alignment: false,
         }
     }
 }

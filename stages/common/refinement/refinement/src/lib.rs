@@ -35,7 +35,6 @@
 //! ```
 
 mod adam;
-mod align;
 mod consistency;
 mod convolution;
 mod error;

@@ -8,7 +8,6 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::align::align;
 use crate::sums::{COMPARED_RADIUS, Sums};
 use crate::view::{INPUTS, KnownView, REFERENCE_INPUTS, Rendered};
 use crate::warped_pixel::WarpedPixel;
@@ -19,14 +18,12 @@ use crate::warped_pixel::WarpedPixel;
 pub struct WarpOptions {
     /// True if points that are hidden in a reference, according to its own depth, are excluded.
     pub occlusion: bool,
-    /// True if a reference's pixels are moved, by up to two pixels, to fit the rendered view.
-    pub alignment: bool,
 }
 
 impl Default for WarpOptions {
-    /// Returns options that exclude hidden points and don't align references.
+    /// Returns options that exclude hidden points.
     fn default() -> Self {
-        Self { occlusion: true, alignment: false }
+        Self { occlusion: true }
     }
 }
 
@@ -162,13 +159,8 @@ fn warp(
     options: WarpOptions,
 ) -> Vec<WarpedPixel> {
     let (width, height) = (rendered.view.width, rendered.view.height);
-    // Alignment makes every compared pixel depend on its own neighbourhood.
-    let around = if options.alignment { 2 * COMPARED_RADIUS } else { COMPARED_RADIUS };
-    let near = rows.start.saturating_sub(around)..(rows.end + around).min(height);
-    let mut warped = warp_by_depth(rendered, reference, near.clone(), options.occlusion);
-    if options.alignment {
-        warped = align(&warped, rendered, reference, near.start);
-    }
+    let near = rows.start.saturating_sub(COMPARED_RADIUS)..(rows.end + COMPARED_RADIUS).min(height);
+    let warped = warp_by_depth(rendered, reference, near.clone(), options.occlusion);
     let terms = warped.iter().map(|pixel| {
         let [r, g, b] = pixel.difference.map(f64::from);
         if pixel.confidence > 0.0 { [r, g, b, 1.0] } else { [0.0; 4] }
@@ -399,25 +391,8 @@ mod tests {
         assert_eq!(judged(&view, &wall(500, |_| 2.0), WarpOptions::default()).0, 0.0);
     }
 
-    fn error_at_depth(depth: f32, alignment: bool) -> f64 {
-        let options = WarpOptions { alignment, ..WarpOptions::default() };
-        judged(&wall(0, |_| depth), &wall(24, |_| depth), options).2
-    }
-
-    /// Depths with a small error displace a warped reference by a pixel or more. Alignment corrects
-    /// the displacement, and leaves a reference with correct depth in place.
-    #[test]
-    fn alignment_moves_what_is_shown_to_where_it_fits() {
-        for depth in [1.9, 2.1] {
-            let (moved, was) = (error_at_depth(depth, true), error_at_depth(depth, false));
-            assert!(moved < 0.7 * was, "depth {depth}: {moved} off where it was {was}");
-        }
-        let right = error_at_depth(2.0, true);
-        assert!(right < 0.01, "{right}");
-    }
-
     fn seen(view: &KnownView, reference: &KnownView, occlusion: bool) -> usize {
-        let options = WarpOptions { occlusion, ..WarpOptions::default() };
+        let options = WarpOptions { occlusion };
         with_references(&view.rendered, &[reference], options).statistics[0].visible_pixels
     }
 
@@ -437,20 +412,16 @@ mod tests {
     #[test]
     fn bands_are_those_of_the_whole() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
-        for options in
-            [WarpOptions::default(), WarpOptions { alignment: true, ..WarpOptions::default() }]
-        {
-            let whole = with_references(&view.rendered, &[&reference], options).view;
-            let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, options);
-            assert_eq!(band.features.len(), 34 * WIDTH);
-            let expected =
-                whole.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
-            for (found, expected) in band.features.iter().zip(expected) {
-                assert!(
-                    found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5),
-                    "{found:?} {expected:?}"
-                );
-            }
+        let options = WarpOptions::default();
+        let whole = with_references(&view.rendered, &[&reference], options).view;
+        let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, options);
+        assert_eq!(band.features.len(), 34 * WIDTH);
+        let expected = whole.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
+        for (found, expected) in band.features.iter().zip(expected) {
+            assert!(
+                found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5),
+                "{found:?} {expected:?}"
+            );
         }
     }
 }
