@@ -15,7 +15,7 @@ root=${DESTDIR:-}$1
 home=$root/lib/nerf-sr
 if [ -e "$home" ] && [ ! -e "$home/nerf-sr" ]; then die "$home exists and has no nerf-sr; choose another PREFIX"; fi
 
-# A stage's folder, crate and binary have one name. nerf-sr-remote is optional, because it is built separately.
+# A stage's folder, crate and binary have one name; a folder may have further binaries. nerf-sr-remote is optional, because it is built separately.
 commands=(nerf-sr)
 [ ! -x "$built/nerf-sr-remote" ] || commands+=(nerf-sr-remote)
 programs=("${commands[@]}")
@@ -23,6 +23,7 @@ for folder in stages/*/; do
   name=$(basename "$folder")
   case $name in common | runner) ;; *) programs+=("$name") ;; esac
 done
+for file in stages/*/src/bin/*.rs; do programs+=("$(basename "$file" .rs)"); done
 for name in "${programs[@]}"; do
   [ -x "$built/$name" ] || die "$built/$name not found; run \`make build\`"
 done

@@ -37,6 +37,8 @@ pub fn stage_names() -> Vec<String> {
         .filter(|folder| folder.join("src/main.rs").exists())
         .map(|folder| folder.file_name().unwrap().to_str().unwrap().to_owned())
         .filter(|name| !["runner", "remote"].contains(&name.as_str()))
+        // The second program of `upsample`.
+        .chain(["train-prior".to_owned()])
         .collect();
     names.sort();
     names
