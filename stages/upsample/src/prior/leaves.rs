@@ -175,7 +175,7 @@ enum PatternKind {
     Patches,
 }
 
-/// Kinds of pattern, as often as they are drawn.
+/// Kinds of pattern; a kind that is listed twice is drawn twice as often.
 const PATTERN_KINDS: [PatternKind; 12] = [
     PatternKind::Plain,
     PatternKind::Plain,
@@ -285,7 +285,7 @@ enum ShapeKind {
     Bar,
 }
 
-/// Kinds of shape, as often as they are drawn.
+/// Kinds of shape; a kind that is listed twice is drawn twice as often.
 const SHAPE_KINDS: [ShapeKind; 12] = [
     ShapeKind::Ellipse,
     ShapeKind::Ellipse,
