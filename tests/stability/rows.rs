@@ -152,8 +152,8 @@ fn training() -> Vec<Row> {
     vec![
         rays("1", 1).fast().expect(Expected::Refused(2, "one pixel needs 4"), ""),
         rays("4", 4).expect(Psnr(3.0), "one step"),
-        rays("1 M", 1_000_000).expect(Like(5.0), "longer"),
-        rays("4 M", 4_000_000).expect(Like(5.0), "longer"),
+        rays("1 M", 1_000_000).expect(Psnr(20.0), "longer"),
+        rays("4 M", 4_000_000).expect(Psnr(20.0), "longer"),
         rates("grid × 10", 0.6, 0.01).expect(Like(5.0), "noisier steps"),
         rates("MLPs × 10", 0.06, 0.1).expect(Like(5.0), "noisier steps"),
         rates("both × 10", 0.6, 0.1).expect(Like(5.0), "noisier steps"),

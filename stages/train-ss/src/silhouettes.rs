@@ -46,7 +46,8 @@ struct Silhouette {
 }
 
 impl Silhouette {
-    /// Returns the silhouette of a photograph; `None` if the photograph has no transparent pixel.
+    /// Returns the silhouette of a photograph; `None` if the photograph has no transparent pixel, or
+    /// no opaque one: from far away, an object may be smaller than a pixel.
     fn new(photograph: &Photograph) -> Option<Self> {
         let Photograph { image, mask } = photograph;
         if image.channels < 4 {
@@ -67,7 +68,7 @@ impl Silhouette {
             }
         }
         let opaque = *sums.last()? as usize;
-        (opaque < width * height).then_some(Self { width, height, sums })
+        (1..width * height).contains(&opaque).then_some(Self { width, height, sums })
     }
 
     /// Excludes the cells that lie behind transparent pixels alone.
@@ -193,6 +194,15 @@ mod tests {
         assert!(Silhouette::new(&white.into()).is_none());
         let without_alpha = Image::new(4, 4, 3, vec![0.0; 48]);
         assert!(Silhouette::new(&without_alpha.into()).is_none());
+    }
+
+    /// From far away the sphere is smaller than a pixel, and the photograph displays none of it.
+    #[test]
+    fn empty_photographs_carve_nothing() {
+        let cells = carved(&[camera(2000.0 * DVec3::new(0.6, 0.0, 0.8))], |photograph| {
+            photograph.image.data.fill(0.0);
+        });
+        assert!(cells.into_iter().all(|kept| kept));
     }
 
     /// Sums of any rectangle equal a count of its pixels.
