@@ -120,7 +120,7 @@ fn sizes_that_cannot_be() {
         |_, _| {},
         &["-p", "lr_width=64", "-p", "scale=1"],
         2,
-        &["lr_width = 64", "larger than", "32"],
+        &["lr_width = 64 and scale = 1 give HR images of 64 pixels", "32 pixels wide"],
     );
     refused(|_, _| {}, &["-p", "lr_width=0"], 2, &["stage prep", "parameter lr_width", "minimum"]);
     refused(|_, _| {}, &["-p", "kernel=gauss"], 2, &["parameter kernel", "lanczos"]);
@@ -229,7 +229,12 @@ fn pipelines_that_cannot_be_used() {
             "no subtree \"test\"; known: cameras, downscaled, references, train, train-cameras, \
             truth",
         ),
-        ("prep/train}", "prep/truth}", 10, "takes scene/train, but prep/truth is scene/truth"),
+        (
+            "prep/train}",
+            "prep/truth}",
+            10,
+            "takes scene/train or views, but prep/truth is scene/truth",
+        ),
         (
             "{dataset: demo-scene}",
             "{dataset: render-depth}",
