@@ -126,17 +126,3 @@ fn a_film_of_refined_views() {
     let films = std::fs::read_dir(project.path("out/refined-video")).unwrap();
     assert!(films.map(|entry| entry.unwrap().file_name()).all(|name| name != "downscaled-views"));
 }
-
-#[test]
-fn a_list_of_poses_is_a_path_and_a_wrong_one_is_refused() {
-    let project = project();
-    project.replace(
-        "{frames: 6}",
-        "{poses: [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]], [[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 4]]]}",
-    );
-    project.ok(&["run", "camera-path"]);
-    let summary = project.artifact("camera-path", &["camera-path"]).join("summary.txt");
-    assert!(std::fs::read_to_string(summary).unwrap().contains("2 frames of 48×48, list"));
-    project.replace("[1, 0, 0, 1]", "[3, 0, 0, 1]");
-    project.run(&["run", "camera-path"]).fails(2, &["poses", "frame_00001", "not a rigid motion"]);
-}
