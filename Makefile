@@ -196,7 +196,7 @@ compare-engines: build ## Compare training and rendering of this build and of AG
 reference: build ## Regenerate schemas/ and docs/reference/ from the types and the built programs
 	UPDATE=1 cargo test --release --workspace --exclude $(REMOTE) --test schemas
 
-prior: build ## Train upsample's own network again (45 minutes of a processor)
+prior: build ## Train upsample's own network again: stages/upsample/src/prior/prior_x4.safetensors
 	rm -rf out/prior && mkdir -p out
 	target/release/train-prior --output out/prior
 	cp out/prior/prior_x4.safetensors stages/upsample/src/prior/
