@@ -75,7 +75,7 @@ fn training(rays: u32) -> String {
     let params = json!({
         "rays": rays,
         "n_levels": 4,
-        "max_resolution": 64,
+        "cells_per_pixel": 1.28,
         "log2_hashmap_size": 12,
         "hidden_dim": 16,
         "march_steps": 128,

@@ -11,7 +11,7 @@ use common::{
 
 /// Long enough for several checkpoints, the first after a second; with all that a checkpoint may
 /// hold.
-const PARAMS: &str = r#"{"supervision": "kernel", "exposure": true, "pose_refinement": true, "ensemble": 2, "rays": 200000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 256, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
+const PARAMS: &str = r#"{"supervision": "kernel", "exposure": true, "pose_refinement": true, "ensemble": 2, "rays": 200000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 256, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
 /// In the second member's training. The first one's rays count twice, since poses are compared.
 const SLOW_FROM: u64 = 240_000;
 

@@ -27,7 +27,7 @@ const SHORT: [&str; 12] = [
     "-p",
     "n_levels=2",
     "-p",
-    "max_resolution=32",
+    "cells_per_pixel=0.64",
     "-p",
     "log2_hashmap_size=10",
     "-p",

@@ -127,7 +127,7 @@ stages:
     inputs: {dataset: demo-scene}
   train-ss:
     inputs: {scene: prep/train}
-    parameters: {rays: 600000, n_levels: 6, max_resolution: 256, log2_hashmap_size: 14, hidden_dim: 16, march_steps: 192, max_rays_per_step: 2048, samples_per_step: 32768}
+    parameters: {rays: 600000, n_levels: 6, cells_per_pixel: 2.56, log2_hashmap_size: 14, hidden_dim: 16, march_steps: 192, max_rays_per_step: 2048, samples_per_step: 32768}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
   eval:

@@ -361,7 +361,7 @@ fn has_signal(process: &std::process::Child, set: &str, signal: u32) -> bool {
 fn a_terminal_that_goes_away_leaves_a_checkpoint() {
     let project = Project::tiny();
     let train = demo_train(&project, 8);
-    let params = r#"{"rays": 900000000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
+    let params = r#"{"rays": 900000000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12, "hidden_dim": 16, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
     let (output, work) = (project.path("out"), project.path("work"));
     let stage = stage_command(
         "train-ss",

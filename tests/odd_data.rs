@@ -286,7 +286,7 @@ stages:
     parameters: {lr_width: 16, scale: 2}
   train-ss:
     inputs: {scene: prep/train, references: prep/references}
-    parameters: {rays: 8000, n_levels: 4, max_resolution: 32, log2_hashmap_size: 11, hidden_dim: 16, march_steps: 128, max_rays_per_step: 1024, samples_per_step: 8192}
+    parameters: {rays: 8000, n_levels: 4, cells_per_pixel: 1, log2_hashmap_size: 11, hidden_dim: 16, march_steps: 128, max_rays_per_step: 1024, samples_per_step: 8192}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
   eval:

@@ -108,7 +108,7 @@ const CASES: &[Case] = &[
     },
     Case {
         stage: "train-ss",
-        params: r#"{"rays": 1000000000000, "log2_hashmap_size": 14, "max_resolution": 256}"#,
+        params: r#"{"rays": 1000000000000, "log2_hashmap_size": 14}"#,
         inputs: &[("scene", "scene/train")],
         goes_on: Some("resuming from step"),
         ..CASE

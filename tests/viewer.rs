@@ -180,7 +180,7 @@ fn clear_scene(demo_scene: &str) -> String {
     format!(
         "  demo-scene:\n    parameters: {{size: 64, train: 40{demo_scene}}}\n  \
         prep:\n    parameters: {{lr_width: 32}}\n  \
-        train-ss:\n    parameters: {{rays: 300000, n_levels: 8, max_resolution: null, \
+        train-ss:\n    parameters: {{rays: 300000, n_levels: 8, cells_per_pixel: 2.56, \
         log2_hashmap_size: null, hidden_dim: 64, march_steps: null, max_rays_per_step: 8192, \
         samples_per_step: 24576}}\n"
     )

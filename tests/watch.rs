@@ -10,7 +10,7 @@ use std::process::Command;
 use common::{Finished, Project, demo_train, manifest, stage, stage_command};
 use serde_json::json;
 
-const PARAMETERS: &str = r#"{"rays": 60000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12,
+const PARAMETERS: &str = r#"{"rays": 60000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12,
     "hidden_dim": 16, "march_steps": 128, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
 
 /// A training with checkpoints.

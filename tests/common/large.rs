@@ -13,7 +13,7 @@ pub struct Small {
     pub project: Project,
 }
 
-const FIELD: &str = r#"{"rays": 60000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
+const FIELD: &str = r#"{"rays": 60000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
 
 impl Small {
     /// Runs the stages up to a field, its LR views and a refiner.

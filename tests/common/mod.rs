@@ -86,7 +86,7 @@ stages:
     parameters: {lr_width: 24, scale: 2}
   train-ss:
     inputs: {scene: prep/train}
-    parameters: {rays: 60000, n_levels: 4, max_resolution: 64, log2_hashmap_size: 12, hidden_dim: 16, march_steps: 128, max_rays_per_step: 2048, samples_per_step: 16384}
+    parameters: {rays: 60000, n_levels: 4, cells_per_pixel: 1.28, log2_hashmap_size: 12, hidden_dim: 16, march_steps: 128, max_rays_per_step: 2048, samples_per_step: 16384}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
   eval:
@@ -104,7 +104,7 @@ stages:
     parameters: {lr_width: 16, scale: 2}
   train-ss:
     inputs: {scene: prep/train}
-    parameters: {rays: 4000, n_levels: 2, max_resolution: 32, log2_hashmap_size: 10, hidden_dim: 16, march_steps: 64, max_rays_per_step: 512, samples_per_step: 4096}
+    parameters: {rays: 4000, n_levels: 2, cells_per_pixel: 0.64, log2_hashmap_size: 10, hidden_dim: 16, march_steps: 64, max_rays_per_step: 512, samples_per_step: 4096}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
     parameters: {samples_per_axis: 1}

@@ -26,7 +26,7 @@ impl Default for Setup {
         Self {
             capture: Capture::default(),
             prep: json!({"lr_width": 24}),
-            train: json!({"rays": 100_000, "n_levels": 3, "max_resolution": 32,
+            train: json!({"rays": 100_000, "n_levels": 3, "cells_per_pixel": 1.28,
                 "log2_hashmap_size": 12, "hidden_dim": 16,
                 "march_steps": 64, "max_rays_per_step": 1024, "samples_per_step": 8192}),
             render: json!({"samples_per_axis": 1}),

@@ -147,7 +147,7 @@ pub struct GridParams {
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
     pub pixel_importance: f64,
     /// Samples along the diagonal of the unit cube. Default: 256 in NDC, where every ray crosses
-    /// the whole cube; otherwise 512.
+    /// the whole cube; otherwise 512. Fewer, in proportion, for `cells_per_pixel` below 2.56.
     #[schemars(range(min = 16, max = 8192), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub march_steps: Option<u32>,
     /// Weight of the distortion loss, which concentrates the sample weights along a ray. Default:
@@ -173,12 +173,12 @@ pub struct GridParams {
     /// Levels of the grid.
     #[schemars(range(min = 1, max = 16), extend("x-group" = "field"))]
     pub n_levels: u32,
-    /// Cells along an axis of the finest level. Default: 2.56 cells for each LR pixel across the
-    /// unit cube.
-    #[schemars(range(min = 16, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
-    pub max_resolution: Option<u32>,
-    /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at a
-    /// `max_resolution` of 256, plus 2 for each doubling of `max_resolution`.
+    /// Cells of the finest level for each LR pixel across the unit cube, but 32 to 2048 cells in
+    /// all.
+    #[schemars(range(min = 0.1, max = 16.0), extend("x-group" = "field"))]
+    pub cells_per_pixel: f64,
+    /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at 256 cells across
+    /// the finest level, plus 2 for each doubling.
     #[schemars(range(min = 8, max = 22), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub log2_hashmap_size: Option<u32>,
     /// Width of the MLPs' hidden layers.
@@ -203,7 +203,7 @@ impl Default for GridParams {
             learning_rate_decay: 0.16,
             ema_decay: 0.97,
             n_levels: grid.n_levels,
-            max_resolution: None,
+            cells_per_pixel: radiance::CELLS_PER_PIXEL,
             log2_hashmap_size: None,
             hidden_dim: grid.hidden_dim,
         }

@@ -104,7 +104,7 @@ impl GridParams {
     fn architecture(&self, scene: &SceneFacts) -> Architecture {
         let given = GivenSizes {
             n_levels: self.n_levels,
-            max_resolution: self.max_resolution,
+            cells_per_pixel: self.cells_per_pixel,
             log2_hashmap_size: self.log2_hashmap_size,
             hidden_dim: self.hidden_dim,
             march_steps: self.march_steps,

@@ -74,12 +74,12 @@ impl Architecture {
 
 /// Sizes of a grid field as given by a user; a scene decides the others. Deserialised from the
 /// parameters of `train-ss`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct GivenSizes {
     /// Number of grid levels.
     pub n_levels: u32,
-    /// Cells along an axis of the finest level.
-    pub max_resolution: Option<u32>,
+    /// Cells of the finest level for each LR pixel across the field's cube.
+    pub cells_per_pixel: f64,
     /// Base-2 logarithm of the maximum number of entries per level.
     pub log2_hashmap_size: Option<u32>,
     /// Width of the hidden layers.
@@ -88,10 +88,15 @@ pub struct GivenSizes {
     pub march_steps: Option<u32>,
 }
 
-/// Cells of the finest level per LR pixel across the field (design note 006).
-const CELLS_PER_PIXEL: f64 = 2.56;
-/// Range of the finest level's cells along an axis by this rule; chosen by hand.
-const MAX_RESOLUTION_RANGE: (f64, f64) = (64.0, 2048.0);
+/// Default number of cells of the finest level for each LR pixel across the field's cube (design
+/// note 006).
+pub const CELLS_PER_PIXEL: f64 = 2.56;
+/// Samples along the diagonal of the unit cube by default, and in NDC, where every ray crosses the
+/// whole cube (design note 008).
+const MARCH_STEPS: f64 = 512.0;
+const MARCH_STEPS_IN_NDC: f64 = 256.0;
+/// Range of the finest level's cells along an axis; chosen by hand.
+const MAX_RESOLUTION_RANGE: (f64, f64) = (32.0, 2048.0);
 /// Range of the base-2 logarithm of a level's entries by rule; chosen by hand.
 const LOG2_HASHMAP_RANGE: (f64, f64) = (14.0, 20.0);
 
@@ -99,13 +104,15 @@ impl GivenSizes {
     /// Sets every size for a scene with `pixels_across` LR pixels across the field's cube.
     pub fn for_scene(&self, pixels_across: f64, is_ndc: bool) -> Architecture {
         let (low, high) = MAX_RESOLUTION_RANGE;
-        let by_width = (CELLS_PER_PIXEL * pixels_across).round().clamp(low, high) as u32;
-        let finest = self.max_resolution.unwrap_or(by_width);
+        let finest = (self.cells_per_pixel * pixels_across).round().clamp(low, high);
         // The number of cells at surfaces grows with the square of the resolution.
         let (low, high) = LOG2_HASHMAP_RANGE;
-        let by_finest =
-            (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(low, high) as u32;
-        let steps = self.march_steps.unwrap_or(if is_ndc { 256 } else { 512 });
+        let by_finest = (17.0 + 2.0 * (finest / 256.0).log2()).round().clamp(low, high) as u32;
+        let by_space = if is_ndc { MARCH_STEPS_IN_NDC } else { MARCH_STEPS };
+        let steps = self.march_steps.unwrap_or_else(|| {
+            // Samples needn't be closer in a coarser field.
+            (by_space * (self.cells_per_pixel / CELLS_PER_PIXEL).min(1.0)).round().max(16.0) as u32
+        });
         let Architecture { base_resolution, mut finest_z, .. } = Architecture::default();
         if is_ndc {
             // Samples along z across the cube: more cells would get none (design note 027).
@@ -114,7 +121,7 @@ impl GivenSizes {
         Architecture {
             n_levels: self.n_levels,
             base_resolution,
-            max_resolution: finest,
+            max_resolution: finest as u32,
             finest_z,
             log2_hashmap_size: self.log2_hashmap_size.unwrap_or(by_finest),
             hidden_dim: self.hidden_dim,

@@ -1,35 +1,14 @@
 //! Models of the stages' processor time and peak memory.
 
-use radiance::GivenSizes;
-use serde::Deserialize as _;
+mod training;
+
 use serde_json::Value;
 use store::ModelCost;
-use workload::{
-    ExportViews, PixelStorage, RayBudget, TrainingMemory, grid_training_bytes, program_bytes,
-};
+use workload::{ExportViews, program_bytes};
 
-use super::work::{Images, SceneKind, Work};
+use super::work::{Images, Work};
+use training::{field_factor, training_memory, training_need, training_seconds};
 
-/// Seconds per training ray late in a training: lego 100×2, fern 252×2 and the demo scene with
-/// backdrop (docs/results/engine.md).
-const OBJECT_RAY_SECONDS: f64 = 12e-6;
-const FRUSTUM_RAY_SECONDS: f64 = 27e-6;
-const UNBOUNDED_RAY_SECONDS: f64 = 22e-6;
-/// Exponents by which a ray's cost grows with `march_steps` and `hidden_dim`: 0.58 and 0.68 of the
-/// time at half of either (docs/design/008).
-const STEPS_EXPONENT: f64 = 0.8;
-const HIDDEN_EXPONENT: f64 = 0.55;
-/// Late rays of the default sizes that cost as much as the higher cost of the first steps
-/// (docs/design/048), of any size: a draft of lego 100×2 takes 16.3 s.
-const FIRST_STEPS_RAYS: f64 = 1.1e6;
-/// Rays in which this cost falls to its e-th part: a draft of the demo scene with 200,000 rays takes
-/// 6.4 s.
-const FIRST_STEPS_LENGTH: f64 = 330e3;
-/// Seconds per training ray of the paper's field (docs/results/engine.md: 369 rays a second on two
-/// cores).
-const MLP_RAY_SECONDS: f64 = 5.4e-3;
-/// Minimum bytes of the paper's field, as in `train-ss`.
-const MLP_BYTES: u64 = 500_000_000;
 /// Seconds per rendered ray, and part of the pixels that get all rays at the default tolerance, of
 /// objects and opaque scenes (docs/results/engine.md).
 const OBJECT_RENDERED_RAY_SECONDS: f64 = 4.4e-6;
@@ -123,79 +102,6 @@ fn prep_memory(work: &Work) -> u64 {
     PREP_BYTES + (views * work.preparation_bytes as f64) as u64
 }
 
-/// Returns the factor of a ray's cost over that of a field with the default sizes.
-fn field_factor(field: &Value, kind: SceneKind) -> Option<f64> {
-    let by_default = GivenSizes {
-        max_resolution: None,
-        log2_hashmap_size: None,
-        march_steps: None,
-        ..GivenSizes::deserialize(field).ok()?
-    };
-    let is_ndc = kind == SceneKind::Frustum;
-    let by_default = by_default.for_scene(1.0, is_ndc);
-    let own = GivenSizes::deserialize(field).ok()?.for_scene(1.0, is_ndc);
-    let steps = f64::from(own.march_steps) / f64::from(by_default.march_steps);
-    let hidden =
-        f64::from(own.hidden_dim) / f64::from(radiance::Architecture::default().hidden_dim);
-    Some(steps.powf(STEPS_EXPONENT) * hidden.powf(HIDDEN_EXPONENT))
-}
-
-fn training_seconds(parameters: &Value, work: &Work) -> Option<f64> {
-    if parameters["field"] == "mlp" {
-        return Some(number(parameters, "rays")? * MLP_RAY_SECONDS);
-    }
-    let budget = RayBudget::deserialize(parameters).ok()?;
-    let is_opaque = work.kind.is_opaque();
-    let rays = budget.total(work.images.pixels, is_opaque, work.is_fine_tuning) as f64;
-    let fields = number(parameters, "ensemble")?;
-    let first_steps = if work.is_fine_tuning { 0.0 } else { fields * first_steps(rays / fields) };
-    let ray = match work.kind {
-        SceneKind::Object => OBJECT_RAY_SECONDS,
-        SceneKind::Frustum => FRUSTUM_RAY_SECONDS,
-        SceneKind::Unbounded => UNBOUNDED_RAY_SECONDS,
-    };
-    Some(ray * (field_factor(parameters, work.kind)? * rays + first_steps))
-}
-
-/// Returns the higher cost of the first steps of a training of one field, in late rays.
-fn first_steps(rays: f64) -> f64 {
-    FIRST_STEPS_RAYS * (1.0 - (-rays / FIRST_STEPS_LENGTH).exp())
-}
-
-fn training_memory(parameters: &Value, work: &Work) -> Option<u64> {
-    Some(training_need(parameters, work)?.total(program_bytes(true)))
-}
-
-/// Returns the memory of a training as `train-ss` computes it, with the largest image for each.
-fn training_need(parameters: &Value, work: &Work) -> Option<TrainingMemory> {
-    let field = if parameters["field"] == "mlp" {
-        MLP_BYTES
-    } else {
-        // The runner gives every stage a folder for checkpoints.
-        grid_training_bytes(work.grid_floats(parameters)?, true)
-    };
-    let has_kernel = match parameters["supervision"].as_str() {
-        Some(supervision) => supervision == "kernel",
-        None => parameters["field"] != "mlp",
-    };
-    let supersample = number(parameters, "supersample")?;
-    let storage = PixelStorage {
-        is_opaque: work.kind.is_opaque(),
-        has_cache: has_kernel && !(work.has_box_kernel && supersample.fract() == 0.0),
-        refines_poses: parameters["pose_refinement"] == true,
-    };
-    let mut memory = TrainingMemory { field, ..TrainingMemory::default() };
-    let size = work.images.largest;
-    let hr_size = [size.0, size.1].map(|side| (side as f64 * supersample).round() as u64);
-    for _ in 0..work.images.count {
-        memory.add_photograph(storage, size, (hr_size[0], hr_size[1]));
-    }
-    for _ in 0..work.references.count {
-        memory.add_reference(storage, work.references.largest);
-    }
-    Some(memory)
-}
-
 fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
     let (ray, detailed) = if work.kind.is_opaque() {
         (OPAQUE_RENDERED_RAY_SECONDS, OPAQUE_DETAILED_PIXELS)
@@ -206,7 +112,11 @@ fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
     if field["field"] == "mlp" {
         return None;
     }
-    let detailed = if number(parameters, "tolerance")? > 0.0 { detailed } else { 1.0 };
+    let detailed = if number(parameters, "tolerance")? > 0.0 {
+        detailed * work.resolved_part(field)?
+    } else {
+        1.0
+    };
     let further = number(parameters, "samples_per_axis")?.powi(2) - 1.0;
     let rays = work.images.pixels as f64 * (1.0 + detailed * further);
     Some(number(field, "ensemble")? * rays * ray * field_factor(field, work.kind)?)
@@ -268,6 +178,7 @@ fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
 mod tests {
     use serde_json::json;
 
+    use super::super::work::SceneKind;
     use super::*;
 
     /// Returns square images, whose LR width is that of the field.
@@ -288,11 +199,11 @@ mod tests {
     }
 
     /// Returns the default parameters of a training.
-    fn training(rays: u64) -> Value {
+    pub(super) fn training(rays: u64) -> Value {
         json!({
             "field": "grid", "rays": rays, "rays_per_pixel": 1, "min_rays": 1, "max_rays": 1,
             "ensemble": 1, "supersample": 2.0, "supervision": null, "pose_refinement": false,
-            "n_levels": 8, "max_resolution": null, "log2_hashmap_size": null,
+            "samples_per_step": 24_576, "n_levels": 8, "cells_per_pixel": 2.56, "log2_hashmap_size": null,
             "hidden_dim": 64, "march_steps": null,
         })
     }
@@ -398,23 +309,6 @@ mod tests {
             let ratio = peak_memory / 1e6 / measured;
             assert!((0.8..1.2).contains(&ratio), "{name}: {peak_memory} B for {measured} MB");
         }
-    }
-
-    /// Half of the steps and of the width make rays cheaper, by the measured exponents.
-    #[test]
-    fn smaller_networks_and_fewer_steps_are_cheaper() {
-        let factor = |march_steps: Value, hidden_dim: u32, kind| {
-            let mut field = training(1);
-            field["march_steps"] = march_steps;
-            field["hidden_dim"] = hidden_dim.into();
-            field_factor(&field, kind).unwrap()
-        };
-        for kind in [SceneKind::Object, SceneKind::Unbounded] {
-            assert_eq!(factor(Value::Null, 64, kind), 1.0);
-            assert!((factor(json!(256), 64, kind) - 0.574).abs() < 1e-3);
-            assert!((factor(Value::Null, 32, kind) - 0.683).abs() < 1e-3);
-        }
-        assert_eq!(factor(json!(256), 64, SceneKind::Frustum), 1.0);
     }
 
     #[test]

@@ -175,7 +175,8 @@ impl SceneImages {
                 ("downscaled", images(&split.train, lr / scale)),
                 ("train-cameras", images(&split.train, hr)),
                 ("cameras", images(&test, hr)),
-                ("truth", images(&test, hr)),
+                // Without HR truth, views are scored at the size of the photographs.
+                ("truth", images(&test, if is_downscaled { hr } else { lr })),
                 ("references", images(references, hr)),
             ],
         }
@@ -305,7 +306,7 @@ mod tests {
             Some(Images { count, pixels: count * largest.0 * largest.1, largest })
         };
         assert_eq!(scene.images("train"), images(7, 1));
-        assert_eq!(scene.images("truth"), images(2, 2));
+        assert_eq!(scene.images("truth"), images(2, 1));
         assert_eq!(scene.preparation_bytes, preparation_bytes(7, 640 * 480, 0));
         assert!(scene.has_box_kernel);
         let lanczos = json!({"scale": 2, "kernel": "lanczos", "lr_width": 320});

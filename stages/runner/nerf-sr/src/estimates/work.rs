@@ -86,6 +86,14 @@ impl Work {
         Some(Self { kind, images, threads, ..Self::default() })
     }
 
+    /// Returns the part of the LR pixels' area that a field of limited size resolves.
+    pub(crate) fn resolved_part(&self, training: &Value) -> Option<f64> {
+        let sizes = GivenSizes::deserialize(training).ok()?;
+        let cells = sizes.for_scene(self.pixels_across, self.kind == SceneKind::Frustum);
+        let wanted = radiance::CELLS_PER_PIXEL * self.pixels_across.max(1.0);
+        Some((f64::from(cells.max_resolution) / wanted).powi(2).min(1.0))
+    }
+
     /// Returns the number of floats of a grid that is trained with some parameters.
     pub(crate) fn grid_floats(&self, training: &Value) -> Option<u64> {
         let sizes = GivenSizes::deserialize(training).ok()?;
