@@ -155,16 +155,17 @@ ifneq ($(PAPER_STEPS),0)
 	@$(NERF_SR) run paper-ablation -j 1 --out out/paper-ablation $(chosen) -p train-paper.steps=$(PAPER_STEPS)
 endif
 
-# Data sets whose test views are withheld training views; settings are chosen on them.
+# Data sets whose test views are withheld training views; settings are chosen on them. `prep` itself holds photographs out.
 held-out:
-	@for scene in $(or $(SCENES),lego chair); do for folder in nerf_synthetic nerf_llff_data .; do \
-	  if [ -d $(DATA)/$$folder/$$scene ]; then python3 scripts/hold-out.py $(DATA)/$$folder/$$scene out/held-out/$$scene; break; fi; done; done >/dev/null
+	@mkdir -p out/held-out; for scene in $(or $(SCENES),lego chair); do for folder in nerf_synthetic nerf_llff_data .; do \
+	  if [ -f $(DATA)/$$folder/$$scene/transforms_train.json ]; then python3 scripts/hold-out.py $(DATA)/$$folder/$$scene out/held-out/$$scene; break; \
+	  elif [ -d $(DATA)/$$folder/$$scene ]; then ln -sfn "$$(realpath $(DATA)/$$folder/$$scene)" out/held-out/$$scene; break; fi; done; done >/dev/null
 
 ablation tradeoff: HELD_OUT = out/held-out
 ablation: build held-out ## Measure PSNR and time of each part of the training, on withheld training views
 	@$(call experiment,ablation,$(if $(VARIANTS),--first-variants $(VARIANTS)))
 
-tradeoff: build held-out ## Measure PSNR against training time, on withheld training views
+tradeoff: build held-out ## Measure accuracy, time and memory of the qualities and of parts, on withheld views: make tradeoff SCENES=fern PROTOCOLS=252x2
 	@$(call experiment,tradeoff)
 
 seeds: build ## Measure the spread of the PSNR over ten seeds of the demo scene

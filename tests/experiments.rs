@@ -95,10 +95,16 @@ fn variants_stand_beside_the_first() {
         "data",
         "--protocol",
         "24x2",
+        "--first-variants",
+        "3",
         "-p",
-        "train-ss.rays=30000,60000",
+        "train-ss.rays=20000",
     ]);
-    assert_eq!(column(&rows(&project, "tradeoff"), "rays"), ["30000", "60000"]);
+    assert_eq!(column(&rows(&project, "tradeoff"), "variant"), ["draft", "fast", "balanced"]);
+    let text = table(&project, "tradeoff");
+    assert!(text.contains(" | front | ") && text.contains(" | ● | "), "{text}");
+    assert!(text.contains("](front.svg)"), "{text}");
+    assert!(project.path("out/tradeoff/front.svg").exists());
     project.ok(&["run", "seeds", "-p", "train-ss.rays=30000", "-p", "train-ss.seed=3,4"]);
     assert!(
         table(&project, "seeds").contains("\nPSNR over 2 results: "),

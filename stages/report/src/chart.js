@@ -103,7 +103,7 @@ function axis(values, { log = false, names = null, count = 5 }) {
 /**
  * Chart in the element `home`. `spec` has: `title`; `x` and `y`, each with `label`, and for x `log` or `names`; `series`,
  * each with `label`, `points` of `x`, `y`, `text` and `key`, and `chosen` if it is highlighted; `lines`; `named` if points
- * are labelled with their series' names where there is room; `pick(point)`.
+ * are labelled with their series' names where there is room; `front`, points that a dashed line joins; `pick(point)`.
  */
 class Chart {
   constructor(home) {
@@ -148,6 +148,7 @@ class Chart {
     this.svg = shape("svg", { width: this.width, height: HEIGHT, "aria-hidden": "true" }, plot);
     this.at = (point) => [MARGIN.left + x.place(point.x) * inner[0], MARGIN.top + (1 - y.place(point.y)) * inner[1]];
     this.frame(x, y, inner);
+    if (spec.front?.length > 1) shape("path", { class: "front", d: this.path(spec.front) }, this.svg);
     const isCrowded = spec.series.length > MAX_COLOURS;
     const order = spec.series
       .map((series, i) => ({ series, i }))
@@ -200,16 +201,15 @@ class Chart {
     }
   }
 
+  /** Returns the path of a line through points. */
+  path(points) {
+    return `M${points.map((point) => this.at(point).map((v) => v.toFixed(1)).join(" ")).join("L")}`;
+  }
+
   drawSeries(series, colour, index) {
     const group = shape("g", { class: `series ${colour}` }, this.svg);
     const places = series.points.map((point) => this.at(point));
-    if (this.spec.lines && places.length > 1) {
-      shape(
-        "path",
-        { class: "line", d: `M${places.map((place) => place.map((v) => v.toFixed(1)).join(" ")).join("L")}` },
-        group,
-      );
-    }
+    if (this.spec.lines && places.length > 1) shape("path", { class: "line", d: this.path(series.points) }, group);
     const mark = MARKS[colour === "rest" ? 0 : Number(colour.slice(1))];
     series.points.forEach((point, i) => {
       const [x, y] = places[i];

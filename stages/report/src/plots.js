@@ -12,6 +12,18 @@ function duration(seconds) {
   return seconds < 90 ? `${seconds.toFixed(1)} s` : `${(seconds / 60).toFixed(1)} min`;
 }
 
+/** Returns the points that no other point beats in both coordinates, from the least x. */
+function frontOf(points, lowerIsBetter) {
+  const value = ({ y }) => (lowerIsBetter ? -y : y);
+  const sorted = points.toSorted((a, b) => a.x - b.x || value(b) - value(a));
+  let best = -Infinity;
+  return sorted.filter((point) => {
+    const isBetter = value(point) > best;
+    best = Math.max(best, value(point));
+    return isBetter;
+  });
+}
+
 class Plots {
   /** `show(view)` shows a view in the comparison. */
   constructor(data, show) {
@@ -107,8 +119,13 @@ class Plots {
       const text = `${row.label}: ${this.text(y, figure)} in ${duration(row.training)}`;
       return [{ label: row.label, points: [{ x: row.training, y, text }], chosen: this.mark(index) }];
     });
+    const front = frontOf(
+      series.flatMap(({ points }) => points),
+      figures[figure].label.includes("↓"),
+    );
     return {
-      title: `${figures[figure].label} against training time`,
+      title: `${figures[figure].label} against training time${front.length > 1 ? "; dashed: no result is faster and better" : ""}`,
+      front,
       named: series.length <= MAX_NAMES,
       x: { label: "Training time, s", log: isLog(times) },
       y: { label: figures[figure].label },

@@ -10,7 +10,7 @@ pub(crate) struct Figures(BTreeMap<String, ScoreFormat>);
 
 /// Values that the table adds to those of metrics: name, title, digits, and true if higher values
 /// are better.
-const ADDED: [(&str, &str, usize, bool); 8] = [
+const ADDED: [(&str, &str, usize, bool); 10] = [
     ("least_gain", "least gain", 2, true),
     ("near_psnr", "near psnr", 2, true),
     ("gain", "gain", 2, true),
@@ -19,6 +19,8 @@ const ADDED: [(&str, &str, usize, bool); 8] = [
     ("samples_per_ray", "samples per ray", 1, false),
     ("rays_per_s", "rays/s", 0, true),
     ("views", "views", 0, true),
+    ("peak_mb", "peak memory, MB", 0, false),
+    ("field_mb", "field, MB", 1, false),
 ];
 
 impl Figures {
@@ -66,6 +68,7 @@ impl Figures {
         }
         match (name, added(name)) {
             ("train_s", _) => "training".to_owned(),
+            ("train_cpu_s", _) => "training, processor".to_owned(),
             ("render_s", _) => "rendering".to_owned(),
             ("refine_s", _) => "refining".to_owned(),
             (_, Some((title, ..))) => title.to_owned(),

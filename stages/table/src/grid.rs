@@ -4,6 +4,7 @@ use serde_json::Value;
 use stage::plain;
 
 use crate::figures::Figures;
+use crate::front::{Axes, Point};
 use crate::params::Params;
 use crate::rows::{GROUP, MISSING};
 use crate::values::{Row, distinct, listed, mean, select};
@@ -37,12 +38,17 @@ impl Layout<'_> {
             .filter(|name| all.iter().any(|row| row.contains_key(*name)))
             .collect();
         let mut lines = vec![self.head(&columns, &values)];
+        let front = self.front(rows);
         for line in distinct(rows, &self.keys) {
-            lines.push(self.line(rows, rows, &line, (&columns, &values)));
+            let mut cells = self.line(rows, rows, &line, (&columns, &values));
+            self.add_front(&mut cells, &front);
+            lines.push(cells);
         }
         for line in distinct(&further, &self.keys) {
             // Rows from other sources are never the best.
-            lines.push(self.line(&further, &[], &line, (&columns, &values)));
+            let mut cells = self.line(&further, &[], &line, (&columns, &values));
+            self.add_front(&mut cells, &[]);
+            lines.push(cells);
         }
         markdown_table(&lines)
     }
@@ -58,8 +64,53 @@ impl Layout<'_> {
             }
         }
         head.extend(self.reference.is_some().then(|| "against the first".to_owned()));
+        head.extend(self.params.front.is_some().then(|| "front".to_owned()));
         head.extend(PROVENANCE.map(str::to_owned));
         head
+    }
+
+    /// Returns the names of the values that make the front; `None` without a front.
+    fn axes(&self) -> Option<Axes<'_>> {
+        let score = self.params.compared_value();
+        Some(Axes {
+            cost: self.params.front.as_ref()?,
+            score,
+            lower_is_better: self.figures.lower_is_better(score),
+        })
+    }
+
+    /// Returns the lines that have both values of the front, named by their keys.
+    fn points(&self, rows: &[Row], axes: &Axes<'_>) -> Vec<Point> {
+        let point = |keys: Vec<String>| {
+            let line = select(rows, &self.keys, &keys);
+            let (cost, score) = (mean(&line, axes.cost)?, mean(&line, axes.score)?);
+            Some(Point { name: keys.join(", "), cost, score })
+        };
+        distinct(rows, &self.keys).into_iter().filter_map(point).collect()
+    }
+
+    /// Returns the names of the lines on the front.
+    fn front(&self, rows: &[Row]) -> Vec<String> {
+        let Some(axes) = self.axes() else { return Vec::new() };
+        let points = self.points(rows, &axes);
+        let is_on_front = axes.front(&points).into_iter();
+        let named = points.into_iter().zip(is_on_front);
+        named.filter_map(|(point, is_on_front)| is_on_front.then_some(point.name)).collect()
+    }
+
+    /// Draws the lines by both values of the front.
+    pub(crate) fn front_picture(&self, rows: &[Row]) -> Option<String> {
+        let axes = self.axes()?;
+        axes.picture(&self.points(rows, &axes), self.figures)
+    }
+
+    /// Adds the front's cell to a line, which starts with its keys, before its provenance.
+    fn add_front(&self, cells: &mut Vec<String>, front: &[String]) {
+        if self.params.front.is_some() {
+            let is_on_front = front.contains(&cells[..self.keys.len()].join(", "));
+            let mark = if is_on_front { "●" } else { "" };
+            cells.insert(cells.len() - PROVENANCE.len(), mark.to_owned());
+        }
     }
 
     /// Returns the cells of a line of `rows`; the best of `rivals` in the line's group are marked.

@@ -4,12 +4,14 @@
 //! * `rows`: a row for every result of a run, with scores, times, commit and machine.
 //! * `markdown`: the document: tables, gains, spreads, failed points.
 //! * `grid`: one table, with means where several results share a cell, and the best marked.
+//! * `front`: results that no other one beats in two values, and their picture.
 //! * `values`: a row, and values of rows by name.
 //!
 //! The stage is a sink: it gets the run's record and is never cached. Failed points are listed, and
 //! left-out results have a row with the reason.
 
 mod figures;
+mod front;
 mod grid;
 mod markdown;
 mod params;
@@ -57,11 +59,18 @@ impl Stage for Table {
         }
         context.write_json("rows.json", &rows)?;
         write_csv(context, &rows)?;
-        let text = markdown::markdown(params, &rows, &figures, &run.failed)?;
-        let path = context.output_path("table.md")?;
-        std::fs::write(&path, &text).with_context(|| format!("cannot write {}", path.display()))?;
+        let document = markdown::document(params, &rows, &figures, &run.failed)?;
+        write_text(context, "table.md", &document.text)?;
+        if let Some(picture) = &document.picture {
+            write_text(context, markdown::PICTURE, picture)?;
+        }
         context.write_summary(&format!("{} results", rows.len()))
     }
+}
+
+fn write_text(context: &Context, name: &str, text: &str) -> anyhow::Result<()> {
+    let path = context.output_path(name)?;
+    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Writes rows as CSV, with a column for every name that any row has.

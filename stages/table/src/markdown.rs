@@ -9,15 +9,27 @@ use crate::params::Params;
 use crate::rows::{GROUP, MISSING};
 use crate::values::{Row, distinct, mean, select};
 
+/// File of [`Document::picture`].
+pub(crate) const PICTURE: &str = "front.svg";
+
+/// Tables and their picture.
+pub(crate) struct Document {
+    /// Markdown, which shows the picture.
+    pub(crate) text: String,
+    /// All results of the first table by cost and score, as SVG.
+    pub(crate) picture: Option<String>,
+}
+
 /// Returns the document. Fails if parameters name keys or values that no result has.
-pub(crate) fn markdown(
+pub(crate) fn document(
     params: &Params,
     rows: &[Row],
     figures: &Figures,
     failed: &[FailedPoint],
-) -> Result<String, Failure> {
+) -> Result<Document, Failure> {
     let keys = row_keys(params, rows)?;
     let reference = reference(params, rows)?;
+    check_front(params, rows)?;
     let is_by_seed = keys == ["seed"];
     let scene = SCENE.to_owned();
     let is_averaged = !keys.contains(&scene) && !params.columns.contains(&scene);
@@ -36,6 +48,10 @@ pub(crate) fn markdown(
         text += &format!("Means over {}:\n\n", parts.join(", "));
     }
     text += &layout.table(rows, false);
+    let picture = layout.front_picture(rows);
+    if picture.is_some() {
+        text += &format!("\n![The results by cost and score]({PICTURE})\n");
+    }
     for part in parts {
         let selected = select(rows, std::slice::from_ref(&scene), std::slice::from_ref(&part));
         text += &format!("\n## {part}\n\n{}", layout.table(&selected, true));
@@ -51,7 +67,7 @@ pub(crate) fn markdown(
             text += &format!("* {}\n", label(&point.stage, &point.point));
         }
     }
-    Ok(text)
+    Ok(Document { text, picture })
 }
 
 /// Returns the keys whose values make a row: the given ones, or all that differ; and the group.
@@ -96,6 +112,17 @@ fn check_keys(
         }
     }
     Ok(())
+}
+
+/// Fails if no result has the cost of the front.
+fn check_front(params: &Params, rows: &[Row]) -> Result<(), Failure> {
+    let Some(front) = &params.front else { return Ok(()) };
+    if rows.is_empty() || rows.iter().any(|row| row.contains_key(front)) {
+        return Ok(());
+    }
+    let names = rows.iter().flatten().filter(|(_, value)| value.is_number());
+    let known = artifact::known_names(front, names.map(|(name, _)| name.as_str()));
+    Err(Failure::Usage(format!("parameter front: no result has a value {front:?}; {known}")))
 }
 
 /// Returns the value that others are compared with.

@@ -6,6 +6,15 @@ use metrics::AnyMetrics;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 
+fn markdown(
+    params: &Params,
+    rows: &[Row],
+    figures: &Figures,
+    failed: &[FailedPoint],
+) -> Result<String, Failure> {
+    document(params, rows, figures, failed).map(|document| document.text)
+}
+
 /// As `metrics.json` describes it.
 fn figure(path: &str, label: &str, digits: usize, higher_is_better: bool) -> Value {
     json!({
@@ -273,4 +282,38 @@ fn rows_follow_the_groups() {
             ["eval", "", ""]
         ]
     );
+}
+
+/// Rows on the front are marked, by their means over scenes and in each scene's table.
+#[test]
+fn the_front_is_marked_and_drawn() {
+    let params = Params {
+        rows: vec!["variant".to_owned()],
+        values: vec!["psnr".to_owned()],
+        front: Some("train_s".to_owned()),
+        ..Params::default()
+    };
+    let made = document(&params, &rows(), &figures(), &[]).unwrap();
+    let expected = "\
+| variant | PSNR | front | commit | machine |
+| --- | --- | --- | --- | --- |
+| as it is | **31.00** | ● | abc1234 | 2 cores |
+| no warm-up | 30.88 |  | abc1234 | 2 cores |
+
+![The results by cost and score](front.svg)
+";
+    assert!(made.text.contains(expected), "{}", made.text);
+    let lego = "## lego
+
+| variant | PSNR | front | commit | machine |
+| --- | --- | --- | --- | --- |
+| as it is | **30.00** | ● | abc1234 | 2 cores |
+| no warm-up | 29.50 | ● | abc1234 | 2 cores |
+";
+    assert!(made.text.contains(lego), "{}", made.text);
+    assert!(made.picture.unwrap().contains(">no warm-up</text>"));
+
+    let unknown = Params { front: Some("train_seconds".to_owned()), ..params };
+    let problem = document(&unknown, &rows(), &figures(), &[]).err().unwrap().to_string();
+    assert!(problem.contains("front: no result has a value \"train_seconds\""), "{problem}");
 }

@@ -26,6 +26,11 @@ pub struct Params {
     /// the first of `values`.
     #[schemars(extend("x-default" = "no comparison"))]
     pub relative_to: BTreeMap<String, String>,
+    /// Value of a cost, such as `train_cpu_s`, `render_s` or `field_mb`. Column `front` marks rows
+    /// that no other row beats in both this cost and the first of `values`, and `front.svg` shows
+    /// all rows by both.
+    #[schemars(extend("x-default" = "no comparison"))]
+    pub front: Option<String>,
     /// Names of methods, by scored block: `{eval: rendered, eval-refined: refined}`. `{variant}` in
     /// a name is replaced by the value of that key.
     #[schemars(extend("x-default" = "the blocks' names"))]
@@ -84,6 +89,7 @@ impl Default for Params {
             columns: Vec::new(),
             values: values.map(str::to_owned).into(),
             relative_to: BTreeMap::new(),
+            front: None,
             methods: BTreeMap::new(),
             groups: Vec::new(),
             extra_rows: Vec::new(),

@@ -136,7 +136,8 @@ fn read<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
     serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
 }
 
-/// Returns the seconds of training, rendering and refining, and the training's speed. Views that a
+/// Returns the seconds of training, rendering and refining, the processor seconds of training, the
+/// peak memory, the size of the field, and the training's speed. Views that a
 /// field or refiner depends on count as training; other views count as rendering, and those of them
 /// that weren't rendered from a field also as refining.
 fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
@@ -145,12 +146,17 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     trained.retain(|&i| ["field", "refiner"].contains(&run.nodes[i].kind.as_str()));
     let in_training: Vec<usize> = trained.iter().flat_map(|&i| run.ancestors(i)).collect();
     // The sums start from 0.0 since that of nothing is -0.
-    let [mut training, mut rendering, mut refining] = [0.0; 3];
+    let [mut training, mut rendering, mut refining, mut processor] = [0.0; 4];
+    let mut peak_memory = 0;
     for &i in &ancestors {
         let node = &run.nodes[i];
         let is_views = node.kind == "views";
+        if is_views || trained.contains(&i) {
+            peak_memory = peak_memory.max(node.peak_memory.unwrap_or(0));
+        }
         if in_training.contains(&i) && (is_views || trained.contains(&i)) {
             training += node.seconds;
+            processor += node.processor_seconds.unwrap_or(f64::NAN);
         } else if is_views && !in_training.contains(&i) {
             rendering += node.seconds;
             refining += if is_from_field(run, i) { 0.0 } else { node.seconds };
@@ -161,9 +167,16 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     {
         row.insert(name.to_owned(), json!(seconds));
     }
+    if processor.is_finite() {
+        row.insert("train_cpu_s".to_owned(), json!(processor));
+    }
+    if peak_memory > 0 {
+        row.insert("peak_mb".to_owned(), json!(peak_memory as f64 / 1e6));
+    }
     // The first field of the run is the one that the views show; a refiner's field is later.
     let field = trained.iter().map(|&i| &run.nodes[i]).find(|node| node.kind == "field");
     if let Some(field) = field {
+        row.insert("field_mb".to_owned(), json!(weights_bytes(&field.folder)? as f64 / 1e6));
         let path = field.folder.join(TRAINING_FILE);
         if path.exists() {
             let log: TrainingLog = read(&path)?;
@@ -173,6 +186,18 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
         }
     }
     Ok(row)
+}
+
+/// Returns the size of a field's weights.
+fn weights_bytes(folder: &Path) -> anyhow::Result<u64> {
+    let mut bytes = 0;
+    for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
+        let entry = entry?;
+        if entry.path().extension().is_some_and(|extension| extension == "safetensors") {
+            bytes += entry.metadata()?.len();
+        }
+    }
+    Ok(bytes)
 }
 
 /// True if a field is an input of a node.

@@ -1,0 +1,210 @@
+//! The Pareto front: results that no other result beats in two values, and its picture.
+
+use std::fmt::Write as _;
+
+use crate::figures::Figures;
+
+/// Size of the picture, and its margins at the left, at the bottom, and at the other sides.
+const SIZE: (f64, f64) = (720.0, 420.0);
+const LEFT: f64 = 64.0;
+const BOTTOM: f64 = 46.0;
+const MARGIN: f64 = 16.0;
+/// Part of an axis that stays free at both ends.
+const FREE: f64 = 0.06;
+/// Number of lines with a number across the picture.
+const LINES: u32 = 5;
+
+/// A result in two values.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Point {
+    /// Name of the result.
+    pub(crate) name: String,
+    /// Value along the horizontal axis, such as a time.
+    pub(crate) cost: f64,
+    /// Value along the vertical axis, such as a PSNR.
+    pub(crate) score: f64,
+}
+
+/// Names of the two values.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Axes<'a> {
+    /// Name of [`Point::cost`]; lower values are better.
+    pub(crate) cost: &'a str,
+    /// Name of [`Point::score`].
+    pub(crate) score: &'a str,
+    /// True if lower scores are better.
+    pub(crate) lower_is_better: bool,
+}
+
+impl Axes<'_> {
+    /// Returns whether each point is on the front: no other point is at least as good in both
+    /// values and better in one.
+    pub(crate) fn front(&self, points: &[Point]) -> Vec<bool> {
+        let value = |point: &Point| if self.lower_is_better { -point.score } else { point.score };
+        let beats = |a: &Point, b: &Point| {
+            a.cost <= b.cost && value(a) >= value(b) && (a.cost < b.cost || value(a) > value(b))
+        };
+        points.iter().map(|point| !points.iter().any(|other| beats(other, point))).collect()
+    }
+
+    /// Draws the points with a logarithmic cost, as SVG. Filled points are on the front, which a
+    /// line joins. Returns `None` if a cost isn't positive or there are fewer than two points.
+    pub(crate) fn picture(&self, points: &[Point], figures: &Figures) -> Option<String> {
+        if points.len() < 2 || !points.iter().all(|point| point.cost > 0.0) {
+            return None;
+        }
+        let (x, y) = (Scale::new(points, |p| p.cost.ln())?, Scale::new(points, |p| p.score)?);
+        let across = |cost: f64| LEFT + x.part(cost.ln()) * (SIZE.0 - LEFT - MARGIN);
+        let up = |score: f64| SIZE.1 - BOTTOM - y.part(score) * (SIZE.1 - BOTTOM - MARGIN);
+        let (width, height) = SIZE;
+        let mut svg = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" \
+            font-family=\"sans-serif\" font-size=\"12\">\n\
+            <rect width=\"{width}\" height=\"{height}\" fill=\"#fff\"/>\n"
+        );
+        for line in 0..LINES {
+            let part = f64::from(line) / f64::from(LINES - 1);
+            let (cost, score) = (x.value(part).exp(), y.value(part));
+            let (at, from) = (up(score), SIZE.1 - BOTTOM);
+            let text = figures.format(self.score, score);
+            _ = writeln!(svg, "<path d=\"M{LEFT} {at:.1}H{}\" stroke=\"#ddd\"/>", width - MARGIN);
+            _ = writeln!(
+                svg,
+                "<text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{text}</text>",
+                LEFT - 8.0,
+                at + 4.0
+            );
+            let text = figures.format(self.cost, cost);
+            _ = writeln!(
+                svg,
+                "<text x=\"{:.1}\" y=\"{}\" text-anchor=\"middle\">{text}</text>",
+                across(cost).clamp(LEFT, width - 3.0 * MARGIN),
+                from + 18.0
+            );
+        }
+        let is_on_front = self.front(points);
+        let mut joined: Vec<&Point> =
+            points.iter().zip(&is_on_front).filter_map(|(p, on)| on.then_some(p)).collect();
+        joined.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        let steps: Vec<String> = joined
+            .iter()
+            .map(|p| format!("{:.1} {:.1}", across(p.cost), up(p.score)))
+            .collect();
+        _ = writeln!(svg, "<path d=\"M{}\" fill=\"none\" stroke=\"#36c\"/>", steps.join("L"));
+        for (point, is_on_front) in points.iter().zip(is_on_front) {
+            let (at, fill) = (across(point.cost), if is_on_front { "#36c" } else { "#fff" });
+            let height = up(point.score);
+            // Names of points at the right end are at their left.
+            let (from, anchor) =
+                if at > 0.7 * width { (at - 8.0, "end") } else { (at + 8.0, "start") };
+            let name = escape(&point.name);
+            _ = writeln!(
+                svg,
+                "<circle cx=\"{at:.1}\" cy=\"{height:.1}\" r=\"4\" fill=\"{fill}\" \
+                stroke=\"#36c\"><title>{name}</title></circle>\
+                <text x=\"{from:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\">{name}</text>",
+                height + 14.0
+            );
+        }
+        let (cost, score) = (figures.title(self.cost), figures.title(self.score));
+        _ = writeln!(
+            svg,
+            "<text x=\"{}\" y=\"{}\" text-anchor=\"middle\">{} against {}</text>\n</svg>",
+            width / 2.0,
+            height - 8.0,
+            escape(&score),
+            escape(&cost)
+        );
+        Some(svg)
+    }
+}
+
+/// An axis from the least to the greatest value.
+struct Scale {
+    low: f64,
+    span: f64,
+}
+
+impl Scale {
+    /// Spans the values of all points; `None` if a value isn't finite.
+    fn new(points: &[Point], value: impl Fn(&Point) -> f64) -> Option<Self> {
+        let values: Vec<f64> = points.iter().map(value).collect();
+        let low = values.iter().copied().reduce(f64::min)?;
+        let high = values.iter().copied().reduce(f64::max)?;
+        let span = if high > low { high - low } else { 1.0 };
+        values.iter().all(|value| value.is_finite()).then_some(Self { low, span })
+    }
+
+    /// Returns the place of a value along the axis, from 0 to 1.
+    fn part(&self, value: f64) -> f64 {
+        FREE + (1.0 - 2.0 * FREE) * (value - self.low) / self.span
+    }
+
+    /// Returns the value at a part of the way from the least to the greatest value.
+    fn value(&self, part: f64) -> f64 {
+        self.low + part * self.span
+    }
+}
+
+fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const AXES: Axes<'_> = Axes { cost: "train_s", score: "psnr", lower_is_better: false };
+
+    fn point(name: &str, cost: f64, score: f64) -> Point {
+        Point { name: name.to_owned(), cost, score }
+    }
+
+    #[test]
+    fn only_unbeaten_results_are_on_the_front() {
+        let points = [
+            point("quick", 1.0, 20.0),
+            point("slow and worse", 2.0, 19.0),
+            point("slow and equal", 3.0, 20.0),
+            point("good", 4.0, 30.0),
+            point("good, too", 4.0, 30.0),
+            point("best", 9.0, 31.0),
+        ];
+        assert_eq!(AXES.front(&points), [true, false, false, true, true, true]);
+        let by_lpips = Axes { lower_is_better: true, ..AXES };
+        assert_eq!(by_lpips.front(&points), [true, true, false, false, false, false]);
+        assert!(AXES.front(&[]).is_empty());
+    }
+
+    #[test]
+    fn the_picture_has_every_name_and_joins_the_front() {
+        let points = [point("a < b", 10.0, 25.0), point("c", 20.0, 24.0), point("d", 300.0, 30.0)];
+        let svg = AXES.picture(&points, &Figures::default()).unwrap();
+        assert!(svg.contains(">a &lt; b</text>") && svg.contains(">d</text>"), "{svg}");
+        assert_eq!(svg.matches("fill=\"#36c\"").count(), 2, "{svg}");
+        let line = svg.lines().find(|line| line.contains("fill=\"none\"")).unwrap();
+        assert_eq!(line.matches('L').count(), 1, "{line}");
+        assert!(!svg.contains("NaN"), "{svg}");
+    }
+
+    #[test]
+    fn impossible_costs_have_no_picture() {
+        for points in [
+            vec![],
+            vec![point("a", 1.0, 1.0)],
+            vec![point("a", 0.0, 1.0), point("b", 1.0, 1.0)],
+            vec![point("a", 1.0, f64::NAN), point("b", 2.0, 1.0)],
+            vec![point("a", f64::INFINITY, 2.0), point("b", 2.0, 1.0)],
+        ] {
+            assert_eq!(AXES.picture(&points, &Figures::default()), None, "{points:?}");
+        }
+    }
+
+    /// Equal values are in the middle of the picture, not at infinity.
+    #[test]
+    fn equal_results_are_drawn() {
+        let points = [point("a", 5.0, 20.0), point("b", 5.0, 20.0)];
+        let svg = AXES.picture(&points, &Figures::default()).unwrap();
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    }
+}
