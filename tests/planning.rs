@@ -349,7 +349,9 @@ fn a_quality_is_known_by_its_parameters() {
     project.run(&["plan", "-p", "quality=good"]).fails(2, &["-p quality=good: ", known]);
     project.ok(&["run", "-p", "quality=fast"]);
     let others = [
-        "rays_per_pixel=3",
+        "rays_per_pixel=3.5",
+        "pixel_importance=15",
+        "supersample_warmup=0.6",
         "min_rays=1000000",
         "max_rays=8000000",
         "render-depth.samples_per_axis=1",
