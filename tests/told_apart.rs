@@ -8,7 +8,7 @@ use std::path::Path;
 
 use common::{Project, data, stage};
 use dataset::Dataset;
-use pixels::{Rgba8, write_png};
+use pixels::{Filter, Rgba8, read_png, resize_pillow, write_png};
 use serde_json::{Value, json};
 
 /// What `prep` makes of a data set: background, kind of space, and its notes.
@@ -129,6 +129,33 @@ fn photographs_of_a_scene_that_goes_on_are_opaque_and_unbounded() {
     // What is said by hand holds.
     let (background, space, _) = prepared(&project, &folder, &json!({"background": "opaque"}));
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"));
+}
+
+/// Enlarged photographs hold no detail for a larger scale, unless they are downscaled again.
+#[test]
+fn missing_detail_is_told() {
+    let project = Project::tiny();
+    let folder = project.path("enlarged");
+    let params = json!({"backdrop": true, "size": 96, "train": 8, "test": 2});
+    assert_eq!(stage("demo-scene", &params.to_string(), &[], &folder, &[]).code, 0);
+    let (_, _, notes) = prepared(&project, &folder, &json!({"lr_source": "photographs"}));
+    assert!(!notes.contains("detail"), "{notes}");
+    // A folder without a manifest is somebody's own.
+    std::fs::remove_file(folder.join("artifact.json")).unwrap();
+    for entry in std::fs::read_dir(folder.join("train")).unwrap() {
+        let path = entry.unwrap().path();
+        let image = read_png(&path).unwrap();
+        write_png(&path, &resize_pillow(&image, 192, 192, Filter::Lanczos)).unwrap();
+    }
+    let (_, _, notes) =
+        prepared(&project, &folder, &json!({"lr_source": "photographs", "split": "holdout"}));
+    let words = "of the LR images' resolution: enlarged, blurred";
+    assert!(notes.contains(words), "{notes}");
+    let summary = std::fs::read_to_string(project.path("scene/scene.json")).unwrap();
+    let detail = serde_json::from_str::<Value>(&summary).unwrap()["detail"].as_f64().unwrap();
+    assert!((0.3..0.7).contains(&detail), "{detail}");
+    let (_, _, notes) = prepared(&project, &folder, &json!({"lr_width": 48, "scale": 2}));
+    assert!(!notes.contains("detail"), "{notes}");
 }
 
 #[test]

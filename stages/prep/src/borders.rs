@@ -8,6 +8,7 @@ use pixels::Rgba8;
 use rayon::prelude::*;
 use scene::Background;
 
+use crate::detail::Spectrum;
 use crate::error::frame_label;
 use crate::strips::Strips;
 
@@ -57,7 +58,7 @@ impl Border {
 }
 
 /// Combined borders of the sampled views.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Borders {
     pub(crate) backdrop: Backdrop,
     /// Number of views whose borders are the flat colour.
@@ -65,6 +66,8 @@ pub(crate) struct Borders {
     /// Number of sampled views.
     views: usize,
     strips: Option<CommonStrips>,
+    /// Spectrum of the sampled views.
+    spectrum: Spectrum,
 }
 
 /// Strips that views have in common.
@@ -82,14 +85,17 @@ impl Borders {
     /// alpha. At most one image per thread is in memory.
     pub(crate) fn inspect(frames: &[&Frame]) -> anyhow::Result<Self> {
         let count = frames.len().min(MAX_VIEWS);
-        if count > 0 && inspect_view(frames[0])?.border == Border::Transparent {
-            return Ok(Self::new(&[Border::Transparent]));
+        if let Some(first) = frames.first() {
+            let view = inspect_view(first)?;
+            if view.border == Border::Transparent {
+                return Ok(Self::new(&[view.border]).with_spectrum(&[view]));
+            }
         }
         let sampled =
             (0..count).into_par_iter().map(|i| inspect_view(frames[i * frames.len() / count]));
         let views = sampled.collect::<anyhow::Result<Vec<ViewBorder>>>()?;
         let borders: Vec<Border> = views.iter().map(|view| view.border).collect();
-        Ok(Self::new(&borders).with_strips(&views))
+        Ok(Self::new(&borders).with_strips(&views).with_spectrum(&views))
     }
 
     /// Combines the borders of sampled views. One image with alpha makes the backdrop transparent;
@@ -97,7 +103,13 @@ impl Borders {
     pub(crate) fn new(borders: &[Border]) -> Self {
         let views = borders.len();
         if borders.contains(&Border::Transparent) {
-            return Self { backdrop: Backdrop::Transparent, flat: 0, views, strips: None };
+            return Self {
+                backdrop: Backdrop::Transparent,
+                flat: 0,
+                views,
+                strips: None,
+                spectrum: Spectrum::default(),
+            };
         }
         let mut colours: Vec<[u8; 3]> = Vec::new();
         for border in borders {
@@ -109,7 +121,7 @@ impl Borders {
         let flat = colours.iter().filter(|colour| is_similar(**colour, median)).count();
         let is_flat = views > 0 && 10 * flat >= 9 * views;
         let backdrop = if is_flat { Backdrop::Flat(median) } else { Backdrop::Scene };
-        Self { backdrop, flat, views, strips: None }
+        Self { backdrop, flat, views, strips: None, spectrum: Spectrum::default() }
     }
 
     /// Adds the strips that the views have in common. A frame of strips is not a background.
@@ -124,6 +136,16 @@ impl Borders {
             }
         }
         self
+    }
+
+    fn with_spectrum(mut self, views: &[ViewBorder]) -> Self {
+        self.spectrum = Spectrum::sum(views.iter().map(|view| &view.spectrum));
+        self
+    }
+
+    /// Returns the part of the photographs' resolution that their detail reaches, if they have any.
+    pub(crate) fn reach(&self) -> Option<f64> {
+        self.spectrum.reach()
     }
 
     /// Returns the evidence for the background, one note per line, and the remedy for strips.
@@ -202,6 +224,7 @@ struct ViewBorder {
     strips: Option<Strips>,
     /// True if the view's mask excludes the strips.
     are_masked: bool,
+    spectrum: Spectrum,
 }
 
 fn inspect_view(frame: &Frame) -> anyhow::Result<ViewBorder> {
@@ -217,7 +240,7 @@ fn inspect_view(frame: &Frame) -> anyhow::Result<ViewBorder> {
         let mask = frame.mask().bad_input(frame_label(frame))?;
         are_masked = mask.is_some_and(|mask| strips.are_masked(&mask));
     }
-    Ok(ViewBorder { border, strips, are_masked })
+    Ok(ViewBorder { border, strips, are_masked, spectrum: Spectrum::of(&image) })
 }
 
 #[cfg(test)]

@@ -82,6 +82,11 @@ impl ImagePlan {
         (scaled_length(width, hr.0, lr.0), scaled_length(height, hr.1, lr.1))
     }
 
+    /// Returns the width of the photographs over that of the LR images.
+    pub(crate) fn lr_factor(&self) -> f64 {
+        f64::from(self.native.0) / f64::from(self.sizes.lr.0)
+    }
+
     /// Describes views, sizes and kernel for the log.
     pub(crate) fn note(&self, split: &Split) -> String {
         let Sizes { lr, hr } = self.sizes;

@@ -8,6 +8,7 @@
 //! * `degrade`: HR and LR images of one photograph, by Pillow's exact kernels.
 //! * `bounds`: the scene's extent and space, from cameras and depths.
 //! * `memory`: number of images that are prepared at a time.
+//! * `detail`: how far the spectrum of the photographs reaches.
 //! * `borders`, `strips`: the scene's background, from the borders of its images.
 //! * `pose_warnings`: checks of implausible poses.
 //!
@@ -21,6 +22,7 @@
 mod borders;
 mod bounds;
 mod degrade;
+mod detail;
 mod error;
 mod image_plan;
 mod memory;
@@ -37,7 +39,6 @@ use std::path::Path;
 
 use artifact::{Failure, FailureExt as _, format_count, list_source_files, printable};
 use dataset::{Dataset, Frame};
-use scene::Background;
 use serde_json::json;
 use stage::{Context, Input, Output, Rule, Stage};
 
@@ -104,10 +105,15 @@ impl Stage for Prep {
         let used = split.train.iter().chain(&split.test).map(|&i| &set.frames[i]);
         let threads = memory::thread_pool(context, used, &images)?;
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
-        let (background, border_notes) = threads.install(|| background(params, &training))?;
+        let borders = threads.install(|| Borders::inspect(&training))?;
+        let background = params.background.unwrap_or(borders.background());
+        let border_notes = if params.background.is_some() { Vec::new() } else { borders.notes() };
+        let detail = borders.reach().map(|reach| detail::lr_reach(reach, images.lr_factor()));
+        let detail_note = detail.and_then(|reach| detail::note(reach, images.sizes.lr.0));
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
         let writer = SceneWriter::new(context, &plan);
-        for note in border_notes.into_iter().chain([space_note(&plan.bounds, background)]) {
+        let space_note = space_note(&plan.bounds, background);
+        for note in border_notes.into_iter().chain([space_note]).chain(detail_note) {
             context.log_line(&note);
             notes.push(note);
         }
@@ -116,7 +122,7 @@ impl Stage for Prep {
             context.log_line(&note);
             notes.push(note);
         }
-        let summary = SceneSummary::new(&set, &plan, notes);
+        let summary = SceneSummary::new(&set, &plan, detail, notes);
         context.write_json("scene.json", &summary)?;
         context.write_summary(&summary.text())
     }
@@ -164,13 +170,4 @@ fn log_ignored_files(context: &Context, folder: &Path) {
             printable(&first.display().to_string())
         ));
     }
-}
-
-/// Returns the scene's background, with notes on the evidence if no parameter gives it.
-fn background(params: &Params, train: &[&Frame]) -> anyhow::Result<(Background, Vec<String>)> {
-    if let Some(given) = params.background {
-        return Ok((given, Vec::new()));
-    }
-    let borders = Borders::inspect(train)?;
-    Ok((borders.background(), borders.notes()))
 }

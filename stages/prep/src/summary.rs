@@ -30,6 +30,10 @@ pub struct SceneSummary {
     pub background: Background,
     /// Extent and space of the scene.
     pub bounds: Bounds,
+    /// Part of the LR images' resolution that their detail reaches, from 0 to 1; `None` for images
+    /// without structure.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub detail: Option<f64>,
     /// Number of training views.
     pub train: usize,
     /// Number of test views.
@@ -42,7 +46,12 @@ pub struct SceneSummary {
 
 impl SceneSummary {
     /// Summarises a written scene.
-    pub(crate) fn new(set: &Dataset, plan: &ScenePlan<'_>, notes: Vec<String>) -> Self {
+    pub(crate) fn new(
+        set: &Dataset,
+        plan: &ScenePlan<'_>,
+        detail: Option<f64>,
+        notes: Vec<String>,
+    ) -> Self {
         let ScenePlan { images, background, bounds, train, test, .. } = plan;
         let Sizes { lr, hr } = images.sizes;
         Self {
@@ -55,6 +64,7 @@ impl SceneSummary {
             kernel: images.kernel,
             background: *background,
             bounds: *bounds,
+            detail,
             train: train.len(),
             test: test.len(),
             has_depth: images.has_truth && test.iter().any(|frame| frame.depth.is_some()),

@@ -86,10 +86,8 @@ impl Axes<'_> {
         let mut joined: Vec<&Point> =
             points.iter().zip(&is_on_front).filter_map(|(p, on)| on.then_some(p)).collect();
         joined.sort_by(|a, b| a.cost.total_cmp(&b.cost));
-        let steps: Vec<String> = joined
-            .iter()
-            .map(|p| format!("{:.1} {:.1}", across(p.cost), up(p.score)))
-            .collect();
+        let steps: Vec<String> =
+            joined.iter().map(|p| format!("{:.1} {:.1}", across(p.cost), up(p.score))).collect();
         _ = writeln!(svg, "<path d=\"M{}\" fill=\"none\" stroke=\"#36c\"/>", steps.join("L"));
         for (point, is_on_front) in points.iter().zip(is_on_front) {
             let (at, fill) = (across(point.cost), if is_on_front { "#36c" } else { "#fff" });

@@ -1,0 +1,217 @@
+//! Measures how far the spectrum of photographs reaches: enlarged, blurred or unfocused photographs
+//! hold less detail than their pixels could (docs/design/035).
+
+use artifact::WARNING;
+use pixels::Rgba8;
+
+/// Side of a block whose spectrum is measured, in pixels.
+const SIDE: usize = 32;
+/// Maximum number of blocks of an image; chosen by hand.
+const MAX_BLOCKS: usize = 256;
+/// Part of the blocks of largest variance that are measured: smooth areas have no detail.
+const DETAILED_PART: usize = 4;
+/// Frequencies that fix the expected spectrum.
+const LOWEST: [usize; 2] = [2, 3];
+/// Minimum power at [`LOWEST`] of a block that is worth measuring, in squared levels; chosen by hand.
+const MIN_POWER: f64 = 1.0;
+/// First frequency that is compared with the expected spectrum.
+const FIRST_COMPARED: usize = 4;
+/// Minimum part of the expected power where there is detail: 6 dB less.
+const MIN_PART: f64 = 0.25;
+/// Part of the LR images' resolution below which detail is missing. Images from full-size sensors
+/// reach 0.78.
+const MIN_REACH: f64 = 0.7;
+
+/// Power of image blocks by frequency, in both directions.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Spectrum {
+    power: [f64; SIDE],
+}
+
+impl Spectrum {
+    /// Measures an image over white. Images without a block have no power.
+    pub(crate) fn of(image: &Rgba8) -> Self {
+        let mut blocks: Vec<([usize; 2], f64)> = Vec::new();
+        for y in (0..image.height.saturating_sub(SIDE - 1)).step_by(SIDE) {
+            for x in (0..image.width.saturating_sub(SIDE - 1)).step_by(SIDE) {
+                blocks.push(([x, y], variance(&block(image, [x, y]))));
+            }
+        }
+        // The sort is stable, so that equal blocks keep their order.
+        blocks.sort_by(|a, b| b.1.total_cmp(&a.1));
+        blocks.truncate(blocks.len().div_ceil(DETAILED_PART));
+        let stride = blocks.len().div_ceil(MAX_BLOCKS).max(1);
+        let waves = waves();
+        let mut power = [0.0; SIDE];
+        for (at, _) in blocks.iter().step_by(stride) {
+            add_power(&mut power, &block(image, *at), &waves);
+        }
+        Self { power }
+    }
+
+    /// Adds the spectra of several images.
+    pub(crate) fn sum<'a>(spectra: impl Iterator<Item = &'a Self>) -> Self {
+        let mut sum = Self::default();
+        for spectrum in spectra {
+            for (sum, power) in sum.power.iter_mut().zip(spectrum.power) {
+                *sum += power;
+            }
+        }
+        sum
+    }
+
+    /// Returns the part of the resolution that detail reaches, from 0 to 1. The power of sharp
+    /// images falls with the square of the frequency (Field 1987, "Relations between the statistics
+    /// of natural images and the response properties of cortical cells"). Noise counts as detail.
+    /// Returns `None` for images without blocks or structure.
+    pub(crate) fn reach(&self) -> Option<f64> {
+        let part = |k: usize| self.power[k] * (k * k) as f64;
+        let expected = LOWEST.map(part).iter().sum::<f64>() / LOWEST.len() as f64;
+        if expected.is_nan() || expected <= MIN_POWER {
+            return None;
+        }
+        let mean = |k: usize| {
+            let near = (k - 1)..=(k + 1).min(SIDE - 1);
+            let parts = near.clone().map(|k| (part(k) / expected).max(f64::MIN_POSITIVE).ln());
+            (parts.sum::<f64>() / near.count() as f64).exp()
+        };
+        let end = (FIRST_COMPARED..SIDE).find(|&k| mean(k) < MIN_PART).unwrap_or(SIDE);
+        Some(end as f64 / SIDE as f64)
+    }
+}
+
+/// Returns the part of the resolution of LR images that detail reaches, from that of photographs
+/// which are `factor` times as wide.
+pub(crate) fn lr_reach(reach: f64, factor: f64) -> f64 {
+    (reach * factor).min(1.0)
+}
+
+/// Describes missing detail, with the remedy; `None` if nothing is missing.
+pub(crate) fn note(lr_reach: f64, lr_width: u32) -> Option<String> {
+    (lr_reach < MIN_REACH).then(|| {
+        let width = (lr_reach * f64::from(lr_width)).ceil();
+        format!(
+            "{WARNING}detail reaches only {:.0} % of the LR images' resolution: enlarged, blurred \
+            or unfocused photographs show nothing new at a larger scale; lr_width {width} keeps \
+            all detail, in less time",
+            100.0 * lr_reach
+        )
+    })
+}
+
+/// Returns the luminance of a block over white, in levels.
+fn block(image: &Rgba8, [x, y]: [usize; 2]) -> [[f64; SIDE]; SIDE] {
+    std::array::from_fn(|row| {
+        let start = 4 * ((y + row) * image.width + x);
+        std::array::from_fn(|column| {
+            let [r, g, b, a] =
+                std::array::from_fn(|c| f64::from(image.data[start + 4 * column + c]));
+            (0.299 * r + 0.587 * g + 0.114 * b) * a / 255.0 + 255.0 - a
+        })
+    })
+}
+
+fn variance(block: &[[f64; SIDE]; SIDE]) -> f64 {
+    let count = (SIDE * SIDE) as f64;
+    let mean = block.iter().flatten().sum::<f64>() / count;
+    block.iter().flatten().map(|value| (value - mean).powi(2)).sum::<f64>() / count
+}
+
+/// Returns the cosines of a discrete cosine transform (DCT-II), by frequency.
+fn waves() -> [[f64; SIDE]; SIDE] {
+    std::array::from_fn(|k| {
+        std::array::from_fn(|x| {
+            let angle = std::f64::consts::PI * ((2 * x + 1) * k) as f64 / (2 * SIDE) as f64;
+            angle.cos() * (2.0 / SIDE as f64).sqrt()
+        })
+    })
+}
+
+/// Adds a block's power along both axes, over all frequencies of the other axis.
+fn add_power(power: &mut [f64; SIDE], block: &[[f64; SIDE]; SIDE], waves: &[[f64; SIDE]; SIDE]) {
+    // By Parseval's theorem, the sum over the other axis' frequencies is that over its pixels.
+    for (k, wave) in waves.iter().enumerate().skip(1) {
+        for line in 0..SIDE {
+            let across: f64 = (0..SIDE).map(|i| wave[i] * block[line][i]).sum();
+            let down: f64 = (0..SIDE).map(|i| wave[i] * block[i][line]).sum();
+            power[k] += (across.powi(2) + down.powi(2)) / SIDE as f64;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use pixels::{Filter, resize_pillow};
+
+    use super::*;
+
+    /// Returns an image of overlapping discs of all sizes: sharp edges everywhere.
+    fn discs(side: usize) -> Rgba8 {
+        let mut data = vec![255; 4 * side * side];
+        let mut state = 1_u64;
+        let mut draw = |bound: usize| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            (state >> 33) as usize % bound
+        };
+        for _ in 0..4 * side {
+            let ([x, y], radius) = ([draw(side), draw(side)], 2 + draw(side) / (1 + draw(12)) / 4);
+            let colour = [draw(256) as u8, draw(256) as u8, draw(256) as u8];
+            for row in y.saturating_sub(radius)..(y + radius).min(side) {
+                for column in x.saturating_sub(radius)..(x + radius).min(side) {
+                    if (row.abs_diff(y)).pow(2) + (column.abs_diff(x)).pow(2) < radius * radius {
+                        let at = 4 * (row * side + column);
+                        data[at..at + 3].copy_from_slice(&colour);
+                    }
+                }
+            }
+        }
+        Rgba8::new(side, side, data)
+    }
+
+    fn resized(image: &Rgba8, side: usize) -> Rgba8 {
+        resize_pillow(image, side, side, Filter::Lanczos)
+    }
+
+    #[test]
+    fn an_enlarged_image_reaches_part_of_its_resolution() {
+        let sharp = resized(&discs(512), 256);
+        assert_eq!(Spectrum::of(&sharp).reach(), Some(1.0));
+        for (side, low, high) in [(512, 0.4, 0.55), (768, 0.25, 0.4)] {
+            let reach = Spectrum::of(&resized(&sharp, side)).reach().unwrap();
+            assert!((low..high).contains(&reach), "{side}: {reach}");
+            // Downscaled again, it is sharp.
+            assert_eq!(Spectrum::of(&resized(&resized(&sharp, side), 200)).reach(), Some(1.0));
+        }
+    }
+
+    #[test]
+    fn images_without_structure_have_no_reach() {
+        for image in [
+            Rgba8::new(64, 64, vec![200; 4 * 64 * 64]),
+            Rgba8::new(20, 90, vec![7; 4 * 20 * 90]),
+            Rgba8::new(0, 0, vec![]),
+        ] {
+            assert_eq!(Spectrum::of(&image).reach(), None);
+        }
+        assert_eq!(Spectrum::default().reach(), None);
+    }
+
+    /// Several images together reach as far as most of their power.
+    #[test]
+    fn spectra_are_summed() {
+        let sharp = resized(&discs(512), 256);
+        let spectrum = Spectrum::of(&sharp);
+        let twice = Spectrum::sum([&spectrum, &spectrum].into_iter());
+        assert_eq!(twice.reach(), spectrum.reach());
+        assert_eq!(twice.power[5], 2.0 * spectrum.power[5]);
+    }
+
+    #[test]
+    fn missing_detail_has_a_remedy() {
+        assert_eq!(lr_reach(0.5, 1.0), 0.5);
+        assert_eq!(lr_reach(0.5, 8.0), 1.0);
+        assert_eq!(note(0.7, 100), None);
+        let note = note(0.47, 800).unwrap();
+        assert!(note.contains(" 47 % ") && note.contains("lr_width 376 "), "{note}");
+    }
+}
