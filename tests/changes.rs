@@ -228,7 +228,7 @@ fn checkpoints_of_inputs_that_were_written_to_are_not_trusted() {
     let said = "train-ss: an input was written to after the checkpoint; starting over";
     assert!(last.stderr.contains(said), "{}", last.stderr);
     assert!(!last.stderr.contains("resuming from step"), "{}", last.stderr);
-    // Without that it goes on.
+    // Without the change it resumes.
     assert_eq!(stopped(&["-p", "train-ss.seed=5"]).code, 130);
     let last = project.run(&[&arguments[..], &["-p", "train-ss.seed=5"]].concat());
     assert!(last.stderr.contains("resuming from step"), "{}", last.stderr);

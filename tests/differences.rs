@@ -7,7 +7,7 @@ use artifact::hash_json;
 use common::Project;
 use serde_json::{Value, json};
 
-/// A stage in shell. It writes so many text files, what the scene decided, and metrics; a part of
+/// A stage in shell. It writes text files, the defaults by scene, and metrics; a part of
 /// the key is an environment variable.
 const PROGRAM: &str = r#"#!/bin/sh
 if [ "$1" = describe ]; then
@@ -49,7 +49,7 @@ fn project() -> Project {
     project
 }
 
-/// What a command says, with hashes and times put into words that are always alike.
+/// Returns a command's output lines, with fixed text in place of hashes and times.
 fn said(project: &Project, arguments: &[&str]) -> Vec<String> {
     project.ok(arguments).lines().map(plain).collect()
 }
@@ -71,8 +71,8 @@ fn plain(line: &str) -> String {
     }
 }
 
-/// Changes the parts of a stage's key as another version would have written them; under the key
-/// that these come to, the next run finds the record no more.
+/// Changes the parts of a stage's key to those of another version, so that the next run doesn't
+/// find the record.
 fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
     let actions = std::fs::read_dir(project.path(".nerf-sr/actions"))
         .unwrap()
@@ -226,7 +226,7 @@ fn pin(project: &Project, name: &str, mode: &str) {
     }
 }
 
-/// What isn't set by the pipeline is told, too.
+/// Differences that no parameter of the pipeline causes are reported, too.
 #[test]
 fn diff_tells_of_code_environment_and_sources() {
     let project = project();

@@ -1,5 +1,5 @@
-//! How runs end before they are done: signals at work that takes long, second signals, runners that
-//! are killed, and all of this behind wrapper scripts.
+//! Early ends of runs: signals during long work, second signals, killed runners, and all of this
+//! behind wrapper scripts.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -124,7 +124,7 @@ fn a_stage_ends_with_its_runner_and_leaves_a_checkpoint() {
         let killed = Instant::now();
         wait_until(|| processes("train-ss", folder).is_empty());
         assert!(killed.elapsed() < Duration::from_secs(10), "{what}: {:?}", killed.elapsed());
-        // Asked to end, it goes on from there and leaves a checkpoint once more.
+        // After a signal, the next run resumes from the checkpoint and leaves another one.
         let before = last_checkpoint(&partial);
         let child = project.spawn(&ENDLESS);
         wait_until(|| !processes("train-ss", folder).is_empty());

@@ -20,12 +20,12 @@ use serde_json::Value;
 
 /// Grid of points of the true surface.
 const CELL: f64 = 0.008;
-/// Splats are drawn with so many times the images' width, as a viewer's window has, and shrunk.
+/// Factor by which splats are drawn wider than the images, as in a viewer's window, then shrunk.
 const ENLARGED: u32 = 4;
 /// Decibels of the splats after a short training, in the mean; 043 has figures.
 const LEAST_SPLATS: f64 = 24.0;
 
-/// What a measuring needs: the exported files, the cameras they were made from, and the test
+/// Inputs of a measurement: the exported files, the cameras they were made from, and the test
 /// images.
 struct Exported {
     files: PathBuf,
@@ -100,12 +100,12 @@ fn splats_score(splats: &[Splat], input: &GivenInput, background: f32, view: &Vi
 }
 
 impl Exported {
-    /// What the training cameras see of the true surface.
+    /// Returns the part of the true surface that the training cameras observe.
     fn true_surface(&self) -> Vec<(DVec3, DVec3)> {
         true_surface(&World::new(0), &cameras(&self.cameras), CELL)
     }
 
-    /// The same and what cameras see that stand as far below the scene's middle.
+    /// Returns that part and the one that mirrored cameras below the scene's middle observe.
     fn whole_surface(&self) -> Vec<(DVec3, DVec3)> {
         let above = cameras(&self.cameras);
         let below = above.iter().map(turned_below).collect::<Vec<_>>();
@@ -157,7 +157,7 @@ fn assert_near(what: &str, compared: Compared) {
     assert!(compared.outward >= 0.96, "{what}: {compared:?}");
 }
 
-/// At least so many dB in the mean. A scene that is mirrored or upside down has about 12.
+/// Fails below `least` dB in the mean. A mirrored or upside-down scene has about 12 dB.
 #[track_caller]
 fn assert_shown(scores: &[f64], least: f64) {
     println!("splats: {}", in_words(scores));
@@ -203,7 +203,7 @@ fn write_truth(path: &Path, surface: &[(DVec3, DVec3)]) {
     std::fs::write(path, text).unwrap();
 }
 
-/// What trimesh, plyfile and pycolmap say; none where they aren't installed.
+/// Returns the results of trimesh, plyfile and pycolmap; `None` if one isn't installed.
 fn read_by_others(exported: &Exported) -> Option<Value> {
     let modules = "import trimesh, plyfile, scipy";
     let has = Command::new("python3").args(["-c", modules]).output();
@@ -223,7 +223,7 @@ fn read_by_others(exported: &Exported) -> Option<Value> {
     Some(serde_json::from_str(&read.stdout).unwrap())
 }
 
-/// As many points, splats and triangles, near the true surface.
+/// Fails unless other programs read all points, splats and triangles, near the true surface.
 fn assert_same_files(exported: &Exported, read: &Value) {
     let summary: Value =
         serde_json::from_slice(&std::fs::read(exported.files.join("export.json")).unwrap())
@@ -309,7 +309,7 @@ fn the_mesh_may_be_left_out() {
 /// Measures an artifact of `export`, `EXPORT`, that was made by the training cameras of a scene of
 /// `prep`, `SCENE`: `docs/design/043-export.md` has the command.
 #[test]
-#[ignore = "measures folders that it is told"]
+#[ignore = "measures folders given by EXPORT and SCENE"]
 fn figures_of_the_demo_scene() {
     let [Some(files), Some(prep)] = ["EXPORT", "SCENE"].map(std::env::var_os) else {
         eprintln!("skipped: EXPORT and SCENE don't name an artifact of export and of prep");

@@ -1,5 +1,5 @@
-//! Kills at any moment: what was finished stays whole, what wasn't goes on, and the bytes come out
-//! equal.
+//! Kills at any moment: finished artifacts stay complete, unfinished actions resume, and the bytes
+//! are equal.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -55,7 +55,7 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     assert!(finished.stderr.contains("interrupted; run again to resume"), "{}", finished.stderr);
     let checkpoint = checkpoints(&work).pop().expect("it left a checkpoint");
     assert!(!output.exists());
-    // A checkpoint cut short is said and left out, not trusted.
+    // A truncated checkpoint is reported and skipped.
     let bytes = std::fs::read(&checkpoint).unwrap();
     std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
     let again = stage("train-ss", PARAMS, &inputs, &output, &more);

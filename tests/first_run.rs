@@ -20,7 +20,7 @@ fn empty() -> Project {
     project
 }
 
-/// What makes a training short; nothing else of a written pipeline is changed.
+/// Parameters of a short training; all others are those of the written pipeline.
 const SHORT: [&str; 12] = [
     "-p",
     "train-ss.rays=4000",
@@ -91,7 +91,7 @@ fn experiments_run_in_a_folder_of_init() {
     assert_eq!(prep(), key);
 }
 
-/// Commented parameters are right, too: whoever takes a `#` away gets a pipeline that works.
+/// Commented parameters are correct, too: without their `#` the pipeline works.
 #[test]
 fn what_init_leaves_commented_out_is_right() {
     let project = empty();
@@ -178,8 +178,8 @@ fn folders_with_odd_names() {
     }
 }
 
-/// Whoever waits sees within ten seconds that a stage lives, even where it says nothing itself. It
-/// works until that was seen, or for a minute or two where it never is.
+/// Within ten seconds the runner reports that a silent stage is alive. The stage works until this
+/// report, or for one or two minutes.
 #[test]
 fn a_silent_stage_shows_that_it_lives() {
     let project = Project::new("default: [quiet]\nstages:\n  quiet: {run: ./quiet}\n");
@@ -234,8 +234,8 @@ fn run_small(programs: &Path, project: &Project, arguments: &[&str]) -> Finished
     Finished::of(command.output().unwrap())
 }
 
-/// What a stage made without libtorch has the same key where it is built with it, and the same
-/// bytes: after `make demo`, `make build` leaves the demo cached.
+/// A stage's builds with and without libtorch give the same key and bytes: after `make demo`,
+/// `make build` leaves the demo cached.
 #[test]
 fn a_build_without_libtorch_makes_what_the_whole_one_makes() {
     let Some(programs) = without_libtorch() else { return };
@@ -265,7 +265,7 @@ fn a_build_without_libtorch_makes_what_the_whole_one_makes() {
     assert_eq!(
         run_small(&programs, &project, &["run", "eval"]).code,
         0,
-        "no matter to what doesn't use it"
+        "ignored by targets that don't use it"
     );
 }
 

@@ -1,4 +1,4 @@
-//! What a new user is told, and when: problems before anything runs, and progress of every stage.
+//! Messages to a new user: problems before anything runs, and progress of every stage.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;

@@ -17,7 +17,7 @@ use serde_json::Value;
 
 const SIGNALS: [&str; 4] = ["-KILL", "-INT", "-TERM", "-HUP"];
 const STAGES: [&str; 5] = ["demo-scene", "prep", "train-ss", "render-depth", "eval"];
-/// So many pipelines are run by turns; each trains from another seed.
+/// Number of pipelines that are run in turn; each trains with another seed.
 const POINTS: u64 = 3;
 
 fn point(number: u64) -> [String; 2] {

@@ -1,5 +1,5 @@
-//! What programs read: `--json` of the looking verbs, `path`, and `diff`, with real scenes that
-//! `prep` makes.
+//! Output for programs: `--json` of the verbs that report, `path`, and `diff`, with real scenes of
+//! `prep`.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -78,7 +78,7 @@ fn hash_of(project: &Project, arguments: &[&str]) -> String {
     folder.trim().rsplit('/').next().unwrap()[..12].to_owned()
 }
 
-/// Every kind of difference has its line, and nothing is told twice.
+/// Every kind of difference has its line, and no difference is reported twice.
 #[test]
 fn diff_tells_what_differs() {
     let project = Project::new(PIPELINE);

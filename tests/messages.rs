@@ -1,5 +1,4 @@
-//! What a run says, to whom, and what is left of it: reasons of failures, logs, remedies, closed
-//! pipes.
+//! Messages of a run and their recipients: reasons of failures, logs, remedies, closed pipes.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -207,7 +206,7 @@ fn a_log_is_found_whatever_the_stage_was_run_with() {
     let project = talking(&format!(
         "grep -q bad $params && {{ echo 'no good' >&2; exit 3; }}; cat $params >&2; {WELL}"
     ));
-    // A stage that the default targets don't come to, and one that ran with another parameter.
+    // A stage that the default targets don't need, and one that ran with another parameter.
     project.ok(&["run", "other"]);
     project.run(&["log", "nobody"]).fails(2, &["no stage \"nobody\""]);
     assert_eq!(project.ok(&["log", "talk"]), "talk: has not run yet\n");
@@ -347,7 +346,7 @@ fn more_threads_than_a_machine_can_use_are_not_started() {
 const HUP: u32 = 1;
 const TERM: u32 = 15;
 
-/// Whether one of a process's sets of signals, as the kernel shows them, has a signal.
+/// Returns whether a set of signals in a process's `/proc` status contains a signal.
 fn has_signal(process: &std::process::Child, set: &str, signal: u32) -> bool {
     let status =
         std::fs::read_to_string(format!("/proc/{}/status", process.id())).unwrap_or_default();
@@ -370,7 +369,7 @@ fn a_terminal_that_goes_away_leaves_a_checkpoint() {
         &output,
         &["--work", work.to_str().unwrap()],
     );
-    // With nohup, under which this test may run, it is to go on.
+    // With nohup, under which this test may run, it must continue.
     for (disposition, code) in [("--default-signal=HUP", 130), ("--ignore-signal=HUP", 130)] {
         let mut command = Command::new("env");
         let child = command
@@ -385,7 +384,7 @@ fn a_terminal_that_goes_away_leaves_a_checkpoint() {
         assert_eq!(
             is_ignored,
             disposition.starts_with("--ignore"),
-            "it goes on where it is told to"
+            "it continues if the signal is ignored"
         );
         signal(&child, "-HUP");
         if is_ignored {
@@ -427,7 +426,7 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
 /// Leaves a process running that holds the stage's pipes open, and a mark if it ends by itself.
 const LEAVES_ONE: &str = "(sleep 1000; touch slept) & echo $! > left";
 
-/// What a stage has left was ended: the runner didn't wait for it.
+/// Fails unless the process that a stage left was ended and the runner didn't wait for it.
 #[track_caller]
 fn assert_left_is_ended(project: &Project) {
     let left = std::fs::read_to_string(project.path("left")).unwrap();

@@ -47,7 +47,7 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     assert_eq!(stage("train-ss", PARAMS, &inputs, &stopped, &more).code, 0);
     assert_eq!(manifest(&one), manifest(&stopped));
 
-    // What goes on from it stands beside it, or their mean does.
+    // A field initialised from it is written next to it, or their mean is.
     let (beside, averaged) = (project.path("beside"), project.path("averaged"));
     let inputs = [("scene", train.as_path()), ("init", one.as_path())];
     let on = PARAMS.replace("40000", "2000");
@@ -72,7 +72,7 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     let rendered =
         stage("render-depth", "{}", &[("field", &one), ("cameras", &cameras)], &views, &[]);
     assert_eq!(rendered.code, 0, "{}", rendered.stderr);
-    // Short as it is: 10.9 dB, where all white is 9.2.
+    // The short training has 10.9 dB; an all-white image has 9.2.
     let psnr = eval::psnr(&only_picture(&views), &only_picture(&project.path("scene/truth")));
     assert!(psnr > 10.0, "{psnr} dB");
 }

@@ -170,8 +170,8 @@ fn poses_that_cannot_be_are_refused() {
     drop(folder);
 }
 
-/// What is likely wrong is used all the same, and said at once, in the log, in `scene.json` and at
-/// the end.
+/// Poses that are probably wrong are used, with a warning at once, in the log, in `scene.json` and
+/// at the end.
 #[test]
 fn poses_that_look_wrong_are_warned_of() {
     type Change = fn(&mut Value);
@@ -322,8 +322,8 @@ fn trained_with(project: &Project, refined: &str) -> (Vec<u8>, String, Value, St
     (weights, run.stderr, project.json("train-ss", "training.json", &settings), page)
 }
 
-/// So few rays say nothing of poses: cameras wander off, photographs don't meet their neighbours,
-/// and the field is the one with the given poses.
+/// Few rays can't refine poses: cameras wander off, photographs don't match their neighbours, and
+/// the field is the one with the given poses.
 #[test]
 fn poses_stay_where_refined_ones_are_no_better() {
     let project = Project::new(TRAINED);

@@ -11,16 +11,16 @@ use common::browser::run_in_browser;
 use common::{Project, stage};
 use serde_json::{Value, json};
 
-/// A page may have so many bytes, with 50 views of 800 pixels.
+/// Maximum size of a page with 50 views of 800 pixels.
 const PAGE_BYTES: u64 = 15_000_000;
 
-/// What the browser saw on a phone and a desktop, light and dark; checks that nothing was wrong.
+/// Returns the browser's reports on a phone and a desktop, light and dark; fails on any problem.
 #[track_caller]
 fn look(page: &Path) -> Option<Vec<Value>> {
     seen(page, "all", 4)
 }
 
-/// The same on a dark phone and a light desktop alone.
+/// Returns the browser's reports on a dark phone and a light desktop.
 #[track_caller]
 fn glance(page: &Path) -> Option<Vec<Value>> {
     seen(page, "some", 2)

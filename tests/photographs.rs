@@ -85,7 +85,7 @@ fn every_form_gives_the_same_cameras_and_images() {
     assert!(scenes.iter().all(|s| image(s) == image(&scenes[0])));
 }
 
-/// What COLMAP's own library writes is read, too.
+/// A model written by COLMAP's own library is read, too.
 #[test]
 fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
     let project = Project::tiny();
@@ -152,13 +152,13 @@ fn one_command_makes_hr_views_of_lr_photographs() {
 }
 
 fn scored_with(project: &Project, exposure: &str) -> (f64, Value) {
-    // Each exposure has a grey of its own behind the things: that looks like a scene that goes on.
+    // Each exposure has its own grey behind the objects, which looks like a scene that continues.
     let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", exposure];
     project.ok(&[&["run"], &settings[..]].concat());
     (lr_psnr(project, "eval", &settings), project.json("train-ss", "training.json", &settings))
 }
 
-/// What a photograph's channels are multiplied by.
+/// Returns the factors of a photograph's channels.
 fn exposure_factors(photograph: usize) -> [f32; 3] {
     [0.7f32, 1.0 / 0.7].map(|f| [f, f.sqrt(), 1.0 / f.sqrt()])[photograph % 2]
 }
@@ -179,7 +179,7 @@ fn exposures_are_found() {
     let folder = as_transforms(&project);
     let file = folder.join("transforms.json");
     let transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
-    // Every eighth is held out and stays as it is; the others' factors have 1 as their mean.
+    // Every eighth photograph is held out and unchanged; the others' factors have mean 1.
     let frames =
         transforms["frames"].as_array().unwrap().iter().enumerate().filter(|(i, _)| i % 8 != 0);
     for (taken, (_, frame)) in frames.enumerate() {
@@ -219,7 +219,7 @@ fn through(lens: &Intrinsics, pinhole: &pixels::Rgba8, i: usize) -> [u8; 4] {
 }
 
 fn lens_psnr(project: &Project, lens: &str) -> f64 {
-    // Seen through it the things touch the border: that looks like a scene that goes on.
+    // Through this lens the objects touch the border, which looks like a scene that continues.
     let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", lens];
     project.ok(&[&["run"], &settings[..]].concat());
     lr_psnr(project, "eval", &settings)

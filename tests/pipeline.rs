@@ -143,7 +143,7 @@ fn graph_status_log_gc_and_verify() {
     let result = format!("\nresult: {}", summary.trim_end());
     assert!(log.contains("\nmemory: about ") && log.contains(&result), "{log}");
     assert!(project.ok(&["verify"]).contains("5 artifacts, 0 damaged"));
-    // What another kernel left is garbage, what the pipeline comes to is not.
+    // Artifacts of another kernel are garbage, those of the pipeline are not.
     project.ok(&["run", "-p", "kernel=box"]);
     let before = project.store_listing();
     assert!(project.ok(&["gc"]).contains("0.0 MB deleted"), "young things stay");
@@ -224,7 +224,7 @@ fn two_runners_at_once_make_everything_once() {
     assert_eq!(ran, 5);
 }
 
-/// Options that change what flows between stages, and the PSNR that each was measured to come to.
+/// Options that change the data between stages, and the measured PSNR of each.
 const OPTIONS: [(f64, &str); 11] = [
     (22.63, "background=alpha"),
     (23.55, "background=black kernel=bicubic"),

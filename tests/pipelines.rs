@@ -46,8 +46,7 @@ fn every_verb_finds_a_target_of_its_own_file() {
     project.run(&["pin", "kept", "video"]).fails(2, &["has no artifact to pin yet"]);
 }
 
-/// What pipeline.yaml made is there for a file of `pipelines/`, however that is named; pages are,
-/// too.
+/// A file of `pipelines/`, by any path, uses the artifacts and pages that pipeline.yaml made.
 #[test]
 fn targets_share_one_store() {
     let project = project();

@@ -44,7 +44,7 @@ const STAGES: u64 = 5;
 struct Block {
     program: u64,
     value: u64,
-    /// Where inputs `a` and `b` come from.
+    /// Sources of inputs `a` and `b`.
     inputs: BTreeMap<&'static str, String>,
 }
 

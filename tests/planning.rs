@@ -1,5 +1,4 @@
-//! What comes before a run: asking programs what they are, checking what is asked for, and saying
-//! what will be done.
+//! Steps before a run: stages' descriptions, checks of the request, and the printed plan.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -112,7 +111,7 @@ fn only_run_starts_a_foreign_program() {
     assert_eq!(started(), before);
 }
 
-/// Asking that takes its time is said, and ends at once when it is no longer wanted.
+/// A slow `describe` is reported, and ends at once after a signal.
 #[test]
 fn asking_can_be_watched_and_interrupted() {
     let project = with_script();
@@ -132,7 +131,7 @@ fn asking_can_be_watched_and_interrupted() {
         line.contains("interrupted") && !line.contains("failed") && !line.contains("stage mine"),
         "{line}"
     );
-    // What was begun goes on when it may.
+    // The started run continues after its stage is released.
     let child =
         project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     std::fs::remove_file(project.path("wait")).unwrap();
@@ -150,8 +149,8 @@ fn run_installed(project: &Project, arguments: &[&str]) -> Finished {
     )
 }
 
-/// A program that isn't there is no matter to targets that don't use it; to others the one command
-/// that builds it is said.
+/// A missing program affects only targets that use it; their message has the command that builds
+/// it.
 #[test]
 fn a_missing_program_is_missed_where_it_is_needed() {
     let project = Project::tiny();
@@ -179,7 +178,7 @@ fn a_missing_program_is_missed_where_it_is_needed() {
     );
 }
 
-/// What can't go well is refused before anything runs, in the plan as in the run.
+/// Calls that stages would refuse are refused before anything runs, by `plan` and by `run`.
 #[test]
 fn what_stages_would_refuse_is_refused_in_the_plan() {
     let upsample = "  upsample:\n    inputs: \
@@ -341,7 +340,7 @@ fn a_run_beyond_the_memory_is_refused_before_its_start() {
     assert_eq!(project.store_listing(), Vec::<String>::new());
 }
 
-/// What runs with a quality is cached for its parameters, and for no quality on other stages.
+/// A stage that ran with a quality is cached for the quality's parameters.
 #[test]
 fn a_quality_is_known_by_its_parameters() {
     let project = Project::tiny();

@@ -19,7 +19,7 @@ use common::{FAST, Finished, Project, bin, root, stage};
 
 /// The programs of the fast pipeline but its last, which is a script.
 const PROGRAMS: [&str; 4] = ["nerf-sr", "prep", "train-ss", "render-depth"];
-/// So many trainings are run by turns.
+/// Number of trainings that are run in turn.
 const POINTS: u64 = 3;
 
 /// The fast pipeline on a data set of its own, with its own copies of the programs.
@@ -63,7 +63,7 @@ fn finished(project: &Project, seed: u64, store: &str) -> Finished {
     Finished::of(run(project, seed, store).wait_with_output().unwrap())
 }
 
-/// What every whole record of a store says: key and artifact.
+/// Returns key and artifact of every complete record of a store.
 fn records(project: &Project, store: &str) -> BTreeMap<String, String> {
     let Ok(entries) = fs::read_dir(project.path(store).join("actions")) else {
         return BTreeMap::new();
@@ -220,7 +220,7 @@ fn round(
     let found = records(project, &store);
     assert_agree(&found, expected, &what);
     if kind < 2 && !is_undone_at_once && changed.code == 0 {
-        // A fresh store has the same of the files as they are now.
+        // A fresh store gives the same for the current files.
         let fresh = format!("fresh-{number}");
         if finished(project, point, &fresh).code == 0 {
             assert_agree(&found, &records(project, &fresh), &what);

@@ -13,7 +13,7 @@ use common::{Finished, Project, bin};
 /// Documents whose commands and blocks are checked, and folders that hold more of them.
 const DOCUMENTS: [&str; 2] = ["README.md", "ARCHITECTURE.md"];
 const FOLDERS: [&str; 2] = ["docs/guide", "docs/results"];
-/// The same for those whose links alone are checked.
+/// Documents of which only links are checked.
 const LINKED: [&str; 4] =
     ["CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md", "docs/comparison.md"];
 const LINKED_FOLDERS: [&str; 1] = ["docs/design"];

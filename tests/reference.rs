@@ -147,7 +147,7 @@ fn choices(schema: &Value) -> String {
     if list.is_empty() { list } else { format!("\n{list}") }
 }
 
-/// A property's type in words.
+/// Returns a property's type as text.
 fn type_of(property: &Value) -> String {
     if let Some(reference) = property.get("$ref").and_then(Value::as_str) {
         return reference.rsplit('/').next().unwrap_or_default().to_owned();

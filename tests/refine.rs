@@ -38,7 +38,7 @@ fn green(file: &Path) -> Vec<f32> {
 #[test]
 fn refined_views_stand_beside_rendered_ones() {
     let project = project();
-    // From a shorter training the network learns to leave views as they are.
+    // From a shorter training the network learns to leave views unchanged.
     project.replace("rays: 40000", "rays: 80000");
     let run = project.ok(&["run", "refined"]);
     assert!(run.contains("out/refined/index.html"), "{run}");
@@ -103,8 +103,8 @@ fn parameters(project: &Project, stage: &str, name: &str, more: &[&str]) -> Vec<
     refined.map(|row| row["stages"][stage]["parameters"][name].to_string()).collect()
 }
 
-/// What a block extends reaches it from the file and from the command line, save what it says
-/// itself.
+/// A block gets the settings of the block that it extends, from the file and from the command
+/// line, except those that it sets itself.
 #[test]
 fn a_block_follows_the_one_it_extends() {
     let project = project();
@@ -163,7 +163,7 @@ fn views_are_consistent_with_their_own_photographs() {
         refine_summary(&project, &["-p", "split=paper"])
             .contains("consistent with their own photographs")
     );
-    // The network has learnt on consistent views, too; what hasn't is said to be another task.
+    // The network was trained on consistent views, too; otherwise the tasks differ, with a warning.
     assert!(is_agreeing(&project, &["-p", "split=paper"]) && !is_agreeing(&project, &[]));
     let folder = |stage: &str| project.artifact(stage, &["refined", "-p", "split=paper"]);
     let (views, refiner) = (folder("render-depth"), folder("train-refine"));
@@ -411,7 +411,7 @@ fn first_psnr(prep: &Path, found: &Path) -> f64 {
     eval::psnr(&read(&found.join("images").join(name.file_name().unwrap())), &read(&truth))
 }
 
-/// How rendered views of a scene are refined and judged.
+/// Inputs of refining and scoring a scene's rendered views.
 struct Refining<'a> {
     project: &'a Project,
     refiner: &'a Path,
@@ -544,8 +544,8 @@ fn psnr_after_finetuning(
 /// HR references that join the training: what they show is learnt.
 #[test]
 fn references_join_a_training() {
-    // A field of its own that learns from both, beside the shipped one, which goes on from the
-    // field of LR images.
+    // A separate field trained on both, compared with the shipped one, which is initialised from
+    // the field of LR images.
     let joined = "
   joined-field:
     extends: train-ss
@@ -570,8 +570,8 @@ fn references_join_a_training() {
         mean_psnr(&project, &arguments, "eval-joined")
             > mean_psnr(&project, &arguments, "eval") + 0.3
     );
-    // Half as many rays do, where the training goes on from what LR images gave and both fields, or
-    // their weights' mean, are kept. Few rays, or one reference alone, lose nothing of that.
+    // Half of the rays are enough if training is initialised from the field of LR images and both
+    // fields, or their weights' mean, are kept. Few rays, or one reference alone, don't lose PSNR.
     let first = project.artifact("train-ss", &arguments);
     for combine in ["ensemble", "average_weights"] {
         assert!(
@@ -669,7 +669,7 @@ fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'sta
     )
 }
 
-/// Of its 600 steps.
+/// First slow step of 600.
 const SLOW_FROM: u64 = 100;
 
 #[test]
@@ -700,7 +700,7 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
     a_checkpoint_cut_short_is_left_out(&project, &inputs);
 }
 
-/// It is said and not trusted: the training starts over.
+/// A truncated checkpoint is reported and skipped: the training starts over.
 fn a_checkpoint_cut_short_is_left_out(project: &Project, inputs: &[(&str, &Path)]) {
     let params = r#"{"steps": 100, "batch_size": 2, "patch_size": 16, "features": 8, "blocks": 1}"#;
     let [whole, output, work] = ["short", "cut", "cut-work"].map(|name| project.path(name));
@@ -737,7 +737,7 @@ fn written(parts: &[PathBuf]) -> Vec<SystemTime> {
         .collect()
 }
 
-/// What stands in the manifest of what a stage makes.
+/// Returns the manifest of a stage's output.
 fn made(
     project: &Project,
     name: &str,
@@ -877,7 +877,7 @@ fn mean_difference(one: &[f32], other: &[f32]) -> f32 {
     one.iter().zip(other).map(|(a, b)| (a - b).abs()).sum::<f32>() / one.len() as f32
 }
 
-/// The published network goes through the same stages; what it can't do is said.
+/// The published network is used by the same stages; impossible requests are reported.
 #[test]
 fn the_paper_s_network_refines_by_references() {
     let project = project();

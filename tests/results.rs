@@ -12,7 +12,7 @@ use common::{Project, data, root};
 
 /// Columns that say what a row is of.
 const KEYS: [&str; 6] = ["protocol", "method", "supervision", "scene", "has seen", "gain"];
-/// Protocols as they are named, on images of 48 pixels.
+/// Protocols of the usual names on images of 48 pixels.
 const SMALL: &str = "  presets:
     100x2: {lr_width: 24, prep.scale: 2}
     100x4: {lr_width: 12, prep.scale: 4}
@@ -51,7 +51,7 @@ struct Marked {
 }
 
 impl Marked {
-    /// Where its command wrote it: `OUT/SINK/table.md`, the sink the first target.
+    /// Returns the path to which its command wrote it: `OUT/SINK/table.md`, with the first target.
     fn file(&self) -> PathBuf {
         let out =
             self.command.iter().position(|word| word == "--out").expect("--out in the comment");

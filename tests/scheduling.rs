@@ -1,4 +1,4 @@
-//! How stages share a machine: what each took is recorded, and by that the next run gives places.
+//! Stages that share a machine: their usage is recorded, and the next run schedules by it.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -7,8 +7,8 @@ use common::Project;
 use serde_json::Value;
 
 /// A stage that takes some memory for a while, keeps one core busy, and writes when it began and
-/// ended and how many threads it had. Where a file `together` lies beside it, it goes on until so
-/// many have begun, or for a minute.
+/// ended and how many threads it had. With a file `together` next to it, it runs until that
+/// number of stages has started, or for a minute.
 const HUNGRY: &str = r#"#!/usr/bin/env python3
 import json, os, pathlib, sys, time
 if sys.argv[1:] == ["describe"]:
@@ -43,7 +43,7 @@ stages:
   hungry: {run: ./hungry, parameters: {mb: 200, seconds: 0.6}}
 ";
 
-/// What each point of a sweep wrote.
+/// Returns the output of each point of a sweep.
 fn written(project: &Project, arguments: &[&str]) -> Vec<Value> {
     let outputs = project.output_of("hungry", arguments);
     let read = |output: &String| std::fs::read(project.object(output).join("it.json")).unwrap();

@@ -17,14 +17,14 @@ fn of<T: JsonSchema>() -> Value {
     schema_for!(T).to_value()
 }
 
-/// What all stages say of themselves.
+/// Returns the descriptions of all stages.
 fn descriptions() -> &'static [Description] {
     static DESCRIPTIONS: LazyLock<Vec<Description>> =
         LazyLock::new(|| common::stage_names().iter().map(|name| description(name)).collect());
     &DESCRIPTIONS
 }
 
-/// What a built stage says of itself, without what differs between builds.
+/// Returns a built stage's description, without parts that differ between builds.
 fn description(name: &str) -> Description {
     let program = common::bin(name);
     assert_up_to_date(&program);
@@ -35,7 +35,7 @@ fn description(name: &str) -> Description {
     Description { version: String::new(), code: String::new(), ..said }
 }
 
-/// Whether files are written anew.
+/// Returns whether files are to be rewritten.
 fn is_update() -> bool {
     std::env::var_os("UPDATE").is_some()
 }
@@ -202,7 +202,7 @@ fn assert_fits(schema: &str, file: &Path) {
     assert!(errors.is_empty(), "{}: {errors:?}", file.display());
 }
 
-/// What the stages write is what the schemas say.
+/// The stages' files match the schemas.
 #[test]
 fn artifacts_fit_their_schemas() {
     let project = common::Project::tiny();

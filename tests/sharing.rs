@@ -61,7 +61,7 @@ fn training(project: &Project) -> Child {
     child
 }
 
-/// Whether this process, and what it starts, was started by nohup.
+/// Returns whether this process and its children ignore hangups, as under nohup.
 fn hangups_are_ignored() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).unwrap();
@@ -139,7 +139,7 @@ fn garbage_collection_keeps_what_a_run_in_progress_needs() {
     );
 }
 
-/// What `plan` promises to find again isn't collected, though its key isn't known.
+/// Records that `plan` expects to reuse aren't collected, even if their keys aren't known yet.
 #[test]
 fn what_waits_keeps_its_records() {
     let project = Project::fast();
@@ -276,7 +276,7 @@ fn a_full_disk_leaves_the_old_page() {
     assert_eq!(again.code, 0, "{}", again.stderr);
 }
 
-/// A name that isn't UTF-8 in a data folder, where no frame names it, is no matter.
+/// A file whose name isn't UTF-8 in a data folder is ignored if no frame names it.
 #[test]
 fn any_file_name_may_lie_in_a_data_folder() {
     let project = Project::fast();
@@ -358,7 +358,7 @@ fn a_runner_takes_nothing_into_a_store_that_has_become_newer() {
     Finished::of(child.wait_with_output().unwrap())
         .fails(1, &["train-ss: failed", "format 2", "use the newer nerf-sr"]);
     assert_eq!(project.store_listing(), before);
-    // The older one again, once it is alone: what it had made is there to go on from.
+    // The older one again, now alone: it resumes from its checkpoint.
     project.write(".nerf-sr/format", "1\n");
     assert!(project.ok(&[&["status"][..], &what].concat()).contains("has a checkpoint"));
     project.ok(&run);

@@ -13,10 +13,10 @@ use std::time::{Duration, Instant};
 use common::{Finished, Project, happens, root, wait_until};
 use numerics::CounterRng;
 
-/// A stage in plain Python. It goes so many steps, each from the one before, and leaves a
-/// checkpoint when it is asked to end, or where it `keeps` them at every step. While a file is
-/// there that `hold` names, it waits at the step that stands in it, and has said so in `held`. A
-/// `pause` makes each step last, so that kills at random moments find it at work.
+/// A stage in plain Python. It takes a number of steps, each from the previous one, and leaves a
+/// checkpoint when it is interrupted or, with `keeps`, at every step. While the file that `hold`
+/// names exists, the stage waits at the step in this file, after a line in `held`. `pause` prolongs
+/// each step, so that kills at random moments interrupt it at work.
 const STEP: &str = r#"#!/usr/bin/env python3
 import hashlib, json, os, pathlib, signal, sys, time
 here = pathlib.Path(__file__).parent
@@ -208,7 +208,7 @@ fn with_environment(mut command: Command, name: &str, value: &Path) -> Command {
     command
 }
 
-/// The runner with the Slurm executor, and no settings of whoever runs the tests.
+/// Returns the runner's command with the Slurm executor, without the user's own settings.
 fn command(project: &Project, arguments: &[&str]) -> Command {
     let mut command = project.command(arguments);
     command
@@ -230,7 +230,7 @@ fn lines(project: &Project, file: &str) -> Vec<String> {
     text.lines().map(str::to_owned).collect()
 }
 
-/// How often stages ran.
+/// Returns the names of the stages that ran, one for each time.
 fn ran(project: &Project) -> Vec<String> {
     lines(project, "ran")
 }

@@ -277,7 +277,7 @@ fn verify_beside_gc_cries_no_damage() {
     }
 }
 
-/// What scripts do to their output, and why it is refused; `${0%/*}` is the project.
+/// Scripts' changes to their output, and the reason of the refusal; `${0%/*}` is the project.
 const LINKS: [(&str, &str); 4] = [
     ("rmdir $out; ln -s ${0%/*}/own $out", "/output is a symbolic link"),
     ("cp ${0%/*}/own/x $out; ln -s x $out/link", "/output/link is a symbolic link"),

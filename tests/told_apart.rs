@@ -1,5 +1,5 @@
-//! Scenes on a background, forward-facing ones and such as go on are told apart, also without known
-//! depths.
+//! Detection of scenes on a background, forward-facing scenes and unbounded ones, also without
+//! known depths.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -11,7 +11,7 @@ use dataset::Dataset;
 use pixels::{Filter, Rgba8, read_png, resize_pillow, write_png};
 use serde_json::{Value, json};
 
-/// What `prep` makes of a data set: background, kind of space, and its notes.
+/// Returns background, kind of space and notes that `prep` writes for a data set.
 fn prepared(project: &Project, dataset: &Path, params: &Value) -> (String, String, String) {
     let scene = project.path("scene");
     std::fs::remove_dir_all(&scene).ok();
@@ -126,7 +126,7 @@ fn photographs_of_a_scene_that_goes_on_are_opaque_and_unbounded() {
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
     let (background, space, notes) = demo(&project, &folder, "around", false);
     assert_eq!((background.as_str(), space.as_str()), ("white", "box"), "{notes}");
-    // What is said by hand holds.
+    // Given parameters are used.
     let (background, space, _) = prepared(&project, &folder, &json!({"background": "opaque"}));
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"));
 }

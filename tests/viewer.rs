@@ -26,7 +26,7 @@ const LETTERS: [[u8; 5]; 4] = [
 /// Middle of the boards: in UTM coordinates, which a browser's floats can't hold.
 const MIDDLE: DVec3 = DVec3::new(500_000.0, 4_649_776.0, 120.0);
 
-/// Whether a place of a board, 0 to 1 to the right and downwards, is ink: "NERF".
+/// Returns whether a point of a board, 0 to 1 to the right and downwards, is ink: "NERF".
 fn is_ink(right: f64, down: f64) -> bool {
     let (column, row) = ((26.0 * right - 1.5).floor(), (10.0 * down - 1.5).floor());
     if !(0.0..24.0).contains(&column) || !(0.0..7.0).contains(&row) {
@@ -262,7 +262,7 @@ fn check_recorder(project: &Project, recorded: &Path, second: &Value) {
     assert_eq!(checked(&page, &views, 22.0, 64.0).unwrap().len(), 1);
 }
 
-/// What people do with mouse, keys and fingers changes the view as they expect.
+/// Mouse, keys and touches change the view as expected.
 #[test]
 fn people_can_look_around() {
     let project = Project::shipped(&["viewer", "video"], &clear_scene(""));

@@ -25,7 +25,7 @@ fn trained(project: &Project, scene: &Path, output: &str, more: &[&str]) -> Fini
 }
 
 /// The latest checkpoint of a training that was stopped becomes a field that is rendered; the
-/// training goes on to the bytes that it would have had.
+/// training continues to the same bytes.
 #[test]
 fn a_checkpoint_becomes_a_field() {
     let project = Project::tiny();
@@ -66,7 +66,7 @@ fn a_checkpoint_becomes_a_field() {
 }
 
 const RAYS: [&str; 2] = ["-p", "train-ss.rays=600000"];
-/// From so many rays on the training waits for a look, since looks may take a fiftieth of the time.
+/// Rays after which the training waits for a look: looks may take a fiftieth of the time.
 const LOOKED_AT: &str = "300000";
 
 fn psnr(look: &str) -> f64 {
@@ -74,8 +74,8 @@ fn psnr(look: &str) -> f64 {
     after.split_whitespace().next().unwrap().parse::<f64>().unwrap()
 }
 
-/// How near to the end a look comes, in dB. Of 21.6 dB in the end a look has 17.9 after 26,000
-/// rays, 20.8 after 73,000 and 21.5 after 314,000. A slow machine's is an early one.
+/// Returns how near to the final PSNR a look is, in dB. Of 21.6 dB in the end a look has 17.9 after
+/// 26,000 rays, 20.8 after 73,000 and 21.5 after 314,000. A slow machine's is an early one.
 fn nearness(look: &str) -> f64 {
     let (_, after) = look.split_once(" view (").unwrap();
     let rays = after.split_whitespace().next().unwrap().replace(',', "");

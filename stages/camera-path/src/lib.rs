@@ -50,8 +50,8 @@ pub enum Kind {
     /// Spiral around the mean camera, up to as wide as the positions of most cameras, for
     /// forward-facing photographs. Its frames stay where the cameras looked.
     Spiral,
-    /// Circle around the middle of the scene's box, at the cameras' mean distance and height, or the
-    /// arc along which cameras are.
+    /// Circle around the middle of the scene's box, at the cameras' mean distance and height, or
+    /// the arc along which cameras are.
     Orbit,
     /// Closed curve through all cameras, in their order.
     Between,
@@ -68,8 +68,8 @@ impl Stage for CameraPath {
     fn inputs() -> Vec<(&'static str, Input)> {
         let kinds =
             ["scene/train", "scene/cameras", "scene/truth", "scene/references", "cameras", "views"];
-        let path = "folder with camera_path.json, as the viewer, nerfstudio or this stage writes it; \
-            replaces kind and frames";
+        let path = "folder with camera_path.json, as the viewer, nerfstudio or this stage writes \
+            it; replaces kind and frames";
         vec![
             ("cameras", Input::required(&kinds, "folder with views.json: the scene's cameras")),
             ("path", Input::optional(&["cameras"], path)),

@@ -8,12 +8,12 @@ use scene::{Bounds, Camera, Pose, looking_at};
 use crate::paths::mean;
 
 /// Minimum angle without cameras that an orbit leaves out, in radians, and its minimum over the
-/// median angle between neighbouring cameras, so that few cameras all around give a circle. Both are
-/// chosen by hand.
+/// median angle between neighbouring cameras, so that few cameras all around give a circle. Both
+/// are chosen by hand.
 const MIN_GAP: f64 = TAU / 8.0;
 const MIN_GAP_OVER_MEDIAN: f64 = 3.0;
-/// Minimum distance of a camera from the axis over the orbit's radius: nearer cameras look down, and
-/// their angles around the axis mean little. Chosen by hand.
+/// Minimum distance of a camera from the axis over the orbit's radius: nearer cameras look down,
+/// and their angles around the axis mean little. Chosen by hand.
 const MIN_AXIS_DISTANCE: f64 = 0.25;
 /// Steps of [`up_direction`]: enough for level cameras along an arc of 40°; chosen by hand.
 const UP_STEPS: u32 = 100;

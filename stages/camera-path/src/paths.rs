@@ -15,16 +15,16 @@ const FOCUS_FRACTION: f64 = 0.75;
 /// Shares of the focus's disparity that are tried; with 0 all frames look in one direction.
 const FOCUS_STEPS: [f64; 5] = [1.0, 0.75, 0.5, 0.25, 0.0];
 /// Maximum share of a frame's tested points that no camera observes. In frames of fern these are
-/// points in corners at its nearest depth, where the scene has no surface; with 0 its spiral would be
-/// 0.35 of the cameras' width instead of 0.95.
+/// points in corners at its nearest depth, where the scene has no surface; with 0 its spiral would
+/// be 0.35 of the cameras' width instead of 0.95.
 const MAX_UNSEEN_FRACTION: f64 = 0.01;
 /// Number of sizes that are tried for a spiral; chosen by hand.
 const SIZE_STEPS: u32 = 20;
 /// Number of frames of a spiral that are tested; chosen by hand.
 const TESTED_FRAMES: u32 = 32;
 
-/// Computes the poses of a closed path: `camera_to_world` of each frame. `frame` has the frames' image
-/// size and lens.
+/// Computes the poses of a closed path: `camera_to_world` of each frame. `frame` has the frames'
+/// image size and lens.
 pub fn poses(
     kind: Kind,
     frames: u32,
@@ -86,8 +86,8 @@ impl Spiral {
     }
 
     /// Creates the largest spiral that stays where the cameras looked: at most
-    /// [`MAX_UNSEEN_FRACTION`] of a frame is unobserved, or as much as at the mean camera. A farther
-    /// focus is preferred to a smaller spiral.
+    /// [`MAX_UNSEEN_FRACTION`] of a frame is unobserved, or as much as at the mean camera. A
+    /// farther focus is preferred to a smaller spiral.
     fn fit(cameras: &[Camera], frame: &Camera, bounds: &Bounds) -> Self {
         let (near, far) = depth_range(bounds);
         let whole = Self::around(cameras, (near, far));

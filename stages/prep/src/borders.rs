@@ -190,7 +190,8 @@ impl Display for Borders {
             Backdrop::Transparent => write!(f, "images have alpha"),
             Backdrop::Flat([r, g, b]) => write!(
                 f,
-                "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of {views}"
+                "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of \
+                {views}"
             ),
             Backdrop::Scene => write!(
                 f,

@@ -266,11 +266,11 @@ const MIN_FOCUS_DETERMINANT: f64 = 1e-9;
 ///
 /// The centre is the point nearest to all optical axes; the half side is the half width of the
 /// widest view at that distance, so that a scene that fits into its views fits into the box. Views
-/// [`MIN_OUTLIER_RATIO`] times as wide as the median, of which `prep` warns, don't count: in a box as
-/// wide as theirs the scene would be a few cells large (docs/results/stability.md). If the
-/// axes don't cross (one view, a forward-facing row), the box surrounds the views between their
-/// known depths or, without depths, a point at distance 4 before the mean camera, the convention of
-/// the Blender scenes.
+/// [`MIN_OUTLIER_RATIO`] times as wide as the median, of which `prep` warns, don't count: in a box
+/// as wide as theirs the scene would be a few cells large (docs/results/stability.md). If the axes
+/// don't cross (one view, a forward-facing row), the box surrounds the views between their known
+/// depths or, without depths, a point at distance 4 before the mean camera, the convention of the
+/// Blender scenes.
 fn box_bounds(views: &[CameraDepths]) -> Bounds {
     let cameras: Vec<&Camera> = views.iter().map(|(camera, _)| camera).collect();
     let centre = if let Some(crossing) = crossing_point(&cameras, MIN_CENTRE_DETERMINANT) {
@@ -296,7 +296,8 @@ fn box_bounds(views: &[CameraDepths]) -> Bounds {
     with_ray_range(box_only, &cameras)
 }
 
-/// Half side of the box around cameras at one position, from which no depth follows; chosen by hand.
+/// Half side of the box around cameras at one position, from which no depth follows; chosen by
+/// hand.
 const UNKNOWN_HALF_SIDE: f64 = 1.0;
 
 /// Maximum slope of a fisheye view's border from which a box's size is computed: 45° from the axis.
@@ -450,8 +451,8 @@ mod tests {
         cameras.iter().map(|c| (c.clone(), depths)).collect()
     }
 
-    /// What each camera sees between its depths lies in the frustum's cube, whatever the world's
-    /// scale.
+    /// Each camera's view between its depths lies in the frustum's cube, at any scale of the
+    /// world.
     #[test]
     fn cameras_that_look_one_way_get_ndc() {
         for scale in [1e-3, 1.0, 1e3] {
@@ -586,7 +587,7 @@ mod tests {
         );
     }
 
-    /// The camera behind an equidistant lens that sees so many degrees across.
+    /// Replaces the camera's lens by an equidistant one whose view is `degrees` wide.
     fn fisheye(camera: &Camera, degrees: f64) -> Camera {
         let focal = 100.0 / degrees.to_radians();
         let distortion = scene::Distortion::fisheye([0.0; 4]);

@@ -187,7 +187,7 @@ mod tests {
         Ok((plan.images, plan.bounds, plan.references))
     }
 
-    /// A benchmark's images are HR truth, photographs are LR images as they are; sizes, kernel and
+    /// A benchmark's images are HR truth, photographs are unmodified LR images; sizes, kernel and
     /// references follow.
     #[test]
     fn images_follow_from_the_form() {
@@ -215,7 +215,7 @@ mod tests {
         planned(set, &params, Background::White).map(|(_, bounds, _)| (bounds.near, bounds.far))
     }
 
-    /// What the user says of near and far holds, unless it can't.
+    /// Given near and far values are used, unless they are impossible.
     #[test]
     fn near_and_far_are_as_given() {
         let set = ring(Format::Blender, 8);
@@ -285,7 +285,7 @@ mod tests {
         assert_eq!(sizes(Some(40)), sizes(None));
     }
 
-    /// What can't be is said by the parameter's name.
+    /// A message about an impossible value names the parameter.
     #[test]
     fn what_cannot_be_is_refused() {
         let kernel =

@@ -53,8 +53,8 @@ impl<'a> SceneWriter<'a> {
             sum.add(*clipping);
         }
         Some(format!(
-            "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and clipped to 1, in {count} of {} \
-            (first: frame {first})",
+            "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and clipped to 1, in {count} of \
+            {} (first: frame {first})",
             sum.clipped,
             sum.pixels,
             100.0 * sum.clipped as f64 / sum.pixels as f64,

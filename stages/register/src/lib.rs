@@ -22,8 +22,8 @@ pub struct Params {}
 /// Number of times that a photograph is halved at the start; more halvings register cameras with
 /// larger errors; chosen by hand.
 const PYRAMID_LEVELS: u32 = 3;
-/// Maximum number of times that the field is rendered for a photograph, at each of its sizes; chosen
-/// by hand.
+/// Maximum number of times that the field is rendered for a photograph, at each of its sizes;
+/// chosen by hand.
 const MAX_RENDERS: u32 = 8;
 
 /// Stage `register`.

@@ -1,5 +1,5 @@
-//! The Markdown document: a table of all rows, a table for each scene, gains, the spread over seeds,
-//! and failed points.
+//! The Markdown document: a table of all rows, a table for each scene, gains, the spread over
+//! seeds, and failed points.
 
 use artifact::{FailedPoint, Failure, label};
 

@@ -15,7 +15,7 @@ fn markdown(
     document(params, rows, figures, failed).map(|document| document.text)
 }
 
-/// As `metrics.json` describes it.
+/// Creates a figure as `metrics.json` describes it.
 fn figure(path: &str, label: &str, digits: usize, higher_is_better: bool) -> Value {
     json!({
         "path": path,

@@ -36,8 +36,8 @@ pub struct Params {
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
     /// Groups of comparable methods, in the order of the table: `[{name: LR images, methods:
-    /// [eval]}]`, with methods by scored block. Column `has seen` names the group, and the best value
-    /// is marked in each.
+    /// [eval]}]`, with methods by scored block. Column `has seen` names the group, and the best
+    /// value is marked in each.
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
     /// Rows from other sources, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:

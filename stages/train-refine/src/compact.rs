@@ -25,7 +25,9 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         Examples::read(context.input("views")?, context.input("truth")?, photographs.as_ref())?;
     if net.references_per_view > 0 && examples.training.len() < 2 {
         return Err(Failure::BadInput(
-            "input views: references_per_view needs at least three views with an image in input truth".to_owned(),
+            "input views: references_per_view needs at least three views with an image in input \
+            truth"
+                .to_owned(),
         )
         .into());
     }

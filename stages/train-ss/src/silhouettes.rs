@@ -46,8 +46,8 @@ struct Silhouette {
 }
 
 impl Silhouette {
-    /// Returns the silhouette of a photograph; `None` if the photograph has no transparent pixel, or
-    /// no opaque one: from far away, an object may be smaller than a pixel.
+    /// Returns the silhouette of a photograph; `None` if the photograph has no transparent pixel,
+    /// or no opaque one: from far away, an object may be smaller than a pixel.
     fn new(photograph: &Photograph) -> Option<Self> {
         let Photograph { image, mask } = photograph;
         if image.channels < 4 {

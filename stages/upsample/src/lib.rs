@@ -4,8 +4,8 @@
 //! * `bicubic`: Pillow's filter on 8 bits, bit-exact.
 //! * `imdn`, `swinir`: networks with a fixed scale, which is read from their weights.
 //! * `liif`: a network for any scale.
-//! * `prior`: a network that `train-prior` taught on random images; the program contains its weights
-//!   for scale 4.
+//! * `prior`: a network that `train-prior` taught on random images; the program contains its
+//!   weights for scale 4.
 //!
 //! Other weights are safetensors files with the tensors' published names, converted from released
 //! checkpoints by `scripts/convert-weights.py`; every tensor's shape is checked. Images are

@@ -14,8 +14,8 @@ use crate::animation::AnimatedPng;
 /// Interval at which ffmpeg and interruptions are checked; chosen by hand.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Constant rate factor of the H.264 encoder, from 0 (lossless) to 51. x264's documentation calls 17
-/// or 18 visually lossless or nearly so.
+/// Constant rate factor of the H.264 encoder, from 0 (lossless) to 51. x264's documentation calls
+/// 17 or 18 visually lossless or nearly so.
 const H264_RATE_FACTOR: &str = "18";
 
 /// Maximum width of an animated PNG, in pixels: its compression is lossless. Chosen by hand.

@@ -15,8 +15,9 @@ pub struct WarpScore {
     pub seen: f64,
 }
 
-/// Maximum distance between two cameras over the median depth of a view: 20° of parallax, 2·tan 10°,
-/// chosen by hand. From farther apart, reflections and occlusions differ more than wrong depths do.
+/// Maximum distance between two cameras over the median depth of a view: 20° of parallax, 2·tan
+/// 10°, chosen by hand. From farther apart, reflections and occlusions differ more than wrong
+/// depths do.
 const MAX_DISTANCE_PER_DEPTH: f64 = 0.3527;
 
 /// Returns the other view whose centre is nearest to a camera's.
@@ -29,8 +30,8 @@ fn squared_distance(camera: &Camera, view: &View) -> f64 {
     (view.camera.centre() - camera.centre()).length_squared()
 }
 
-/// True if two cameras are near enough for a comparison of their views, by [`MAX_DISTANCE_PER_DEPTH`].
-/// `depth` is the surface in the first one's view.
+/// True if two cameras are near enough for a comparison of their views, by
+/// [`MAX_DISTANCE_PER_DEPTH`]. `depth` is the surface in the first one's view.
 fn are_near(camera: &Camera, other: &Camera, depth: &ExrImage) -> bool {
     let (Some(z), Some(opacity)) = (depth.channel("Z"), depth.channel("A")) else { return false };
     let mut depths: Vec<f32> =

@@ -133,7 +133,7 @@ fn pages(dir: &Path) -> Vec<String> {
     pages
 }
 
-/// What a kill leaves of a publishing is ended by the next one: whole pages are found again.
+/// The next publishing completes one that was killed: no complete page is lost.
 #[test]
 fn pages_left_by_a_kill_are_archived() {
     const NEW: &str = ".report.nerf-sr-new";

@@ -6,9 +6,9 @@ use planning::{Describing, Pipeline, Plan, PlanError, Request, State};
 
 use crate::session::Session;
 
-/// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts. The artifact is that
-/// of the same command line, without the argument and without the stage's own parameters, which are
-/// those of the training that continues.
+/// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts. The artifact is
+/// that of the same command line, without the argument and without the stage's own parameters,
+/// which are those of the training that continues.
 pub(crate) fn with_folders(
     pipeline: &Pipeline,
     session: &Session,

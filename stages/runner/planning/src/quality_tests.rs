@@ -82,7 +82,7 @@ fn every_quality_sets_the_same_valid_parameters() {
     assert!(ROWS.values().all(|row| row.len() == SCHEMAS.len()));
 }
 
-/// So a stage that runs without a runner has the quality `best`.
+/// A stage that runs without a runner therefore has the quality `best`.
 #[test]
 fn best_has_the_defaults_of_the_stages() {
     for (program, schema) in SCHEMAS {

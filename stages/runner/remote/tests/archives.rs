@@ -100,12 +100,12 @@ fn what_is_not_whole_is_not_exported() {
     assert_not_exported(dir.path(), &store, &records[3].key(), 3, "the artifact is incomplete");
 }
 
-/// An entry of an archive, as bytes say it.
+/// Entry of an archive.
 #[derive(Clone)]
 struct Entry {
     path: String,
     kind: tar::EntryType,
-    /// What the header says, where it lies.
+    /// Size in the header, if it differs from that of `bytes`.
     size: Option<u64>,
     bytes: Vec<u8>,
 }
@@ -331,7 +331,7 @@ fn cut_and_flipped_archives() {
         fs::write(&file, bytes).unwrap();
         let (code, _, err) = import(&file, &dir.path().join("flipped"));
         let store = Store::open(&dir.path().join("flipped")).unwrap();
-        // A flipped bit may lie in padding, or in words of a record that no hash covers.
+        // A flipped bit may be in padding, or in text of a record that no hash covers.
         assert!(
             code == 0
                 || (code == 3 && err.lines().count() == 1 && store.objects().unwrap().is_empty()),

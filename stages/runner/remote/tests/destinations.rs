@@ -1,4 +1,4 @@
-//! What `export` may replace, what `import` may read, and what killed commands leave.
+//! Files that `export` may replace and `import` may read, and leftovers of killed commands.
 
 mod common;
 
@@ -26,7 +26,7 @@ fn listing(folder: &Path) -> Vec<String> {
     all
 }
 
-/// What isn't a regular file stays, with --force, too; a regular file is replaced only with it.
+/// Only a regular file is replaced, and only with --force.
 #[test]
 fn export_replaces_nothing_unasked() {
     type Make = fn(&Path);

@@ -74,7 +74,7 @@ fn some_are_selected() {
     assert!(code == 2 && err.contains("no action \"zz\""), "{err}");
 }
 
-/// What is here stays, unless it is damaged: that is what pulling is for.
+/// Pulling replaces an existing artifact only if it is damaged.
 #[test]
 fn what_is_here_is_not_overwritten() {
     let setup = Setup::pushed();
@@ -291,8 +291,8 @@ fn other_formats_and_places_are_refused_in_one_line() {
         refused(&["pull", &remote], &setup.path("other"), 3, "use the newer nerf-sr-remote");
         refused(&["push", &remote], store, 3, "use the newer nerf-sr-remote");
     }
-    // Whoever writes into one of an older form marks it, so that older programs leave alone what is
-    // new there.
+    // A program that writes into a store of an older format marks the store, so that older
+    // programs don't use its new entries.
     fs::write(setup.path("remote/format"), "0\n").unwrap();
     for (words, store, format) in [
         (["pull", &remote], setup.path("other").as_path(), "0\n"),

@@ -99,7 +99,7 @@ fn two_machines_share_a_store_through_s3() {
     let dir = tempfile::tempdir().unwrap();
     let place = |name: &str| dir.path().join(name);
     let (store, records) = sample(&place("store"));
-    // Nothing is there yet, which is said.
+    // The prefix is empty, which is reported.
     let (code, _, err) = said(&mut server.command(&place("other"), &["pull", REMOTE]));
     assert!(
         code == 3 && err.contains("nothing was pushed here") && err.lines().count() == 1,

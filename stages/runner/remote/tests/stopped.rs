@@ -37,7 +37,7 @@ fn interrupt(child: &std::process::Child) {
     );
 }
 
-/// How often a push or pull is stopped.
+/// Number of times that a push or pull is stopped.
 const TURNS: u32 = 12;
 
 /// A store with enough in it that a kill comes in the middle.

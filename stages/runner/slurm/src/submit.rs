@@ -204,7 +204,7 @@ mod tests {
                 .unwrap()
         }
 
-        /// What stands in the queue: jobs of the submission "one".
+        /// Sets the queue: jobs of the submission "one".
         fn queue(&self, jobs: &[(&str, &str, usize)]) {
             let lines = jobs.iter().map(|job| queue_line(self.dir.path(), job));
             std::fs::write(self.path("queue"), lines.collect::<String>()).unwrap();

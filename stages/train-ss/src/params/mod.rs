@@ -41,8 +41,8 @@ pub struct Params {
     #[schemars(range(min = 1, max = 1_048_576))]
     #[schemars(extend("x-group" = "sampling", "x-default" = "by `field`"))]
     pub max_rays_per_step: Option<u32>,
-    /// Highest learning rate: of the grid's coarsest level, or of the paper's MLPs. Default: 0.06, or
-    /// 0.0005 with `field: mlp`.
+    /// Highest learning rate: of the grid's coarsest level, or of the paper's MLPs. Default: 0.06,
+    /// or 0.0005 with `field: mlp`.
     #[schemars(range(min = 0.0, max = 1.0))]
     #[schemars(extend("x-group" = "optimiser", "x-default" = "by `field`"))]
     pub learning_rate: Option<f64>,
@@ -133,8 +133,8 @@ pub struct GridParams {
     /// Minimum of the rays that follow from `rays_per_pixel`.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
     pub min_rays: u64,
-    /// Maximum of the rays that follow from `rays_per_pixel`, even if `min_rays` is larger. It limits
-    /// the time of a training on many or large photographs.
+    /// Maximum of the rays that follow from `rays_per_pixel`, even if `min_rays` is larger. It
+    /// limits the time of a training on many or large photographs.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
     pub max_rays: u64,
     /// Target number of samples in the first steps. The last steps have 8/3 times as many. Steps

@@ -210,7 +210,7 @@ mod tests {
         params.resolve(scene).record().remove(name).unwrap_or(Value::Null)
     }
 
-    /// A default holds where nothing else is said, for its own field alone.
+    /// A default applies only if the parameter is omitted, and only to its own field.
     #[test]
     fn scenes_decide_defaults() {
         let (grid, mlp) = (

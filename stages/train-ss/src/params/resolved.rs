@@ -34,8 +34,8 @@ pub struct Resolved {
     pub pose_refinement: bool,
     /// True if photographs with alpha limit the cells of the grid.
     pub silhouettes: bool,
-    /// True if each pixel is drawn once per epoch, as in the paper's code; if false, pixels are drawn
-    /// independently.
+    /// True if each pixel is drawn once per epoch, as in the paper's code; if false, pixels are
+    /// drawn independently.
     pub in_epochs: bool,
     /// Ratio of the draw rates of detailed and flat pixels.
     pub pixel_importance: f64,

@@ -153,7 +153,7 @@ mod tests {
         Image::new(32, 32, 3, (0..32 * 32 * 3).map(hr_sample).collect())
     }
 
-    /// What is left of the changed HR image, the number of views, and what is said.
+    /// Returns the rest of the changed HR image, the number of views, and the message.
     fn checked_with(name: &str, change: &dyn Fn(f32) -> f32) -> (Option<Image>, usize, String) {
         let lr = Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr());
         let lr = photographs("a", lr);

@@ -301,8 +301,8 @@ mod tests {
         cache
     }
 
-    /// Where a filter's footprint is the pixel's own block, the residual asks of every HR pixel
-    /// what the mean's does.
+    /// If a filter's footprint is the pixel's own block, the residual of every HR pixel equals that
+    /// of the mean.
     #[test]
     fn a_whole_box_is_the_mean() {
         let (hr, lr) = ((12, 8), (6, 4));

@@ -14,8 +14,8 @@ const WHITE_FRACTION: f32 = 0.3;
 /// Ranges of the number of shapes, and of the smallest radius in pixels; chosen by hand.
 const SHAPES: [f32; 2] = [25.0, 250.0];
 const SMALLEST_RADII: [f32; 2] = [2.0, 10.0];
-/// Range of the standard deviation in pixels of the filter that blurs an image, as a lens or a renderer
-/// does. Without a blur, a network makes other images too sharp (design note 051).
+/// Range of the standard deviation in pixels of the filter that blurs an image, as a lens or a
+/// renderer does. Without a blur, a network makes other images too sharp (design note 051).
 const DEVIATIONS: [f32; 2] = [0.3, 0.8];
 /// Number of samples on each side of a pixel's centre that the filter weights.
 const REACH: usize = 4;
@@ -302,8 +302,8 @@ const SHAPE_KINDS: [ShapeKind; 12] = [
 ];
 
 impl Shape {
-    /// Draws a shape. The density of radii r is proportional to r⁻³, as in images that look the same
-    /// at any size.
+    /// Draws a shape. The density of radii r is proportional to r⁻³, as in images that look the
+    /// same at any size.
     fn draw([smallest, largest]: [f32; 2], side: usize, rng: &mut CounterRng) -> Self {
         let [a, b] = [smallest.powi(-2), largest.powi(-2)];
         let kind = SHAPE_KINDS[rng.below(SHAPE_KINDS.len() as u64) as usize];

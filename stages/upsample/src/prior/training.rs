@@ -25,8 +25,8 @@ const HOLD_OUT_EVERY: usize = 64;
 const LEARNING_RATE: f64 = 5e-4;
 /// Number of steps over which the learning rate rises; chosen by hand.
 const WARM_UP_STEPS: u64 = 200;
-/// Fraction of the steps that minimise the absolute error; the last ones minimise the squared error,
-/// which PSNR counts.
+/// Fraction of the steps that minimise the absolute error; the last ones minimise the squared
+/// error, which PSNR counts.
 const ABSOLUTE_FRACTION: f64 = 0.6;
 /// Factor of the squared error, which makes both losses similar in size.
 const SQUARED_FACTOR: f64 = 10.0;

@@ -195,10 +195,10 @@ impl Lanes for Portable {
 
 #[cfg(target_arch = "x86_64")]
 pub mod x86 {
-    //! Lanes in registers of x86-64. Intrinsics fix the vector width: with auto-vectorisation the accumulators of a matrix tile
-    //! spill. The `unsafe` is sound because these types are only used in functions compiled for
-    //! their features (see `kernel!`). There are no closures: a closure wouldn't inherit the
-    //! features, and its intrinsics would be calls.
+    //! Lanes in registers of x86-64. Intrinsics fix the vector width: with auto-vectorisation the
+    //! accumulators of a matrix tile spill. The `unsafe` is sound because these types are only used
+    //! in functions compiled for their features (see `kernel!`). There are no closures: a closure
+    //! wouldn't inherit the features, and its intrinsics would be calls.
 
     use std::arch::x86_64::*;
 

@@ -15,7 +15,7 @@ use crate::sampling::{importance, midpoints, stratified};
 
 const GOLDENS: &[u8] = include_bytes!("../tests/goldens/mlp.safetensors");
 
-/// What the script's `draw` gives.
+/// Draws the numbers that the script's `draw` draws.
 fn draw(purpose: u64, shape: &[i64]) -> Tensor {
     let values: Vec<f64> = (0..shape.iter().product::<i64>())
         .map(|i| f64::from(uniform(11, purpose, i as u64)))

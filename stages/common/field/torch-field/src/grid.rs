@@ -621,7 +621,7 @@ mod tests {
         p.colour.iter().chain(&[p.opacity, p.depth, p.median_depth]).all(|x| x.is_finite())
     }
 
-    /// What misses the box, runs along its faces, begins inside, has no length or isn't finite.
+    /// Rays that miss the box, run along its faces, start inside, have no length or aren't finite.
     #[test]
     fn extreme_rays_are_finite_alike() {
         let bounds = Bounds::cube(1.0, 0.0, 1e6);

@@ -574,7 +574,7 @@ mod tests {
         }
     }
 
-    /// Where nothing may be there is the background, and nothing to learn.
+    /// Empty cells render the background and get no gradient.
     #[test]
     fn nothing_is_learnt_where_nothing_may_be() {
         let mut start = field(Space::Box);
@@ -592,7 +592,7 @@ mod tests {
         judge
     }
 
-    /// What goes on from a checkpoint ends in the same numbers.
+    /// A training resumed from a checkpoint ends with the same numbers.
     #[test]
     fn a_checkpoint_holds_all() {
         let new = || GridTrainer::new(&field(Space::Box), options(), Device::Cpu).unwrap();

@@ -9,9 +9,9 @@ use crate::ray_maps::to_host;
 /// Number of final epochs during which the learning rate decays.
 const FALLING_EPOCHS: u64 = 10;
 
-/// Returns the learning rate when a fraction `done` of a training run of `epochs` is over, as in the
-/// reference implementation: constant until the last ten epochs, each of which multiplies the rate
-/// by the eleventh root of the decay. The final rate is never quite reached. Fewer than twenty
+/// Returns the learning rate when a fraction `done` of a training run of `epochs` is over, as in
+/// the reference implementation: constant until the last ten epochs, each of which multiplies the
+/// rate by the eleventh root of the decay. The final rate is never quite reached. Fewer than twenty
 /// epochs pass through the same schedule faster.
 pub(crate) fn learning_rate(highest: f64, decay: f64, epochs: u64, done: f64) -> f64 {
     let epochs = epochs.max(2 * FALLING_EPOCHS);

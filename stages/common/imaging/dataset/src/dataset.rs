@@ -216,7 +216,7 @@ mod tests {
         Dataset::read(folder).unwrap()
     }
 
-    /// What a lens has no ray for is left out, in addition to what a mask leaves out.
+    /// Pixels without a ray are left out, in addition to those that a mask excludes.
     #[test]
     fn masks_of_lenses_join_those_of_the_data() {
         let dir = tempfile::tempdir().unwrap();

@@ -179,7 +179,7 @@ mod tests {
         }
     }
 
-    /// A file of version 2 whose header claims to have so many bytes.
+    /// Returns a file of version 2 whose header claims `length` bytes.
     fn claiming(length: u32, header: &str, data: &[u8]) -> Vec<u8> {
         [&b"\x93NUMPY\x02\0"[..], &length.to_le_bytes(), header.as_bytes(), data].concat()
     }

@@ -169,8 +169,8 @@ fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<bool, String> {
             Err(format!("cut short or damaged: {rows} of {height} rows are missing"))
         }
         Extent::Coarse { scan, height } => Err(format!(
-            "cut short or damaged in scan {scan} of a progressive JPEG: detail of all {height} rows \
-            is missing"
+            "cut short or damaged in scan {scan} of a progressive JPEG: detail of all {height} \
+            rows is missing"
         )),
     }
 }

@@ -234,7 +234,7 @@ mod tests {
             .distortion
     }
 
-    /// The same letters are other coefficients in other models.
+    /// A letter names different coefficients in different models.
     #[test]
     fn coefficients_belong_to_their_model() {
         let all = r#""k1": 0.1, "k2": -0.02, "k3": 0.003, "k4": -0.0004, "p1": 0.01, "p2": 0.002"#;

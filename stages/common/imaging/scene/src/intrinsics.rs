@@ -293,7 +293,7 @@ mod tests {
         assert!(!bent([-0.193, -0.047, -0.0156], [-0.0056, 0.0078]).has_rays());
     }
 
-    /// A fisheye camera that sees so many degrees from left to right, without distortion.
+    /// Creates a fisheye camera without distortion whose view is `degrees` wide.
     fn fisheye(degrees: f64) -> Intrinsics {
         let focal = 400.0 / degrees.to_radians();
         Intrinsics { fx: focal, fy: focal, ..camera(Distortion::fisheye([0.0; 4])) }
@@ -333,8 +333,7 @@ mod tests {
     }
 
     proptest! {
-        /// What the pinhole camera sees lies inside the image, and a slightly wider one would see
-        /// past it.
+        /// The pinhole camera's view lies inside the image; that of a slightly wider one would not.
         #[test]
         fn a_pinhole_sees_as_much_as_there_is(camera in mild()) {
             let pinhole = camera.pinhole().expect("a mild distortion");

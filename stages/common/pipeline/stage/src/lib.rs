@@ -9,8 +9,8 @@
 //! * [`CheckpointSchedule`]: times at which a training writes checkpoints.
 //! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic;
 //!   the runner uses them, too.
-//! * [`available_memory`], [`processors`], [`check_device`]: limits of memory, the default number of
-//!   threads, and the compute device.
+//! * [`available_memory`], [`processors`], [`check_device`]: limits of memory, the default number
+//!   of threads, and the compute device.
 //!
 //! The crate knows neither images nor tensors nor the store. Artifacts and failures are in
 //! `artifact`.

@@ -130,8 +130,8 @@ fn format_error(path: &Path, reason: String) -> WeightsError {
     WeightsError::Format { path: path.to_path_buf(), reason }
 }
 
-/// Writes named tensors of f32, f16, i64 or u8 as safetensors without metadata, so that equal tensors
-/// give equal bytes.
+/// Writes named tensors of f32, f16, i64 or u8 as safetensors without metadata, so that equal
+/// tensors give equal bytes.
 pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
     let bytes = serialized(tensors)
         .map_err(std::io::Error::other)

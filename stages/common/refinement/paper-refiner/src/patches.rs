@@ -209,7 +209,7 @@ mod tests {
         assert_eq!(patch_starts(150, 64), patch_starts(150, 32));
     }
 
-    /// A wall at distance 2, seen by cameras that move along it by so many pixels.
+    /// Creates the view of a wall at distance 2 by a camera moved along it by a number of pixels.
     fn known(pixels: f64) -> KnownView {
         let (width, height) = (160, 96);
         let camera = Camera {

@@ -30,7 +30,8 @@ fn load<L: Lanes>(from: &Vector) -> L {
     L::load(&from.0)
 }
 
-/// Feature maps: rows of pixels, channels last. The channels are padded with zeros to whole vectors.
+/// Feature maps: rows of pixels, channels last. The channels are padded with zeros to whole
+/// vectors.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Maps {
     pub(crate) width: usize,
@@ -244,8 +245,8 @@ impl LayerGradients {
         kernels
     }
 
-    /// Returns the gradients of a kernel's nine taps for an input and sixteen outputs, whose vectors
-    /// are at `offset` of each point's `size`.
+    /// Returns the gradients of a kernel's nine taps for an input and sixteen outputs, whose
+    /// vectors are at `offset` of each point's `size`.
     fn taps(&self, size: usize, offset: usize) -> [Vector; 9] {
         let mut rows = [[Vector::default(); INPUTS]; 3];
         for point in 0..POINTS {
@@ -283,8 +284,8 @@ impl BlockRows {
         self.data.resize(POINTS * self.stride(), Vector::default());
     }
 
-    /// Returns the number of vectors per point. An odd number: with a power of two, a tile's vectors
-    /// would share few sets of the cache.
+    /// Returns the number of vectors per point. An odd number: with a power of two, a tile's
+    /// vectors would share few sets of the cache.
     #[inline(always)]
     fn stride(&self) -> usize {
         BLOCK * self.depth + 1

@@ -20,8 +20,8 @@
 //!
 //! Colours are display-encoded sRGB, composited on the background.
 //!
-//! Convolutions are Winograd's, on kernels of sixteen lanes. Gradients of shards are added in order,
-//! so bytes don't depend on the number of threads.
+//! Convolutions are Winograd's, on kernels of sixteen lanes. Gradients of shards are added in
+//! order, so bytes don't depend on the number of threads.
 //!
 //! ```
 //! use pixels::Image;

@@ -376,7 +376,7 @@ mod tests {
         assert!(apart > 0.01, "{apart}");
     }
 
-    /// A tile without any opacity in sight stays as it is; one opaque pixel in sight changes it.
+    /// A tile without opacity in its surroundings stays unchanged; one opaque pixel changes it.
     #[test]
     fn transparent_tiles_stay() {
         let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });

@@ -124,8 +124,8 @@ impl Starter {
         &self.notes
     }
 
-    /// Writes the pipeline file and, in folders next to it, the shipped targets. Returns the written
-    /// files. Writes nothing if any of them exists.
+    /// Writes the pipeline file and, in folders next to it, the shipped targets. Returns the
+    /// written files. Writes nothing if any of them exists.
     pub(crate) fn write(&self) -> Result<Vec<PathBuf>, StarterError> {
         let name = self.file.file_name().unwrap_or_default().to_string_lossy();
         let mut files = vec![(self.file.clone(), self.text.clone())];
@@ -148,8 +148,8 @@ impl Starter {
     }
 }
 
-/// Returns a shipped target's text for the pipeline's own data set: experiments run on this scene by
-/// default.
+/// Returns a shipped target's text for the pipeline's own data set: experiments run on this scene
+/// by default.
 fn own_scene(text: &str, dataset: &str) -> String {
     // Paths in the file start from its folder.
     let path = serde_json::from_str(dataset).unwrap_or_else(|_| dataset.to_owned());

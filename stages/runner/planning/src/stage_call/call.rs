@@ -318,8 +318,8 @@ impl<'a> OutputReader<'a> {
 }
 
 /// Waits for the end of a stage, then kills the processes that it has left running. `tick` runs
-/// every few milliseconds. `are_closed` returns whether all processes have closed the stage's pipes.
-/// Returns the peak memory as well.
+/// every few milliseconds. `are_closed` returns whether all processes have closed the stage's
+/// pipes. Returns the peak memory as well.
 fn wait(
     group: Group,
     stop: &AtomicBool,

@@ -16,7 +16,8 @@ impl<'a> Reader<'a> {
     }
 
     /// Converts a value, including nested values, to the schema's form: for type `number` 2 becomes
-    /// 2.0, otherwise 2.0 becomes 2, and for type `integer` "2k" becomes 2000. Invalid values stay unchanged; the validator reports them.
+    /// 2.0, otherwise 2.0 becomes 2, and for type `integer` "2k" becomes 2000. Invalid values stay
+    /// unchanged; the validator reports them.
     pub(crate) fn read(&self, schema: &'a Value, value: &Value) -> Value {
         self.read_by(&self.alternatives(&[schema]), value)
     }
