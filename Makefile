@@ -70,7 +70,7 @@ faults: build remote ## Inject faults: kills at random moments and at every call
 
 # libtorch of `make setup` is for x86-64 only, so that crates that can't do without libtorch aren't checked for aarch64.
 ARM := aarch64-unknown-linux-gnu
-NEED_LIBTORCH := nets refinement paper-refiner train-refine refine upsample end-to-end
+NEED_LIBTORCH := nets refinement train-refine refine upsample end-to-end
 lint: setup ## Run rustfmt, clippy (with and without libtorch, fuzz targets included), and where installed a check for aarch64, cargo-deny and typos
 	cargo fmt --all --check
 	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Generates the golden files of `paper-refiner` with PyTorch's own layers in f64: run by `make goldens`.
+"""Generates the golden files of `refinement::paper` with PyTorch's own layers in f64: run by `make goldens`.
 
 The network and VGG-19's blocks are built here from their published descriptions, with narrow layers and fixed random weights. Golden files
 contain features after each block, the network's output with running and with batch statistics, the loss with and without its perceptual
@@ -14,7 +14,7 @@ from torch import nn
 from torch.nn import functional
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-TO = ROOT / "stages/common/refinement/paper-refiner/tests/goldens"
+TO = ROOT / "stages/common/refinement/refinement/tests/goldens"
 torch.manual_seed(3)
 
 

@@ -29,19 +29,26 @@ pub fn bin(name: &str) -> PathBuf {
     path
 }
 
-/// Returns the names of all stages, sorted: a stage's folder, crate and program have one name.
+/// Returns the names of all stages, sorted: a stage has the name of its crate's folder or, as a
+/// crate's second program, of its file in `src/bin/`.
 pub fn stage_names() -> Vec<String> {
-    let folders = std::fs::read_dir(root().join("stages")).unwrap();
-    let mut names: Vec<String> = folders
-        .map(|entry| entry.unwrap().path())
-        .filter(|folder| folder.join("src/main.rs").exists())
-        .map(|folder| folder.file_name().unwrap().to_str().unwrap().to_owned())
-        .filter(|name| !["runner", "remote"].contains(&name.as_str()))
-        // The second program of `upsample`.
-        .chain(["train-prior".to_owned()])
-        .collect();
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(root().join("stages")).unwrap() {
+        let folder = entry.unwrap().path();
+        if folder.join("src/main.rs").exists() {
+            names.push(stem(&folder));
+        }
+        if let Ok(programs) = std::fs::read_dir(folder.join("src/bin")) {
+            names.extend(programs.map(|program| stem(&program.unwrap().path())));
+        }
+    }
     names.sort();
     names
+}
+
+/// Returns a path's last component, without its extension.
+fn stem(path: &Path) -> String {
+    path.file_stem().unwrap().to_str().unwrap().to_owned()
 }
 
 /// Returns the runner's verbs.

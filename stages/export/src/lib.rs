@@ -15,11 +15,14 @@
 //! coordinates are relative to an offset ([`coordinates`]). Camera axes are OpenGL's (x right, y
 //! up, looking along -z) in `transforms.json`, and COLMAP's (x right, y down, looking along z) in
 //! its model.
+//!
+//! A second program, [`CopyFiles`], copies artifacts such as these to the folder of pages.
 
 mod cameras;
 mod colour;
 mod consensus;
 mod coordinates;
+mod copy;
 mod fusion;
 mod glb;
 mod lattice;
@@ -47,6 +50,7 @@ use workload::ExportViews;
 use cameras::CameraFormat;
 use coordinates::Coordinates;
 pub use coordinates::{ExportOffset, OFFSET_FILE};
+pub use copy::CopyFiles;
 use lattice::Lattice;
 use mesh::Mesh;
 use surface_view::SurfaceView;

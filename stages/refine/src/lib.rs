@@ -22,7 +22,7 @@ mod references;
 mod summary;
 mod view;
 
-use paper_refiner::DEFAULT_OVERLAP_PIXELS;
+use refinement::paper::DEFAULT_OVERLAP_PIXELS;
 use refinement::{KnownView, LrObservations, REFINER_FILE, ReferenceStatistics, RefinerFile};
 use scene::{VIEWS_FILE, Views, image_file, preview_file};
 use schemars::JsonSchema;

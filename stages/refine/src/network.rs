@@ -1,6 +1,6 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
-use paper_refiner::PaperRefiner;
 use pixels::Image;
+use refinement::paper::PaperRefiner;
 use refinement::{
     KnownView, Network, ReferenceStatistics, Refiner, RefinerFile, Rendered, WEIGHTS_FILE,
     WarpOptions, with_references,

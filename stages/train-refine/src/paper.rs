@@ -1,8 +1,8 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
-use paper_refiner::{
+use pixels::{Image, psnr_of};
+use refinement::paper::{
     DEFAULT_OVERLAP_PIXELS, PaperRefiner, PaperTrainer, PaperTraining, PerceptualLoss,
 };
-use pixels::{Image, psnr_of};
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 use serde_json::json;
 use stage::{Context, Rule};

@@ -17,6 +17,7 @@
 //! * [`LrObservations`]: LR photographs that views are made consistent with (data consistency).
 //! * [`RefinerTrainer`], [`RefinerTraining`]: training on examples, a [`Training`].
 //! * [`RefinerFile`]: description of a refiner in its artifact.
+//! * [`paper`]: the paper's own network, for comparison.
 //!
 //! Colours are display-encoded sRGB, composited on the background.
 //!
@@ -40,6 +41,7 @@ mod convolution;
 mod error;
 mod folded;
 mod network;
+pub mod paper;
 mod refiner;
 mod sums;
 mod trainer;

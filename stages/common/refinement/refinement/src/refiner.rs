@@ -44,7 +44,7 @@ impl RefinerArchitecture {
 pub enum Network {
     /// This project's network: [`Refiner`].
     Compact(RefinerArchitecture),
-    /// The paper's network (crate `paper-refiner`).
+    /// The paper's network (`refinement::paper`).
     Paper {
         /// Number of features of the first layer; 128 as published.
         width: u32,

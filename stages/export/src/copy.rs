@@ -1,7 +1,3 @@
-//! `copy`: a run's artifacts as a folder next to its pages, for files that other programs open.
-//!
-//! The stage is a sink: it gets the run's record. Each point of a sweep has its own folder.
-
 use std::io::{self, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -14,16 +10,17 @@ use stage::{Context, Input, Output, Progress, SUMMARY_FILE, Stage};
 /// Parameters of `copy`: none.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Params {}
+pub struct CopyParams {}
 
 /// Number of bytes copied between two reports of progress; chosen by hand.
 const CHUNK_BYTES: usize = 1 << 20;
 
-/// The stage.
-pub struct Copy;
+/// Stage `copy`: a sink that copies a run's artifacts to a folder next to its pages, for other
+/// programs. Each point of a sweep has its own folder.
+pub struct CopyFiles;
 
-impl Stage for Copy {
-    type Params = Params;
+impl Stage for CopyFiles {
+    type Params = CopyParams;
     const NAME: &'static str = "copy";
     const SUMMARY: &'static str = "Copies artifacts to the folder of pages, for other programs.";
     const SINK: bool = true;
@@ -39,7 +36,7 @@ impl Stage for Copy {
         Output::kind("files")
     }
 
-    fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
+    fn run(context: &Context, _: &CopyParams) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
         run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
         let shown: Vec<&RunNode> = run.nodes.iter().filter(|node| node.is_shown).collect();

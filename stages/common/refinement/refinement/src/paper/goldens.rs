@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use nets::Weights;
 use tch::{Kind, Tensor};
 
-use crate::loss::PerceptualLoss;
-use crate::network::PaperRefiner;
-use crate::trainer::loss;
+use super::loss::PerceptualLoss;
+use super::network::PaperRefiner;
+use super::trainer::loss;
 
 fn golden() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/golden.safetensors")

@@ -1,12 +1,12 @@
 use std::collections::BTreeSet;
 
+use crate::{KnownView, RefinementError, Rendered};
 use pixels::Image;
 use rayon::prelude::*;
-use refinement::{KnownView, RefinementError, Rendered};
 use scene::Surface;
 use tch::{TchError, no_grad};
 
-use crate::network::{PaperRefiner, patch_tensor};
+use super::network::{PaperRefiner, patch_tensor};
 
 /// Side of a patch in pixels, as published.
 pub(crate) const PATCH_PIXELS: usize = 64;

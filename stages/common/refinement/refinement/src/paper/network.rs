@@ -1,8 +1,8 @@
 use std::path::Path;
 
+use crate::RefinementError;
 use nets::Weights;
 use numerics::CounterRng;
-use refinement::RefinementError;
 use tch::{TchError, Tensor};
 
 /// The published network, of any width.

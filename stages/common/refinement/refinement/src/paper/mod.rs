@@ -17,7 +17,7 @@
 //! without blending (design note 024).
 //!
 //! ```
-//! use paper_refiner::PaperRefiner;
+//! use refinement::paper::PaperRefiner;
 //! let published = PaperRefiner::new(128, 0)?;
 //! assert_eq!(published.parameter_count(), 30_253_187);
 //! # Ok::<(), refinement::RefinementError>(())

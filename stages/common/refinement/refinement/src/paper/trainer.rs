@@ -1,14 +1,14 @@
 use std::path::Path;
 
+use crate::{KnownView, RefinementError, Training};
 use nets::Adam;
 use numerics::CounterRng;
 use pixels::Image;
-use refinement::{KnownView, RefinementError, Training};
 use tch::{Kind, TchError, Tensor};
 
-use crate::loss::PerceptualLoss;
-use crate::network::{PATCH_MULTIPLE, PaperRefiner, patch_tensor};
-use crate::perspective::Perspective;
+use super::loss::PerceptualLoss;
+use super::network::{PATCH_MULTIPLE, PaperRefiner, patch_tensor};
+use super::perspective::Perspective;
 
 /// Options for training a [`PaperRefiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -230,7 +230,7 @@ impl PaperTraining {
 
 #[cfg(test)]
 mod tests {
-    use refinement::Rendered;
+    use crate::Rendered;
     use scene::{Camera, Intrinsics};
 
     use super::*;

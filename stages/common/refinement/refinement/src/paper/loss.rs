@@ -1,7 +1,7 @@
 use std::path::Path;
 
+use crate::RefinementError;
 use nets::{Conv, Weights};
-use refinement::RefinementError;
 use tch::{Kind, TchError, Tensor};
 
 /// The paper's perceptual loss: the weighted mean absolute differences of VGG-19's features after
