@@ -22,9 +22,6 @@ pub struct MlpArchitecture {
     pub coarse_samples: u32,
     /// Number of additional samples per ray of the fine network.
     pub fine_samples: u32,
-    /// In NDC, colours depend on the NDC direction from the near to the far plane, not normalised,
-    /// as in the reference code; if false, on the world direction.
-    pub ndc_directions: bool,
     /// In a box, positions are relative to the box's middle, in [`scene::Bounds::unit`]s. If
     /// false, they are in scene units from the origin, as in the reference code, which expects
     /// scenes of a few units around the origin.
@@ -40,7 +37,6 @@ impl Default for MlpArchitecture {
             hidden_dim: 256,
             coarse_samples: 64,
             fine_samples: 64,
-            ndc_directions: false,
             scaled_positions: false,
         }
     }

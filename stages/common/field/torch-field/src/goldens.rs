@@ -78,7 +78,6 @@ fn small() -> (Mlp, Batch, SampleDraws) {
         hidden_dim: 16,
         coarse_samples: 8,
         fine_samples: 8,
-        ndc_directions: false,
         scaled_positions: false,
     };
     let bounds = Bounds::cube(2.0, 2.0, 6.0);

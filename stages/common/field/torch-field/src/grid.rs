@@ -334,7 +334,7 @@ impl TorchGrid {
         strides: Strides,
     ) -> Result<GridForward, TchError> {
         let n = rays.len() as i64;
-        let maps = RayMaps::new(&self.bounds, rays, self.device, false)?;
+        let maps = RayMaps::new(&self.bounds, rays, self.device)?;
         let Marched { t, kept, positions, length, count } = self.march(&maps, offsets, strides)?;
 
         let outputs = self.outputs(&positions)?;

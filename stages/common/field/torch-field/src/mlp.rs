@@ -137,14 +137,13 @@ impl Batch {
     /// Converts rays to a field's frame and device.
     pub(crate) fn new(rays: &[Ray], field: &Mlp) -> Result<Self, TchError> {
         let frame = field.frame();
-        let Mlp { bounds, device, architecture: MlpArchitecture { ndc_directions, .. }, .. } =
-            *field;
+        let Mlp { bounds, device, .. } = *field;
         Ok(Self {
             origin: columns(rays, device, |r| frame.origin_of(r))?,
             direction: columns(rays, device, |r| r.direction.map(|x| x as f32))?,
             background: columns(rays, device, |r| r.background)?,
             maps: (bounds.space != Space::Box)
-                .then(|| RayMaps::new(&bounds, rays, device, ndc_directions))
+                .then(|| RayMaps::new(&bounds, rays, device))
                 .transpose()?,
         })
     }

@@ -8,8 +8,7 @@ use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
 pub(crate) struct RayMaps {
     origin: Tensor,
     direction: Tensor,
-    /// View directions, on which colours depend (n × 3): in the world with unit length, or in NDC
-    /// scaled so that z runs from -1 to 1.
+    /// View directions in the world, of unit length, on which colours depend (n × 3).
     pub(crate) view: Tensor,
     /// Parameters t at which rays enter and leave the cube (n × 1 each), equal if they miss it.
     pub(crate) enter: Tensor,
@@ -22,18 +21,12 @@ pub(crate) struct RayMaps {
 
 impl RayMaps {
     /// Clips rays to the unit cube of `bounds`.
-    pub(crate) fn new(
-        bounds: &Bounds,
-        rays: &[Ray],
-        device: Device,
-        ndc_directions: bool,
-    ) -> Result<Self, TchError> {
+    pub(crate) fn new(bounds: &Bounds, rays: &[Ray], device: Device) -> Result<Self, TchError> {
         let rays: Vec<NormalizedRay> = rays.iter().map(|r| clip(bounds, r)).collect();
-        let is_ndc = ndc_directions && matches!(bounds.space, Space::Ndc(_));
         Ok(Self {
             origin: columns(&rays, device, |r| r.origin)?,
             direction: columns(&rays, device, |r| r.direction)?,
-            view: columns(&rays, device, |r| view_direction(r, is_ndc))?,
+            view: columns(&rays, device, view_direction)?,
             enter: columns(&rays, device, |r| [r.enter])?,
             leave: columns(&rays, device, |r| [r.leave.max(r.enter)])?,
             distance: [
@@ -80,9 +73,8 @@ impl RayMaps {
 
 /// Returns a ray's view direction; zero if it isn't finite, since NaN would spoil the sums of other
 /// rays.
-fn view_direction(ray: &NormalizedRay, is_ndc: bool) -> [f32; 3] {
-    let view = if is_ndc { ray.direction.map(|d| 2.0 * d / ray.direction[2]) } else { ray.view };
-    if view.iter().all(|x| x.is_finite()) { view } else { [0.0; 3] }
+fn view_direction(ray: &NormalizedRay) -> [f32; 3] {
+    if ray.view.iter().all(|x| x.is_finite()) { ray.view } else { [0.0; 3] }
 }
 
 /// Computes a·b + c rounded once, through f64, like the fused multiply-add of the hand-written
@@ -131,54 +123,4 @@ pub(crate) fn to_host(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
         .f_contiguous()?
         .f_view([-1])?;
     Vec::<f32>::try_from(flat)
-}
-
-#[cfg(test)]
-mod tests {
-    use glam::DVec3;
-    use scene::Frustum;
-
-    use super::*;
-
-    fn view_of(bounds: &Bounds, ray: Ray, ndc: bool) -> [f64; 3] {
-        let maps = RayMaps::new(bounds, &[ray], Device::Cpu, ndc).unwrap();
-        [0, 1, 2].map(|i| maps.view.double_value(&[0, i]))
-    }
-
-    /// In NDC a direction points from the near to the far plane, as in the reference
-    /// implementation: d' = to - from with z from -1 to 1.
-    #[test]
-    fn ndc_directions_are_the_references() {
-        let camera_to_world = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]];
-        let frustum =
-            Frustum { camera_to_world, min: [-0.5, -0.4], max: [0.5, 0.4], near: 1.0, far: 1e9 };
-        let bounds =
-            Bounds { min: [-9.; 3], max: [9.; 3], near: 0.0, far: 1e9, space: Space::Ndc(frustum) };
-        let (origin, direction) =
-            (DVec3::new(0.05, -0.02, 0.1), DVec3::new(0.1, 0.05, -1.0).normalize());
-        let ray = Ray {
-            origin: origin.to_array(),
-            direction: direction.to_array(),
-            background: [1.0; 3],
-        };
-        // Shifted to the near plane, then as Mildenhall et al. 2020 have it, appendix C; f / (W /
-        // 2) is 1 / 0.5, which our NDC, as wide as high, has for y, too.
-        let start = origin + direction * ((-1.0 - origin.z) / direction.z);
-        let slope = [
-            direction.x / direction.z - start.x / start.z,
-            direction.y / direction.z - start.y / start.z,
-        ];
-        let expected = [-slope[0] / 0.5, -slope[1] / 0.5, 2.0];
-        assert!(
-            view_of(&bounds, ray, true).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5),
-            "{:?} {expected:?}",
-            view_of(&bounds, ray, true)
-        );
-        assert!(
-            view_of(&bounds, ray, false)
-                .iter()
-                .zip(direction.to_array())
-                .all(|(a, b)| (a - b).abs() < 1e-6)
-        );
-    }
 }
