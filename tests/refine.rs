@@ -369,9 +369,9 @@ fn changed(
 /// Changes a view's depth, pixel by pixel.
 fn change_depth(path: &Path, change: fn(usize, f32) -> f32) {
     let image = pixels::read_exr(path).unwrap();
-    let channels = &scene::VIEW_CHANNELS[..5];
+    let channels = scene::VIEW_CHANNELS;
     let size = (image.width, image.height);
-    let written = scene::write_view_image(path, size, channels, |first, _, samples| {
+    let written = scene::write_view_image(path, size, &channels, |first, _, samples| {
         for (i, sample) in (first * image.width..).zip(samples.chunks_exact_mut(5)) {
             (0..5).for_each(|c| sample[c] = image.channel(channels[c].name).unwrap()[i]);
             sample[4] = change(i, sample[4]);

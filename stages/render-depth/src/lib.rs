@@ -119,8 +119,6 @@ fn resize(camera: &Camera, width: Option<u32>) -> Camera {
     camera.resized(width, height as u32)
 }
 
-/// Number of a view's channels.
-const CHANNELS: usize = 5;
 /// Minimum number of pixels whose rays a task combines; chosen by hand.
 const MIN_PIXELS_PER_TASK: usize = 64;
 
@@ -142,12 +140,11 @@ impl RenderJob<'_> {
     ) -> anyhow::Result<()> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
-        let channels = &VIEW_CHANNELS[..CHANNELS];
         let exr = context.output_path(image)?;
         let mut png = PngRows::create(&context.output_path(preview)?, width, height)?;
         let mut centres = CentreRows::default();
         let mut preview = Vec::new();
-        write_view_image(&exr, (width, height), channels, |first, rows, samples| {
+        write_view_image(&exr, (width, height), &VIEW_CHANNELS, |first, rows, samples| {
             context.check_interrupt()?;
             // Another thread writes the preview's previous rows meanwhile.
             let mut written = Ok(());
@@ -156,7 +153,7 @@ impl RenderJob<'_> {
                 self.render_rows(&mut centres, first..first + rows)
             })?;
             written?;
-            for (i, sample) in samples.chunks_exact_mut(channels.len()).enumerate() {
+            for (i, sample) in samples.chunks_exact_mut(VIEW_CHANNELS.len()).enumerate() {
                 sample.copy_from_slice(&pixels[i].channels);
             }
             preview.clear();
@@ -240,7 +237,7 @@ fn pixel_positions(rows: Range<usize>, width: usize) -> Vec<[usize; 2]> {
 #[derive(Clone, Copy)]
 struct ViewPixel {
     /// Channels of the EXR: premultiplied colour, opacity and z-depth.
-    channels: [f32; CHANNELS],
+    channels: [f32; VIEW_CHANNELS.len()],
     /// Colour over the background, for the preview.
     colour: [f32; 3],
 }

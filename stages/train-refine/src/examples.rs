@@ -148,8 +148,7 @@ mod tests {
 
     fn write_rendered(path: &Path) {
         let pixel = [0.25, 0.25, 0.25, 0.5, 2.0];
-        let channels = &VIEW_CHANNELS[..pixel.len()];
-        let written = write_view_image(path, (SIDE, SIDE), channels, |_, _, samples| {
+        let written = write_view_image(path, (SIDE, SIDE), &VIEW_CHANNELS, |_, _, samples| {
             samples.as_chunks_mut().0.fill(pixel);
             Ok::<(), Box<dyn std::error::Error>>(())
         });

@@ -18,15 +18,13 @@ pub fn mask_file(name: &str) -> String {
     format!("masks/{name}.png")
 }
 
-/// Channels of a rendered view: premultiplied colour and opacity, depth, and optionally the
-/// distance along the ray.
-pub const VIEW_CHANNELS: [Channel; 6] = [
+/// Channels of a rendered view: premultiplied colour, opacity and depth.
+pub const VIEW_CHANNELS: [Channel; 5] = [
     Channel { name: "R", sample_type: SampleType::Half },
     Channel { name: "G", sample_type: SampleType::Half },
     Channel { name: "B", sample_type: SampleType::Half },
     Channel { name: "A", sample_type: SampleType::Half },
     Channel { name: "Z", sample_type: SampleType::Float },
-    Channel { name: "distance", sample_type: SampleType::Float },
 ];
 
 /// Description of [`VIEW_CHANNELS`] in the file.
