@@ -1,6 +1,6 @@
 //! Figures over all views that compare them with another result or with references.
 
-use artifact::{Failure, GivenInput};
+use artifact::{GivenInput, bail_bad_input};
 use metrics::{METRICS_FILE, Metrics, NearReferences, ViewScores};
 use scene::{Camera, Views};
 
@@ -20,9 +20,7 @@ pub(crate) fn least_gain(
     let mut least: Option<f64> = None;
     for view in scored {
         let Some(before) = baseline.views.iter().find(|before| before.name == view.name) else {
-            let message =
-                format!("input baseline: no view {}; score both on the same views", view.name);
-            return Err(Failure::BadInput(message).into());
+            bail_bad_input!("input baseline: no view {}; score both on the same views", view.name);
         };
         if let Some(psnr) = value(&view.scores, "psnr")
             && let Some(psnr_before) = value(&before.scores, "psnr")

@@ -1,5 +1,5 @@
 use anyhow::Context as _;
-use artifact::{Failure, FailureExt as _, GivenInput};
+use artifact::{Failure, FailureExt as _, GivenInput, bail_bad_input};
 use pixels::{Degradation, Filter, Image, Mask, Resampling};
 use scene::{View, Views};
 
@@ -47,8 +47,7 @@ impl<'a> ScoredView<'a> {
         check_sizes(true_view, &render, truth.as_ref())?;
         let lr = read_true_image(scene, true_view, true_view.low_resolution.as_deref())?;
         if truth.is_none() && lr.is_none() {
-            let message = format!("truth: view {name} has neither an HR nor an LR image");
-            return Err(Failure::BadInput(message).into());
+            bail_bad_input!("truth: view {name} has neither an HR nor an LR image");
         }
         let filter =
             scene.degradation.map_or(Filter::Box, |degradation| degradation.kernel.filter());
@@ -89,9 +88,7 @@ fn fill_masked(name: &str, mask: &Mask, truth: &mut Image, render: &Image) -> an
     let mask = mask.resized((truth.width, truth.height), 0);
     mask.fill(truth, render);
     if mask.counted_fraction() == 0.0 {
-        let message =
-            format!("view {name}: the mask excludes every pixel; remove the view or its mask");
-        return Err(Failure::BadInput(message).into());
+        bail_bad_input!("view {name}: the mask excludes every pixel; remove the view or its mask");
     }
     Ok(mask.counted_fraction())
 }
@@ -101,18 +98,22 @@ fn check_sizes(true_view: &View, render: &Image, truth: Option<&Image>) -> anyho
     let (name, k) = (&true_view.camera.name, &true_view.camera.intrinsics);
     let expected = (k.width as usize, k.height as usize);
     if expected != (render.width, render.height) {
-        let message = format!(
+        bail_bad_input!(
             "view {name}: rendered at {}×{}, but the truth has {}×{}; set size in render-depth",
-            render.width, render.height, k.width, k.height
+            render.width,
+            render.height,
+            k.width,
+            k.height
         );
-        return Err(Failure::BadInput(message).into());
     }
     if let Some(truth) = truth.filter(|truth| (truth.width, truth.height) != expected) {
-        let message = format!(
+        bail_bad_input!(
             "view {name}: the image has {}×{} pixels, its camera {}×{}",
-            truth.width, truth.height, k.width, k.height
+            truth.width,
+            truth.height,
+            k.width,
+            k.height
         );
-        return Err(Failure::BadInput(message).into());
     }
     Ok(())
 }

@@ -37,7 +37,9 @@ mod writer;
 
 use std::path::Path;
 
-use artifact::{Failure, FailureExt as _, format_count, list_source_files, printable};
+use artifact::{
+    Failure, FailureExt as _, bail_bad_input, format_count, list_source_files, printable,
+};
 use dataset::{Dataset, Frame};
 use serde_json::json;
 use stage::{Context, Input, Output, Rule, Stage};
@@ -149,11 +151,10 @@ fn read_dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
 fn check_lenses(set: &Dataset) -> Result<(), Failure> {
     for frame in &set.frames {
         if let Err(error) = frame.camera().check() {
-            let message = format!(
+            bail_bad_input!(
                 "dataset: {}: {error} (parameter lens: undo keeps the valid part of the image)",
                 frame_label(frame)
             );
-            return Err(Failure::BadInput(message));
         }
     }
     Ok(())

@@ -1,6 +1,6 @@
 //! Peak memory of preparing images, estimated from their headers before any is decoded.
 
-use artifact::{Failure, FailureExt as _, format_size};
+use artifact::{Failure, FailureExt as _, bail_usage, format_size};
 use dataset::Frame;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use stage::{Context, MEMORY_REMEDY, available_memory};
@@ -32,13 +32,13 @@ impl MemoryNeed {
         let count = usize::try_from(free / self.bytes.max(1)).unwrap_or(usize::MAX);
         if count == 0 {
             let (width, height) = self.size;
-            return Err(Failure::Usage(format!(
+            bail_usage!(
                 "{}: preparing its image of {width}×{height} pixels needs {} of memory, and {} \
                 are free; {MEMORY_REMEDY}",
                 self.frame,
                 format_size(self.bytes),
                 format_size(free)
-            )));
+            );
         }
         Ok(count)
     }

@@ -1,4 +1,4 @@
-use artifact::{Failure, WARNING};
+use artifact::{Failure, WARNING, bail_bad_input};
 use dataset::{Dataset, Frame, Split};
 use scene::{Background, Bounds, Camera, Space, format_length};
 
@@ -70,11 +70,11 @@ fn bounds(
     }
     let side = bounds.longest_side();
     if side < MIN_SIDE {
-        return Err(Failure::BadInput(format!(
+        bail_bad_input!(
             "dataset: the scene is {} units wide, less than {MIN_SIDE:e}; multiply all camera \
             centres by a constant",
             format_length(side, 3)
-        )));
+        );
     }
     for (name, given, bound) in
         [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)]

@@ -1,4 +1,4 @@
-use artifact::{Failure, FailureExt as _, GivenInput};
+use artifact::{FailureExt as _, GivenInput, bail_bad_input};
 use pixels::Image;
 use scene::{Camera, Photograph, Views};
 
@@ -29,11 +29,13 @@ impl<'a> EnlargedPhotographs<'a> {
         let Photograph { image: mut other, mask } =
             photograph.over(self.views.background.grey_level());
         if (other.width, other.height) != (image.width, image.height) {
-            let message = format!(
+            bail_bad_input!(
                 "{name}: {}×{} pixels, but the view to refine has {}×{}",
-                other.width, other.height, image.width, image.height
+                other.width,
+                other.height,
+                image.width,
+                image.height
             );
-            return Err(Failure::BadInput(message).into());
         }
         if let Some(mask) = mask {
             mask.fill(&mut other, &image);
@@ -47,7 +49,7 @@ impl<'a> EnlargedPhotographs<'a> {
 
 #[cfg(test)]
 mod tests {
-    use artifact::write_json;
+    use artifact::{Failure, write_json};
     use pixels::{Mask, Rgba8, write_png};
     use scene::{Background, Bounds, Intrinsics, VIEWS_FILE, View};
 

@@ -1,4 +1,4 @@
-use artifact::{Failure, FailureExt as _};
+use artifact::{Failure, FailureExt as _, bail_bad_input};
 use refinement::{KnownView, ReferenceStatistics, Rendered, WarpOptions, with_references};
 use scene::{Background, View, Views};
 use stage::Context;
@@ -40,11 +40,10 @@ pub(crate) fn read_references(
             continue;
         };
         let Some(view) = rendered_views.taken_by(&true_view.camera) else {
-            let message = format!(
+            bail_bad_input!(
                 "input reference-views: no view {name} with the reference's pose; render the \
                 cameras of input references"
             );
-            return Err(Failure::BadInput(message).into());
         };
         let view = read_view(rendered, view, background.grey_level())?.0;
         let known = KnownView::new(view, truth.over(background.grey_level()))

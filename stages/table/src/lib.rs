@@ -19,7 +19,7 @@ mod rows;
 mod values;
 
 use anyhow::Context as _;
-use artifact::{Failure, RunRecord};
+use artifact::{Failure, RunRecord, bail_bad_input};
 use stage::{Context, Input, Output, Stage, plain};
 
 use figures::Figures;
@@ -55,7 +55,7 @@ impl Stage for Table {
         let progress = context.progress("reading scores", scored as u64);
         let rows = rows::rows(&run, params, &mut figures, &progress)?;
         if rows.is_empty() && run.failed.is_empty() {
-            return Err(Failure::BadInput("run.json has no scored results".to_owned()).into());
+            bail_bad_input!("run.json has no scored results");
         }
         context.write_json("rows.json", &rows)?;
         write_csv(context, &rows)?;

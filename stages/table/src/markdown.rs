@@ -1,7 +1,7 @@
 //! The Markdown document: a table of all rows, a table for each scene, gains, the spread over
 //! seeds, and failed points.
 
-use artifact::{FailedPoint, Failure, label};
+use artifact::{FailedPoint, Failure, bail_usage, label};
 
 use crate::figures::Figures;
 use crate::grid::{Layout, NO_VALUE, PROVENANCE, SCENE, markdown_table};
@@ -107,8 +107,7 @@ fn check_keys(
     for name in names {
         if !rows.is_empty() && !rows.iter().any(|row| row.contains_key(name)) {
             let known = artifact::known_names(name, known.iter().map(|name| name.as_str()));
-            let problem = format!("parameter {parameter}: no result has a key {name:?}; {known}");
-            return Err(Failure::Usage(problem));
+            bail_usage!("parameter {parameter}: no result has a key {name:?}; {known}");
         }
     }
     Ok(())

@@ -1,4 +1,4 @@
-use artifact::{Failure, FailureExt as _, GivenInput};
+use artifact::{Failure, FailureExt as _, GivenInput, bail_bad_input, bail_usage};
 use pixels::psnr_of;
 use refinement::{
     Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer,
@@ -14,22 +14,16 @@ use crate::steps::train;
 /// Trains our network by internal learning.
 pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::Result<()> {
     if net.patch_size % 2 == 1 {
-        return Err(Failure::Usage(format!(
-            "parameter patch_size: expected an even number, found {}",
-            net.patch_size
-        ))
-        .into());
+        bail_usage!("parameter patch_size: expected an even number, found {}", net.patch_size);
     }
     let photographs = lr_photographs(context)?;
     let examples =
         Examples::read(context.input("views")?, context.input("truth")?, photographs.as_ref())?;
     if net.references_per_view > 0 && examples.training.len() < 2 {
-        return Err(Failure::BadInput(
+        bail_bad_input!(
             "input views: references_per_view needs at least three views with an image in input \
             truth"
-                .to_owned(),
-        )
-        .into());
+        );
     }
     let refiner = match context.optional_input("prior") {
         Some(prior) => read_prior(prior, net)?,

@@ -1,4 +1,4 @@
-use artifact::{Failure, FailureExt as _, GivenInput};
+use artifact::{Failure, FailureExt as _, GivenInput, bail_bad_input};
 use refinement::{KnownView, LrObservations, Rendered};
 use scene::{View, Views};
 use stage::Context;
@@ -49,10 +49,9 @@ impl Examples {
             }
         }
         if all.is_empty() {
-            return Err(Failure::BadInput(
+            bail_bad_input!(
                 "input views: no view has an image in input truth with the same name and pose"
-                    .to_owned(),
-            ));
+            );
         }
         Ok(Self::split(all))
     }

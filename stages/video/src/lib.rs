@@ -9,7 +9,7 @@ mod film;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Failure, FailureExt as _, RunNode, RunRecord, label, sink_folders};
+use artifact::{Failure, FailureExt as _, RunNode, RunRecord, bail_bad_input, label, sink_folders};
 use pixels::{DepthMap, Rgba8, common_range, read_exr, write_png};
 use rayon::prelude::*;
 use scene::{View, Views};
@@ -73,7 +73,7 @@ impl Stage for Video {
         let rendered: Vec<&RunNode> =
             run.nodes.iter().filter(|n| n.is_shown && n.kind == "views").collect();
         if rendered.is_empty() {
-            return Err(Failure::BadInput("run.json has no rendered views".to_owned()).into());
+            bail_bad_input!("run.json has no rendered views");
         }
         for (node, prefix) in rendered.iter().zip(sink_folders(&rendered)) {
             let rate = match params.frames_per_second {
@@ -115,10 +115,7 @@ fn make_film(
 ) -> anyhow::Result<()> {
     let views = Views::read_folder(folder)?;
     if views.views.iter().any(|view| size_of_view(view) != size_of_view(&views.views[0])) {
-        return Err(Failure::BadInput(
-            "views have different sizes; set render-depth.size".to_owned(),
-        )
-        .into());
+        bail_bad_input!("views have different sizes; set render-depth.size");
     }
     let progress = context.progress("drawing", 2 * views.views.len() as u64);
     // All frames have one range of depths: with a range per frame, colours would flicker.

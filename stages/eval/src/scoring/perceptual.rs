@@ -59,12 +59,11 @@ impl Perceptual {
         let mut given = LpipsNetwork::ALL.to_vec();
         given.retain(|network| network.files().iter().all(|file| folder.join(file).is_file()));
         if given.is_empty() {
-            let message = format!(
+            artifact::bail_bad_input!(
                 "input weights: {}: no network found; {}",
                 folder.display(),
                 missing_files(&LpipsNetwork::ALL)
             );
-            return Err(Failure::BadInput(message).into());
         }
         let mut pools = Vec::with_capacity(given.len());
         for &network in &given {

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::{Failure, print_line, report_line};
+use artifact::{Failure, bail_bad_input, print_line, report_line};
 use clap::{CommandFactory as _, Parser, Subcommand};
 use store::Store;
 
@@ -139,9 +139,7 @@ fn run(cli: Cli) -> anyhow::Result<()> {
 /// Opens a store to read from; fails if it doesn't exist.
 fn open_existing(folder: &Path) -> anyhow::Result<Store> {
     if !folder.join("objects").is_dir() {
-        let message =
-            format!("{}: not a store of nerf-sr; choose one with --store", folder.display());
-        return Err(Failure::BadInput(message).into());
+        bail_bad_input!("{}: not a store of nerf-sr; choose one with --store", folder.display());
     }
     Ok(Store::open(folder)?)
 }

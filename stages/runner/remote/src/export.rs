@@ -13,7 +13,7 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{
-    Failure, MANIFEST_FILE, Manifest, format_count, format_size, print_line, report_line,
+    MANIFEST_FILE, Manifest, bail_bad_input, format_count, format_size, print_line, report_line,
 };
 use serde::{Deserialize, Serialize};
 use store::{Record, Store};
@@ -101,7 +101,7 @@ impl History {
         if !store.is_complete(&artifact)? {
             let object = store.object(&artifact);
             let problem = "the artifact is incomplete; run again, or pull it";
-            return Err(Failure::BadInput(format!("{}: {problem}", object.display())).into());
+            bail_bad_input!("{}: {problem}", object.display());
         }
         let history = with_history(&records, keys);
         records.retain(|key, _| history.contains(key));

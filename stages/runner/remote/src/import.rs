@@ -7,7 +7,8 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{
-    Failure, FailureExt as _, FileEntry, MANIFEST_FILE, file_kind, format_count, format_size,
+    Failure, FailureExt as _, FileEntry, MANIFEST_FILE, bail_bad_input, file_kind, format_count,
+    format_size,
 };
 use serde_json::Value;
 use store::{Arrival, Record, Store, is_hash};
@@ -83,8 +84,7 @@ fn open(path: &Path) -> Result<(File, u64), Failure> {
     let found = path.metadata().bad_input(&name)?;
     if !found.is_file() {
         let kind = file_kind(found.file_type());
-        let problem = format!("{name} is {kind}, not a regular file; save the archive as a file");
-        return Err(Failure::BadInput(problem));
+        bail_bad_input!("{name} is {kind}, not a regular file; save the archive as a file");
     }
     Ok((File::open(path).bad_input(&name)?, found.len()))
 }

@@ -3,7 +3,9 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, MANIFEST_FILE, format_count, format_size, one_line, print_line};
+use artifact::{
+    Failure, MANIFEST_FILE, bail_bad_input, format_count, format_size, one_line, print_line,
+};
 use store::{Record, Store, StoreError};
 
 use crate::folder::{ACTIONS, Listing};
@@ -173,9 +175,7 @@ async fn fetch_manifest(
     }
     let file = format!("objects/{identity}/{MANIFEST_FILE}");
     let Some(bytes) = remote.read(&file, MAX_MANIFEST_BYTES).await? else {
-        let message =
-            format!("{}: not found; push again from a complete store", remote.name(&file));
-        return Err(Failure::BadInput(message).into());
+        bail_bad_input!("{}: not found; push again from a complete store", remote.name(&file));
     };
     let folder = intake.scratch(&identity);
     let path = folder.join(MANIFEST_FILE);

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::{Failure, FileEntry, one_line};
+use artifact::{Failure, FileEntry, bail_bad_input, bail_usage, one_line};
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use object_store::aws::AmazonS3Builder;
 use object_store::local::LocalFileSystem;
@@ -76,15 +76,14 @@ impl Remote {
     fn open_folder(folder: &FilePath, name: String, access: Access) -> anyhow::Result<Self> {
         if access == Access::Write {
             if folder.join("locks").exists() {
-                let message = format!(
+                bail_usage!(
                     "{name}: the folder is a store, which only nerf-sr may write; choose another \
                     folder"
                 );
-                return Err(Failure::Usage(message).into());
             }
             std::fs::create_dir_all(folder).with_context(|| name.clone())?;
         } else if !folder.is_dir() {
-            return Err(Failure::BadInput(format!("{name}: no such folder")).into());
+            bail_bad_input!("{name}: no such folder");
         }
         // Without fsync, a record could survive a power failure, but not its artifact.
         let files = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true);
@@ -106,10 +105,7 @@ impl Remote {
     fn open_s3(rest: &str, name: String) -> anyhow::Result<Self> {
         let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
         if bucket.is_empty() {
-            return Err(Failure::Usage(format!(
-                "{name}: bucket missing; a remote is a folder or s3://bucket/prefix"
-            ))
-            .into());
+            bail_usage!("{name}: bucket missing; a remote is a folder or s3://bucket/prefix");
         }
         // An error means that another provider is installed, which works, too.
         rustls::crypto::ring::default_provider().install_default().ok();
@@ -191,8 +187,7 @@ impl Remote {
         while let Some(piece) = stream.next().await {
             bytes.extend_from_slice(&piece.map_err(|e| self.read_error(file, e))?);
             if bytes.len() as u64 > max_bytes {
-                let problem = format!("{}: more than {max_bytes} bytes", self.name(file));
-                return Err(Failure::BadInput(problem).into());
+                bail_bad_input!("{}: more than {max_bytes} bytes", self.name(file));
             }
         }
         Ok(Some(bytes))
@@ -280,11 +275,7 @@ impl Remote {
             Some(bytes) => bytes,
             None if access == Access::Write => return self.mark().await,
             None => {
-                return Err(Failure::BadInput(format!(
-                    "{}: nothing was pushed here: file `format` not found",
-                    self.name
-                ))
-                .into());
+                bail_bad_input!("{}: nothing was pushed here: file `format` not found", self.name);
             }
         };
         let text = String::from_utf8_lossy(&bytes);

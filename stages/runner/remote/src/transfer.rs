@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use artifact::{Failure, FileEntry};
+use artifact::{Failure, FileEntry, bail_bad_input};
 use futures_util::StreamExt as _;
 use object_store::{ObjectStoreExt as _, WriteMultipart};
 use tokio::sync::Semaphore;
@@ -109,7 +109,7 @@ impl Transfer {
         let _slot = self.slots.acquire().await?;
         let name = self.remote.name(source);
         let Some(found) = self.remote.get(source).await? else {
-            return Err(Failure::BadInput(format!("{name}: not found; {REMOTE_REMEDY}")).into());
+            bail_bad_input!("{name}: not found; {REMOTE_REMEDY}");
         };
         let mut file = create_file(target)?;
         let mut check = ContentCheck::new(entry);
@@ -151,8 +151,7 @@ impl<'a> ContentCheck<'a> {
         self.size += piece.len() as u64;
         let expected = self.entry.size;
         if self.size > expected {
-            let problem = format!("{name}: more than the {expected} bytes in the manifest");
-            return Err(Failure::BadInput(problem));
+            bail_bad_input!("{name}: more than the {expected} bytes in the manifest");
         }
         self.hasher.update(piece);
         progress.add(piece.len() as u64)

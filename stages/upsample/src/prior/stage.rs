@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use artifact::Failure;
+use artifact::{Failure, bail_usage};
 use pixels::psnr_of;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -52,8 +52,7 @@ impl Stage for TrainPrior {
     fn run(context: &Context, params: &PriorParams) -> anyhow::Result<()> {
         nets::deterministic();
         if ![2, 4, 8].contains(&params.scale) {
-            let message = format!("parameter scale: expected 2, 4 or 8, found {}", params.scale);
-            return Err(Failure::Usage(message).into());
+            bail_usage!("parameter scale: expected 2, 4 or 8, found {}", params.scale);
         }
         let scale = params.scale as usize;
         context.log_line(format!("drawing {} images", params.images));

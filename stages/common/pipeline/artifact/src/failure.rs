@@ -35,6 +35,22 @@ impl Failure {
     }
 }
 
+/// Returns from a function with [`Failure::Usage`]; the arguments are those of [`format!`].
+#[macro_export]
+macro_rules! bail_usage {
+    ($($text:tt)*) => {
+        return Err($crate::Failure::Usage(format!($($text)*)).into())
+    };
+}
+
+/// Returns from a function with [`Failure::BadInput`]; the arguments are those of [`format!`].
+#[macro_export]
+macro_rules! bail_bad_input {
+    ($($text:tt)*) => {
+        return Err($crate::Failure::BadInput(format!($($text)*)).into())
+    };
+}
+
 /// Returns the exit code of the [`Failure`] in an error's chain; 1 without one.
 pub fn exit_code(error: &anyhow::Error) -> u8 {
     error.chain().find_map(|cause| cause.downcast_ref::<Failure>()).map_or(1, Failure::exit_code)

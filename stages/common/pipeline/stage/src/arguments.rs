@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::contract::{Description, Schema};
 use anyhow::anyhow;
-use artifact::{Failure, FailureExt as _, known_names};
+use artifact::{Failure, FailureExt as _, bail_usage, known_names};
 use serde_json::Value;
 
 use crate::progress::ProgressMode;
@@ -59,17 +59,13 @@ pub(crate) fn input_folders<'a>(
             .ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
         if !description.inputs.contains_key(name) {
             let known = known_names(name, description.inputs.keys().map(String::as_str));
-            return Err(Failure::Usage(format!("--input {name}: no such input; {known}")).into());
+            bail_usage!("--input {name}: no such input; {known}");
         }
         folders.push((name, Path::new(folder)));
     }
     for (name, input) in &description.inputs {
         if !input.optional && !folders.iter().any(|(given, _)| given == name) {
-            return Err(Failure::Usage(format!(
-                "input {name} is missing; give --input {name}=DIR ({})",
-                input.summary
-            ))
-            .into());
+            bail_usage!("input {name} is missing; give --input {name}=DIR ({})", input.summary);
         }
     }
     Ok(folders)

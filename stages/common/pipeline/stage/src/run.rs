@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use crate::contract::Description;
 use anyhow::Context as _;
 use artifact::{
-    Failure, FailureExt as _, GivenInput, exit_code, format_count, hash_json, one_line,
+    Failure, FailureExt as _, GivenInput, bail_usage, exit_code, format_count, hash_json, one_line,
     print_lines, report_line,
 };
 use clap::CommandFactory as _;
@@ -191,15 +191,14 @@ impl Program {
             return Err(Failure::Usage(problem).into());
         }
         if arguments.from_checkpoint && !description.from_checkpoint {
-            let problem = format!(
+            bail_usage!(
                 "--from-checkpoint: stage {} doesn't support this option; leave it out",
                 self.name
             );
-            return Err(Failure::Usage(problem).into());
         }
         let threads = match arguments.threads {
             Some(0) => {
-                return Err(Failure::Usage("--threads 0: at least 1 is required".to_owned()).into());
+                bail_usage!("--threads 0: at least 1 is required");
             }
             Some(n) => n,
             None => processors().count,

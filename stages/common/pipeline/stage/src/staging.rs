@@ -2,7 +2,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use artifact::{Failure, MANIFEST_FILE, Manifest, write_json};
+use artifact::{Failure, MANIFEST_FILE, Manifest, bail_usage, write_json};
 
 /// Unpublished output: a folder next to the final one, which is removed unless published.
 pub(crate) struct Staging {
@@ -13,11 +13,7 @@ impl Staging {
     /// Creates the folder. Fails if the output exists or can't be written.
     pub(crate) fn new(output: &Path) -> anyhow::Result<Self> {
         if output.exists() {
-            return Err(Failure::Usage(format!(
-                "--output {}: already exists; choose a new folder",
-                output.display()
-            ))
-            .into());
+            bail_usage!("--output {}: already exists; choose a new folder", output.display());
         }
         let name = output.file_name().ok_or_else(|| {
             Failure::Usage(format!("--output {}: not the name of a folder", output.display()))

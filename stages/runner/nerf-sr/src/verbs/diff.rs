@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::{Failure, print_line};
+use artifact::{bail_bad_input, print_line};
 use planning::{Change, PlanError, Request, State};
 
 use super::print_json;
@@ -96,7 +96,7 @@ fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
         return Err(usage(text, "a sweep has several results; give one value for each parameter"));
     };
     let State::Cached(record) = &states[index] else {
-        return Err(Failure::BadInput(format!("{text} has no artifact yet; run it first")).into());
+        bail_bad_input!("{text} has no artifact yet; run it first");
     };
     Lineage::read(&session.store, [record.key()])
 }

@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 use std::process::ExitCode;
 
-use artifact::{Failure, print_line};
+use artifact::{bail_bad_input, print_line};
 use planning::{PlanError, Request, State};
 
 use crate::session::{Session, nodes_of_stage};
@@ -25,8 +25,7 @@ pub(crate) fn path(
     for index in nodes_of_stage(&plan, stage)? {
         let State::Cached(record) = &states[index] else {
             let label = plan.nodes[index].label();
-            let message = format!("{label} has no artifact yet; run it first");
-            return Err(Failure::BadInput(message).into());
+            bail_bad_input!("{label} has no artifact yet; run it first");
         };
         let mut path = session.store.object(&record.output);
         path.extend(inner);
