@@ -60,7 +60,7 @@ mod shading;
 pub mod spec;
 mod specks;
 #[cfg(test)]
-mod stability;
+mod stability_tests;
 mod tensors;
 mod trainer;
 mod training_log;

@@ -206,7 +206,7 @@ pub fn clip(bounds: &Bounds, ray: &Ray) -> NormalizedRay {
 
 /// Maximum distance of a ray's origin from the box it enters, in box sides; farther rays start
 /// where they enter. In single precision, positions along a ray from this distance are exact to a
-/// millionth of a side (`stability.rs`).
+/// millionth of a side (`stability_tests.rs`).
 const MAX_ORIGIN_DISTANCE: f64 = 16.0;
 
 fn clip_to_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
