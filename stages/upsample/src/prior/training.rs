@@ -167,10 +167,9 @@ impl PriorTrainer {
         if !error.is_finite() || !nets::all_finite(&gradients)? {
             return Err(TrainingError::NotFinite { step });
         }
-        let warm_up = ((step + 1) as f64 / WARM_UP_STEPS as f64).min(1.0);
-        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
+        let rate = nets::cosine_rate(LEARNING_RATE, step, steps, WARM_UP_STEPS);
         let parameters = self.tensors.iter().map(|(_, tensor)| tensor.shallow_clone());
-        self.adam.step(parameters, &gradients, LEARNING_RATE * warm_up * cosine)?;
+        self.adam.step(parameters, &gradients, rate)?;
         Ok(Some(error))
     }
 

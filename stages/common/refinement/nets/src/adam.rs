@@ -133,6 +133,14 @@ fn trainable(network: &[(String, Tensor)]) -> Vec<(String, Tensor)> {
     trainable.map(|(name, tensor)| (name.clone(), tensor.shallow_clone())).collect()
 }
 
+/// Returns the learning rate of step 0, 1, …: it rises to `highest` during the warm-up, and follows
+/// a cosine to 0.
+pub fn cosine_rate(highest: f64, step: u64, steps: u64, warm_up_steps: u64) -> f64 {
+    let warm_up = ((step + 1) as f64 / warm_up_steps as f64).min(1.0);
+    let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
+    highest * warm_up * cosine
+}
+
 /// Adds a shard's gradients to their sum.
 pub fn add_gradients(sum: &mut [Tensor], gradients: &[Tensor]) -> Result<(), TchError> {
     no_grad(|| {

@@ -22,7 +22,7 @@ mod weights;
 use pixels::Image;
 use tch::{Cuda, TchError, Tensor};
 
-pub use adam::{Adam, add_gradients, all_finite};
+pub use adam::{Adam, add_gradients, all_finite, cosine_rate};
 pub use tch::Device;
 pub use weights::{Conv, Weights, WeightsError, write};
 

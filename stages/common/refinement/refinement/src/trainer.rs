@@ -268,9 +268,7 @@ impl Training for RefinerTrainer {
         if !loss.is_finite() || !gradients.iter().flatten().all(|g| g.is_finite()) {
             return Err(RefinementError::NotFinite { step });
         }
-        let warm_up = ((step + 1) as f64 / WARM_UP_STEPS as f64).min(1.0);
-        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
-        let rate = learning_rate * warm_up * cosine;
+        let rate = nets::cosine_rate(learning_rate, step, steps, WARM_UP_STEPS);
         self.adam.step(&mut self.refiner, &gradients, rate);
         Ok(Some(loss))
     }
