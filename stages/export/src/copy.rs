@@ -2,7 +2,9 @@ use std::io::{self, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use artifact::{Failure, MANIFEST_FILE, Manifest, RunNode, RunRecord, sink_folders};
+use artifact::{
+    FailureExt as _, MANIFEST_FILE, Manifest, RunNode, RunRecord, bail_bad_input, sink_folders,
+};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Progress, SUMMARY_FILE, Stage};
@@ -37,22 +39,20 @@ impl Stage for CopyFiles {
     }
 
     fn run(context: &Context, _: &CopyParams) -> anyhow::Result<()> {
-        let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let run = RunRecord::read(context.input("run")?)?;
         let shown: Vec<&RunNode> = run.nodes.iter().filter(|node| node.is_shown).collect();
         let mut files: Vec<(PathBuf, String)> = Vec::new();
         let mut bytes = 0;
         for (node, prefix) in shown.iter().zip(sink_folders(&shown)) {
-            let manifest = Manifest::read(&node.folder).map_err(|e| {
-                Failure::BadInput(format!("{}: {e}", node.folder.join(MANIFEST_FILE).display()))
-            })?;
+            let manifest = Manifest::read(&node.folder)
+                .bad_input(node.folder.join(MANIFEST_FILE).display())?;
             for file in manifest.files.iter().filter(|file| file.path != SUMMARY_FILE) {
                 bytes += file.size;
                 files.push((node.folder.join(&file.path), format!("{prefix}{}", file.path)));
             }
         }
         if files.is_empty() {
-            return Err(Failure::BadInput("run.json has no artifact with files".to_owned()).into());
+            bail_bad_input!("run.json has no artifact with files");
         }
         let progress = context.progress("copying", bytes);
         for (source, name) in files {

@@ -19,7 +19,7 @@ mod rows;
 mod values;
 
 use anyhow::Context as _;
-use artifact::{Failure, RunRecord, bail_bad_input};
+use artifact::{RunRecord, bail_bad_input};
 use stage::{Context, Input, Output, Stage, plain};
 
 use figures::Figures;
@@ -48,8 +48,7 @@ impl Stage for Table {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let run = RunRecord::read(context.input("run")?)?;
         let mut figures = Figures::default();
         let scored = run.nodes.iter().filter(|node| node.is_shown).count();
         let progress = context.progress("reading scores", scored as u64);

@@ -68,8 +68,7 @@ impl Stage for Video {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let run = RunRecord::read(context.input("run")?)?;
         let rendered: Vec<&RunNode> =
             run.nodes.iter().filter(|n| n.is_shown && n.kind == "views").collect();
         if rendered.is_empty() {

@@ -6,6 +6,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::failure::Failure;
+use crate::given_input::GivenInput;
+
 /// `run.json`: record of a run, the input of a sink.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -168,6 +171,13 @@ pub fn sink_folders(nodes: &[&RunNode]) -> Vec<String> {
 }
 
 impl RunRecord {
+    /// Reads and checks `run.json` in a sink's input.
+    pub fn read(input: &GivenInput) -> Result<Self, Failure> {
+        let run: Self = input.read_json("run.json")?;
+        run.check().map_err(|error| Failure::BadInput(error.to_string()))?;
+        Ok(run)
+    }
+
     /// Checks that all nodes refer to earlier ones only.
     pub fn check(&self) -> Result<(), RunRecordError> {
         for (index, node) in self.nodes.iter().enumerate() {
