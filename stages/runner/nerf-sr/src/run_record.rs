@@ -161,13 +161,18 @@ fn data_sets(plan: &Plan, sink: &Sink) -> Vec<String> {
                 Origin::Node { .. } => None,
             })
             .collect();
-        match node.program.description.output.kind.as_str() {
-            "dataset" if folders.is_empty() => _ = found.insert(node.stage.clone()),
-            "dataset" | "scene" => found.extend(folders),
-            _ => {}
-        }
+        add_data_sets(&mut found, &node.stage, &node.program.description.output.kind, folders);
     }
     found.into_iter().collect()
+}
+
+/// Adds the data sets that a stage reads from folders, or that it creates itself.
+fn add_data_sets(found: &mut BTreeSet<String>, stage: &str, kind: &str, folders: Vec<String>) {
+    match kind {
+        "dataset" if folders.is_empty() => _ = found.insert(stage.to_owned()),
+        "dataset" | "scene" => found.extend(folders),
+        _ => {}
+    }
 }
 
 /// Returns the shown results, each as its data sets, stage and point.
@@ -178,11 +183,7 @@ pub(crate) fn shown_results(record: &RunRecord) -> BTreeSet<String> {
         for ancestor in record.ancestors(index).into_iter().map(|index| &record.nodes[index]) {
             let folders = ancestor.inputs.values().filter_map(|input| input.folder.as_ref());
             let folders: Vec<String> = folders.map(|folder| folder.display().to_string()).collect();
-            match ancestor.kind.as_str() {
-                "dataset" if folders.is_empty() => _ = data_sets.insert(ancestor.stage.clone()),
-                "dataset" | "scene" => data_sets.extend(folders),
-                _ => {}
-            }
+            add_data_sets(&mut data_sets, &ancestor.stage, &ancestor.kind, folders);
         }
         let data_sets = data_sets.into_iter().collect::<Vec<_>>().join(", ");
         results.insert(format!("{data_sets}: {}", artifact::label(&node.stage, &node.point)));
