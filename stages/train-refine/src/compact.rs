@@ -9,7 +9,7 @@ use stage::Context;
 use crate::examples::{Examples, lr_photographs};
 use crate::params::CompactParams;
 use crate::report_gain;
-use crate::steps::train;
+use crate::steps::OnExamples;
 
 /// Trains our network by internal learning.
 pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::Result<()> {
@@ -38,10 +38,12 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         learning_rate: net.learning_rate,
         seed,
     };
-    let mut trainer = RefinerTrainer::new(refiner, options);
-    train(context, options.steps, &mut trainer, &examples.training, |error| {
+    let trainer = RefinerTrainer::new(refiner, options);
+    let mut training = OnExamples { trainer, examples: &examples.training };
+    context.train(options.steps, &mut training, |error| {
         format!("PSNR of training patches {:.2} dB", psnr_of(error))
     })?;
+    let trainer = training.trainer;
     let scores = trainer.score(&examples.left_out, &examples.training)?;
     trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?)?;
     let file = RefinerFile {

@@ -10,7 +10,7 @@ use stage::{Context, Rule};
 use crate::examples::Examples;
 use crate::params::PaperParams;
 use crate::report_gain;
-use crate::steps::train;
+use crate::steps::OnExamples;
 
 /// File names of VGG-19's weights: all layers with torchvision's names, or the first blocks in
 /// Caffe's scaling.
@@ -41,10 +41,12 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     });
     let width = params.features;
     let network = PaperRefiner::new(width, seed)?;
-    let mut trainer = PaperTrainer::new(network, options, perceptual)?;
-    train(context, options.steps, &mut trainer, &known, |error| {
+    let trainer = PaperTrainer::new(network, options, perceptual)?;
+    let mut training = OnExamples { trainer, examples: &known };
+    context.train(options.steps, &mut training, |error| {
         format!("L1 of training patches {error:.4}")
     })?;
+    let trainer = training.trainer;
     trainer.network().write(&context.output_path(WEIGHTS_FILE)?)?;
     let (mut rendered, mut refined) = (0.0, 0.0);
     let share = 1.0 / known.len() as f64;

@@ -4,7 +4,7 @@ use artifact::{Failure, bail_usage};
 use pixels::psnr_of;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use stage::{CheckpointSchedule, Context, Input, Output, Stage};
+use stage::{Context, Input, Output, Stage, Training};
 
 use super::training::{PriorTrainer, TrainingError, TrainingImages};
 
@@ -33,9 +33,6 @@ impl Default for PriorParams {
 /// Stage `train-prior`.
 pub struct TrainPrior;
 
-/// Steps between two progress reports; chosen by hand.
-const STEPS_PER_REPORT: u64 = 20;
-
 impl Stage for TrainPrior {
     type Params = PriorParams;
     const NAME: &'static str = "train-prior";
@@ -58,15 +55,12 @@ impl Stage for TrainPrior {
         context.log_line(format!("drawing {} images", params.images));
         let images =
             TrainingImages::draw(params.seed, params.images, scale, || context.check_interrupt())?;
-        let mut trainer = PriorTrainer::new(scale, params.steps, params.seed)?;
-        let checkpoint = context.work().map(|work| work.join("checkpoint.safetensors"));
-        if let Some(path) = checkpoint.as_deref().filter(|path| path.exists()) {
-            match trainer.resume(path) {
-                Ok(()) => context.log_line(format!("resuming from step {}", trainer.steps())),
-                Err(error) => context.log_line(format!("{error}; starting over")),
-            }
-        }
-        train(context, params.steps, &mut trainer, &images, checkpoint.as_deref())?;
+        let trainer = PriorTrainer::new(scale, params.steps, params.seed)?;
+        let mut training = PriorRun { trainer, images };
+        context.train(params.steps, &mut training, |error| {
+            format!("PSNR of patches {:.2} dB", psnr_of(error))
+        })?;
+        let PriorRun { trainer, images } = training;
         trainer.write(&context.output_path(&format!("prior_x{scale}.safetensors"))?)?;
         let [bicubic, enlarged] = trainer.score(&images)?;
         context.write_summary(&format!(
@@ -75,38 +69,29 @@ impl Stage for TrainPrior {
     }
 }
 
-/// Takes the remaining steps and writes checkpoints.
-fn train(
-    context: &Context,
-    steps: u64,
-    trainer: &mut PriorTrainer,
-    images: &TrainingImages,
-    checkpoint: Option<&Path>,
-) -> anyhow::Result<()> {
-    let progress = context.progress("training", steps);
-    let mut schedule = CheckpointSchedule::default();
-    let mut error_sum = 0.0;
-    loop {
-        schedule.write_if_due(context.is_interrupted(), || {
-            checkpoint.map_or(Ok(()), |path| write_checkpoint(trainer, path))
-        })?;
-        let error = trainer.step(images).map_err(|error| match error {
-            TrainingError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
-            error => anyhow::Error::from(error),
-        })?;
-        let Some(error) = error else { return Ok(()) };
-        error_sum += error;
-        if trainer.steps().is_multiple_of(STEPS_PER_REPORT) {
-            let mean = error_sum / STEPS_PER_REPORT as f64;
-            progress.set(trainer.steps(), &format!("PSNR of patches {:.2} dB", psnr_of(mean)));
-            error_sum = 0.0;
-        }
-    }
+/// Trainer with its images.
+struct PriorRun {
+    trainer: PriorTrainer,
+    images: TrainingImages,
 }
 
-/// Writes a checkpoint and replaces the previous one atomically.
-fn write_checkpoint(trainer: &PriorTrainer, path: &Path) -> anyhow::Result<()> {
-    let partial = path.with_extension("partial");
-    trainer.write_checkpoint(&partial)?;
-    Ok(std::fs::rename(partial, path)?)
+impl Training for PriorRun {
+    fn steps(&self) -> u64 {
+        self.trainer.steps()
+    }
+
+    fn step(&mut self) -> anyhow::Result<Option<f64>> {
+        self.trainer.step(&self.images).map_err(|error| match error {
+            TrainingError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
+            error => error.into(),
+        })
+    }
+
+    fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
+        Ok(self.trainer.write_checkpoint(path)?)
+    }
+
+    fn resume(&mut self, path: &Path) -> anyhow::Result<()> {
+        Ok(self.trainer.resume(path)?)
+    }
 }

@@ -6,7 +6,8 @@
 //! * [`Description`], [`Schema`], [`Rule`]: a stage's description, and the checks of values against
 //!   it.
 //! * [`Progress`], [`Event`]: progress reports for a terminal and for the runner.
-//! * [`CheckpointSchedule`]: times at which a training writes checkpoints.
+//! * [`Training`], [`Context::train`]: a resumable training in steps; [`CheckpointSchedule`]: times
+//!   at which a training writes checkpoints.
 //! * [`stop_on_signals`], [`install_panic_hook`]: early end of a program by a signal or a panic;
 //!   the runner uses them, too.
 //! * [`available_memory`], [`processors`], [`check_device`]: limits of memory, the default number
@@ -61,6 +62,7 @@ mod signal_tests;
 mod signals;
 mod stage;
 mod staging;
+mod training;
 
 pub use arguments::{DeviceError, check_device};
 pub use checkpoint_schedule::CheckpointSchedule;
@@ -81,3 +83,4 @@ pub use progress::{Event, Pace, Progress, ProgressMode};
 pub use run::{RUNNER_VARIABLE, run_stage};
 pub use signals::{stop_on_signals, stop_signals};
 pub use stage::Stage;
+pub use training::Training;

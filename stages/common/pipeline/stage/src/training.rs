@@ -1,0 +1,215 @@
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use crate::checkpoint_schedule::CheckpointSchedule;
+use crate::context::Context;
+
+/// Steps between two progress reports; chosen by hand.
+const STEPS_PER_REPORT: u64 = 50;
+/// Maximum time between two progress reports; chosen by hand.
+const MAX_REPORT_INTERVAL: Duration = Duration::from_secs(10);
+
+/// Interruptible training, step by step.
+pub trait Training {
+    /// Returns the number of steps taken.
+    fn steps(&self) -> u64;
+
+    /// Takes a step. Returns the error before the step, or `None` after the last step.
+    fn step(&mut self) -> anyhow::Result<Option<f64>>;
+
+    /// Writes a checkpoint, from which the training resumes. The caller makes the write atomic.
+    fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()>;
+
+    /// Resumes from a checkpoint of a training with the same parameters.
+    fn resume(&mut self, path: &Path) -> anyhow::Result<()>;
+}
+
+impl Context {
+    /// Trains to the end, from the checkpoint of an earlier run if there is one. `format_error`
+    /// formats a mean error for the progress bar.
+    pub fn train(
+        &self,
+        steps: u64,
+        training: &mut impl Training,
+        format_error: impl Fn(f64) -> String,
+    ) -> anyhow::Result<()> {
+        let checkpoint = self.work().map(|work| work.join("checkpoint.safetensors"));
+        if let Some(path) = checkpoint.as_deref().filter(|path| path.exists()) {
+            self.log_line(resume(training, path));
+        }
+        let progress = self.progress("training", steps);
+        take_steps(
+            training,
+            checkpoint.as_deref(),
+            || self.is_interrupted(),
+            |done, mean| progress.set(done, &format_error(mean)),
+        )
+    }
+}
+
+/// Resumes from a checkpoint, or starts over if the checkpoint can't be used. Returns a log line.
+fn resume(training: &mut impl Training, checkpoint: &Path) -> String {
+    match training.resume(checkpoint) {
+        Ok(()) => format!("resuming from step {}", training.steps()),
+        Err(error) => format!("{error}; starting over"),
+    }
+}
+
+/// Takes the remaining steps and writes checkpoints. Writes a last checkpoint and fails if the run
+/// is interrupted. `report` gets the number of steps and the mean error since the last report.
+fn take_steps(
+    training: &mut impl Training,
+    checkpoint: Option<&Path>,
+    interrupted: impl Fn() -> bool,
+    report: impl Fn(u64, f64),
+) -> anyhow::Result<()> {
+    let mut schedule = CheckpointSchedule::default();
+    let mut last_report = Instant::now();
+    let (mut sum, mut count) = (0.0, 0u64);
+    loop {
+        schedule.write_if_due(interrupted(), || {
+            checkpoint.map_or(Ok(()), |path| write_checkpoint(training, path))
+        })?;
+        let Some(error) = training.step()? else { return Ok(()) };
+        sum += error;
+        count += 1;
+        if count == STEPS_PER_REPORT || last_report.elapsed() > MAX_REPORT_INTERVAL {
+            report(training.steps(), sum / count as f64);
+            (sum, count) = (0.0, 0);
+            last_report = Instant::now();
+        }
+    }
+}
+
+/// Writes a checkpoint and replaces the previous one atomically.
+fn write_checkpoint(training: &impl Training, path: &Path) -> anyhow::Result<()> {
+    let partial = path.with_extension("partial");
+    training.write_checkpoint(&partial)?;
+    Ok(std::fs::rename(partial, path)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::{Cell, RefCell};
+
+    use anyhow::anyhow;
+    use artifact::{Failure, exit_code};
+
+    use super::*;
+
+    const STEPS: u64 = 120;
+
+    /// Training whose errors are 1, 2, 3, …; its checkpoint is the number of steps as text.
+    #[derive(Default)]
+    struct Counting {
+        steps: u64,
+        /// Number of steps of this run.
+        taken: u64,
+        /// Error of the step after a number of steps.
+        failure: Option<(u64, anyhow::Error)>,
+    }
+
+    impl Training for Counting {
+        fn steps(&self) -> u64 {
+            self.steps
+        }
+
+        fn step(&mut self) -> anyhow::Result<Option<f64>> {
+            if self.steps == STEPS {
+                return Ok(None);
+            }
+            if let Some((_, error)) = self.failure.take_if(|(after, _)| *after == self.steps) {
+                return Err(error);
+            }
+            (self.steps, self.taken) = (self.steps + 1, self.taken + 1);
+            Ok(Some(self.steps as f64))
+        }
+
+        fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
+            std::fs::write(path, self.steps.to_string()).map_err(|_| anyhow!("unwritable"))
+        }
+
+        fn resume(&mut self, path: &Path) -> anyhow::Result<()> {
+            let text = std::fs::read_to_string(path).unwrap();
+            self.steps = text.parse().map_err(|_| anyhow!("no number"))?;
+            Ok(())
+        }
+    }
+
+    /// Takes steps without checkpoints; returns the result and the reports.
+    fn reports_of(trainer: &mut Counting) -> (anyhow::Result<()>, Vec<(u64, f64)>) {
+        let reports = RefCell::new(Vec::new());
+        let report = |done, mean| reports.borrow_mut().push((done, mean));
+        let ended = take_steps(trainer, None, || false, report);
+        (ended, reports.into_inner())
+    }
+
+    #[test]
+    fn a_resumed_training_takes_the_steps_that_are_left() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("checkpoint");
+        std::fs::write(&checkpoint, "100").unwrap();
+        let mut trainer = Counting::default();
+        assert_eq!(resume(&mut trainer, &checkpoint), "resuming from step 100");
+        reports_of(&mut trainer).0.unwrap();
+        assert_eq!((trainer.steps, trainer.taken), (STEPS, 20));
+    }
+
+    #[test]
+    fn a_checkpoint_that_cannot_be_used_starts_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("checkpoint");
+        std::fs::write(&checkpoint, "torn").unwrap();
+        let mut trainer = Counting::default();
+        let said = resume(&mut trainer, &checkpoint);
+        assert_eq!(said, "no number; starting over");
+        reports_of(&mut trainer).0.unwrap();
+        assert_eq!((trainer.steps, trainer.taken), (STEPS, STEPS));
+    }
+
+    #[test]
+    fn an_interruption_leaves_a_checkpoint_to_resume_from() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("checkpoint");
+        let mut trainer = Counting::default();
+        let looks = Cell::new(0);
+        let interrupted = || looks.replace(looks.get() + 1) == 3;
+        let ended = take_steps(&mut trainer, Some(&checkpoint), interrupted, |_, _| {});
+        let failure = ended.unwrap_err();
+        assert!(matches!(failure.downcast_ref(), Some(Failure::Interrupted)), "{failure}");
+        assert_eq!((trainer.steps, exit_code(&failure)), (3, 130));
+        assert_eq!(std::fs::read_to_string(&checkpoint).unwrap(), "3");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing partial is left");
+        let mut trainer = Counting::default();
+        assert_eq!(resume(&mut trainer, &checkpoint), "resuming from step 3");
+        reports_of(&mut trainer).0.unwrap();
+        assert_eq!(trainer.taken, STEPS - 3);
+    }
+
+    #[test]
+    fn a_checkpoint_that_cannot_be_written_is_an_error_of_its_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("absent/checkpoint");
+        let ended = take_steps(&mut Counting::default(), Some(&checkpoint), || true, |_, _| {});
+        let failure = ended.unwrap_err();
+        let said = "cannot write the checkpoint: unwritable";
+        assert_eq!((format!("{failure:#}").as_str(), exit_code(&failure)), (said, 1));
+    }
+
+    #[test]
+    fn a_failed_step_ends_the_training() {
+        let failure = Failure::Numerical("not finite".to_owned()).into();
+        let mut trainer = Counting { failure: Some((7, failure)), ..Counting::default() };
+        let failure = reports_of(&mut trainer).0.unwrap_err();
+        assert_eq!((failure.to_string().as_str(), exit_code(&failure)), ("not finite", 4));
+        assert_eq!(trainer.taken, 7);
+    }
+
+    #[test]
+    fn a_report_is_the_mean_since_the_last_one() {
+        let (ended, reports) = reports_of(&mut Counting::default());
+        ended.unwrap();
+        // Means of 1 to 50 and of 51 to 100; 20 more steps make no report.
+        assert_eq!(reports, [(50, 25.5), (100, 75.5)]);
+    }
+}
