@@ -3,6 +3,7 @@
 //! * [`Members`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
 //!   cancels errors where images don't determine the scene (docs/design/011). [`read_field`] reads
 //!   one of them.
+//! * [`read_point_fields`]: all fields of an artifact at points, for baking.
 //! * [`FieldFile`]: description of a field artifact.
 //! * [`pixel_rays`]: the rays of a view's pixels.
 //! * [`mean`], [`lower_median`]: a pixel's value from several fields or rays.
@@ -20,7 +21,7 @@ mod field_file;
 use std::path::Path;
 
 use artifact::{Failure, FailureExt as _, GivenInput};
-use radiance::{Field, Pixel, Ray, RayField, RenderError};
+use radiance::{Field, Pixel, PointField, Ray, RayField, RenderError};
 use rayon::prelude::*;
 use scene::{Background, Bounds, Camera};
 
@@ -50,6 +51,38 @@ impl Members {
         let fields = paths.map(|path| read_field(file.field, file.bounds, &path, device));
         let fields = fields.collect::<Result<_, _>>()?;
         Ok(Self { file, fields })
+    }
+}
+
+/// Reads all fields of an input, to be evaluated at points by the CPU.
+///
+/// # Errors
+/// Those of [`Members::read`].
+pub fn read_point_fields(
+    input: &GivenInput,
+) -> Result<(FieldFile, Vec<Box<dyn PointField>>), Failure> {
+    let file = read_field_file(input)?;
+    let paths = (0..file.members).map(|index| input.path(&FieldFile::member_file(index)));
+    let fields = paths.map(|path| read_point_field(file.field, file.bounds, &path));
+    Ok((file, fields.collect::<Result<_, _>>()?))
+}
+
+fn read_point_field(
+    model: FieldModel,
+    bounds: Bounds,
+    weights: &Path,
+) -> Result<Box<dyn PointField>, Failure> {
+    match model {
+        FieldModel::Grid(architecture) => {
+            Ok(Box::new(Field::read(weights, architecture, bounds).bad_input("field")?))
+        }
+        #[cfg(feature = "torch")]
+        FieldModel::Mlp(architecture) => {
+            let field = torch_field::Mlp::read(weights, architecture, bounds, torch_device("cpu")?);
+            Ok(Box::new(torch_field::MlpPoints::new(field.bad_input("field")?)))
+        }
+        #[cfg(not(feature = "torch"))]
+        FieldModel::Mlp(_) => Err(needs_libtorch("field: mlp")),
     }
 }
 

@@ -12,7 +12,7 @@
 //! * [`regularisers`]: losses on a ray other than its colour error.
 //! * [`spec`]: constants shared with the libtorch twin.
 //! * [`Passes`]: one forward and backward pass without an optimiser, for benchmarks.
-//! * [`PointSample`]: the field at a point of the unit cube, for baking.
+//! * [`PointField`]: trait of fields that are evaluated at points, for baking.
 //! * [`Architecture`]: sizes of a field; [`scene::Bounds`]: its position in the world.
 //!
 //! Shading is deferred (SNeRG, Hedman et al. 2021): a sample has a density, a raw colour and view
@@ -71,7 +71,7 @@ pub use field::Field;
 pub use math::spherical_harmonics;
 pub use occupancy::{CellHit, Occupancy};
 pub use passes::Passes;
-pub use points::PointSample;
+pub use points::{PointField, PointSample, PointSamples};
 pub use ray::{NormalizedRay, Ray, RayMap, clip};
 pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};

@@ -1,5 +1,6 @@
 //! Density and colour of a field at points of its unit cube, without rays: for baking.
 
+use crate::RenderError;
 use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::math::exp;
@@ -20,8 +21,81 @@ pub struct PointSample {
     pub density: f32,
     /// Red, green and blue before the sigmoid, without the view-dependent part.
     pub raw_colour: [f32; 3],
-    /// Input of [`Field::view_colours`].
+    /// Inputs of the view network.
     pub view_features: [f32; VIEW_FEATURES],
+}
+
+/// Values of a field at some points.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PointSamples {
+    /// Optical depth per unit of a ray's t at each point.
+    pub densities: Vec<f32>,
+    /// Red, green and blue of each point before the sigmoid, without the view-dependent part.
+    pub raw_colours: Vec<[f32; 3]>,
+    /// Inputs of [`PointField::view_colours`], a row of equal length for each point.
+    pub view_features: Vec<f32>,
+}
+
+/// Field of any kind that is evaluated at points of its unit cube, in the calling thread.
+///
+/// # Errors
+/// All methods return [`RenderError::Backend`] if a library fails.
+pub trait PointField: Sync {
+    /// Returns whether a density of at least `min_density` is possible between two corners.
+    fn may_have_density(
+        &self,
+        low: [f32; 3],
+        high: [f32; 3],
+        min_density: f32,
+    ) -> Result<bool, RenderError>;
+
+    /// Evaluates the densities of [`PointSamples`] alone.
+    fn densities(&self, points: &[[f32; 3]]) -> Result<Vec<f32>, RenderError>;
+
+    /// Evaluates density, raw colour and view features.
+    fn samples(&self, points: &[[f32; 3]]) -> Result<PointSamples, RenderError>;
+
+    /// Computes the view-dependent part of raw colours for rows of view features, each in some unit
+    /// directions of the world.
+    fn view_colours(
+        &self,
+        features: &[f32],
+        directions: &[Vec<[f32; 3]>],
+    ) -> Result<Vec<Vec<[f32; 3]>>, RenderError>;
+}
+
+impl PointField for Field {
+    fn may_have_density(
+        &self,
+        low: [f32; 3],
+        high: [f32; 3],
+        _min_density: f32,
+    ) -> Result<bool, RenderError> {
+        Ok(self.has_occupied_cell(low, high))
+    }
+
+    fn densities(&self, points: &[[f32; 3]]) -> Result<Vec<f32>, RenderError> {
+        Ok(self.sample_points(points).iter().map(|sample| sample.density).collect())
+    }
+
+    fn samples(&self, points: &[[f32; 3]]) -> Result<PointSamples, RenderError> {
+        let mut samples = PointSamples::default();
+        for sample in self.sample_points(points) {
+            samples.densities.push(sample.density);
+            samples.raw_colours.push(sample.raw_colour);
+            samples.view_features.extend(sample.view_features);
+        }
+        Ok(samples)
+    }
+
+    fn view_colours(
+        &self,
+        features: &[f32],
+        directions: &[Vec<[f32; 3]>],
+    ) -> Result<Vec<Vec<[f32; 3]>>, RenderError> {
+        let rows = features.as_chunks().0.iter().zip(directions);
+        Ok(rows.map(|(row, directions)| Self::view_colours(self, row, directions)).collect())
+    }
 }
 
 /// Number of points per pass, whose activations fit the cache; chosen by hand.

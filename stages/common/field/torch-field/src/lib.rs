@@ -3,6 +3,7 @@
 //! * [`Mlp`]: NeRF-SR's own field as published (Wang et al. 2022; Mildenhall et al. 2020):
 //!   positional encoding, a coarse and a fine network of eight layers, stratified and importance
 //!   sampling. [`Mlp::render`] returns colour, opacity and depth of rays.
+//! * [`MlpPoints`]: the paper's field at points, for baking.
 //! * [`MlpArchitecture`]: sizes of the paper's field; the only item without feature `torch`.
 //! * [`MlpTrainer`], [`MlpTraining`]: training of the paper's field, driven by the same
 //!   [`radiance::Supervisor`] as the hash-grid field's.
@@ -40,6 +41,8 @@ mod grid_trainer;
 #[cfg(feature = "torch")]
 mod mlp;
 #[cfg(feature = "torch")]
+mod mlp_points;
+#[cfg(feature = "torch")]
 mod mlp_trainer;
 #[cfg(feature = "torch")]
 mod network;
@@ -56,5 +59,5 @@ pub use architecture::MlpArchitecture;
 #[cfg(feature = "torch")]
 pub use {
     error::TorchFieldError, grid::TorchGrid, grid_trainer::GridTrainer, mlp::Mlp,
-    mlp_trainer::MlpTrainer, mlp_trainer::MlpTraining,
+    mlp_points::MlpPoints, mlp_trainer::MlpTrainer, mlp_trainer::MlpTraining,
 };

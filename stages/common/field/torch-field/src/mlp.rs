@@ -47,15 +47,15 @@ pub(crate) struct SampleDraws {
 /// Coordinate frame of the networks' positions in a box: origin and unit of length in world space.
 /// Distances t along a ray have the same unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct MlpFrame {
+pub(crate) struct MlpFrame {
     origin: DVec3,
-    unit: f64,
+    pub(crate) unit: f64,
 }
 
 impl MlpFrame {
-    /// Returns the origin of a ray in this frame, computed in f64 and then rounded to f32.
-    fn origin_of(&self, ray: &Ray) -> [f32; 3] {
-        ((DVec3::from(ray.origin) - self.origin) / self.unit).as_vec3().to_array()
+    /// Returns a world position in this frame, computed in f64 and then rounded to f32.
+    pub(crate) fn position_of(&self, point: DVec3) -> [f32; 3] {
+        ((point - self.origin) / self.unit).as_vec3().to_array()
     }
 }
 
@@ -139,7 +139,7 @@ impl Batch {
         let frame = field.frame();
         let Mlp { bounds, device, .. } = *field;
         Ok(Self {
-            origin: columns(rays, device, |r| frame.origin_of(r))?,
+            origin: columns(rays, device, |r| frame.position_of(r.origin.into()))?,
             direction: columns(rays, device, |r| r.direction.map(|x| x as f32))?,
             background: columns(rays, device, |r| r.background)?,
             maps: (bounds.space != Space::Box)
@@ -224,7 +224,7 @@ impl Mlp {
     }
 
     /// Returns the frame of positions, which only fields in a box use.
-    fn frame(&self) -> MlpFrame {
+    pub(crate) fn frame(&self) -> MlpFrame {
         if self.architecture.scaled_positions {
             MlpFrame { origin: self.bounds.middle(), unit: self.bounds.unit() }
         } else {

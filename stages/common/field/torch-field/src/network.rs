@@ -128,19 +128,47 @@ impl MlpNetwork {
         position: &Tensor,
         direction: &Tensor,
     ) -> Result<(Tensor, Tensor), TchError> {
-        let depth = self.architecture.layers as usize;
+        let trunk = self.trunk(position)?;
+        let density = self.raw_density(&trunk)?;
+        let colour = self.raw_colour(&self.feature(&trunk)?, direction)?.f_sigmoid()?;
+        Ok((colour, density))
+    }
+
+    /// Returns the outputs of the layers before the branch (n × width) at encoded positions.
+    pub(crate) fn trunk(&self, position: &Tensor) -> Result<Tensor, TchError> {
         let mut x = position.shallow_clone();
-        for i in 0..depth {
+        for i in 0..self.architecture.layers as usize {
             if i == SKIP_LAYER as usize {
                 x = Tensor::f_cat(&[position, &x], -1)?;
             }
             x = self.layer(&x, i)?.f_relu()?;
         }
-        let density = self.layer(&x, depth)?.f_squeeze_dim(-1)?;
-        let feature = self.layer(&x, depth + 1)?;
-        let input = Tensor::f_cat(&[&feature, direction], -1)?;
-        let hidden = self.layer(&input, depth + 2)?.f_relu()?;
-        Ok((self.layer(&hidden, depth + 3)?.f_sigmoid()?, density))
+        Ok(x)
+    }
+
+    /// Returns raw densities (n) from the trunk's outputs.
+    pub(crate) fn raw_density(&self, trunk: &Tensor) -> Result<Tensor, TchError> {
+        self.head(trunk, 0)?.f_squeeze_dim(-1)
+    }
+
+    /// Returns the colour branch's features (n × width) from the trunk's outputs.
+    pub(crate) fn feature(&self, trunk: &Tensor) -> Result<Tensor, TchError> {
+        self.head(trunk, 1)
+    }
+
+    /// Returns colours before the sigmoid (n × 3) from features and encoded directions.
+    pub(crate) fn raw_colour(
+        &self,
+        feature: &Tensor,
+        direction: &Tensor,
+    ) -> Result<Tensor, TchError> {
+        let input = Tensor::f_cat(&[feature, direction], -1)?;
+        self.head(&self.head(&input, 2)?.f_relu()?, 3)
+    }
+
+    /// Applies the layer with this index after the trunk.
+    fn head(&self, x: &Tensor, i: usize) -> Result<Tensor, TchError> {
+        self.layer(x, self.architecture.layers as usize + i)
     }
 
     /// Applies the layer with this index.
