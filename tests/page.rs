@@ -139,21 +139,23 @@ fn a_page_shows_a_sweep_as_eval_scored_it() {
 fn record_node(project: &Project, stage: &str, kind: &str, point: &str, inputs: &Value) -> Value {
     let folder = project.artifact(stage, &[]);
     json!({"stage": stage, "program": stage, "point": point, "kind": kind, "key": "k",
-        "values": if point.is_empty() { json!({}) } else { json!({"rays": point[5..]}) },
+        "values": if point.is_empty() { json!({}) } else { json!({"rays": point[5..9]}) },
         "is_cached": point.is_empty(), "peak_memory": 100_000_000,
         "output": folder.file_name().unwrap().to_str().unwrap(), "folder": folder,
         "parameters": {"rays": 4000, "seed": null}, "inputs": inputs,
         "started_unix": 1_790_000_000, "seconds": 3.5, "threads": 2})
 }
 
-/// A run's record, as the runner writes it, with the same result many times.
-fn record(project: &Project, results: usize) -> Value {
+/// A run's record, as the runner writes it, with the same result many times. `constant` ends the
+/// points' names.
+fn record(project: &Project, results: usize, constant: &str) -> Value {
     let mut nodes = vec![
         record_node(project, "demo-scene", "dataset", "", &json!({})),
         record_node(project, "prep", "scene", "", &json!({"dataset": {"node": 0}})),
     ];
     for result in 0..results {
-        let point = if results == 1 { String::new() } else { format!("rays={}", 1000 + result) };
+        let point =
+            if results == 1 { String::new() } else { format!("rays={}{constant}", 1000 + result) };
         let first = nodes.len();
         let prep = |folder: &str| json!({"node": 1, "subtree": folder});
         let inputs = json!({"scene": prep("train")});
@@ -191,7 +193,7 @@ fn layers(page: &str, kind: &str) -> Vec<String> {
 fn a_failed_run_shows_the_renders_that_it_finished() {
     let project = Project::fast();
     project.ok(&["run"]);
-    let mut record = record(&project, 1);
+    let mut record = record(&project, 1, "");
     record["nodes"].as_array_mut().unwrap().pop();
     record["failed"] = json!([{"stage": "eval", "point": ""}]);
     record["unfinished"] = json!([{"stage": "eval", "point": "", "kind": "metrics",
@@ -220,9 +222,14 @@ fn one_result_and_a_hundred_have_readable_pages() {
     let project = Project::fast();
     project.ok(&["run"]);
     let metrics = project.json("eval", "metrics.json", &[]);
-    for (results, last) in [(1, "rendered"), (12, "rays=1011"), (100, "rays=1099")] {
+    let long = ", experiment=photographs of the garden behind the house";
+    for (results, constant, last) in [
+        (1, "", "rendered".to_owned()),
+        (12, "", "rays=1011".to_owned()),
+        (100, long, format!("rays=1099{long}")),
+    ] {
         let folder = tempfile::tempdir().unwrap();
-        let page = page_of(folder.path(), &record(&project, results));
+        let page = page_of(folder.path(), &record(&project, results, constant));
         let text = std::fs::read_to_string(&page).unwrap();
         assert_eq!(text.matches("★</span>").count() > 0, results > 1, "{results}");
         assert!(text.len() as u64 <= PAGE_BYTES, "{} bytes", text.len());
@@ -231,7 +238,7 @@ fn one_result_and_a_hundred_have_readable_pages() {
         assert_eq!(renders.len(), 1, "{renders:?}");
         assert_eq!(renders[0].ends_with(&format!("and {} more", results - 1)), results > 1);
         let Some(looks) = glance(&page) else { return };
-        looks.iter().for_each(|look| says(look, last, &metrics));
+        looks.iter().for_each(|look| says(look, &last, &metrics));
     }
 }
 
@@ -389,7 +396,7 @@ fn a_run_that_failed_has_a_page() {
 fn a_page_without_scores_to_read_says_so() {
     let project = Project::fast();
     project.ok(&["run"]);
-    let mut record = record(&project, 2);
+    let mut record = record(&project, 2, "");
     let empty = tempfile::tempdir().unwrap();
     record["nodes"][4]["folder"] = json!(empty.path());
     // Metrics of somebody's own, without views or figures.

@@ -128,7 +128,7 @@ async function link(browser, page, size, expect) {
   await page.locator("#fit").click();
 }
 
-/** Checks that wide tables show that they scroll, and that no word is broken and no caption cut. */
+/** Checks that tables are lower than the window and keep their heads, that wide ones show that they scroll, and that no word is broken and no caption cut. */
 async function tables(page, expect) {
   const problems = await page.locator(".wide").evaluateAll((all) =>
     all.flatMap((region) => {
@@ -142,6 +142,13 @@ async function tables(page, expect) {
         const isCut = range.getBoundingClientRect().right > region.getBoundingClientRect().right + 1;
         if (isCut) found.push(`${caption.textContent} is cut`);
       }
+      const name = region.getAttribute("aria-label") ?? region.getAttribute("aria-labelledby");
+      if (region.clientHeight > 0.7 * innerHeight) found.push(`${name}: a table of ${region.clientHeight} pixels`);
+      const head = region.querySelector("thead th");
+      region.scrollTop = region.scrollHeight;
+      const isAtTop = (box) => Math.abs(box.getBoundingClientRect().top - region.getBoundingClientRect().top) < 2;
+      if (region.scrollTop > 100 && head && !isAtTop(head)) found.push(`${name}: the head scrolls away`);
+      region.scrollTop = 0;
       if (isHinted !== region.scrollWidth - region.clientWidth >= 2) found.push("a wide table without a hint");
       for (const cell of region.querySelectorAll("th, td")) {
         for (const node of textNodes(cell)) {

@@ -59,7 +59,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                     "screen pixel. N and P change the view."
                 }
                 div id="scales" {}
-                div class="wide" tabindex="0" role="region" aria-label="Numbers of this view" {
+                div class="wide tall low" tabindex="0" role="region" aria-label="Numbers of this view" {
                     table id="numbers" aria-live="polite" {}
                 }
                 p id="originals" class="note" {}
