@@ -9,6 +9,7 @@ use std::path::Path;
 use std::process::Command;
 
 use common::{Finished, Project, bin};
+use serde_json::Value;
 
 /// Documents whose commands and blocks are checked, and folders that hold more of them.
 const DOCUMENTS: [&str; 2] = ["README.md", "ARCHITECTURE.md"];
@@ -189,9 +190,18 @@ fn pipeline_blocks_are_valid() {
     }
 }
 
-/// The guide's programs run one after the other, next to a finished run.
+/// The code cells of a notebook.
+fn code_cells(notebook: &str) -> Vec<String> {
+    let notebook: Value = serde_json::from_str(&read(notebook)).unwrap();
+    let cells = notebook["cells"].as_array().unwrap().iter();
+    let code = cells.filter(|cell| cell["cell_type"] == "code");
+    let lines = code.map(|cell| cell["source"].as_array().unwrap().iter());
+    lines.map(|lines| lines.map(|line| line.as_str().unwrap()).collect()).collect()
+}
+
+/// The notebook's programs, which are the guide's, run one after the other, next to a finished run.
 #[test]
-fn programs_of_the_python_guide_run() {
+fn programs_of_the_notebook_run() {
     let modules = ["-c", "import numpy, pandas, OpenEXR"];
     let has = Command::new("python3").args(modules).output();
     if !has.is_ok_and(|output| output.status.success()) {
@@ -204,7 +214,7 @@ fn programs_of_the_python_guide_run() {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let path = std::env::join_paths([programs].into_iter().chain(std::env::split_paths(&path)));
     let path = path.unwrap();
-    let blocks = blocks(&read("docs/guide/python.md"), "python");
+    let blocks = code_cells("docs/guide/python.ipynb");
     let words = [&["eval", "psnr", "seconds"][..], &["view_0 (48, 48, 4)", "view_2 (48, 48, 4)"]];
     assert_eq!(blocks.len(), words.len());
     for (block, words) in blocks.iter().zip(words) {

@@ -1,5 +1,5 @@
-//! `schemas/` and `docs/reference/` are made from the types and from what the built stages say;
-//! this test keeps them current. `make reference` writes them anew.
+//! `schemas/` and `docs/reference/` are made from the types and from what the built stages say, the
+//! notebook from the guide; this test keeps them current. `make reference` writes them anew.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -10,7 +10,7 @@ use std::sync::LazyLock;
 use std::time::SystemTime;
 
 use schemars::{JsonSchema, schema_for};
-use serde_json::Value;
+use serde_json::{Value, json};
 use stage::Description;
 
 fn of<T: JsonSchema>() -> Value {
@@ -91,21 +91,23 @@ fn schemas() -> BTreeMap<String, Value> {
         .collect()
 }
 
+/// Compares a file with what it should hold, or writes it anew.
+fn check_file(file: &str, expected: &str) {
+    let path = common::root().join(file);
+    if is_update() {
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(&path, expected).unwrap();
+    } else {
+        let found = std::fs::read_to_string(&path).unwrap_or_default();
+        assert!(found == expected, "{file} is out of date; CONTRIBUTING.md says how it is made");
+    }
+}
+
 /// Compares a folder with what it should hold, or writes it anew.
 fn check_folder(folder: &str, expected: &BTreeMap<String, String>) {
     let root = common::root().join(folder);
     for (name, text) in expected {
-        let path = root.join(name);
-        if is_update() {
-            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-            std::fs::write(&path, text).unwrap();
-        } else {
-            let found = std::fs::read_to_string(&path).unwrap_or_default();
-            assert!(
-                found == *text,
-                "{folder}/{name} is out of date; CONTRIBUTING.md says how it is made"
-            );
-        }
+        check_file(&format!("{folder}/{name}"), text);
     }
     let files = walkdir::WalkDir::new(&root)
         .into_iter()
@@ -143,6 +145,35 @@ fn reference_pages_are_current() {
         + further;
     pages.insert("README.md".to_owned(), index);
     check_folder("docs/reference", &pages);
+}
+
+/// The notebook has the Python guide's text and programs, in their order.
+#[test]
+fn the_notebook_is_current() {
+    let guide = std::fs::read_to_string(common::root().join("docs/guide/python.md")).unwrap();
+    let mut cells = Vec::new();
+    for (index, part) in guide.split("```").enumerate() {
+        let (kind, text) = match part.strip_prefix("python\n") {
+            Some(program) => ("code", program),
+            None => ("markdown", part),
+        };
+        let lines: Vec<&str> = text.trim().split_inclusive('\n').collect();
+        if lines.is_empty() {
+            continue;
+        }
+        let mut cell = json!({"cell_type": kind, "id": format!("part-{index}"), "metadata": {},
+            "source": lines});
+        if kind == "code" {
+            cell["execution_count"] = Value::Null;
+            cell["outputs"] = json!([]);
+        }
+        cells.push(cell);
+    }
+    let kernel = json!({"display_name": "Python 3", "language": "python", "name": "python3"});
+    let notebook = json!({"cells": cells, "metadata": {"kernelspec": kernel}, "nbformat": 4,
+        "nbformat_minor": 5});
+    let text = serde_json::to_string_pretty(&notebook).unwrap() + "\n";
+    check_file("docs/guide/python.ipynb", &text);
 }
 
 /// A stage's help names its page, and a parameter's group is one of those that there are.
