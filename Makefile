@@ -75,7 +75,7 @@ lint: setup ## Run rustfmt, clippy (with and without libtorch, fuzz targets incl
 	cargo fmt --all --check
 	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
-	cargo clippy --release -p train-ss -p render-depth -p register -p eval -p export --no-default-features --all-targets -- -D warnings
+	cargo clippy --release -p train-ss -p render-depth -p register -p eval -p export -p viewer --no-default-features --all-targets -- -D warnings
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
 	$(IN_FUZZ) cargo clippy --release -- -D warnings
 	@if [ -d "$$(rustc --print sysroot)/lib/rustlib/$(ARM)/lib" ] && command -v aarch64-linux-gnu-gcc >/dev/null; then \

@@ -174,26 +174,31 @@ fn the_page_shows_text_as_the_field_does() {
     }
 }
 
-/// Blocks of a demo scene with a field of the default size: smaller fields and fewer rays give
-/// haze.
-fn clear_scene(demo_scene: &str) -> String {
+/// Parameters of a field of the default size: smaller fields and fewer rays give haze.
+const GRID: &str = "rays: 300000, n_levels: 8, cells_per_pixel: 2.56, log2_hashmap_size: null, \
+    hidden_dim: 64, march_steps: null, max_rays_per_step: 8192, samples_per_step: 24576";
+
+/// Parameters of the paper's field, in miniature.
+const MLP: &str = "field: mlp, rays: 400000, hidden_dim: 64, layers: 4, coarse_samples: 32, \
+    fine_samples: 32, max_rays_per_step: 512";
+
+/// Blocks of a demo scene and its field.
+fn clear_scene(demo_scene: &str, field: &str) -> String {
     format!(
         "  demo-scene:\n    parameters: {{size: 64, train: 40{demo_scene}}}\n  \
         prep:\n    parameters: {{lr_width: 32}}\n  \
-        train-ss:\n    parameters: {{rays: 300000, n_levels: 8, cells_per_pixel: 2.56, \
-        log2_hashmap_size: null, hidden_dim: 64, march_steps: null, max_rays_per_step: 8192, \
-        samples_per_step: 24576}}\n"
+        train-ss:\n    parameters: {{{field}}}\n"
     )
 }
 
 /// Trains a field of the demo scene in a space, and compares the page with rendered views of three
 /// test cameras and of three cameras between them.
-fn compare_space(demo_scene: &str, space: &str) {
+fn compare_space(demo_scene: &str, space: &str, field: &str) {
     let blocks = format!(
         "{}  camera-path:\n    inputs: {{cameras: prep/cameras}}\n    \
         parameters: {{kind: between, frames: 6, size: 512}}\n  \
         viewer:\n    parameters: {{resolution: 128}}\n",
-        clear_scene(demo_scene)
+        clear_scene(demo_scene, field)
     );
     let project = Project::shipped(&["viewer", "video"], &blocks);
     project.ok(&["run", "viewer", "path-views"]);
@@ -213,26 +218,33 @@ fn compare_space(demo_scene: &str, space: &str) {
 
 #[test]
 fn the_page_shows_a_box() {
-    compare_space("", "box");
+    compare_space("", "box", GRID);
 }
 
 #[test]
 fn the_page_shows_a_frustum() {
-    compare_space(", layout: forward, backdrop: true", "ndc");
+    compare_space(", layout: forward, backdrop: true", "ndc", GRID);
 }
 
 #[test]
 fn the_page_shows_a_contracted_space() {
-    compare_space(", backdrop: true", "contraction");
+    compare_space(", backdrop: true", "contraction", GRID);
 }
 
-/// A field that can't be shown is refused before it is trained.
+/// The paper's field is shown as well.
 #[test]
-fn the_papers_field_is_refused_before_anything_runs() {
-    let project = Project::shipped(&["viewer"], "");
-    project.run(&["run", "viewer", "-p", "field=mlp"]).fails(2, &["viewer", "baked", "grid"]);
-    let actions = std::fs::read_dir(project.path(".nerf-sr/actions"));
-    assert_eq!(actions.map_or(0, Iterator::count), 0);
+fn the_page_shows_the_papers_field_in_a_box() {
+    compare_space("", "box", MLP);
+}
+
+#[test]
+fn the_page_shows_the_papers_field_in_a_frustum() {
+    compare_space(", layout: forward, backdrop: true", "ndc", MLP);
+}
+
+#[test]
+fn the_page_shows_the_papers_field_in_a_contracted_space() {
+    compare_space(", backdrop: true", "contraction", MLP);
 }
 
 fn distance_from_origin(state: &Value) -> f64 {
@@ -265,7 +277,7 @@ fn check_recorder(project: &Project, recorded: &Path, second: &Value) {
 /// Mouse, keys and touches change the view as expected.
 #[test]
 fn people_can_look_around() {
-    let project = Project::shipped(&["viewer", "video"], &clear_scene(""));
+    let project = Project::shipped(&["viewer", "video"], &clear_scene("", GRID));
     project.ok(&["run", "viewer", "-p", "viewer.resolution=64", "-p", "photographs=20"]);
     let page = project.path("out/viewer/index.html");
     let recorded = project.path("recorded/camera_path.json");
@@ -297,6 +309,9 @@ fn people_can_look_around() {
         assert_ne!(desktop(pair[0])["hash"], desktop(pair[1])["hash"], "{pair:?}");
     }
     assert_ne!(desktop("angle")["angle"], desktop("keys")["angle"]);
+    assert_eq!(first["panes"][0], first["panes"][1], "view and photograph have one size and level");
+    assert_eq!([&desktop("full")["full"], &desktop("saved")["full"]], ["stage", ""]);
+    assert_eq!(desktop("saved")["clicked"], "demo-scene.png");
     // Zooming stops before the surface.
     let nearest = &desktop("inside")["nearest"];
     assert!(nearest.as_f64().is_some_and(|found| (0.01..0.2).contains(&found)), "{nearest}");

@@ -27,6 +27,11 @@ async function state() {
     scale: document.getElementById("depth-scale").hidden ? "" : document.getElementById("depth-scale").textContent,
     corner: [...viewer.volume.pixels().slice(0, 3)],
     path: viewer.path(), clicked: window.clicked,
+    panes: ["view", "photo"].map((id) => {
+      const { top, width, height } = document.getElementById(id).getBoundingClientRect();
+      return [top, width, height];
+    }),
+    full: document.fullscreenElement?.id ?? "",
     centre: viewer.pose.map((row) => row[3]),
     right: viewer.pose.map((row) => row[0]),
   };
@@ -57,6 +62,15 @@ const onDesktop = (page) => [
   ["keys", () => page.click("#show-help")],
   ["angle", async () => { await page.keyboard.press("Escape"); await page.focus("#view"); await page.keyboard.press("]"); }],
   ["turntable", async () => { await page.keyboard.press("t"); await page.waitForTimeout(300); await page.keyboard.press("t"); }],
+  ["full", () => page.click("#full-screen")],
+  ["saved", async () => {
+    await page.focus("#view");
+    await page.keyboard.press("f");
+    const download = page.waitForEvent("download");
+    await page.click("#save-image");
+    const name = (await download).suggestedFilename();
+    await page.evaluate((name) => (window.clicked = name), name);
+  }],
   ["reset", async () => { await page.check("[value=colour]"); await page.uncheck("#with-frusta"); await page.click("#reset"); }],
   ["inside", async () => { await page.mouse.move(200, 250); for (let i = 0; i < 40; i++) await page.mouse.wheel(0, -300); }],
   ["home", () => page.click("#reset")],

@@ -95,11 +95,11 @@ mod tests {
     use std::io::Read as _;
 
     use super::*;
-    use crate::bake::tests::{Ball, bake, bounds, cameras};
+    use crate::bake::tests::{Ball, bake};
 
     fn packed() -> (Volume, Atlas) {
         let ball = Ball { radius: 0.3, density: 200.0 };
-        let volume = bake(&[ball], &bounds(), &cameras(), 64);
+        let volume = bake(vec![ball], 64);
         let atlas = Atlas::pack(&volume, |_| Progress::silent()).unwrap();
         (volume, atlas)
     }

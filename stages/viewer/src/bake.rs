@@ -2,7 +2,7 @@
 //! mean colour in the directions of the cameras that see it, and the colour's view dependence.
 
 use glam::DVec3;
-use radiance::{Field, PointSample, spec::VIEW_FEATURES};
+use radiance::{PointField, PointSamples, RenderError};
 use rayon::prelude::*;
 use scene::{Bounds, Camera};
 use stage::Progress;
@@ -20,38 +20,6 @@ const SAMPLES_PER_VOXEL: usize = SAMPLES_PER_SIDE * SAMPLES_PER_SIDE * SAMPLES_P
 const MAX_DIRECTIONS: usize = 16;
 /// Minimum opacity of a stored voxel: a smaller one rounds to byte 0.
 const MIN_OPACITY: f32 = 0.5 / 255.0;
-
-/// Field that is baked, a trait for tests. Positions are those of the unit cube.
-pub(crate) trait Source: Sync {
-    /// True if density is possible between two corners.
-    fn has_occupied_cell(&self, low: [f32; 3], high: [f32; 3]) -> bool;
-    /// Evaluates density, raw colour and view features at some positions.
-    fn sample(&self, positions: &[[f32; 3]]) -> Vec<PointSample>;
-    /// Evaluates the view network's raw colours for view features and some directions.
-    fn view_colours(
-        &self,
-        features: &[f32; VIEW_FEATURES],
-        directions: &[[f32; 3]],
-    ) -> Vec<[f32; 3]>;
-}
-
-impl Source for Field {
-    fn has_occupied_cell(&self, low: [f32; 3], high: [f32; 3]) -> bool {
-        Self::has_occupied_cell(self, low, high)
-    }
-
-    fn sample(&self, positions: &[[f32; 3]]) -> Vec<PointSample> {
-        self.sample_points(positions)
-    }
-
-    fn view_colours(
-        &self,
-        features: &[f32; VIEW_FEATURES],
-        directions: &[[f32; 3]],
-    ) -> Vec<[f32; 3]> {
-        Self::view_colours(self, features, directions)
-    }
-}
 
 /// A baked field.
 #[derive(Clone, Debug, PartialEq)]
@@ -102,23 +70,43 @@ impl Shape {
 }
 
 /// Bakes the mean of some sources where cameras see it.
-pub(crate) struct Baker<'a, S> {
-    pub(crate) sources: &'a [S],
+pub(crate) struct Baker<'a> {
+    pub(crate) sources: &'a [Box<dyn PointField>],
     pub(crate) bounds: &'a Bounds,
     pub(crate) cameras: &'a [Camera],
     pub(crate) resolution: usize,
 }
 
-impl<S: Source> Baker<'_, S> {
+impl Baker<'_> {
+    /// Returns the number of positions at which bricks may be.
+    pub(crate) fn brick_positions(&self) -> u64 {
+        (self.resolution / SIDE).pow(3) as u64
+    }
+
     /// Returns the bricks in which some source may have density.
-    pub(crate) fn bricks(&self) -> Bricks {
-        Bricks::new(self.resolution, |brick| {
-            let low = brick.map(|c| (c * SIDE) as f32 / self.resolution as f32);
-            // The upper corner itself belongs to the next brick.
-            let high = brick.map(|c| ((c + 1) * SIDE) as f32 / self.resolution as f32 - 1e-6);
-            is_reachable(self.bounds, low, high)
-                && self.sources.iter().any(|source| source.has_occupied_cell(low, high))
-        })
+    pub(crate) fn bricks(&self, progress: &Progress) -> Result<Bricks, RenderError> {
+        let side = self.resolution / SIDE;
+        let min_density = -(-MIN_OPACITY).ln_1p() * self.resolution as f32;
+        let is_kept: Vec<bool> = (0..side * side * side)
+            .into_par_iter()
+            .map(|i| {
+                progress.add(1);
+                let brick = [i % side, i / side % side, i / (side * side)];
+                let low = brick.map(|c| (c * SIDE) as f32 / self.resolution as f32);
+                // The upper corner itself belongs to the next brick.
+                let high = brick.map(|c| ((c + 1) * SIDE) as f32 / self.resolution as f32 - 1e-6);
+                if !is_reachable(self.bounds, low, high) {
+                    return Ok(false);
+                }
+                for source in self.sources {
+                    if source.may_have_density(low, high, min_density)? {
+                        return Ok(true);
+                    }
+                }
+                Ok(false)
+            })
+            .collect::<Result<_, RenderError>>()?;
+        Ok(Bricks::new(self.resolution, |[x, y, z]| is_kept[x + side * (y + side * z)]))
     }
 
     /// Returns the number of progress steps of baking.
@@ -127,44 +115,60 @@ impl<S: Source> Baker<'_, S> {
     }
 
     /// Computes the voxels' opacities and the cameras that see each voxel.
-    pub(crate) fn shape(&self, bricks: Bricks, progress: &Progress) -> Shape {
-        let opacity: Vec<f32> = bricks
-            .positions()
-            .par_iter()
-            .flat_map_iter(|&brick| {
-                progress.add(1);
-                opacities(self.sources, brick, self.resolution)
-            })
-            .collect();
+    pub(crate) fn shape(&self, bricks: Bricks, progress: &Progress) -> Result<Shape, RenderError> {
+        let mut opacity = vec![0.0; bricks.len() * VOXELS];
+        let parts = opacity.par_chunks_mut(VOXELS).zip(bricks.positions());
+        parts.try_for_each(|(opacity, &brick)| {
+            progress.add(1);
+            self.add_opacities(brick, opacity)
+        })?;
         let seen = visible_from(&bricks, &opacity, (self.cameras, self.bounds), progress);
-        Shape { seen: spread_to_neighbours(&bricks, &seen), bricks, opacity }
+        Ok(Shape { seen: spread_to_neighbours(&bricks, &seen), bricks, opacity })
+    }
+
+    /// Adds to the opacity of each of a brick's voxels the mean over sources.
+    fn add_opacities(&self, brick: [usize; 3], opacity: &mut [f32]) -> Result<(), RenderError> {
+        let positions = sample_positions(brick, 0..VOXELS, self.resolution);
+        let weight = 1.0 / self.sources.len() as f32;
+        for source in self.sources {
+            let densities = source.densities(&positions)?;
+            for (opacity, densities) in opacity.iter_mut().zip(voxels_of(&densities)) {
+                *opacity += weight * opacity_of(densities, self.resolution);
+            }
+        }
+        Ok(())
     }
 
     /// Computes the colours of the visible voxels.
-    pub(crate) fn volume(&self, shape: &Shape, progress: &Progress) -> Volume {
+    pub(crate) fn volume(&self, shape: &Shape, progress: &Progress) -> Result<Volume, RenderError> {
         let bricks = &shape.bricks;
-        let voxels = (0..bricks.len())
+        let voxels: Vec<Vec<Voxel>> = (0..bricks.len())
             .into_par_iter()
-            .flat_map_iter(|slot| {
+            .map(|slot| {
                 progress.add(1);
                 let visible: Vec<usize> =
                     (slot * VOXELS..(slot + 1) * VOXELS).filter(|&v| shape.is_visible(v)).collect();
-                let shaded = self.shade_brick(bricks.positions()[slot], &visible, &shape.seen);
+                let shaded = self.shade_brick(bricks.positions()[slot], &visible, &shape.seen)?;
                 let voxels = visible.into_iter().zip(shaded).map(|(voxel, shaded)| Voxel {
                     position: bricks.position(voxel).map(|c| c as u16),
                     opacity: shape.opacity[voxel],
                     colour: shaded.colour,
                     view: shaded.view,
                 });
-                voxels.collect::<Vec<_>>()
+                Ok(voxels.collect())
             })
-            .collect();
-        Volume { resolution: self.resolution, voxels }
+            .collect::<Result<_, RenderError>>()?;
+        Ok(Volume { resolution: self.resolution, voxels: voxels.concat() })
     }
 
     /// Computes colour and view dependence of some of a brick's voxels: the mean over sources,
     /// weighted by opacity.
-    fn shade_brick(&self, brick: [usize; 3], voxels: &[usize], seen: &[u64]) -> Vec<Shaded> {
+    fn shade_brick(
+        &self,
+        brick: [usize; 3],
+        voxels: &[usize],
+        seen: &[u64],
+    ) -> Result<Vec<Shaded>, RenderError> {
         let positions = sample_positions(brick, voxels.iter().copied(), self.resolution);
         let mut directions = Vec::with_capacity(voxels.len());
         for (i, &voxel) in voxels.iter().enumerate() {
@@ -175,10 +179,11 @@ impl<S: Source> Baker<'_, S> {
         let mut means = vec![Shaded { colour: [0.0; 3], view: [0.0; COEFFICIENTS] }; voxels.len()];
         let mut weights = vec![0.0f32; voxels.len()];
         for source in self.sources {
-            let samples = source.sample(&positions);
-            for (i, samples) in samples.chunks_exact(SAMPLES_PER_VOXEL).enumerate() {
-                let opacity = opacity_of(samples, self.resolution);
-                let shaded = shade(source, samples, &directions[i], self.resolution);
+            let samples = source.samples(&positions)?;
+            let shaded = shade(source.as_ref(), &samples, &directions, self.resolution)?;
+            let voxels = shaded.into_iter().zip(voxels_of(&samples.densities)).enumerate();
+            for (i, (shaded, densities)) in voxels {
+                let opacity = opacity_of(densities, self.resolution);
                 for c in 0..3 {
                     means[i].colour[c] += opacity * shaded.colour[c];
                 }
@@ -192,7 +197,7 @@ impl<S: Source> Baker<'_, S> {
             mean.colour = mean.colour.map(|c| c / weights[i]);
             mean.view = mean.view.map(|v| v / weights[i]);
         }
-        means
+        Ok(means)
     }
 
     /// Returns unit world directions to a position from some of the cameras that see it.
@@ -241,35 +246,26 @@ fn sample_positions(
         .collect()
 }
 
-/// Returns the opacity of each of a brick's voxels, the mean over sources.
-fn opacities<S: Source>(sources: &[S], brick: [usize; 3], resolution: usize) -> Vec<f32> {
-    let positions = sample_positions(brick, 0..VOXELS, resolution);
-    let weight = 1.0 / sources.len() as f32;
-    let mut opacity = vec![0.0; VOXELS];
-    for source in sources {
-        let samples = source.sample(&positions);
-        for (i, samples) in samples.chunks_exact(SAMPLES_PER_VOXEL).enumerate() {
-            opacity[i] += weight * opacity_of(samples, resolution);
-        }
-    }
-    opacity
+/// Splits values of samples by voxel.
+fn voxels_of<T>(samples: &[T]) -> impl Iterator<Item = &[T; SAMPLES_PER_VOXEL]> {
+    samples.as_chunks().0.iter()
 }
 
 /// Computes a voxel's opacity from its samples: the mean over columns along an axis, for the axis
 /// that stops most light. A mean over positions would let light through a wall thinner than the
 /// voxel.
-fn opacity_of(samples: &[PointSample], resolution: usize) -> f32 {
+fn opacity_of(densities: &[f32; SAMPLES_PER_VOXEL], resolution: usize) -> f32 {
     let length = 1.0 / (SAMPLES_PER_SIDE * resolution) as f32;
-    (0..3).map(|axis| stopped_along(axis, samples, length)).fold(0.0, f32::max)
+    (0..3).map(|axis| stopped_along(axis, densities, length)).fold(0.0, f32::max)
 }
 
 /// Returns the share of light along an axis that a voxel's samples stop, each over `length`.
-fn stopped_along(axis: u32, samples: &[PointSample], length: f32) -> f32 {
+fn stopped_along(axis: u32, densities: &[f32; SAMPLES_PER_VOXEL], length: f32) -> f32 {
     let step = SAMPLES_PER_SIDE.pow(axis);
     let columns = (0..SAMPLES_PER_VOXEL).filter(|i| (i / step).is_multiple_of(SAMPLES_PER_SIDE));
     let stopped: f32 = columns
         .map(|first| {
-            let depth: f32 = (0..SAMPLES_PER_SIDE).map(|k| samples[first + k * step].density).sum();
+            let depth: f32 = (0..SAMPLES_PER_SIDE).map(|k| densities[first + k * step]).sum();
             -(-depth * length).exp_m1()
         })
         .sum();
@@ -297,46 +293,59 @@ fn spread_to_neighbours(bricks: &Bricks, seen: &[u64]) -> Vec<u64> {
         .collect()
 }
 
-/// Computes mean colour and view dependence of a voxel's samples.
-fn shade<S: Source>(
-    source: &S,
-    samples: &[PointSample],
-    directions: &[[f32; 3]],
+/// Computes mean colour and view dependence of each voxel from its samples and directions.
+fn shade(
+    source: &dyn PointField,
+    samples: &PointSamples,
+    directions: &[Vec<[f32; 3]>],
     resolution: usize,
-) -> Shaded {
+) -> Result<Vec<Shaded>, RenderError> {
     // Samples are weighted by the light that they stop.
-    let weights: Vec<f32> =
-        samples.iter().map(|s| -(-s.density / resolution as f32).exp_m1()).collect();
-    let scale = 1.0 / weights.iter().sum::<f32>().max(1e-9);
-    let features: [f32; VIEW_FEATURES] = std::array::from_fn(|f| {
-        scale * samples.iter().zip(&weights).map(|(s, w)| w * s.view_features[f]).sum::<f32>()
-    });
-    let (mean, view) = fit(directions, &source.view_colours(&features, directions));
-    let colour = std::array::from_fn(|c| {
-        let mut sum = 0.0;
-        for (sample, weight) in samples.iter().zip(&weights) {
-            sum += weight * (1.0 / (1.0 + (-sample.raw_colour[c] - mean[c]).exp()));
+    let stopped = |density: &f32| -(-density / resolution as f32).exp_m1();
+    let weights: Vec<f32> = samples.densities.iter().map(stopped).collect();
+    let scales: Vec<f32> =
+        voxels_of(&weights).map(|weights| 1.0 / weights.iter().sum::<f32>().max(1e-9)).collect();
+    let width = samples.view_features.len() / weights.len().max(1);
+    let mut features = vec![0.0; directions.len() * width];
+    for (voxel, mean) in features.chunks_exact_mut(width.max(1)).enumerate() {
+        for sample in voxel * SAMPLES_PER_VOXEL..(voxel + 1) * SAMPLES_PER_VOXEL {
+            let weight = scales[voxel] * weights[sample];
+            for (sum, feature) in mean.iter_mut().zip(&samples.view_features[sample * width..]) {
+                *sum += weight * feature;
+            }
         }
-        scale * sum
-    });
-    Shaded { colour, view }
+    }
+    let view_colours = source.view_colours(&features, directions)?;
+    let raw_colours = voxels_of(&samples.raw_colours).zip(voxels_of(&weights)).zip(scales);
+    let shaded = raw_colours.zip(directions.iter().zip(&view_colours));
+    Ok(shaded
+        .map(|(((raw_colours, weights), scale), (directions, view_colours))| {
+            let (mean, view) = fit(directions, view_colours);
+            let colour = std::array::from_fn(|c| {
+                let samples = raw_colours.iter().zip(weights);
+                let light =
+                    |(raw, weight): (&[f32; 3], &f32)| weight / (1.0 + (-raw[c] - mean[c]).exp());
+                scale * samples.map(light).sum::<f32>()
+            });
+            Shaded { colour, view }
+        })
+        .collect())
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use radiance::spherical_harmonics;
+    use radiance::{spec::VIEW_FEATURES, spherical_harmonics};
     use scene::Intrinsics;
 
-    pub(crate) fn bake<S: Source>(
-        sources: &[S],
-        bounds: &Bounds,
-        cameras: &[Camera],
-        resolution: usize,
-    ) -> Volume {
-        let baker = Baker { sources, bounds, cameras, resolution };
+    pub(crate) fn bake(balls: Vec<Ball>, resolution: usize) -> Volume {
+        let sources: Vec<Box<dyn PointField>> =
+            balls.into_iter().map(|ball| Box::new(ball) as _).collect();
+        let (bounds, cameras) = (bounds(), cameras());
+        let baker = Baker { sources: &sources, bounds: &bounds, cameras: &cameras, resolution };
         let progress = Progress::silent();
-        baker.volume(&baker.shape(baker.bricks(), &progress), &progress)
+        let bricks = baker.bricks(&progress).unwrap();
+        baker.volume(&baker.shape(bricks, &progress).unwrap(), &progress).unwrap()
     }
 
     /// A solid ball in the middle of the cube, red to the right, whose green grows with the
@@ -346,32 +355,43 @@ pub(crate) mod tests {
         pub(crate) density: f32,
     }
 
-    fn ball_sample(ball: &Ball, p: &[f32; 3]) -> PointSample {
-        let away = p.map(|c| (c - 0.5).powi(2)).iter().sum::<f32>().sqrt();
-        let mut view_features = [0.0; VIEW_FEATURES];
-        view_features[0] = 1.0;
-        PointSample {
-            density: if away < ball.radius { ball.density } else { 0.0 },
-            raw_colour: [if p[0] > 0.5 { 2.0 } else { -2.0 }, 0.0, 0.0],
-            view_features,
-        }
-    }
-
-    impl Source for Ball {
-        fn has_occupied_cell(&self, _low: [f32; 3], _high: [f32; 3]) -> bool {
-            true
+    impl PointField for Ball {
+        fn may_have_density(
+            &self,
+            _low: [f32; 3],
+            _high: [f32; 3],
+            _min_density: f32,
+        ) -> Result<bool, RenderError> {
+            Ok(true)
         }
 
-        fn sample(&self, positions: &[[f32; 3]]) -> Vec<PointSample> {
-            positions.iter().map(|p| ball_sample(self, p)).collect()
+        fn densities(&self, points: &[[f32; 3]]) -> Result<Vec<f32>, RenderError> {
+            let away = |p: &[f32; 3]| p.map(|c| (c - 0.5).powi(2)).iter().sum::<f32>().sqrt();
+            let density = |p| if away(p) < self.radius { self.density } else { 0.0 };
+            Ok(points.iter().map(density).collect())
+        }
+
+        fn samples(&self, points: &[[f32; 3]]) -> Result<PointSamples, RenderError> {
+            let red = |p: &[f32; 3]| if p[0] > 0.5 { 2.0 } else { -2.0 };
+            let mut row = [0.0; VIEW_FEATURES];
+            row[0] = 1.0;
+            Ok(PointSamples {
+                densities: self.densities(points)?,
+                raw_colours: points.iter().map(|p| [red(p), 0.0, 0.0]).collect(),
+                view_features: row.repeat(points.len()),
+            })
         }
 
         fn view_colours(
             &self,
-            features: &[f32; VIEW_FEATURES],
-            directions: &[[f32; 3]],
-        ) -> Vec<[f32; 3]> {
-            directions.iter().map(|d| [0.0, features[0] * d[2], 0.5]).collect()
+            features: &[f32],
+            directions: &[Vec<[f32; 3]>],
+        ) -> Result<Vec<Vec<[f32; 3]>>, RenderError> {
+            let rows = features.chunks(VIEW_FEATURES).zip(directions);
+            let colours = |row: &[f32], directions: &[[f32; 3]]| {
+                directions.iter().map(|d| [0.0, row[0] * d[2], 0.5]).collect()
+            };
+            Ok(rows.map(|(row, directions)| colours(row, directions)).collect())
         }
     }
 
@@ -400,7 +420,7 @@ pub(crate) mod tests {
     #[test]
     fn a_ball_is_baked_where_cameras_see_it() {
         let ball = Ball { radius: 0.3, density: 1e4 };
-        let volume = bake(&[ball], &bounds(), &cameras(), 64);
+        let volume = bake(vec![ball], 64);
         let middle = |v: &Voxel| v.position.map(|c| (f32::from(c) + 0.5) / 64.0 - 0.5);
         let away = |v: &Voxel| middle(v).iter().map(|c| c * c).sum::<f32>().sqrt();
         assert!(volume.voxels.len() > 1000);
@@ -428,13 +448,11 @@ pub(crate) mod tests {
         }
     }
 
-    fn wall(along: usize, k: usize) -> Vec<PointSample> {
-        (0..SAMPLES_PER_VOXEL)
-            .map(|i| {
-                let is_in = i / SAMPLES_PER_SIDE.pow(along as u32) % SAMPLES_PER_SIDE == k;
-                PointSample { density: if is_in { 5e3 } else { 0.0 }, ..PointSample::default() }
-            })
-            .collect()
+    fn wall(along: usize, k: usize) -> [f32; SAMPLES_PER_VOXEL] {
+        std::array::from_fn(|i| {
+            let is_in = i / SAMPLES_PER_SIDE.pow(along as u32) % SAMPLES_PER_SIDE == k;
+            if is_in { 5e3 } else { 0.0 }
+        })
     }
 
     /// A wall thinner than a voxel has its full opacity at any position in the voxel.
@@ -445,13 +463,14 @@ pub(crate) mod tests {
             let expected = 1.0 - (-5e3f32 / 512.0).exp();
             assert!((opacity - expected).abs() < 1e-5, "{opacity} {expected}");
         }
-        assert_eq!(opacity_of(&[PointSample::default(); SAMPLES_PER_VOXEL], 256), 0.0);
+        assert_eq!(opacity_of(&[0.0; SAMPLES_PER_VOXEL], 256), 0.0);
     }
 
     fn baked_with(threads: usize) -> Volume {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let balls = [Ball { radius: 0.3, density: 50.0 }, Ball { radius: 0.25, density: 900.0 }];
-        pool.install(|| bake(&balls, &bounds(), &cameras(), 48))
+        let balls =
+            || vec![Ball { radius: 0.3, density: 50.0 }, Ball { radius: 0.25, density: 900.0 }];
+        pool.install(|| bake(balls(), 48))
     }
 
     #[test]

@@ -26,19 +26,16 @@ mod visibility;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Failure, FailureExt as _, GivenInput, RunNode, RunRecord, sink_folders};
+use artifact::{Failure, GivenInput, RunNode, RunRecord, sink_folders};
 use base64::Engine as _;
-use fields::{FieldFile, FieldModel};
 use pixels::{
     DEGRADATION_FILE, Degradation, Filter, Image, Rgba8, encode_png, read_premultiplied,
     resize_pillow,
 };
-use radiance::Field;
 use scene::{Bounds, Camera, Intrinsics, Space, Views, undistort_image};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::json;
-use stage::{Context, Input, Output, Rule, Stage};
+use stage::{Context, Input, Output, Stage};
 
 use crate::atlas::Atlas;
 use crate::bake::{Baker, Shape, Volume};
@@ -66,9 +63,6 @@ impl Default for Params {
 /// Maximum width in pixels of the LR photographs in the page; wider ones are shrunk; chosen by hand.
 const MAX_PHOTOGRAPH_WIDTH: usize = 400;
 
-/// Message for a field that can't be baked, also before its training.
-const PAPER_FIELD: &str = "the paper's field can't be baked; train with `field: grid` to view it";
-
 /// Remedy for short memory, as a sentence fragment.
 const REMEDY: &str = "choose a smaller resolution, or end other programs";
 
@@ -90,10 +84,6 @@ impl Stage for Viewer {
 
     fn output() -> Output {
         Output::kind("page")
-    }
-
-    fn rules() -> Vec<Rule> {
-        vec![Rule::new(PAPER_FIELD).must("run.field", json!({"not": {"const": "mlp"}}))]
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
@@ -121,7 +111,8 @@ fn write_page(
     node: &RunNode,
     prefix: &str,
 ) -> anyhow::Result<()> {
-    let (file, fields) = read_fields(&node.folder)?;
+    let input = GivenInput::open("field", &node.folder)?;
+    let (file, fields) = fields::read_point_fields(&input)?;
     let folder = node.inputs.get("scene").map(|input| run.folder_of(input));
     let folder = folder.context("the field's training has no input `scene`")?;
     let views = Views::read_folder(&folder)?;
@@ -168,13 +159,13 @@ fn film_width(folder: &Path, cameras: &[&Camera]) -> anyhow::Result<u32> {
 }
 
 /// Bakes a field. Fails if memory is short.
-fn bake(context: &Context, baker: &Baker<'_, Field>) -> anyhow::Result<Volume> {
-    let bricks = baker.bricks();
+fn bake(context: &Context, baker: &Baker<'_>) -> anyhow::Result<Volume> {
+    let bricks = baker.bricks(&context.progress("finding density", baker.brick_positions()))?;
     context.check_memory("baking", Shape::memory_need(&bricks), REMEDY)?;
     let progress = context.progress("baking", baker.steps(&bricks));
-    let shape = baker.shape(bricks, &progress);
+    let shape = baker.shape(bricks, &progress)?;
     context.check_memory("baking", shape.volume_memory_need(), REMEDY)?;
-    Ok(baker.volume(&shape, &progress))
+    Ok(baker.volume(&shape, &progress)?)
 }
 
 /// Returns the bounds of the page's rays. A viewer may be nearer than the cameras were and, where
@@ -182,20 +173,6 @@ fn bake(context: &Context, baker: &Baker<'_, Field>) -> anyhow::Result<Volume> {
 fn page_bounds(bounds: &Bounds) -> Bounds {
     let far = if bounds.space == Space::Contraction { bounds.far } else { 1e30 };
     Bounds { near: 0.0, far, ..*bounds }
-}
-
-/// Reads all fields of an artifact.
-fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
-    let input = GivenInput::open("field", folder)?;
-    let file = fields::read_field_file(&input)?;
-    let FieldModel::Grid(architecture) = file.field else {
-        return Err(Failure::BadInput(PAPER_FIELD.to_owned()).into());
-    };
-    let fields = (0..file.members)
-        .map(|i| Field::read(&input.path(&FieldFile::member_file(i)), architecture, file.bounds))
-        .collect::<Result<_, _>>()
-        .bad_input("field")?;
-    Ok((file, fields))
 }
 
 /// Returns the training cameras, some of them with their photograph.

@@ -18,6 +18,13 @@ const POINTS_PER_PASS: usize = 1024;
 /// included: at every other voxel of a brick of the viewer. Chosen by hand.
 const PROBES_PER_SIDE: usize = 5;
 
+/// Depth in cube sides of the layer before the end of unbounded rays whose density extends to
+/// infinity; chosen by hand.
+const END_DEPTH: f64 = 1.0 / 128.0;
+
+/// Length of a ray's last sample, as in [`crate::composite`].
+const INFINITY: f32 = 1e10;
+
 /// Magnitude to which raw colours are limited: beyond, eight bits show no difference.
 const MAX_RAW_COLOUR: f64 = 6.0;
 
@@ -68,7 +75,7 @@ impl PointField for MlpPoints {
         self.with_field(|field| {
             let mut densities = Vec::with_capacity(points.len());
             for points in points.chunks(POINTS_PER_PASS) {
-                densities.extend(field.densities_of(&field.trunk_at(points)?)?);
+                densities.extend(field.densities_of(points, &field.trunk_at(points)?)?);
             }
             Ok(densities)
         })
@@ -79,7 +86,7 @@ impl PointField for MlpPoints {
             let mut samples = PointSamples::default();
             for points in points.chunks(POINTS_PER_PASS) {
                 let trunk = field.trunk_at(points)?;
-                samples.densities.extend(field.densities_of(&trunk)?);
+                samples.densities.extend(field.densities_of(points, &trunk)?);
                 samples.view_features.extend(to_host(&field.fine.feature(&trunk)?)?);
             }
             samples.raw_colours = vec![[0.0; 3]; points.len()];
@@ -118,12 +125,34 @@ impl Mlp {
 
     /// Returns densities per unit of a ray's t from the trunk's outputs. In a box this unit is the
     /// cube's side.
-    fn densities_of(&self, trunk: &Tensor) -> Result<Vec<f32>, TchError> {
+    fn densities_of(&self, points: &[[f32; 3]], trunk: &Tensor) -> Result<Vec<f32>, TchError> {
         let unit = match self.bounds.space {
             Space::Box => self.bounds.longest_side() / self.frame().unit,
             Space::Ndc(_) | Space::Contraction => 1.0,
         };
-        to_host(&self.fine.raw_density(trunk)?.f_relu()?.f_mul_scalar(unit)?)
+        let densities = self.fine.raw_density(trunk)?.f_relu()?.f_mul_scalar(unit)?;
+        let mut densities = to_host(&densities)?;
+        for (density, &point) in densities.iter_mut().zip(points) {
+            if self.is_at_end(point) {
+                *density *= INFINITY;
+            }
+        }
+        Ok(densities)
+    }
+
+    /// Returns whether rays end at a point of an unbounded space, so that its density extends to
+    /// infinity. In a box rays end outside of the cube.
+    fn is_at_end(&self, point: [f32; 3]) -> bool {
+        let point = DVec3::from(point.map(f64::from));
+        match self.bounds.space {
+            Space::Box => false,
+            Space::Ndc(_) => point.z > 1.0 - END_DEPTH,
+            Space::Contraction => {
+                let radius = 0.5 * self.bounds.longest_side();
+                let end = 0.25 * (2.0 - radius / self.bounds.far.max(radius));
+                point.distance(DVec3::splat(0.5)) > end - END_DEPTH
+            }
+        }
     }
 
     /// Returns raw colours for rows of features, each in some directions.
@@ -214,7 +243,11 @@ mod tests {
             let expected = to_host(&(raw.relu() * scale)).unwrap();
             assert_eq!(samples.densities, points_of.densities(&points).unwrap());
             assert!(expected.iter().any(|&density| density > 0.0), "{space:?}");
-            for (found, expected) in samples.densities.iter().zip(&expected) {
+            // The density at a ray's end extends to infinity.
+            let end = (samples.densities[39], expected[39]);
+            assert!(bounds.space == Space::Box || (end.0 > 1e6) == (end.1 > 1e-4), "{end:?}");
+            let inside = samples.densities.iter().zip(&expected).filter(|(found, _)| **found < 1e6);
+            for (found, expected) in inside {
                 assert!((found - expected).abs() < 1e-2 * expected.max(0.1), "{found} {expected}");
             }
             let directions = vec![vec![direction.map(|x| x as f32)]; 40];
