@@ -73,10 +73,13 @@ fn descriptions() -> BTreeMap<String, Description> {
                 "message": "alpha needs open"}]},
         {"name": "score", "output": {"kind": "metrics"},
          "inputs": {"field": {"kinds": ["field"], "summary": "field"},
-         "truth": {"kinds": ["scene"], "summary": "truth"}}},
+         "truth": {"kinds": ["scene"], "summary": "truth"}},
+         "parameters": {"properties": {"quick": {"type": "boolean", "default": false}}}},
         {"name": "report", "output": {"kind": "page"}, "sink": true,
             "inputs": {"run": {"kinds": ["run"], "summary": "a run"}},
-         "parameters": {"properties": {"views": {"type": "integer", "default": 4}}}}
+         "parameters": {"properties": {"views": {"type": "integer", "default": 4}}},
+         "rules": [{"when": {"run.quick": {"const": true}}, "must": {"views": {"maximum": 8}},
+            "message": "quick scores have few views"}]}
     ]);
     described.as_array().unwrap().iter().cloned().map(whole).collect()
 }
@@ -280,6 +283,7 @@ fn command_lines_that_cannot_be_meant() {
         ),
         (&["-p", "method=net"], "stage train: input weights is missing: method net needs it"),
         (&["-p", "background=alpha"], "stage train: alpha needs open"),
+        (&["-p", "quick=true", "-p", "views=9"], "stage report: quick scores have few views"),
         (&["-p", "method=plain,net"], "stage train [method=net]: input weights is missing"),
     ] {
         let problem = refused(PIPELINE, arguments);
@@ -292,6 +296,7 @@ fn command_lines_that_cannot_be_meant() {
         &["-p", "background=alpha", "-p", "open=true"],
         &["-p", "background=alpha", "-i", "scene=elsewhere"],
         &["prep", "-p", "background=alpha"],
+        &["-p", "quick=true"],
     ] {
         assert!(plan_of(PIPELINE, fine).is_ok(), "{fine:?}");
     }
