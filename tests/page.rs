@@ -242,6 +242,20 @@ fn one_result_and_a_hundred_have_readable_pages() {
     }
 }
 
+/// A result has the name of its method, not of the block that scored it.
+#[test]
+fn a_result_is_named_by_its_method() {
+    let project = Project::fast();
+    project.ok(&["run"]);
+    for (program, name) in [("render-depth", "rendered"), ("refine", "refined")] {
+        let mut record = record(&project, 1, "");
+        record["nodes"][3]["program"] = json!(program);
+        let folder = tempfile::tempdir().unwrap();
+        let text = std::fs::read_to_string(page_of(folder.path(), &record)).unwrap();
+        assert!(text.contains(&format!("<th scope=\"row\">{name}<wbr></th>")), "{name}");
+    }
+}
+
 fn camera(name: &str, side: usize) -> Value {
     json!({"name": name, "intrinsics": {"width": side, "height": side, "fx": side, "fy": side,
             "cx": side / 2, "cy": side / 2},

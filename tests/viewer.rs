@@ -174,13 +174,31 @@ fn the_page_shows_text_as_the_field_does() {
     }
 }
 
-/// Parameters of a field of the default size: smaller fields and fewer rays give haze.
-const GRID: &str = "rays: 300000, n_levels: 8, cells_per_pixel: 2.56, log2_hashmap_size: null, \
-    hidden_dim: 64, march_steps: null, max_rays_per_step: 8192, samples_per_step: 24576";
+/// Field of a comparison, with sizes that suit it.
+struct Compared {
+    /// Parameters of the training.
+    field: &'static str,
+    /// Voxels along the cube's side.
+    resolution: u32,
+    /// Width of the views, and rays along a pixel's side.
+    views: (u32, u32),
+}
 
-/// Parameters of the paper's field, in miniature.
-const MLP: &str = "field: mlp, rays: 400000, hidden_dim: 64, layers: 4, coarse_samples: 32, \
-    fine_samples: 32, max_rays_per_step: 512";
+/// A grid of the default size: smaller fields and fewer rays give haze.
+const GRID: Compared = Compared {
+    field: "rays: 300000, n_levels: 8, cells_per_pixel: 2.56, log2_hashmap_size: null, \
+        hidden_dim: 64, march_steps: null, max_rays_per_step: 8192, samples_per_step: 24576",
+    resolution: 128,
+    views: (512, 2),
+};
+
+/// The paper's field in miniature, which is rendered slowly.
+const MLP: Compared = Compared {
+    field: "field: mlp, rays: 80000, supersample: 1, hidden_dim: 48, layers: 4, \
+        coarse_samples: 24, fine_samples: 24, max_rays_per_step: 128, learning_rate: 0.002",
+    resolution: 96,
+    views: (128, 1),
+};
 
 /// Blocks of a demo scene and its field.
 fn clear_scene(demo_scene: &str, field: &str) -> String {
@@ -193,12 +211,15 @@ fn clear_scene(demo_scene: &str, field: &str) -> String {
 
 /// Trains a field of the demo scene in a space, and compares the page with rendered views of three
 /// test cameras and of three cameras between them.
-fn compare_space(demo_scene: &str, space: &str, field: &str) {
+fn compare_space(demo_scene: &str, space: &str, compared: &Compared) {
+    let (size, samples) = compared.views;
     let blocks = format!(
         "{}  camera-path:\n    inputs: {{cameras: prep/cameras}}\n    \
-        parameters: {{kind: between, frames: 6, size: 512}}\n  \
-        viewer:\n    parameters: {{resolution: 128}}\n",
-        clear_scene(demo_scene, field)
+        parameters: {{kind: between, frames: 6, size: {size}}}\n  \
+        path-views:\n    parameters: {{samples_per_axis: {samples}}}\n  \
+        viewer:\n    parameters: {{resolution: {}}}\n",
+        clear_scene(demo_scene, compared.field),
+        compared.resolution
     );
     let project = Project::shipped(&["viewer", "video"], &blocks);
     project.ok(&["run", "viewer", "path-views"]);
@@ -218,33 +239,33 @@ fn compare_space(demo_scene: &str, space: &str, field: &str) {
 
 #[test]
 fn the_page_shows_a_box() {
-    compare_space("", "box", GRID);
+    compare_space("", "box", &GRID);
 }
 
 #[test]
 fn the_page_shows_a_frustum() {
-    compare_space(", layout: forward, backdrop: true", "ndc", GRID);
+    compare_space(", layout: forward, backdrop: true", "ndc", &GRID);
 }
 
 #[test]
 fn the_page_shows_a_contracted_space() {
-    compare_space(", backdrop: true", "contraction", GRID);
+    compare_space(", backdrop: true", "contraction", &GRID);
 }
 
 /// The paper's field is shown as well.
 #[test]
 fn the_page_shows_the_papers_field_in_a_box() {
-    compare_space("", "box", MLP);
+    compare_space("", "box", &MLP);
 }
 
 #[test]
 fn the_page_shows_the_papers_field_in_a_frustum() {
-    compare_space(", layout: forward, backdrop: true", "ndc", MLP);
+    compare_space(", layout: forward, backdrop: true", "ndc", &MLP);
 }
 
 #[test]
 fn the_page_shows_the_papers_field_in_a_contracted_space() {
-    compare_space(", backdrop: true", "contraction", MLP);
+    compare_space(", backdrop: true", "contraction", &MLP);
 }
 
 fn distance_from_origin(state: &Value) -> f64 {
@@ -277,7 +298,7 @@ fn check_recorder(project: &Project, recorded: &Path, second: &Value) {
 /// Mouse, keys and touches change the view as expected.
 #[test]
 fn people_can_look_around() {
-    let project = Project::shipped(&["viewer", "video"], &clear_scene("", GRID));
+    let project = Project::shipped(&["viewer", "video"], &clear_scene("", GRID.field));
     project.ok(&["run", "viewer", "-p", "viewer.resolution=64", "-p", "photographs=20"]);
     let page = project.path("out/viewer/index.html");
     let recorded = project.path("recorded/camera_path.json");
