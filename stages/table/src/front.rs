@@ -9,6 +9,8 @@ const SIZE: (f64, f64) = (720.0, 420.0);
 const LEFT: f64 = 64.0;
 const BOTTOM: f64 = 46.0;
 const MARGIN: f64 = 16.0;
+/// Colour of points and of the line.
+const COLOUR: &str = "#36c";
 /// Part of an axis that stays free at both ends.
 const FREE: f64 = 0.06;
 /// Number of lines with a number across the picture.
@@ -53,68 +55,85 @@ impl Axes<'_> {
         if points.len() < 2 || !points.iter().all(|point| point.cost > 0.0) {
             return None;
         }
-        let (x, y) = (Scale::new(points, |p| p.cost.ln())?, Scale::new(points, |p| p.score)?);
-        let across = |cost: f64| LEFT + x.part(cost.ln()) * (SIZE.0 - LEFT - MARGIN);
-        let up = |score: f64| SIZE.1 - BOTTOM - y.part(score) * (SIZE.1 - BOTTOM - MARGIN);
+        let chart = Chart {
+            x: Scale::new(points, |point| point.cost.ln())?,
+            y: Scale::new(points, |point| point.score)?,
+        };
         let (width, height) = SIZE;
         let mut svg = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" \
             font-family=\"sans-serif\" font-size=\"12\">\n\
             <rect width=\"{width}\" height=\"{height}\" fill=\"#fff\"/>\n"
         );
+        svg += &self.numbers(&chart, figures);
+        let is_on_front = self.front(points);
+        svg += &chart.line(points, &is_on_front);
+        for (point, is_on_front) in points.iter().zip(is_on_front) {
+            svg += &chart.point(point, is_on_front);
+        }
+        let title = format!("{} against {}", figures.title(self.score), figures.title(self.cost));
+        let middle = [width / 2.0, height - 8.0];
+        Some(svg + &text(middle, "middle", &escape(&title)) + "</svg>\n")
+    }
+
+    /// Draws lines across the chart, and the numbers of both axes.
+    fn numbers(&self, chart: &Chart, figures: &Figures) -> String {
+        let mut svg = String::new();
         for line in 0..LINES {
             let part = f64::from(line) / f64::from(LINES - 1);
-            let (cost, score) = (x.value(part).exp(), y.value(part));
-            let (at, from) = (up(score), SIZE.1 - BOTTOM);
-            let text = figures.format(self.score, score);
-            _ = writeln!(svg, "<path d=\"M{LEFT} {at:.1}H{}\" stroke=\"#ddd\"/>", width - MARGIN);
-            _ = writeln!(
-                svg,
-                "<text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{text}</text>",
-                LEFT - 8.0,
-                at + 4.0
-            );
-            let text = figures.format(self.cost, cost);
-            _ = writeln!(
-                svg,
-                "<text x=\"{:.1}\" y=\"{}\" text-anchor=\"middle\">{text}</text>",
-                across(cost).clamp(LEFT, width - 3.0 * MARGIN),
-                from + 18.0
-            );
+            let (cost, score) = (chart.x.value(part).exp(), chart.y.value(part));
+            let [x, y] = chart.at(cost, score);
+            let end = SIZE.0 - MARGIN;
+            _ = writeln!(svg, "<path d=\"M{LEFT} {y:.1}H{end}\" stroke=\"#ddd\"/>");
+            svg += &text([LEFT - 8.0, y + 4.0], "end", &figures.format(self.score, score));
+            let below = [x, SIZE.1 - BOTTOM + 18.0];
+            svg += &text(below, "middle", &figures.format(self.cost, cost));
         }
-        let is_on_front = self.front(points);
-        let mut joined: Vec<&Point> =
-            points.iter().zip(&is_on_front).filter_map(|(p, on)| on.then_some(p)).collect();
-        joined.sort_by(|a, b| a.cost.total_cmp(&b.cost));
-        let steps: Vec<String> =
-            joined.iter().map(|p| format!("{:.1} {:.1}", across(p.cost), up(p.score))).collect();
-        _ = writeln!(svg, "<path d=\"M{}\" fill=\"none\" stroke=\"#36c\"/>", steps.join("L"));
-        for (point, is_on_front) in points.iter().zip(is_on_front) {
-            let (at, fill) = (across(point.cost), if is_on_front { "#36c" } else { "#fff" });
-            let height = up(point.score);
-            // Names of points at the right end are at their left.
-            let (from, anchor) =
-                if at > 0.7 * width { (at - 8.0, "end") } else { (at + 8.0, "start") };
-            let name = escape(&point.name);
-            _ = writeln!(
-                svg,
-                "<circle cx=\"{at:.1}\" cy=\"{height:.1}\" r=\"4\" fill=\"{fill}\" \
-                stroke=\"#36c\"><title>{name}</title></circle>\
-                <text x=\"{from:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\">{name}</text>",
-                height + 14.0
-            );
-        }
-        let (cost, score) = (figures.title(self.cost), figures.title(self.score));
-        _ = writeln!(
-            svg,
-            "<text x=\"{}\" y=\"{}\" text-anchor=\"middle\">{} against {}</text>\n</svg>",
-            width / 2.0,
-            height - 8.0,
-            escape(&score),
-            escape(&cost)
-        );
-        Some(svg)
+        svg
     }
+}
+
+/// Axes of the picture; costs are logarithmic.
+struct Chart {
+    x: Scale,
+    y: Scale,
+}
+
+impl Chart {
+    /// Returns the position of a cost and a score, in the picture's units.
+    fn at(&self, cost: f64, score: f64) -> [f64; 2] {
+        let x = LEFT + self.x.part(cost.ln()) * (SIZE.0 - LEFT - MARGIN);
+        let y = SIZE.1 - BOTTOM - self.y.part(score) * (SIZE.1 - BOTTOM - MARGIN);
+        [x, y]
+    }
+
+    /// Draws the line that joins the front.
+    fn line(&self, points: &[Point], is_on_front: &[bool]) -> String {
+        let pairs = points.iter().zip(is_on_front);
+        let mut front: Vec<&Point> = pairs.filter_map(|(point, on)| on.then_some(point)).collect();
+        front.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        let corners = front.iter().map(|point| {
+            let [x, y] = self.at(point.cost, point.score);
+            format!("{x:.1} {y:.1}")
+        });
+        let path = corners.collect::<Vec<_>>().join("L");
+        format!("<path d=\"M{path}\" fill=\"none\" stroke=\"{COLOUR}\"/>\n")
+    }
+
+    /// Draws a point with its name: at its left near the right end, otherwise at its right.
+    fn point(&self, point: &Point, is_on_front: bool) -> String {
+        let [x, y] = self.at(point.cost, point.score);
+        let fill = if is_on_front { COLOUR } else { "#fff" };
+        let (from, anchor) = if x > 0.7 * SIZE.0 { (x - 8.0, "end") } else { (x + 8.0, "start") };
+        format!(
+            "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"{fill}\" stroke=\"{COLOUR}\"/>\n"
+        ) + &text([from, y + 14.0], anchor, &escape(&point.name))
+    }
+}
+
+/// Returns a text element.
+fn text([x, y]: [f64; 2], anchor: &str, escaped: &str) -> String {
+    format!("<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{escaped}</text>\n")
 }
 
 /// An axis from the least to the greatest value.
