@@ -350,6 +350,7 @@ fn a_quality_is_known_by_its_parameters() {
     let others = [
         "rays_per_pixel=3.5",
         "pixel_importance=15",
+        "cells_per_pixel=1.6",
         "supersample_warmup=0.6",
         "min_rays=1000000",
         "max_rays=8000000",

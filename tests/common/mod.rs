@@ -93,7 +93,7 @@ stages:
     parameters: {lr_width: 24, scale: 2}
   train-ss:
     inputs: {scene: prep/train}
-    parameters: {rays: 60000, n_levels: 4, cells_per_pixel: 1.28, log2_hashmap_size: 12, hidden_dim: 16, march_steps: 128, max_rays_per_step: 2048, samples_per_step: 16384}
+    parameters: {rays: 60000, n_levels: 4, log2_hashmap_size: 12, hidden_dim: 16, march_steps: 128, max_rays_per_step: 2048, samples_per_step: 16384}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
   eval:
