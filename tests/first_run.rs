@@ -4,6 +4,8 @@
 mod common;
 #[path = "common/forms.rs"]
 mod forms;
+#[path = "common/installed.rs"]
+mod installed;
 
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
@@ -280,20 +282,9 @@ fn run_bare(prefix: &Path, project: &Project, program: &str, arguments: &[&str])
 fn installed_programs_run_from_any_folder() {
     let project = Project::fast();
     let prefix = project.path("usr");
-    let given = std::env::var_os("LIBTORCH").map(PathBuf::from);
-    let libtorch = given.unwrap_or_else(|| root().join(".libtorch"));
-    if !libtorch.join("lib").is_dir() {
-        eprintln!("skipped: {} is no libtorch of `make setup`", libtorch.display());
+    if !installed::install(&prefix) {
         return;
     }
-    let install = Command::new(root().join("scripts/install.sh"))
-        .arg(&prefix)
-        .arg(libtorch)
-        .env("BUILT", bin("nerf-sr").parent().unwrap())
-        .output()
-        .unwrap();
-    let install = Finished::of(install);
-    assert_eq!(install.code, 0, "{}", install.stderr);
     let ran = run_bare(&prefix, &project, "bin/nerf-sr", &["run"]);
     assert_eq!(ran.code, 0, "{}", ran.stderr);
     assert!(project.ok(&["run"]).contains("all 5 stages are cached"), "one key, wherever it lies");

@@ -1,0 +1,23 @@
+//! Programs as `make install` installs them.
+
+#![allow(unreachable_pub, reason = "shared by several test binaries")]
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use super::common::{Finished, bin, root};
+
+/// Installs the built programs into a folder. Returns false without libtorch.
+pub fn install(prefix: &Path) -> bool {
+    let given = std::env::var_os("LIBTORCH").map(PathBuf::from);
+    let libtorch = given.unwrap_or_else(|| root().join(".libtorch"));
+    if !libtorch.join("lib").is_dir() {
+        eprintln!("skipped: {} is no libtorch of `make setup`", libtorch.display());
+        return false;
+    }
+    let mut install = Command::new(root().join("scripts/install.sh"));
+    install.arg(prefix).arg(libtorch).env("BUILT", bin("nerf-sr").parent().unwrap());
+    let installed = Finished::of(install.output().unwrap());
+    assert_eq!(installed.code, 0, "{}", installed.stderr);
+    true
+}

@@ -1,0 +1,136 @@
+//! Runs the commands of README and of the guides, as they stand there, with installed programs.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+#[path = "common/forms.rs"]
+mod forms;
+#[path = "common/installed.rs"]
+mod installed;
+
+use std::path::Path;
+use std::process::Command;
+
+use common::{FAST, Finished, Project, data, root, stage};
+
+/// Documents whose commands run elsewhere: `tests/slurm.rs`, and the tests of `nerf-sr-remote`.
+const ELSEWHERE: [&str; 2] = ["slurm.md", "sharing.md"];
+/// Parts of commands that don't run here, with the reason.
+const LEFT_OUT: [(&str, &str); 5] = [
+    ("--device cuda", "needs a GPU"),
+    ("--watch", "runs until it is interrupted: tests/watch.rs"),
+    ("paper-table", "trains the paper's field on lego: tests/upsample.rs"),
+    ("paper-page", "trains the paper's field on lego: tests/upsample.rs"),
+    ("paper-refine", "takes minutes for each step: tests/refine.rs"),
+];
+/// Parts of commands and what takes their place, so that each command takes a second. Commands end
+/// in a space.
+const SMALL: [(&str, &str); 16] = [
+    ("rays=30M", "rays=5000"),
+    ("rays=2000000", "rays=500 -p layers=2 -p hidden_dim=16"),
+    ("run seeds ", "run seeds -p train-ss.rays=4000 "),
+    ("run viewer ", "run viewer -p viewer.resolution=32 "),
+    (" -p viewer.resolution=384", ""),
+    ("run video ", "run video -p frames=2 "),
+    (" -p frames=300", ""),
+    ("run refined-video ", "run refined-video -p frames=2 -p train-refine.steps=2 "),
+    ("run refined ", "run refined -p train-refine.steps=2 "),
+    ("run prior-refine ", "run prior-refine -p train-refine.steps=2 "),
+    ("run sisr-fuse ", "run sisr-fuse -p train-refine.steps=2 "),
+    ("camera-path.size=400", "camera-path.size=24"),
+    ("lr_width=100", "lr_width=12"),
+    ("compare=r_5", "compare=r_1"),
+    ("--memory 8G", "--memory 3G"),
+    ("references_per_view=2", "references_per_view=2 -p train-reference.steps=2"),
+];
+
+/// Commands of a document that begin with `nerf-sr`.
+fn commands(document: &Path) -> Vec<String> {
+    let text = std::fs::read_to_string(document).unwrap();
+    let blocks = text.split("```sh\n").skip(1).map(|rest| rest.split("```").next().unwrap());
+    let lines = blocks.flat_map(|block| {
+        let joined = block.replace("\\\n", " ");
+        joined
+            .lines()
+            .map(|line| line.split('#').next().unwrap().trim().to_owned())
+            .collect::<Vec<_>>()
+    });
+    lines.filter(|line| line.starts_with("nerf-sr ")).collect()
+}
+
+/// Runs a shell command with the installed programs.
+fn run(project: &Project, line: &str) -> Finished {
+    let path = std::env::var("PATH").unwrap_or_default();
+    let mut shell = project.command_of(Path::new("sh"), &["-c", line]);
+    shell.env("PATH", format!("{}:{path}", project.path("usr/bin").display()));
+    shell.env_remove("LD_LIBRARY_PATH").current_dir(project.path("work"));
+    Finished::of(shell.output().unwrap())
+}
+
+/// Makes an empty folder with photographs, writes its pipeline by `nerf-sr init`, and replaces the
+/// pipeline by one of seconds.
+fn prepare(project: &Project) -> bool {
+    if !installed::install(&project.path("usr")) {
+        return false;
+    }
+    let photographs = forms::as_transforms(project);
+    std::fs::create_dir(project.path("work")).unwrap();
+    std::fs::rename(photographs, project.path("work/my-photographs")).unwrap();
+    let params = r#"{"size": 48, "train": 8, "test": 2, "samples_per_axis": 1}"#;
+    let scene = project.path("work/my-scene");
+    assert_eq!(stage("demo-scene", params, &[], &scene, &[]).code, 0);
+    let written = run(project, "nerf-sr init my-photographs");
+    assert_eq!(written.code, 0, "{}", written.stderr);
+    // Photographs are LR images, as in the pipeline that `init` has written.
+    let pipeline = FAST.replace("size: 32", "size: 64").replace("lr_width: 16, ", "");
+    // Blocks that extend `train-ss` have no `rays`.
+    let pipeline = pipeline.replace("rays: 4000,", "rays: 4000, min_rays: 4000, max_rays: 4000,");
+    let pipeline = pipeline.replace("\ndefault:", "\nquality: draft\ndefault:");
+    project.write("work/pipeline.yaml", &pipeline);
+    if let Some(data) = data() {
+        std::os::unix::fs::symlink(data.join("weights"), project.path("work/weights")).unwrap();
+    }
+    let film = run(
+        project,
+        "nerf-sr run video -p frames=2 && mkdir my-path && \
+        cp \"$(nerf-sr path camera-path -p frames=2)\"/camera_path.json my-path",
+    );
+    assert_eq!(film.code, 0, "{}", film.stderr);
+    true
+}
+
+#[test]
+fn every_command_runs() {
+    let project = Project::fast();
+    if !prepare(&project) {
+        return;
+    }
+    let mut documents = vec![root().join("README.md")];
+    let guides = std::fs::read_dir(root().join("docs/guide")).unwrap();
+    documents.extend(guides.map(|entry| entry.unwrap().path()));
+    documents[1..].sort();
+    documents.retain(|path| path.extension().is_some_and(|extension| extension == "md"));
+    let mut count = 0;
+    for document in documents {
+        let name = document.file_name().unwrap().to_str().unwrap();
+        if ELSEWHERE.contains(&name) {
+            continue;
+        }
+        for command in commands(&document) {
+            let needs_weights =
+                command.contains("=weights") && !project.path("work/weights").exists();
+            let is_left_out = LEFT_OUT.iter().any(|(part, _)| command.contains(part));
+            // `init` overwrites no pipeline.
+            if needs_weights || is_left_out || command.starts_with("nerf-sr init ") {
+                continue;
+            }
+            let command = command + " ";
+            let small = SMALL.iter().fold(command, |text, (from, to)| text.replace(from, to));
+            let start = std::time::Instant::now();
+            let finished = run(&project, &small);
+            assert_eq!(finished.code, 0, "{name}: {small}\n{}", finished.stderr);
+            println!("{:5.1} s: {small}", start.elapsed().as_secs_f64());
+            count += 1;
+        }
+    }
+    assert!(count > 50, "{count}");
+}
