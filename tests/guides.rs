@@ -8,7 +8,6 @@ mod forms;
 mod installed;
 
 use std::path::Path;
-use std::process::Command;
 
 use common::{FAST, Finished, Project, data, root, stage};
 
