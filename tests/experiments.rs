@@ -101,6 +101,17 @@ fn variants_stand_beside_the_first() {
         "train-ss.rays=20000",
     ]);
     assert_eq!(column(&rows(&project, "tradeoff"), "variant"), ["draft", "fast", "balanced"]);
+    // Without a number on the command line, rays follow from each quality.
+    let plan = ["tradeoff", "--scene", "other", "--protocol", "100x2", "--first-variants", "4"];
+    let plan = project.nodes(&[&plan[..], &["--data", "data"]].concat());
+    let trainings = plan.iter().filter(|node| node["stage"] == "train-ss");
+    let rays: Vec<f64> = trainings
+        .map(|node| {
+            assert!(node["parameters"]["rays"].is_null(), "{node}");
+            node["parameters"]["rays_per_pixel"].as_f64().unwrap()
+        })
+        .collect();
+    assert!(rays.len() == 4 && rays.is_sorted_by(|a, b| 2.0 * a < *b), "{rays:?}");
     let text = table(&project, "tradeoff");
     assert!(text.contains(" | front | ") && text.contains(" | ● | "), "{text}");
     assert!(text.contains("](front.svg)"), "{text}");
