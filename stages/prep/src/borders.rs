@@ -2,18 +2,13 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use artifact::{FailureExt as _, WARNING, format_count};
-use dataset::Frame;
+use artifact::{WARNING, format_count};
 use pixels::Rgba8;
-use rayon::prelude::*;
 use scene::Background;
 
-use crate::detail::Spectrum;
-use crate::error::frame_label;
+use crate::inspection::ViewBorder;
 use crate::strips::Strips;
 
-/// Maximum number of views to sample, spread evenly: enough to tell nine in ten (docs/design/035).
-pub(crate) const MAX_VIEWS: usize = 20;
 /// Maximum deviation of a flat colour in 8-bit levels: JPEG noise on a uniform area. A clear sky
 /// varies more from corner to corner (docs/design/035).
 const MAX_NOISE_LEVELS: u8 = 8;
@@ -58,7 +53,7 @@ impl Border {
 }
 
 /// Combined borders of the sampled views.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Borders {
     pub(crate) backdrop: Backdrop,
     /// Number of views whose borders are the flat colour.
@@ -66,8 +61,6 @@ pub(crate) struct Borders {
     /// Number of sampled views.
     views: usize,
     strips: Option<CommonStrips>,
-    /// Spectrum of the sampled views.
-    spectrum: Spectrum,
 }
 
 /// Strips that views have in common.
@@ -81,35 +74,12 @@ struct CommonStrips {
 }
 
 impl Borders {
-    /// Samples the borders of training views, spread evenly; only the first view's if that has
-    /// alpha. At most one image per thread is in memory.
-    pub(crate) fn inspect(frames: &[&Frame]) -> anyhow::Result<Self> {
-        let count = frames.len().min(MAX_VIEWS);
-        if let Some(first) = frames.first() {
-            let view = inspect_view(first)?;
-            if view.border == Border::Transparent {
-                return Ok(Self::new(&[view.border]).with_spectrum(&[view]));
-            }
-        }
-        let sampled =
-            (0..count).into_par_iter().map(|i| inspect_view(frames[i * frames.len() / count]));
-        let views = sampled.collect::<anyhow::Result<Vec<ViewBorder>>>()?;
-        let borders: Vec<Border> = views.iter().map(|view| view.border).collect();
-        Ok(Self::new(&borders).with_strips(&views).with_spectrum(&views))
-    }
-
     /// Combines the borders of sampled views. One image with alpha makes the backdrop transparent;
     /// nine in ten views must share a flat colour.
     pub(crate) fn new(borders: &[Border]) -> Self {
         let views = borders.len();
         if borders.contains(&Border::Transparent) {
-            return Self {
-                backdrop: Backdrop::Transparent,
-                flat: 0,
-                views,
-                strips: None,
-                spectrum: Spectrum::default(),
-            };
+            return Self { backdrop: Backdrop::Transparent, flat: 0, views, strips: None };
         }
         let mut colours: Vec<[u8; 3]> = Vec::new();
         for border in borders {
@@ -121,11 +91,11 @@ impl Borders {
         let flat = colours.iter().filter(|colour| is_similar(**colour, median)).count();
         let is_flat = views > 0 && 10 * flat >= 9 * views;
         let backdrop = if is_flat { Backdrop::Flat(median) } else { Backdrop::Scene };
-        Self { backdrop, flat, views, strips: None, spectrum: Spectrum::default() }
+        Self { backdrop, flat, views, strips: None }
     }
 
     /// Adds the strips that the views have in common. A frame of strips is not a background.
-    fn with_strips(mut self, views: &[ViewBorder]) -> Self {
+    pub(crate) fn with_strips(mut self, views: &[ViewBorder]) -> Self {
         let strips: Vec<Option<Strips>> = views.iter().map(|view| view.strips).collect();
         let common = Strips::common(&strips).filter(|_| self.backdrop != Backdrop::Transparent);
         if let Some((strips, count)) = common {
@@ -136,16 +106,6 @@ impl Borders {
             }
         }
         self
-    }
-
-    fn with_spectrum(mut self, views: &[ViewBorder]) -> Self {
-        self.spectrum = Spectrum::sum(views.iter().map(|view| &view.spectrum));
-        self
-    }
-
-    /// Returns the part of the photographs' resolution that their detail reaches, if they have any.
-    pub(crate) fn reach(&self) -> Option<f64> {
-        self.spectrum.reach()
     }
 
     /// Returns the evidence for the background, one note per line, and the remedy for strips.
@@ -217,31 +177,6 @@ fn median_colour(colours: &[[u8; 3]]) -> [u8; 3] {
         values.sort_unstable();
         values.get(values.len() / 2).copied().unwrap_or(0)
     })
-}
-
-/// Border of one view's image.
-struct ViewBorder {
-    border: Border,
-    strips: Option<Strips>,
-    /// True if the view's mask excludes the strips.
-    are_masked: bool,
-    spectrum: Spectrum,
-}
-
-fn inspect_view(frame: &Frame) -> anyhow::Result<ViewBorder> {
-    let image = frame.photograph().bad_input(frame_label(frame))?;
-    let mut border = Border::of(&image);
-    // Fisheye photographs are black outside their image circle, whatever the background.
-    if matches!(border, Border::Flat(_)) && frame.intrinsics().has_cut_rays() {
-        border = Border::Mixed;
-    }
-    let strips = if border == Border::Transparent { None } else { Strips::of(&image) };
-    let mut are_masked = false;
-    if let Some(strips) = &strips {
-        let mask = frame.mask().bad_input(frame_label(frame))?;
-        are_masked = mask.is_some_and(|mask| strips.are_masked(&mask));
-    }
-    Ok(ViewBorder { border, strips, are_masked, spectrum: Spectrum::of(&image) })
 }
 
 #[cfg(test)]

@@ -50,7 +50,7 @@ impl Spectrum {
     }
 
     /// Adds the spectra of several images.
-    pub(crate) fn sum<'a>(spectra: impl Iterator<Item = &'a Self>) -> Self {
+    pub(crate) fn sum(spectra: &[Self]) -> Self {
         let mut sum = Self::default();
         for spectrum in spectra {
             for (sum, power) in sum.power.iter_mut().zip(spectrum.power) {
@@ -201,7 +201,7 @@ mod tests {
     fn spectra_are_summed() {
         let sharp = resized(&discs(512), 256);
         let spectrum = Spectrum::of(&sharp);
-        let twice = Spectrum::sum([&spectrum, &spectrum].into_iter());
+        let twice = Spectrum::sum(&[spectrum.clone(), spectrum.clone()]);
         assert_eq!(twice.reach(), spectrum.reach());
         assert_eq!(twice.power[5], 2.0 * spectrum.power[5]);
     }

@@ -9,6 +9,7 @@
 //! * `bounds`: the scene's extent and space, from cameras and depths.
 //! * `memory`: number of images that are prepared at a time.
 //! * `detail`: how far the spectrum of the photographs reaches.
+//! * `inspection`: sampled views, for `detail` and `borders`.
 //! * `borders`, `strips`: the scene's background, from the borders of its images.
 //! * `pose_warnings`: checks of implausible poses.
 //!
@@ -25,6 +26,7 @@ mod degrade;
 mod detail;
 mod error;
 mod image_plan;
+mod inspection;
 mod memory;
 mod params;
 mod pose_warnings;
@@ -44,10 +46,10 @@ use dataset::{Dataset, Frame};
 use serde_json::json;
 use stage::{Context, Input, Output, Rule, Stage};
 
-use borders::Borders;
 pub use bounds::SpaceKind;
 use error::frame_label;
 use image_plan::ImagePlan;
+use inspection::Inspection;
 pub use params::{LensHandling, LrSource, Params, SplitKind};
 use scene_plan::{ScenePlan, check_poses, space_note};
 use split::split_views;
@@ -107,10 +109,10 @@ impl Stage for Prep {
         let used = split.train.iter().chain(&split.test).map(|&i| &set.frames[i]);
         let threads = memory::thread_pool(context, used, &images)?;
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
-        let borders = threads.install(|| Borders::inspect(&training))?;
+        let Inspection { borders, spectrum } = threads.install(|| Inspection::of(&training))?;
         let background = params.background.unwrap_or(borders.background());
         let border_notes = if params.background.is_some() { Vec::new() } else { borders.notes() };
-        let detail = borders.reach().map(|reach| detail::lr_reach(reach, images.lr_factor()));
+        let detail = spectrum.reach().map(|reach| detail::lr_reach(reach, images.lr_factor()));
         let detail_note = detail.and_then(|reach| detail::note(reach, images.sizes.lr.0));
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
         let writer = SceneWriter::new(context, &plan);

@@ -1,0 +1,64 @@
+//! Samples training views: their borders and strips, and the spectrum of their images.
+
+use artifact::FailureExt as _;
+use dataset::Frame;
+use rayon::prelude::*;
+
+use crate::borders::{Border, Borders};
+use crate::detail::Spectrum;
+use crate::error::frame_label;
+use crate::strips::Strips;
+
+/// Maximum number of views to sample, spread evenly: enough to tell nine in ten (docs/design/035).
+const MAX_VIEWS: usize = 20;
+
+/// Findings in the sampled views.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Inspection {
+    pub(crate) borders: Borders,
+    /// Sum over the views' images.
+    pub(crate) spectrum: Spectrum,
+}
+
+/// Border of one view's image.
+pub(crate) struct ViewBorder {
+    pub(crate) border: Border,
+    pub(crate) strips: Option<Strips>,
+    /// True if the view's mask excludes the strips.
+    pub(crate) are_masked: bool,
+}
+
+impl Inspection {
+    /// Samples training views, spread evenly; only the first view if that has alpha. At most one
+    /// image per thread is in memory.
+    pub(crate) fn of(frames: &[&Frame]) -> anyhow::Result<Self> {
+        let count = frames.len().min(MAX_VIEWS);
+        let mut views: Vec<(ViewBorder, Spectrum)> =
+            frames.first().map(|first| inspect_view(first)).transpose()?.into_iter().collect();
+        if views.iter().any(|(view, _)| view.border != Border::Transparent) {
+            let others =
+                (1..count).into_par_iter().map(|i| inspect_view(frames[i * frames.len() / count]));
+            views.extend(others.collect::<anyhow::Result<Vec<_>>>()?);
+        }
+        let (views, spectra): (Vec<ViewBorder>, Vec<Spectrum>) = views.into_iter().unzip();
+        let borders: Vec<Border> = views.iter().map(|view| view.border).collect();
+        let borders = Borders::new(&borders).with_strips(&views);
+        Ok(Self { borders, spectrum: Spectrum::sum(&spectra) })
+    }
+}
+
+fn inspect_view(frame: &Frame) -> anyhow::Result<(ViewBorder, Spectrum)> {
+    let image = frame.photograph().bad_input(frame_label(frame))?;
+    let mut border = Border::of(&image);
+    // Fisheye photographs are black outside their image circle, whatever the background.
+    if matches!(border, Border::Flat(_)) && frame.intrinsics().has_cut_rays() {
+        border = Border::Mixed;
+    }
+    let strips = if border == Border::Transparent { None } else { Strips::of(&image) };
+    let mut are_masked = false;
+    if let Some(strips) = &strips {
+        let mask = frame.mask().bad_input(frame_label(frame))?;
+        are_masked = mask.is_some_and(|mask| strips.are_masked(&mask));
+    }
+    Ok((ViewBorder { border, strips, are_masked }, Spectrum::of(&image)))
+}
