@@ -218,6 +218,15 @@ mod tests {
         let mut draft = training(1_000_000);
         draft["march_steps"] = json!(256);
         draft["hidden_dim"] = json!(32);
+        // Rows of docs/results/time.md, with the parameters of these qualities.
+        let quick = |rays: u64, step_samples: u64, cells: f64| {
+            let mut quick = training(rays);
+            quick["samples_per_step"] = json!(step_samples);
+            quick["cells_per_pixel"] = json!(cells);
+            quick["hidden_dim"] = json!(32);
+            quick
+        };
+        let withheld = work(object, 88, 100);
         let short = |rays: u64| {
             let mut short = draft.clone();
             short["rays"] = json!(rays);
@@ -227,7 +236,11 @@ mod tests {
         for (name, program, parameters, work, seconds) in [
             ("lego 100×2", "train-ss", training(32_000_000), &lego, 408.0),
             ("lego 100×2, short", "train-ss", training(2_000_000), &lego, 46.8),
-            ("lego 100×2, draft", "train-ss", draft.clone(), &lego, 16.3),
+            ("draft", "train-ss", quick(1_056_000, 6_144, 1.28), &withheld, 11.4),
+            ("fast", "train-ss", quick(3_080_000, 12_288, 1.6), &withheld, 30.2),
+            ("balanced", "train-ss", training(9_680_000), &withheld, 138.0),
+            ("best", "train-ss", training(28_160_000), &withheld, 390.0),
+            ("half the steps and width", "train-ss", draft.clone(), &lego, 16.3),
             ("demo, 200,000 rays", "train-ss", short(200_000), &demo, 6.4),
             ("demo, 50,000 rays", "train-ss", short(50_000), &demo, 2.8),
             ("lego 200×2", "train-ss", training(80_000_000), &lego, 1056.0),
