@@ -25,6 +25,7 @@ async function look(browser, size) {
     await link(browser, page, size, expect);
     await arrange(page, expect);
     await pick(page, expect);
+    await front(page, expect);
   }
   await followGraph(page, expect);
   const isWide = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
@@ -254,6 +255,17 @@ async function pick(page, expect) {
     text.startsWith(`${name}`) && (await page.locator("#view").inputValue()) !== before,
     `the plot picks ${name} for ${text}`,
   );
+}
+
+/** Checks that the front has the results that no other beats, and is drawn where the title says so. */
+async function front(page, expect) {
+  const points = [[3, 2], [1, 2], [2, 1], [3, 4]].map(([x, y]) => ({ x, y }));
+  for (const [isLower, expected] of [[false, "12 34"], [true, "12 21"]]) {
+    const found = await page.evaluate(([p, lower]) => frontOf(p, lower).map(({ x, y }) => `${x}${y}`), [points, isLower]);
+    expect(found.join(" ") === expected, `the front is ${found}`);
+  }
+  const said = await page.locator(".chart figcaption", { hasText: "dashed" }).count();
+  expect(said === (await page.locator("path.front").count()), "a front is missing, or isn't explained");
 }
 
 /** Checks that a box of the graph opens the details of its stage. */
