@@ -622,7 +622,7 @@ fn other_fields_are_not_gone_on_from() {
         &field,
         &["input init: the field's architecture differs from the parameters"],
     );
-    let own = r#"{"rays": 8000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128}"#;
+    let own = r#"{"rays": 8000, "n_levels": 4, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128}"#;
     cannot_go_on(
         &project,
         &scene,
