@@ -6,7 +6,7 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use common::Project;
+use common::{Project, data};
 use common::browser::run_in_browser;
 use glam::DVec3;
 use pixels::Rgba8;
@@ -211,26 +211,30 @@ fn clear_scene(demo_scene: &str, field: &str) -> String {
     )
 }
 
-/// Trains a field of the demo scene in a space, and compares the page with rendered views of three
-/// test cameras and of three cameras between them.
+/// Trains a field of the demo scene in a space, and compares the page with rendered views.
 fn compare_space(demo_scene: &str, space: &str, compared: &Compared) {
+    compare_page(&clear_scene(demo_scene, &compared.field), &[], space, compared);
+}
+
+/// Trains the field of the stages in `blocks`, and compares the page with rendered views of three
+/// test cameras and of three cameras between them. `inputs` are command-line arguments.
+fn compare_page(blocks: &str, inputs: &[&str], space: &str, compared: &Compared) {
     let (size, samples) = compared.views;
     let blocks = format!(
-        "{}  camera-path:\n    inputs: {{cameras: prep/cameras}}\n    \
+        "{blocks}  camera-path:\n    inputs: {{cameras: prep/cameras}}\n    \
         parameters: {{kind: between, frames: 6, size: {size}}}\n  \
         path-views:\n    parameters: {{samples_per_axis: {samples}}}\n  \
         viewer:\n    parameters: {{resolution: {}}}\n",
-        clear_scene(demo_scene, &compared.field),
         compared.resolution
     );
     let project = Project::shipped(&["viewer", "video"], &blocks);
-    project.ok(&["run", "viewer", "path-views"]);
-    let field = project.json("train-ss", "field.json", &["train-ss"]);
+    project.ok(&[&["run", "viewer", "path-views"], inputs].concat());
+    let field = project.json("train-ss", "field.json", &[&["train-ss"], inputs].concat());
     let found = &field["bounds"]["space"];
     assert!(found == space || found.get(space).is_some(), "{found}");
     let page = project.path("out/viewer/index.html");
     assert!(page.metadata().unwrap().len() < 25_000_000);
-    let views = project.artifact("path-views", &["path-views"]);
+    let views = project.artifact("path-views", &[&["path-views"], inputs].concat());
     let Some(views) = checked(&page, &views, 26.0, 64.0) else { return };
     assert_eq!(views.len(), 6);
     for view in &views {
@@ -252,6 +256,19 @@ fn the_page_shows_a_frustum() {
 #[test]
 fn the_page_shows_a_contracted_space() {
     compare_space(", backdrop: true", "contraction", &grid());
+}
+
+/// Forward-facing photographs.
+#[test]
+fn the_page_shows_fern() {
+    let Some(data) = data() else { return };
+    let dataset = format!("dataset={}", data.join("nerf_llff_data/fern").display());
+    let compared = Compared { resolution: 160, ..grid() };
+    let blocks = format!(
+        "  prep:\n    parameters: {{lr_width: 126}}\n  train-ss:\n    parameters: {{{}}}\n",
+        compared.field
+    );
+    compare_page(&blocks, &["-i", &dataset], "ndc", &compared);
 }
 
 #[test]
