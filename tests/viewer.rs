@@ -6,8 +6,8 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use common::{Project, data};
 use common::browser::run_in_browser;
+use common::{Project, data};
 use glam::DVec3;
 use pixels::Rgba8;
 use serde_json::{Value, json};

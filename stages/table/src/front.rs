@@ -13,6 +13,11 @@ const MARGIN: f64 = 16.0;
 const COLOUR: &str = "#36c";
 /// Part of an axis that stays free at both ends.
 const FREE: f64 = 0.06;
+/// Size of a name's letters: mean width with some reserve, and distance of two lines.
+const LETTER_WIDTH: f64 = 6.8;
+const LINE_HEIGHT: f64 = 13.0;
+/// Base lines of a name relative to its point, the preferred one first.
+const NAME_OFFSETS: [f64; 5] = [14.0, -8.0, 28.0, -22.0, 42.0];
 /// Number of lines with a number across the picture.
 const LINES: u32 = 5;
 
@@ -68,8 +73,9 @@ impl Axes<'_> {
         svg += &self.numbers(&chart, figures);
         let is_on_front = self.front(points);
         svg += &chart.line(points, &is_on_front);
+        let mut names = Vec::new();
         for (point, is_on_front) in points.iter().zip(is_on_front) {
-            svg += &chart.point(point, is_on_front);
+            svg += &chart.point(point, is_on_front, &mut names);
         }
         let title = format!("{} against {}", figures.title(self.score), figures.title(self.cost));
         let middle = [width / 2.0, height - 8.0];
@@ -120,14 +126,37 @@ impl Chart {
         format!("<path d=\"M{path}\" fill=\"none\" stroke=\"{COLOUR}\"/>\n")
     }
 
-    /// Draws a point with its name: at its left near the right end, otherwise at its right.
-    fn point(&self, point: &Point, is_on_front: bool) -> String {
+    /// Draws a point with its name: to the left near the right end, otherwise to the right.
+    /// `names` are the boxes of all names so far, which the name avoids.
+    fn point(&self, point: &Point, is_on_front: bool, names: &mut Vec<NameBox>) -> String {
         let [x, y] = self.at(point.cost, point.score);
         let fill = if is_on_front { COLOUR } else { "#fff" };
-        let (from, anchor) = if x > 0.7 * SIZE.0 { (x - 8.0, "end") } else { (x + 8.0, "start") };
+        let is_left = x > 0.7 * SIZE.0;
+        let (from, anchor) = if is_left { (x - 8.0, "end") } else { (x + 8.0, "start") };
+        let width = LETTER_WIDTH * point.name.chars().count() as f64;
+        let left = if is_left { from - width } else { from };
+        let boxes = NAME_OFFSETS.map(|offset| NameBox { left, right: left + width, y: y + offset });
+        let is_free = |name: &&NameBox| !names.iter().any(|other| name.overlaps(other));
+        let name = *boxes.iter().find(is_free).unwrap_or(&boxes[0]);
+        names.push(name);
         format!(
             "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"{fill}\" stroke=\"{COLOUR}\"/>\n"
-        ) + &text([from, y + 14.0], anchor, &escape(&point.name))
+        ) + &text([from, name.y], anchor, &escape(&point.name))
+    }
+}
+
+/// Position of a name in the picture.
+#[derive(Clone, Copy)]
+struct NameBox {
+    left: f64,
+    right: f64,
+    /// Base line.
+    y: f64,
+}
+
+impl NameBox {
+    fn overlaps(&self, other: &Self) -> bool {
+        self.left < other.right && other.left < self.right && (self.y - other.y).abs() < LINE_HEIGHT
     }
 }
 
@@ -191,6 +220,20 @@ mod tests {
         let by_lpips = Axes { lower_is_better: true, ..AXES };
         assert_eq!(by_lpips.front(&points), [true, true, false, false, false, false]);
         assert!(AXES.front(&[]).is_empty());
+    }
+
+    #[test]
+    fn names_of_near_points_do_not_overlap() {
+        let points = ["one", "two", "three", "four"].map(|name| point(name, 10.0, 25.0));
+        let far = point("far", 300.0, 30.0);
+        let svg = AXES.picture(&[&points[..], &[far]].concat(), &Figures::default()).unwrap();
+        let lines = ["one", "two", "three", "four"].map(|name| {
+            let before = svg.split(&format!(">{name}</text>")).next().unwrap();
+            before.rsplit("y=\"").next().unwrap().split('"').next().unwrap().to_owned()
+        });
+        for (i, line) in lines.iter().enumerate() {
+            assert!(!lines[..i].contains(line), "{lines:?}");
+        }
     }
 
     #[test]
