@@ -43,7 +43,7 @@ impl Stage for TrainRefine {
             (
                 "truth",
                 Input::required(
-                    &["scene/train", "scene/truth", "scene/references", "views"],
+                    &["scene/train", "scene/truth", "scene/references"],
                     "ground truth of the views",
                 ),
             ),
