@@ -1,8 +1,3 @@
 //! The stage's binary; see the library.
 
-fn main() -> std::process::ExitCode {
-    stage::run_stage::<camera_path::CameraPath>(
-        env!("CARGO_PKG_VERSION"),
-        env!("STAGE_FINGERPRINT"),
-    )
-}
+stage::main!(camera_path::CameraPath);

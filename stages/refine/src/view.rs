@@ -25,7 +25,6 @@ pub(crate) fn read_view(
 #[derive(Serialize, Deserialize)]
 pub(crate) struct RefinedView {
     /// True if the view was made consistent with its own LR photograph.
-    #[serde(alias = "agreed")]
     pub(crate) is_consistent: bool,
     /// Statistics of each reference.
     pub(crate) statistics: Vec<ReferenceStatistics>,

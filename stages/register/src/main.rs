@@ -1,5 +1,3 @@
 //! The stage's binary; see the library.
 
-fn main() -> std::process::ExitCode {
-    stage::run_stage::<register::Register>(env!("CARGO_PKG_VERSION"), env!("STAGE_FINGERPRINT"))
-}
+stage::main!(register::Register);

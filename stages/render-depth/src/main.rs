@@ -1,8 +1,3 @@
 //! The stage's binary; see the library.
 
-fn main() -> std::process::ExitCode {
-    stage::run_stage::<render_depth::RenderDepth>(
-        env!("CARGO_PKG_VERSION"),
-        env!("STAGE_FINGERPRINT"),
-    )
-}
+stage::main!(render_depth::RenderDepth);

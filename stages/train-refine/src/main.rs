@@ -1,8 +1,3 @@
 //! The stage's binary; see the library.
 
-fn main() -> std::process::ExitCode {
-    stage::run_stage::<train_refine::TrainRefine>(
-        env!("CARGO_PKG_VERSION"),
-        env!("STAGE_FINGERPRINT"),
-    )
-}
+stage::main!(train_refine::TrainRefine);

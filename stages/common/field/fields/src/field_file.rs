@@ -13,9 +13,6 @@ pub const FIELD_FILE: &str = "field.json";
 /// single format.
 pub const FIELD_FORMAT: u32 = 3;
 
-/// Oldest format of a grid field that this build reads: only its names differ.
-const OLDEST_FORMAT: u32 = 2;
-
 /// Description of a field artifact, `field.json`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -48,8 +45,8 @@ pub enum FieldFileError {
     OutOfRange(#[from] OutOfRange),
     /// The file has another format.
     #[error(
-        "field has format {0} of another build; this build reads formats {OLDEST_FORMAT} to \
-        {FIELD_FORMAT}: train the field again"
+        "field has format {0} of another build; this build reads format {FIELD_FORMAT}: train the \
+        field again"
     )]
     Format(u32),
 }
@@ -64,7 +61,7 @@ impl FieldFile {
     pub fn check(&self) -> Result<(), FieldFileError> {
         check_ranges(&[("members", self.members, 1, 16)])?;
         match self.field {
-            FieldModel::Grid(_) if !(OLDEST_FORMAT..=FIELD_FORMAT).contains(&self.format) => {
+            FieldModel::Grid(_) if self.format != FIELD_FORMAT => {
                 Err(FieldFileError::Format(self.format))
             }
             FieldModel::Grid(architecture) => Ok(architecture.check()?),

@@ -1,6 +1,6 @@
 //! Fields trained by an older build render unchanged, or are rejected. The files in `goldens/` are
-//! of the demo scene at 16 px: `mlp` is from commit 5af0c3e, `grid` from the first commit with
-//! format 2.
+//! of the demo scene at 16 px: weights of `mlp` are from commit 5af0c3e, those of `grid` from the first
+//! commit with format 2. Descriptions have today's names.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -80,7 +80,7 @@ fn a_grid_of_the_first_format_is_refused() {
     let line = format!("{error:#}");
     assert!(
         line.ends_with(
-            "field has format 1 of another build; this build reads formats 2 to 3: train the field again"
+            "field has format 1 of another build; this build reads format 3: train the field again"
         ),
         "{line}"
     );

@@ -1,30 +1,24 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Sizes of a grid field. Aliases are the names in `field.json` of format 2.
+/// Sizes of a grid field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Architecture {
     /// Number of grid levels.
-    #[serde(alias = "levels")]
     pub n_levels: u32,
     /// Cells along an axis of the coarsest level.
-    #[serde(alias = "coarsest")]
     pub base_resolution: u32,
     /// Cells along an axis of the finest level.
-    #[serde(alias = "finest")]
     pub max_resolution: u32,
     /// Maximum number of cells along z, of any level: in NDC rays run along z, and cells thinner
     /// than the distance between samples train poorly.
     pub finest_z: u32,
     /// Base-2 logarithm of the maximum number of entries per level; finer levels are hashed.
-    #[serde(alias = "log2_entries")]
     pub log2_hashmap_size: u32,
     /// Width of the hidden layers.
-    #[serde(alias = "hidden")]
     pub hidden_dim: u32,
     /// Number of samples along the diagonal of the unit cube.
-    #[serde(alias = "steps")]
     pub march_steps: u32,
 }
 

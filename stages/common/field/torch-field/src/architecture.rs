@@ -2,21 +2,17 @@ use radiance::{OutOfRange, check_ranges};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Sizes of the paper's field; defaults are the published ones. Aliases are the names of format 2.
+/// Sizes of the paper's field; defaults are the published ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MlpArchitecture {
     /// Octaves of the positional encoding of positions.
-    #[serde(alias = "position_octaves")]
     pub position_frequencies: u32,
     /// Octaves of the positional encoding of directions.
-    #[serde(alias = "direction_octaves")]
     pub direction_frequencies: u32,
     /// Number of layers before density and colour branch; the fifth has a skip connection.
-    #[serde(alias = "depth")]
     pub layers: u32,
     /// Width of the layers before the branch.
-    #[serde(alias = "width")]
     pub hidden_dim: u32,
     /// Number of samples per ray of the coarse network.
     pub coarse_samples: u32,

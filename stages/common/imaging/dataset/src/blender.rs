@@ -4,7 +4,6 @@ use artifact::{WARNING, format_count};
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
-use crate::file_reason::FileReason;
 use crate::file_status::is_file;
 use crate::format::Format;
 use crate::frame_file::{FrameFile, MissingImages, lookup_of};
@@ -29,7 +28,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
         frames.extend(read.frames);
     }
     if counts[0] == 0 {
-        return Err(DatasetError::format(train_file.path(), FileReason::NoFrames));
+        return Err(train_file.no_frames());
     }
     let (train, test) = (0..counts[0], counts[0]..frames.len());
     let mut notes = vec![if test.is_empty() {

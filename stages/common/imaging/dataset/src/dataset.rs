@@ -3,8 +3,7 @@ use std::collections::BTreeSet;
 use artifact::{WARNING, format_count};
 use scene::Intrinsics;
 
-use crate::error::DatasetError;
-use crate::file_reason::FileReason;
+use crate::error::{DatasetError, Reason};
 use crate::format::Format;
 use crate::frame::{Frame, Turn};
 use crate::split::Split;
@@ -77,7 +76,9 @@ impl Dataset {
         for frame in self.frames.iter_mut().filter(|f| f.has_distortion()) {
             let distortion = frame.stored_intrinsics.distortion;
             let pinhole = frame.stored_intrinsics.pinhole().ok_or_else(|| {
-                DatasetError::format(&frame.image, FileReason::Distortion(distortion))
+                let problem = format!("lens distortion {distortion} leaves no pinhole image");
+                let reason = Reason::new(format!("{problem}; are its coefficients right?"));
+                DatasetError::format(&frame.image, reason)
             })?;
             frame.pinhole = Some(pinhole);
             if distortion.is_fisheye() {

@@ -2,10 +2,11 @@ use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
+use artifact::shortened;
 use glam::{DMat3, DVec3};
 use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of, without_scale};
 
-use crate::error::{DatasetError, FrameReason};
+use crate::error::{DatasetError, Reason};
 use crate::file_status::path_text;
 use crate::masks::MaskFile;
 
@@ -97,7 +98,7 @@ impl Frame {
     pub(crate) fn check(&self) -> Result<(), CameraError> {
         let distortion = self.stored_intrinsics.distortion;
         if !distortion.is_finite() {
-            return Err(CameraError::Distortion(distortion));
+            return Err(CameraError::distortion(distortion));
         }
         let mut camera = self.camera();
         camera.intrinsics.distortion = Distortion::default();
@@ -144,8 +145,11 @@ pub(crate) fn unique_names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>
     match first_duplicate(&names) {
         None => Ok(names),
         Some((first, second)) => {
-            let (name, first) = (names[second].clone(), path_text(&paths[first]));
-            let reason = FrameReason::DuplicateName { name, first };
+            let (name, first) = (shortened(&names[second]), path_text(&paths[first]));
+            let reason = Reason::new(format!(
+                "view name {name:?} is already that of {}; rename one of the two files",
+                shortened(&first)
+            ));
             Err(DatasetError::frame(list, second, &path_text(&paths[second]), reason))
         }
     }
@@ -154,7 +158,7 @@ pub(crate) fn unique_names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>
 fn each_name(
     list: &Path,
     paths: &[PathBuf],
-    name: impl Fn(&Path) -> Result<String, FrameReason>,
+    name: impl Fn(&Path) -> Result<String, Reason>,
 ) -> Result<Vec<String>, DatasetError> {
     let mut names = Vec::with_capacity(paths.len());
     for (index, path) in paths.iter().enumerate() {
@@ -164,7 +168,7 @@ fn each_name(
     Ok(names)
 }
 
-fn name_with_folders(path: &Path, separator: &str) -> Result<String, FrameReason> {
+fn name_with_folders(path: &Path, separator: &str) -> Result<String, Reason> {
     let path = path.with_extension("");
     let parts =
         path.iter().map(|part| printable_part(Some(part))).collect::<Result<Vec<_>, _>>()?;
@@ -173,8 +177,9 @@ fn name_with_folders(path: &Path, separator: &str) -> Result<String, FrameReason
 
 /// Returns a part of a path as text without control characters: names become file names and are
 /// printed.
-fn printable_part(part: Option<&OsStr>) -> Result<String, FrameReason> {
-    let name = part.and_then(OsStr::to_str).ok_or(FrameReason::NameNotUtf8)?;
+fn printable_part(part: Option<&OsStr>) -> Result<String, Reason> {
+    let name = part.and_then(OsStr::to_str);
+    let name = name.ok_or_else(|| Reason::new("file name is not UTF-8; rename the file"))?;
     Ok(name.replace(char::is_control, "_"))
 }
 

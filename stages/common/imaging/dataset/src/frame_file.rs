@@ -1,11 +1,11 @@
 //! Reads files that list frames: `transforms.json`, `transforms_train.json` and so on.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
-use artifact::format_count;
+use artifact::{format_count, shortened};
 
-use crate::error::{DatasetError, FrameReason};
-use crate::file_reason::FileReason;
+use crate::error::{DatasetError, Reason};
 use crate::file_status::FileProblem;
 use crate::frame::{Frame, assign_names};
 use crate::lookup::{Located, Lookup};
@@ -94,13 +94,20 @@ impl ReadFrames {
 impl FrameFile {
     /// Parses a file.
     pub(crate) fn read(path: &Path) -> Result<Self, DatasetError> {
-        let transforms = parse(&read_text(path)?).map_err(|e| DatasetError::format(path, e))?;
+        let transforms = parse(&read_text(path)?)
+            .map_err(|e| DatasetError::format(path, Reason::new(json_message(&e))))?;
         Ok(Self { path: path.to_path_buf(), transforms })
     }
 
     /// Returns the path of the file.
     pub(crate) fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// Returns the error of a file without frames.
+    pub(crate) fn no_frames(&self) -> DatasetError {
+        let reason = Reason::new("`frames` is empty; at least one view is required");
+        DatasetError::format(&self.path, reason)
     }
 
     /// Returns nerfstudio's own split.
@@ -128,7 +135,7 @@ impl FrameFile {
                 Located::File(file) => file,
                 Located::Missing(problem) if on_missing == MissingImages::Refused => {
                     let remedy = "remove the frame or restore the file";
-                    return Err(frame_error(FrameReason::File { problem, remedy }));
+                    return Err(frame_error(Reason::unusable(&problem, remedy)));
                 }
                 Located::Missing(_) => {
                     read.missing.add(&entry.file_path);
@@ -136,7 +143,7 @@ impl FrameFile {
                 }
                 Located::Unusable(problem) => {
                     let remedy = "remove the frame or name its image";
-                    return Err(frame_error(FrameReason::File { problem, remedy }));
+                    return Err(frame_error(Reason::unusable(&problem, remedy)));
                 }
             };
             let image = lookup.root().join(&file.path);
@@ -149,9 +156,8 @@ impl FrameFile {
             read.frames.push(frame);
             labels.push(file.label);
         }
-        if let Some(first) = read.missing.first.clone().filter(|_| read.frames.is_empty()) {
-            let reason =
-                FileReason::ImagesMissing { count: read.missing.count, folder: None, first };
+        if let Some(first) = read.missing.first.as_ref().filter(|_| read.frames.is_empty()) {
+            let reason = Reason::images_missing(read.missing.count, None, first);
             return Err(DatasetError::format(&self.path, reason));
         }
         assign_names(&mut read.frames, &self.path, &labels)?;
@@ -160,14 +166,14 @@ impl FrameFile {
 }
 
 /// Finds the mask that a frame names, if any.
-fn find_mask(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>, FrameReason> {
+fn find_mask(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>, Reason> {
     let Some(name) = &entry.mask_path else { return Ok(None) };
     match lookup.find(name)? {
         Located::File(file) => {
             let path = lookup.root().join(file.path);
             Ok(Some(MaskFile { path, kind: MaskKind::Listed }))
         }
-        Located::Missing(problem) | Located::Unusable(problem) => Err(unusable_entry(problem)),
+        Located::Missing(problem) | Located::Unusable(problem) => Err(unusable_entry(&problem)),
     }
 }
 
@@ -177,7 +183,7 @@ fn find_depth(
     lookup: &mut Lookup,
     entry: &FrameEntry,
     missing: &mut MissingNames,
-) -> Result<Option<PathBuf>, FrameReason> {
+) -> Result<Option<PathBuf>, Reason> {
     let Some(name) = &entry.depth_file_path else { return Ok(None) };
     match lookup.find(name) {
         Ok(Located::File(file)) => {
@@ -187,13 +193,22 @@ fn find_depth(
             missing.add(name);
             Ok(None)
         }
-        Ok(Located::Missing(problem) | Located::Unusable(problem)) => Err(unusable_entry(problem)),
+        Ok(Located::Missing(problem) | Located::Unusable(problem)) => Err(unusable_entry(&problem)),
         Err(error) => Err(error.into()),
     }
 }
 
-fn unusable_entry(problem: FileProblem) -> FrameReason {
-    FrameReason::File { problem, remedy: "remove the entry or restore the file" }
+fn unusable_entry(problem: &FileProblem) -> Reason {
+    Reason::unusable(problem, "remove the entry or restore the file")
+}
+
+/// Returns the message of a JSON error, cut where serde repeats a long string.
+fn json_message(error: &serde_json::Error) -> String {
+    let text = error.to_string();
+    match shortened(&text) {
+        Cow::Borrowed(_) => text,
+        Cow::Owned(cut) => format!("{cut} at line {} column {}", error.line(), error.column()),
+    }
 }
 
 /// Parses the JSON. Python's `NaN` and `Infinity` are accepted as numbers, so that the later error

@@ -53,8 +53,9 @@ mod tests {
             encoder.set_restart_interval(restart_interval);
         }
         encoder.set_sampling_factor(sampling);
-        encoder.add_app_segment(1, b"Exif\xff\xd8\xff\xd9").unwrap();
-        let samples: Vec<u8> = (0..45 * 70 * 3).map(|i: usize| (i * 7 + i * i / 31) as u8).collect();
+        encoder.add_app_segment(1, b"Exif\xff\xd8\xff\xd9".to_vec()).unwrap();
+        let samples: Vec<u8> =
+            (0..45 * 70 * 3).map(|i: usize| (i * 7 + i * i / 31) as u8).collect();
         encoder.encode(&samples, 45, 70, ColorType::Rgb).unwrap();
         bytes
     }

@@ -1,8 +1,9 @@
+use artifact::shortened;
 use scene::Distortion;
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::error::FrameReason;
+use crate::error::Reason;
 use crate::number::Number;
 
 /// Lens of all frames of a `transforms.json`, or of one, with instant-ngp's and nerfstudio's keys.
@@ -70,9 +71,9 @@ impl LensEntry {
     /// Returns the distortion; fails for a model that isn't supported. For a fisheye lens k1 to k4
     /// are OpenCV's. For a perspective lens k4 is Brown's fourth radial term, as in nerfstudio,
     /// unless the model is OpenCV's rational one, the only one with k5 and k6.
-    pub(crate) fn distortion(&self) -> Result<Distortion, FrameReason> {
+    pub(crate) fn distortion(&self) -> Result<Distortion, Reason> {
         if let Some(model) = self.unsupported_projection() {
-            return Err(FrameReason::UnsupportedModel { model: model.to_owned() });
+            return Err(unsupported_model(model));
         }
         let [k1, k2, k3, k4, k5, k6, p1, p2] =
             [self.k1, self.k2, self.k3, self.k4, self.k5, self.k6, self.p1, self.p2]
@@ -88,7 +89,7 @@ impl LensEntry {
             | "RADIAL_FISHEYE"
             | "SIMPLE_FISHEYE"
             | "FISHEYE" => (true, false),
-            _ => return Err(FrameReason::UnsupportedModel { model: model.to_owned() }),
+            _ => return Err(unsupported_model(model)),
         };
         let radial = [k1, k2, k3, k4];
         Ok(if is_fisheye {
@@ -114,4 +115,12 @@ impl LensEntry {
         }
         self.ftheta_p0.as_ref().map(|_| "ftheta")
     }
+}
+
+/// Returns the reason for a camera model that isn't supported.
+fn unsupported_model(model: &str) -> Reason {
+    Reason::new(format!(
+        "camera_model {:?} is not supported; undistort the images first (colmap image_undistorter)",
+        shortened(model)
+    ))
 }

@@ -26,7 +26,6 @@ mod blender;
 mod colmap;
 mod dataset;
 mod error;
-mod file_reason;
 mod file_status;
 mod format;
 mod frame;

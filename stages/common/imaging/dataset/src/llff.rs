@@ -1,19 +1,20 @@
 use std::path::{Path, PathBuf};
 
-use artifact::format_count;
+use artifact::{format_count, format_number};
 use glam::{DMat3, DVec3};
 use scene::{Distortion, Intrinsics, pose_of};
 
 use crate::colmap;
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, FrameReason};
-use crate::file_reason::{FileReason, ImageFolder};
-use crate::file_status::{FileStatus, check_link, file_status, is_file, is_hidden, path_text};
+use crate::error::{DatasetError, Reason};
+use crate::file_status::{
+    FileProblem, FileStatus, check_link, file_status, is_file, is_hidden, path_text,
+};
 use crate::format::Format;
 use crate::frame::{Frame, unique_names};
 use crate::lookup::{Located, Lookup};
 use crate::masks::without_dynamic_masks;
-use crate::npy::{ArrayReason, read_matrix};
+use crate::npy::{read_matrix, shape_reason};
 use crate::photograph::{ImageHeader, fit_camera, is_image_name, read_header};
 use crate::text::read_text;
 use crate::unsupported::unsupported_images;
@@ -76,7 +77,7 @@ fn read_frame(
     distortion: Distortion,
     name: &str,
     image: PathBuf,
-) -> Result<Frame, FrameReason> {
+) -> Result<Frame, Reason> {
     let stored: ImageHeader = read_header(&image)?;
     let [down, right, back, centre, inner] =
         [0, 1, 2, 3, 4].map(|c| DVec3::new(row[c], row[5 + c], row[10 + c]));
@@ -87,7 +88,13 @@ fn read_frame(
     let fitted = fit_camera(intrinsics, stored)?;
     let (near, far) = (row[15], row[16]);
     if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
-        return Err(FrameReason::InvalidDepths { near, far });
+        return Err(Reason::new(format!(
+            "bounds {} and {}, expected 0 < near < far; LLFF's imgs2poses confuses views if COLMAP \
+            registered them in another order than that of their names: rerun COLMAP on images \
+            sorted by name, or use COLMAP's model without poses_bounds.npy",
+            format_number(near),
+            format_number(far)
+        )));
     }
     let camera_to_world = pose_of(DMat3::from_cols(right, -down, back), centre);
     let mut frame = Frame::new(image, fitted, camera_to_world);
@@ -97,11 +104,11 @@ fn read_frame(
     Ok(frame)
 }
 
-fn side_length(value: f64, name: &'static str) -> Result<u32, FrameReason> {
+fn side_length(value: f64, name: &str) -> Result<u32, Reason> {
     if (1.0..=f64::from(u32::MAX)).contains(&value) {
         Ok(value.round() as u32)
     } else {
-        Err(FrameReason::InvalidSide { name, value })
+        Err(Reason::invalid_side(name, value))
     }
 }
 
@@ -121,6 +128,34 @@ impl Photographs {
     }
 }
 
+/// Folder with images, for a message.
+struct ImageFolder {
+    name: String,
+    /// Number of images.
+    images: usize,
+    /// First entry that is named like an image but can't be read.
+    unusable: Option<FileProblem>,
+    /// Number and format of images in an unsupported format, with the remedy.
+    unsupported: Option<String>,
+}
+
+/// Lists the folders with their numbers of images.
+fn folders_text(folders: &[ImageFolder]) -> String {
+    if folders.is_empty() {
+        return "without a folder images next to them".to_owned();
+    }
+    let mut listed = Vec::new();
+    for ImageFolder { name, images, unusable, unsupported } in folders {
+        let remark = unusable.as_ref().map(ToString::to_string).or_else(|| unsupported.clone());
+        let remark = remark.map(|remark| format!(" ({remark})")).unwrap_or_default();
+        listed.push(format!("{} in {name}/{remark}", format_count(*images, "image")));
+    }
+    format!(
+        "for {}; counts must match, or view_imgs.txt must list the images that have poses",
+        listed.join(" and ")
+    )
+}
+
 /// Finds the folder with one image per pose: `images`, or the first of `images_2`, `images_3` and
 /// so on. Without such a folder, a list may name the images that have poses.
 fn find_photographs(folder: &Path, path: &Path, poses: usize) -> Result<Photographs, DatasetError> {
@@ -138,7 +173,10 @@ fn find_photographs(folder: &Path, path: &Path, poses: usize) -> Result<Photogra
     }
     match find_listed_photographs(folder, path, poses)? {
         Some(found) => Ok(found),
-        None => Err(DatasetError::format(path, FileReason::Counts { poses, folders })),
+        None => {
+            let reason = Reason::new(format!("{poses} poses {}", folders_text(&folders)));
+            Err(DatasetError::format(path, reason))
+        }
     }
 }
 
@@ -197,7 +235,7 @@ fn find_listed_photographs(
             }
             Located::Missing(problem) | Located::Unusable(problem) => {
                 let remedy = "restore the photograph";
-                return Err(frame_error(FrameReason::File { problem, remedy }));
+                return Err(frame_error(Reason::unusable(&problem, remedy)));
             }
         }
     }
@@ -211,15 +249,16 @@ fn find_listed_photographs(
 /// Reads the array's rows.
 fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
     let bytes = std::fs::read(path).map_err(|source| DatasetError::io(path, source))?;
-    let matrix = read_matrix(&bytes).map_err(|reason| array_error(path, reason))?;
+    let matrix = read_matrix(&bytes).map_err(|reason| array_error(path, &reason))?;
     if matrix.columns != NUMBERS || matrix.numbers.is_empty() {
-        return Err(array_error(path, ArrayReason::Shape(vec![matrix.rows, matrix.columns])));
+        return Err(array_error(path, &shape_reason(&[matrix.rows, matrix.columns])));
     }
     Ok(matrix.numbers.as_chunks().0.to_vec())
 }
 
-fn array_error(path: &Path, reason: ArrayReason) -> DatasetError {
-    DatasetError::format(path, FileReason::Array { columns: NUMBERS, reason })
+fn array_error(path: &Path, reason: &Reason) -> DatasetError {
+    let reason = format!("not a NumPy array of N×{NUMBERS} numbers: {reason}");
+    DatasetError::format(path, Reason::new(reason))
 }
 
 #[cfg(test)]

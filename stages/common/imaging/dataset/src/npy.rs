@@ -1,26 +1,9 @@
 //! Reads matrices in NumPy's format, versions 1 to 3.
 
+use crate::error::Reason;
+
 /// Maximum length of a header: NumPy's default limit. The header of a matrix has about 100 bytes.
 const MAX_HEADER_BYTES: usize = 10_000;
-
-/// Reason why a file isn't a readable matrix.
-#[derive(Debug, PartialEq, thiserror::Error)]
-pub(crate) enum ArrayReason {
-    #[error("magic string or version is wrong, or the header is incomplete")]
-    Preamble,
-    #[error("header has {length} bytes; the maximum is {MAX_HEADER_BYTES}")]
-    LongHeader { length: usize },
-    /// Header without a valid entry; contains the entry's name and type.
-    #[error("header has no {0}")]
-    Entry(&'static str),
-    #[error("unsupported shape {0:?}; a matrix has rows and columns")]
-    Shape(Vec<usize>),
-    #[error("element type is {0:?}, not a float")]
-    ElementType(String),
-    /// Fewer numbers than the header's shape requires.
-    #[error("file is cut short")]
-    CutShort,
-}
 
 /// Two-dimensional array, row by row.
 #[derive(Debug, PartialEq)]
@@ -31,36 +14,47 @@ pub(crate) struct Matrix {
 }
 
 /// Reads a matrix of floats from a file's bytes.
-pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, ArrayReason> {
-    let (header, data) = split_header(bytes).ok_or(ArrayReason::Preamble)?;
+pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, Reason> {
+    let preamble = "magic string or version is wrong, or the header is incomplete";
+    let (header, data) = split_header(bytes).ok_or_else(|| Reason::new(preamble))?;
     if header.len() > MAX_HEADER_BYTES {
-        return Err(ArrayReason::LongHeader { length: header.len() });
+        let length = header.len();
+        let problem = format!("header has {length} bytes; the maximum is {MAX_HEADER_BYTES}");
+        return Err(Reason::new(problem));
     }
+    let missing = |entry: &str| Reason::new(format!("header has no {entry}"));
     let element_type = entry(header, "descr")
         .and_then(parse_string)
-        .ok_or(ArrayReason::Entry("descr that is a string"))?;
+        .ok_or_else(|| missing("descr that is a string"))?;
     let is_by_columns = entry(header, "fortran_order")
         .and_then(parse_bool)
-        .ok_or(ArrayReason::Entry("fortran_order that is True or False"))?;
-    let shape = entry(header, "shape")
-        .and_then(parse_shape)
-        .ok_or(ArrayReason::Entry("shape of integers"))?;
-    let [rows, columns] = shape[..] else { return Err(ArrayReason::Shape(shape)) };
-    let count = rows.checked_mul(columns).ok_or(ArrayReason::Shape(shape))?;
+        .ok_or_else(|| missing("fortran_order that is True or False"))?;
+    let shape =
+        entry(header, "shape").and_then(parse_shape).ok_or_else(|| missing("shape of integers"))?;
+    let [rows, columns] = shape[..] else { return Err(shape_reason(&shape)) };
+    let count = rows.checked_mul(columns).ok_or_else(|| shape_reason(&shape))?;
     let stored = match element_type {
         "<f8" | "=f8" => numbers(data, count, f64::from_le_bytes),
         ">f8" => numbers(data, count, f64::from_be_bytes),
         "<f4" | "=f4" => numbers(data, count, |bytes| f64::from(f32::from_le_bytes(bytes))),
         ">f4" => numbers(data, count, |bytes| f64::from(f32::from_be_bytes(bytes))),
-        _ => return Err(ArrayReason::ElementType(element_type.to_owned())),
+        _ => {
+            let problem = format!("element type is {element_type:?}, not a float");
+            return Err(Reason::new(problem));
+        }
     };
-    let stored = stored.ok_or(ArrayReason::CutShort)?;
+    let stored = stored.ok_or_else(|| Reason::new("file is cut short"))?;
     let numbers = if is_by_columns {
         (0..count).map(|i| stored[i % columns * rows + i / columns]).collect()
     } else {
         stored
     };
     Ok(Matrix { rows, columns, numbers })
+}
+
+/// Returns the reason why an array's shape isn't that of the expected matrix.
+pub(crate) fn shape_reason(shape: &[usize]) -> Reason {
+    Reason::new(format!("unsupported shape {shape:?}; a matrix has rows and columns"))
 }
 
 /// Splits a file into the header's text and the data after it.
@@ -123,7 +117,7 @@ mod tests {
         [b"\x93NUMPY", &[version, 0][..], length, header.as_bytes(), data].concat()
     }
 
-    fn matrix(numbers: [f64; 6]) -> Result<Matrix, ArrayReason> {
+    fn matrix(numbers: [f64; 6]) -> Result<Matrix, Reason> {
         Ok(Matrix { rows: 2, columns: 3, numbers: numbers.to_vec() })
     }
 

@@ -10,7 +10,7 @@ use pixels::{
 };
 use scene::{Intrinsics, undistort_image};
 
-use crate::error::{DatasetError, FrameReason};
+use crate::error::{DatasetError, Reason};
 use crate::frame::{Frame, Turn};
 use crate::jpeg::has_end;
 use crate::unsupported::unsupported_error;
@@ -97,10 +97,7 @@ pub(crate) fn read_header(path: &Path) -> Result<ImageHeader, PixelError> {
 
 /// Resizes a camera to an image, as stored or as turned by EXIF. Returns the resized intrinsics and
 /// the treatment of the EXIF orientation. Fails if the aspect ratios differ.
-pub(crate) fn fit_camera(
-    k: Intrinsics,
-    stored: ImageHeader,
-) -> Result<(Intrinsics, Turn), FrameReason> {
+pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> Result<(Intrinsics, Turn), Reason> {
     let (width, height) = stored.size;
     let is_turned_fit = stored.is_sideways() && has_aspect_of(&k, height, width);
     let is_turned_exactly = stored.is_sideways() && (k.height, k.width) == stored.size;
@@ -114,7 +111,10 @@ pub(crate) fn fit_camera(
     } else if is_turned_fit {
         Ok((k.resized(height, width), Turn::Upright))
     } else {
-        Err(FrameReason::AspectRatio { image: stored.size, camera: (k.width, k.height) })
+        Err(Reason::new(format!(
+            "the image has {width}×{height} pixels, its camera {}×{}; aspect ratios must match",
+            k.width, k.height
+        )))
     }
 }
 

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 
 use artifact::{format_count, relative_path};
 
-use crate::file_reason::FileReason;
+use crate::error::Reason;
 use crate::lookup::{Located, Lookup, LookupError};
 
 /// Indices of training and test frames.
@@ -52,7 +52,7 @@ impl FrameNames {
         }
     }
 
-    fn find(&self, name: &str, lookup: &mut Lookup) -> Result<&[usize], FileReason> {
+    fn find(&self, name: &str, lookup: &mut Lookup) -> Result<&[usize], Reason> {
         let literal = relative_path(name).unwrap_or_else(|_| PathBuf::from(name));
         if let Some(frames) = self.by_name.get(&literal) {
             return Ok(frames);
@@ -75,7 +75,7 @@ impl SplitLists<'_> {
         count: usize,
         names: &FrameNames,
         lookup: &mut Lookup,
-    ) -> Result<(Option<Split>, Vec<String>), FileReason> {
+    ) -> Result<(Option<Split>, Vec<String>), Reason> {
         let mut notes = Vec::new();
         let train = listed_frames("train_filenames", self.train, names, lookup, &mut notes)?;
         let test = listed_frames("test_filenames", self.test, names, lookup, &mut notes)?;
@@ -102,12 +102,12 @@ impl SplitLists<'_> {
 /// Returns the frames of a list. Names without a frame are noted; a list of only such names is an
 /// error.
 fn listed_frames(
-    list: &'static str,
+    list: &str,
     list_names: &[String],
     names: &FrameNames,
     lookup: &mut Lookup,
     notes: &mut Vec<String>,
-) -> Result<BTreeSet<usize>, FileReason> {
+) -> Result<BTreeSet<usize>, Reason> {
     let (mut found, mut unknown) = (BTreeSet::new(), Vec::new());
     for name in list_names {
         let frames = names.find(name, lookup)?;
@@ -118,8 +118,10 @@ fn listed_frames(
     }
     if let Some(first) = unknown.first() {
         if found.is_empty() {
-            let (count, first) = (unknown.len(), (*first).clone());
-            return Err(FileReason::NoFrameListed { list, count, first });
+            let count = unknown.len();
+            return Err(Reason::new(format!(
+                "none of the {count} names in {list} is that of a frame (first: {first})"
+            )));
         }
         let names = format_count(list_names.len(), "name");
         let have = if unknown.len() == 1 { "has" } else { "have" };

@@ -1,9 +1,8 @@
 use std::path::Path;
 
-use artifact::format_count;
+use artifact::{format_count, shortened};
 
-use crate::error::DatasetError;
-use crate::file_reason::FileReason;
+use crate::error::{DatasetError, Reason};
 
 /// Formats a count with its noun and verb, such as `1 mask has` or `2 masks have`.
 pub(crate) fn counted_with_verb(count: usize, noun: &str, [one, many]: [&str; 2]) -> String {
@@ -19,9 +18,9 @@ pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {
 const UTF8_MARK: &[u8] = b"\xef\xbb\xbf";
 
 /// Decodes a file's text; fails with the encoding or the first word that isn't UTF-8.
-fn decode(mut bytes: Vec<u8>) -> Result<String, FileReason> {
+fn decode(mut bytes: Vec<u8>) -> Result<String, Reason> {
     if is_utf16(&bytes) {
-        return Err(FileReason::Utf16);
+        return Err(Reason::new("file is UTF-16; save it as UTF-8"));
     }
     if bytes.starts_with(UTF8_MARK) {
         bytes.drain(..UTF8_MARK.len());
@@ -35,7 +34,10 @@ fn decode(mut bytes: Vec<u8>) -> Result<String, FileReason> {
             .iter()
             .position(u8::is_ascii_whitespace)
             .map_or(bytes.len(), |space| offset + space);
-        FileReason::NotUtf8 { word: bytes[start..end].escape_ascii().to_string() }.on_line(line)
+        let word = bytes[start..end].escape_ascii().to_string();
+        let word = shortened(&word);
+        let remedy = "save the file as UTF-8, and rename files with such names";
+        Reason::new(format!("line {line}: {word} is not UTF-8; {remedy}"))
     })
 }
 

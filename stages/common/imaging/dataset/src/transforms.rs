@@ -1,12 +1,11 @@
 use std::path::{Path, PathBuf};
 
-use artifact::format_count;
+use artifact::{format_count, format_number};
 use scene::{CameraError, Intrinsics};
 use serde::Deserialize;
 
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, FrameReason};
-use crate::file_reason::FileReason;
+use crate::error::{DatasetError, Reason};
 use crate::format::Format;
 use crate::frame::{Frame, Turn};
 use crate::frame_file::{FrameFile, MissingImages, lookup_of};
@@ -43,7 +42,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let mut lookup = lookup_of(folder, &[&file]);
     let read = file.frames(&mut lookup, MissingImages::Skipped)?;
     if read.frames.is_empty() {
-        return Err(DatasetError::format(file.path(), FileReason::NoFrames));
+        return Err(file.no_frames());
     }
     let (split, split_notes) = file
         .split_lists()
@@ -65,11 +64,11 @@ pub(crate) fn read_frame(
     image: PathBuf,
     entry: &FrameEntry,
     shared: &LensEntry,
-) -> Result<Frame, FrameReason> {
+) -> Result<Frame, Reason> {
     let mut camera_to_world = [[0.0; 4]; 3];
     let matrix = &entry.transform_matrix;
     if !(3..=4).contains(&matrix.len()) || matrix.iter().any(|row| row.len() != 4) {
-        return Err(FrameReason::MatrixSize);
+        return Err(Reason::new("transform_matrix must have 4 rows of 4 numbers"));
     }
     for (row, values) in camera_to_world.iter_mut().enumerate() {
         for (column, value) in values.iter_mut().enumerate() {
@@ -80,18 +79,13 @@ pub(crate) fn read_frame(
     let frame = Frame::new(image, fitted, camera_to_world);
     match frame.check() {
         Ok(()) => Ok(frame),
-        Err(
-            e @ (CameraError::Intrinsics { .. }
-            | CameraError::Proportion { .. }
-            | CameraError::Distortion(_)
-            | CameraError::Empty { .. }),
-        ) => Err(e.into()),
-        Err(e) => Err(FrameReason::Pose(e)),
+        Err(CameraError::Intrinsics(problem)) => Err(Reason::new(problem)),
+        Err(CameraError::Pose(problem)) => Err(Reason::new(problem).at("transform_matrix")),
     }
 }
 
 /// Returns an image's intrinsics and the treatment of its EXIF orientation.
-fn intrinsics(entry: &LensEntry, stored: ImageHeader) -> Result<(Intrinsics, Turn), FrameReason> {
+fn intrinsics(entry: &LensEntry, stored: ImageHeader) -> Result<(Intrinsics, Turn), Reason> {
     let distortion = entry.distortion()?;
     // The size to which the intrinsics refer; the stored image may be a smaller copy.
     let width = side_length(entry.w, "w", stored.size.0)?;
@@ -99,7 +93,7 @@ fn intrinsics(entry: &LensEntry, stored: ImageHeader) -> Result<(Intrinsics, Tur
     let fx = focal_length(entry.fl_x, entry.camera_angle_x, "camera_angle_x", width)?;
     let fy = focal_length(entry.fl_y, entry.camera_angle_y, "camera_angle_y", height)?;
     let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
-        return Err(FrameReason::NoFocalLength);
+        return Err(Reason::new("no focal length: neither fl_x nor camera_angle_x is given"));
     };
     let cx = entry.cx.map_or(0.5 * f64::from(width), |cx| cx.0);
     let cy = entry.cy.map_or(0.5 * f64::from(height), |cy| cy.0);
@@ -110,11 +104,11 @@ fn intrinsics(entry: &LensEntry, stored: ImageHeader) -> Result<(Intrinsics, Tur
 }
 
 /// Returns a side of the image in pixels; `stored` is the default.
-fn side_length(value: Option<Number>, name: &'static str, stored: u32) -> Result<u32, FrameReason> {
+fn side_length(value: Option<Number>, name: &str, stored: u32) -> Result<u32, Reason> {
     match value {
         None => Ok(stored),
         Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
-        Some(Number(value)) => Err(FrameReason::InvalidSide { name, value }),
+        Some(Number(value)) => Err(Reason::invalid_side(name, value)),
     }
 }
 
@@ -122,9 +116,9 @@ fn side_length(value: Option<Number>, name: &'static str, stored: u32) -> Result
 fn focal_length(
     length: Option<Number>,
     angle: Option<Number>,
-    name: &'static str,
+    name: &str,
     size: u32,
-) -> Result<Option<f64>, FrameReason> {
+) -> Result<Option<f64>, Reason> {
     match (length, angle) {
         (Some(Number(length)), _) => Ok(Some(length)),
         (None, Some(Number(angle))) if angle > 0.0 && angle < std::f64::consts::PI => {
@@ -132,7 +126,9 @@ fn focal_length(
         }
         (None, Some(Number(angle))) => {
             let focal = 0.5 / (0.5 * angle).tan();
-            Err(FrameReason::InvalidAngle { name, angle, focal })
+            let [angle, focal] = [angle, focal].map(format_number);
+            let problem = format!("{name} is {angle}: focal length {focal}");
+            Err(Reason::new(format!("{problem}; the angle must be between 0 and π")))
         }
         (None, None) => Ok(None),
     }

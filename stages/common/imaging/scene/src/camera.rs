@@ -63,80 +63,20 @@ impl CameraRays {
 /// Error returned when a camera is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CameraError {
-    /// A number of the pose isn't finite.
-    #[error("camera_to_world[{row}][{column}] is {}; poses must be \
-        finite", if value.is_nan() { "NaN" } else { "infinite" })]
-    NotFinite {
-        /// Row of the pose.
-        row: usize,
-        /// Column of the pose.
-        column: usize,
-        /// Number found.
-        value: f64,
-    },
-    /// A focal length isn't positive, or an intrinsic parameter isn't finite.
-    #[error(
-        "{name} is {}; focal lengths must be above 0 and principal points finite",
-        format_number(*value)
-    )]
-    Intrinsics {
-        /// `fx`, `fy`, `cx` or `cy`.
-        name: &'static str,
-        /// Number found.
-        value: f64,
-    },
-    /// A focal length or principal point doesn't fit the image size.
-    #[error(
-        "{name} is {} pixels, but the image's side is {side} pixels; check that the {quantity} is \
-        in pixels and belongs to this image",
-        format_number(*value)
-    )]
-    Proportion {
-        /// `fx`, `fy`, `cx` or `cy`.
-        name: &'static str,
-        /// Description of the quantity.
-        quantity: &'static str,
-        /// Number found, in pixels.
-        value: f64,
-        /// Length of the image along the same axis, in pixels.
-        side: u32,
-    },
-    /// The distortion isn't invertible within the image.
-    #[error("lens distortion {0} is not invertible within the image; check its coefficients")]
-    Distortion(Distortion),
-    /// The image has no pixels.
-    #[error("image size {width}×{height}; both must be at least 1")]
-    Empty {
-        /// Number of columns.
-        width: u32,
-        /// Number of rows.
-        height: u32,
-    },
-    /// The centre is so far away that depths leave the range of single precision.
-    #[error(
-        "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than \
-        {MAX_CENTRE_DISTANCE:e}; check the pose and its unit",
-        .0[0], .0[1], .0[2]
-    )]
-    FarAway([f64; 3]),
-    /// The left 3×3 part has determinant -1.
-    #[error(
-        "camera_to_world is a reflection (its determinant is {determinant:.3}): axes must be \
-        right-handed; negate one of its columns"
-    )]
-    Mirrored {
-        /// Determinant of R.
-        determinant: f64,
-    },
-    /// The left 3×3 part isn't a rotation.
-    #[error(
-        "camera_to_world is not a rigid motion: R·Rᵀ differs from the identity by {error:.3}; \
-        remove scale or shear from the pose"
-    )]
-    NotRigid {
-        /// Maximum deviation of R·Rᵀ from the identity.
-        error: f64,
-    },
+    /// The image size, focal length, principal point or distortion is invalid.
+    #[error("{0}")]
+    Intrinsics(String),
+    /// The pose is invalid.
+    #[error("{0}")]
+    Pose(String),
+}
+
+impl CameraError {
+    /// Returns the error for a distortion that isn't invertible within the image.
+    pub fn distortion(distortion: Distortion) -> Self {
+        let problem = format!("lens distortion {distortion} is not invertible within the image");
+        Self::Intrinsics(format!("{problem}; check its coefficients"))
+    }
 }
 
 /// Maximum distance of a camera from the origin, in scene units. Depths have single precision, and
@@ -234,43 +174,57 @@ impl Camera {
     /// Fails for an invalid camera: NaN, focal length 0, an empty image, a pose with scale, shear
     /// or reflection, or a centre beyond [`MAX_CENTRE_DISTANCE`].
     pub fn check(&self) -> Result<(), CameraError> {
-        let k = &self.intrinsics;
-        if k.width == 0 || k.height == 0 {
-            return Err(CameraError::Empty { width: k.width, height: k.height });
+        self.check_intrinsics()?;
+        for (row, values) in self.camera_to_world.iter().enumerate() {
+            for (column, value) in values.iter().enumerate().filter(|(_, v)| !v.is_finite()) {
+                let value = if value.is_nan() { "NaN" } else { "infinite" };
+                let problem = format!("camera_to_world[{row}][{column}] is {value}");
+                return Err(CameraError::Pose(format!("{problem}; poses must be finite")));
+            }
         }
-        for (name, value, side) in [("fx", k.fx, k.width), ("fy", k.fy, k.height)] {
+        if !self.intrinsics.has_rays() {
+            return Err(CameraError::distortion(self.intrinsics.distortion));
+        }
+        let r = self.rotation();
+        let (error, determinant, centre) = (rotation_error(r), r.determinant(), self.centre());
+        let problem = if error > MAX_ROTATION_ERROR {
+            format!(
+                "camera_to_world is not a rigid motion: R·Rᵀ differs from the identity by \
+                {error:.3}; remove scale or shear from the pose"
+            )
+        } else if determinant < 0.0 {
+            format!(
+                "camera_to_world is a reflection (its determinant is {determinant:.3}): axes must \
+                be right-handed; negate one of its columns"
+            )
+        } else if centre.length() > MAX_CENTRE_DISTANCE {
+            format!(
+                "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than \
+                {MAX_CENTRE_DISTANCE:e}; check the pose and its unit",
+                centre.x, centre.y, centre.z
+            )
+        } else {
+            return Ok(());
+        };
+        Err(CameraError::Pose(problem))
+    }
+
+    /// Checks image size, focal lengths and principal point.
+    fn check_intrinsics(&self) -> Result<(), CameraError> {
+        let Intrinsics { width, height, fx, fy, cx, cy, .. } = self.intrinsics;
+        if width == 0 || height == 0 {
+            let problem = format!("image size {width}×{height}; both must be at least 1");
+            return Err(CameraError::Intrinsics(problem));
+        }
+        for (name, value, side) in [("fx", fx, width), ("fy", fy, height)] {
             check_intrinsic(name, value, value > 0.0)?;
             check_proportion(name, "focal length", value, side, ALLOWED_FOCAL_LENGTHS)?;
         }
-        for (name, value, side) in [("cx", k.cx, k.width), ("cy", k.cy, k.height)] {
+        for (name, value, side) in [("cx", cx, width), ("cy", cy, height)] {
             check_intrinsic(name, value, true)?;
             check_proportion(name, "principal point", value, side, ALLOWED_PRINCIPAL_POINTS)?;
         }
-        for (row, values) in self.camera_to_world.iter().enumerate() {
-            for (column, &value) in values.iter().enumerate() {
-                if !value.is_finite() {
-                    return Err(CameraError::NotFinite { row, column, value });
-                }
-            }
-        }
-        if !k.has_rays() {
-            return Err(CameraError::Distortion(k.distortion));
-        }
-        let r = self.rotation();
-        let error = rotation_error(r);
-        if error > MAX_ROTATION_ERROR {
-            return Err(CameraError::NotRigid { error });
-        }
-        let determinant = r.determinant();
-        if determinant < 0.0 {
-            return Err(CameraError::Mirrored { determinant });
-        }
-        let centre = self.centre();
-        if centre.length() > MAX_CENTRE_DISTANCE {
-            Err(CameraError::FarAway(centre.to_array()))
-        } else {
-            Ok(())
-        }
+        Ok(())
     }
 }
 
@@ -281,17 +235,20 @@ const ALLOWED_FOCAL_LENGTHS: RangeInclusive<f64> = 1e-4..=1e4;
 /// may be far from the principal point.
 const ALLOWED_PRINCIPAL_POINTS: RangeInclusive<f64> = -1e4..=1e4;
 
-fn check_intrinsic(name: &'static str, value: f64, is_allowed: bool) -> Result<(), CameraError> {
+fn check_intrinsic(name: &str, value: f64, is_allowed: bool) -> Result<(), CameraError> {
     if value.is_finite() && is_allowed {
         Ok(())
     } else {
-        Err(CameraError::Intrinsics { name, value })
+        Err(CameraError::Intrinsics(format!(
+            "{name} is {}; focal lengths must be above 0 and principal points finite",
+            format_number(value)
+        )))
     }
 }
 
 fn check_proportion(
-    name: &'static str,
-    quantity: &'static str,
+    name: &str,
+    quantity: &str,
     value: f64,
     side: u32,
     allowed: RangeInclusive<f64>,
@@ -299,7 +256,11 @@ fn check_proportion(
     if allowed.contains(&(value / f64::from(side))) {
         Ok(())
     } else {
-        Err(CameraError::Proportion { name, quantity, value, side })
+        Err(CameraError::Intrinsics(format!(
+            "{name} is {} pixels, but the image's side is {side} pixels; check that the {quantity} \
+            is in pixels and belongs to this image",
+            format_number(value)
+        )))
     }
 }
 
@@ -414,10 +375,14 @@ mod tests {
         let good = camera(DVec3::Y, 0.5, DVec3::ZERO);
         let mut bad = good.clone();
         bad.camera_to_world[1][2] = f64::NAN;
-        assert!(matches!(bad.check(), Err(CameraError::NotFinite { row: 1, column: 2, .. })));
+        let refused = |camera: &Camera, words: &str| {
+            let message = camera.check().unwrap_err().to_string();
+            assert!(message.contains(words), "{message}");
+        };
+        refused(&bad, "camera_to_world[1][2] is NaN; poses must be finite");
         let mut bad = good.clone();
         bad.intrinsics.fx = 0.0;
-        assert!(matches!(bad.check(), Err(CameraError::Intrinsics { name: "fx", .. })));
+        refused(&bad, "fx is 0; focal lengths must be above 0");
         for (fx, cy, words) in [
             (
                 1e300,
@@ -440,32 +405,17 @@ mod tests {
         let mut bad = good.clone();
         bad.camera_to_world[0][0] *= 1.1;
         bad.camera_to_world[0][1] += 0.2;
-        assert!(matches!(bad.check(), Err(CameraError::NotRigid { .. })));
+        refused(&bad, "camera_to_world is not a rigid motion");
         let mut bad = good.clone();
         bad.camera_to_world.iter_mut().for_each(|row| row[1] = -row[1]);
-        let reflection = bad.check().unwrap_err();
-        assert!(
-            matches!(reflection, CameraError::Mirrored { .. })
-                && reflection.to_string().contains("is -1.000"),
-            "{reflection}"
-        );
+        refused(&bad, "camera_to_world is a reflection (its determinant is -1.000)");
         let mut bad = good.clone();
         bad.camera_to_world[0][3] = 1e30;
-        let far = bad.check().unwrap_err();
-        assert!(
-            far.to_string()
-                .contains("centre (1e30, 0e0, 0e0) is farther from the origin than 1e18"),
-            "{far}"
-        );
+        refused(&bad, "centre (1e30, 0e0, 0e0) is farther from the origin than 1e18");
         bad.camera_to_world[0][3] = f64::NEG_INFINITY;
-        assert!(
-            bad.check()
-                .unwrap_err()
-                .to_string()
-                .contains("camera_to_world[0][3] is infinite; poses must be finite")
-        );
+        refused(&bad, "camera_to_world[0][3] is infinite; poses must be finite");
         let mut bad = good;
         bad.intrinsics.height = 0;
-        assert!(matches!(bad.check(), Err(CameraError::Empty { .. })));
+        refused(&bad, "image size 37×0; both must be at least 1");
     }
 }

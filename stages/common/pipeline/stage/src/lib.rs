@@ -1,6 +1,6 @@
 //! Command line of a stage: arguments, parameters, progress, exit codes, output.
 //!
-//! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked
+//! * [`Stage`] and [`main!`]: a stage implements the trait and gets arguments, checked
 //!   parameters, `describe`, progress, exit codes, interruption and an atomic output for free.
 //! * [`Context`]: inputs, output and checkpoint folder of a running stage.
 //! * [`Description`], [`Schema`], [`Rule`]: a stage's description, and the checks of values against

@@ -37,6 +37,16 @@ pub fn run_stage<S: Stage>(version: &'static str, code: &str) -> ExitCode {
     run_stage_with::<S>(version, code, std::env::args_os())
 }
 
+/// Defines `main` of a stage's program; the crate's `build.rs` calls `fingerprint::emit`.
+#[macro_export]
+macro_rules! main {
+    ($stage:ty) => {
+        fn main() -> std::process::ExitCode {
+            $crate::run_stage::<$stage>(env!("CARGO_PKG_VERSION"), env!("STAGE_FINGERPRINT"))
+        }
+    };
+}
+
 pub(crate) fn run_stage_with<S: Stage>(
     version: &'static str,
     code: &str,

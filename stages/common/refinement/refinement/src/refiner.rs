@@ -59,7 +59,7 @@ pub const REFINER_FILE: &str = "refiner.json";
 /// columns × inputs.
 pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 
-/// Content of `refiner.json`. Aliases are names of an earlier format.
+/// Content of `refiner.json`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RefinerFile {
@@ -67,7 +67,6 @@ pub struct RefinerFile {
     pub network: Network,
     /// Fraction of the predicted residual that is added, from 0 to 1: the best one for the
     /// validation views.
-    #[serde(alias = "strength")]
     pub residual_weight: f64,
     /// Mean PSNR of the rendered validation views, in dB.
     pub rendered_psnr: f64,
@@ -75,10 +74,10 @@ pub struct RefinerFile {
     pub refined_psnr: f64,
     /// Confidence in references as a fraction of their visibility in the validation views; absent
     /// if the network takes no references.
-    #[serde(alias = "trusted", default)]
+    #[serde(default)]
     pub confidence: Option<f64>,
     /// True if the network's input views are made consistent with their own LR photographs.
-    #[serde(alias = "agreeing", default)]
+    #[serde(default)]
     pub data_consistent: bool,
 }
 

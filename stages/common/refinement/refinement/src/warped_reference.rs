@@ -51,7 +51,6 @@ pub struct ReferenceStatistics {
     #[serde(rename = "seen")]
     pub visible_pixels: usize,
     /// Sum of the visible pixels' visibility, which depends on viewing angle and resolution.
-    #[serde(alias = "sight")]
     pub visibility: f64,
     /// Sum of the visible pixels' confidence: visibility, reduced where the reference differs from
     /// the rendered view.

@@ -2,7 +2,7 @@
 
 use scene::{Distortion, Intrinsics};
 
-use crate::file_reason::FileReason;
+use crate::error::Reason;
 
 /// Camera model of COLMAP.
 pub(super) struct CameraModel {
@@ -31,6 +31,9 @@ const MODELS: [CameraModel; 13] = [
     CameraModel { number: 15, name: "FISHEYE", parameters: 4 },
 ];
 
+/// Remedy for a camera model that isn't supported.
+pub(super) const UNDISTORT: &str = "undistort with colmap image_undistorter";
+
 impl CameraModel {
     /// Finds a model by its number.
     pub(super) fn with_number(number: u32) -> Option<&'static Self> {
@@ -48,25 +51,23 @@ impl CameraModel {
         width: u64,
         height: u64,
         parameters: &[f64],
-    ) -> Result<Intrinsics, FileReason> {
+    ) -> Result<Intrinsics, Reason> {
         let [columns, rows] =
             [width, height].map(|side| u32::try_from(side).ok().filter(|side| *side > 0));
         let (Some(columns), Some(rows)) = (columns, rows) else {
-            return Err(FileReason::InvalidSize { width, height });
+            return Err(Reason::new(format!("image size {width}×{height} is invalid")));
         };
         if parameters.len() != self.parameters {
-            return Err(FileReason::ParameterCount {
-                model: self.name.to_owned(),
-                expected: self.parameters,
-                found: parameters.len(),
-            });
+            let Self { name, parameters: expected, .. } = self;
+            let found = parameters.len();
+            return Err(Reason::new(format!("{name} has {expected} parameters, not {found}")));
         }
         let ([fx, fy, cx, cy], distortion) = self.lens(parameters)?;
         Ok(Intrinsics { width: columns, height: rows, fx, fy, cx, cy, distortion })
     }
 
     /// Returns [fx, fy, cx, cy] and the distortion; fails for a model that isn't supported.
-    fn lens(&self, parameters: &[f64]) -> Result<([f64; 4], Distortion), FileReason> {
+    fn lens(&self, parameters: &[f64]) -> Result<([f64; 4], Distortion), Reason> {
         let none = Distortion::default();
         let lens = match (self.name, parameters) {
             ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f, cx, cy], none),
@@ -99,7 +100,10 @@ impl CameraModel {
                 let radial = Distortion::fisheye([k1, k2, k3, k4]);
                 ([fx, fy, cx, cy], Distortion { tangential: [p1, p2], ..radial })
             }
-            _ => return Err(FileReason::UnsupportedModel { model: self.name.to_owned() }),
+            _ => {
+                let problem = format!("camera model {} is not supported", self.name);
+                return Err(Reason::new(format!("{problem}; {UNDISTORT}")));
+            }
         };
         Ok(lens)
     }

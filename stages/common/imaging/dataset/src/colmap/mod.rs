@@ -11,8 +11,7 @@ use artifact::format_count;
 use scene::Intrinsics;
 
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, FrameReason, Problem};
-use crate::file_reason::FileReason;
+use crate::error::{DatasetError, Problem, Reason};
 use crate::file_status::{check_link, is_file, visible_entries};
 use crate::format::Format;
 use crate::frame::assign_names;
@@ -100,18 +99,14 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
             Located::Missing(_) => missing.push(&image.name),
             Located::Unusable(problem) => {
                 let remedy = "put the photograph there";
-                return Err(frame_error(FrameReason::File { problem, remedy }));
+                return Err(frame_error(Reason::unusable(&problem, remedy)));
             }
         }
     }
     if frames.is_empty() {
         let reason = match missing.first() {
-            Some(first) => FileReason::ImagesMissing {
-                count: missing.len(),
-                folder: Some(lookup.base()),
-                first: first.to_string(),
-            },
-            None => FileReason::NoImages,
+            Some(first) => Reason::images_missing(missing.len(), Some(&lookup.base()), first),
+            None => Reason::new("the model has no images; at least one is required"),
         };
         return Err(DatasetError::format(&list, reason));
     }

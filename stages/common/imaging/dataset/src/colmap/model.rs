@@ -1,16 +1,17 @@
 //! Files of a COLMAP reconstruction (COLMAP's documentation, "Output format").
 
 use std::collections::BTreeMap;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
+use artifact::{format_number, shortened};
 use glam::{DMat3, DQuat, DVec3};
 use scene::Intrinsics;
 
 use super::bytes::Bytes;
-use super::camera::CameraModel;
+use super::camera::{CameraModel, UNDISTORT};
 use super::points::{Reach, depth_range, removed_points_note};
-use crate::error::{DatasetError, FrameReason};
-use crate::file_reason::FileReason;
+use crate::error::{DatasetError, Reason};
 use crate::file_status::is_file;
 use crate::frame::{Frame, pose_from_world_to_camera};
 use crate::photograph::{fit_camera, read_header};
@@ -87,14 +88,15 @@ impl Model {
             let model = bytes.u32("a camera")?;
             let (width, height) = (bytes.u64("a camera")?, bytes.u64("a camera")?);
             let Some(model) = CameraModel::with_number(model) else {
-                return Err(bytes.error(FileReason::UnknownModelNumber { id, model }));
+                let problem = format!("camera {id} has unknown model {model}");
+                return Err(bytes.error(format!("{problem} (from a newer COLMAP?); {UNDISTORT}")));
             };
             let parameters = (0..model.parameters)
                 .map(|_| bytes.f64("a camera"))
                 .collect::<Result<Vec<_>, _>>()?;
-            let intrinsics = model.intrinsics(width, height, &parameters).map_err(|reason| {
-                bytes.error(FileReason::Camera { id, reason: Box::new(reason) })
-            })?;
+            let intrinsics = model
+                .intrinsics(width, height, &parameters)
+                .map_err(|reason| bytes.error(reason.at(format!("camera {id}"))))?;
             self.cameras.insert(id, intrinsics);
         }
         bytes.check_end("cameras")
@@ -108,8 +110,7 @@ impl Model {
             let camera = bytes.u32("an image")?;
             let name = bytes.text("an image's name")?.to_owned();
             let rotation = rotation_matrix(quaternion).map_err(|reason| {
-                let (name, reason) = (name.clone(), Box::new(reason));
-                bytes.error(FileReason::Image { id, name, reason })
+                bytes.error(reason.at(format!("image {id} ({})", shortened(&name))))
             })?;
             let mut points = Vec::new();
             for _ in 0..bytes.count(24, "points of an image")? {
@@ -141,7 +142,9 @@ impl Model {
                 .map(|i| line.number(i, "parameter"))
                 .collect::<Result<Vec<f64>, _>>()?;
             let Some(model) = CameraModel::with_name(name) else {
-                return Err(line.error(FileReason::UnknownModelName { model: name.to_owned() }));
+                let name = shortened(name);
+                let problem = format!("camera model {name:?} is unknown (from a newer COLMAP?)");
+                return Err(line.error(format!("{problem}; {UNDISTORT}")));
             };
             let intrinsics = model
                 .intrinsics(width, height, &parameters)
@@ -166,15 +169,20 @@ impl Model {
             let translation = DVec3::new(x?, y?, z?);
             let camera = line.number(8, "camera id")?;
             if line.words.len() < 10 {
-                return Err(line.error(FileReason::Missing { what: "an image's name" }));
+                return Err(line.error("an image's name is missing"));
             }
             let name = line.rest_after(9).to_owned();
             let points = match lines.next() {
                 None => Vec::new(),
                 Some(second) => second.points().ok_or_else(|| {
-                    let image = line.words[0].to_owned();
-                    let reason = FileReason::PointsExpected { line: second.number, image };
-                    DatasetError::format(path, reason)
+                    let (number, image) = (second.number, line.words[0]);
+                    DatasetError::format(
+                        path,
+                        Reason::new(format!(
+                            "line {number} should be the points of image {image} (an empty line if \
+                            there are none)"
+                        )),
+                    )
                 })?,
             };
             self.images.push(Image { rotation, translation, camera, name, points });
@@ -203,11 +211,12 @@ impl Model {
     }
 
     /// Creates the frame of an image, without its name; `file` is its photograph.
-    pub(super) fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, FrameReason> {
+    pub(super) fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, Reason> {
         let id = image.camera;
-        let camera = self.cameras.get(&id).ok_or(FrameReason::CameraNotFound { id })?;
+        let camera = self.cameras.get(&id);
+        let camera = camera.ok_or_else(|| Reason::new(format!("camera {id} not found")))?;
         let fitted = fit_camera(*camera, read_header(&file)?)
-            .map_err(|reason| FrameReason::OfCamera { id, reason: Box::new(reason) })?;
+            .map_err(|reason| Reason::new(format!("{reason} (camera {id})")))?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
         let mut frame = Frame::new(file, fitted, camera_to_world);
         frame.depths = depth_range(image, camera, &self.points);
@@ -217,11 +226,12 @@ impl Model {
 }
 
 /// Returns the rotation matrix of a quaternion (w, x, y, z) of any positive length.
-fn rotation_matrix([w, x, y, z]: [f64; 4]) -> Result<DMat3, FileReason> {
+fn rotation_matrix([w, x, y, z]: [f64; 4]) -> Result<DMat3, Reason> {
     let quaternion = DQuat::from_xyzw(x, y, z, w);
     let length = quaternion.length();
     if !(length.is_finite() && length > 1e-9) {
-        return Err(FileReason::Rotation([w, x, y, z]));
+        let numbers = [w, x, y, z].map(format_number).join(", ");
+        return Err(Reason::new(format!("({numbers}) is not a rotation quaternion")));
     }
     Ok(DMat3::from_quat(quaternion * (1.0 / length)))
 }
@@ -247,8 +257,8 @@ impl<'a> TextLine<'a> {
         })
     }
 
-    fn error(&self, reason: FileReason) -> DatasetError {
-        DatasetError::format(self.path, reason.on_line(self.number))
+    fn error(&self, reason: impl Display) -> DatasetError {
+        DatasetError::format(self.path, Reason::new(format!("line {}: {reason}", self.number)))
     }
 
     /// Returns the rest of the line after a number of words: a file name, which may have spaces.
@@ -274,15 +284,11 @@ impl<'a> TextLine<'a> {
     }
 
     /// Parses the word with an index; `what` describes it in errors.
-    fn number<T: std::str::FromStr>(
-        &self,
-        index: usize,
-        what: &'static str,
-    ) -> Result<T, DatasetError> {
+    fn number<T: std::str::FromStr>(&self, index: usize, what: &str) -> Result<T, DatasetError> {
         let Some(word) = self.words.get(index) else {
-            return Err(self.error(FileReason::Missing { what }));
+            return Err(self.error(format!("{what} is missing")));
         };
         word.parse()
-            .map_err(|_| self.error(FileReason::InvalidNumber { what, word: (*word).to_owned() }))
+            .map_err(|_| self.error(format!("{what}: {:?} is not a valid number", shortened(word))))
     }
 }
