@@ -1,9 +1,8 @@
-use artifact::{Failure, format_count};
+use artifact::{Failure, bail_usage, format_count};
 use dataset::{Dataset, Split};
 use pixels::Kernel;
 use scene::{Camera, Intrinsics};
 
-use crate::error::ParameterError;
 use crate::params::{LrSource, Params};
 use crate::sizes::{Sizes, downscaled_sizes, enlarged_sizes, scaled_length};
 
@@ -28,14 +27,13 @@ impl ImagePlan {
             None => set.format.is_benchmark() || params.lr_width.is_some(),
         };
         if !has_truth && params.kernel == Some(Kernel::Average) {
-            return Err(ParameterError::AssumedAverage.into());
+            bail_usage!("parameter kernel: photographs cannot have kernel average; choose box");
         }
         let kernel = params.kernel.unwrap_or(if has_truth { Kernel::Lanczos } else { Kernel::Box });
         let first = set.frames[split.train[0]].intrinsics();
         let native = (first.width, first.height);
         let sizes = if has_truth {
-            downscaled_sizes(native, params.lr_width, params.scale)
-                .map_err(ParameterError::Sizes)?
+            downscaled_sizes(native, params.lr_width, params.scale)?
         } else {
             enlarged_sizes(native, params.scale)
         };
@@ -44,7 +42,12 @@ impl ImagePlan {
             for &i in split.train.iter().chain(&split.test) {
                 let sizes = plan.sizes_of(&set.frames[i].intrinsics());
                 if !sizes.is_integer() {
-                    return Err(ParameterError::FractionalAverage(sizes).into());
+                    bail_usage!(
+                        "parameter kernel: average requires an integer scale, found {:?} → {:?}; \
+                        choose box",
+                        sizes.hr,
+                        sizes.lr
+                    );
                 }
             }
         }

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use crate::borders::{Border, Borders};
 use crate::detail::Spectrum;
-use crate::error::frame_label;
+use crate::frame_label;
 use crate::strips::Strips;
 
 /// Maximum number of views to sample, spread evenly: enough to tell nine in ten (docs/design/035).

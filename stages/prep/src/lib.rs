@@ -24,7 +24,6 @@ mod borders;
 mod bounds;
 mod degrade;
 mod detail;
-mod error;
 mod image_plan;
 mod inspection;
 mod memory;
@@ -47,7 +46,6 @@ use serde_json::json;
 use stage::{Context, Input, Output, Rule, Stage};
 
 pub use bounds::SpaceKind;
-use error::frame_label;
 use image_plan::ImagePlan;
 use inspection::Inspection;
 pub use params::{LensHandling, LrSource, Params, SplitKind};
@@ -95,7 +93,7 @@ impl Stage for Prep {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let set = read_dataset(context, params)?;
         let split = split_views(&set, params)?;
-        let warnings = check_poses(&set, &split).bad_input("dataset")?;
+        let warnings = check_poses(&set, &split)?;
         let images = ImagePlan::new(&set, &split, params)?;
         let mut notes = set.notes.clone();
         notes.push(images.note(&split));
@@ -173,4 +171,9 @@ fn log_ignored_files(context: &Context, folder: &Path) {
             printable(&first.display().to_string())
         ));
     }
+}
+
+/// Returns `frame NAME`, the prefix of messages about a frame.
+fn frame_label(frame: &Frame) -> String {
+    format!("frame {}", frame.name)
 }

@@ -6,7 +6,7 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 use stage::{Context, MEMORY_REMEDY, available_memory};
 use workload::preparation_bytes;
 
-use crate::error::frame_label;
+use crate::frame_label;
 use crate::image_plan::ImagePlan;
 
 /// Peak memory of preparing one view.

@@ -1,9 +1,8 @@
-use artifact::{Failure, WARNING, bail_bad_input};
+use artifact::{Failure, WARNING, bail_bad_input, bail_usage, format_number};
 use dataset::{Dataset, Frame, Split};
 use scene::{Background, Bounds, Camera, Space, format_length};
 
 use crate::bounds::{CameraDepths, scene_bounds};
-use crate::error::{ParameterError, SamePose};
 use crate::image_plan::ImagePlan;
 use crate::params::Params;
 use crate::pose_warnings;
@@ -63,8 +62,8 @@ fn bounds(
         .filter(|[near, far]| 0.0 < *near && near < far);
     let (train, test) = (camera_depths(train, given), camera_depths(test, given));
     let is_unbounded = background == Background::Opaque;
-    let mut bounds =
-        scene_bounds(&train, &test, is_unbounded, params.space).map_err(ParameterError::from)?;
+    let mut bounds = scene_bounds(&train, &test, is_unbounded, params.space)
+        .map_err(|error| Failure::Usage(error.to_string()))?;
     if !bounds.is_valid() {
         return Err(Failure::BadInput(EMPTY_BOX.to_owned()));
     }
@@ -81,7 +80,10 @@ fn bounds(
     {
         if let Some(value) = given {
             if !value.is_finite() || value > MAX_FAR {
-                return Err(ParameterError::InvalidDistance { name, value }.into());
+                let value = format_number(value);
+                bail_usage!(
+                    "parameter {name}: {value} is not a valid distance; choose at most 1e18"
+                );
             }
             *bound = value;
         }
@@ -90,7 +92,8 @@ fn bounds(
         frustum.far = frustum.far.min(far);
     }
     if bounds.near >= bounds.far || !bounds.is_valid() {
-        return Err(ParameterError::NearAndFar { near: bounds.near, far: bounds.far }.into());
+        let [near, far] = [bounds.near, bounds.far].map(format_number);
+        bail_usage!("parameter near: {near} is not less than far = {far}");
     }
     Ok(bounds)
 }
@@ -101,11 +104,17 @@ fn camera_depths(frames: &[&Frame], given: Option<[f64; 2]>) -> Vec<CameraDepths
 }
 
 /// Returns warnings about implausible poses; fails if all training poses are equal.
-pub(crate) fn check_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, SamePose> {
+pub(crate) fn check_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, Failure> {
     let training: Vec<Camera> = split.train.iter().map(|&i| set.frames[i].camera()).collect();
     let only_test = split.test.iter().filter(|i| !split.train.contains(i));
     let test: Vec<Camera> = only_test.map(|&i| set.frames[i].camera()).collect();
-    pose_warnings::check(&training)?;
+    if pose_warnings::have_equal_poses(&training) {
+        bail_bad_input!(
+            "dataset: all {} training views have the same pose: depth cannot be estimated; check \
+            the poses",
+            training.len()
+        );
+    }
     let warnings = pose_warnings::warnings(&training, &test);
     Ok(warnings.into_iter().map(|text| format!("{WARNING}{text}")).collect())
 }

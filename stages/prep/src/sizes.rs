@@ -1,3 +1,5 @@
+use artifact::{Failure, bail_usage};
+
 /// LR and HR size, (width, height) in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Sizes {
@@ -14,41 +16,33 @@ impl Sizes {
     }
 }
 
-/// Error returned when `lr_width` and `scale` don't give valid sizes.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub(crate) enum SizeError {
-    #[error(
-        "lr_width = {lr} and scale = {scale} give HR images of {hr} pixels, but the data set's \
-        images are {native} pixels wide; choose a smaller lr_width or scale"
-    )]
-    TooLarge { lr: u32, scale: f64, hr: u32, native: u32 },
-    #[error(
-        "scale = {scale} gives LR and HR images the same width of {hr} pixels; give larger images, \
-        or choose scale = 1"
-    )]
-    Unchanged { scale: f64, hr: u32 },
-    #[error("scale = {scale} reduces a width of {hr} pixels to 0; choose a smaller scale")]
-    Empty { scale: f64, hr: u32 },
-}
-
 /// Returns LR and HR size from `lr_width` and `scale`; heights follow the native aspect ratio.
 pub(crate) fn downscaled_sizes(
     native: (u32, u32),
     lr: Option<u32>,
     scale: f64,
-) -> Result<Sizes, SizeError> {
+) -> Result<Sizes, Failure> {
     let (lr, hr) = match lr {
         Some(lr) => (lr, scaled_by(lr, scale)),
         None => (scaled_by(native.0, 1.0 / scale), native.0),
     };
     if lr == 0 {
-        return Err(SizeError::Empty { scale, hr });
+        bail_usage!(
+            "parameters: scale = {scale} reduces a width of {hr} pixels to 0; choose a smaller scale"
+        );
     }
     if scale > 1.0 && lr == hr {
-        return Err(SizeError::Unchanged { scale, hr });
+        bail_usage!(
+            "parameters: scale = {scale} gives LR and HR images the same width of {hr} pixels; give \
+            larger images, or choose scale = 1"
+        );
     }
     if hr > native.0 {
-        return Err(SizeError::TooLarge { lr, scale, hr, native: native.0 });
+        bail_usage!(
+            "parameters: lr_width = {lr} and scale = {scale} give HR images of {hr} pixels, but the \
+            data set's images are {} pixels wide; choose a smaller lr_width or scale",
+            native.0
+        );
     }
     let (lr_height, hr_height) =
         (scaled_length(native.1, native.0, lr), scaled_length(native.1, native.0, hr));
@@ -76,40 +70,34 @@ mod tests {
     #[test]
     fn sizes_follow_from_width_and_scale() {
         let native = (800, 800);
-        assert_eq!(
-            downscaled_sizes(native, Some(100), 2.0),
-            Ok(Sizes { lr: (100, 100), hr: (200, 200) })
-        );
-        assert_eq!(downscaled_sizes(native, None, 2.0), Ok(Sizes { lr: (400, 400), hr: native }));
-        assert_eq!(
-            downscaled_sizes((504, 378), None, 4.0),
-            Ok(Sizes { lr: (126, 95), hr: (504, 378) })
-        );
+        for (native, lr, scale, expected) in [
+            (native, Some(100), 2.0, Sizes { lr: (100, 100), hr: (200, 200) }),
+            (native, None, 2.0, Sizes { lr: (400, 400), hr: native }),
+            ((504, 378), None, 4.0, Sizes { lr: (126, 95), hr: (504, 378) }),
+        ] {
+            assert_eq!(downscaled_sizes(native, lr, scale).unwrap(), expected);
+        }
         assert!(!downscaled_sizes((504, 378), None, 4.0).unwrap().is_integer());
         assert_eq!(enlarged_sizes((90, 61), 1.5), Sizes { lr: (90, 61), hr: (135, 92) });
     }
 
     #[test]
     fn enlarging_and_empty_sizes_are_refused() {
-        for (native, lr, scale, expected) in [
-            (
-                800,
-                Some(900),
-                1.0,
-                SizeError::TooLarge { lr: 900, scale: 1.0, hr: 900, native: 800 },
-            ),
+        for (native, lr, scale, words) in [
+            (800, Some(900), 1.0, "lr_width = 900 and scale = 1 give HR images of 900 pixels"),
             (
                 800,
                 Some(500),
                 2.0,
-                SizeError::TooLarge { lr: 500, scale: 2.0, hr: 1000, native: 800 },
+                "images of 1000 pixels, but the data set's images are 800 pixels",
             ),
-            (4, None, 16.0, SizeError::Empty { scale: 16.0, hr: 4 }),
-            (1, None, 2.0, SizeError::Unchanged { scale: 2.0, hr: 1 }),
-            (10, Some(10), 1.01, SizeError::Unchanged { scale: 1.01, hr: 10 }),
+            (4, None, 16.0, "scale = 16 reduces a width of 4 pixels to 0"),
+            (1, None, 2.0, "scale = 2 gives LR and HR images the same width of 1 pixels"),
+            (10, Some(10), 1.01, "scale = 1.01 gives LR and HR images the same width of 10 pixels"),
         ] {
-            assert_eq!(downscaled_sizes((native, native), lr, scale), Err(expected));
+            let message = downscaled_sizes((native, native), lr, scale).unwrap_err().to_string();
+            assert!(message.contains(words), "{message}");
         }
-        assert_eq!(downscaled_sizes((1, 1), None, 1.0), Ok(Sizes { lr: (1, 1), hr: (1, 1) }));
+        assert_eq!(downscaled_sizes((1, 1), None, 1.0).unwrap(), Sizes { lr: (1, 1), hr: (1, 1) });
     }
 }

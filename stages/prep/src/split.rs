@@ -1,8 +1,7 @@
-use artifact::Failure;
+use artifact::{Failure, bail_usage};
 use dataset::{Dataset, Split};
 use glam::DVec3;
 
-use crate::error::ParameterError;
 use crate::params::{Params, SplitKind};
 
 /// Interval of held-out views: every eighth, as in LLFF's code.
@@ -24,7 +23,11 @@ fn full_split(set: &Dataset, params: &Params) -> Result<Split, Failure> {
     let count = set.frames.len();
     match (params.split, &set.split) {
         (Some(SplitKind::Given) | None, Some(given)) => Ok(given.clone()),
-        (Some(SplitKind::Given), None) => Err(ParameterError::NoSplit.into()),
+        (Some(SplitKind::Given), None) => {
+            bail_usage!(
+                "parameter split: the data set has no split of its own; choose holdout or paper"
+            )
+        }
         (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count, HOLD_OUT_EVERY)),
         (Some(SplitKind::Paper), _) => {
             let mut split = Split::all(count);

@@ -14,7 +14,7 @@ use scene::{VIEWS_FILE, View, Views, mask_file};
 use stage::{Context, Progress};
 
 use crate::degrade::{self, LrImage, degrade};
-use crate::error::frame_label;
+use crate::frame_label;
 use crate::scene_plan::ScenePlan;
 
 /// Writer of a scene's subtrees. At most one image per thread is in memory.

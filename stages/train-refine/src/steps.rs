@@ -43,7 +43,7 @@ mod tests {
 
     #[test]
     fn numbers_that_are_not_finite_are_a_numerical_failure() {
-        let channels = RefinementError::Channels { channels: 3, expected: 4 };
+        let channels = RefinementError::Unusable("view r_0: too small".to_owned());
         for (error, code) in [(RefinementError::NotFinite { step: 7 }, 4), (channels, 1)] {
             let words = error.to_string();
             let failure = step_error(error);

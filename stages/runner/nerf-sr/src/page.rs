@@ -3,8 +3,9 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use anyhow::{anyhow, bail};
 use artifact::{Damage, MANIFEST_FILE, Manifest, list_files};
 use serde::{Deserialize, Serialize};
 
@@ -45,45 +46,20 @@ impl PageMark {
     }
 }
 
-/// Reason why a folder may not be replaced.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum OwnershipError {
-    /// The path is a file or a link.
-    #[error("{0} is not a folder written by nerf-sr")]
-    NotAFolder(PathBuf),
-    /// No sink wrote this file.
-    #[error("{0} was not written by nerf-sr")]
-    Foreign(PathBuf),
-    /// The content of this file differs from the manifest.
-    #[error("{0} was changed after nerf-sr wrote it")]
-    Changed(PathBuf),
-    /// The folder, or a file in it, can't be read.
-    #[error("cannot read {path}: {problem}")]
-    Unreadable {
-        /// Path of the folder or file.
-        path: PathBuf,
-        /// Reason why the path can't be read.
-        problem: io::Error,
-    },
-    /// The folder's files can't be listed.
-    #[error("{0}")]
-    Unlisted(io::Error),
-}
-
 /// Fails if a folder contains a file that no sink wrote, or that was changed since. An empty folder
 /// passes. `kind` is the kind of the sink's output.
-pub(crate) fn check_ownership(target: &Path, kind: &str) -> Result<(), OwnershipError> {
+pub(crate) fn check_ownership(target: &Path, kind: &str) -> anyhow::Result<()> {
     let is_link = target.symlink_metadata().is_ok_and(|meta| meta.file_type().is_symlink());
     if is_link || !target.is_dir() {
-        return Err(OwnershipError::NotAFolder(target.to_path_buf()));
+        bail!("{} is not a folder written by nerf-sr", target.display());
     }
-    let mut entries = fs::read_dir(target).map_err(|e| unreadable(target, e))?;
+    let mut entries = fs::read_dir(target).map_err(|e| unreadable(target, &e))?;
     if entries.next().is_none() {
         return Ok(());
     }
-    let files = list_files(target).map_err(OwnershipError::Unlisted)?;
+    let files = list_files(target)?;
     // The mark decides whether the page is archived, so it must be readable.
-    PageMark::read(target).map_err(|e| unreadable(&target.join(MARK_FILE), e))?;
+    PageMark::read(target).map_err(|e| unreadable(&target.join(MARK_FILE), &e))?;
     let manifest = Manifest::read(target).ok().filter(|manifest| manifest.kind == kind);
     let listed = manifest.as_ref().map_or(&[][..], |manifest| manifest.files.as_slice());
     let is_foreign = |file: &Path| {
@@ -93,20 +69,24 @@ pub(crate) fn check_ownership(target: &Path, kind: &str) -> Result<(), Ownership
     };
     let foreign = files.iter().map(|(file, _)| file.as_path()).find(|file| is_foreign(file));
     let Some(manifest) = manifest.as_ref().filter(|_| foreign.is_none()) else {
-        return Err(OwnershipError::Foreign(target.join(foreign.unwrap_or(Path::new("")))));
+        let foreign = target.join(foreign.unwrap_or(Path::new("")));
+        bail!("{} was not written by nerf-sr", foreign.display());
     };
     for entry in &manifest.files {
         let single = Manifest { files: vec![entry.clone()], ..manifest.clone() };
         match single.check_contents(target) {
             // A page that lost a file still belongs to nerf-sr.
             Ok(()) | Err(Damage::Missing { .. }) => {}
-            Err(Damage::Unreadable { path, source }) => return Err(unreadable(&path, source)),
-            Err(_) => return Err(OwnershipError::Changed(target.join(&entry.path))),
+            Err(Damage::Unreadable { path, source }) => return Err(unreadable(&path, &source)),
+            Err(_) => {
+                let file = target.join(&entry.path);
+                bail!("{} was changed after nerf-sr wrote it", file.display());
+            }
         }
     }
     Ok(())
 }
 
-fn unreadable(path: &Path, problem: io::Error) -> OwnershipError {
-    OwnershipError::Unreadable { path: path.to_path_buf(), problem }
+fn unreadable(path: &Path, problem: &io::Error) -> anyhow::Error {
+    anyhow!("cannot read {}: {problem}", path.display())
 }

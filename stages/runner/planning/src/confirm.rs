@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
-use crate::stage_call::{DescribeError, Interrupted, describe_all};
+use crate::stage_call::{Interrupted, ProgramError, describe_all};
 use store::Store;
 
 use crate::stages::{DescriptionCache, StageProgram, is_own};
@@ -26,7 +26,7 @@ pub enum ConfirmError {
     },
     /// The program no longer describes itself.
     #[error(transparent)]
-    Describe(#[from] DescribeError),
+    Describe(#[from] ProgramError),
     /// A signal came while the program was described.
     #[error("interrupted")]
     Interrupted,

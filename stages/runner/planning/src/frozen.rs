@@ -12,7 +12,8 @@ use slurm::Resources;
 use stage::Description;
 
 use crate::node::{Devices, Node, NodeInput, Origin, Plan, Sink};
-use crate::stages::{ProgramError, StageProgram};
+use crate::stage_call::ProgramError;
+use crate::stages::StageProgram;
 
 /// Serialisable plan.
 #[derive(Serialize, Deserialize)]
@@ -43,33 +44,6 @@ struct FrozenSink {
     shows: Vec<usize>,
     left_out: Vec<FailedPoint>,
     program: PathBuf,
-}
-
-/// Error returned when a frozen plan can't be used.
-#[derive(Debug, thiserror::Error)]
-pub enum FrozenError {
-    /// The file can't be read.
-    #[error("{path}: {source}")]
-    Read {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the system.
-        source: std::io::Error,
-    },
-    /// The file has the format of another version.
-    #[error("{path}: written by another version of nerf-sr ({source}); submit again")]
-    Format {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the parser.
-        source: serde_json::Error,
-    },
-    /// The plan has no such task.
-    #[error("the submission has no task {0}")]
-    Task(usize),
-    /// The description of a program is missing or invalid.
-    #[error(transparent)]
-    Program(#[from] ProgramError),
 }
 
 impl FrozenPlan {
@@ -105,23 +79,27 @@ impl FrozenPlan {
     }
 
     /// Reads the plan of a submission.
-    pub fn read(path: &Path) -> Result<Self, FrozenError> {
-        let bytes = std::fs::read(path)
-            .map_err(|source| FrozenError::Read { path: path.to_path_buf(), source })?;
-        serde_json::from_slice(&bytes)
-            .map_err(|source| FrozenError::Format { path: path.to_path_buf(), source })
+    pub fn read(path: &Path) -> Result<Self, ProgramError> {
+        let name = path.display();
+        let bytes =
+            std::fs::read(path).map_err(|problem| ProgramError(format!("{name}: {problem}")))?;
+        serde_json::from_slice(&bytes).map_err(|problem| {
+            let problem = format!("written by another version of nerf-sr ({problem})");
+            ProgramError(format!("{name}: {problem}; submit again"))
+        })
     }
 
     /// Returns the plan of one task: the node or sink of this number, with all nodes that it needs.
     /// Sinks are numbered after the nodes.
-    pub fn task_plan(&self, number: usize) -> Result<Plan, FrozenError> {
+    pub fn task_plan(&self, number: usize) -> Result<Plan, ProgramError> {
         let mut needed = BTreeSet::new();
         let mut sink = None;
         if number < self.nodes.len() {
             needed.insert(number);
         } else {
-            let found =
-                self.sinks.get(number - self.nodes.len()).ok_or(FrozenError::Task(number))?;
+            let found = self.sinks.get(number - self.nodes.len());
+            let found = found
+                .ok_or_else(|| ProgramError(format!("the submission has no task {number}")))?;
             needed.extend(&found.shows);
             sink = Some(found.clone());
         }
@@ -167,12 +145,12 @@ impl FrozenPlan {
         &self,
         path: &Path,
         known: &mut BTreeMap<PathBuf, Arc<StageProgram>>,
-    ) -> Result<Arc<StageProgram>, FrozenError> {
+    ) -> Result<Arc<StageProgram>, ProgramError> {
         if let Some(program) = known.get(path) {
             return Ok(Arc::clone(program));
         }
         let Some(description) = self.programs.get(path) else {
-            return Err(ProgramError::Undescribed(path.to_path_buf()).into());
+            return Err(ProgramError::undescribed(path));
         };
         let program = Arc::new(StageProgram::new(path, description.clone())?);
         known.insert(path.to_path_buf(), Arc::clone(&program));

@@ -30,7 +30,7 @@ impl Plan {
             let missing = description.missing_files(&node.parameters, &inputs, &folders);
             if let Some((input, problem)) = missing {
                 let folder = folders[input].clone();
-                return Err(failure(input, SourceError::Incomplete { folder, problem }));
+                return Err(failure(input, SourceError::Folder { folder, problem }));
             }
         }
         Ok(())

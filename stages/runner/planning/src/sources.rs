@@ -27,43 +27,13 @@ const NOTICE_AFTER: Duration = Duration::from_secs(2);
 /// Error returned when a folder outside the store can't be hashed.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// The folder doesn't exist.
-    #[error("{0:?}: no such folder; name an existing one")]
-    Missing(PathBuf),
-    /// The folder can't be accessed.
-    #[error("{folder:?}: {problem}; name another folder")]
-    NotAccessible {
-        /// Path of the folder.
-        folder: PathBuf,
-        /// Error of the system.
-        problem: io::Error,
-    },
-    /// The path is that of a file.
-    #[error("{0:?}: not a folder")]
-    NotFolder(PathBuf),
-    /// The folder lacks files that the stage will need.
+    /// The folder doesn't exist, can't be read, or changed while it was hashed.
     #[error("{folder:?}: {problem}")]
-    Incomplete {
+    Folder {
         /// Path of the folder.
         folder: PathBuf,
-        /// Problem and remedy, as the stage's rule states them.
+        /// Problem and remedy.
         problem: String,
-    },
-    /// A file in the folder can't be read.
-    #[error("{folder:?}: {problem}")]
-    Unreadable {
-        /// Path of the folder.
-        folder: PathBuf,
-        /// Error of the system.
-        problem: io::Error,
-    },
-    /// A file changed while the folder was hashed.
-    #[error("{folder:?}: {change} during hashing; run again when no program writes to the folder")]
-    Changed {
-        /// Path of the folder.
-        folder: PathBuf,
-        /// File and kind of change, as text.
-        change: String,
     },
     /// A signal came during hashing.
     #[error("interrupted")]
@@ -151,11 +121,14 @@ impl Source {
 
 /// Returns the absolute path of a folder. Fails if the folder doesn't exist or can't be accessed.
 pub(crate) fn check_folder(folder: &Path) -> Result<PathBuf, SourceError> {
-    let absolute = folder.canonicalize().map_err(|problem| match problem.kind() {
-        io::ErrorKind::NotFound => SourceError::Missing(folder.to_path_buf()),
-        _ => SourceError::NotAccessible { folder: folder.to_path_buf(), problem },
+    let error = |problem: String| SourceError::Folder { folder: folder.to_path_buf(), problem };
+    let absolute = folder.canonicalize().map_err(|problem| {
+        error(match problem.kind() {
+            io::ErrorKind::NotFound => "no such folder; name an existing one".to_owned(),
+            _ => format!("{problem}; name another folder"),
+        })
     })?;
-    if absolute.is_dir() { Ok(absolute) } else { Err(SourceError::NotFolder(folder.to_path_buf())) }
+    if absolute.is_dir() { Ok(absolute) } else { Err(error("not a folder".to_owned())) }
 }
 
 /// Returns the first difference between two maps of files, as text.
@@ -204,11 +177,13 @@ enum ReadError {
 
 impl ReadError {
     fn in_folder(self, folder: &Path) -> SourceError {
-        let folder = folder.to_path_buf();
-        match self {
-            Self::Unreadable(problem) => SourceError::Unreadable { folder, problem },
-            Self::Changed(change) => SourceError::Changed { folder, change },
-        }
+        let problem = match self {
+            Self::Unreadable(problem) => problem.to_string(),
+            Self::Changed(change) => {
+                format!("{change} during hashing; run again when no program writes to the folder")
+            }
+        };
+        SourceError::Folder { folder: folder.to_path_buf(), problem }
     }
 }
 

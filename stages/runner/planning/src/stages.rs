@@ -9,11 +9,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use crate::stage_call::{DescribeError, Interrupted, describe_all};
+use crate::stage_call::{Interrupted, ProgramError, describe_all};
 use artifact::{hash_file, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use stage::{Description, DescriptionError, Schema, SchemaError};
+use stage::{Description, Schema};
 use store::Store;
 
 use crate::file::{Part, PipelineError, StageBlock};
@@ -34,57 +34,14 @@ pub struct StageProgram {
     pub(crate) stamp: Option<Stamp>,
 }
 
-/// Error returned when a stage's program can't be used.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum ProgramError {
-    /// The program's file can't be used.
-    #[error("{path}: {problem}")]
-    File {
-        /// Path of the file.
-        path: PathBuf,
-        /// Problem and remedy.
-        problem: String,
-    },
-    /// The program isn't built.
-    #[error("{path} isn't built; {remedy}")]
-    Unbuilt {
-        /// Path of the missing file.
-        path: PathBuf,
-        /// Command that builds the program, or an alternative.
-        remedy: String,
-    },
-    /// The program is a user's file, which only `run` may start.
-    #[error("{0} isn't part of nerf-sr; read it first, then start it with `nerf-sr run`")]
-    Foreign(PathBuf),
-    /// The program can't be described.
-    #[error(transparent)]
-    Describe(#[from] DescribeError),
-    /// The program's file changed while the program was described.
-    #[error("{0} changed while it was described; run again")]
-    Changed(PathBuf),
-    /// The given descriptions lack the program.
-    #[error("no description of {0}")]
-    Undescribed(PathBuf),
-    /// The description is invalid.
-    #[error("description of {path} is invalid: {problem}")]
-    Description {
-        /// Path of the program.
-        path: PathBuf,
-        /// Problem of the description.
-        problem: DescriptionError,
-    },
-    /// The schema of the parameters can't be compiled.
-    #[error(transparent)]
-    Schema(#[from] SchemaError),
-}
-
 impl StageProgram {
     /// Creates a program from its description. Fails if the description is invalid.
     pub fn new(path: &Path, description: Description) -> Result<Self, ProgramError> {
-        description
-            .check()
-            .map_err(|problem| ProgramError::Description { path: path.to_path_buf(), problem })?;
-        let schema = Schema::new(&description.parameters)?;
+        description.check().map_err(|problem| {
+            ProgramError(format!("description of {} is invalid: {problem}", path.display()))
+        })?;
+        let schema =
+            Schema::new(&description.parameters).map_err(|e| ProgramError(e.to_string()))?;
         Ok(Self { path: path.to_path_buf(), description, schema, stamp: None })
     }
 
@@ -139,7 +96,7 @@ impl Programs {
             let path = Path::new(program_name(pipeline, stage));
             match descriptions.get(program_name(pipeline, stage)) {
                 Some(description) => StageProgram::new(path, description.clone()),
-                None => Err(ProgramError::Undescribed(path.to_path_buf())),
+                None => Err(ProgramError::undescribed(path)),
             }
         })
     }
@@ -168,7 +125,10 @@ impl Programs {
                         unknown.insert(path.clone(), identity);
                         continue;
                     }
-                    None => Err(ProgramError::Foreign(path.clone())),
+                    None => Err(ProgramError(format!(
+                        "{} isn't part of nerf-sr; read it first, then start it with `nerf-sr run`",
+                        path.display()
+                    ))),
                 },
             };
             answers.insert(path.clone(), answer);
@@ -211,13 +171,14 @@ impl Programs {
 fn check_answer(
     path: &Path,
     identity: Identity,
-    description: Result<Description, DescribeError>,
+    description: Result<Description, ProgramError>,
 ) -> Result<Answer, ProgramError> {
     let description = description?;
     if Stamp::of(path).is_ok_and(|now| now.is_untouched_since(&identity.stamp)) {
         Ok(Answer { identity, description })
     } else {
-        Err(ProgramError::Changed(path.to_path_buf()))
+        let path = path.display();
+        Err(ProgramError(format!("{path} changed while it was described; run again")))
     }
 }
 
@@ -329,25 +290,28 @@ fn runner_folder() -> PathBuf {
 fn identify(path: &Path, name: &str) -> Result<Identity, ProgramError> {
     let stamp =
         if path.is_dir() { Err(std::io::ErrorKind::IsADirectory.into()) } else { Stamp::of(path) };
+    let is_unstamped = stamp.is_err();
     let error = match stamp {
         Ok(stamp) if is_own(path) => return Ok(Identity { stamp, blake3: None }),
         Ok(stamp) => match hash_file(path) {
             Ok(hash) => return Ok(Identity { stamp, blake3: Some(hash) }),
-            Err(error) => error.to_string(),
+            Err(error) => error,
         },
-        Err(error) if name.contains('/') => {
-            format!("{error}; set `run:` to the stage's executable")
-        }
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-            let suggestion = nearest_program(name)
-                .map(|other| format!("did you mean {other}? "))
-                .unwrap_or_default();
-            let remedy = format!("{suggestion}run `make build`, or set `run:` to another program");
-            return Err(ProgramError::Unbuilt { path: path.to_path_buf(), remedy });
-        }
-        Err(error) => error.to_string(),
+        Err(error) => error,
     };
-    Err(ProgramError::File { path: path.to_path_buf(), problem: error })
+    let path = path.display();
+    Err(ProgramError(if is_unstamped && name.contains('/') {
+        format!("{path}: {error}; set `run:` to the stage's executable")
+    } else if is_unstamped && error.kind() == std::io::ErrorKind::NotFound {
+        let suggestion = nearest_program(name)
+            .map(|other| format!("did you mean {other}? "))
+            .unwrap_or_default();
+        format!(
+            "{path} isn't built; {suggestion}run `make build`, or set `run:` to another program"
+        )
+    } else {
+        format!("{path}: {error}")
+    }))
 }
 
 /// Returns the program in the runner's folder whose name is most similar to an unknown name.

@@ -1,21 +1,15 @@
 //! Human-readable amounts of memory and time: `8G`, `1h30m`.
 
 use std::fmt::{self, Display, Formatter};
-use std::marker::PhantomData;
 use std::str::FromStr;
 
-use serde::de::{Deserializer, Error, Visitor};
+use serde::Deserialize;
+use serde::de::{Deserializer, Error};
 
 /// Error returned when a text is not an amount.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum AmountError {
-    /// The text is not an amount of memory.
-    #[error("invalid amount of memory {0:?}; write a number with M, G or T, such as 8G")]
-    Memory(String),
-    /// The text is not a duration.
-    #[error("invalid duration {0:?}; write numbers with d, h, m or s, such as 2h or 1h30m")]
-    Period(String),
-}
+#[error("{0}")]
+pub struct AmountError(String);
 
 /// An amount of memory in whole MiB: `512M`, `8G`, `1T`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -78,7 +72,9 @@ impl FromStr for Memory {
     type Err = AmountError;
 
     fn from_str(text: &str) -> Result<Self, AmountError> {
-        Self::parse(text).ok_or_else(|| AmountError::Memory(text.to_owned()))
+        let remedy = "write a number with M, G or T, such as 8G";
+        Self::parse(text)
+            .ok_or_else(|| AmountError(format!("invalid amount of memory {text:?}; {remedy}")))
     }
 }
 
@@ -86,7 +82,8 @@ impl FromStr for Period {
     type Err = AmountError;
 
     fn from_str(text: &str) -> Result<Self, AmountError> {
-        Self::parse(text).ok_or_else(|| AmountError::Period(text.to_owned()))
+        let remedy = "write numbers with d, h, m or s, such as 2h or 1h30m";
+        Self::parse(text).ok_or_else(|| AmountError(format!("invalid duration {text:?}; {remedy}")))
     }
 }
 
@@ -117,31 +114,9 @@ impl Display for Period {
 fn deserialize_amount<'de, D: Deserializer<'de>, T: FromStr<Err = AmountError>>(
     deserializer: D,
 ) -> Result<T, D::Error> {
-    struct AmountVisitor<T>(PhantomData<T>);
-    impl<T: FromStr<Err = AmountError>> Visitor<'_> for AmountVisitor<T> {
-        type Value = T;
-
-        fn expecting(&self, f: &mut Formatter<'_>) -> fmt::Result {
-            f.write_str("a number with its unit")
-        }
-
-        fn visit_str<E: Error>(self, text: &str) -> Result<T, E> {
-            text.parse().map_err(E::custom)
-        }
-
-        fn visit_u64<E: Error>(self, number: u64) -> Result<T, E> {
-            self.visit_str(&number.to_string())
-        }
-
-        fn visit_i64<E: Error>(self, number: i64) -> Result<T, E> {
-            self.visit_str(&number.to_string())
-        }
-
-        fn visit_f64<E: Error>(self, number: f64) -> Result<T, E> {
-            self.visit_str(&number.to_string())
-        }
-    }
-    deserializer.deserialize_any(AmountVisitor(PhantomData))
+    let value = serde_json::Value::deserialize(deserializer)?;
+    let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+    text.parse().map_err(D::Error::custom)
 }
 
 macro_rules! serde_as_text {

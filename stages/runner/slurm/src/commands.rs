@@ -35,10 +35,7 @@ impl Slurm {
         let last = stdout.trim().lines().last().unwrap_or_default();
         let id = last.split(';').next().unwrap_or_default();
         if id.is_empty() || !id.bytes().all(|b| b.is_ascii_digit()) {
-            return Err(SlurmError::Refused {
-                program: "sbatch",
-                reason: format!("expected a job ID, found {last:?}"),
-            });
+            return Err(SlurmError(format!("sbatch: expected a job ID, found {last:?}")));
         }
         Ok(id.to_owned())
     }
@@ -59,11 +56,7 @@ impl Slurm {
     }
 
     /// Calls a program and returns its stdout.
-    fn call(
-        &self,
-        program: &'static str,
-        arguments: &[impl AsRef<OsStr>],
-    ) -> Result<String, SlurmError> {
+    fn call(&self, program: &str, arguments: &[impl AsRef<OsStr>]) -> Result<String, SlurmError> {
         let path = match &self.folder {
             Some(folder) => folder.join(program),
             None => PathBuf::from(program),
@@ -75,10 +68,10 @@ impl Slurm {
                 command.env_remove(name);
             }
         }
-        let output = command
-            .args(arguments)
-            .output()
-            .map_err(|source| SlurmError::Absent { program, source })?;
+        let output = command.args(arguments).output().map_err(|problem| {
+            let remedy = "run this where Slurm's programs are on PATH";
+            SlurmError(format!("{program}: {problem}; {remedy}"))
+        })?;
         if output.status.success() {
             return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
         }
@@ -89,6 +82,6 @@ impl Slurm {
         if reason.is_empty() {
             reason = format!("failed ({})", output.status);
         }
-        Err(SlurmError::Refused { program, reason })
+        Err(SlurmError(format!("{program}: {reason}")))
     }
 }

@@ -35,7 +35,7 @@ mod site;
 mod submission;
 mod submit;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 pub use amounts::{AmountError, Memory, Period};
 pub use commands::{Slurm, current_job_id};
@@ -47,35 +47,11 @@ pub use submit::{SubmitOptions, Submitted};
 
 /// Error of a call of Slurm, or of a file of a submission or site.
 #[derive(Debug, thiserror::Error)]
-pub enum SlurmError {
-    /// A program of Slurm can't be started.
-    #[error("{program}: {source}; run this where Slurm's programs are on PATH")]
-    Absent {
-        /// Name of the program.
-        program: &'static str,
-        /// Reason why the program can't be started.
-        source: std::io::Error,
-    },
-    /// A program of Slurm failed.
-    #[error("{program}: {reason}")]
-    Refused {
-        /// Name of the program.
-        program: &'static str,
-        /// The program's stderr on one line.
-        reason: String,
-    },
-    /// A file can't be used.
-    #[error("{path}: {problem}")]
-    File {
-        /// Path of the file.
-        path: PathBuf,
-        /// Reason why the file can't be used.
-        problem: String,
-    },
-}
+#[error("{0}")]
+pub struct SlurmError(String);
 
 impl SlurmError {
     pub(crate) fn file(path: &Path, problem: impl std::fmt::Display) -> Self {
-        Self::File { path: path.to_path_buf(), problem: problem.to_string() }
+        Self(format!("{}: {problem}", path.display()))
     }
 }

@@ -186,8 +186,7 @@ impl FieldTrainer for torch_field::GridTrainer {
 #[cfg(feature = "torch")]
 fn torch_failure(error: torch_field::TorchFieldError) -> anyhow::Error {
     match error {
-        torch_field::TorchFieldError::NotFinite { .. }
-        | torch_field::TorchFieldError::Collapsed { .. } => {
+        torch_field::TorchFieldError::Diverged { .. } => {
             Failure::Numerical(error.to_string()).into()
         }
         _ => error.into(),

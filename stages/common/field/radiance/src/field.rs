@@ -139,7 +139,8 @@ impl Field {
         read_tensors(path, |tensors| {
             architecture.check()?;
             if !bounds.is_valid() {
-                return Err(FieldProblem::NoInside(Box::new(bounds)));
+                let problem = format!("bounds {bounds:?} are empty or not finite");
+                return Err(FieldProblem::Unusable(problem));
             }
             Self::from_tensors(tensors, architecture, bounds)
         })
@@ -156,7 +157,7 @@ impl Field {
         let occupancy = read_u8(tensors, "occupancy", CELLS)?;
         field.occupancy.set(|cell| Cell::from_byte(occupancy[cell]));
         if !field.is_finite() {
-            return Err(FieldProblem::NotFinite);
+            return Err(FieldProblem::Unusable("a parameter is not finite".to_owned()));
         }
         Ok(field)
     }

@@ -2,7 +2,6 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView, View};
-use scene::Bounds;
 
 use crate::architecture::OutOfRange;
 
@@ -27,43 +26,18 @@ pub enum FieldError {
     },
 }
 
-/// Reason why a file is neither a field nor a checkpoint.
+/// Reason why a field's file can't be used.
 #[derive(Debug, thiserror::Error)]
 pub enum FieldProblem {
-    /// The file isn't in safetensors format.
+    /// The file doesn't contain tensors.
     #[error(transparent)]
     NotTensors(#[from] SafeTensorError),
-    /// A tensor is missing.
-    #[error("tensor {name}: {problem}")]
-    Missing {
-        /// Name of the tensor.
-        name: String,
-        /// Error of the safetensors library.
-        problem: SafeTensorError,
-    },
-    /// A tensor has an unexpected type or length.
-    #[error("tensor {name}: expected {count} {expected}, found {found:?} {shape:?}")]
-    Unexpected {
-        /// Name of the tensor.
-        name: String,
-        /// Type found.
-        found: Dtype,
-        /// Shape found.
-        shape: Vec<usize>,
-        /// Number of elements expected.
-        count: usize,
-        /// Type expected.
-        expected: &'static str,
-    },
-    /// A number of the architecture is out of range.
+    /// A size is out of range.
     #[error(transparent)]
     Architecture(#[from] OutOfRange),
-    /// The bounds are empty or not finite.
-    #[error("bounds {0:?} are empty or not finite")]
-    NoInside(Box<Bounds>),
-    /// A parameter isn't finite.
-    #[error("a parameter is not finite")]
-    NotFinite,
+    /// The bounds or a tensor can't be used.
+    #[error("{0}")]
+    Unusable(String),
 }
 
 /// Vector to write. Its bytes are created only when it is written, so that memory never holds
@@ -166,20 +140,19 @@ pub(crate) fn read_u8(
 }
 
 fn find_tensor<'a>(tensors: &SafeTensors<'a>, name: &str) -> Result<TensorView<'a>, FieldProblem> {
-    tensors.tensor(name).map_err(|problem| FieldProblem::Missing { name: name.to_owned(), problem })
+    tensors
+        .tensor(name)
+        .map_err(|problem| FieldProblem::Unusable(format!("tensor {name}: {problem}")))
 }
 
 fn unexpected_tensor(
     tensor: &TensorView<'_>,
     name: &str,
     count: usize,
-    expected: &'static str,
+    expected: &str,
 ) -> FieldProblem {
-    FieldProblem::Unexpected {
-        name: name.to_owned(),
-        found: tensor.dtype(),
-        shape: tensor.shape().to_vec(),
-        count,
-        expected,
-    }
+    let (found, shape) = (tensor.dtype(), tensor.shape());
+    FieldProblem::Unusable(format!(
+        "tensor {name}: expected {count} {expected}, found {found:?} {shape:?}"
+    ))
 }

@@ -17,23 +17,22 @@ pub enum TorchFieldError {
         /// Reason, as a sentence fragment.
         reason: String,
     },
-    /// The gradient wasn't finite in two of 100 steps.
-    #[error(
-        "step {step}: the gradient is not finite, for the second time within 100 steps; lower the \
-        learning rate"
-    )]
-    NotFinite {
+    /// The gradient wasn't finite in two of 100 steps, or a network's output no longer depends on
+    /// the ray.
+    #[error("step {step}: {problem}")]
+    Diverged {
         /// Index of the step.
         step: u64,
+        /// Problem and remedy.
+        problem: String,
     },
-    /// A network's output no longer depends on the ray, so it gets no useful gradient.
-    #[error("step {step}: the {network} network has collapsed: {reason}; try another seed")]
-    Collapsed {
-        /// Index of the step.
-        step: u64,
-        /// Name of the network: `coarse` or `fine`.
-        network: &'static str,
-        /// Kind of collapse.
-        reason: &'static str,
-    },
+}
+
+impl TorchFieldError {
+    /// Returns the error of a second step within 100 whose gradient isn't finite.
+    pub(crate) fn not_finite(step: u64) -> Self {
+        let problem = "the gradient is not finite, for the second time within 100 steps; lower the \
+            learning rate";
+        Self::Diverged { step, problem: problem.to_owned() }
+    }
 }

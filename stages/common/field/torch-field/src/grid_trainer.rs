@@ -122,7 +122,7 @@ impl GridTrainer {
         let skipped = !loss.is_finite() || !nets::all_finite(&sum)?;
         if skipped {
             if !self.state.record_nonfinite_step() {
-                return Err(TorchFieldError::NotFinite { step: self.state.steps });
+                return Err(TorchFieldError::not_finite(self.state.steps));
             }
         } else {
             no_grad(|| self.apply_gradients(&sum))?;

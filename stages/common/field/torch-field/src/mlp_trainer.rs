@@ -168,7 +168,7 @@ impl MlpTrainer {
         let skipped = !loss.is_finite() || !nets::all_finite(&sum.gradients)?;
         if skipped {
             if !self.state.record_nonfinite_step() {
-                return Err(TorchFieldError::NotFinite { step: self.state.steps });
+                return Err(TorchFieldError::not_finite(self.state.steps));
             }
         } else {
             self.apply_gradients(&sum.gradients, done)?;
@@ -195,7 +195,9 @@ impl MlpTrainer {
         };
         self.stuck_steps += 1;
         if self.stuck_steps >= MAX_STUCK_STEPS {
-            return Err(TorchFieldError::Collapsed { step: self.state.steps, network, reason });
+            let problem =
+                format!("the {network} network has collapsed: {reason}; try another seed");
+            return Err(TorchFieldError::Diverged { step: self.state.steps, problem });
         }
         Ok(())
     }

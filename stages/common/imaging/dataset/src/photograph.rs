@@ -88,8 +88,7 @@ pub(crate) fn read_header(path: &Path) -> Result<ImageHeader, PixelError> {
         return Err(PixelError::format(path, format!("{width}×{height} pixels")));
     }
     if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 {
-        let (width, height) = (width as usize, height as usize);
-        return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
+        return Err(PixelError::too_large(path, width as usize, height as usize));
     }
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     Ok(ImageHeader { size: (width, height), orientation })

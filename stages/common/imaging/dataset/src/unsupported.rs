@@ -77,11 +77,12 @@ pub(crate) fn unsupported_error(path: &Path) -> Option<PixelError> {
     let is_read = File::open(path).and_then(|mut file| file.read_exact(&mut bytes)).is_ok();
     let format = UnsupportedFormat::from_signature(&bytes).filter(|_| is_read);
     let format = format.or_else(|| UnsupportedFormat::from_name(path))?;
-    Some(PixelError::Unsupported {
-        path: path.to_path_buf(),
-        format: format.name,
-        command: format.command(path),
-    })
+    Some(PixelError::Unsupported(format!(
+        "{} is a {} image, which is not supported; convert: {}",
+        path.display(),
+        format.name,
+        format.command(path)
+    )))
 }
 
 /// Returns the format of the first unsupported image among files, the number of images in that

@@ -19,33 +19,11 @@ pub enum PixelError {
         /// Reason, as a sentence fragment.
         reason: String,
     },
-    /// The image format is not supported.
-    #[error("{path} is a {format} image, which is not supported; convert: {command}")]
-    Unsupported {
-        /// Path of the image.
-        path: PathBuf,
-        /// Name of the format.
-        format: &'static str,
-        /// Shell command that converts the file.
-        command: String,
-    },
-    /// The image has more than [`MAX_PIXELS`] pixels.
-    #[error(
-        "{path}: {width}×{height} pixels exceed the limit of {MAX_PIXELS} (such as 16384×16384); \
-        make the image smaller"
-    )]
-    TooLarge {
-        /// Path of the image.
-        path: PathBuf,
-        /// Width in pixels.
-        width: usize,
-        /// Height in pixels.
-        height: usize,
-    },
-    /// A sample to write is NaN or infinite.
-    #[error(
-        "{path}: channel {channel} is {value} at column {x}, row {y}; the file was not written"
-    )]
+    /// The image format is not supported, or the image has more than [`MAX_PIXELS`] pixels.
+    #[error("{0}")]
+    Unsupported(String),
+    /// A sample is NaN or infinite.
+    #[error("{path}: channel {channel} is {value} at column {x}, row {y}; {remedy}")]
     NotFinite {
         /// Path of the image.
         path: PathBuf,
@@ -57,23 +35,8 @@ pub enum PixelError {
         y: usize,
         /// Value of the sample.
         value: f32,
-    },
-    /// A sample of a file is NaN or infinite.
-    #[error(
-        "{path}: channel {channel} is {value} at column {x}, row {y}; export the image again with \
-        finite samples"
-    )]
-    NotFiniteInput {
-        /// Path of the image.
-        path: PathBuf,
-        /// Name of the channel.
-        channel: String,
-        /// Column of the pixel.
-        x: usize,
-        /// Row of the pixel.
-        y: usize,
-        /// Value of the sample.
-        value: f32,
+        /// Consequence or remedy.
+        remedy: &'static str,
     },
 }
 
@@ -81,6 +44,15 @@ impl PixelError {
     /// Returns a conversion of an error of the operating system.
     pub fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { path: path.to_path_buf(), source }
+    }
+
+    /// Creates the error of an image with more than [`MAX_PIXELS`] pixels.
+    pub fn too_large(path: &Path, width: usize, height: usize) -> Self {
+        Self::Unsupported(format!(
+            "{}: {width}×{height} pixels exceed the limit of {MAX_PIXELS} (such as 16384×16384); \
+            make the image smaller",
+            path.display()
+        ))
     }
 
     /// Creates the error of a file in another or a damaged format.

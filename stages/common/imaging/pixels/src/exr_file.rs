@@ -59,12 +59,13 @@ impl ExrImage {
         for name in names {
             let samples = self.channel(name).unwrap_or_default();
             if let Some(index) = samples.iter().position(|sample| !sample.is_finite()) {
-                return Err(PixelError::NotFiniteInput {
+                return Err(PixelError::NotFinite {
                     path: path.to_path_buf(),
                     channel: (*name).to_owned(),
                     x: index % self.width,
                     y: index / self.width,
                     value: samples[index],
+                    remedy: "export the image again with finite samples",
                 });
             }
         }
@@ -193,6 +194,7 @@ fn check_finite(
         x: pixel % width,
         y: first + pixel / width,
         value: samples[index],
+        remedy: "the file was not written",
     })
 }
 
@@ -250,7 +252,7 @@ fn read_header(path: &Path) -> Result<MetaData, PixelError> {
     let meta = MetaData::read_from_buffered(file, false).map_err(|e| exr_error(path, e))?;
     if let Some(header) = meta.headers.iter().find(|h| h.layer_size.area() > MAX_PIXELS) {
         let (width, height) = (header.layer_size.width(), header.layer_size.height());
-        return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
+        return Err(PixelError::too_large(path, width, height));
     }
     // Decoding would first allocate memory for the whole table, and for all pixels.
     let chunks: u64 = meta.headers.iter().map(|header| header.chunk_count as u64).sum();

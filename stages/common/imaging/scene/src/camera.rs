@@ -175,12 +175,11 @@ impl Camera {
     /// or reflection, or a centre beyond [`MAX_CENTRE_DISTANCE`].
     pub fn check(&self) -> Result<(), CameraError> {
         self.check_intrinsics()?;
-        for (row, values) in self.camera_to_world.iter().enumerate() {
-            for (column, value) in values.iter().enumerate().filter(|(_, v)| !v.is_finite()) {
-                let value = if value.is_nan() { "NaN" } else { "infinite" };
-                let problem = format!("camera_to_world[{row}][{column}] is {value}");
-                return Err(CameraError::Pose(format!("{problem}; poses must be finite")));
-            }
+        let pose = self.camera_to_world.as_flattened();
+        if let Some(index) = pose.iter().position(|value| !value.is_finite()) {
+            let value = if pose[index].is_nan() { "NaN" } else { "infinite" };
+            let problem = format!("camera_to_world[{}][{}] is {value}", index / 4, index % 4);
+            return Err(CameraError::Pose(format!("{problem}; poses must be finite")));
         }
         if !self.intrinsics.has_rays() {
             return Err(CameraError::distortion(self.intrinsics.distortion));

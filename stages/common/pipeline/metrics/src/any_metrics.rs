@@ -1,4 +1,5 @@
-use std::path::{Path, PathBuf};
+use std::io;
+use std::path::Path;
 
 use serde_json::Value;
 
@@ -11,40 +12,13 @@ pub const METRICS_FILE: &str = "metrics.json";
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct AnyMetrics(Value);
 
-/// Error returned if a `metrics.json` can't be read.
-#[derive(Debug, thiserror::Error)]
-pub enum MetricsError {
-    /// The file can't be read.
-    #[error("{}: {source}", file.display())]
-    Io {
-        /// Path of the file.
-        file: PathBuf,
-        /// Error of the read.
-        source: std::io::Error,
-    },
-    /// The file is not JSON.
-    #[error("{}: {source}", file.display())]
-    Json {
-        /// Path of the file.
-        file: PathBuf,
-        /// Error of the parser.
-        source: serde_json::Error,
-    },
-}
-
 impl AnyMetrics {
-    /// Reads the file of an artifact; accepts JSON of any form.
-    ///
-    /// # Errors
-    /// [`MetricsError`] with the path of the file.
-    pub fn read(folder: &Path) -> Result<Self, MetricsError> {
+    /// Reads the file of an artifact; accepts JSON of any form. Errors name the file.
+    pub fn read(folder: &Path) -> io::Result<Self> {
         let file = folder.join(METRICS_FILE);
-        match std::fs::read(&file) {
-            Ok(bytes) => serde_json::from_slice(&bytes)
-                .map(Self)
-                .map_err(|source| MetricsError::Json { file, source }),
-            Err(source) => Err(MetricsError::Io { file, source }),
-        }
+        let named = |e: io::Error| io::Error::new(e.kind(), format!("{}: {e}", file.display()));
+        let bytes = std::fs::read(&file).map_err(named)?;
+        serde_json::from_slice(&bytes).map(Self).map_err(|e| named(e.into()))
     }
 
     /// Returns the numbers to display; `None` if the list is missing or contains anything but a

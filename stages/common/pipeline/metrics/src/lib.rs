@@ -37,7 +37,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use any_metrics::{AnyMetrics, METRICS_FILE, MetricsError};
+pub use any_metrics::{AnyMetrics, METRICS_FILE};
 pub use score_format::ScoreFormat;
 
 /// `metrics.json`.

@@ -68,9 +68,8 @@ pub use arguments::{DeviceError, check_device};
 pub use checkpoint_schedule::CheckpointSchedule;
 pub use context::{Context, SUMMARY_FILE};
 pub use contract::{
-    Description, DescriptionError, GivenInputs, Input, KeywordError, Output, PARAMETER_GROUPS,
-    ParameterDoc, ParameterProblem, ParameterSection, Rule, RuleError, Schema, SchemaError,
-    group_parameters, plain,
+    ContractError, Description, GivenInputs, Input, Output, PARAMETER_GROUPS, ParameterDoc,
+    ParameterProblem, ParameterSection, Rule, Schema, group_parameters, plain,
 };
 pub use hooks::{SLOW_VARIABLE, STOP_VARIABLE};
 pub use memory::{

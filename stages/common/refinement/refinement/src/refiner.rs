@@ -125,7 +125,8 @@ impl Refiner {
         let RefinerArchitecture { channels, blocks, .. } = architecture;
         // Checked before anything of this size is allocated.
         if !(1..=MAX_CHANNELS).contains(&channels) || blocks > MAX_BLOCKS {
-            return Err(RefinementError::Architecture { channels, blocks });
+            let problem = format!("unsupported network: {channels} channels, {blocks} blocks");
+            return Err(RefinementError::Unusable(problem));
         }
         Self::from_weights(&nets::Weights::read(path)?, architecture)
     }
@@ -181,7 +182,9 @@ impl Refiner {
         let architecture = self.architecture;
         let inputs = architecture.input_channels();
         if view.channels != inputs {
-            return Err(RefinementError::Channels { channels: view.channels, expected: inputs });
+            let found = view.channels;
+            let problem = format!("expected a view of {inputs} channels, found {found}");
+            return Err(RefinementError::Unusable(problem));
         }
         let count = (orientations as usize).clamp(1, Orientation::ALL.len());
         let orientations = &Orientation::ALL[..count];
@@ -451,10 +454,10 @@ mod tests {
                     .contains("unsupported network")
             );
         }
-        assert!(matches!(
-            again.refine(&image(8, 8)),
-            Err(RefinementError::Channels { channels: 4, expected: REFERENCE_INPUTS })
-        ));
+        assert_eq!(
+            again.refine(&image(8, 8)).unwrap_err().to_string(),
+            format!("expected a view of {REFERENCE_INPUTS} channels, found 4")
+        );
         let bytes = std::fs::read(&path).unwrap();
         for end in [0, 7, 100, bytes.len() - 1] {
             std::fs::write(&path, &bytes[..end]).unwrap();

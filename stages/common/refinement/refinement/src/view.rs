@@ -28,8 +28,8 @@ impl Rendered {
     /// Converts a view's image, composited on a grey background.
     pub fn new(camera: Camera, image: &ExrImage, background: f32) -> Result<Self, RefinementError> {
         let (Some(premultiplied), Some(map)) = (image.premultiplied(), DepthMap::of(image)) else {
-            let reason = "channels R, G, B, A and Z are expected".to_owned();
-            return Err(RefinementError::View { name: camera.name, reason });
+            let reason = "channels R, G, B, A and Z are expected";
+            return Err(RefinementError::view(&camera.name, reason));
         };
         let k = &camera.intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
@@ -37,7 +37,7 @@ impl Rendered {
                 "{}×{} pixels, but its camera has {}×{}",
                 image.width, image.height, k.width, k.height
             );
-            return Err(RefinementError::View { name: camera.name, reason });
+            return Err(RefinementError::view(&camera.name, reason));
         }
         let mut view = premultiplied.clone();
         let composited = premultiplied.over(background);
@@ -124,7 +124,7 @@ impl KnownView {
                 "{}×{} pixels, but its image has {}×{}; render it for the image's camera",
                 view.width, view.height, truth.width, truth.height
             );
-            return Err(RefinementError::View { name: rendered.camera.name, reason });
+            return Err(RefinementError::view(&rendered.camera.name, reason));
         }
         if let Some(mask) = mask {
             mask.fill(&mut truth, view);

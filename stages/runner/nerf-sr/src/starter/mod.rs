@@ -10,10 +10,11 @@
 mod unposed;
 
 use std::fs;
-use std::io::{self, Write as _};
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use artifact::format_count;
+use anyhow::Context as _;
+use artifact::{Failure, bail_bad_input, bail_usage, format_count};
 use dataset::{Dataset, DatasetError, Frame};
 
 use unposed::UnposedImages;
@@ -39,69 +40,13 @@ pub(crate) struct Starter {
     file: PathBuf,
 }
 
-/// Error returned when the pipeline can't be composed or written.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum StarterError {
-    /// The folder doesn't exist.
-    #[error("{}: no such folder", .0.display())]
-    Missing(PathBuf),
-    /// The folder contains no data set.
-    #[error(transparent)]
-    Dataset(#[from] DatasetError),
-    /// The folder contains images, but no cameras.
-    #[error(
-        "{}: {found}, but no cameras; estimate them with COLMAP: {command}", folder.display()
-    )]
-    NoCameras {
-        /// Folder of the images.
-        folder: PathBuf,
-        /// Number and unsupported formats of the images, as text.
-        found: String,
-        /// Command that estimates the cameras.
-        command: String,
-    },
-    /// The pipeline file would be inside the data set.
-    #[error(
-        "{}: the pipeline and its results can't be inside the data set; change to another folder, \
-        such as the parent",
-        folder.display()
-    )]
-    Inside {
-        /// Folder of the data set.
-        folder: PathBuf,
-    },
-    /// The path can't be written to a pipeline file.
-    #[error("{}: path isn't UTF-8; rename the folder", folder.display())]
-    Name {
-        /// Folder of the data set.
-        folder: PathBuf,
-    },
-    /// A file to write exists already.
-    #[error(
-        "{} exists and was not changed; run `nerf-sr init` in a new folder",
-        file.display()
-    )]
-    Exists {
-        /// Existing file.
-        file: PathBuf,
-    },
-    /// A file or folder can't be found or written.
-    #[error("{}: {source}", file.display())]
-    Io {
-        /// Path of the file or folder.
-        file: PathBuf,
-        /// Error of the system.
-        source: io::Error,
-    },
-}
-
 impl Starter {
     /// Reads a folder of posed photographs and composes the pipeline `file` for it.
-    pub(crate) fn new(folder: &Path, file: &Path) -> Result<Self, StarterError> {
+    pub(crate) fn new(folder: &Path, file: &Path) -> anyhow::Result<Self> {
         if !folder.exists() {
-            return Err(StarterError::Missing(folder.to_path_buf()));
+            bail_bad_input!("{}: no such folder", folder.display());
         }
-        let set = Dataset::read(folder).map_err(|error| read_error(folder, error))?;
+        let set = Dataset::read(folder).map_err(|error| read_failure(folder, &error))?;
         let parent = file.parent().filter(|parent| !parent.as_os_str().is_empty());
         let dataset = data_path(folder, parent.unwrap_or(Path::new(".")))?;
         let (summary, sizes) = (summarize(&set), sizes(&set));
@@ -126,7 +71,7 @@ impl Starter {
 
     /// Writes the pipeline file and, in folders next to it, the shipped targets. Returns the
     /// written files. Writes nothing if any of them exists.
-    pub(crate) fn write(&self) -> Result<Vec<PathBuf>, StarterError> {
+    pub(crate) fn write(&self) -> anyhow::Result<Vec<PathBuf>> {
         let name = self.file.file_name().unwrap_or_default().to_string_lossy();
         let mut files = vec![(self.file.clone(), self.text.clone())];
         for (folder, target, text) in TARGETS {
@@ -135,14 +80,17 @@ impl Starter {
             files.push((self.file.with_file_name(folder).join(target), text));
         }
         if let Some((file, _)) = files.iter().find(|(file, _)| fs::symlink_metadata(file).is_ok()) {
-            return Err(StarterError::Exists { file: file.clone() });
+            bail_usage!(
+                "{} exists and was not changed; run `nerf-sr init` in a new folder",
+                file.display()
+            );
         }
         for (file, text) in &files {
             let folder = file.parent().unwrap_or(Path::new(""));
-            fs::create_dir_all(folder).map_err(|e| io_error(folder, e))?;
+            fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
             fs::File::create_new(file)
                 .and_then(|mut created| created.write_all(text.as_bytes()))
-                .map_err(|e| io_error(file, e))?;
+                .with_context(|| file.display().to_string())?;
         }
         Ok(files.into_iter().map(|(file, _)| file).collect())
     }
@@ -165,23 +113,25 @@ fn own_scene(text: &str, dataset: &str) -> String {
     lines.map(|line| line + "\n").collect()
 }
 
-fn io_error(file: &Path, source: io::Error) -> StarterError {
-    StarterError::Io { file: file.to_path_buf(), source }
-}
-
 /// Returns the YAML text for the data set's folder in a pipeline file of the folder `parent`: a
 /// relative path if the data set is inside `parent`, otherwise an absolute one.
-fn data_path(folder: &Path, parent: &Path) -> Result<String, StarterError> {
-    let data = folder.canonicalize().map_err(|e| io_error(folder, e))?;
-    let parent = parent.canonicalize().map_err(|e| io_error(parent, e))?;
+fn data_path(folder: &Path, parent: &Path) -> anyhow::Result<String> {
+    let data = folder.canonicalize().with_context(|| folder.display().to_string())?;
+    let parent = parent.canonicalize().with_context(|| parent.display().to_string())?;
     if parent.starts_with(&data) {
-        return Err(StarterError::Inside { folder: folder.to_path_buf() });
+        bail_usage!(
+            "{}: the pipeline and its results can't be inside the data set; change to another \
+            folder, such as the parent",
+            folder.display()
+        );
     }
     let path = match data.strip_prefix(&parent) {
         Ok(relative) => Path::new(".").join(relative),
         Err(_) => data,
     };
-    let text = path.to_str().ok_or_else(|| StarterError::Name { folder: folder.to_path_buf() })?;
+    let Some(text) = path.to_str() else {
+        bail_usage!("{}: path isn't UTF-8; rename the folder", folder.display());
+    };
     if text.chars().all(|c| c.is_alphanumeric() || "./_-+".contains(c)) {
         return Ok(text.to_owned());
     }
@@ -304,18 +254,19 @@ fn image_parameters(set: &Dataset) -> String {
     }
 }
 
-/// Converts an error of the data set's reader: if the folder contains images, the new error names
-/// the command that estimates their cameras.
-fn read_error(folder: &Path, error: DatasetError) -> StarterError {
+/// Converts an error of the data set's reader: if the folder contains images, the message names the
+/// command that estimates their cameras.
+fn read_failure(folder: &Path, error: &DatasetError) -> Failure {
     let images = UnposedImages::find(folder);
     if !error.is_unrecognised() || images.files.is_empty() {
-        return StarterError::Dataset(error);
+        return Failure::BadInput(error.to_string());
     }
-    StarterError::NoCameras {
-        folder: folder.to_path_buf(),
-        found: images.summary(),
-        command: images.colmap_command(folder),
-    }
+    Failure::BadInput(format!(
+        "{}: {}, but no cameras; estimate them with COLMAP: {}",
+        folder.display(),
+        images.summary(),
+        images.colmap_command(folder)
+    ))
 }
 
 #[cfg(test)]

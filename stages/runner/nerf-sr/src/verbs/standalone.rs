@@ -4,20 +4,20 @@ use std::io::Write as _;
 use std::path::Path;
 use std::process::{Command, ExitCode};
 
-use crate::starter::{Starter, StarterError};
+use crate::starter::Starter;
 use anyhow::Context as _;
-use artifact::{Failure, format_count, print_line};
+use artifact::{format_count, print_line};
 use planning::{Pipeline, PlanError, executable};
 
 /// Writes a pipeline for a folder of posed photographs, and prints what was found.
 pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
-    let starter = Starter::new(folder, file).map_err(starter_failure)?;
+    let starter = Starter::new(folder, file)?;
     print_line!("found: {}", starter.summary());
     print_line!("sizes: {}", starter.sizes());
     for note in starter.notes() {
         print_line!("  {note}");
     }
-    let written = starter.write().map_err(starter_failure)?;
+    let written = starter.write()?;
     let count = |folder: &str| {
         let inside =
             written.iter().filter(|file| file.parent().is_some_and(|p| p.ends_with(folder)));
@@ -31,18 +31,6 @@ pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
     );
     print_line!("`nerf-sr run` renders the views; `nerf-sr plan` shows the stages for this");
     Ok(ExitCode::SUCCESS)
-}
-
-fn starter_failure(error: StarterError) -> anyhow::Error {
-    match error {
-        StarterError::Missing(_) | StarterError::Dataset(_) | StarterError::NoCameras { .. } => {
-            Failure::BadInput(error.to_string()).into()
-        }
-        StarterError::Io { .. } => error.into(),
-        StarterError::Inside { .. } | StarterError::Name { .. } | StarterError::Exists { .. } => {
-            Failure::Usage(error.to_string()).into()
-        }
-    }
 }
 
 /// Prints the help of a stage's program.

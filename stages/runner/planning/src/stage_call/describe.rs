@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitStatus, Output, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
@@ -27,50 +27,20 @@ const POLL_INTERVAL: Duration = Duration::from_millis(5);
 #[derive(Debug, PartialEq, Eq)]
 pub struct Interrupted;
 
-/// Error returned when a program can't be described.
+/// Error returned when a stage's program can't be used or described.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum DescribeError {
-    /// The program can't be started or waited for.
-    #[error("`{program} describe`: {problem}")]
-    Start {
-        /// Path of the program.
-        program: PathBuf,
-        /// Error of the system.
-        problem: String,
-    },
-    /// The program didn't end or close its output within the time limit.
-    #[error(
-        "`{program} describe` didn't finish within {limit:?}; check what it waits for, or set \
-        `run:` to another program"
-    )]
-    TimedOut {
-        /// Path of the program.
-        program: PathBuf,
-        /// Time limit.
-        limit: Duration,
-    },
-    /// The program failed.
-    #[error("`{program} describe` failed ({status}): {message}")]
-    Failed {
-        /// Path of the program.
-        program: PathBuf,
-        /// Exit status.
-        status: ExitStatus,
-        /// Last line of its stderr.
-        message: String,
-    },
-    /// The output isn't a description.
-    #[error("output of `{program} describe` isn't a description: {problem}")]
-    Invalid {
-        /// Path of the program.
-        program: PathBuf,
-        /// Error of the parser.
-        problem: String,
-    },
+#[error("{0}")]
+pub struct ProgramError(pub(crate) String);
+
+impl ProgramError {
+    /// Returns the error for a program whose description isn't given.
+    pub(crate) fn undescribed(path: &Path) -> Self {
+        Self(format!("no description of {}", path.display()))
+    }
 }
 
 /// Descriptions, or the errors instead, by the program's path.
-pub type Descriptions = BTreeMap<PathBuf, Result<Description, DescribeError>>;
+pub type Descriptions = BTreeMap<PathBuf, Result<Description, ProgramError>>;
 
 /// Describes programs, as many in parallel as this process has processors.
 pub fn describe_all(
@@ -118,12 +88,15 @@ fn describe(
     path: &Path,
     limit: Duration,
     stop: Option<&AtomicBool>,
-) -> Result<Description, DescribeError> {
-    let program = path.to_path_buf();
+) -> Result<Description, ProgramError> {
+    let call = format!("`{} describe`", path.display());
     let Some(Output { status, stdout, stderr }) = run_describe(path, limit, stop)
-        .map_err(|e| DescribeError::Start { program: program.clone(), problem: e.to_string() })?
+        .map_err(|problem| ProgramError(format!("{call}: {problem}")))?
     else {
-        return Err(DescribeError::TimedOut { program, limit });
+        return Err(ProgramError(format!(
+            "{call} didn't finish within {limit:?}; check what it waits for, or set `run:` to \
+            another program"
+        )));
     };
     if !status.success() {
         let stderr = String::from_utf8_lossy(&stderr);
@@ -131,10 +104,10 @@ fn describe(
             let last = stderr.trim_end().lines().last().unwrap_or_default();
             last.replace(char::is_control, " ")
         });
-        return Err(DescribeError::Failed { program, status, message });
+        return Err(ProgramError(format!("{call} failed ({status}): {message}")));
     }
     serde_json::from_slice(&stdout)
-        .map_err(|e| DescribeError::Invalid { program, problem: e.to_string() })
+        .map_err(|problem| ProgramError(format!("output of {call} isn't a description: {problem}")))
 }
 
 /// Runs `describe`. Returns `None` if the time limit is exceeded or `stop` is set.

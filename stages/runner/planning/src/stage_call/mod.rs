@@ -49,7 +49,7 @@ mod group;
 mod log;
 
 pub use call::{Call, Usage, Watcher, read_summary};
-pub use describe::{DescribeError, Descriptions, Interrupted, describe_all};
+pub use describe::{Descriptions, Interrupted, ProgramError, describe_all};
 pub use display::{Display, StageView};
 pub use failure::StageFailure;
 pub use group::stop_on_signals;

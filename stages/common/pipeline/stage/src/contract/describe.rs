@@ -1,14 +1,14 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use artifact::{PathError, relative_path};
+use artifact::relative_path;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::contract::error::SchemaError;
+use crate::contract::error::ContractError;
 use crate::contract::parameters::Schema;
-use crate::contract::rules::{GivenInputs, Rule, RuleError};
+use crate::contract::rules::{GivenInputs, Rule};
 
 /// Output of `STAGE describe`: all that the runner knows about a stage.
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
@@ -121,41 +121,20 @@ impl Output {
     }
 }
 
-/// Reason why a description is invalid.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum DescriptionError {
-    /// The parameter schema can't be used.
-    #[error("parameter schema: {0}")]
-    Schema(#[from] SchemaError),
-    /// The name is empty.
-    #[error("the description has no name")]
-    Unnamed,
-    /// A folder or file of the output is outside the output.
-    #[error("output: {0}")]
-    Output(#[from] PathError),
-    /// A rule can't be used.
-    #[error("rule {number}: {problem}")]
-    Rule {
-        /// Number of the rule, counted from 1.
-        number: usize,
-        /// Reason why the rule can't be used.
-        problem: RuleError,
-    },
-}
-
 impl Description {
     /// Checks the schema, and that rules refer to existing names and folders are inside the output.
-    pub fn check(&self) -> Result<(), DescriptionError> {
-        let schema = Schema::new(&self.parameters)?;
+    pub fn check(&self) -> Result<(), ContractError> {
+        let schema = Schema::new(&self.parameters)
+            .map_err(|e| ContractError(format!("parameter schema: {e}")))?;
         if self.name.is_empty() {
-            return Err(DescriptionError::Unnamed);
+            return Err(ContractError("the description has no name".to_owned()));
         }
         for folder in self.output.subtrees.keys().chain(&self.output.resolved) {
-            relative_path(folder)?;
+            relative_path(folder).map_err(|e| ContractError(format!("output: {e}")))?;
         }
         for (index, rule) in self.rules.iter().enumerate() {
             rule.check(&schema.names(), &self.inputs)
-                .map_err(|problem| DescriptionError::Rule { number: index + 1, problem })?;
+                .map_err(|problem| ContractError(format!("rule {}: {problem}", index + 1)))?;
         }
         Ok(())
     }

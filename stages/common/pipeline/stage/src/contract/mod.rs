@@ -19,7 +19,7 @@
 //! let none = Map::from_iter([("rays".to_owned(), json!(0))]);
 //! let problems = schema.resolve(&none).unwrap_err();
 //! assert_eq!(problems[0].to_string(), "parameter rays: 0 is less than the minimum of 1");
-//! # Ok::<(), stage::SchemaError>(())
+//! # Ok::<(), stage::ContractError>(())
 //! ```
 
 mod describe;
@@ -33,8 +33,8 @@ mod values;
 #[cfg(test)]
 mod variant_tests;
 
-pub use describe::{Description, DescriptionError, Input, Output};
+pub use describe::{Description, Input, Output};
 pub use documented::{PARAMETER_GROUPS, ParameterDoc, ParameterSection, group_parameters, plain};
-pub use error::{KeywordError, SchemaError};
+pub use error::ContractError;
 pub use parameters::{ParameterProblem, Schema};
-pub use rules::{GivenInputs, Rule, RuleError};
+pub use rules::{GivenInputs, Rule};

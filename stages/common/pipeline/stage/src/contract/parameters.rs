@@ -1,7 +1,7 @@
 use artifact::{known_names, nearest};
 use serde_json::{Map, Value, json};
 
-use crate::contract::error::SchemaError;
+use crate::contract::error::ContractError;
 use crate::contract::tagged::Tag;
 use crate::contract::validator::{Misfit, Validator};
 use crate::contract::values::Reader;
@@ -37,7 +37,7 @@ pub struct ParameterProblem {
 
 impl Schema {
     /// Compiles a stage's parameter schema.
-    pub fn new(schema: &Value) -> Result<Self, SchemaError> {
+    pub fn new(schema: &Value) -> Result<Self, ContractError> {
         let tag = Tag::find(schema)?;
         let schemas =
             tag.as_ref().map_or_else(|| vec![schema.clone()], |t| t.variant_schemas(schema));
@@ -146,10 +146,11 @@ pub(crate) const DEFAULT_KEYWORD: &str = "x-default";
 const BY_SCENE: &str = "by scene";
 
 impl VariantSchema {
-    fn new(schema: Value) -> Result<Self, SchemaError> {
+    fn new(schema: Value) -> Result<Self, ContractError> {
         let mut bounded = schema.clone();
         bound_formats(&mut bounded);
-        let validator = Validator::new(&bounded).map_err(SchemaError::Keyword)?;
+        let validator = Validator::new(&bounded)
+            .map_err(|e| ContractError(format!("invalid or unsupported JSON Schema: {e}")))?;
         Ok(Self { schema, validator })
     }
 

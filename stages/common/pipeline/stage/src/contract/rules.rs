@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::contract::describe::Input;
 use crate::contract::documented::plain;
-use crate::contract::error::KeywordError;
+use crate::contract::error::ContractError;
 use crate::contract::validator::Validator;
 
 /// Constraint between parameters and inputs, in addition to the checks of each alone. The runner
@@ -37,25 +37,6 @@ pub struct Rule {
 
 /// Given inputs by name, with the parameters of the stage that created each, if known.
 pub type GivenInputs = BTreeMap<String, Option<Value>>;
-
-/// Reason why a rule can't be used.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum RuleError {
-    /// The rule refers to an input that the stage doesn't have.
-    #[error("no input {0:?}")]
-    UnknownInput(String),
-    /// The rule refers to a parameter that the stage doesn't have.
-    #[error("no parameter {0:?}")]
-    UnknownParameter(String),
-    /// A JSON Schema of the rule can't be used.
-    #[error("{name}: invalid or unsupported JSON Schema: {reason}")]
-    Schema {
-        /// Parameter that the schema belongs to.
-        name: String,
-        /// Reason why the schema can't be used.
-        reason: KeywordError,
-    },
-}
 
 impl Rule {
     /// Creates a rule that always applies and has no requirement yet.
@@ -104,10 +85,10 @@ impl Rule {
         &self,
         parameters: &[&str],
         inputs: &BTreeMap<String, Input>,
-    ) -> Result<(), RuleError> {
+    ) -> Result<(), ContractError> {
         let mut named = self.needs.iter().chain(self.files.keys());
         if let Some(input) = named.find(|input| !inputs.contains_key(*input)) {
-            return Err(RuleError::UnknownInput(input.clone()));
+            return Err(ContractError(format!("no input {input:?}")));
         }
         for (name, schema) in self.when.iter().chain(&self.must) {
             let is_known = match name.split_once('.') {
@@ -115,10 +96,11 @@ impl Rule {
                 None => parameters.contains(&name.as_str()),
             };
             if !is_known {
-                return Err(RuleError::UnknownParameter(name.clone()));
+                return Err(ContractError(format!("no parameter {name:?}")));
             }
-            Validator::new(schema)
-                .map_err(|reason| RuleError::Schema { name: name.clone(), reason })?;
+            Validator::new(schema).map_err(|reason| {
+                ContractError(format!("{name}: invalid or unsupported JSON Schema: {reason}"))
+            })?;
         }
         Ok(())
     }

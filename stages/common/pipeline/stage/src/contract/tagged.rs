@@ -3,7 +3,7 @@
 
 use serde_json::{Map, Value, json};
 
-use crate::contract::error::SchemaError;
+use crate::contract::error::ContractError;
 use crate::contract::values::Reader;
 
 /// Parameter that selects a variant, with its variants, the default one first.
@@ -23,7 +23,7 @@ struct Variant {
 impl Tag {
     /// Finds the tag of a schema. Fails if there are two, or if a variant has a parameter of the
     /// same name as a common one.
-    pub(crate) fn find(schema: &Value) -> Result<Option<Self>, SchemaError> {
+    pub(crate) fn find(schema: &Value) -> Result<Option<Self>, ContractError> {
         let Some(properties) = schema.get("properties").and_then(Value::as_object) else {
             return Ok(None);
         };
@@ -32,19 +32,20 @@ impl Tag {
             .filter_map(|(name, property)| Self::read(schema, name, property))
             .collect();
         if let [first, second, ..] = &tags[..] {
-            let (first, second) = (first.name.clone(), second.name.clone());
-            return Err(SchemaError::TwoSelectors { first, second });
+            return Err(ContractError(format!(
+                "{} and {} both select a variant; at most one parameter may",
+                first.name, second.name
+            )));
         }
         let Some(tag) = tags.pop() else { return Ok(None) };
         for variant in &tag.variants {
             if let Some(name) =
                 variant.properties.keys().find(|name| properties.contains_key(*name))
             {
-                return Err(SchemaError::AmbiguousName {
-                    name: name.clone(),
-                    selector: tag.name.clone(),
-                    variant: variant.name.clone(),
-                });
+                return Err(ContractError(format!(
+                    "variant {} of {} has a parameter {name}, like the stage itself",
+                    variant.name, tag.name
+                )));
             }
         }
         Ok(Some(tag))

@@ -5,7 +5,7 @@ use std::cmp::Ordering;
 
 use serde_json::{Map, Number, Value};
 
-use crate::contract::error::KeywordError;
+use crate::contract::error::ContractError;
 
 /// Unsupported keywords that constrain values. A schema with one of them is refused, so that no
 /// value passes unchecked.
@@ -55,7 +55,7 @@ pub(crate) struct Misfit {
 
 impl Validator {
     /// Creates a validator; fails if a keyword of the schema is invalid or unsupported.
-    pub(crate) fn new(schema: &Value) -> Result<Self, KeywordError> {
+    pub(crate) fn new(schema: &Value) -> Result<Self, ContractError> {
         check_schema(schema, schema)?;
         Ok(Self { root: schema.clone() })
     }
@@ -74,11 +74,14 @@ impl Validator {
 }
 
 /// Checks that a schema can be used.
-fn check_schema(root: &Value, schema: &Value) -> Result<(), KeywordError> {
+fn check_schema(root: &Value, schema: &Value) -> Result<(), ContractError> {
     let keywords = match schema {
         Value::Bool(_) => return Ok(()),
         Value::Object(keywords) => keywords,
-        other => return Err(KeywordError::NotASchema(other.clone())),
+        other => {
+            let problem = format!("{other} is neither an object nor true or false");
+            return Err(ContractError(problem));
+        }
     };
     for (keyword, value) in keywords {
         let is_valid = match keyword.as_str() {
@@ -92,11 +95,14 @@ fn check_schema(root: &Value, schema: &Value) -> Result<(), KeywordError> {
             // Further keywords are descriptions, defaults, formats, and extensions such as
             // `x-group`.
             other if !UNSUPPORTED.contains(&other) => true,
-            other => return Err(KeywordError::Unsupported(other.to_owned())),
+            other => {
+                let problem = format!("keyword {other} isn't supported; leave it out");
+                return Err(ContractError(problem));
+            }
         };
         if !is_valid {
-            let (keyword, value) = (keyword.clone(), value.clone());
-            return Err(KeywordError::InvalidValue { keyword, value });
+            let problem = format!("keyword {keyword} cannot have the value {value}");
+            return Err(ContractError(problem));
         }
         let schemas: Vec<&Value> = match (keyword.as_str(), value) {
             ("items" | "additionalProperties" | "not", schema) => vec![schema],

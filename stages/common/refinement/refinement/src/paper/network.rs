@@ -94,7 +94,8 @@ impl PaperRefiner {
     pub fn read(path: &Path, width: u32) -> Result<Self, RefinementError> {
         // Checked before anything of this size is allocated.
         if !(1..=MAX_WIDTH).contains(&width) {
-            return Err(RefinementError::Architecture { channels: width, blocks: 0 });
+            let problem = format!("unsupported network: {width} channels, 0 blocks");
+            return Err(RefinementError::Unusable(problem));
         }
         let weights = Weights::read(path)?;
         Self::build(width, |name, shape, _| Ok(weights.tensor(name, shape)?))

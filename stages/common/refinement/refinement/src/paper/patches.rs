@@ -37,14 +37,14 @@ impl PaperRefiner {
                 "{}×{} pixels; the paper's network needs at least {PATCH_PIXELS}×{PATCH_PIXELS}",
                 view.width, view.height
             );
-            return Err(RefinementError::View { name: rendered.camera.name.clone(), reason });
+            return Err(RefinementError::view(&rendered.camera.name, reason));
         }
         if let Some(small) = references
             .iter()
             .find(|r| r.truth.width < PATCH_PIXELS || r.truth.height < PATCH_PIXELS)
         {
             let reason = format!("reference of fewer than {PATCH_PIXELS}×{PATCH_PIXELS} pixels");
-            return Err(RefinementError::View { name: small.rendered.camera.name.clone(), reason });
+            return Err(RefinementError::view(&small.rendered.camera.name, reason));
         }
         let corners: Vec<(Corner, Self)> = patch_starts(view.height, overlap)
             .into_iter()

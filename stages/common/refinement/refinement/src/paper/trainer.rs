@@ -218,11 +218,13 @@ impl PaperTraining {
         for KnownView { rendered, truth } in examples {
             if truth.width < size || truth.height < size {
                 let reason = format!("smaller than a patch of {size}×{size} pixels");
-                return Err(RefinementError::View { name: rendered.camera.name.clone(), reason });
+                return Err(RefinementError::view(&rendered.camera.name, reason));
             }
         }
         if size == 0 || !size.is_multiple_of(PATCH_MULTIPLE) {
-            return Err(RefinementError::PatchSize { size, multiple: PATCH_MULTIPLE });
+            return Err(RefinementError::Unusable(format!(
+                "a patch size of {size} pixels is not a multiple of {PATCH_MULTIPLE}"
+            )));
         }
         Ok(())
     }
