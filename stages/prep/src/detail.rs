@@ -5,14 +5,14 @@ use artifact::WARNING;
 use pixels::Rgba8;
 
 /// Side of a block whose spectrum is measured, in pixels.
-const SIDE: usize = 32;
+const BLOCK_SIDE: usize = 32;
 /// Maximum number of blocks of an image; chosen by hand.
 const MAX_BLOCKS: usize = 256;
 /// Part of the blocks of largest variance that are measured: smooth areas have no detail.
 const DETAILED_PART: usize = 4;
 /// Frequencies that fix the expected spectrum.
-const LOWEST: [usize; 2] = [2, 3];
-/// Minimum power at [`LOWEST`] of images with structure, in squared levels; chosen by hand.
+const REFERENCE_FREQUENCIES: [usize; 2] = [2, 3];
+/// Minimum power at [`REFERENCE_FREQUENCIES`] of images with structure, in squared levels; chosen by hand.
 const MIN_POWER: f64 = 1.0;
 /// First frequency that is compared with the expected spectrum.
 const FIRST_COMPARED: usize = 4;
@@ -25,15 +25,15 @@ const MIN_REACH: f64 = 0.7;
 /// Power of image blocks by frequency, in both directions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Spectrum {
-    power: [f64; SIDE],
+    power: [f64; BLOCK_SIDE],
 }
 
 impl Spectrum {
     /// Measures an image over white. Images without a block have no power.
     pub(crate) fn of(image: &Rgba8) -> Self {
         let mut blocks: Vec<([usize; 2], f64)> = Vec::new();
-        for y in (0..image.height.saturating_sub(SIDE - 1)).step_by(SIDE) {
-            for x in (0..image.width.saturating_sub(SIDE - 1)).step_by(SIDE) {
+        for y in (0..image.height.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
+            for x in (0..image.width.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
                 blocks.push(([x, y], variance(&block(image, [x, y]))));
             }
         }
@@ -42,7 +42,7 @@ impl Spectrum {
         blocks.truncate(blocks.len().div_ceil(DETAILED_PART));
         let stride = blocks.len().div_ceil(MAX_BLOCKS).max(1);
         let waves = waves();
-        let mut power = [0.0; SIDE];
+        let mut power = [0.0; BLOCK_SIDE];
         for (at, _) in blocks.iter().step_by(stride) {
             add_power(&mut power, &block(image, *at), &waves);
         }
@@ -66,17 +66,17 @@ impl Spectrum {
     /// Returns `None` for images without blocks or structure.
     pub(crate) fn reach(&self) -> Option<f64> {
         let part = |k: usize| self.power[k] * (k * k) as f64;
-        let expected = LOWEST.map(part).iter().sum::<f64>() / LOWEST.len() as f64;
+        let expected = REFERENCE_FREQUENCIES.map(part).iter().sum::<f64>() / REFERENCE_FREQUENCIES.len() as f64;
         if expected.is_nan() || expected <= MIN_POWER {
             return None;
         }
         let mean = |k: usize| {
-            let near = (k - 1)..=(k + 1).min(SIDE - 1);
+            let near = (k - 1)..=(k + 1).min(BLOCK_SIDE - 1);
             let parts = near.clone().map(|k| (part(k) / expected).max(f64::MIN_POSITIVE).ln());
             (parts.sum::<f64>() / near.count() as f64).exp()
         };
-        let end = (FIRST_COMPARED..SIDE).find(|&k| mean(k) < MIN_PART).unwrap_or(SIDE);
-        Some(end as f64 / SIDE as f64)
+        let end = (FIRST_COMPARED..BLOCK_SIDE).find(|&k| mean(k) < MIN_PART).unwrap_or(BLOCK_SIDE);
+        Some(end as f64 / BLOCK_SIDE as f64)
     }
 }
 
@@ -86,8 +86,8 @@ pub(crate) fn lr_reach(reach: f64, factor: f64) -> f64 {
     (reach * factor).min(1.0)
 }
 
-/// Describes missing detail, with the remedy; `None` if nothing is missing.
-pub(crate) fn note(lr_reach: f64, lr_width: u32) -> Option<String> {
+/// Returns a warning of missing detail, with the remedy; `None` if nothing is missing.
+pub(crate) fn missing_detail_warning(lr_reach: f64, lr_width: u32) -> Option<String> {
     (lr_reach < MIN_REACH).then(|| {
         let width = (lr_reach * f64::from(lr_width)).ceil();
         format!(
@@ -100,7 +100,7 @@ pub(crate) fn note(lr_reach: f64, lr_width: u32) -> Option<String> {
 }
 
 /// Returns the luminance of a block over white, in levels.
-fn block(image: &Rgba8, [x, y]: [usize; 2]) -> [[f64; SIDE]; SIDE] {
+fn block(image: &Rgba8, [x, y]: [usize; 2]) -> [[f64; BLOCK_SIDE]; BLOCK_SIDE] {
     std::array::from_fn(|row| {
         let start = 4 * ((y + row) * image.width + x);
         std::array::from_fn(|column| {
@@ -111,30 +111,30 @@ fn block(image: &Rgba8, [x, y]: [usize; 2]) -> [[f64; SIDE]; SIDE] {
     })
 }
 
-fn variance(block: &[[f64; SIDE]; SIDE]) -> f64 {
-    let count = (SIDE * SIDE) as f64;
+fn variance(block: &[[f64; BLOCK_SIDE]; BLOCK_SIDE]) -> f64 {
+    let count = (BLOCK_SIDE * BLOCK_SIDE) as f64;
     let mean = block.iter().flatten().sum::<f64>() / count;
     block.iter().flatten().map(|value| (value - mean).powi(2)).sum::<f64>() / count
 }
 
 /// Returns the cosines of a discrete cosine transform (DCT-II), by frequency.
-fn waves() -> [[f64; SIDE]; SIDE] {
+fn waves() -> [[f64; BLOCK_SIDE]; BLOCK_SIDE] {
     std::array::from_fn(|k| {
         std::array::from_fn(|x| {
-            let angle = std::f64::consts::PI * ((2 * x + 1) * k) as f64 / (2 * SIDE) as f64;
-            angle.cos() * (2.0 / SIDE as f64).sqrt()
+            let angle = std::f64::consts::PI * ((2 * x + 1) * k) as f64 / (2 * BLOCK_SIDE) as f64;
+            angle.cos() * (2.0 / BLOCK_SIDE as f64).sqrt()
         })
     })
 }
 
 /// Adds a block's power along both axes, over all frequencies of the other axis.
-fn add_power(power: &mut [f64; SIDE], block: &[[f64; SIDE]; SIDE], waves: &[[f64; SIDE]; SIDE]) {
+fn add_power(power: &mut [f64; BLOCK_SIDE], block: &[[f64; BLOCK_SIDE]; BLOCK_SIDE], waves: &[[f64; BLOCK_SIDE]; BLOCK_SIDE]) {
     // By Parseval's theorem, the sum over the other axis' frequencies is that over its pixels.
     for (k, wave) in waves.iter().enumerate().skip(1) {
-        for line in 0..SIDE {
-            let across: f64 = (0..SIDE).map(|i| wave[i] * block[line][i]).sum();
-            let down: f64 = (0..SIDE).map(|i| wave[i] * block[i][line]).sum();
-            power[k] += (across.powi(2) + down.powi(2)) / SIDE as f64;
+        for line in 0..BLOCK_SIDE {
+            let across: f64 = (0..BLOCK_SIDE).map(|i| wave[i] * block[line][i]).sum();
+            let down: f64 = (0..BLOCK_SIDE).map(|i| wave[i] * block[i][line]).sum();
+            power[k] += (across.powi(2) + down.powi(2)) / BLOCK_SIDE as f64;
         }
     }
 }
@@ -210,8 +210,8 @@ mod tests {
     fn missing_detail_has_a_remedy() {
         assert_eq!(lr_reach(0.5, 1.0), 0.5);
         assert_eq!(lr_reach(0.5, 8.0), 1.0);
-        assert_eq!(note(0.7, 100), None);
-        let note = note(0.47, 800).unwrap();
+        assert_eq!(missing_detail_warning(0.7, 100), None);
+        let note = missing_detail_warning(0.47, 800).unwrap();
         assert!(note.contains(" 47 % ") && note.contains("lr_width 376 "), "{note}");
     }
 }

@@ -43,9 +43,8 @@ pub(crate) enum Group {
 
 /// Location of a layer's pictures.
 enum Source<'a> {
-    Image(Arc<Folder>),
-    LowResolution(Arc<Folder>),
-    Depth(Arc<Folder>),
+    /// Files of a folder of views, which the layer's group names.
+    Views(Arc<Folder>),
     /// Files of a result, and the JSON pointer of their names in a view's scores.
     Scored(&'a Row<'a>, String),
 }
@@ -114,18 +113,32 @@ fn files_identity<'a>(
 }
 
 impl Layer<'_> {
+    fn of_views(
+        group: Group,
+        folder: &Arc<Folder>,
+        label: &str,
+        scene: usize,
+        rows: &[usize],
+    ) -> Self {
+        Self {
+            label: label.to_owned(),
+            identity: folder.identity(|view| group.file(view)),
+            group,
+            scene,
+            rows: rows.to_vec(),
+            source: Source::Views(Arc::clone(folder)),
+        }
+    }
+
     /// Draws the picture of a view, if available; `range` is that of the depths' colours.
     pub(crate) fn picture(&self, view: &str, range: (f32, f32)) -> anyhow::Result<Option<Rgba8>> {
         match &self.source {
-            Source::Image(folder) => {
-                folder.colour(folder.view(view).and_then(|view| view.image.as_ref()))
-            }
-            Source::LowResolution(folder) => {
-                folder.colour(folder.view(view).and_then(|view| view.low_resolution.as_ref()))
-            }
-            Source::Depth(folder) => {
+            Source::Views(folder) if self.group == Group::Depth => {
                 let image = folder.depth(view)?;
                 Ok(image.and_then(|image| Some(DepthMap::of(&image)?.draw(image.width, range))))
+            }
+            Source::Views(folder) => {
+                folder.colour(folder.view(view).and_then(|view| self.group.file(view)))
             }
             Source::Scored(row, pointer) => {
                 let file = row.view(view).and_then(|scores| scores.pointer(pointer)?.as_str());
@@ -141,7 +154,9 @@ impl Layer<'_> {
         &self,
         views: impl Iterator<Item = &'a String>,
     ) -> anyhow::Result<Option<(f32, f32)>> {
-        let Source::Depth(folder) = &self.source else { return Ok(None) };
+        let (Source::Views(folder), Group::Depth) = (&self.source, &self.group) else {
+            return Ok(None);
+        };
         let mut ranges = Vec::new();
         for view in views {
             let image = folder.depth(view)?;
@@ -155,7 +170,10 @@ impl Layer<'_> {
 pub(crate) fn max_pixels(layers: &[Layer<'_>], scene: usize) -> u64 {
     let mut pixels = 1;
     for layer in layers.iter().filter(|layer| layer.scene == scene) {
-        let Source::Image(folder) = &layer.source else { continue };
+        let (Source::Views(folder), Group::Truth | Group::Render) = (&layer.source, &layer.group)
+        else {
+            continue;
+        };
         for view in &folder.views.views {
             let intrinsics = view.camera.intrinsics;
             pixels = pixels.max(u64::from(intrinsics.width) * u64::from(intrinsics.height));
@@ -239,23 +257,10 @@ fn name_observations(layers: &mut [Layer<'_>]) {
 /// Adds photographs, ground truth and true depth, if available. `label` names the results that they
 /// belong to.
 fn add_observations(layers: &mut Vec<Layer<'_>>, scene: usize, folder: &Arc<Folder>, label: &str) {
-    let views = &folder.views.views;
-    let mut found = Vec::new();
-    if views.iter().any(|view| view.low_resolution.is_some()) {
-        let identity = folder.identity(|view| view.low_resolution.as_ref());
-        found.push((Group::LowResolution, identity, Source::LowResolution(Arc::clone(folder))));
-    }
-    if views.iter().any(|view| view.image.is_some()) {
-        let identity = folder.identity(|view| view.image.as_ref());
-        found.push((Group::Truth, identity, Source::Image(Arc::clone(folder))));
-    }
-    if views.iter().any(|view| view.depth.is_some()) {
-        let identity = folder.identity(|view| view.depth.as_ref());
-        found.push((Group::Depth, identity, Source::Depth(Arc::clone(folder))));
-    }
-    for (group, identity, source) in found {
-        let (label, rows) = (label.to_owned(), Vec::new());
-        layers.push(Layer { label, group, scene, rows, identity, source });
+    for group in [Group::LowResolution, Group::Truth, Group::Depth] {
+        if folder.views.views.iter().any(|view| group.file(view).is_some()) {
+            layers.push(Layer::of_views(group, folder, label, scene, &[]));
+        }
     }
 }
 
@@ -267,18 +272,9 @@ fn add_views(
     scene: usize,
     rows: &[usize],
 ) {
-    let mut found = vec![(
-        Group::Render,
-        folder.identity(|view| view.image.as_ref()),
-        Source::Image(Arc::clone(folder)),
-    )];
+    layers.push(Layer::of_views(Group::Render, folder, label, scene, rows));
     if folder.views.views.iter().any(|view| view.depth.is_some()) {
-        let identity = folder.identity(|view| view.depth.as_ref());
-        found.push((Group::Depth, identity, Source::Depth(Arc::clone(folder))));
-    }
-    for (group, identity, source) in found {
-        let (label, rows) = (label.to_owned(), rows.to_vec());
-        layers.push(Layer { label, group, scene, rows, identity, source });
+        layers.push(Layer::of_views(Group::Depth, folder, label, scene, rows));
     }
 }
 
@@ -351,6 +347,15 @@ fn scored_on(report: &Report<'_>, truth: &Path) -> String {
 }
 
 impl Group {
+    /// Returns the file of a view that the group displays.
+    fn file<'v>(&self, view: &'v View) -> Option<&'v String> {
+        match self {
+            Self::LowResolution => view.low_resolution.as_ref(),
+            Self::Depth => view.depth.as_ref(),
+            _ => view.image.as_ref(),
+        }
+    }
+
     /// Returns the heading of the group's layers in lists.
     pub(crate) fn heading(&self) -> &str {
         match self {

@@ -6,20 +6,20 @@ use crate::figures::Figures;
 
 /// Size of the picture, and its margins at the left, at the bottom, and at the other sides.
 const SIZE: (f64, f64) = (720.0, 420.0);
-const LEFT: f64 = 64.0;
-const BOTTOM: f64 = 46.0;
-const MARGIN: f64 = 16.0;
+const LEFT_MARGIN: f64 = 64.0;
+const BOTTOM_MARGIN: f64 = 46.0;
+const OTHER_MARGIN: f64 = 16.0;
 /// Colour of points and of the line.
 const COLOUR: &str = "#36c";
 /// Part of an axis that stays free at both ends.
-const FREE: f64 = 0.06;
+const FREE_PART: f64 = 0.06;
 /// Size of a name's letters: mean width with some reserve, and distance of two lines.
 const LETTER_WIDTH: f64 = 6.8;
 const LINE_HEIGHT: f64 = 13.0;
 /// Base lines of a name relative to its point, the preferred one first.
 const NAME_OFFSETS: [f64; 5] = [14.0, -8.0, 28.0, -22.0, 42.0];
 /// Number of lines with a number across the picture.
-const LINES: u32 = 5;
+const GRID_LINES: u32 = 5;
 
 /// A result in two values.
 #[derive(Clone, Debug, PartialEq)]
@@ -85,14 +85,14 @@ impl Axes<'_> {
     /// Draws lines across the chart, and the numbers of both axes.
     fn numbers(&self, chart: &Chart, figures: &Figures) -> String {
         let mut svg = String::new();
-        for line in 0..LINES {
-            let part = f64::from(line) / f64::from(LINES - 1);
+        for line in 0..GRID_LINES {
+            let part = f64::from(line) / f64::from(GRID_LINES - 1);
             let (cost, score) = (chart.x.value(part).exp(), chart.y.value(part));
             let [x, y] = chart.at(cost, score);
-            let end = SIZE.0 - MARGIN;
-            _ = writeln!(svg, "<path d=\"M{LEFT} {y:.1}H{end}\" stroke=\"#ddd\"/>");
-            svg += &text([LEFT - 8.0, y + 4.0], "end", &figures.format(self.score, score));
-            let below = [x, SIZE.1 - BOTTOM + 18.0];
+            let end = SIZE.0 - OTHER_MARGIN;
+            _ = writeln!(svg, "<path d=\"M{LEFT_MARGIN} {y:.1}H{end}\" stroke=\"#ddd\"/>");
+            svg += &text([LEFT_MARGIN - 8.0, y + 4.0], "end", &figures.format(self.score, score));
+            let below = [x, SIZE.1 - BOTTOM_MARGIN + 18.0];
             svg += &text(below, "middle", &figures.format(self.cost, cost));
         }
         svg
@@ -108,8 +108,8 @@ struct Chart {
 impl Chart {
     /// Returns the position of a cost and a score, in the picture's units.
     fn at(&self, cost: f64, score: f64) -> [f64; 2] {
-        let x = LEFT + self.x.part(cost.ln()) * (SIZE.0 - LEFT - MARGIN);
-        let y = SIZE.1 - BOTTOM - self.y.part(score) * (SIZE.1 - BOTTOM - MARGIN);
+        let x = LEFT_MARGIN + self.x.part(cost.ln()) * (SIZE.0 - LEFT_MARGIN - OTHER_MARGIN);
+        let y = SIZE.1 - BOTTOM_MARGIN - self.y.part(score) * (SIZE.1 - BOTTOM_MARGIN - OTHER_MARGIN);
         [x, y]
     }
 
@@ -183,7 +183,7 @@ impl Scale {
 
     /// Returns the place of a value along the axis, from 0 to 1.
     fn part(&self, value: f64) -> f64 {
-        FREE + (1.0 - 2.0 * FREE) * (value - self.low) / self.span
+        FREE_PART + (1.0 - 2.0 * FREE_PART) * (value - self.low) / self.span
     }
 
     /// Returns the value at a part of the way from the least to the greatest value.

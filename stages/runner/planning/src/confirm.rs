@@ -1,7 +1,7 @@
 //! Checks before a stage's start and after its end that its program is the planned one: the key
 //! contains the hash of its code (docs/design/002).
 
-use std::path::PathBuf;
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use crate::stage_call::{Interrupted, ProgramError, describe_all};
@@ -13,20 +13,9 @@ use crate::stamp::Stamp;
 /// Error returned when a program differs from the planned one, or can't be compared with it.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfirmError {
-    /// The program's file or its code differs.
-    #[error("{0} was changed or rebuilt after planning; run again")]
-    Changed(PathBuf),
-    /// The program's file can't be read.
-    #[error("{program}: {problem}")]
-    File {
-        /// Path of the file.
-        program: PathBuf,
-        /// Error of the system.
-        problem: std::io::Error,
-    },
-    /// The program no longer describes itself.
+    /// The program's file or its code differs, or can't be read.
     #[error(transparent)]
-    Describe(#[from] ProgramError),
+    Program(#[from] ProgramError),
     /// A signal came while the program was described.
     #[error("interrupted")]
     Interrupted,
@@ -36,6 +25,11 @@ impl From<Interrupted> for ConfirmError {
     fn from(_: Interrupted) -> Self {
         Self::Interrupted
     }
+}
+
+fn changed(path: &Path) -> ConfirmError {
+    let problem = "was changed or rebuilt after planning; run again";
+    ProgramError(format!("{} {problem}", path.display())).into()
 }
 
 impl StageProgram {
@@ -74,8 +68,9 @@ impl StageProgram {
     }
 
     fn stamp_now(&self) -> Result<Stamp, ConfirmError> {
+        let path = self.path.display();
         Stamp::of(&self.path)
-            .map_err(|problem| ConfirmError::File { program: self.path.clone(), problem })
+            .map_err(|problem| ProgramError(format!("{path}: {problem}")).into())
     }
 
     /// Fails if a user's file was written to: an interpreter may read a script at any time. The
@@ -85,7 +80,7 @@ impl StageProgram {
         if self.is_own() || now.is_untouched_since(before) {
             return Ok(());
         }
-        Err(ConfirmError::Changed(self.path.clone()))
+        Err(changed(&self.path))
     }
 
     /// Describes the program again. Fails if its code has changed.
@@ -98,6 +93,6 @@ impl StageProgram {
         }
         // The cache knows a wrapper script by its own file, which may be unchanged.
         DescriptionCache::forget(store, path);
-        Err(ConfirmError::Changed(path.clone()))
+        Err(changed(path))
     }
 }

@@ -26,36 +26,15 @@ pub enum StoreError {
         /// Remedy.
         remedy: String,
     },
-    /// The file system doesn't support locks.
-    #[error(
-        "file locks don't work on the file system of {path} ({source}); choose a folder on a local \
-        disk, with --store or --out"
-    )]
-    NoLocks {
-        /// Path of the file to be locked.
-        path: PathBuf,
-        /// Error of the lock operation.
-        source: io::Error,
-    },
+    /// The file system doesn't support locks, or a newer program has marked the store.
+    #[error("{0}")]
+    Unsupported(String),
     /// An object is damaged.
     #[error(transparent)]
     Damage(#[from] Damage),
     /// A stage succeeded, but its output is not a valid artifact.
     #[error("the stage ended without a valid artifact: {0}")]
     NoArtifact(String),
-    /// A newer program has marked the store.
-    #[error(
-        "{path}: the store has format {found}, this nerf-sr supports format {known}; use the newer \
-        nerf-sr, or another folder with --store"
-    )]
-    Newer {
-        /// Folder of the store.
-        path: PathBuf,
-        /// Format of the store.
-        found: String,
-        /// Format that this program supports.
-        known: u32,
-    },
 }
 
 /// Adds the path to the error of a file operation.
@@ -85,12 +64,13 @@ pub fn is_lock_acquired(
 
 /// Converts the error of a lock operation; file systems without locks have an error of their own.
 pub(crate) fn lock_error(path: &Path, source: io::Error) -> StoreError {
-    let path = path.to_path_buf();
     match Errno::from_io_error(&source) {
-        Some(Errno::NOSYS | Errno::OPNOTSUPP | Errno::NOLCK) => {
-            StoreError::NoLocks { path, source }
-        }
-        _ => StoreError::Io { path, source },
+        Some(Errno::NOSYS | Errno::OPNOTSUPP | Errno::NOLCK) => StoreError::Unsupported(format!(
+            "file locks don't work on the file system of {} ({source}); choose a folder on a \
+            local disk, with --store or --out",
+            path.display()
+        )),
+        _ => StoreError::Io { path: path.to_path_buf(), source },
     }
 }
 

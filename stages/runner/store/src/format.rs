@@ -44,11 +44,13 @@ impl Store {
         let Some(text) = if_found(&path, fs::read_to_string(&path))? else { return Ok(None) };
         match text.trim().parse::<u32>() {
             Ok(found) if found <= self.format => Ok(Some(found)),
-            _ => Err(StoreError::Newer {
-                path: self.root().to_path_buf(),
-                found: text.trim().chars().take(20).collect(),
-                known: self.format,
-            }),
+            _ => Err(StoreError::Unsupported(format!(
+                "{}: the store has format {}, this nerf-sr supports format {}; use the newer \
+                nerf-sr, or another folder with --store",
+                self.root().display(),
+                text.trim().chars().take(20).collect::<String>(),
+                self.format
+            ))),
         }
     }
 

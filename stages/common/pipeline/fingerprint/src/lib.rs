@@ -1,9 +1,9 @@
 //! Build-time hash of a stage's code, which is part of an action's key.
 //!
-//! A stage's `build.rs` calls [`emit`]; its `main.rs` reads `env!("STAGE_FINGERPRINT")`. The hash
-//! covers the sources of the stage's crate and of the workspace crates that it depends on, their
-//! part of `Cargo.lock`, compiler, target and profile. The binary's bytes and absolute paths are
-//! excluded, so that moving or rebuilding a checkout doesn't rerun anything.
+//! The stages' build script calls [`emit`]; a stage's `main.rs` reads `env!("STAGE_FINGERPRINT")`.
+//! The hash covers the sources of the stage's crate and of the workspace crates that it depends on,
+//! their part of `Cargo.lock`, compiler, target and profile. The binary's bytes and absolute paths
+//! are excluded, so that moving or rebuilding a checkout doesn't rerun anything.
 //!
 //! Cargo features are excluded, too. A feature (`torch`) only adds functions, without which a stage
 //! fails and has no result, so results are equal with and without the feature. Optional

@@ -37,7 +37,7 @@ pub fn run_stage<S: Stage>(version: &'static str, code: &str) -> ExitCode {
     run_stage_with::<S>(version, code, std::env::args_os())
 }
 
-/// Defines `main` of a stage's program; the crate's `build.rs` calls `fingerprint::emit`.
+/// Defines `main` of a stage's program; the crate's build script calls `fingerprint::emit`.
 #[macro_export]
 macro_rules! main {
     ($stage:ty) => {

@@ -47,7 +47,7 @@ const START_SECONDS: f64 = 0.3;
 const DEMO_PIXEL_SECONDS: f64 = 0.2e-6;
 const DEMO_RAY_SECONDS: f64 = 0.165e-6;
 const BACKDROP_RAY_SECONDS: f64 = 0.32e-6;
-/// Bytes of `demo-scene` without data and per pixel of a view, as there, and of `camera-path`.
+/// Bytes of `demo-scene` without data and per pixel of a view, and of `camera-path`.
 const DEMO_BYTES: u64 = 5_000_000;
 const DEMO_PIXEL_BYTES: u64 = 16;
 const CAMERA_PATH_BYTES: u64 = 5_000_000;
@@ -86,7 +86,7 @@ fn number(parameters: &Value, name: &str) -> Option<f64> {
 
 /// Returns the bytes of data of the views that are processed at a time, one by each thread.
 fn concurrent_bytes(work: &Work, images: &Images, bytes_per_pixel: u64) -> u64 {
-    images.count.min(work.threads) * bytes_per_pixel * images.largest()
+    images.count.min(work.threads) * bytes_per_pixel * images.largest_pixels()
 }
 
 fn demo_scene(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
@@ -150,14 +150,14 @@ fn refiner_training(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
 fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let versions = number(parameters, "self_ensemble")?;
     let seconds = versions * work.images.pixels as f64 * REFINED_PIXEL_SECONDS;
-    Some((seconds, PROGRAM_BYTES + REFINED_PIXEL_BYTES * work.images.largest()))
+    Some((seconds, PROGRAM_BYTES + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
 }
 
 /// Returns the cost of an export: the time of its rendering, and the memory as `export` computes
 /// it, with a lattice that is a cube.
 fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let scale = match number(parameters, "size") {
-        Some(width) => width / work.images.largest.0.max(1) as f64,
+        Some(width) => width / work.images.largest_size.0.max(1) as f64,
         None => ExportViews::default_scale(work.images.pixels),
     };
     let pixels = (work.images.pixels as f64 * scale.powi(2)) as u64;
@@ -183,7 +183,7 @@ mod tests {
 
     /// Returns square images, whose LR width is that of the field.
     fn work(kind: SceneKind, count: u64, width: u64) -> Work {
-        let images = Images { count, pixels: count * width * width, largest: (width, width) };
+        let images = Images { count, pixels: count * width * width, largest_size: (width, width) };
         Work {
             kind,
             pixels_across: width as f64,

@@ -189,7 +189,7 @@ impl<'a> Estimator<'a> {
             _ => self.field(node),
         };
         let lr_images = training.and_then(|training| self.images(training)).map(|(_, lr)| lr);
-        let lr_width = lr_images.unwrap_or_default().largest.0;
+        let lr_width = lr_images.unwrap_or_default().largest_size.0;
         let references = has_input("references").then(|| scene.images("references")).flatten();
         Some(Work {
             kind: scene.kind,

@@ -23,7 +23,7 @@ struct PathFile {
 /// unless their width is given.
 pub(super) fn computed(parameters: &Value, scene: &SceneImages) -> Option<Images> {
     let count = parameters["frames"].as_u64()?;
-    Some(frames(count, scene.images("train-cameras")?.largest, parameters))
+    Some(frames(count, scene.images("train-cameras")?.largest_size, parameters))
 }
 
 /// Returns the frames of a recorded path; `None` if its file can't be read.
@@ -34,9 +34,9 @@ pub(super) fn recorded(parameters: &Value, folder: &Path) -> Option<Images> {
     Some(frames(path.camera_path.len() as u64, size, parameters))
 }
 
-fn frames(count: u64, largest: (u64, u64), parameters: &Value) -> Images {
-    let pixels = largest.0.saturating_mul(largest.1).saturating_mul(count);
-    let images = Images { count, pixels, largest };
+fn frames(count: u64, largest_size: (u64, u64), parameters: &Value) -> Images {
+    let pixels = largest_size.0.saturating_mul(largest_size.1).saturating_mul(count);
+    let images = Images { count, pixels, largest_size };
     match parameters["size"].as_f64() {
         Some(width) => images.resized(width),
         None => images,
@@ -53,8 +53,8 @@ mod tests {
     fn frames_follow_from_the_path() {
         let demo = json!({"size": 200, "aspect": 2.0, "train": 8, "test": 2, "backdrop": false});
         let scene = SceneImages::of_demo(&demo, &json!({"scale": 2})).unwrap();
-        let images = |count, largest: (u64, u64)| {
-            Some(Images { count, pixels: count * largest.0 * largest.1, largest })
+        let images = |count, largest_size: (u64, u64)| {
+            Some(Images { count, pixels: count * largest_size.0 * largest_size.1, largest_size })
         };
         let parameters = json!({"frames": 120});
         assert_eq!(computed(&parameters, &scene), images(120, (200, 100)));

@@ -70,7 +70,7 @@ impl SceneImages {
                 let size = &view["camera"]["intrinsics"];
                 Some((size["width"].as_f64()?, size["height"].as_f64()?))
             });
-            scene.folders.push((folder, count(&sizes.collect::<Option<Vec<_>>>()?)));
+            scene.folders.push((folder, images_of(&sizes.collect::<Option<Vec<_>>>()?)));
         }
         if let Ok(bytes) = std::fs::read(artifact.join("train").join("degradation.json")) {
             let degradation: Value = serde_json::from_slice(&bytes).ok()?;
@@ -150,7 +150,7 @@ impl SceneImages {
         let max_test = number("test_views").map_or(usize::MAX, |count| count as usize);
         let images = |indices: &[usize], factor: f64| {
             let scaled = indices.iter().map(|&i| (sizes[i].0 * factor, sizes[i].1 * factor));
-            count(&scaled.collect::<Vec<_>>())
+            images_of(&scaled.collect::<Vec<_>>())
         };
         let test: Vec<usize> = split.test.iter().copied().take(max_test).collect();
         let references = number("hr_references").unwrap_or(0.0) as usize;
@@ -244,12 +244,13 @@ fn size_of(frame: &Frame) -> (f64, f64) {
     (f64::from(size.width), f64::from(size.height))
 }
 
-fn count(sizes: &[(f64, f64)]) -> Images {
+/// Returns number and size of images with the given widths and heights.
+fn images_of(sizes: &[(f64, f64)]) -> Images {
     let sizes = sizes.iter().map(|(width, height)| (width.round() as u64, height.round() as u64));
     Images {
         count: sizes.len() as u64,
         pixels: sizes.clone().map(|(width, height)| width * height).sum(),
-        largest: sizes.max_by_key(|(width, height)| width * height).unwrap_or_default(),
+        largest_size: sizes.max_by_key(|(width, height)| width * height).unwrap_or_default(),
     }
 }
 
@@ -281,7 +282,7 @@ mod tests {
         let smaller = json!({"scale": 4, "lr_width": 30, "test_views": 3, "hr_references": 0});
         let scene = SceneImages::of_demo(&demo, &smaller).unwrap();
         let images = |count, side| {
-            Some(Images { count, pixels: count * side * side, largest: (side, side) })
+            Some(Images { count, pixels: count * side * side, largest_size: (side, side) })
         };
         assert_eq!(scene.images("train"), images(80, 30));
         assert_eq!(scene.images("cameras"), images(3, 120));
@@ -302,8 +303,8 @@ mod tests {
         };
         let scene = SceneImages::planned(&planned, &json!({"scale": 2}), |_| 7);
         let images = |count, factor: u64| {
-            let largest = (factor * 640, factor * 480);
-            Some(Images { count, pixels: count * largest.0 * largest.1, largest })
+            let largest_size = (factor * 640, factor * 480);
+            Some(Images { count, pixels: count * largest_size.0 * largest_size.1, largest_size })
         };
         assert_eq!(scene.images("train"), images(7, 1));
         assert_eq!(scene.images("truth"), images(2, 1));
@@ -331,7 +332,7 @@ mod tests {
         };
         let scene = write(json!("contraction"));
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Unbounded, 2.0));
-        let images = Images { count: 2, pixels: 1200, largest: (30, 20) };
+        let images = Images { count: 2, pixels: 1200, largest_size: (30, 20) };
         assert_eq!(scene.images("train"), Some(images));
         let scene = write(json!({"ndc": {"min": [-0.5, -0.25], "max": [0.5, 0.25]}}));
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Frustum, 1.5));

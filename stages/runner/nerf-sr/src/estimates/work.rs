@@ -30,22 +30,22 @@ pub(crate) struct Images {
     /// Pixels of all images.
     pub(crate) pixels: u64,
     /// Width and height of the largest image.
-    pub(crate) largest: (u64, u64),
+    pub(crate) largest_size: (u64, u64),
 }
 
 impl Images {
     /// Returns the number of pixels of the largest image.
-    pub(crate) fn largest(&self) -> u64 {
-        self.largest.0 * self.largest.1
+    pub(crate) fn largest_pixels(&self) -> u64 {
+        self.largest_size.0 * self.largest_size.1
     }
 
     /// Returns as many images of another width.
     pub(crate) fn resized(&self, width: f64) -> Self {
-        let factor = width / self.largest.0.max(1) as f64;
+        let factor = width / self.largest_size.0.max(1) as f64;
         let scaled = |side: u64| (side as f64 * factor).round() as u64;
         let pixels = (self.pixels as f64 * factor.powi(2)) as u64;
-        let largest = (scaled(self.largest.0), scaled(self.largest.1));
-        Self { count: self.count, pixels, largest }
+        let largest_size = (scaled(self.largest_size.0), scaled(self.largest_size.1));
+        Self { count: self.count, pixels, largest_size }
     }
 }
 
@@ -78,11 +78,11 @@ impl Work {
     pub(crate) fn of_demo(demo: &Value, threads: u64) -> Option<Self> {
         let number = |name: &str| demo[name].as_f64();
         let (width, count) = (number("size")?, number("train")? + number("test")?);
-        let largest = (width as u64, (width / number("aspect")?).round() as u64);
+        let largest_size = (width as u64, (width / number("aspect")?).round() as u64);
         let kind =
             if demo["backdrop"].as_bool()? { SceneKind::Unbounded } else { SceneKind::Object };
         let count = count as u64;
-        let images = Images { count, pixels: count * largest.0 * largest.1, largest };
+        let images = Images { count, pixels: count * largest_size.0 * largest_size.1, largest_size };
         Some(Self { kind, images, threads, ..Self::default() })
     }
 

@@ -73,7 +73,7 @@ pub(super) fn training_seconds(parameters: &Value, work: &Work) -> Option<f64> {
     let first_steps = if work.is_fine_tuning {
         0.0
     } else {
-        // The first steps are about as many, of any size.
+        // The number of first steps hardly depends on their size.
         fields * first_steps(rays / fields) * step_samples / DEFAULT_STEP_SAMPLES
     };
     let (ray, ray_samples) = match work.kind {
@@ -114,13 +114,13 @@ pub(super) fn training_need(parameters: &Value, work: &Work) -> Option<TrainingM
         refines_poses: parameters["pose_refinement"] == true,
     };
     let mut memory = TrainingMemory { field, ..TrainingMemory::default() };
-    let size = work.images.largest;
+    let size = work.images.largest_size;
     let hr_size = [size.0, size.1].map(|side| (side as f64 * supersample).round() as u64);
     for _ in 0..work.images.count {
         memory.add_photograph(storage, size, (hr_size[0], hr_size[1]));
     }
     for _ in 0..work.references.count {
-        memory.add_reference(storage, work.references.largest);
+        memory.add_reference(storage, work.references.largest_size);
     }
     Some(memory)
 }
