@@ -66,7 +66,8 @@ impl Spectrum {
     /// Returns `None` for images without blocks or structure.
     pub(crate) fn reach(&self) -> Option<f64> {
         let part = |k: usize| self.power[k] * (k * k) as f64;
-        let expected = REFERENCE_FREQUENCIES.map(part).iter().sum::<f64>() / REFERENCE_FREQUENCIES.len() as f64;
+        let expected = REFERENCE_FREQUENCIES.map(part).iter().sum::<f64>()
+            / REFERENCE_FREQUENCIES.len() as f64;
         if expected.is_nan() || expected <= MIN_POWER {
             return None;
         }
@@ -128,7 +129,11 @@ fn waves() -> [[f64; BLOCK_SIDE]; BLOCK_SIDE] {
 }
 
 /// Adds a block's power along both axes, over all frequencies of the other axis.
-fn add_power(power: &mut [f64; BLOCK_SIDE], block: &[[f64; BLOCK_SIDE]; BLOCK_SIDE], waves: &[[f64; BLOCK_SIDE]; BLOCK_SIDE]) {
+fn add_power(
+    power: &mut [f64; BLOCK_SIDE],
+    block: &[[f64; BLOCK_SIDE]; BLOCK_SIDE],
+    waves: &[[f64; BLOCK_SIDE]; BLOCK_SIDE],
+) {
     // By Parseval's theorem, the sum over the other axis' frequencies is that over its pixels.
     for (k, wave) in waves.iter().enumerate().skip(1) {
         for line in 0..BLOCK_SIDE {

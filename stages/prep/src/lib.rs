@@ -111,7 +111,8 @@ impl Stage for Prep {
         let background = params.background.unwrap_or(borders.background());
         let border_notes = if params.background.is_some() { Vec::new() } else { borders.notes() };
         let detail = spectrum.reach().map(|reach| detail::lr_reach(reach, images.lr_factor()));
-        let detail_note = detail.and_then(|reach| detail::missing_detail_warning(reach, images.sizes.lr.0));
+        let detail_note =
+            detail.and_then(|reach| detail::missing_detail_warning(reach, images.sizes.lr.0));
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
         let writer = SceneWriter::new(context, &plan);
         let space_note = space_note(&plan.bounds, background);

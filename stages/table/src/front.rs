@@ -109,7 +109,8 @@ impl Chart {
     /// Returns the position of a cost and a score, in the picture's units.
     fn at(&self, cost: f64, score: f64) -> [f64; 2] {
         let x = LEFT_MARGIN + self.x.part(cost.ln()) * (SIZE.0 - LEFT_MARGIN - OTHER_MARGIN);
-        let y = SIZE.1 - BOTTOM_MARGIN - self.y.part(score) * (SIZE.1 - BOTTOM_MARGIN - OTHER_MARGIN);
+        let y =
+            SIZE.1 - BOTTOM_MARGIN - self.y.part(score) * (SIZE.1 - BOTTOM_MARGIN - OTHER_MARGIN);
         [x, y]
     }
 

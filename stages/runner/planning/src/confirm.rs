@@ -69,8 +69,7 @@ impl StageProgram {
 
     fn stamp_now(&self) -> Result<Stamp, ConfirmError> {
         let path = self.path.display();
-        Stamp::of(&self.path)
-            .map_err(|problem| ProgramError(format!("{path}: {problem}")).into())
+        Stamp::of(&self.path).map_err(|problem| ProgramError(format!("{path}: {problem}")).into())
     }
 
     /// Fails if a user's file was written to: an interpreter may read a script at any time. The

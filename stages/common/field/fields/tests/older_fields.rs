@@ -1,6 +1,6 @@
 //! Fields trained by an older build render unchanged, or are rejected. The files in `goldens/` are
-//! of the demo scene at 16 px: weights of `mlp` are from commit 5af0c3e, those of `grid` from the first
-//! commit with format 2. Descriptions have today's names.
+//! of the demo scene at 16 px: weights of `mlp` are from commit 5af0c3e, those of `grid` from the
+//! first commit with format 2. Descriptions have today's names.
 
 #![allow(missing_docs, reason = "a test")]
 

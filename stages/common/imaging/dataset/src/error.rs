@@ -6,7 +6,6 @@ use artifact::{format_number, printable, shortened};
 
 use crate::file_status::{FileProblem, path_text};
 use crate::format::expected_files;
-use crate::nearby::Nearby;
 
 /// Error returned when a data set can't be read; its message names the file and the remedy.
 #[derive(Debug, thiserror::Error)]
@@ -18,7 +17,7 @@ pub struct DatasetError(#[from] Problem);
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Problem {
     #[error("{}: no data set; {}", path_text(path), hint(nearby.as_ref()))]
-    Unrecognised { path: PathBuf, nearby: Option<Nearby> },
+    Unrecognised { path: PathBuf, nearby: Option<String> },
     #[error("{}: {source}", path_text(path))]
     Io { path: PathBuf, source: io::Error },
     #[error("{0}")]
@@ -37,9 +36,9 @@ pub(crate) enum Problem {
 }
 
 /// Returns what was found instead of a data set, or what was expected.
-fn hint(nearby: Option<&Nearby>) -> String {
+fn hint(nearby: Option<&String>) -> String {
     match nearby {
-        Some(nearby) => printable(&nearby.to_string()).into_owned(),
+        Some(nearby) => printable(nearby).into_owned(),
         None => format!("expected {}", expected_files()),
     }
 }

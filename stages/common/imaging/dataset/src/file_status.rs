@@ -20,13 +20,9 @@ pub(crate) enum FileStatus {
 /// Reason why a path isn't a readable file.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum FileProblem {
-    #[error("{} not found", path_text(path))]
-    NotFound { path: PathBuf },
-    /// Absolute path from another machine. No file in the data set matches the end of the path.
-    #[error("no file in the data set matches the end of the absolute path {}", path_text(path))]
-    NoMatchingTail { path: PathBuf },
-    #[error("{} is {kind}, not {expected}", path_text(path))]
-    WrongKind { path: PathBuf, kind: &'static str, expected: &'static str },
+    /// Nothing at the path, or something that isn't a file or can't be accessed.
+    #[error("{0}")]
+    Other(String),
     /// Link to a missing target, at the path or above it.
     #[error(
         "{} is a symbolic link to {}, which does not exist",
@@ -39,10 +35,6 @@ pub(crate) enum FileProblem {
     BrokenLink { link: PathBuf, error: io::Error },
     #[error("{} is named like an editor or system file, which are ignored", path_text(path))]
     IgnoredName { path: PathBuf },
-    #[error("{}: path is too long ({bytes} bytes)", shortened(&path_text(path)))]
-    TooLong { path: PathBuf, bytes: usize },
-    #[error("cannot access {}: {error}", path_text(path))]
-    Inaccessible { path: PathBuf, error: io::Error },
 }
 
 /// Returns a path for a message, on one line; bytes that aren't UTF-8 are escaped as `\xFF`.
@@ -57,21 +49,23 @@ pub(crate) fn path_text(path: &Path) -> String {
 const MAX_PATH_BYTES: usize = 4096;
 
 /// Checks a path; `expected` describes the expected file in messages ("an image").
-pub(crate) fn file_status(path: &Path, expected: &'static str) -> FileStatus {
-    let bytes = path.as_os_str().len();
-    let too_long = FileProblem::TooLong { path: path.to_path_buf(), bytes };
-    if bytes > MAX_PATH_BYTES {
-        return FileStatus::Unusable(too_long);
+pub(crate) fn file_status(path: &Path, expected: &str) -> FileStatus {
+    let name = path_text(path);
+    let too_long = || {
+        let bytes = path.as_os_str().len();
+        FileProblem::Other(format!("{}: path is too long ({bytes} bytes)", shortened(&name)))
+    };
+    if path.as_os_str().len() > MAX_PATH_BYTES {
+        return FileStatus::Unusable(too_long());
     }
-    let path_buf = path.to_path_buf();
     if path.file_name().is_some_and(is_ignored_name) {
-        return FileStatus::Unusable(FileProblem::IgnoredName { path: path_buf });
+        return FileStatus::Unusable(FileProblem::IgnoredName { path: path.to_path_buf() });
     }
     let error = match fs::metadata(path) {
         Ok(found) if found.is_file() => return FileStatus::File,
         Ok(found) => {
-            let kind = file_kind(found.file_type());
-            return FileStatus::Unusable(FileProblem::WrongKind { path: path_buf, kind, expected });
+            let problem = format!("{name} is {}, not {expected}", file_kind(found.file_type()));
+            return FileStatus::Unusable(FileProblem::Other(problem));
         }
         Err(error) => error,
     };
@@ -81,11 +75,11 @@ pub(crate) fn file_status(path: &Path, expected: &'static str) -> FileStatus {
             FileProblem::DanglingLink { link: link.to_path_buf(), target }
         }
         (Some(link), _) => FileProblem::BrokenLink { link: link.to_path_buf(), error },
-        (None, ErrorKind::InvalidFilename) => too_long,
+        (None, ErrorKind::InvalidFilename) => too_long(),
         (None, ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-            return FileStatus::Missing(FileProblem::NotFound { path: path_buf });
+            return FileStatus::Missing(FileProblem::Other(format!("{name} not found")));
         }
-        (None, _) => FileProblem::Inaccessible { path: path_buf, error },
+        (None, _) => FileProblem::Other(format!("cannot access {name}: {error}")),
     })
 }
 

@@ -57,7 +57,7 @@ pub use format::Format;
 pub use frame::{Frame, Turn};
 use masks::add_masks;
 pub use masks::{MaskFile, MaskKind};
-use nearby::Nearby;
+use nearby::find_nearby;
 pub use photograph::{Clipping, is_image_name};
 pub use split::Split;
 pub use unsupported::{is_unsupported_name, unsupported_images};
@@ -80,7 +80,7 @@ impl Dataset {
 fn recognise_format(folder: &Path) -> Result<Format, DatasetError> {
     let format = find_format(folder)?.ok_or_else(|| Problem::Unrecognised {
         path: folder.to_path_buf(),
-        nearby: Nearby::of(folder),
+        nearby: find_nearby(folder),
     })?;
     Ok(format)
 }

@@ -1,6 +1,5 @@
 //! Explains why a folder is no data set, and finds data sets near it.
 
-use std::fmt::{self, Display, Formatter};
 use std::path::{Path, PathBuf};
 
 use artifact::nearest;
@@ -19,60 +18,37 @@ const SIGNS: [&str; 3] = ["transforms_train.json", "transforms.json", "poses_bou
 /// Files of the Blender format that don't identify it.
 const PARTS: [&str; 2] = ["transforms_test.json", "transforms_val.json"];
 
-/// Content of a folder that is no data set, and the remedy.
-#[derive(Debug)]
-pub(crate) enum Nearby {
-    /// A file instead of a folder; `folder` contains the file.
-    File { folder: PathBuf },
-    /// Export of an application, identified by the file or folder `sign`; `remedy` converts it.
-    Export { application: &'static str, sign: PathBuf, remedy: String },
-    /// File or folder `found`, whose name is similar to `meant`, a name that a data set uses.
-    Misspelt { found: String, meant: &'static str },
-    /// Test views without training views.
-    Incomplete { found: &'static str },
-    /// Data sets in folders below or above.
-    Elsewhere { sets: Vec<(PathBuf, Format)> },
+/// Searches in and around a folder for a data set, or for something that may become one. Returns
+/// what was found, with the remedy.
+pub(crate) fn find_nearby(folder: &Path) -> Option<String> {
+    if folder.is_file() {
+        let parent = parent_folder(folder);
+        let parent = path_text(&parent);
+        return Some(format!("expected a folder, found a file; give its folder {parent}"));
+    }
+    find_export(folder)
+        .or_else(|| find_misnamed(folder))
+        .or_else(|| find_below(folder))
+        .or_else(|| find_above(folder))
 }
 
-impl Display for Nearby {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::File { folder } => {
-                write!(f, "expected a folder, found a file; give its folder {}", path_text(folder))
-            }
-            Self::Export { application, sign, remedy } => {
-                let sign = path_text(sign);
-                write!(f, "found a {application} export ({sign}), which is not supported; {remedy}")
-            }
-            Self::Misspelt { found, meant } => write!(f, "found {found}; did you mean {meant}?"),
-            Self::Incomplete { found } => {
-                write!(f, "found {found}, but no transforms_train.json with the training views")
-            }
-            Self::Elsewhere { sets } => {
-                let listed = sets.iter().take(MAX_LISTED);
-                let listed: Vec<String> = listed
-                    .map(|(folder, format)| format!("{} in {}", format.title(), path_text(folder)))
-                    .collect();
-                let more = sets.len().saturating_sub(MAX_LISTED);
-                let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-                write!(f, "found {}{more}; give ", listed.join(", "))?;
-                f.write_str(if sets.len() == 1 { "that folder" } else { "one of these folders" })
-            }
-        }
-    }
+/// Describes an export of an application, identified by the file or folder `sign`; `remedy`
+/// converts the export.
+fn export_text(application: &str, sign: &Path, remedy: &str) -> String {
+    let sign = path_text(sign);
+    format!("found a {application} export ({sign}), which is not supported; {remedy}")
 }
 
-impl Nearby {
-    /// Searches in and around a folder for a data set, or for something that may become one.
-    pub(crate) fn of(folder: &Path) -> Option<Self> {
-        if folder.is_file() {
-            return Some(Self::File { folder: parent_folder(folder) });
-        }
-        find_export(folder)
-            .or_else(|| find_misnamed(folder))
-            .or_else(|| find_below(folder))
-            .or_else(|| find_above(folder))
-    }
+/// Describes data sets in other folders; `None` if there are none.
+fn sets_text(sets: &[(PathBuf, Format)]) -> Option<String> {
+    let listed = sets.iter().take(MAX_LISTED);
+    let listed: Vec<String> = listed
+        .map(|(folder, format)| format!("{} in {}", format.title(), path_text(folder)))
+        .collect();
+    let more = sets.len().saturating_sub(MAX_LISTED);
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    let choice = if sets.len() == 1 { "that folder" } else { "one of these folders" };
+    (!sets.is_empty()).then(|| format!("found {}{more}; give {choice}", listed.join(", ")))
 }
 
 fn parent_folder(path: &Path) -> PathBuf {
@@ -94,7 +70,7 @@ fn has_extension(path: &Path, extension: &str) -> bool {
 
 /// Recognises exports of Polycam and Record3D, also in a folder's only sub-folder, as in an
 /// archive.
-fn find_export(folder: &Path) -> Option<Nearby> {
+fn find_export(folder: &Path) -> Option<String> {
     let mut candidates = vec![folder.to_path_buf()];
     if let [only] = &sub_folders(folder)[..] {
         candidates.push(only.clone());
@@ -102,7 +78,7 @@ fn find_export(folder: &Path) -> Option<Nearby> {
     candidates.iter().find_map(|folder| find_polycam(folder).or_else(|| find_record3d(folder)))
 }
 
-fn find_polycam(folder: &Path) -> Option<Nearby> {
+fn find_polycam(folder: &Path) -> Option<String> {
     let (data, keyframes) = if name_text(folder) == "keyframes" {
         (parent_folder(folder), folder.to_path_buf())
     } else {
@@ -111,11 +87,10 @@ fn find_polycam(folder: &Path) -> Option<Nearby> {
     let mut cameras = ["corrected_cameras", "cameras"].map(|name| keyframes.join(name)).into_iter();
     let sign =
         cameras.find(|path| visible_entries(path).iter().any(|e| has_extension(e, "json")))?;
-    let remedy = conversion("polycam", &data);
-    Some(Nearby::Export { application: "Polycam", sign, remedy })
+    Some(export_text("Polycam", &sign, &conversion("polycam", &data)))
 }
 
-fn find_record3d(folder: &Path) -> Option<Nearby> {
+fn find_record3d(folder: &Path) -> Option<String> {
     let [has_exr, has_rgbd, has_rgb, has_depth, has_metadata, has_json] =
         ["EXR_RGBD", "rgbd", "rgb", "depth", "metadata", "metadata.json"]
             .map(|name| folder.join(name).exists());
@@ -136,7 +111,7 @@ fn find_record3d(folder: &Path) -> Option<Nearby> {
     } else {
         command
     };
-    Some(Nearby::Export { application: "Record3D", sign, remedy })
+    Some(export_text("Record3D", &sign, &remedy))
 }
 
 /// Returns nerfstudio's command that converts an application's export to a data set.
@@ -155,9 +130,11 @@ fn shell_quoted(path: &Path) -> String {
 }
 
 /// Recognises files and folders whose name is similar to a name that a data set uses.
-fn find_misnamed(folder: &Path) -> Option<Nearby> {
+fn find_misnamed(folder: &Path) -> Option<String> {
     if let Some(found) = PARTS.into_iter().find(|part| folder.join(part).is_file()) {
-        return Some(Nearby::Incomplete { found });
+        return Some(format!(
+            "found {found}, but no transforms_train.json with the training views"
+        ));
     }
     for path in &visible_entries(folder) {
         let name = name_text(path);
@@ -167,7 +144,7 @@ fn find_misnamed(folder: &Path) -> Option<Nearby> {
             nearest(name, SIGNS)
         };
         if let Some(meant) = meant {
-            return Some(Nearby::Misspelt { found: name.to_owned(), meant });
+            return Some(format!("found {name}; did you mean {meant}?"));
         }
     }
     None
@@ -183,25 +160,22 @@ fn has_image_list(folder: &Path) -> bool {
 }
 
 /// Finds data sets one level below a folder, otherwise two levels below.
-fn find_below(folder: &Path) -> Option<Nearby> {
+fn find_below(folder: &Path) -> Option<String> {
     let near = sub_folders(folder);
-    let sets = sets_of(&near);
-    if !sets.is_empty() {
-        return Some(Nearby::Elsewhere { sets });
-    }
-    let far: Vec<PathBuf> =
-        near.iter().flat_map(|path| sub_folders(path)).take(MAX_FOLDERS).collect();
-    let sets = sets_of(&far);
-    (!sets.is_empty()).then_some(Nearby::Elsewhere { sets })
+    sets_text(&sets_of(&near)).or_else(|| {
+        let far: Vec<PathBuf> =
+            near.iter().flat_map(|path| sub_folders(path)).take(MAX_FOLDERS).collect();
+        sets_text(&sets_of(&far))
+    })
 }
 
 /// Finds the data set that contains a folder such as `images` or `sparse/0`.
-fn find_above(folder: &Path) -> Option<Nearby> {
+fn find_above(folder: &Path) -> Option<String> {
     let folder = folder.canonicalize().ok()?;
     let above: Vec<PathBuf> = folder.ancestors().skip(1).take(2).map(Path::to_path_buf).collect();
     let mut sets = sets_of(&above);
     sets.truncate(1);
-    (!sets.is_empty()).then_some(Nearby::Elsewhere { sets })
+    sets_text(&sets)
 }
 
 fn sets_of(folders: &[PathBuf]) -> Vec<(PathBuf, Format)> {

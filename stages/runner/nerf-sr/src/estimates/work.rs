@@ -82,7 +82,8 @@ impl Work {
         let kind =
             if demo["backdrop"].as_bool()? { SceneKind::Unbounded } else { SceneKind::Object };
         let count = count as u64;
-        let images = Images { count, pixels: count * largest_size.0 * largest_size.1, largest_size };
+        let images =
+            Images { count, pixels: count * largest_size.0 * largest_size.1, largest_size };
         Some(Self { kind, images, threads, ..Self::default() })
     }
 

@@ -188,7 +188,10 @@ impl Lookup {
         match (missing, literal) {
             (Some(problem), _) => Ok(Located::Missing(problem)),
             (None, Err(error)) if absolute_parts(name).is_none() => Err(error.into()),
-            _ => Ok(Located::Missing(FileProblem::NoMatchingTail { path: PathBuf::from(name) })),
+            _ => Ok(Located::Missing(FileProblem::Other(format!(
+                "no file in the data set matches the end of the absolute path {}",
+                path_text(Path::new(name))
+            )))),
         }
     }
 
