@@ -12,7 +12,8 @@ const MAX_BLOCKS: usize = 256;
 const DETAILED_PART: usize = 4;
 /// Frequencies that fix the expected spectrum.
 const REFERENCE_FREQUENCIES: [usize; 2] = [2, 3];
-/// Minimum power at [`REFERENCE_FREQUENCIES`] of images with structure, in squared levels; chosen by hand.
+/// Minimum power at [`REFERENCE_FREQUENCIES`] of images with structure, in squared levels; chosen by
+/// hand.
 const MIN_POWER: f64 = 1.0;
 /// First frequency that is compared with the expected spectrum.
 const FIRST_COMPARED: usize = 4;

@@ -28,19 +28,20 @@ pub(crate) fn downscaled_sizes(
     };
     if lr == 0 {
         bail_usage!(
-            "parameters: scale = {scale} reduces a width of {hr} pixels to 0; choose a smaller scale"
+            "parameters: scale = {scale} reduces a width of {hr} pixels to 0; choose a smaller \
+            scale"
         );
     }
     if scale > 1.0 && lr == hr {
         bail_usage!(
-            "parameters: scale = {scale} gives LR and HR images the same width of {hr} pixels; give \
-            larger images, or choose scale = 1"
+            "parameters: scale = {scale} gives LR and HR images the same width of {hr} pixels; \
+            give larger images, or choose scale = 1"
         );
     }
     if hr > native.0 {
         bail_usage!(
-            "parameters: lr_width = {lr} and scale = {scale} give HR images of {hr} pixels, but the \
-            data set's images are {} pixels wide; choose a smaller lr_width or scale",
+            "parameters: lr_width = {lr} and scale = {scale} give HR images of {hr} pixels, but \
+            the data set's images are {} pixels wide; choose a smaller lr_width or scale",
             native.0
         );
     }

@@ -75,8 +75,8 @@ impl DatasetError {
     }
 }
 
-/// Reason why a file or a frame is invalid. Text of the data set is unescaped here; [`DatasetError`]
-/// escapes it.
+/// Reason why a file or a frame is invalid. Text of the data set is unescaped here;
+/// [`DatasetError`] escapes it.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Reason(String);
 
