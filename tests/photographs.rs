@@ -163,12 +163,29 @@ fn exposure_factors(photograph: usize) -> [f32; 3] {
     [0.7f32, 1.0 / 0.7].map(|f| [f, f.sqrt(), 1.0 / f.sqrt()])[photograph % 2]
 }
 
+const WHITE: &str = "background=white";
+
+/// Returns the log and the weights of a field trained on a data set, with a setting.
+fn field(project: &Project, dataset: &str, setting: &str) -> (Value, Vec<u8>) {
+    let dataset = format!("dataset={dataset}");
+    let settings = ["-i", &dataset, "-p", WHITE, "-p", setting];
+    project.ok(&[&["run", "train-ss"], &settings[..]].concat());
+    let folder = project.artifact("train-ss", &settings);
+    let weights = std::fs::read(folder.join("field-0.safetensors")).unwrap();
+    (project.json("train-ss", "training.json", &settings), weights)
+}
+
 fn off_by(found: &[[f32; 3]]) -> f32 {
     found
         .iter()
         .enumerate()
         .flat_map(|(i, e)| (0..3).map(move |c| (e[c] / exposure_factors(i)[c]).ln().abs()))
         .sum()
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    let status = std::process::Command::new("cp").arg("-r").args([from, to]).status().unwrap();
+    assert!(status.success());
 }
 
 /// Photographs of one scene with exposures and white balances of their own: the field has one, and
@@ -179,6 +196,7 @@ fn exposures_are_found() {
     let folder = as_transforms(&project);
     let file = folder.join("transforms.json");
     let transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    copy_folder(&folder, &project.path("equal"));
     // Every eighth photograph is held out and unchanged; the others' factors have mean 1.
     let frames =
         transforms["frames"].as_array().unwrap().iter().enumerate().filter(|(i, _)| i % 8 != 0);
@@ -195,10 +213,20 @@ fn exposures_are_found() {
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 500000");
+    // Without differences, it ends in the field of a training that looked for none.
+    let (by_scene, weights) = field(&project, "./equal", "seed=0");
+    let expected = field(&project, "./equal", "exposure=false").1;
+    assert_eq!((&by_scene["resolved"]["exposure"], weights == expected), (&json!(false), true));
     let ((found, training), (ignored, _)) =
         (scored_with(&project, "exposure=true"), scored_with(&project, "exposure=false"));
     let exposures: Vec<[f32; 3]> = serde_json::from_value(training["exposures"].clone()).unwrap();
     println!("{found:.2} dB with exposures, {ignored:.2} dB without; {exposures:?}");
+    // By default the training measures this, starts over, and ends in the same field.
+    let (by_scene, weights) = field(&project, "./transforms", "seed=0");
+    let expected = field(&project, "./transforms", "exposure=true").1;
+    assert_eq!((&by_scene["resolved"]["exposure"], weights == expected), (&json!(true), true));
+    let log = project.ok(&["log", "train-ss", "-i", "dataset=./transforms", "-p", WHITE]);
+    println!("{log}");
     // Against having found nothing: all factors 1.
     let (off, was) = (off_by(&exposures), off_by(&vec![[1.0; 3]; exposures.len()]));
     assert!(!exposures.is_empty() && off < 0.5 * was, "off by {off} of {was}: {exposures:?}");

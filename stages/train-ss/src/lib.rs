@@ -28,7 +28,7 @@ use serde_json::json;
 use stage::{Context, Input, Output, Rule, Stage};
 
 pub use params::{
-    Combine, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
+    Combine, Exposure, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
     ResolvedRegularisers, SceneFacts, Supervision,
 };
 use supervision::transparent_background;
@@ -99,7 +99,8 @@ impl Stage for TrainSs {
         views.bounds = views.bounds.rounded(anchor);
         let init = context.optional_input("init");
         let has_kernel = input.path(DEGRADATION_FILE).exists();
-        let params = params.resolve(&SceneFacts {
+        let given_exposure = params.exposure;
+        let mut params = params.resolve(&SceneFacts {
             is_fine_tuning: init.is_some(),
             ..SceneFacts::of(&views, has_kernel)
         });
@@ -112,6 +113,9 @@ impl Stage for TrainSs {
         };
         let init = init.map(|input| InitField::read(input, &mut file, anchor)).transpose()?;
         views.bounds = file.bounds;
+        if let (Some(init), None) = (&init, given_exposure) {
+            params.exposure = init.has_exposures()?.into();
+        }
         let mut log = TrainingLog { resolved: params.record(), ..TrainingLog::default() };
         if context.from_checkpoint() {
             let init = init.as_ref().map(|init| (init.member(0), params.combine));
@@ -157,8 +161,11 @@ impl Stage for TrainSs {
             }
             rays += trained.rays;
             log.append(trained);
+            // The measurement by the first member decides for all.
+            params.exposure = (!log.exposures.is_empty()).into();
             progress.set(rays, "");
         }
+        log.resolved.extend(params.record());
         publish(context, &file, &log)
     }
 }

@@ -9,7 +9,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use torch_field::MlpArchitecture;
 
-pub use resolved::{Resolved, ResolvedField, ResolvedRegularisers};
+pub use resolved::{Exposure, Resolved, ResolvedField, ResolvedRegularisers};
 pub use scene_facts::SceneFacts;
 
 /// Parameters of `train-ss`. [`Params::resolve`] replaces `None` with a default for the scene.
@@ -52,8 +52,11 @@ pub struct Params {
     pub supervision: Option<Supervision>,
     /// Estimates a gain for red, green and blue of each photograph, for photographs with several
     /// exposures or white balances. Rendered views have the mean exposure of the photographs.
-    #[schemars(extend("x-group" = "data"))]
-    pub exposure: bool,
+    /// Default: the first 512 steps measure the gains, and the training starts over with exposures
+    /// if gains differ by more than 2 to 3 %. Fine-tuning (input `init`) follows the initial field.
+    /// False for `field: mlp` and background `alpha`.
+    #[schemars(extend("x-group" = "data", "x-default" = BY_SCENE))]
+    pub exposure: Option<bool>,
     /// Optimises camera poses during training, for poses that aren't exact. Motion that all cameras
     /// share is removed. Each field of an `ensemble` estimates its own poses.
     /// `nerf-sr run registered` then renders test views from registered cameras.
@@ -94,7 +97,7 @@ impl Default for Params {
             max_rays_per_step: None,
             learning_rate: None,
             supervision: None,
-            exposure: false,
+            exposure: None,
             pose_refinement: false,
             silhouettes: true,
             max_references: None,

@@ -4,7 +4,7 @@ use torch_field::MlpArchitecture;
 use workload::RayBudget;
 
 use super::{
-    Combine, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
+    Combine, Exposure, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
     ResolvedRegularisers, SceneFacts, Supervision,
 };
 use crate::supersample::whole_supersample;
@@ -47,13 +47,15 @@ impl Params {
         } else {
             Supervision::Average
         };
+        let can_measure = is_grid && scene.background != Background::Alpha && !scene.is_fine_tuning;
+        let exposure = if can_measure { Exposure::ByScene } else { Exposure::Off };
         let combine = if scene.is_ndc() { Combine::AverageWeights } else { Combine::Ensemble };
         Resolved {
             field: self.field.resolve(scene),
             supersample: self.supersample,
             supersample_warmup: defaults.supersample_warmup,
             supervision: self.supervision.unwrap_or(supervision),
-            exposure: self.exposure,
+            exposure: self.exposure.map_or(exposure, Exposure::from),
             pose_refinement: self.pose_refinement,
             silhouettes: self.silhouettes && is_grid,
             in_epochs: !is_grid,
@@ -242,6 +244,10 @@ mod tests {
             (&grid, boxed, "log2_hashmap_size", json!(20)),
             (&grid, boxed, "supersample_warmup", json!(0.3)),
             (&grid, boxed, "supervision", json!("kernel")),
+            (&grid, boxed, "exposure", json!(null)),
+            (&grid, open, "exposure", json!(false)),
+            (&grid, SceneFacts { is_fine_tuning: true, ..boxed }, "exposure", json!(false)),
+            (&mlp, boxed, "exposure", json!(false)),
             (&grid, boxed, "combine", json!("ensemble")),
             (&grid, open, "supervision", json!("average")),
             (&grid, SceneFacts { has_kernel: false, ..boxed }, "supervision", json!("average")),

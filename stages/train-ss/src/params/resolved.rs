@@ -28,8 +28,8 @@ pub struct Resolved {
     pub supersample_warmup: f64,
     /// Comparison of an LR pixel with its rays.
     pub supervision: Supervision,
-    /// True if exposures are estimated.
-    pub exposure: bool,
+    /// Estimation of exposures.
+    pub exposure: Exposure,
     /// True if camera poses are optimised.
     pub pose_refinement: bool,
     /// True if photographs with alpha limit the cells of the grid.
@@ -57,6 +57,23 @@ pub struct Resolved {
     pub combine: Combine,
     /// Seed of all random numbers.
     pub seed: u64,
+}
+
+/// Estimation of exposures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Exposure {
+    /// Gains are 1.
+    Off,
+    /// Gains are estimated.
+    On,
+    /// Gains are measured in the first part of the training, and estimated if they differ.
+    ByScene,
+}
+
+impl From<bool> for Exposure {
+    fn from(is_estimated: bool) -> Self {
+        if is_estimated { Self::On } else { Self::Off }
+    }
 }
 
 /// Field with every default set.
@@ -95,6 +112,12 @@ impl Resolved {
     pub fn record(&self) -> BTreeMap<String, Value> {
         let common = json!({
             "combine": self.combine,
+            "exposure": match self.exposure {
+                Exposure::Off => Some(false),
+                Exposure::On => Some(true),
+                // Known after the first part of the training.
+                Exposure::ByScene => None,
+            },
             "learning_rate": self.learning_rate,
             "max_rays_per_step": self.max_rays_per_step,
             "rays": self.rays,

@@ -1,3 +1,6 @@
+use std::fmt;
+use std::ops::Range;
+
 /// Factor by which a view's sums decay with every drawn pixel; chosen by hand.
 const DECAY: f64 = 0.998;
 /// Weight of the prior that gains are 1, in white pixels; chosen by hand.
@@ -6,6 +9,56 @@ const PRIOR: f64 = 1.0;
 /// the field has already explained exposures by floaters: from 0.1, gains are half of the true
 /// ones; from 0.3, they stay 1 (design note 026).
 const FIRST_PROGRESS: f64 = 0.02;
+/// Steps in which the gains of a training that applies none are measured, each range with the
+/// minimum clear difference relative to the field's error. Differences between equal exposures come
+/// from this error. The field explains true differences by floaters: in a contraction, large ones
+/// within 70 steps (design note 026).
+const MEASUREMENTS: [(Range<u64>, f64); 5] =
+    [(24..36, 0.4), (128..192, 0.15), (192..256, 0.15), (256..384, 0.15), (384..512, 0.15)];
+/// Maximum training progress at the end of a measurement: starting over later would cost too much.
+const MAX_MEASURED_PROGRESS: f64 = 0.25;
+
+/// Sums of photographed · rendered and of rendered², for every view and channel, from which gains
+/// follow by least squares.
+#[derive(Clone, Debug)]
+struct GainSums(Vec<[[f64; 2]; 3]>);
+
+impl GainSums {
+    fn new(views: usize) -> Self {
+        Self(vec![[[0.0; 2]; 3]; views])
+    }
+
+    /// Adds a pixel of a view; earlier ones keep the fraction `decay` of their weight. NaN marks
+    /// channels without information.
+    fn add_pixel(&mut self, view: usize, photographed: [f32; 3], rendered: [f32; 3], decay: f64) {
+        for (c, sums) in self.0[view].iter_mut().enumerate() {
+            let [y, x] = [photographed[c], rendered[c]].map(f64::from);
+            if y.is_finite() && x.is_finite() {
+                *sums = [decay.mul_add(sums[0], y * x), decay.mul_add(sums[1], x * x)];
+            }
+        }
+    }
+
+    /// Returns the logarithms of the first `views` gains in a channel; their mean is 0.
+    fn logarithms(&self, channel: usize, views: usize) -> Vec<f64> {
+        let logarithms: Vec<f64> = (self.0.iter().take(views))
+            .map(|sums| ((sums[channel][0] + PRIOR) / (sums[channel][1] + PRIOR)).ln())
+            .collect();
+        let mean = logarithms.iter().sum::<f64>() / logarithms.len().max(1) as f64;
+        logarithms.into_iter().map(|logarithm| logarithm - mean).collect()
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        self.0.as_flattened().as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect()
+    }
+
+    fn restore(&mut self, bytes: &[u8]) {
+        let sums = self.0.as_flattened_mut().as_flattened_mut();
+        for (sum, number) in sums.iter_mut().zip(bytes.as_chunks::<8>().0) {
+            *sum = f64::from_le_bytes(*number);
+        }
+    }
+}
 
 /// Per-channel gain of each photograph relative to the field's render, by least squares over the
 /// drawn pixels with exponential decay. The geometric mean of the gains is 1, since a gain that all
@@ -15,14 +68,13 @@ const FIRST_PROGRESS: f64 = 0.02;
 /// almost a power function.
 #[derive(Clone, Debug)]
 pub(crate) struct Exposures {
-    /// Sums of photographed · rendered and of rendered², for every view and channel.
-    sums: Vec<[[f64; 2]; 3]>,
+    sums: GainSums,
     gains: Vec<[f32; 3]>,
 }
 
 impl Exposures {
     pub(crate) fn new(views: usize) -> Self {
-        Self { sums: vec![[[0.0; 2]; 3]; views], gains: vec![[1.0; 3]; views] }
+        Self { sums: GainSums::new(views), gains: vec![[1.0; 3]; views] }
     }
 
     /// Returns the gain of every view.
@@ -32,12 +84,7 @@ impl Exposures {
 
     /// Adds a pixel of a view to the sums. NaN marks channels without information.
     pub(crate) fn add_pixel(&mut self, view: usize, photographed: [f32; 3], rendered: [f32; 3]) {
-        for (c, sums) in self.sums[view].iter_mut().enumerate() {
-            let [y, x] = [photographed[c], rendered[c]].map(f64::from);
-            if y.is_finite() && x.is_finite() {
-                *sums = [DECAY.mul_add(sums[0], y * x), DECAY.mul_add(sums[1], x * x)];
-            }
-        }
+        self.sums.add_pixel(view, photographed, rendered, DECAY);
     }
 
     /// Recomputes the gains at a training progress in 0..1.
@@ -46,27 +93,126 @@ impl Exposures {
             return;
         }
         for c in 0..3 {
-            let logarithms: Vec<f64> = (self.sums.iter())
-                .map(|sums| ((sums[c][0] + PRIOR) / (sums[c][1] + PRIOR)).ln())
-                .collect();
-            let mean = logarithms.iter().sum::<f64>() / logarithms.len().max(1) as f64;
-            for (view, logarithm) in logarithms.iter().enumerate() {
-                self.gains[view][c] = (logarithm - mean).exp() as f32;
+            let logarithms = self.sums.logarithms(c, self.gains.len());
+            for (gains, logarithm) in self.gains.iter_mut().zip(logarithms) {
+                gains[c] = logarithm.exp() as f32;
             }
         }
     }
 
     /// Serialises the sums, from which the gains follow.
     pub(crate) fn to_bytes(&self) -> Vec<u8> {
-        self.sums.iter().flatten().flatten().flat_map(|v| v.to_le_bytes()).collect()
+        self.sums.to_bytes()
     }
 
     /// Restores the result of [`Exposures::to_bytes`].
     pub(crate) fn restore(&mut self, bytes: &[u8]) {
-        let numbers = bytes.as_chunks::<8>().0;
-        for (sum, number) in self.sums.iter_mut().flatten().flatten().zip(numbers) {
-            *sum = f64::from_le_bytes(*number);
+        self.sums.restore(bytes);
+    }
+}
+
+/// Measurement of the photographs' gains in the first steps of a training that applies none.
+#[derive(Clone, Debug)]
+pub(crate) struct ExposureMeasurement {
+    /// Number of steps that have started.
+    steps: u64,
+    sums: GainSums,
+    /// Sum of squared differences between photographed and rendered values.
+    error: f64,
+}
+
+impl ExposureMeasurement {
+    pub(crate) fn new(views: usize) -> Self {
+        Self { steps: 0, sums: GainSums::new(views), error: 0.0 }
+    }
+
+    /// Starts the next step.
+    pub(crate) fn start_step(&mut self) {
+        if MEASUREMENTS.iter().any(|(steps, _)| steps.start == self.steps) {
+            (self.sums, self.error) = (GainSums::new(self.sums.0.len()), 0.0);
         }
+        self.steps += 1;
+    }
+
+    /// True if the pixels of the current step count.
+    pub(crate) fn is_measuring(&self) -> bool {
+        let step = self.steps.saturating_sub(1);
+        MEASUREMENTS.iter().any(|(steps, _)| steps.contains(&step))
+    }
+
+    /// Adds a pixel of a view if the current step counts. NaN marks channels without information.
+    pub(crate) fn add_pixel(&mut self, view: usize, photographed: [f32; 3], rendered: [f32; 3]) {
+        if self.is_measuring() {
+            self.sums.add_pixel(view, photographed, rendered, 1.0);
+            let errors = photographed.iter().zip(rendered).map(|(y, x)| f64::from(y - x));
+            self.error += errors.filter(|e| e.is_finite()).map(|e| e * e).sum::<f64>();
+        }
+    }
+
+    /// Returns the difference between the first `views` photographs after a step that ends a
+    /// measurement, at a training progress in 0..1; `None` after any other step.
+    pub(crate) fn difference(&self, progress: f64, views: usize) -> Option<ExposureDifference> {
+        let ended = MEASUREMENTS.iter().find(|(steps, _)| steps.end == self.steps);
+        let (_, factor) = ended.filter(|_| progress <= MAX_MEASURED_PROGRESS)?;
+        let rendered: f64 = self.sums.0.as_flattened().iter().map(|sums| sums[1]).sum();
+        let limit = factor * (self.error / (rendered + PRIOR)).sqrt();
+        let logarithms = (0..3).flat_map(|c| self.sums.logarithms(c, views));
+        let mean_square = logarithms.map(|l| l * l).sum::<f64>() / (3 * views).max(1) as f64;
+        Some(ExposureDifference { steps: self.steps, spread: mean_square.sqrt(), limit })
+    }
+
+    /// Serialises steps, error and sums.
+    pub(crate) fn to_bytes(&self) -> Vec<u8> {
+        [&self.steps.to_le_bytes()[..], &self.error.to_le_bytes(), &self.sums.to_bytes()].concat()
+    }
+
+    /// Restores the result of [`ExposureMeasurement::to_bytes`].
+    pub(crate) fn restore(&mut self, bytes: &[u8]) {
+        let Some((steps, sums)) = bytes.split_first_chunk::<8>() else { return };
+        let Some((error, sums)) = sums.split_first_chunk::<8>() else { return };
+        self.steps = u64::from_le_bytes(*steps);
+        self.error = f64::from_le_bytes(*error);
+        self.sums.restore(sums);
+    }
+}
+
+/// Result of a measurement.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct ExposureDifference {
+    /// Number of steps until then.
+    steps: u64,
+    /// Root mean square of the logarithms of the photographs' gains.
+    spread: f64,
+    /// Minimum of `spread` that is clear.
+    limit: f64,
+}
+
+impl ExposureDifference {
+    /// True if this measurement was the last one.
+    pub(crate) fn is_last(self) -> bool {
+        MEASUREMENTS.last().is_some_and(|(steps, _)| steps.end == self.steps)
+    }
+
+    /// True if exposures are to be estimated.
+    pub(crate) fn is_clear(self) -> bool {
+        self.spread >= self.limit
+    }
+}
+
+impl fmt::Display for ExposureDifference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { steps, spread, limit } = self;
+        let [spread, limit] = [spread, limit].map(|of| 100.0 * of);
+        let (order, decision) = if self.is_clear() {
+            ("at least", "starting over with exposures")
+        } else {
+            ("less than", "they stay equal")
+        };
+        write!(
+            f,
+            "exposures of the photographs differ by {spread:.1} % after {steps} steps, {order} \
+            {limit:.1} %: {decision}"
+        )
     }
 }
 
@@ -100,5 +246,66 @@ mod tests {
         other.restore(&exposures.to_bytes());
         other.update_gains(0.5);
         assert_eq!(other.gains(), exposures.gains());
+    }
+
+    /// Returns the differences measured between photographs with gains of e^±`spread`, by a field
+    /// whose error is `error` times its colours.
+    fn measured(spread: f32, error: f32, progress: f64) -> Vec<ExposureDifference> {
+        let mut measurement = ExposureMeasurement::new(5);
+        let mut differences = Vec::new();
+        for _ in 0..600 {
+            measurement.start_step();
+            for i in 0..70 {
+                let (view, rendered) = (i % 5, [0.1 + 0.3 * (i % 7) as f32 / 7.0; 3]);
+                // The fifth view is a reference of another exposure, which doesn't count.
+                let gain = if view == 4 { 1.2 } else { (spread * [1.0, -1.0][view % 2]).exp() };
+                let error = if i < 35 { 1.0 + error } else { 1.0 - error };
+                measurement.add_pixel(view, rendered.map(|x| error * gain * x), rendered);
+                measurement.add_pixel(view, [f32::NAN; 3], rendered);
+            }
+            differences.extend(measurement.difference(progress, 4));
+        }
+        differences
+    }
+
+    #[test]
+    fn differences_are_measured() {
+        for (spread, error, is_clear) in [
+            (0.0, 0.05, [false; 5]),
+            (0.02, 0.2, [false; 5]),
+            (0.06, 0.2, [false, true, true, true, true]),
+            (0.06, 0.5, [false; 5]),
+            (0.3, 0.5, [true; 5]),
+        ] {
+            let differences = measured(spread, error, 0.1);
+            let found: Vec<bool> = differences.iter().map(|d| d.is_clear()).collect();
+            assert_eq!(found, is_clear, "{differences:?}");
+            let off = differences.iter().map(|d| (d.spread - f64::from(spread)).abs());
+            assert!(off.fold(0.0, f64::max) < 0.15 * f64::from(spread) + 1e-9, "{differences:?}");
+        }
+        let text = measured(0.06, 0.2, 0.1)[3].to_string();
+        assert!(text.contains("differ by 5.9 % after 384 steps, at least 3."), "{text}");
+        assert_eq!(measured(0.5, 0.1, 0.3), []);
+    }
+
+    /// A measurement resumed from a checkpoint has the same result.
+    #[test]
+    fn a_measurement_is_resumed() {
+        let mut measurement = ExposureMeasurement::new(2);
+        for step in 0..192 {
+            measurement.start_step();
+            assert_eq!(measurement.is_measuring(), (24..36).contains(&step) || step >= 128);
+            measurement.add_pixel(0, [0.5; 3], [0.4; 3]);
+            measurement.add_pixel(1, [0.4; 3], [0.5; 3]);
+            if step == 150 {
+                let mut other = ExposureMeasurement::new(2);
+                other.restore(&measurement.to_bytes());
+                assert_eq!(other.to_bytes(), measurement.to_bytes());
+                measurement = other;
+            }
+            assert_eq!(measurement.difference(0.1, 2).is_some(), [35, 191].contains(&step));
+        }
+        let gains = measurement.difference(0.1, 2).unwrap().spread;
+        assert!((gains - 1.25f64.ln()).abs() < 0.03, "{gains}");
     }
 }

@@ -6,7 +6,7 @@ mod moving_cameras;
 
 use std::io;
 
-pub(crate) use exposure::Exposures;
+pub(crate) use exposure::{ExposureDifference, ExposureMeasurement, Exposures};
 pub(crate) use hr_cache::{HrCache, KernelOperator, LrPixel};
 pub(crate) use moving_cameras::MovingCameras;
 
@@ -16,6 +16,8 @@ pub(crate) struct TrainingState {
     pub(crate) cache: Option<HrCache>,
     /// Gain of each photograph.
     pub(crate) exposures: Option<Exposures>,
+    /// Measurement of whether gains are needed.
+    pub(crate) measurement: Option<ExposureMeasurement>,
     /// Cameras whose poses are optimised.
     pub(crate) cameras: Option<MovingCameras>,
 }
@@ -29,6 +31,9 @@ impl TrainingState {
         if let Some(exposures) = &self.exposures {
             to.write_all(&exposures.to_bytes())?;
         }
+        if let Some(measurement) = &self.measurement {
+            to.write_all(&measurement.to_bytes())?;
+        }
         if let Some(cameras) = &self.cameras {
             to.write_all(&cameras.to_bytes())?;
         }
@@ -39,6 +44,7 @@ impl TrainingState {
     pub(crate) fn byte_length(&self) -> usize {
         self.cache.as_ref().map_or(0, HrCache::byte_length)
             + self.exposures.as_ref().map_or(0, |exposures| exposures.to_bytes().len())
+            + self.measurement.as_ref().map_or(0, |measurement| measurement.to_bytes().len())
             + self.cameras.as_ref().map_or(0, |cameras| cameras.to_bytes().len())
     }
 
@@ -49,6 +55,9 @@ impl TrainingState {
         }
         if let Some(exposures) = &mut self.exposures {
             exposures.restore(&read_bytes(from, exposures.to_bytes().len())?);
+        }
+        if let Some(measurement) = &mut self.measurement {
+            measurement.restore(&read_bytes(from, measurement.to_bytes().len())?);
         }
         if let Some(cameras) = &mut self.cameras {
             cameras.restore(&read_bytes(from, cameras.to_bytes().len())?);
@@ -89,6 +98,7 @@ mod tests {
         TrainingState {
             cache: Some(cache),
             exposures: Some(Exposures::new(1)),
+            measurement: Some(ExposureMeasurement::new(1)),
             cameras: Some(cameras),
         }
     }
@@ -106,6 +116,8 @@ mod tests {
         let pixel = LrPixel { view: 0, x: 3, y: 5 };
         first.cache.as_mut().unwrap().store(pixel, &[[255, 0, 51]; 4]);
         first.exposures.as_mut().unwrap().add_pixel(0, [0.5; 3], [0.25; 3]);
+        let measurement = first.measurement.as_mut().unwrap();
+        measurement.start_step();
         let bytes = written(&first);
         assert_eq!(bytes.len(), first.byte_length());
         let mut other = state(5.0);
@@ -120,7 +132,8 @@ mod tests {
     /// Disabled parts write nothing.
     #[test]
     fn disabled_parts_write_nothing() {
-        let nothing = TrainingState { cache: None, exposures: None, cameras: None };
+        let nothing =
+            TrainingState { cache: None, exposures: None, measurement: None, cameras: None };
         assert_eq!((written(&nothing).len(), nothing.byte_length()), (0, 0));
     }
 }

@@ -8,8 +8,11 @@ use scene::Camera;
 use super::options::SupersamplingOptions;
 use super::pixel_sampler::{Importance, PixelNumbers, PixelSampler, detailed_pixels};
 use super::{Supersampling, TrainingView};
+use crate::params::Exposure;
 use crate::photographs::{PackedPhotograph, Photographs, PixelMemory, PixelSet};
-use crate::state::{Exposures, HrCache, KernelOperator, MovingCameras, TrainingState};
+use crate::state::{
+    ExposureMeasurement, Exposures, HrCache, KernelOperator, MovingCameras, TrainingState,
+};
 use crate::supersample::SupersampleSchedule;
 
 /// Ratio of the number of draws of a reference's blocks to that of an LR image's pixels. On a small
@@ -45,7 +48,9 @@ impl Supersampling {
             sampler: PixelSampler::new(numbers, count, importance, order, params.seed),
             state: TrainingState {
                 cache,
-                exposures: params.exposure.then(|| Exposures::new(views.len())),
+                exposures: (params.exposure == Exposure::On).then(|| Exposures::new(views.len())),
+                measurement: (params.exposure == Exposure::ByScene)
+                    .then(|| ExposureMeasurement::new(views.len())),
                 cameras,
             },
             views,

@@ -19,7 +19,7 @@ use scene::{Background, Camera, CameraRays};
 
 use crate::params::Supervision;
 use crate::photographs::{PackedPhotograph, PixelMemory};
-use crate::state::{Exposures, HrCache, LrPixel, MovingCameras, TrainingState};
+use crate::state::{ExposureDifference, Exposures, HrCache, LrPixel, MovingCameras, TrainingState};
 use crate::supersample::SupersampleSchedule;
 
 use assembly::block_start;
@@ -169,6 +169,12 @@ impl Supersampling {
         exposures.map_or(&[], |exposures| &exposures.gains()[..self.lr_views()])
     }
 
+    /// Returns how much the photographs' exposures differ, after the step that ends the
+    /// measurement; `None` after any other step.
+    pub(crate) fn exposure_difference(&self, progress: f64) -> Option<ExposureDifference> {
+        self.state.measurement.as_ref()?.difference(progress, self.lr_views())
+    }
+
     /// Returns the view and pixel that a bundle trains on.
     fn drawn_pixel(&self, bundle: u64) -> (usize, usize) {
         self.sampler.draw(bundle, |view, pixel| self.views[view].image.is_valid(pixel))
@@ -240,6 +246,9 @@ impl radiance::Supervisor for Supersampling {
         if let Some(exposures) = &mut self.state.exposures {
             exposures.update_gains(progress);
         }
+        if let Some(measurement) = &mut self.state.measurement {
+            measurement.start_step();
+        }
         self.schedule.set_progress(progress);
     }
 
@@ -310,7 +319,8 @@ impl radiance::Supervisor for Supersampling {
     }
 
     fn record_colours(&mut self, rendered: &[RenderedBundles<'_>], clock: &PhaseClock) {
-        if self.state.cache.is_none() && self.state.exposures.is_none() {
+        let is_measuring = self.state.measurement.as_ref().is_some_and(|m| m.is_measuring());
+        if self.state.cache.is_none() && self.state.exposures.is_none() && !is_measuring {
             return;
         }
         let rays = self.rays_per_bundle();
@@ -321,11 +331,15 @@ impl radiance::Supervisor for Supersampling {
             .collect();
         for RenderedPixels { pixels, levels } in drawn {
             for (pixel, levels) in pixels.iter().zip(levels.chunks_exact(rays)) {
+                let RenderedPixel { position, photographed, rendered, .. } = *pixel;
                 if let Some(exposures) = &mut self.state.exposures {
-                    exposures.add_pixel(pixel.position.view, pixel.photographed, pixel.rendered);
+                    exposures.add_pixel(position.view, photographed, rendered);
+                }
+                if let Some(measurement) = &mut self.state.measurement {
+                    measurement.add_pixel(position.view, photographed, rendered);
                 }
                 if let Some(cache) = self.state.cache.as_mut().filter(|_| pixel.is_cached) {
-                    cache.store(pixel.position, levels);
+                    cache.store(position, levels);
                 }
             }
         }
@@ -358,8 +372,8 @@ mod tests {
             has_kernel: true,
             is_fine_tuning: false,
         };
-        let params =
-            Params { supersample, supervision: Some(supervision), seed: 9, ..Params::default() };
+        let (supervision, exposure) = (Some(supervision), Some(false));
+        let params = Params { supersample, supervision, exposure, seed: 9, ..Params::default() };
         let params = params.resolve(&scene);
         let params = Resolved { supersample_warmup: 0.0, pixel_importance: 1.0, ..params };
         SupersamplingOptions { params, filter: Filter::Lanczos }

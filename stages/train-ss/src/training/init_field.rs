@@ -4,6 +4,7 @@ use anyhow::Context as _;
 use artifact::{Failure, GivenInput};
 use fields::{FieldFile, FieldModel};
 use glam::DVec3;
+use radiance::{TRAINING_FILE, TrainingLog};
 use stage::Context;
 
 /// Input `init`: the field that training is initialised from.
@@ -46,6 +47,12 @@ impl<'a> InitField<'a> {
     /// members than the initial field uses its members in turn.
     pub(crate) fn member(&self, index: u32) -> PathBuf {
         self.input.path(&FieldFile::member_file(index % self.members))
+    }
+
+    /// True if the initial field's training estimated exposures.
+    pub(crate) fn has_exposures(&self) -> anyhow::Result<bool> {
+        let log: Option<TrainingLog> = self.input.read_optional_json(TRAINING_FILE)?;
+        Ok(log.is_some_and(|log| !log.exposures.is_empty()))
     }
 
     /// Copies the initial field's members to the output, before those to train, and returns their

@@ -11,7 +11,7 @@ use stage::{Context, Progress};
 use super::checkpoint::{Checkpoints, Curve, read_latest};
 use super::field_trainer::{FieldTrainer, average_weights, new_trainer};
 use super::time_left::{TimeLeft, TrainingRays};
-use crate::params::{Combine, Resolved};
+use crate::params::{Combine, Exposure, Resolved};
 use crate::supervision::{Supersampling, supervision};
 
 /// Inputs of a training run, and its progress bar.
@@ -33,6 +33,15 @@ struct Training {
     supervision: Supersampling,
     checkpoints: Checkpoints,
     curve: Curve,
+}
+
+/// Reason for the end of a training's steps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Outcome {
+    /// All rays are cast.
+    Complete,
+    /// The photographs' exposures differ, and aren't estimated.
+    ExposuresDiffer,
 }
 
 /// Field of an ensemble, with checkpoints in a folder of its own.
@@ -113,11 +122,34 @@ impl<'a> Member<'a> {
         Some(log)
     }
 
-    /// Trains the field to the end, with checkpoints, progress and a curve.
+    /// Trains the field to the end, with checkpoints, progress and a curve. If the photographs'
+    /// exposures turn out to differ, starts over with exposures: the field has begun to explain the
+    /// differences by floaters (design note 026).
     fn train(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
+        let with_exposures = self.with_exposures();
+        if self.params.exposure == Exposure::ByScene && with_exposures.has_started() {
+            return with_exposures.run(data);
+        }
         let mut training = self.start(data)?;
-        self.take_steps(&mut training, data)?;
+        if self.take_steps(&mut training, data)? == Outcome::ExposuresDiffer {
+            drop(training);
+            return with_exposures.run(data);
+        }
         self.finish(training, data.views.bounds)
+    }
+
+    /// Returns a copy that estimates exposures, with its checkpoints in a subfolder, which also
+    /// marks the measurement as done.
+    fn with_exposures(&self) -> Self {
+        let mut member = self.clone();
+        member.params.exposure = Exposure::On;
+        member.work = self.work.as_ref().map(|work| work.join("exposures"));
+        member
+    }
+
+    /// True if an earlier run has started this training.
+    fn has_started(&self) -> bool {
+        self.work.as_ref().is_some_and(|work| work.is_dir())
     }
 
     /// Starts training, or resumes from the last checkpoint in the work folder.
@@ -148,15 +180,20 @@ impl<'a> Member<'a> {
         Ok(Training { trainer, supervision, checkpoints, curve })
     }
 
-    /// Takes steps until all rays are cast, with checkpoints and progress.
-    fn take_steps(&self, training: &mut Training, data: &TrainingData<'_>) -> anyhow::Result<()> {
+    /// Takes steps until all rays are cast or exposures turn out to differ, with checkpoints and
+    /// progress.
+    fn take_steps(
+        &self,
+        training: &mut Training,
+        data: &TrainingData<'_>,
+    ) -> anyhow::Result<Outcome> {
         let total = self.params.rays;
         let Training { trainer, supervision, checkpoints, curve } = training;
         let mut time_left = TimeLeft::new(&self.params, self.init.is_some());
         loop {
             let is_interrupted = self.context.is_interrupted();
             checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
-            let Some(report) = trainer.step(supervision)? else { return Ok(()) };
+            let Some(report) = trainer.step(supervision)? else { return Ok(Outcome::Complete) };
             if let Some(error) = supervision.first_error() {
                 anyhow::bail!("cannot read or write the file of pixels: {error}");
             }
@@ -167,6 +204,14 @@ impl<'a> Member<'a> {
                 ));
             }
             let rays = trainer.rays_done();
+            if let Some(difference) = supervision.exposure_difference(rays as f64 / total as f64) {
+                if difference.is_clear() || difference.is_last() {
+                    self.context.log_line(difference.to_string());
+                }
+                if difference.is_clear() {
+                    return Ok(Outcome::ExposuresDiffer);
+                }
+            }
             supervision.refine_poses(rays as f64 / total as f64, || trainer.field())?;
             curve.add(&report, rays, total);
             time_left.add(&report);
