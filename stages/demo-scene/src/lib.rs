@@ -10,10 +10,12 @@
 //! * `generated`, `pattern`: random objects and their materials, for training networks.
 //! * `camera`: pinhole camera, or a fisheye lens for training views.
 //! * `render`: light, shadow, reflection, anti-aliasing.
+//! * `disturbance`: exposures that differ, and poses that aren't exact.
 //! * `dataset_writer`: files of both formats.
 
 mod camera;
 mod dataset_writer;
+mod disturbance;
 mod generated;
 mod material;
 mod params;
@@ -75,11 +77,18 @@ impl Stage for DemoScene {
                     context.check_interrupt()?;
                     let pose = &poses[i as usize];
                     let samples = params.samples_per_axis;
-                    let image = render::render(&world, pose, &camera, samples, &progress);
+                    let mut image = render::render(&world, pose, &camera, samples, &progress);
+                    if split == "train" {
+                        disturbance::expose(&mut image.colour, params, i);
+                    }
                     params.form.write_view(context, split, i, &image)
                 })
                 .collect::<anyhow::Result<Vec<()>>>()?;
-            writer.add_split(context, split, &camera, &poses)?;
+            let written = (0..).zip(&poses).map(|(i, pose)| match split {
+                "train" => disturbance::with_error(pose, params, i),
+                _ => *pose,
+            });
+            writer.add_split(context, split, &camera, &written.collect::<Vec<_>>())?;
         }
         writer.finish(context)?;
         let [width, height] = splits[0].2.sides;

@@ -42,6 +42,14 @@ pub struct Params {
     pub generated: bool,
     /// Format of the data set.
     pub form: Form,
+    /// Difference in exposure between training views, from the mean exposure: 0.1 makes each about
+    /// 10 % brighter or darker. Test views have the mean exposure.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub exposure_difference: f64,
+    /// Standard deviation of the errors in the training views' poses: rotation about each axis, in
+    /// degrees.
+    #[schemars(range(min = 0.0, max = 10.0))]
+    pub pose_error: f64,
     /// Seed of the objects' positions and textures.
     pub seed: u32,
 }
@@ -98,6 +106,8 @@ impl Default for Params {
             backdrop: false,
             generated: false,
             form: Form::Blender,
+            exposure_difference: 0.0,
+            pose_error: 0.0,
             seed: 0,
         }
     }
