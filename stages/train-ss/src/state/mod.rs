@@ -98,7 +98,7 @@ mod tests {
         TrainingState {
             cache: Some(cache),
             exposures: Some(Exposures::new(1)),
-            measurement: Some(ExposureMeasurement::new(1)),
+            measurement: Some(ExposureMeasurement::new(1, false)),
             cameras: Some(cameras),
         }
     }

@@ -3,7 +3,7 @@ use std::io;
 use std::sync::Arc;
 
 use pixels::{Filter, Image, Resampling};
-use scene::Camera;
+use scene::{Camera, Space};
 
 use super::options::SupersamplingOptions;
 use super::pixel_sampler::{Importance, PixelNumbers, PixelSampler, detailed_pixels};
@@ -30,6 +30,7 @@ impl Supersampling {
         memory: PixelMemory,
     ) -> io::Result<Self> {
         let background = photographs.views.background;
+        let is_contraction = photographs.views.bounds.space == Space::Contraction;
         let params = &options.params;
         let cameras = params
             .pose_refinement
@@ -50,7 +51,7 @@ impl Supersampling {
                 cache,
                 exposures: (params.exposure == Exposure::On).then(|| Exposures::new(views.len())),
                 measurement: (params.exposure == Exposure::ByScene)
-                    .then(|| ExposureMeasurement::new(views.len())),
+                    .then(|| ExposureMeasurement::new(views.len(), is_contraction)),
                 cameras,
             },
             views,
