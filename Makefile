@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 # Folder with real scenes and network weights, read by the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds stability bench bench-runner compare-engines fuzz clean reference prior goldens
+.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff parts seeds stability bench bench-runner compare-engines fuzz clean reference prior goldens
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -167,6 +167,9 @@ ablation: build held-out ## Measure PSNR and time of each part of the training, 
 
 tradeoff: build held-out ## Measure accuracy, time and memory of the qualities and of parts, on withheld views: make tradeoff SCENES=fern PROTOCOLS=252x2
 	@$(call experiment,tradeoff)
+
+parts: build ## Measure what parts bring to scenes that require them and to scenes that don't
+	@$(call experiment,parts)
 
 seeds: build ## Measure the spread of the PSNR over ten seeds of the demo scene
 	@$(call experiment,seeds)
