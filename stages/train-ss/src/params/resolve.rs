@@ -47,7 +47,11 @@ impl Params {
         } else {
             Supervision::Average
         };
-        let can_measure = is_grid && scene.background != Background::Alpha && !scene.is_fine_tuning;
+        // Moving cameras change gains as exposures do (design note 026).
+        let can_measure = is_grid
+            && scene.background != Background::Alpha
+            && !scene.is_fine_tuning
+            && !self.pose_refinement;
         let exposure = if can_measure { Exposure::ByScene } else { Exposure::Off };
         let combine = if scene.is_ndc() { Combine::AverageWeights } else { Combine::Ensemble };
         Resolved {
