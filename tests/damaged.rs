@@ -70,11 +70,15 @@ type Damage = (fn(&Path), &'static [&'static str]);
 const DAMAGES: &[Damage] = &[
     (
         |data| put_cut_jpeg(&data.join("train/r_1.png"), false),
-        &["frame r_1", "data/train/r_1.png: cut short: a JPEG without its end marker;"],
+        &["frame r_1", "data/train/r_1.png: cut short or damaged: ", " of 32 rows are missing;"],
     ),
     (
         |data| put_cut_jpeg(&data.join("test/r_1.png"), true),
-        &["frame r_1", "data/test/r_1.png: cut short: a JPEG without its end marker;"],
+        &[
+            "frame r_1",
+            "data/test/r_1.png: cut short or damaged in scan ",
+            "of all 32 rows is missing;",
+        ],
     ),
     (
         |data| {

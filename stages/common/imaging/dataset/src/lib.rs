@@ -30,6 +30,7 @@ mod file_status;
 mod format;
 mod frame;
 mod frame_file;
+mod huffman;
 mod jpeg;
 mod lens_entry;
 mod llff;

@@ -12,7 +12,7 @@ use scene::{Intrinsics, undistort_image};
 
 use crate::error::{DatasetError, Reason};
 use crate::frame::{Frame, Turn};
-use crate::jpeg::has_end;
+use crate::jpeg::{END_MARKER, Extent, extent};
 use crate::unsupported::unsupported_error;
 
 /// Extensions of supported images.
@@ -134,20 +134,44 @@ fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelE
     if is_exr(path) {
         return read_exr_photograph(path);
     }
-    let bytes = fs::read(path).map_err(PixelError::io(path))?;
-    let is_jpeg = image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg);
-    let is_cut = is_jpeg && !has_end(&bytes);
+    let mut bytes = fs::read(path).map_err(PixelError::io(path))?;
+    let mut has_image_data = true;
+    if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
+        has_image_data =
+            complete_jpeg(&mut bytes).map_err(|reason| PixelError::format(path, reason))?;
+    }
     let mut decoder = decoder(Cursor::new(bytes), path)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
         .map_err(|e| PixelError::format(path, format!("incomplete or damaged image ({e})")))?;
-    if is_cut {
-        return Err(PixelError::format(path, "cut short: a JPEG without its end marker"));
+    if !has_image_data {
+        return Err(PixelError::format(path, "damaged JPEG: headers and image data don't match"));
     }
     if is_upright {
         image.apply_orientation(orientation);
     }
     Ok((image.into(), Clipping::default()))
+}
+
+/// Fails if a JPEG lacks image data, which its decoder would replace by grey. Adds a missing end
+/// marker, without which the decoder omits the last rows. Returns whether image data were found.
+fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<bool, String> {
+    match extent(jpeg) {
+        Extent::Whole => Ok(true),
+        Extent::Unknown => Ok(false),
+        Extent::Unterminated { end } => {
+            jpeg.truncate(end);
+            jpeg.extend(END_MARKER);
+            Ok(true)
+        }
+        Extent::Missing { rows, height } => {
+            Err(format!("cut short or damaged: {rows} of {height} rows are missing"))
+        }
+        Extent::Coarse { scan, height } => Err(format!(
+            "cut short or damaged in scan {scan} of a progressive JPEG: detail of all {height} \
+            rows is missing"
+        )),
+    }
 }
 
 /// Reads an EXR with linear light and encodes it for display.

@@ -1,4 +1,6 @@
 use super::*;
+use crate::jpeg::tests::{hidden_jpeg, jpeg};
+use jpeg_encoder::SamplingFactor;
 use scene::Distortion;
 
 /// Returns an image whose red encodes the column and whose green encodes the row.
@@ -115,17 +117,20 @@ fn a_jpeg_that_is_cut_is_refused() {
         fs::write(&path, bytes).unwrap();
         super::read_image(&path, false).map_err(|error| error.to_string())
     };
-    let mut bytes = Vec::new();
-    let samples: Vec<u8> = (0..40 * 64 * 3).map(|i: usize| (i * 7 + i * i / 31) as u8).collect();
-    let encoder = jpeg_encoder::Encoder::new(&mut bytes, 80);
-    encoder.encode(&samples, 40, 64, jpeg_encoder::ColorType::Rgb).unwrap();
-    assert_eq!(read(&[&bytes, &b"more"[..]].concat()), Ok(read(&bytes).unwrap()));
-    for (end, words) in [
-        (bytes.len() - 2, "a.jpg: cut short: a JPEG without its end marker; export"),
-        (bytes.len() / 2, "a.jpg: cut short: a JPEG without its end marker; export"),
-        (20, "a.jpg: cannot read its header (Format error"),
+    let bytes = jpeg((40, 64), Some(SamplingFactor::R_4_2_0), false, 3);
+    let whole = read(&bytes).unwrap();
+    assert_eq!(read(&bytes[..bytes.len() - 2]), Ok(whole.clone()), "only the end marker is cut");
+    assert_eq!(read(&[&bytes, &b"more"[..]].concat()), Ok(whole));
+    let progressive = jpeg((40, 64), Some(SamplingFactor::R_4_2_0), true, 0);
+    let third = bytes.windows(2).position(|w| w == [0xff, 0xd1]).unwrap();
+    for (bytes, words) in [
+        (&bytes[..third], "a.jpg: cut short or damaged: 32 of 64 rows are missing; export"),
+        (&bytes[..bytes.len() - 9], "a.jpg: cut short or damaged: 16 of 64 rows are missing;"),
+        (&bytes[..100], "a.jpg: cut short or damaged: 64 of 64 rows are missing; export"),
+        (&bytes[..20], "a.jpg: cannot read its header (Format error"),
+        (&progressive[..progressive.len() - 1], "detail of all 64 rows is missing; export"),
+        (&hidden_jpeg(), "a.jpg: damaged JPEG: headers and image data don't match; export"),
     ] {
-        let bytes = &bytes[..end];
         let message = read(bytes).unwrap_err();
         assert!(message.contains(words), "{message}");
     }

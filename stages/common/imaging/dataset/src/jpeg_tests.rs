@@ -1,0 +1,182 @@
+use super::*;
+use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
+
+/// Makes a noisy JPEG.
+pub(crate) fn jpeg(
+    (width, height): (u16, u16),
+    sampling: Option<SamplingFactor>,
+    is_progressive: bool,
+    restart_interval: u16,
+) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut encoder = Encoder::new(&mut bytes, 80);
+    encoder.set_progressive(is_progressive);
+    encoder.set_optimized_huffman_tables(restart_interval == 0);
+    if restart_interval > 0 {
+        encoder.set_restart_interval(restart_interval);
+    }
+    let channels = if sampling.is_some() { 3 } else { 1 };
+    let samples: Vec<u8> = (0..usize::from(width) * usize::from(height) * channels)
+        .map(|i| (i * 7 + i * i / 31) as u8)
+        .collect();
+    let colours = if channels == 3 { ColorType::Rgb } else { ColorType::Luma };
+    if let Some(sampling) = sampling {
+        encoder.set_sampling_factor(sampling);
+    }
+    encoder.encode(&samples, width, height, colours).unwrap();
+    bytes
+}
+
+/// Returns a JPEG that only the decoder reads: it takes a restart marker for a segment.
+pub(crate) fn hidden_jpeg() -> Vec<u8> {
+    let bytes = jpeg(SIZE, None, false, 0);
+    let hidden = [&bytes[..2], b"\xff\xd7\0\x08\xff\xe0\xff\xff\0\0", &bytes[2..]].concat();
+    assert!(decoded(&hidden).is_some());
+    hidden
+}
+
+const SAMPLINGS: [Option<SamplingFactor>; 6] = [
+    None,
+    Some(SamplingFactor::R_4_4_4),
+    Some(SamplingFactor::R_4_2_2),
+    Some(SamplingFactor::R_4_2_0),
+    Some(SamplingFactor::R_4_4_0),
+    Some(SamplingFactor::R_4_1_1),
+];
+
+const SIZE: (u16, u16) = (45, 70);
+const ROWS: u32 = 70;
+
+fn decoded(bytes: &[u8]) -> Option<Vec<u8>> {
+    image::load_from_memory(bytes).ok().map(|image| image.into_rgb8().into_raw())
+}
+
+/// Rows are counted as the decoder shows them: those before the missing ones are whole.
+#[test]
+fn missing_rows_are_counted() {
+    for sampling in SAMPLINGS {
+        for restart_interval in [0, 4] {
+            let bytes = jpeg(SIZE, sampling, false, restart_interval);
+            let case = format!("{sampling:?}, restart {restart_interval}");
+            assert_eq!(extent(&bytes), Extent::Whole, "{case}");
+            assert_eq!(extent(&[&bytes, &b"\xff\xd8 more"[..]].concat()), Extent::Whole);
+            let whole = decoded(&bytes).unwrap();
+            let head = bytes.windows(2).position(|w| w == [0xff, SOS]).unwrap();
+            let mut most = ROWS;
+            for end in (head + 20..bytes.len()).step_by(13) {
+                let cut = &bytes[..end];
+                let zeros = [cut, &[0; 512]].concat();
+                let ended = [cut, &END_MARKER].concat();
+                let (found, rows) = match extent(cut) {
+                    it @ Extent::Missing { rows, height: ROWS } => (it, rows),
+                    Extent::Unterminated { end: found } if found == end => (Extent::Whole, 0),
+                    other => panic!("{case}: {other:?} at {end}"),
+                };
+                assert!(rows <= most, "{case}: {rows} rows missing at {end}, {most} before");
+                most = rows;
+                assert_eq!(extent(&ended), found, "{case} at {end}");
+                if rows > 0 {
+                    assert_eq!(extent(&zeros), found, "{case} at {end}");
+                }
+                // The row above the missing ones is blended with them. After a restart marker
+                // the decoder may give up earlier.
+                let same = 3 * usize::from(SIZE.0) * (ROWS - rows).saturating_sub(1) as usize;
+                if let Some(shown) = decoded(&ended) {
+                    let is_same = restart_interval > 0 || shown[..same] == whole[..same];
+                    assert!(is_same, "{case}: rows above the {rows} missing ones at {end}");
+                    assert!(rows > 0 || shown == whole, "{case}: no row is missing at {end}");
+                }
+            }
+            assert!(most < 20, "{case}: {most} rows missing near the end");
+            let end = bytes.len() - END_MARKER.len();
+            assert_eq!(extent(&bytes[..end]), Extent::Unterminated { end }, "{case}");
+        }
+    }
+}
+
+/// At a marker that the decoder doesn't know, it would give up the last blocks.
+#[test]
+fn unknown_markers_end_the_image_data() {
+    for sampling in SAMPLINGS {
+        let bytes = jpeg(SIZE, sampling, false, 0);
+        let whole = decoded(&bytes).unwrap();
+        let end = bytes.len() - END_MARKER.len();
+        for (marker, filling) in [(&b"\xff\x46"[..], 0), (b"\xff\xe5", 0), (b"\xff\xff\xff\xf3", 2)]
+        {
+            let tail = [marker, &b"\x00\x04ab"[..], &END_MARKER].concat();
+            let mut followed = [&bytes[..end], &tail].concat();
+            let found = extent(&followed);
+            assert_eq!(found, Extent::Unterminated { end: end + filling }, "{sampling:?}");
+            followed.truncate(end + filling);
+            followed.extend(END_MARKER);
+            assert!(decoded(&followed).unwrap() == whole, "{sampling:?} {marker:?}");
+        }
+        let known = [&bytes[..end], b"\xff\xe1\x00\x04ab", &END_MARKER].concat();
+        assert_eq!(extent(&known), Extent::Whole);
+        assert!(decoded(&known).unwrap() == whole, "{sampling:?}");
+    }
+}
+
+#[test]
+fn a_progressive_jpeg_needs_its_end() {
+    for sampling in SAMPLINGS {
+        for restart_interval in [0, 4] {
+            let bytes = jpeg(SIZE, sampling, true, restart_interval);
+            assert_eq!(extent(&bytes), Extent::Whole);
+            for end in (bytes.len() / 4..bytes.len()).step_by(17) {
+                let found = extent(&bytes[..end]);
+                assert!(matches!(found, Extent::Coarse { height: ROWS, .. }), "{found:?} at {end}");
+            }
+        }
+    }
+}
+
+#[test]
+fn an_invalid_scan_header_is_damage() {
+    for is_progressive in [false, true] {
+        let bytes = jpeg(SIZE, Some(SamplingFactor::R_4_2_0), is_progressive, 0);
+        let scan = bytes.windows(2).position(|w| w == [0xff, SOS]).unwrap();
+        // After marker, length and the number of components: the first component's number.
+        let mut unknown = bytes.clone();
+        unknown[scan + 5] = 9;
+        let expected = if is_progressive {
+            Extent::Coarse { scan: 1, height: ROWS }
+        } else {
+            Extent::Missing { rows: ROWS, height: ROWS }
+        };
+        assert_eq!(extent(&unknown), expected);
+        if is_progressive {
+            let mut band = bytes;
+            let components = usize::from(band[scan + 4]);
+            band[scan + 5 + 2 * components] = 34;
+            assert_eq!(extent(&band), expected);
+        }
+    }
+}
+
+/// A lost piece is found even if restart markers let the decoder resume after it.
+#[test]
+fn a_lost_piece_is_missing() {
+    let bytes = jpeg(SIZE, Some(SamplingFactor::R_4_4_4), false, 6);
+    let marker = |n: u8| bytes.windows(2).position(|w| w == [0xff, 0xd0 + n]).unwrap();
+    let (from, to) = (marker(2), marker(3));
+    let lost = [&bytes[..from + 12], &bytes[to..]].concat();
+    assert_eq!(extent(&lost), Extent::Missing { rows: 8, height: ROWS });
+}
+
+#[test]
+fn any_bytes_have_an_extent() {
+    for sampling in SAMPLINGS {
+        let bytes = jpeg((20, 20), sampling, false, 2);
+        for at in 0..bytes.len() {
+            for value in [0, 1, 0x11, 0x7f, 0xff] {
+                let mut damaged = bytes.clone();
+                damaged[at] = value;
+                extent(&damaged);
+            }
+            extent(&bytes[at..]);
+        }
+    }
+    assert_eq!(extent(b""), Extent::Unknown);
+    assert_eq!(extent(&hidden_jpeg()), Extent::Unknown);
+}
