@@ -53,9 +53,8 @@ pub struct Params {
     /// Estimates a gain for red, green and blue of each photograph, for photographs with several
     /// exposures or white balances. Rendered views have the mean exposure of the photographs.
     /// Default: the first 512 steps measure the gains, and the training starts over with exposures
-    /// if gains differ by more than 2 to 3 %. Fine-tuning (input `init`) follows the initial field.
-    /// False for `field: mlp`, background
-    /// `alpha` and `pose_refinement`.
+    /// if gains differ by more than 3 to 4 %. Fine-tuning (input `init`) follows the initial field.
+    /// False for `field: mlp`, background `alpha` and `pose_refinement`.
     #[schemars(extend("x-group" = "data", "x-default" = BY_SCENE))]
     pub exposure: Option<bool>,
     /// Optimises camera poses during training, for poses that aren't exact. Motion that all cameras

@@ -11,12 +11,12 @@ const PRIOR: f64 = 1.0;
 const FIRST_PROGRESS: f64 = 0.02;
 /// Steps in which the gains of a training that applies none are measured, each range with the
 /// minimum clear difference relative to the field's error. Differences between equal exposures come
-/// from this error (design note 026).
+/// from this error: up to 0.134 in eight scenes (design note 026).
 const MEASUREMENTS: [(Range<u64>, f64); 4] =
-    [(128..192, 0.16), (192..256, 0.15), (256..384, 0.15), (384..512, 0.15)];
+    [(128..192, 0.2), (192..256, 0.2), (256..384, 0.2), (384..512, 0.2)];
 /// Additional measurement in a contraction, where the field explains large differences within 70
 /// steps, by floaters in front of the cameras (design note 026).
-const EARLY_MEASUREMENT: (Range<u64>, f64) = (24..36, 0.3);
+const EARLY_MEASUREMENT: (Range<u64>, f64) = (24..36, 0.25);
 /// Maximum training progress at the end of a measurement: starting over later would cost too much.
 const MAX_MEASURED_PROGRESS: f64 = 0.25;
 
@@ -279,7 +279,8 @@ mod tests {
         for (spread, error, is_clear) in [
             (0.0, 0.05, [false; 5]),
             (0.02, 0.2, [false; 5]),
-            (0.06, 0.2, [false, true, true, true, true]),
+            (0.045, 0.2, [false, true, true, true, true]),
+            (0.06, 0.2, [true; 5]),
             (0.06, 0.5, [false; 5]),
             (0.3, 0.5, [true; 5]),
         ] {
@@ -291,7 +292,7 @@ mod tests {
         }
         assert!(!ExposureMeasurement::new(5, false).measurements.contains(&EARLY_MEASUREMENT));
         let text = measured(0.06, 0.2, 0.1)[3].to_string();
-        assert!(text.contains("differ by 5.9 % after 384 steps, at least 3."), "{text}");
+        assert!(text.contains("differ by 5.9 % after 384 steps, at least 4."), "{text}");
         assert_eq!(measured(0.5, 0.1, 0.3), []);
     }
 
