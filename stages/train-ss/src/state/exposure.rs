@@ -279,8 +279,8 @@ mod tests {
         for (spread, error, is_clear) in [
             (0.0, 0.05, [false; 5]),
             (0.02, 0.2, [false; 5]),
-            (0.045, 0.2, [false, true, true, true, true]),
-            (0.06, 0.2, [true; 5]),
+            (0.05, 0.2, [false, true, true, true, true]),
+            (0.07, 0.2, [true; 5]),
             (0.06, 0.5, [false; 5]),
             (0.3, 0.5, [true; 5]),
         ] {
