@@ -19,7 +19,10 @@ use scene::{Background, Camera, CameraRays};
 
 use crate::params::Supervision;
 use crate::photographs::{PackedPhotograph, PixelMemory};
-use crate::state::{ExposureDifference, Exposures, HrCache, LrPixel, MovingCameras, TrainingState};
+use crate::state::{
+    ExposureDifference, ExposureMeasurement, Exposures, HrCache, LrPixel, MovingCameras,
+    TrainingState,
+};
 use crate::supersample::SupersampleSchedule;
 
 use assembly::block_start;
@@ -319,7 +322,8 @@ impl radiance::Supervisor for Supersampling {
     }
 
     fn record_colours(&mut self, rendered: &[RenderedBundles<'_>], clock: &PhaseClock) {
-        let is_measuring = self.state.measurement.as_ref().is_some_and(|m| m.is_measuring());
+        let is_measuring =
+            self.state.measurement.as_ref().is_some_and(ExposureMeasurement::is_measuring);
         if self.state.cache.is_none() && self.state.exposures.is_none() && !is_measuring {
             return;
         }
