@@ -184,22 +184,25 @@ struct Compared {
     resolution: u32,
     /// Width of the views, and rays along a pixel's side.
     views: (u32, u32),
+    /// Maximum number of texture reads per pixel.
+    max_reads: f64,
 }
 
 /// A grid of the default size: smaller fields and fewer rays give haze.
 fn grid() -> Compared {
     let field = "rays: 300000, n_levels: 8, cells_per_pixel: 2.56, log2_hashmap_size: null, \
         hidden_dim: 64, march_steps: null, max_rays_per_step: 8192, samples_per_step: 24576";
-    Compared { field: field.to_owned(), resolution: 128, views: (512, 2) }
+    Compared { field: field.to_owned(), resolution: 128, views: (512, 2), max_reads: 64.0 }
 }
 
-/// The paper's field in miniature, which is rendered slowly.
+/// The paper's field in miniature, which is rendered slowly. After so few rays the field has haze,
+/// whose reads differ between processors by libtorch's rounding: 62.8 to 67.5 in a box.
 fn mlp(rays: u32, resolution: u32) -> Compared {
     let field = format!(
         "field: mlp, rays: {rays}, supersample: 1, hidden_dim: 48, layers: 4, \
         coarse_samples: 24, fine_samples: 24, max_rays_per_step: 128, learning_rate: 0.002"
     );
-    Compared { field, resolution, views: (128, 1) }
+    Compared { field, resolution, views: (128, 1), max_reads: 80.0 }
 }
 
 /// Blocks of a demo scene and its field.
@@ -235,7 +238,7 @@ fn compare_page(blocks: &str, inputs: &[&str], space: &str, compared: &Compared)
     let page = project.path("out/viewer/index.html");
     assert!(page.metadata().unwrap().len() < 25_000_000);
     let views = project.artifact("path-views", &[&["path-views"], inputs].concat());
-    let Some(views) = checked(&page, &views, 26.0, 64.0) else { return };
+    let Some(views) = checked(&page, &views, 26.0, compared.max_reads) else { return };
     assert_eq!(views.len(), 6);
     for view in &views {
         let [psnr, mirrored] = ["psnr", "mirrored"].map(|key| view[key].as_f64().unwrap());
