@@ -32,10 +32,7 @@ pub(crate) fn train_with_best_poses(
     let weights = &member.output;
     let refined_weights = weights.with_extension("refined");
     let refined = member.variant(true, "refined", refined_weights.clone(), 0).run(data)?;
-    let mut given = member.variant(false, "given", weights.clone(), refined.rays);
-    // The measurement with refined poses decides for both.
-    given.params.exposure = (!refined.exposures.is_empty()).into();
-    let mut given = given.run(data)?;
+    let mut given = member.variant(false, "given", weights.clone(), refined.rays).run(data)?;
     given.poses = data.views.views.iter().map(|view| view.camera.camera_to_world).collect();
     let judge = PoseJudge::new(member, data)?;
     let refined_error = judge.error(&refined_weights, &refined)?;
