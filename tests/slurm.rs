@@ -10,7 +10,7 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::{Duration, Instant};
 
-use common::{Finished, Project, happens, root, wait_until};
+use common::{Finished, Project, commands, happens, root, wait_until};
 use numerics::CounterRng;
 
 /// A stage in plain Python. It takes a number of steps, each from the previous one, and leaves a
@@ -319,6 +319,25 @@ fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
     assert_eq!(cluster.state(&jobs["eval"]), "COMPLETED 0:0");
     assert!(cluster.ok(&project, &[&["log", "eval"][..], &hit].concat()).contains("eval: cached"));
     assert_eq!(ran(&project).len(), 6, "{:?}", ran(&project));
+}
+
+/// The guide's commands, one after the other, on a pipeline of seconds.
+#[test]
+fn commands_of_the_guide_run() {
+    let Some(cluster) = Cluster::start() else { return };
+    let project = Project::fast();
+    let guide = commands(&root().join("docs/guide/slurm.md"));
+    assert_eq!(guide.len(), 4, "{guide:?}");
+    for command in &guide {
+        let words: Vec<&str> = command.split_whitespace().skip(1).collect();
+        let said = cluster.ok(&project, &words);
+        assert!(!said.is_empty(), "{command}");
+        if words[0] == "run" {
+            // Two supersamplings, three seeds, and what each training needs and feeds.
+            assert_eq!(jobs(&said).keys().filter(|label| label.starts_with("train-ss")).count(), 6);
+        }
+    }
+    cluster.drain();
 }
 
 const ONE: &str =

@@ -314,6 +314,22 @@ impl Project {
     }
 }
 
+/// Returns a document's commands of the runner and of `nerf-sr-remote`.
+pub fn commands(document: &Path) -> Vec<String> {
+    let text = std::fs::read_to_string(document).unwrap();
+    let blocks = text.split("```sh\n").skip(1).map(|rest| rest.split("```").next().unwrap());
+    let lines = blocks.flat_map(|block| {
+        let joined = block.replace("\\\n", " ");
+        joined
+            .lines()
+            .map(|line| line.split('#').next().unwrap().trim().to_owned())
+            .collect::<Vec<_>>()
+    });
+    let is_command =
+        |line: &String| line.starts_with("nerf-sr ") || line.starts_with("nerf-sr-remote ");
+    lines.filter(is_command).collect()
+}
+
 /// Exit code and output of a finished command.
 pub struct Finished {
     pub code: i32,
