@@ -8,7 +8,7 @@ mod forms;
 
 use std::path::Path;
 
-use common::{Project, stage};
+use common::{Finished, Project, stage};
 use forms::{ANGLE, FORMS, WIDTH, as_colmap, as_llff, as_transforms, photographs};
 use glam::{DMat3, DQuat, DVec3};
 use scene::{Distortion, Intrinsics};
@@ -165,11 +165,18 @@ fn exposure_factors(photograph: usize) -> [f32; 3] {
 
 const WHITE: &str = "background=white";
 
-/// Returns the log and the weights of a field trained on a data set, with a setting.
-fn field(project: &Project, dataset: &str, setting: &str) -> (Value, Vec<u8>) {
+/// Trains a field on a data set with a setting, and stops it after each given number of rays.
+/// Returns the log and the weights.
+fn field(project: &Project, dataset: &str, setting: &str, stops: &[&str]) -> (Value, Vec<u8>) {
     let dataset = format!("dataset={dataset}");
     let settings = ["-i", &dataset, "-p", WHITE, "-p", setting];
-    project.ok(&[&["run", "train-ss"], &settings[..]].concat());
+    let run = [&["run", "train-ss"], &settings[..]].concat();
+    for rays in stops {
+        let mut command = project.command(&run);
+        let stopped = Finished::of(command.env("NERF_SR_STOP_AFTER", rays).output().unwrap());
+        assert_eq!(stopped.code, 130, "{rays}: {}", stopped.stderr);
+    }
+    project.ok(&run);
     let folder = project.artifact("train-ss", &settings);
     let weights = std::fs::read(folder.join("field-0.safetensors")).unwrap();
     (project.json("train-ss", "training.json", &settings), weights)
@@ -218,14 +225,16 @@ fn exposures_are_found() {
     let exposures: Vec<[f32; 3]> = serde_json::from_value(training["exposures"].clone()).unwrap();
     println!("{found:.2} dB with exposures, {ignored:.2} dB without; {exposures:?}");
     // By default the training measures differences, in its first quarter, and then ends in the field
-    // of a training that was told. It needs some hundred steps for this.
+    // of a training that was told. It needs some hundred steps for this. Stops lie before, while it
+    // measures, and after the training has started over.
     project.replace("samples_per_step: 16384", "samples_per_step: 2048");
-    for (dataset, told, expected) in
-        [("./transforms", "exposure=true", true), ("./equal", "exposure=false", false)]
-    {
-        let (training, by_scene) = field(&project, dataset, "train-ss.seed=0");
+    for (dataset, told, expected, stops) in [
+        ("./transforms", "exposure=true", true, &["3000", "60000", "200000"][..]),
+        ("./equal", "exposure=false", false, &[]),
+    ] {
+        let (training, by_scene) = field(&project, dataset, "train-ss.seed=0", stops);
         assert_eq!(training["resolved"]["exposure"], json!(expected), "{dataset}");
-        assert!(by_scene == field(&project, dataset, told).1, "{dataset}");
+        assert!(by_scene == field(&project, dataset, told, &[]).1, "{dataset}");
     }
     // Against having found nothing: all factors 1.
     let (off, was) = (off_by(&exposures), off_by(&vec![[1.0; 3]; exposures.len()]));

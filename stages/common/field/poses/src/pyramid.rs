@@ -30,8 +30,9 @@ impl InformativePixel {
     }
 }
 
-/// Minimum width and height of a smaller level, in pixels; chosen by hand.
-const MIN_LEVEL_SIDE: usize = 12;
+/// Minimum width and height of a smaller level, in pixels. With 13 pixels, a field after few rays
+/// turned cameras by several degrees (docs/design/025).
+const MIN_LEVEL_SIDE: usize = 16;
 /// Maximum number of pixels rendered per level, spread evenly over the informative ones; chosen by
 /// hand.
 const MAX_PIXELS: usize = 4096;

@@ -152,11 +152,12 @@ fn moved_cameras_come_back() {
             .filter(|i| i % 64 < 15)
             .for_each(|i| taken.data[3 * i..3 * i + 3].fill(f32::NAN));
         let pyramid = Pyramid::new(&taken, 5);
-        assert_eq!(pyramid.smaller_levels(), 2);
+        // Half the size; a quarter would be too small.
+        assert_eq!(pyramid.smaller_levels(), 1);
         let mut found = motion(turn, shift).applied_to(&truth);
         let was = pixels_apart(&truth, &found);
         assert!(was > 1.5, "{i}: {was} pixels");
-        for level in (0..3).rev() {
+        for level in (0..2).rev() {
             let refined = refine(
                 &BallAndWall,
                 &found,
@@ -207,7 +208,7 @@ fn cameras_come_back_wherever_the_scene_lies() {
     let off = motion([0.01, -0.02, 0.01], [0.1, -0.05, 0.1]).applied_to(&truth);
     let found_by = |field: &dyn RayField, camera: &Camera| {
         let mut found = camera.clone();
-        for level in (0..3).rev() {
+        for level in (0..2).rev() {
             let refined = refine(field, &found, &pyramid, level, &Options::default()).unwrap();
             found = refined.camera;
         }
