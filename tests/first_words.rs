@@ -46,7 +46,7 @@ fn every_input_is_checked_before_anything_runs() {
             2,
             &["imdn has networks for scales 2, 3, 4 only"],
         ),
-        (vec!["-i", "eval.weights=weights"], 3, &["eval", "weights", "no network found"]),
+        (vec!["-i", "eval.weights=weights"], 3, &["eval", "weights", "no LPIPS network found"]),
         (vec!["-i", "eval.weights=nowhere"], 3, &["nowhere", "no such folder"]),
     ] {
         let run = [&["run", "eval-upsampled"], &arguments[..]].concat();

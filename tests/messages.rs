@@ -407,7 +407,7 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
     let stopped = Finished::of(command.env("NERF_SR_STOP_AFTER", "30000").output().unwrap());
     assert_eq!(stopped.code, 130, "{}", stopped.stderr);
     assert!(
-        stopped.stderr.contains("train-ss: failed: interrupted; run again to resume"),
+        stopped.stderr.contains("train-ss: interrupted; run again to resume"),
         "{}",
         stopped.stderr
     );

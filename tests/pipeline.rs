@@ -94,7 +94,9 @@ fn every_network_given_scores() {
     let folder = project.path("weights");
     std::fs::create_dir(&folder).unwrap();
     let arguments = ["run", "-i", "eval.weights=./weights"];
-    project.run(&arguments).fails(3, &["input weights", "no network found", "alexnet.safetensors"]);
+    project
+        .run(&arguments)
+        .fails(3, &["input weights", "no LPIPS network found", "alexnet.safetensors"]);
     let layers =
         [(0, 64, 3, 11), (3, 192, 64, 5), (6, 384, 192, 3), (8, 256, 384, 3), (10, 256, 256, 3)];
     let network = layers.iter().flat_map(|&(i, outputs, inputs, size)| {
@@ -105,7 +107,7 @@ fn every_network_given_scores() {
     });
     write_zeros(&folder.join("alexnet.safetensors"), &network.collect::<Vec<_>>());
     // Without its heads it isn't whole.
-    project.run(&arguments).fails(3, &["no network found"]);
+    project.run(&arguments).fails(3, &["no LPIPS network found"]);
     let heads = layers
         .iter()
         .enumerate()

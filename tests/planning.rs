@@ -199,7 +199,7 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         ),
         (
             &["-p", "background=alpha", "-p", "supervision=kernel"],
-            "stage train-ss: parameter supervision: kernel needs an opaque background",
+            "stage train-ss: parameter supervision: kernel cannot be compared over a transparent background",
         ),
         (
             &["-p", "background=white,alpha", "-p", "exposure=true"],
@@ -348,10 +348,10 @@ fn a_quality_is_known_by_its_parameters() {
     project.run(&["plan", "-p", "quality=good"]).fails(2, &["-p quality=good: ", known]);
     project.ok(&["run", "-p", "quality=fast"]);
     let others = [
-        "rays_per_pixel=3.5",
-        "pixel_importance=15",
+        "rays_per_pixel=4",
+        "pixel_importance=20",
         "cells_per_pixel=1.6",
-        "supersample_warmup=0.6",
+        "supersample_warmup=0.4",
         "min_rays=1000000",
         "max_rays=8000000",
         "render-depth.samples_per_axis=1",

@@ -26,7 +26,7 @@ pub(crate) fn expose(image: &mut Rgba8, params: &Params, i: u32) {
     }
 }
 
-/// Returns the pose of training view `i` with an error, for the camera file.
+/// Returns the pose of training view `i`, turned by a random error, for the camera file.
 pub(crate) fn with_error(pose: &[[f64; 4]; 4], params: &Params, i: u32) -> [[f64; 4]; 4] {
     if params.pose_error == 0.0 {
         return *pose;
@@ -34,8 +34,8 @@ pub(crate) fn with_error(pose: &[[f64; 4]; 4], params: &Params, i: u32) -> [[f64
     let mut rng = CounterRng::new(u64::from(params.seed), POSE_STREAM, u64::from(i));
     // The sum of twelve uniform numbers is almost normal, with variance 1.
     let mut normal = || (0..12).map(|_| f64::from(rng.uniform())).sum::<f64>() - 6.0;
-    let axis = DVec3::new(normal(), normal(), normal());
-    let error = DQuat::from_scaled_axis(params.pose_error.to_radians() * axis);
+    let rotation = DVec3::new(normal(), normal(), normal());
+    let error = DQuat::from_scaled_axis(params.pose_error.to_radians() * rotation);
     let column = |k: usize| DVec3::new(pose[0][k], pose[1][k], pose[2][k]);
     let axes = DMat3::from_cols(column(0), column(1), column(2)) * DMat3::from_quat(error);
     crate::camera_to_world(axes, column(3))

@@ -69,7 +69,7 @@ impl Stage for Eval {
                 "baseline",
                 Input::optional(
                     &["metrics"],
-                    "another method's scores of the same views, for the least gain of any view",
+                    "another method's scores of the same views, to compute the smallest gain of a view",
                 ),
             ),
             (

@@ -80,7 +80,7 @@ impl CameraFormat {
         match self {
             Self::Transforms if is_any(|lens| lens.denominator != [0.0; 3]) => Some(
                 "transforms.json is not written: its readers don't support the rational terms of \
-                a lens, k4 to k6",
+                a lens, OpenCV's k4 to k6",
             ),
             Self::Colmap if is_any(|lens| lens.radial[3] != 0.0 && !lens.is_fisheye()) => Some(
                 "colmap/ is not written: COLMAP doesn't support the fourth radial term of a \
@@ -92,7 +92,7 @@ impl CameraFormat {
 }
 
 /// Returns a COLMAP model as text files: names and contents. Poses are world to camera with axes
-/// right, down, forward. Points have no track; `offset` is the world point of their origin.
+/// right, down, forward. Points have no track; `offset` is added to their positions.
 pub(crate) fn colmap_files(
     cameras: &[Camera],
     surfels: &[Surfel],

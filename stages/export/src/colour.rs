@@ -10,8 +10,8 @@ use crate::surface_view::{PointState, SurfaceView};
 
 /// Returns the colours of a mesh's vertices, display-encoded sRGB: the mean over the views that
 /// observe the vertex, weighted by the squared cosine between the vertex normal and the direction
-/// to the camera, or otherwise the field's own colour along the
-/// normal. `offset` is the origin of the mesh's frame, in the world.
+/// to the camera. Other vertices get the colour that the field renders against the normal. `offset`
+/// is the origin of the mesh's frame, in the world.
 pub(crate) fn vertex_colours(
     field: &Members,
     views: &[SurfaceView],

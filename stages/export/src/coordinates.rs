@@ -11,7 +11,7 @@ pub const OFFSET_FILE: &str = "offset.json";
 /// Files whose coordinates have single precision; the last two are the mesh.
 const SINGLE_FILES: [&str; 4] = ["points.ply", "splats.ply", "mesh.glb", "mesh.ply"];
 
-/// Maximum distance of a scene's middle from the origin, in scene sizes, for files without an
+/// Maximum distance of a scene's middle from the origin, in scene sizes, up to which files need no
 /// offset: single precision moves a point by less than a millionth of the size (design note 043).
 const MAX_DISTANCE_SIZES: f64 = 8.0;
 
@@ -24,7 +24,7 @@ pub struct ExportOffset {
     pub note: String,
     /// Offset in scene units: added to a coordinate of the files, it gives the input's.
     pub offset: [f64; 3],
-    /// Files whose coordinates lack the offset.
+    /// Files from whose coordinates the offset is subtracted.
     pub files: Vec<String>,
 }
 
@@ -49,7 +49,7 @@ impl Coordinates {
         Self { offset: middle.to_array().map(|x| round_coordinate(x, size)).into() }
     }
 
-    /// True if files with single precision lack an offset.
+    /// True if an offset is subtracted in files with single precision.
     pub(crate) fn is_moved(&self) -> bool {
         self.offset != DVec3::ZERO
     }

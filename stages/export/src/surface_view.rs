@@ -241,7 +241,7 @@ impl SurfaceView {
         self.pixels[index].depth -= distance / along.max(0.5);
     }
 
-    /// Removes a pixel's surface.
+    /// Excludes a pixel from the surfaces by a zero normal. Its depth stays and hides points behind it.
     pub(crate) fn remove_surface(&mut self, index: usize) {
         self.pixels[index].normal = Vec3::ZERO;
     }
@@ -294,8 +294,8 @@ impl SurfaceView {
     }
 }
 
-/// Maximum difference of depth, relative to the maximum distance from the surface, of a point near
-/// the surface: the ratio on surfaces slanted by 76°; source not recorded.
+/// Maximum difference in depth between a point and its pixel, over the maximum distance from the
+/// surface: as on surfaces slanted by 76°; source not recorded.
 const MAX_DEPTH_RATIO: f32 = 4.0;
 
 /// Converts a rendered pixel; `z_per_distance` is z-depth per distance along the pixel's ray.

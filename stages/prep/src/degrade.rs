@@ -7,8 +7,8 @@ pub(crate) fn extension(kernel: Kernel) -> &'static str {
     if kernel == Kernel::Average { "exr" } else { "png" }
 }
 
-/// Returns the number of neighbouring LR pixels that must be unmasked, too, for a pixel to count:
-/// beyond them are only a kernel's last lobe and less than a tenth of its weight (docs/design/005).
+/// Returns the distance in LR pixels up to which neighbours must be unmasked, too, for a pixel to
+/// count. Less than a tenth of the kernel's weight lies beyond (docs/design/005).
 pub(crate) fn mask_reach(kernel: Kernel) -> usize {
     match kernel {
         Kernel::Lanczos | Kernel::Bicubic => 1,

@@ -19,7 +19,7 @@ const BLENDED_LINES: usize = 1;
 /// Minimum ratio of an image's side to a strip's width if all four sides have a strip: margins
 /// around objects on a background are wider.
 const MIN_FRAME_RATIO: usize = 5;
-/// Minimum ratio of an image's side to any strip's width. It is small, since upright photographs in
+/// The ratio of an image's side to any strip's width is above this. It is small, since upright photographs in
 /// a wide format have wide strips.
 const MIN_RATIO: usize = 2;
 
@@ -28,6 +28,7 @@ const MIN_RATIO: usize = 2;
 pub(crate) struct Strips {
     /// Widths in pixels: top, right, bottom, left.
     pub(crate) widths: [usize; 4],
+    /// Colour of the first side that has a strip.
     pub(crate) colour: [u8; 3],
 }
 
@@ -43,7 +44,7 @@ impl Strips {
             let count = line_count(image, side);
             let width =
                 (0..count).take_while(|i| is_flat(&line(image, side, *i, [0, 0]), *colour)).count();
-            widths[side] = if width < count / MIN_RATIO { width } else { 0 };
+            widths[side] = if MIN_RATIO * width < count { width } else { 0 };
         }
         for (side, colour) in colours.iter().enumerate() {
             let Some(colour) = colour.filter(|_| widths[side] > 0) else { continue };

@@ -50,9 +50,7 @@ pub(crate) fn page(report: &Report<'_>, data: Option<&Data>) -> anyhow::Result<M
                     (plots(report))
                     (view_figures(report))
                     (conventions(report))
-                    @if !report.run.nodes.is_empty() || !report.run.unfinished.is_empty() {
-                        (pipeline(report.run))
-                    }
+                    @if has_pipeline(report.run) { (pipeline(report.run)) }
                     (commands(report.run))
                 }
                 footer { p { "Written by nerf-sr. This page needs no network." } }
@@ -90,14 +88,19 @@ fn end_time(run: &RunRecord) -> Option<u64> {
     run.nodes.iter().map(|node| node.started_unix + node.seconds.max(0.0) as u64).max()
 }
 
+fn has_pipeline(run: &RunRecord) -> bool {
+    !run.nodes.is_empty() || !run.unfinished.is_empty()
+}
+
 fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
     let run = report.run;
     let views: usize = report.scenes.iter().map(|scene| scene.views.len()).sum();
+    let has_pipeline = has_pipeline(run);
     let links = [
         ("compare", "Compare", has_pictures),
         ("scores", "Scores", !report.rows.is_empty()),
         ("plots", "Plots", !report.rows.is_empty()),
-        ("pipeline", "Pipeline", true),
+        ("pipeline", "Pipeline", has_pipeline),
         ("commands", "Commands", true),
     ];
     html! {

@@ -14,7 +14,7 @@ pub(crate) struct Scale {
 /// Number of a scale's colours; a browser's interpolation between two neighbours is
 /// indistinguishable from the exact colours. Chosen by hand.
 const COLOURS: usize = 24;
-/// Minimum number of intervals between the round numbers of a scale; chosen by hand.
+/// Minimum length of a scale in steps between round numbers; chosen by hand.
 const MIN_INTERVALS: f64 = 4.0;
 
 impl Scale {
@@ -58,7 +58,8 @@ fn css([r, g, b]: [u8; 3]) -> String {
 fn ticks(low: f64, high: f64) -> Vec<(f64, String)> {
     let span = high - low;
     if !(span > 0.0 && span.is_finite()) {
-        return vec![(0.0, format!("{low}"))];
+        // As single precision, which has the digits that a depth is written with.
+        return vec![(0.0, format!("{}", low as f32))];
     }
     let power = 10f64.powf((span / MIN_INTERVALS).log10().floor());
     let factors = [5.0, 2.0, 1.0].map(|factor| factor * power);
@@ -91,7 +92,7 @@ mod tests {
         assert_eq!(texts(&depth), ["3", "4", "5", "6"]);
         assert!(depth.ticks.windows(2).all(|pair| pair[0].0 < pair[1].0));
         // One depth alone, and what can't be.
-        assert_eq!(texts(&Scale::depth((3.0, 3.0))), ["3"]);
+        assert_eq!(texts(&Scale::depth((2.13, 2.13))), ["2.13"]);
         assert_eq!(Scale::depth((3.0, f32::NAN)).ticks.len(), 1);
     }
 

@@ -4,7 +4,7 @@
 
 /** Maximum number of pictures side by side. */
 const MAX_PANES = 24;
-/** Maximum distance in screen pixels at which a drag moves the division instead of panning. */
+/** Maximum distance in screen pixels at which a drag moves the divider instead of panning. */
 const GRIP = 18;
 const MAX_ZOOM = 40;
 /** Time after the last change until the address is written: browsers ignore more than some 20 writes a second. */

@@ -40,7 +40,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                 div class="controls under" {
                     label class="split" { span { "Divide" }
                         input type="range" id="split" min="0" max="100" step="0.5" value="50"
-                            aria-label="Position of the division between left and right, per cent";
+                            aria-label="Position of the divider between left and right, per cent";
                     }
                     div class="field modes" role="group" aria-label="Zoom" {
                         button type="button" id="zoom-out" aria-label="Zoom out" { "−" }
@@ -54,7 +54,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                     }
                 }
                 p id="stage-help" class="note" {
-                    "Drag to move the division, or to pan a zoomed view. Ctrl and wheel, pinch, + "
+                    "Drag to move the divider, or to pan a zoomed view. Ctrl and wheel, pinch, + "
                     "and − zoom. 0 fits the view; 1 or a double click shows one image pixel per "
                     "screen pixel. N and P change the view."
                 }

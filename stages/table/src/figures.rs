@@ -32,7 +32,7 @@ impl Figures {
         }
     }
 
-    /// True if lower values are better.
+    /// True if lower values are better, as for times and values without a title here.
     pub(crate) fn lower_is_better(&self, name: &str) -> bool {
         match self.0.get(name) {
             Some(figure) => figure.higher_is_better == Some(false),

@@ -63,7 +63,7 @@ impl Stage for Table {
         if let Some(picture) = &document.picture {
             write_text(context, markdown::PICTURE, picture)?;
         }
-        context.write_summary(&format!("{} results", rows.len()))
+        context.write_summary(&artifact::format_count(rows.len(), "result"))
     }
 }
 

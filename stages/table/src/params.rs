@@ -41,8 +41,8 @@ pub struct Params {
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
     /// Rows from other sources, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:
-    /// 29.77}]`. An extra row appears in tables whose results have the values of the row's keys, in
-    /// a single scene's only if it has key `scene`, and is never marked as the best.
+    /// 29.77}]`. An extra row appears if the table's results have the same values of its keys. In
+    /// the table of a single scene it also needs key `scene`. It is never marked as the best.
     #[schemars(extend("x-default" = "none"))]
     pub extra_rows: Vec<Row>,
     /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over:

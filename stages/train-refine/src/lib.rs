@@ -58,7 +58,7 @@ impl Stage for TrainRefine {
                 "cameras",
                 Input::optional(
                     &cameras,
-                    "net: compact: cameras of the views to be refined; if all have LR photographs, \
+                    "net: compact: cameras of the views to be refined; if each has an LR photograph, \
                     training views are made consistent with their own LR photographs, too",
                 ),
             ),

@@ -20,9 +20,9 @@ const VGG_FILES: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetens
 pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow::Result<()> {
     let Examples { training: mut known, left_out } =
         Examples::read(context.input("views")?, context.input("truth")?, None)?;
-    if known.len() > 1 {
-        known.extend(left_out);
-    }
+    // A single view is in both parts.
+    let first = known[0].rendered.camera.name.clone();
+    known.extend(left_out.into_iter().filter(|view| view.rendered.camera.name != first));
     let options = PaperTraining {
         steps: params.steps,
         batch_size: params.batch_size as usize,

@@ -1,7 +1,7 @@
 //! `video`: rendered views as a film, colour and depth side by side.
 //!
-//! The stage is a sink. It writes a PNG per frame and a film: `video.mp4` if `ffmpeg` is installed,
-//! otherwise `video.png`. Each point of a sweep has its own folder.
+//! The stage is a sink. It writes a PNG per frame and a film: `video.mp4` by `ffmpeg`, or
+//! `video.png` if `ffmpeg` is missing or fails. Each point of a sweep has its own folder.
 
 mod animation;
 mod film;
@@ -154,7 +154,15 @@ fn draw_frame(
     let (Some(file), Some(range)) = (&view.depth, range) else { return Ok(colour) };
     let image = read_exr(&folder.join(file))?;
     Ok(match DepthMap::of(&image) {
-        Some(map) => side_by_side(&colour, &map.draw(image.width, range)),
+        Some(map) if image.height == colour.height => {
+            side_by_side(&colour, &map.draw(image.width, range))
+        }
+        Some(_) => bail_bad_input!(
+            "view {}: image and depth have different heights, {} and {} pixels",
+            view.camera.name,
+            colour.height,
+            image.height
+        ),
         None => colour,
     })
 }

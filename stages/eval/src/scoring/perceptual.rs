@@ -60,7 +60,7 @@ impl Perceptual {
         given.retain(|network| network.files().iter().all(|file| folder.join(file).is_file()));
         if given.is_empty() {
             artifact::bail_bad_input!(
-                "input weights: {}: no network found; {}",
+                "input weights: {}: no LPIPS network found; {}",
                 folder.display(),
                 missing_files(&LpipsNetwork::ALL)
             );
@@ -107,7 +107,7 @@ impl Perceptual {
 
 /// Returns the rule that the folder of weights must contain a complete network.
 pub(crate) fn weights_rule() -> Rule {
-    let message = format!("no network found; {}", missing_files(&LpipsNetwork::ALL));
+    let message = format!("no LPIPS network found; {}", missing_files(&LpipsNetwork::ALL));
     let rule = Rule::new(&message);
     LpipsNetwork::ALL.iter().fold(rule, |rule, network| rule.or_files("weights", &network.files()))
 }
@@ -175,11 +175,11 @@ fn missing_files(networks: &[LpipsNetwork]) -> String {
     let pairs: Vec<String> = networks
         .iter()
         .map(|network| network.files())
-        .map(|[weights, heads]| format!("{weights} with {heads}"))
+        .map(|[weights, heads]| format!("{weights} and {heads}"))
         .collect();
     format!(
-        "-i eval.weights=FOLDER with {} (torchvision's and richzhang/PerceptualSimilarity's, as \
-        safetensors)",
-        pairs.join(", or ")
+        "-i eval.weights=FOLDER must have one of these pairs: {} (torchvision's and \
+        richzhang/PerceptualSimilarity's, as safetensors)",
+        pairs.join("; ")
     )
 }

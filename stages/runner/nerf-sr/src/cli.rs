@@ -64,14 +64,15 @@ struct PlanArgs {
     targets: Vec<String>,
     /// Set a parameter. Several values run all combinations; stages that don't depend on the
     /// parameter run once. A value is JSON, such as a number, true or null, or plain text; an empty
-    /// value is null. If a parameter is given twice, the last value wins. `quality` sets those
-    /// parameters of training, rendering and refinement that are not set otherwise: `best`,
-    /// `balanced` in a third of its time [default], `fast` in a tenth, or `draft` in a thirtieth
+    /// value is null, and whole numbers may end in k, M or G. If a parameter is given twice, the
+    /// last value wins. `quality` is `best`, `balanced` [default], `fast` or `draft`, which take a
+    /// third, a tenth and a thirtieth of the time of `best`. It sets those parameters of training,
+    /// rendering and refinement that are not set otherwise
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
     /// Read an input from this folder, not from what the pipeline names, e.g. -i
-    /// dataset=scenes/lego. A stage's name stands for its artifact: -i init=train-ss continues a
-    /// training
+    /// dataset=scenes/lego. A stage's name stands for its artifact: -i init=train-ss trains the field
+    /// of train-ss further
     #[arg(short = 'i', long = "input", value_name = "[STAGE.]NAME=DIR[,DIR…]")]
     inputs: Vec<String>,
     #[command(flatten)]
@@ -84,8 +85,8 @@ struct ExperimentArgs {
     /// Scenes of an experiment: folders in --data, or `demo` [default: those that its file names]
     #[arg(long = "scene", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     scenes: Vec<String>,
-    /// Protocols of an experiment: presets of its file, or WIDTHxSCALE [default: those that its
-    /// file names]
+    /// Protocols of an experiment: presets of its file, or LR width and scale, such as 100x2
+    /// [default: those that its file names]
     #[arg(long = "protocol", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     protocols: Vec<String>,
     /// Variant of an experiment; repeat for more [default: all]
@@ -94,8 +95,8 @@ struct ExperimentArgs {
     /// Use only the first N variants of an experiment
     #[arg(long, value_name = "N")]
     first_variants: Option<usize>,
-    /// Show only these results on pages and in tables: names of a sink's inputs, or of blocks
-    /// [default: all]
+    /// Show only these results on pages and in tables: stages of the pipeline, or inputs of the page
+    /// or table [default: all]
     #[arg(long = "show", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     show: Vec<String>,
     /// Folder of an experiment's data sets [default: the one that its file names]
@@ -109,8 +110,8 @@ struct RunOptions {
     /// Maximum number of stages that run at once [default: number of cores, at most 4]
     #[arg(short, long, value_name = "N")]
     jobs: Option<usize>,
-    /// Number of cores that all stages share, and of threads of each stage; results don't depend on
-    /// the number [default: processors of this process]
+    /// Number of processors that all stages share; each stage starts as many threads. Results don't
+    /// depend on the number [default: processors of this process]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
     /// Memory limit for all stages together, such as 8G; each stage counts with the peak memory of
@@ -120,11 +121,12 @@ struct RunOptions {
     /// Continue with stages that don't depend on a failed one
     #[arg(short, long)]
     keep_going: bool,
-    /// Folder of pages and watched views [default: out next to the pipeline file]
+    /// Folder of pages, tables, films, exports and watched views [default: out next to the pipeline
+    /// file]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Show a test view and its scores while a field trains, using about 2 % of the processor
-    /// time; needs a target that scores views, such as eval [default view: the first]
+    /// Show a test view and its scores while a field trains, in the terminal and in out/watch, using
+    /// about 2 % of the processor time; needs a target that scores views, such as eval [default view: the first]
     #[arg(long, value_name = "VIEW", num_args = 0..=1, require_equals = true,
         default_missing_value = "")]
     watch: Option<String>,
@@ -175,7 +177,8 @@ enum Verb {
     Advise {
         #[command(flatten)]
         plan: PlanArgs,
-        /// Time that the run may take; the best quality within it is chosen [default: balanced]
+        /// Time that the run may take; the best quality within it is chosen [without a limit:
+        /// balanced]
         #[arg(long, value_name = "N")]
         minutes: Option<f64>,
         /// Memory that a stage may use, such as 8G; the best quality within it is chosen
@@ -224,7 +227,7 @@ enum Verb {
         #[command(flatten)]
         plan: PlanArgs,
         /// Output format
-        #[arg(long, value_enum, default_value = "ascii")]
+        #[arg(long, value_enum, default_value = "text")]
         format: GraphFormat,
     },
     /// Print the log of a stage

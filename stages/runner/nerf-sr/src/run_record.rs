@@ -70,7 +70,7 @@ pub(crate) fn run_record(
             reason: None,
         });
     }
-    // Sinks that show complete runs alone don't know of missing results.
+    // Sinks that show only complete runs don't know of missing results.
     if can_be_partial {
         failed.extend_from_slice(&sink.left_out);
     }

@@ -52,11 +52,12 @@ impl std::fmt::Display for Change {
 fn format_value(value: Option<&Value>) -> String {
     match value {
         None => "absent".to_owned(),
-        Some(Value::String(hash)) if hash.len() == 64 && hash.is_ascii() => {
-            short_hash(hash).to_owned()
+        Some(Value::String(hash)) if store::is_hash(hash) => short_hash(hash).to_owned(),
+        // Whole numbers are written 2, not 2.0.
+        Some(value) => {
+            let text = value.to_string();
+            text.strip_suffix(".0").unwrap_or(&text).to_owned()
         }
-        // 2 and 2.0 are equal as parameters, but not as JSON.
-        Some(value) => value.to_string().trim_end_matches(".0").to_owned(),
     }
 }
 

@@ -158,8 +158,8 @@ impl<'a> Expansion<'a> {
         inputs
     }
 
-    /// Returns whether a setting applies to a stage: it is the stage's own, or that of the block
-    /// that the stage's block extends without a value of its own.
+    /// Returns whether a setting applies to a stage: it is the stage's own. A block without a value
+    /// of its own takes the setting of the block that it extends.
     fn applies(&self, setting: &Setting, stage: &str) -> bool {
         if setting.kind == Kind::Quality {
             return self.programs.get(stage).is_some_and(Quality::affects);
@@ -223,8 +223,8 @@ impl<'a> Expansion<'a> {
         }
     }
 
-    /// Returns the reason for leaving out a stage at a point: a missing file, its own or a
-    /// parent's.
+    /// Returns the reason for leaving out a stage at a point, and notes it: a missing file, its own
+    /// or a parent's.
     fn missing(&mut self, stage: &str, point: &Point, parameters: &Value) -> Option<String> {
         if let Some(reason) = self.required_files.missing(stage, parameters) {
             let data = self.required_files.data.display();
@@ -339,12 +339,14 @@ impl<'a> Expansion<'a> {
     fn quality(&self, stage: &str, point: &Point) -> Quality {
         let settings = self.settings(stage, point);
         let last = settings.into_iter().rfind(|setting| setting.kind == Kind::Quality);
+        // Axes hold valid qualities alone.
         let given = last.and_then(|setting| Quality::parse(&setting.value).ok());
         given.or(self.pipeline.quality).unwrap_or_default()
     }
 
-    /// Resolves a stage's parameters at a point. The command line overrides the file, a block
-    /// overrides the block that it extends, both override the quality, and all override defaults.
+    /// Resolves a stage's parameters at a point. Defaults are overridden by the quality, this by the
+    /// block that the stage's block extends, and this by the block itself. In each of the two, the
+    /// file's values are overridden by those of the axes, from command line and experiment.
     fn resolve(
         &self,
         stage: &str,

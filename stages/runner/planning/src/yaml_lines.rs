@@ -55,8 +55,9 @@ pub(crate) fn expand_merge_keys(document: &mut Value) -> Result<bool, serde_yaml
 
 fn has_merge_key(value: &Value) -> bool {
     match value {
+        // Like `apply_merge`, this ignores a key with a tag, which stays.
         Value::Mapping(entries) => {
-            entries.iter().any(|(key, value)| key.as_str() == Some("<<") || has_merge_key(value))
+            entries.contains_key("<<") || entries.values().any(has_merge_key)
         }
         Value::Sequence(items) => items.iter().any(has_merge_key),
         Value::Tagged(tagged) => has_merge_key(&tagged.value),
@@ -67,7 +68,9 @@ fn has_merge_key(value: &Value) -> bool {
 /// Returns the keys that lead to the first number that JSON can't represent (`.nan` or `.inf`).
 pub(crate) fn find_non_finite(value: &Value) -> Option<Vec<String>> {
     match value {
-        Value::Number(number) if !number.as_f64().is_none_or(f64::is_finite) => Some(Vec::new()),
+        Value::Number(number) if number.as_f64().is_some_and(|n| !n.is_finite()) => {
+            Some(Vec::new())
+        }
         Value::Mapping(entries) => entries.iter().find_map(|(key, value)| {
             let mut path = find_non_finite(value)?;
             path.insert(0, key.as_str().unwrap_or_default().to_owned());

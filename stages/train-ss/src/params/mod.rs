@@ -41,7 +41,7 @@ pub struct Params {
     #[schemars(range(min = 1, max = 1_048_576))]
     #[schemars(extend("x-group" = "sampling", "x-default" = "by `field`"))]
     pub max_rays_per_step: Option<u32>,
-    /// Highest learning rate: of the grid's coarsest level, or of the paper's MLPs. Default: 0.06,
+    /// Learning rate at its peak, of the grid's coarsest level or of the paper's MLPs. Default: 0.06,
     /// or 0.0005 with `field: mlp`.
     #[schemars(range(min = 0.0, max = 1.0))]
     #[schemars(extend("x-group" = "optimiser", "x-default" = "by `field`"))]
@@ -52,9 +52,10 @@ pub struct Params {
     pub supervision: Option<Supervision>,
     /// Estimates a gain for red, green and blue of each photograph, for photographs with several
     /// exposures or white balances. Rendered views have the mean exposure of the photographs.
-    /// Default: the first 512 steps measure the gains, and the training starts over with exposures
-    /// if gains differ by more than 3 to 4 %. Fine-tuning (input `init`) follows the initial field.
-    /// False for `field: mlp`, background `alpha` and `pose_refinement`.
+    /// Default: the first 512 steps measure the gains. If they differ by more than a fifth of the
+    /// field's relative error, usually 2 to 4 %, the training starts over with exposures.
+    /// Fine-tuning (input `init`) follows the initial field. False for `field: mlp`, background
+    /// `alpha` and `pose_refinement`.
     #[schemars(extend("x-group" = "data", "x-default" = BY_SCENE))]
     pub exposure: Option<bool>,
     /// Optimises camera poses during training, for poses that aren't exact. Motion that all cameras
@@ -62,8 +63,8 @@ pub struct Params {
     /// `nerf-sr run registered` then renders test views from registered cameras.
     #[schemars(extend("x-group" = "data"))]
     pub pose_refinement: bool,
-    /// Keeps cells empty that some photograph shows only through transparent pixels. For
-    /// `field: grid`, photographs with alpha and space `box`, unless `pose_refinement` moves the
+    /// Carves the visual hull: cells stay empty if they lie behind transparent pixels alone in at
+    /// least one photograph. For `field: grid`, photographs with alpha and space `box`, unless `pose_refinement` moves the
     /// cameras.
     #[schemars(extend("x-group" = "data"))]
     pub silhouettes: bool,
@@ -176,8 +177,7 @@ pub struct GridParams {
     /// Levels of the grid.
     #[schemars(range(min = 1, max = 16), extend("x-group" = "field"))]
     pub n_levels: u32,
-    /// Cells of the finest level for each LR pixel across the unit cube, but 32 to 2048 cells in
-    /// all.
+    /// Size of an LR pixel in cells of the finest level, which has 32 to 2048 cells along each axis.
     #[schemars(range(min = 0.1, max = 16.0), extend("x-group" = "field"))]
     pub cells_per_pixel: f64,
     /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at 256 cells across

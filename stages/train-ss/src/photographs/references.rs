@@ -52,8 +52,8 @@ pub(crate) fn check_references(
         let psnr = premultiplied_psnr(&shrunk, &own);
         if psnr < MIN_REFERENCE_PSNR {
             log(format!(
-                "reference {name} differs from its own LR photograph ({psnr:.1} dB) and is left \
-                out: another view, or did something move?"
+                "reference {name} differs from its own LR photograph (PSNR {psnr:.1} dB) and is \
+                left out; check that both show the same view"
             ));
         } else {
             views.push(view);

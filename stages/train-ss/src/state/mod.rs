@@ -14,7 +14,7 @@ pub(crate) use moving_cameras::MovingCameras;
 pub(crate) struct TrainingState {
     /// HR pixels as last rendered.
     pub(crate) cache: Option<HrCache>,
-    /// Gain of each photograph.
+    /// Gains of each photograph's channels.
     pub(crate) exposures: Option<Exposures>,
     /// Measurement of whether gains are needed.
     pub(crate) measurement: Option<ExposureMeasurement>,

@@ -21,15 +21,15 @@ impl SupersamplingOptions {
         (width, height)
     }
 
-    /// True if HR pixels are cached: those of all LR photographs if the kernel of any size needs
-    /// them.
+    /// True if HR pixels of the LR photographs are cached: of all photographs if the kernel needs
+    /// them at the size of one.
     pub(crate) fn needs_cache(&self, mut lr_sizes: impl Iterator<Item = (usize, usize)>) -> bool {
         self.params.supervision == Supervision::Kernel
             && lr_sizes.any(|lr| HrCache::is_needed(self.filter, self.hr_size(lr), lr))
     }
 
-    /// Returns the number of sub-pixel rays along x and y, at most the size of the smallest view in
-    /// HR pixels.
+    /// Returns the number of sub-pixel rays along x and y, at most the least width and height of any
+    /// view in HR pixels.
     pub(crate) fn supersample_within(
         &self,
         photographs: &Photographs,

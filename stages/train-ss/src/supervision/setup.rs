@@ -16,7 +16,8 @@ use crate::photographs::{NO_SPACE, PackedPhotograph, Photographs, check_referenc
 pub(crate) fn transparent_background(parameter: &str) -> String {
     let problem = match parameter {
         "supervision" => {
-            "kernel needs an opaque background; choose average, or prep.background white"
+            "kernel cannot be compared over a transparent background; choose average, or \
+            prep.background white or opaque"
         }
         "exposure" => {
             "exposure cannot be estimated over a transparent background; choose prep.background \

@@ -4,7 +4,7 @@ use radiance::StepReport;
 
 use crate::params::{Resolved, ResolvedField};
 
-/// Cost of a grid's ray over that late in the training, by step: until the occupancy grid has found
+/// Relative cost of a ray of a grid field at each step, 1 late in the training: until the occupancy grid has found
 /// the empty space, rays have many samples, and small steps share their fixed costs among few rays.
 /// Processor time per ray of lego 100×2 and fern 252×2 (design note 048).
 const COURSE: [(f64, f64); 9] = [
@@ -20,7 +20,7 @@ const COURSE: [(f64, f64); 9] = [
 ];
 /// Minimum number of steps over which the current pace is averaged; chosen by hand.
 const MIN_WINDOW_STEPS: f64 = 32.0;
-/// Steps per step of the averaging window; chosen by hand.
+/// Number of steps taken for each step of the averaging window; chosen by hand.
 const STEPS_PER_WINDOW_STEP: f64 = 8.0;
 /// Number of parts of growing size in which the remaining rays are predicted; chosen by hand.
 const PARTS: u32 = 64;
@@ -186,7 +186,7 @@ mod tests {
         estimates
     }
 
-    /// From a tenth of the time on within a factor of 1.5, by the measured time of the whole.
+    /// From a tenth of the time on, the estimate is within a factor of 1.5 of the measured time.
     #[test]
     fn the_course_of_a_training_is_foreseen() {
         for (course, total, whole) in [

@@ -78,7 +78,8 @@ kernel! {
     }
 }
 
-/// Gradients of half of the entries of some bricks, and marks of the bricks that have one.
+/// Gradients of one half of each of some bricks, and a mark for each brick: not 0 if its half has a
+/// gradient. Half h of brick b is block 2·b + h of the weights.
 pub(crate) type HalfPiece<'a> = (&'a mut [f32], &'a mut [u8]);
 
 kernel! {

@@ -44,7 +44,7 @@ pub(crate) struct Roulette {
     /// whose norm g is below m is kept with probability g/m, its gradient multiplied by m/g, so the
     /// expected gradient is unchanged.
     pub(crate) limit: f32,
-    /// Start of the systematic draw, in 0..1.
+    /// Random start of the running sum by which samples are chosen, in 0..1.
     pub(crate) draw: f32,
 }
 

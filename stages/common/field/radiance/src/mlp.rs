@@ -1,6 +1,6 @@
 //! Matrix kernels of the small networks. Activations are rows of `n` samples (a multiple of 16);
-//! weights are stored by input (`w[i·outputs + j]`). There are no biases: the first spherical
-//! harmonic is a constant input.
+//! weights are stored by input (`w[i·outputs + j]`). There are no biases; the view
+//! network has a constant input, the first spherical harmonic.
 
 use crate::spec::{DENSITY_OUTPUTS, VIEW_INPUTS};
 use numerics::kernel;
@@ -25,7 +25,7 @@ pub(crate) struct Matrix<'a> {
     outputs: usize,
 }
 
-/// Activation applied to a sum before it is stored.
+/// Operation on a sum before it is stored.
 #[derive(Clone, Copy)]
 pub(crate) enum After<'a> {
     /// Identity.
@@ -46,8 +46,8 @@ struct Product<'a> {
     after: After<'a>,
 }
 
-/// Computes TO outputs from `j` on of TV vectors of samples from `s` on, all in registers. The
-/// order of the sum over inputs doesn't depend on the tile.
+/// Computes outputs j to j + TO for TV vectors of samples from `s` on, all in registers. The order
+/// of the sum over inputs doesn't depend on the tile.
 #[inline(always)]
 fn tile<L: Lanes, const TO: usize, const TV: usize>(
     product: &Product<'_>,

@@ -15,7 +15,7 @@ use crate::spec::{
 };
 use numerics::simd::LANES;
 
-/// Sums over one ray's samples.
+/// Sums over one ray's samples. Marching starts from a transmittance of 1.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RaySum {
     pub(crate) colour: [f32; 3],

@@ -1,5 +1,5 @@
-/// Progress of a training run, and its response to non-finite steps. The first such step is skipped
-/// and halves the learning rates; a second one within 100 steps ends the run (docs/design/006).
+/// Progress of a training run, and its response to non-finite steps. Such a step is skipped and
+/// halves the learning rates; another one within 100 steps ends the run (docs/design/006).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrainingState {
     /// Number of steps taken.
@@ -29,17 +29,21 @@ impl TrainingState {
     }
 
     /// Returns the number of bundles of the next step; `None` after the last step. `rays` is the
-    /// number of rays of the training run, `target_rays` that of the step, `bundle` that of a
-    /// bundle.
-    pub fn bundles_of_step(&self, rays: u64, target_rays: usize, bundle: usize) -> Option<usize> {
-        let remaining = rays.saturating_sub(self.rays) as usize / bundle;
-        (remaining > 0).then(|| (target_rays / bundle).clamp(1, remaining))
+    /// number of rays of the training run, `target_rays` that of the step.
+    pub fn bundles_of_step(
+        &self,
+        rays: u64,
+        target_rays: usize,
+        rays_per_bundle: usize,
+    ) -> Option<usize> {
+        let remaining = rays.saturating_sub(self.rays) as usize / rays_per_bundle;
+        (remaining > 0).then(|| (target_rays / rays_per_bundle).clamp(1, remaining))
     }
 
-    /// Adds bundles of `bundle` rays each to the counters.
-    pub fn count(&mut self, bundles: usize, bundle: usize) {
+    /// Adds bundles to the counters.
+    pub fn count(&mut self, bundles: usize, rays_per_bundle: usize) {
         self.bundles += bundles as u64;
-        self.rays += (bundles * bundle) as u64;
+        self.rays += (bundles * rays_per_bundle) as u64;
     }
 
     /// Records a non-finite step and halves the learning rates. Returns whether training may

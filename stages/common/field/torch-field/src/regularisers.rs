@@ -5,7 +5,8 @@ use tch::{Kind, TchError, Tensor};
 use crate::grid::GridForward;
 
 /// Adds the regularisers' losses to `surrogate`, a scalar whose gradient is that of the step's mean
-/// loss. `forward` has some of the step's `rays` rays, marched by `march_step`.
+/// loss. `forward` has a part of the step's rays, which are `rays` in all; `march_step` is the
+/// distance between samples, in sides of the unit cube.
 pub(crate) fn add_regularisers(
     mut surrogate: Tensor,
     regularisers: &Regularisers,
@@ -28,8 +29,8 @@ pub(crate) fn add_regularisers(
     Ok(surrogate)
 }
 
-/// Computes the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), summed over all rays:
-/// Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i².
+/// Computes the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), summed over
+/// the rays of `forward`: Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i².
 fn distortion_sum(forward: &GridForward, step: f64) -> Result<Tensor, TchError> {
     let weights = forward.weights.f_mul(&forward.counted)?;
     let moments = weights.f_mul(&forward.t)?;
@@ -40,8 +41,9 @@ fn distortion_sum(forward: &GridForward, step: f64) -> Result<Tensor, TchError> 
     pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
 }
 
-/// Computes the floater loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, without
-/// gradients through the colours c or the transmittance T.
+/// Computes the floater loss, summed over the rays of `forward`: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊
+/// with a ray's transmittance T, background b and [`MAX_FLOATER_COLOUR_DISTANCE`] as reach. No
+/// gradients go through the colours c or T.
 fn floater_sum(forward: &GridForward, backgrounds: &Tensor) -> Result<Tensor, TchError> {
     let background = backgrounds.f_index_select(0, &forward.shaded_ray)?;
     let squared = forward

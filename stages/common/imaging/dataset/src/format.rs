@@ -79,11 +79,8 @@ impl fmt::Display for Format {
 
 /// Lists the files that identify a data set.
 pub(crate) fn expected_files() -> String {
-    let signs = Format::ALL.map(|format| format.description().sign);
-    match signs.split_last() {
-        Some((last, others)) => format!("{}, or {last}", others.join(", ")),
-        None => String::new(),
-    }
+    let [others @ .., last] = Format::ALL.map(|format| format.description().sign);
+    format!("{}, or {last}", others.join(", "))
 }
 
 #[cfg(test)]

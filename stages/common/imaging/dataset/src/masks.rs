@@ -107,7 +107,8 @@ fn find_mask(
 fn without_images_folder(parent: &Path) -> PathBuf {
     let mut parts = parent.iter();
     let first = parts.next().and_then(|part| part.to_str()).unwrap_or_default();
-    let is_images = first.eq_ignore_ascii_case("images") || first.starts_with("images_");
+    let lower_case = first.to_ascii_lowercase();
+    let is_images = lower_case == "images" || lower_case.starts_with("images_");
     if is_images { parts.collect() } else { parent.to_path_buf() }
 }
 

@@ -15,7 +15,7 @@ const UNCLIPPED_RANGE: [f32; 2] = [0.02, 0.98];
 const MIN_BLOCKS: f64 = 12.0;
 /// Minimum variance of the reference's block means for a fit; chosen by hand.
 const MIN_VARIANCE: f64 = 1e-5;
-/// Range of plausible gains: images outside it show different content. Chosen by hand.
+/// Range of plausible gains: images with a gain outside it show different content. Chosen by hand.
 const GAIN_RANGE: [f32; 2] = [0.1, 10.0];
 /// Maximum deviation of a gain from 1, and of an offset from 0, that a field's errors explain:
 /// views of fern deviate by 1 %, of lego by 6 %.
@@ -24,7 +24,8 @@ const NEGLIGIBLE_CHANGE: [f32; 2] = [0.1, 0.05];
 impl Exposure {
     /// Fits the exposure of `image` relative to `reference`, an image of the same size. The fit is
     /// by least squares per channel over means of square blocks; pixels that are clipped in either
-    /// image are ignored. `None` if too few blocks remain or the gain is implausible.
+    /// image are ignored. `None` if too few blocks remain, the reference is nearly uniform, or the
+    /// gain is implausible.
     ///
     /// # Panics
     /// With fewer than three channels, different sizes, or a block of 0 pixels.

@@ -156,10 +156,10 @@ pub enum Background {
     White,
     /// Black.
     Black,
-    /// Transparent: opacity is data, colours are premultiplied.
+    /// Transparent: the field learns the images' alpha, too. Scores compare premultiplied colours.
     Alpha,
-    /// None: every ray ends on a surface, as in photographs. Training draws a new background colour
-    /// for each ray, so that no density can imitate the background.
+    /// No background: every ray ends on a surface, as in photographs. Training draws a new background
+    /// colour for each ray, so that no density can imitate the background.
     Opaque,
 }
 

@@ -47,7 +47,7 @@ pub struct Metrics {
     /// Method of each metric as text; also the background of the scene (`background`) and the
     /// content of error maps (`error_maps`).
     pub conventions: BTreeMap<String, String>,
-    /// Numbers to display, the most important first.
+    /// Formats of the numbers to display, the most important first.
     pub figures: Vec<ScoreFormat>,
     /// Titles of the metrics' pictures, by metric.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]

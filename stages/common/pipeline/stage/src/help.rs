@@ -26,10 +26,11 @@ pub(crate) fn render_help(description: &Description) -> String {
     if sections.iter().all(|section| section.parameters.is_empty()) {
         return text + "This stage has no parameters.\n";
     }
-    text.push_str(
-        "Parameters, set in pipeline.yaml under `parameters:` or by -p NAME=VALUE of nerf-sr:\n",
-    );
-    text.push_str(&format!("see docs/reference/{}.md for details.\n", description.name));
+    text.push_str(&format!(
+        "Parameters, set in pipeline.yaml under `parameters:` or by -p NAME=VALUE of nerf-sr\n\
+        (details: docs/reference/{}.md):\n",
+        description.name
+    ));
     for section in &sections {
         if let Some(variant) = &section.variant {
             text.push_str(&format!("\nWith {variant}\n"));
@@ -99,8 +100,8 @@ mod tests {
 Inputs, with the accepted kinds of artifact:
   scene                 images [scene/train or views, optional]
 
-Parameters, set in pipeline.yaml under `parameters:` or by -p NAME=VALUE of nerf-sr:
-see docs/reference/x.md for details.
+Parameters, set in pipeline.yaml under `parameters:` or by -p NAME=VALUE of nerf-sr
+(details: docs/reference/x.md):
 
   rate                  Rate. [a number from 0 to 0.5; default: none]
   rays                  Rays. [a whole number from 1; default: 5]

@@ -78,7 +78,7 @@ struct Program {
     summary: &'static str,
     version: &'static str,
     description: Description,
-    /// Function that converts checked parameters to the stage's type.
+    /// Function that returns the stage's work with checked parameters.
     work: fn(Value) -> Result<Work, ParamsError>,
 }
 

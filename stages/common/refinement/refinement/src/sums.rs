@@ -1,5 +1,5 @@
-/// Radius in pixels of the window in which a reference is compared with the rendered view. In its
-/// mean, missing detail averages out (design note 018).
+/// Radius in pixels of the window in which a reference is compared with the rendered view. In the
+/// window's mean, missing detail averages out (docs/design/018).
 pub(crate) const COMPARED_RADIUS: usize = 5;
 
 /// Summed-area table of `N` values per pixel.

@@ -129,7 +129,7 @@ pub struct RefinerScores {
     pub rendered_psnr: f64,
     /// Mean PSNR of the refined views with the best residual weight, in dB.
     pub refined_psnr: f64,
-    /// Fraction of the predicted residual with the smallest squared error, from 0 to 1.
+    /// Factor of the predicted residual, from 0 to 1, that gives the smallest squared error.
     pub residual_weight: f64,
     /// Confidence in references as a fraction of their visibility; `None` without references.
     pub confidence: Option<f64>,

@@ -31,10 +31,10 @@ impl Default for WarpOptions {
 #[derive(Debug)]
 struct ReferenceFeatures {
     /// Features of each pixel:
-    /// * colour difference between references and render;
+    /// * colours of references minus those of the render;
     /// * confidence, from 0 (visible in no reference) to 1 (visible in a reference from the same
     ///   direction, at the view's resolution or a finer one, with the rendered colour);
-    /// * detail: difference between references and their own renders. Detail helps even if a
+    /// * detail: colours of references minus those of their own renders. Detail helps even if a
     ///   reference displays a point slightly displaced or in another light.
     features: Vec<[f32; FEATURES]>,
     /// Statistics of each reference.
@@ -81,7 +81,7 @@ pub struct ConditionedView {
     pub statistics: Vec<ReferenceStatistics>,
 }
 
-/// Mean difference around a pixel that quarters the confidence (design note 018).
+/// Length of the mean RGB difference around a pixel that quarters the confidence (design note 018).
 const QUARTERING_DIFFERENCE: f32 = 0.1;
 /// Second difference of neighbouring warped positions that halves the confidence, in pixels of the
 /// reference; chosen by hand.
@@ -99,8 +99,8 @@ struct FeatureSums {
 }
 
 impl FeatureSums {
-    /// Adds a reference's pixel. The less confidence, the more its features fade to 0, the value of
-    /// an invisible point.
+    /// Adds a reference's pixel. Its features fade to 0, the value of an invisible point, as
+    /// confidence falls below visibility.
     fn add(&mut self, pixel: &WarpedPixel) {
         let weight = pixel.confidence.powi(4);
         let fade = pixel.confidence / pixel.visibility.max(f32::MIN_POSITIVE);

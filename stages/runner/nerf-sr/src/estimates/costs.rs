@@ -9,17 +9,18 @@ use workload::{ExportViews, program_bytes};
 use super::work::{Images, Work};
 use training::{field_factor, training_memory, training_need, training_seconds};
 
-/// Seconds per rendered ray, and part of the pixels that get all rays at the default tolerance, of
-/// objects and opaque scenes (docs/results/engine.md).
+/// Seconds per rendered ray, of objects and of opaque scenes (docs/results/engine.md).
 const OBJECT_RENDERED_RAY_SECONDS: f64 = 4.4e-6;
 const OPAQUE_RENDERED_RAY_SECONDS: f64 = 8e-6;
+/// Fraction of the pixels that get all rays at the default tolerance, likewise.
 const OBJECT_DETAILED_PIXELS: f64 = 0.31;
 const OPAQUE_DETAILED_PIXELS: f64 = 0.39;
 /// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
 const RENDERED_BYTES_PER_FLOAT: u64 = 7;
-/// Bytes of `render-depth`, with the rays of a band of rows, and of other programs with libtorch,
-/// without data; as in the tests below.
+/// Bytes of `render-depth` without its field, but with the rays of a band of rows; as in the tests
+/// below.
 const RENDERER_BYTES: u64 = 143_000_000;
+/// Bytes of any other program with libtorch, without data; as in the tests below.
 const PROGRAM_BYTES: u64 = 120_000_000;
 /// Seconds per pixel of `eval` without and with LPIPS: lego 100×2, 12 views.
 const SCORED_PIXEL_SECONDS: f64 = 1.4e-6;
@@ -123,7 +124,7 @@ fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
 }
 
 fn rendering_memory(work: &Work) -> Option<u64> {
-    let field = work.field.as_ref()?;
+    let field = work.field.as_ref().filter(|field| field["field"] != "mlp")?;
     let floats = number(field, "ensemble")? as u64 * work.grid_floats(field)?;
     Some(RENDERER_BYTES + RENDERED_BYTES_PER_FLOAT * floats)
 }

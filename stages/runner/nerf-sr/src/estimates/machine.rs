@@ -1,17 +1,18 @@
-//! Speed of this machine compared with that of the models' figures.
+//! Speed of this machine relative to the reference machine, on which the constants of the estimates
+//! were measured.
 
 use std::sync::OnceLock;
 use std::time::Instant;
 
 use numerics::SpeedTest;
 
-/// Seconds of a piece of work on the machine of the models' figures: two cores with AVX-512.
+/// Seconds of a piece of work on the reference machine: two cores with AVX-512.
 const REFERENCE_SECONDS: f64 = 0.42e-3;
 /// Number of measurements, of which the fastest counts: others may have been interrupted by other
 /// programs. All together take a hundredth of a second.
 const MEASUREMENTS: u32 = 24;
 
-/// Returns the time that this machine takes for a piece of work, over that of the models' machine.
+/// Returns the time that this machine takes for a piece of work, over that of the reference machine.
 /// The first call measures it.
 pub(crate) fn slowness() -> f64 {
     static SLOWNESS: OnceLock<f64> = OnceLock::new();

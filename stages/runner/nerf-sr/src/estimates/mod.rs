@@ -33,7 +33,7 @@ use work::{Images, Work};
 /// by hand.
 const MIN_RECORD_SECONDS: f64 = 1.0;
 const MAX_TIME_FACTOR: f64 = 10.0;
-/// Maximum factor by which an earlier run corrects an estimate; chosen by hand.
+/// Maximum factor by which an earlier run corrects the estimated memory; chosen by hand.
 const MAX_CORRECTION: f64 = 4.0;
 
 /// Expected cost of a node.
@@ -136,10 +136,8 @@ impl<'a> Estimator<'a> {
         let program = &node.program.description.name;
         let work = self.work(node)?;
         let model = model_cost(program, &node.parameters, &work)?;
-        let (time, memory) = match self.nearest(node, state, model) {
-            Some(record) => corrections(record)?,
-            None => (machine::slowness(), 1.0),
-        };
+        let earlier = self.nearest(node, state, model).and_then(corrections);
+        let (time, memory) = earlier.unwrap_or_else(|| (machine::slowness(), 1.0));
         let min_memory = min_memory(program, &node.parameters, &work)?;
         Some(Estimate {
             processor_seconds: time * model.processor_seconds,
@@ -266,11 +264,10 @@ fn partial_key_parts(node: &Node) -> Map<String, Value> {
 /// Returns the factors from the model's time and memory to the measured ones.
 fn corrections(record: &Record) -> Option<(f64, f64)> {
     let model = record.model?;
-    let limited = |factor: f64| factor.max(1.0 / MAX_CORRECTION).min(MAX_CORRECTION);
     let time = record.processor_seconds? / model.processor_seconds;
     let memory = record.peak_memory? as f64 / model.peak_memory as f64;
-    // The time's factor contains the speed of the machine.
-    Some((time, limited(memory)))
+    // The time's factor has no limit, because it contains the speed of the machine.
+    Some((time, memory.clamp(1.0 / MAX_CORRECTION, MAX_CORRECTION)))
 }
 
 /// Returns the index of the node that produces an input, and the input's subtree.

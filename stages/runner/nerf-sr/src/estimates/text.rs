@@ -26,7 +26,7 @@ impl Estimates {
         let seconds = self.processor_seconds();
         let without = match self.unknown {
             0 => String::new(),
-            count => format!(", without {}", format_count(count, "other stage")),
+            count => format!("; no estimate for {}", format_count(count, "other stage")),
         };
         Some(format!(
             "about {} of processor time: {} on {}; at most {} of memory for a stage{without}",
@@ -124,7 +124,7 @@ mod tests {
         let text = "about 40.0 s of processor time: 20.0 s on 2 processors; at most 2.0 MB of \
             memory for a stage";
         assert_eq!(estimates(0).total_text(2).unwrap(), text);
-        let text = format!("{text}, without 3 other stages");
+        let text = format!("{text}; no estimate for 3 other stages");
         assert_eq!(estimates(3).total_text(2).unwrap(), text);
         assert_eq!(Estimates::default().total_text(2), None);
     }

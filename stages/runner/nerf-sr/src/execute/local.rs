@@ -293,7 +293,9 @@ impl<'a> Schedule<'a> {
     }
 
     fn fail(&mut self, index: usize, failure: StageFailure) {
-        self.report(index, &format!("failed: {}", failure.message));
+        // A stage that was interrupted has not failed.
+        let failed = if failure.code == Failure::Interrupted.exit_code() { "" } else { "failed: " };
+        self.report(index, &format!("{failed}{}", failure.message));
         self.outcome.failures.push((index, failure));
     }
 }

@@ -9,7 +9,7 @@ use crate::session::Session;
 // Values have no doc comments: clap would give every verb's help its long form.
 #[derive(Clone, Copy, clap::ValueEnum)]
 pub(crate) enum GraphFormat {
-    Ascii,
+    Text,
     Dot,
 }
 
@@ -22,7 +22,7 @@ pub(crate) fn graph(
     let (plan, states) = session.plan_with_states(request)?;
     let vertices = vertices(&plan, &states);
     print_lines(&match format {
-        GraphFormat::Ascii => draw_as_text(&vertices),
+        GraphFormat::Text => draw_as_text(&vertices),
         GraphFormat::Dot => draw_for_graphviz(&vertices),
     });
     Ok(ExitCode::SUCCESS)
@@ -91,10 +91,15 @@ fn draw_for_graphviz(vertices: &[Vertex]) -> String {
     let mut text = "digraph pipeline {\n  rankdir=LR;\n  node [shape=box];\n".to_owned();
     for (i, vertex) in vertices.iter().enumerate() {
         let shape = if vertex.is_sink { ", shape=note" } else { "" };
-        text += &format!("  n{i} [label={:?}{shape}];\n", vertex.label);
+        text += &format!("  n{i} [label={}{shape}];\n", quoted(&vertex.label));
         for (parent, subtree) in &vertex.parents {
-            text += &format!("  n{parent} -> n{i} [label={subtree:?}];\n");
+            text += &format!("  n{parent} -> n{i} [label={}];\n", quoted(subtree));
         }
     }
     text + "}\n"
+}
+
+/// Quotes a text for Graphviz.
+fn quoted(text: &str) -> String {
+    format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\""))
 }

@@ -8,8 +8,8 @@ use workload::{PixelStorage, RayBudget, TrainingMemory, grid_training_bytes, pro
 use super::number;
 use crate::estimates::work::{SceneKind, Work};
 
-/// Seconds per training ray late in a training, without those per step: lego 100×2, fern 252×2 and
-/// the demo scene with backdrop (docs/results/engine.md).
+/// Seconds per training ray late in a training, without [`STEP_SECONDS`]. Measured on lego 100×2,
+/// fern 252×2 and the demo scene with backdrop (docs/results/engine.md).
 const OBJECT_RAY_SECONDS: f64 = 10.8e-6;
 const FRUSTUM_RAY_SECONDS: f64 = 24e-6;
 const UNBOUNDED_RAY_SECONDS: f64 = 20e-6;
@@ -24,11 +24,11 @@ const OBJECT_RAY_SAMPLES: f64 = 22.0;
 const OPAQUE_RAY_SAMPLES: f64 = 36.0;
 /// Mean number of samples of a step over `samples_per_step`: steps grow to 8/3 times as many.
 const STEP_GROWTH: f64 = 2.0;
-/// Late rays that cost as much as the higher cost of the first steps with the default
-/// `samples_per_step` (docs/design/048).
+/// Extra cost of the first steps with the default `samples_per_step`, as a number of rays late in a
+/// training (docs/design/048).
 const FIRST_STEPS_RAYS: f64 = 1.1e6;
 const DEFAULT_STEP_SAMPLES: f64 = 24_576.0;
-/// Rays in which this cost falls to its e-th part: an early draft of the demo scene with 200,000
+/// Number of rays after which the extra cost of a step has fallen to 1/e: an early draft of the demo scene with 200,000
 /// rays took 6.4 s.
 const FIRST_STEPS_LENGTH: f64 = 330e3;
 /// Seconds per training ray of the paper's field (docs/results/engine.md: 369 rays a second on two
@@ -86,7 +86,8 @@ pub(super) fn training_seconds(parameters: &Value, work: &Work) -> Option<f64> {
     Some(ray * (samples * sample * rays + first_steps) + STEP_SECONDS * steps)
 }
 
-/// Returns the higher cost of the first steps of a training of one field, in late rays.
+/// Returns the extra cost of the first steps of a training of one field, as a number of rays late
+/// in the training.
 fn first_steps(rays: f64) -> f64 {
     FIRST_STEPS_RAYS * (1.0 - (-rays / FIRST_STEPS_LENGTH).exp())
 }
@@ -95,7 +96,8 @@ pub(super) fn training_memory(parameters: &Value, work: &Work) -> Option<u64> {
     Some(training_need(parameters, work)?.total(program_bytes(true)))
 }
 
-/// Returns the memory of a training as `train-ss` computes it, with the largest image for each.
+/// Returns the memory of a training as `train-ss` computes it, with each image as large
+/// as the largest one.
 pub(super) fn training_need(parameters: &Value, work: &Work) -> Option<TrainingMemory> {
     let field = if parameters["field"] == "mlp" {
         MLP_BYTES
