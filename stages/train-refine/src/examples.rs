@@ -32,13 +32,22 @@ impl<T: Clone> Examples<T> {
 }
 
 impl Examples {
-    /// Reads rendered views and their truth, and makes the views consistent with LR `photographs`
-    /// if given.
+    /// Reads views like [`Examples::read_all`], and leaves out some of them.
     pub(crate) fn read(
         views: &GivenInput,
         truth: &GivenInput,
         photographs: Option<&LrObservations<'_>>,
     ) -> Result<Self, Failure> {
+        Ok(Self::split(Self::read_all(views, truth, photographs)?))
+    }
+
+    /// Reads rendered views and their truth, and makes the views consistent with LR `photographs`
+    /// if given.
+    pub(crate) fn read_all(
+        views: &GivenInput,
+        truth: &GivenInput,
+        photographs: Option<&LrObservations<'_>>,
+    ) -> Result<Vec<KnownView>, Failure> {
         let true_views = Views::read(truth)?;
         let background = true_views.background.grey_level();
         let sources = Sources { views, truth, photographs, background };
@@ -53,7 +62,7 @@ impl Examples {
                 "input views: no view has an image in input truth with the same name and pose"
             );
         }
-        Ok(Self::split(all))
+        Ok(all)
     }
 }
 

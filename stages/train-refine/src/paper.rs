@@ -18,11 +18,7 @@ const VGG_FILES: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetens
 
 /// Trains the published network on all given views; the publication uses one.
 pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow::Result<()> {
-    let Examples { training: mut known, left_out } =
-        Examples::read(context.input("views")?, context.input("truth")?, None)?;
-    // A single view is in both parts.
-    let first = known[0].rendered.camera.name.clone();
-    known.extend(left_out.into_iter().filter(|view| view.rendered.camera.name != first));
+    let known = Examples::read_all(context.input("views")?, context.input("truth")?, None)?;
     let options = PaperTraining {
         steps: params.steps,
         batch_size: params.batch_size as usize,
