@@ -432,6 +432,9 @@ fn files_as_editors_write_them() {
         merged.replace("rays: 7", "rays: {x: 7}").replace("extends: train", "extends: [train]");
     let problem = refused(&merged, &["again"]).to_string();
     assert!(problem.starts_with("dir/pipeline.yaml:11: stages.again.extends"), "{problem}");
+    // A merge key with a tag is a key like any other.
+    let tagged = format!("!tag <<: {{a: 1}}\n{PIPELINE}");
+    assert!(refused(&tagged, &[]).to_string().contains("dir/pipeline.yaml"));
 }
 
 #[test]

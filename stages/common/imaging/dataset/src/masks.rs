@@ -206,3 +206,17 @@ pub(crate) fn without_dynamic_masks(images: Vec<PathBuf>) -> Vec<PathBuf> {
 fn lowercase_stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().to_lowercase()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn masks_lie_beside_image_folders_in_any_case() {
+        for (parent, rest) in
+            [("images/a", "a"), ("Images_4/a", "a"), ("IMAGES", ""), ("other/a", "other/a")]
+        {
+            assert_eq!(without_images_folder(Path::new(parent)), Path::new(rest), "{parent}");
+        }
+    }
+}
