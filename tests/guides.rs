@@ -120,9 +120,11 @@ fn every_command_runs() {
                 command.contains("=weights") && !project.path("work/weights").exists();
             let needs_remote = command.starts_with("nerf-sr-remote ")
                 && !project.path("usr/bin/nerf-sr-remote").exists();
-            // `init` overwrites no pipeline.
-            let overwrites = command.starts_with("nerf-sr init ");
-            if needs_weights || needs_remote || overwrites || command.contains(GPU) {
+            // `prepare` has run it; a second one would overwrite the pipeline.
+            if command.starts_with("nerf-sr init ") {
+                continue;
+            }
+            if needs_weights || needs_remote || command.contains(GPU) {
                 println!("skipped: {command}");
                 continue;
             }
