@@ -199,7 +199,7 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         ),
         (
             &["-p", "background=alpha", "-p", "supervision=kernel"],
-            "stage train-ss: parameter supervision: kernel cannot be compared over a transparent background",
+            "stage train-ss: parameter supervision: kernel cannot be used over a transparent background",
         ),
         (
             &["-p", "background=white,alpha", "-p", "exposure=true"],

@@ -241,7 +241,8 @@ impl SurfaceView {
         self.pixels[index].depth -= distance / along.max(0.5);
     }
 
-    /// Excludes a pixel from the surfaces by a zero normal. Its depth stays and hides points behind it.
+    /// Excludes a pixel from the surfaces by a zero normal. Its depth stays and hides points
+    /// behind it.
     pub(crate) fn remove_surface(&mut self, index: usize) {
         self.pixels[index].normal = Vec3::ZERO;
     }

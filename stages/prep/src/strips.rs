@@ -19,8 +19,8 @@ const BLENDED_LINES: usize = 1;
 /// Minimum ratio of an image's side to a strip's width if all four sides have a strip: margins
 /// around objects on a background are wider.
 const MIN_FRAME_RATIO: usize = 5;
-/// The ratio of an image's side to any strip's width is above this. It is small, since upright photographs in
-/// a wide format have wide strips.
+/// Ratio that an image's side over any strip's width must exceed. It is small, since upright
+/// photographs in a wide format have wide strips.
 const MIN_RATIO: usize = 2;
 
 /// Uniform strips of an image.

@@ -71,8 +71,8 @@ struct PlanArgs {
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
     /// Read an input from this folder, not from what the pipeline names, e.g. -i
-    /// dataset=scenes/lego. A stage's name stands for its artifact: -i init=train-ss trains the field
-    /// of train-ss further
+    /// dataset=scenes/lego. A stage's name stands for its artifact: -i init=train-ss trains the
+    /// field of train-ss further
     #[arg(short = 'i', long = "input", value_name = "[STAGE.]NAME=DIR[,DIR…]")]
     inputs: Vec<String>,
     #[command(flatten)]
@@ -95,8 +95,8 @@ struct ExperimentArgs {
     /// Use only the first N variants of an experiment
     #[arg(long, value_name = "N")]
     first_variants: Option<usize>,
-    /// Show only these results on pages and in tables: stages of the pipeline, or inputs of the page
-    /// or table [default: all]
+    /// Show only these results on pages and in tables: stages of the pipeline, or inputs of the
+    /// page or table [default: all]
     #[arg(long = "show", value_name = "NAME[,NAME…]", value_delimiter = ',')]
     show: Vec<String>,
     /// Folder of an experiment's data sets [default: the one that its file names]
@@ -125,8 +125,9 @@ struct RunOptions {
     /// file]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Show a test view and its scores while a field trains, in the terminal and in out/watch, using
-    /// about 2 % of the processor time; needs a target that scores views, such as eval [default view: the first]
+    /// Show a test view and its scores while a field trains, in the terminal and in out/watch,
+    /// using about 2 % of the processor time; needs a target that scores views, such as eval
+    /// [default view: the first]
     #[arg(long, value_name = "VIEW", num_args = 0..=1, require_equals = true,
         default_missing_value = "")]
     watch: Option<String>,

@@ -344,9 +344,9 @@ impl<'a> Expansion<'a> {
         given.or(self.pipeline.quality).unwrap_or_default()
     }
 
-    /// Resolves a stage's parameters at a point. Defaults are overridden by the quality, this by the
-    /// block that the stage's block extends, and this by the block itself. In each of the two, the
-    /// file's values are overridden by those of the axes, from command line and experiment.
+    /// Resolves a stage's parameters at a point. Later layers override earlier ones: defaults, the
+    /// quality, the block that the stage's block extends, the block itself. In both blocks, values
+    /// of axes (command line and experiment) override those of the file.
     fn resolve(
         &self,
         stage: &str,

@@ -41,8 +41,8 @@ pub struct Params {
     #[schemars(range(min = 1, max = 1_048_576))]
     #[schemars(extend("x-group" = "sampling", "x-default" = "by `field`"))]
     pub max_rays_per_step: Option<u32>,
-    /// Learning rate at its peak, of the grid's coarsest level or of the paper's MLPs. Default: 0.06,
-    /// or 0.0005 with `field: mlp`.
+    /// Learning rate at its peak, of the grid's coarsest level or of the paper's MLPs. Default:
+    /// 0.06, or 0.0005 with `field: mlp`.
     #[schemars(range(min = 0.0, max = 1.0))]
     #[schemars(extend("x-group" = "optimiser", "x-default" = "by `field`"))]
     pub learning_rate: Option<f64>,
@@ -64,8 +64,8 @@ pub struct Params {
     #[schemars(extend("x-group" = "data"))]
     pub pose_refinement: bool,
     /// Carves the visual hull: cells stay empty if they lie behind transparent pixels alone in at
-    /// least one photograph. For `field: grid`, photographs with alpha and space `box`, unless `pose_refinement` moves the
-    /// cameras.
+    /// least one photograph. For `field: grid`, photographs with alpha and space `box`, unless
+    /// `pose_refinement` moves the cameras.
     #[schemars(extend("x-group" = "data"))]
     pub silhouettes: bool,
     /// Maximum number of HR references: the first ones of input `references` are used.
@@ -177,7 +177,8 @@ pub struct GridParams {
     /// Levels of the grid.
     #[schemars(range(min = 1, max = 16), extend("x-group" = "field"))]
     pub n_levels: u32,
-    /// Size of an LR pixel in cells of the finest level, which has 32 to 2048 cells along each axis.
+    /// Size of an LR pixel in cells of the finest level, which has 32 to 2048 cells along each
+    /// axis.
     #[schemars(range(min = 0.1, max = 16.0), extend("x-group" = "field"))]
     pub cells_per_pixel: f64,
     /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at 256 cells across

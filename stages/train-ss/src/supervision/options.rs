@@ -28,8 +28,8 @@ impl SupersamplingOptions {
             && lr_sizes.any(|lr| HrCache::is_needed(self.filter, self.hr_size(lr), lr))
     }
 
-    /// Returns the number of sub-pixel rays along x and y, at most the least width and height of any
-    /// view in HR pixels.
+    /// Returns the number of sub-pixel rays along x and y, at most the least width and height of
+    /// any view in HR pixels.
     pub(crate) fn supersample_within(
         &self,
         photographs: &Photographs,

@@ -16,7 +16,7 @@ use crate::photographs::{NO_SPACE, PackedPhotograph, Photographs, check_referenc
 pub(crate) fn transparent_background(parameter: &str) -> String {
     let problem = match parameter {
         "supervision" => {
-            "kernel cannot be compared over a transparent background; choose average, or \
+            "kernel cannot be used over a transparent background; choose average, or \
             prep.background white or opaque"
         }
         "exposure" => {

@@ -4,9 +4,9 @@ use radiance::StepReport;
 
 use crate::params::{Resolved, ResolvedField};
 
-/// Relative cost of a ray of a grid field at each step, 1 late in the training: until the occupancy grid has found
-/// the empty space, rays have many samples, and small steps share their fixed costs among few rays.
-/// Processor time per ray of lego 100×2 and fern 252×2 (design note 048).
+/// Relative cost of a ray of a grid field at each step, 1 late in the training. Until the occupancy
+/// grid has found the empty space, rays have many samples, and small steps share their fixed costs
+/// among few rays. Processor time per ray of lego 100×2 and fern 252×2 (design note 048).
 const COURSE: [(f64, f64); 9] = [
     (0.0, 14.0),
     (48.0, 9.0),

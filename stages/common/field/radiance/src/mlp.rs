@@ -1,6 +1,6 @@
 //! Matrix kernels of the small networks. Activations are rows of `n` samples (a multiple of 16);
-//! weights are stored by input (`w[i·outputs + j]`). There are no biases; the view
-//! network has a constant input, the first spherical harmonic.
+//! weights are stored by input (`w[i·outputs + j]`). There are no biases; the view network
+//! has a constant input, the first spherical harmonic.
 
 use crate::spec::{DENSITY_OUTPUTS, VIEW_INPUTS};
 use numerics::kernel;

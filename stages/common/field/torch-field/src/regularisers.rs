@@ -41,8 +41,8 @@ fn distortion_sum(forward: &GridForward, step: f64) -> Result<Tensor, TchError> 
     pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
 }
 
-/// Computes the floater loss, summed over the rays of `forward`: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊
-/// with a ray's transmittance T, background b and [`MAX_FLOATER_COLOUR_DISTANCE`] as reach. No
+/// Computes the floater loss, summed over the rays of `forward`:
+/// T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊ with a ray's transmittance T, background b and [`MAX_FLOATER_COLOUR_DISTANCE`] as reach. No
 /// gradients go through the colours c or T.
 fn floater_sum(forward: &GridForward, backgrounds: &Tensor) -> Result<Tensor, TchError> {
     let background = backgrounds.f_index_select(0, &forward.shaded_ray)?;

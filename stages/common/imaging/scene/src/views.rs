@@ -158,8 +158,8 @@ pub enum Background {
     Black,
     /// Transparent: the field learns the images' alpha, too. Scores compare premultiplied colours.
     Alpha,
-    /// No background: every ray ends on a surface, as in photographs. Training draws a new background
-    /// colour for each ray, so that no density can imitate the background.
+    /// No background: every ray ends on a surface, as in photographs. Training draws a new
+    /// background colour for each ray, so that no density can imitate the background.
     Opaque,
 }
 

@@ -12,7 +12,8 @@ const REFERENCE_SECONDS: f64 = 0.42e-3;
 /// programs. All together take a hundredth of a second.
 const MEASUREMENTS: u32 = 24;
 
-/// Returns the time that this machine takes for a piece of work, over that of the reference machine.
+/// Returns the time that this machine takes for a piece of work, over that of the reference
+/// machine.
 /// The first call measures it.
 pub(crate) fn slowness() -> f64 {
     static SLOWNESS: OnceLock<f64> = OnceLock::new();

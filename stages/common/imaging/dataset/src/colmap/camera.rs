@@ -100,12 +100,9 @@ impl CameraModel {
                 let radial = Distortion::fisheye([k1, k2, k3, k4]);
                 ([fx, fy, cx, cy], Distortion { tangential: [p1, p2], ..radial })
             }
-            ("THIN_PRISM_FISHEYE", _) => {
-                let problem = "the prism of camera model THIN_PRISM_FISHEYE is not supported";
-                return Err(Reason::new(format!("{problem}; {UNDISTORT}")));
-            }
             _ => {
-                let problem = format!("camera model {} is not supported", self.name);
+                let part = if self.name == "THIN_PRISM_FISHEYE" { "the prism of " } else { "" };
+                let problem = format!("{part}camera model {} is not supported", self.name);
                 return Err(Reason::new(format!("{problem}; {UNDISTORT}")));
             }
         };

@@ -28,8 +28,8 @@ const STEP_GROWTH: f64 = 2.0;
 /// training (docs/design/048).
 const FIRST_STEPS_RAYS: f64 = 1.1e6;
 const DEFAULT_STEP_SAMPLES: f64 = 24_576.0;
-/// Number of rays after which the extra cost of a step has fallen to 1/e: an early draft of the demo scene with 200,000
-/// rays took 6.4 s.
+/// Number of rays after which the extra cost of a step has fallen to 1/e: an early draft
+/// of the demo scene with 200,000 rays took 6.4 s.
 const FIRST_STEPS_LENGTH: f64 = 330e3;
 /// Seconds per training ray of the paper's field (docs/results/engine.md: 369 rays a second on two
 /// cores).
