@@ -1,12 +1,12 @@
-use artifact::GivenInput;
-use pixels::{DepthMap, ExrImage, Image, Rgba8, psnr_of, to_u8};
+use artifact::{FailureExt as _, GivenInput};
+use pixels::{DepthMap, ExrImage, Image, Mask, Rgba8, psnr_of, to_u8};
 use scene::{Camera, Surface, View};
 
 use super::read_depth;
 use crate::scored_view::{ScoredView, read_image};
 
 /// Agreement of a view's true image with its neighbour's, warped by the rendered depths: a measure
-/// of depth.
+/// of the depths' accuracy.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct WarpScore {
     /// Peak signal-to-noise ratio in dB over the pixels that are visible from the neighbour.
@@ -15,9 +15,9 @@ pub struct WarpScore {
     pub seen: f64,
 }
 
-/// Maximum distance between two cameras over the median depth of a view: 20° of parallax, 2·tan
-/// 10°, chosen by hand. From farther apart, reflections and occlusions differ more than wrong
-/// depths do.
+/// Maximum distance between two cameras divided by the median depth of a view: 20° of parallax,
+/// 2·tan 10°, chosen by hand. Between cameras farther apart, reflections and occlusions cause
+/// larger errors than wrong depths.
 const MAX_DISTANCE_PER_DEPTH: f64 = 0.3527;
 
 /// Returns the other view whose centre is nearest to a camera's.
@@ -31,7 +31,7 @@ fn squared_distance(camera: &Camera, view: &View) -> f64 {
 }
 
 /// True if two cameras are near enough for a comparison of their views, by
-/// [`MAX_DISTANCE_PER_DEPTH`]. `depth` is the surface in the first one's view.
+/// [`MAX_DISTANCE_PER_DEPTH`]. `depth` is the depth image of the first camera.
 fn are_near(camera: &Camera, other: &Camera, depth: &ExrImage) -> bool {
     let (Some(z), Some(opacity)) = (depth.channel("Z"), depth.channel("A")) else { return false };
     let mut depths: Vec<f32> =
@@ -43,7 +43,7 @@ fn are_near(camera: &Camera, other: &Camera, depth: &ExrImage) -> bool {
 }
 
 /// Reads depth and opacity of a rendered view; `None` if missing or of another size.
-fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Option<ExrImage>> {
+fn read_depth_image(input: &GivenInput, view: &View) -> anyhow::Result<Option<ExrImage>> {
     let Some(depth) = &view.depth else { return Ok(None) };
     let image = read_depth(&input.path(depth), &view.camera.name)?;
     let k = &view.camera.intrinsics;
@@ -51,17 +51,40 @@ fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Option<ExrIma
     Ok((has_size && DepthMap::of(&image).is_some()).then_some(image))
 }
 
+/// View with its true image; images have the size of the camera's.
+struct TrueView<'a> {
+    camera: &'a Camera,
+    /// Rendered depth and opacity.
+    depth: &'a ExrImage,
+    truth: &'a Image,
+    mask: Option<Mask>,
+}
+
+/// Number of pixels that [`Image::colour_at`] reads on each side of the nearest one.
+const CUBIC_MARGIN: usize = 2;
+
 /// Warps the neighbour's image to a view by both depths, and scores the result. In the picture,
-/// pixels that aren't visible from the neighbour are red. Images must have the sizes of the views.
-/// `None` if nothing is visible.
-fn warp(
-    (camera, depth, truth): (&Camera, &ExrImage, &Image),
-    (other_camera, other_depth, other_truth): (&Camera, &ExrImage, &Image),
-) -> Option<(WarpScore, Rgba8)> {
+/// pixels that are masked or aren't visible from the neighbour are red. `None` if no pixel remains.
+fn warp(view: &TrueView<'_>, neighbour: &TrueView<'_>) -> Option<(WarpScore, Rgba8)> {
     const INVISIBLE_COLOUR: [u8; 4] = [120, 20, 30, 255];
-    let surface = Surface { camera, map: DepthMap::of(depth)? };
-    let other = Surface { camera: other_camera, map: DepthMap::of(other_depth)? };
-    let positions = surface.positions_in(&other);
+    let (truth, other_truth) = (view.truth, neighbour.truth);
+    let surface = Surface { camera: view.camera, map: DepthMap::of(view.depth)? };
+    let other = Surface { camera: neighbour.camera, map: DepthMap::of(neighbour.depth)? };
+    let mut positions = surface.positions_in(&other);
+    if let Some(mask) = &view.mask {
+        for (position, _) in positions.iter_mut().zip(&mask.counts).filter(|(_, counts)| !**counts)
+        {
+            *position = None;
+        }
+    }
+    let size = (other_truth.width, other_truth.height);
+    if let Some(mask) = neighbour.mask.as_ref().map(|mask| mask.resized(size, CUBIC_MARGIN)) {
+        for position in &mut positions {
+            *position = position.filter(|&[x, y]| {
+                mask.counts.get(y as usize * mask.width + x as usize).is_some_and(|counts| *counts)
+            });
+        }
+    }
     let (mut sum, mut visible) = (0.0, 0usize);
     let mut data = Vec::with_capacity(4 * positions.len());
     for (i, pixel) in truth.data.chunks_exact(3).enumerate() {
@@ -88,7 +111,8 @@ fn warp(
 }
 
 /// Scores a view against its nearest neighbour's true image, warped by the rendered depths. `None`
-/// also if the neighbour is too far away.
+/// if an image or depth is missing, the neighbour is too far away, or the neighbour shows no pixel
+/// of the view.
 pub(super) fn score_view(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
     let (scene, own_camera) = (view.scene, &view.view.camera);
     let Some(truth) = &view.truth else { return Ok(None) };
@@ -97,16 +121,32 @@ pub(super) fn score_view(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpSc
     let Some((other_view, file)) = other_truth.and_then(|v| Some((v, v.image.as_ref()?))) else {
         return Ok(None);
     };
-    let Some(depth) = read_surface(scene.views_input, view.view)? else { return Ok(None) };
+    let Some(depth) = read_depth_image(scene.views_input, view.view)? else { return Ok(None) };
     if !are_near(own_camera, &other.camera, &depth) {
         return Ok(None);
     }
-    let Some(other_depth) = read_surface(scene.views_input, other)? else { return Ok(None) };
+    let Some(other_depth) = read_depth_image(scene.views_input, other)? else { return Ok(None) };
     let image = read_image(scene.truth_input, scene.truth, other_view, file)?;
     if (image.width, image.height) != (other_depth.width, other_depth.height) {
         return Ok(None);
     }
-    Ok(warp((own_camera, &depth, truth), (&other.camera, &other_depth, &image)))
+    let read_mask = |view: &View, image: &Image| {
+        let mask = view.read_mask(scene.truth_input, (image.width, image.height));
+        mask.bad_input(format!("view {}", view.camera.name))
+    };
+    let view = TrueView {
+        camera: own_camera,
+        depth: &depth,
+        truth,
+        mask: read_mask(view.true_view, truth)?,
+    };
+    let neighbour = TrueView {
+        camera: &other.camera,
+        depth: &other_depth,
+        truth: &image,
+        mask: read_mask(other_view, &image)?,
+    };
+    Ok(warp(&view, &neighbour))
 }
 
 #[cfg(test)]
@@ -141,8 +181,14 @@ mod tests {
     }
 
     fn walls_warped(depth: f32) -> (WarpScore, Rgba8) {
-        let (a, b) = (camera("a", 0.0), camera("b", 0.1));
-        warp((&a, &image(depth), &wall(0)), (&b, &image(depth), &wall(2))).unwrap()
+        warp_masked(depth, [None, None])
+    }
+
+    fn warp_masked(depth: f32, [mask, other_mask]: [Option<Mask>; 2]) -> (WarpScore, Rgba8) {
+        let (a, b, depth) = (camera("a", 0.0), camera("b", 0.1), image(depth));
+        let view = TrueView { camera: &a, depth: &depth, truth: &wall(0), mask };
+        let neighbour = TrueView { camera: &b, depth: &depth, truth: &wall(2), mask: other_mask };
+        warp(&view, &neighbour).unwrap()
     }
 
     /// A step of a tenth to the side in front of a wall at distance 2 moves its image by two
@@ -155,6 +201,22 @@ mod tests {
         assert_eq!(picture.data[..3], [120, 20, 30]);
         let (wrong, _) = walls_warped(3.0);
         assert!(wrong.psnr < 25.0, "{wrong:?}");
+    }
+
+    /// Masked pixels of either view aren't compared: here the right half of the view, or the left
+    /// half of the neighbour.
+    #[test]
+    fn masked_pixels_are_not_compared() {
+        let half = |is_left: bool| Mask {
+            width: 40,
+            height: 4,
+            counts: (0..160).map(|i| (i % 40 < 20) == is_left).collect(),
+        };
+        let (own, picture) = warp_masked(2.0, [Some(half(true)), None]);
+        assert!((own.seen - 0.45).abs() < 0.03, "{own:?}");
+        assert_eq!(picture.data[4 * 30..][..3], [120, 20, 30]);
+        let (others, _) = warp_masked(2.0, [None, Some(half(false))]);
+        assert!((others.seen - 0.45).abs() < 0.06, "{others:?}");
     }
 
     /// Views 10° apart are compared, views 30° apart are not: their surfaces look different.
