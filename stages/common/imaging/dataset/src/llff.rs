@@ -42,27 +42,32 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     Ok(Dataset { format: Format::Llff, frames, split: None, notes })
 }
 
-/// Returns the lens distortion of COLMAP's model next to the poses, with a note if it is unknown.
-/// `poses_bounds.npy` stores no distortion, but its poses were estimated by COLMAP. They share the
-/// lens of its model if the model has exactly one camera, with the focal length of the poses
-/// (docs/design/005).
+/// Returns the photographs' lens distortion, with a note if the distortion is unknown.
+/// `poses_bounds.npy` stores no distortion, but COLMAP estimated its poses. The photographs have
+/// the lens of COLMAP's model next to the poses if the model has exactly one camera, with the focal
+/// length of the poses (docs/design/005). Otherwise no distortion is assumed.
 fn colmap_distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<String>) {
-    let camera = match colmap::only_camera(folder) {
-        Ok(Some(camera)) if !camera.distortion.is_none() => camera,
-        Ok(_) => return (Distortion::default(), None),
-        Err(e) => {
-            return (Distortion::default(), Some(format!("lens distortion is unknown: {e}")));
+    let without = |reason: String| {
+        (Distortion::default(), Some(format!("lens distortion is unknown and ignored: {reason}")))
+    };
+    let camera = match colmap::read_cameras(folder) {
+        Ok(cameras) if cameras.iter().all(|camera| camera.distortion.is_none()) => {
+            return (Distortion::default(), None);
         }
+        Ok(cameras) if cameras.len() > 1 => {
+            return without(format!("the model in sparse has {} cameras", cameras.len()));
+        }
+        Ok(cameras) => cameras[0],
+        Err(e) => return without(e.to_string()),
     };
     if rows.iter().all(|row| has_focal_length_of(&camera, row)) {
         (camera.distortion, None)
     } else {
-        let note = format!(
-            "lens distortion is unknown: the model in sparse has a different focal length ({} at a \
-            width of {} pixels)",
+        without(format!(
+            "the model in sparse has a different focal length ({} at a width of {} pixels); to use \
+            that model, remove poses_bounds.npy",
             camera.fx, camera.width
-        );
-        (Distortion::default(), Some(note))
+        ))
     }
 }
 
@@ -142,7 +147,7 @@ struct ImageFolder {
 /// Lists the folders with their numbers of images.
 fn folders_text(folders: &[ImageFolder]) -> String {
     if folders.is_empty() {
-        return "without a folder images next to them".to_owned();
+        return "and no folder images/ next to this file; put the photographs there".to_owned();
     }
     let mut listed = Vec::new();
     for ImageFolder { name, images, unusable, unsupported } in folders {
@@ -217,7 +222,7 @@ fn find_listed_photographs(
         lists.push(("view_imgs.txt", names.filter(|name| !name.is_empty()).collect()));
     }
     // A model that can't be read counts as an empty list.
-    lists.push(("sparse", colmap::image_names(folder).unwrap_or_default()));
+    lists.push(("COLMAP's model in sparse", colmap::image_names(folder).unwrap_or_default()));
     let Some((source, mut names)) = lists.into_iter().find(|(_, names)| names.len() == poses)
     else {
         return Ok(None);

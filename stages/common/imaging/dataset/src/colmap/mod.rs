@@ -18,9 +18,9 @@ use crate::frame::assign_names;
 use crate::lookup::{Listings, Located, Lookup, reduced_copies};
 use model::Model;
 
-/// Finds the models in `sparse` and its sub-folders, sorted by name. Without any, and if the data
-/// set's folder has images, searches `sparse` of sub-folders without images: nerfstudio writes
-/// `colmap/sparse/0`.
+/// Finds the models in `sparse` and its sub-folders, sorted by name. If there are none and the
+/// folder has photographs, searches the `sparse` of each sub-folder without photographs: nerfstudio
+/// writes `colmap/sparse/0`.
 pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, DatasetError> {
     let found = folders_with_list(folder, "images")?;
     if !found.is_empty() || !has_images(folder) {
@@ -49,15 +49,13 @@ pub(crate) fn image_names(folder: &Path) -> Result<Vec<String>, DatasetError> {
     Ok(model.images.into_iter().map(|image| image.name).collect())
 }
 
-/// Returns the camera of the first model in `sparse` if that has exactly one. The model's images
-/// aren't read.
-pub(crate) fn only_camera(folder: &Path) -> Result<Option<Intrinsics>, DatasetError> {
+/// Returns the cameras of the first model in `sparse`. The model's images aren't read.
+pub(crate) fn read_cameras(folder: &Path) -> Result<Vec<Intrinsics>, DatasetError> {
     let mut model = Model::default();
     if let Some(first) = folders_with_list(folder, "cameras")?.first() {
         model.read_cameras(first)?;
     }
-    let mut cameras = model.cameras.into_values();
-    Ok(cameras.next().filter(|_| cameras.next().is_none()))
+    Ok(model.cameras.into_values().collect())
 }
 
 /// Returns `sparse` and its sub-folders that contain the list `NAME.bin` or `NAME.txt`, sorted.
@@ -76,7 +74,8 @@ fn folders_with_list(folder: &Path, name: &str) -> Result<Vec<PathBuf>, DatasetE
     Ok(found)
 }
 
-/// Reads the model with most images, the first of several, and the images that it names.
+/// Reads the model with the most images (the first one, if several have as many), and finds the
+/// files of its images.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let models = find_models(folder)?;
     let (path, mut model, mut notes) = read_largest_model(folder, &models)?;
@@ -122,7 +121,8 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     Ok(Dataset { format: Format::Colmap, frames, split: None, notes })
 }
 
-/// Reads the first model with most images; returns its folder, the model, and notes on the choice.
+/// Reads the model with the most images (the first one, if several have as many). Returns the
+/// model's folder, the model, and notes on the choice.
 fn read_largest_model<'a>(
     folder: &Path,
     models: &'a [PathBuf],
