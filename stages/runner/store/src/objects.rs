@@ -1,3 +1,4 @@
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -79,9 +80,9 @@ impl Store {
         Ok(true)
     }
 
-    /// Moves a checked folder into the place of an object, unless the object `is_stored`. Two
-    /// actions may create the same object concurrently: an undamaged object stays, a damaged one is
-    /// replaced.
+    /// Moves a checked folder into the place of an object. With `is_stored`, the caller found the
+    /// object complete: then nothing moves unless the object has vanished since. Two actions may
+    /// create the same object concurrently: an undamaged object stays, a damaged one is replaced.
     pub(crate) fn install_object(
         &self,
         folder: &Path,
@@ -125,20 +126,25 @@ pub fn is_hash(name: &str) -> bool {
     name.len() == 64 && name.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
 }
 
-/// Makes the files of an artifact durable, including its manifest.
+/// Makes the files of an artifact durable, including its manifest, with their entries in folders.
 pub(crate) fn make_durable(folder: &Path, manifest: &Manifest) -> Result<(), StoreError> {
+    let mut folders = BTreeSet::from([Path::new("")]);
     for file in manifest.files.iter().map(|file| file.path.as_str()).chain([MANIFEST_FILE]) {
         let path = folder.join(file);
         with_path(&path, File::open(&path).and_then(|f| f.sync_all()))?;
+        folders.extend(Path::new(file).ancestors().skip(1));
     }
-    with_path(folder, sync_folder(folder))
+    for path in folders.into_iter().map(|part| folder.join(part)) {
+        with_path(&path, sync_folder(&path))?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::action::Record;
-    use crate::testing::{UNREADABLE, begin, entered, make};
+    use crate::testing::{UNREADABLE, begin, entered, finish_action};
 
     /// A name is either an object's or foreign.
     #[test]
@@ -169,7 +175,7 @@ mod tests {
         for (file, damage) in [(MANIFEST_FILE, folder), (MANIFEST_FILE, looped), ("x", looped)] {
             let dir = tempfile::tempdir().unwrap();
             let store = Store::open(dir.path()).unwrap();
-            let done = make(&store, "a", "1234");
+            let done = finish_action(&store, "a", "1234");
             let path = store.object(&done.output).join(file);
             damage(&path);
             let checked = store.check(begin(&store, "b", Some("1234")), "text").unwrap();
@@ -192,7 +198,7 @@ mod tests {
     fn actions_at_once_make_one_object() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let output = make(&store, "a", "1234").output;
+        let output = finish_action(&store, "a", "1234").output;
         for round in 0..200 {
             fs::write(store.object(&output).join("x"), "4321").unwrap();
             std::thread::scope(|scope| {
@@ -200,7 +206,7 @@ mod tests {
                     let store = &store;
                     scope.spawn(move || {
                         assert_eq!(
-                            make(store, &format!("{round} {action}"), "1234").output.len(),
+                            finish_action(store, &format!("{round} {action}"), "1234").output.len(),
                             64
                         );
                     });
