@@ -12,12 +12,12 @@ pub(crate) struct AnimatedPng {
 }
 
 impl AnimatedPng {
-    /// Creates the file for the given number of frames, each displayed for `delay` seconds.
+    /// Creates the file for the given number of frames, at `rate` frames per second, at most 600.
     pub(crate) fn create(
         path: &Path,
         (width, height): (usize, usize),
         frames: u32,
-        delay: f64,
+        rate: f64,
     ) -> anyhow::Result<Self> {
         let file = BufWriter::new(File::create(path)?);
         let mut encoder = png::Encoder::new(file, width as u32, height as u32);
@@ -25,7 +25,8 @@ impl AnimatedPng {
         encoder.set_depth(png::BitDepth::Eight);
         encoder.set_compression(png::Compression::Balanced);
         encoder.set_animated(frames, 0)?;
-        encoder.set_frame_delay((1000.0 * delay).round() as u16, 1000)?;
+        // In hundredths, so that rates of films, such as 29.97, are exact.
+        encoder.set_frame_delay(100, (100.0 * rate).round().max(1.0) as u16)?;
         Ok(Self { writer: encoder.write_header()? })
     }
 
@@ -49,7 +50,7 @@ mod tests {
     fn frames_and_their_times_are_written() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("video.png");
-        let mut animation = AnimatedPng::create(&path, (3, 2), 2, 1.0 / 15.0).unwrap();
+        let mut animation = AnimatedPng::create(&path, (3, 2), 2, 15.0).unwrap();
         let frame = |level| Rgba8::new(3, 2, vec![level; 4 * 6]);
         for level in [10, 20] {
             animation.add(&frame(level)).unwrap();
@@ -62,7 +63,7 @@ mod tests {
             reader.next_frame(&mut data).unwrap();
             assert_eq!(data, [level; 18]);
             let frame = reader.info().frame_control.unwrap();
-            assert_eq!((frame.delay_num, frame.delay_den), (67, 1000));
+            assert_eq!((frame.delay_num, frame.delay_den), (100, 1500));
         }
         let frames = reader.info().animation_control.unwrap();
         assert_eq!((frames.num_frames, frames.num_plays), (2, 0));

@@ -34,9 +34,10 @@ pub(crate) struct Film<'a> {
 }
 
 impl Film<'_> {
-    /// Returns the path of a frame, by its number as text.
-    pub(crate) fn frame(&self, context: &Context, number: &str) -> anyhow::Result<PathBuf> {
-        context.output_path(&format!("{}frames/{number}.png", self.prefix))
+    /// Returns the path of a frame. `stem` is the frame's number in five digits, or ffmpeg's
+    /// pattern for all numbers.
+    pub(crate) fn frame_path(&self, context: &Context, stem: &str) -> anyhow::Result<PathBuf> {
+        context.output_path(&format!("{}frames/{stem}.png", self.prefix))
     }
 
     /// Writes `video.mp4` by ffmpeg; without ffmpeg, or if it fails, `video.png`.
@@ -73,22 +74,23 @@ impl Film<'_> {
         let rate = self.rate.to_string();
         let mut command = Command::new("ffmpeg");
         command.args(["-loglevel", "error", "-nostdin", "-y", "-framerate", &rate, "-i"]);
-        command.arg(self.frame(context, "%05d")?);
+        command.arg(self.frame_path(context, "%05d")?);
         command.args(["-c:v", "libx264", "-crf", H264_RATE_FACTOR, "-pix_fmt", "yuv420p"]);
         command.args(["-movflags", "+faststart", "-progress", "pipe:1"]);
         command.arg(film).stdin(Stdio::null());
         Ok(command)
     }
 
-    /// Writes `video.png`, an animated PNG, with narrower and, at a high rate, fewer frames.
+    /// Writes `video.png`, an animated PNG. Frames are at most [`MAX_ANIMATION_WIDTH`] wide; above
+    /// [`MAX_ANIMATION_RATE`] every other frame is left out.
     fn write_animation(&self, context: &Context, progress: &Progress) -> anyhow::Result<()> {
         let path = context.output_path(&format!("{}video.png", self.prefix))?;
         let step = if self.rate > MAX_ANIMATION_RATE { 2 } else { 1 };
-        let delay = step as f64 / self.rate;
+        let rate = self.rate / step as f64;
         let mut animation = None;
         for index in (0..self.frames).step_by(step) {
             context.check_interrupt()?;
-            let frame = read_png(&self.frame(context, &format!("{index:05}"))?)?;
+            let frame = read_png(&self.frame_path(context, &format!("{index:05}"))?)?;
             let width = frame.width.min(MAX_ANIMATION_WIDTH);
             let height = (frame.height * width).div_ceil(frame.width);
             let frame = resize_pillow(&frame, width, height, Filter::Lanczos);
@@ -96,7 +98,7 @@ impl Film<'_> {
                 Some(animation) => animation,
                 None => {
                     let frames = self.frames.div_ceil(step) as u32;
-                    animation.insert(AnimatedPng::create(&path, (width, height), frames, delay)?)
+                    animation.insert(AnimatedPng::create(&path, (width, height), frames, rate)?)
                 }
             };
             animation.add(&frame)?;

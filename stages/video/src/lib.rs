@@ -59,7 +59,11 @@ impl Stage for Video {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "run",
-            Input::required(&["run"], "folder with run.json, the record of the rendered views"),
+            Input::required(
+                &["run"],
+                "in pipeline.yaml: a block that renders views; nerf-sr passes a folder \
+                with its record, run.json",
+            ),
         )]
     }
 
@@ -130,7 +134,7 @@ fn make_film(
     views.views.par_iter().enumerate().try_for_each(|(i, view)| {
         context.check_interrupt()?;
         let frame = draw_frame(&views, view, folder, range)?;
-        write_png(&film.frame(context, &format!("{i:05}"))?, &with_even_size(&frame))?;
+        write_png(&film.frame_path(context, &format!("{i:05}"))?, &with_even_size(&frame))?;
         progress.add(1);
         anyhow::Ok(())
     })?;
