@@ -2,20 +2,25 @@ use std::fs::File;
 use std::io::{BufReader, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use image::ImageDecoder as _;
+
 use crate::error::{MAX_PIXELS, PixelError};
 use crate::image_buffer::Rgba8;
 
 /// Reads a PNG of any type as 8-bit RGBA; without alpha it is opaque.
 pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
     let file = File::open(path).map_err(PixelError::io(path))?;
+    let damaged = |e| PixelError::format(path, format!("not a complete PNG ({e})"));
     let mut reader = image::ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
-    let image = reader.decode().map_err(|e| {
-        let reason = format!("not a complete PNG of at most {MAX_PIXELS} pixels ({e})");
-        PixelError::format(path, reason)
-    })?;
+    let decoder = reader.into_decoder().map_err(damaged)?;
+    let (width, height) = decoder.dimensions();
+    if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 {
+        return Err(PixelError::too_large(path, width as usize, height as usize));
+    }
+    let image = image::DynamicImage::from_decoder(decoder).map_err(damaged)?;
     Ok(image.into())
 }
 
