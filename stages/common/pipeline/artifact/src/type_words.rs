@@ -40,7 +40,10 @@ fn expected_words(expected: &str) -> String {
         }
     }
     match expected {
-        "u8" | "u16" | "u32" | "u64" | "usize" => "a whole number of at least 0",
+        "u8" => "a whole number from 0 to 255",
+        "u16" => "a whole number from 0 to 65535",
+        "u32" => "a whole number from 0 to 4294967295",
+        "u64" | "usize" => "a whole number of at least 0",
         "i8" | "i16" | "i32" | "i64" | "isize" => "a whole number",
         "f32" | "f64" => "a number",
         "a boolean" => "true or false",
@@ -62,11 +65,12 @@ mod tests {
         for (text, words) in [
             (
                 "a.yaml:3: gpus: invalid type: integer `-1`, expected u32",
-                "a.yaml:3: gpus: expected a whole number of at least 0, found -1",
+                "a.yaml:3: gpus: expected a whole number from 0 to 4294967295, found -1",
             ),
             (
                 "x.json: w: invalid type: floating point `2.5`, expected u32 at line 1 column 9",
-                "x.json: w: expected a whole number of at least 0, found 2.5 at line 1 column 9",
+                "x.json: w: expected a whole number from 0 to 4294967295, found 2.5 at line 1 \
+                column 9",
             ),
             ("invalid type: string \"a\", expected f64", "expected a number, found \"a\""),
             ("invalid type: map, expected a sequence", "expected a list, found a mapping"),
@@ -90,7 +94,8 @@ mod tests {
     fn the_parsers_messages_are_known() {
         let message = |text: &str| serde_json::from_str::<(u32, bool)>(text).unwrap_err();
         for (text, words) in [
-            ("[2.5, true]", "expected a whole number of at least 0, found 2.5 at line"),
+            ("[2.5, true]", "expected a whole number from 0 to 4294967295, found 2.5 at line"),
+            ("[4294967296, true]", "expected a whole number from 0 to 4294967295, found 4294"),
             ("[2, 1]", "expected true or false, found 1 at line"),
             ("{}", "expected a list of 2 values, found a mapping at line"),
             ("[2]", "expected a list of 2 values, found 1 at line"),
