@@ -55,7 +55,8 @@ impl Progress {
             return Ok(());
         }
         let left = state.pace.time_left(done, self.total, None);
-        let text = format!("{} of {} · {left} left", format_size(done), format_size(self.total));
+        let bytes = format!("{} of {}", format_size(done), format_size(self.total));
+        let text = stage::join_parts(&[&bytes, &left]);
         if let Some(bar) = &self.bar {
             bar.set_position(done);
             bar.set_message(text);

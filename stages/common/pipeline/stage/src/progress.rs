@@ -55,21 +55,22 @@ impl Event {
     }
 }
 
-/// True if events are enabled. Global, because a panic hook or any thread may end the process.
-static EVENTS_ENABLED: AtomicBool = AtomicBool::new(false);
+/// True if a failure is reported as an event. Global, because a panic hook or any thread may end
+/// the process.
+static FAILURE_EVENT_ENABLED: AtomicBool = AtomicBool::new(false);
 
 /// Enables the event that reports a failure of the process.
-pub(crate) fn enable_events() {
-    EVENTS_ENABLED.store(true, Ordering::SeqCst);
+pub(crate) fn enable_failure_event() {
+    FAILURE_EVENT_ENABLED.store(true, Ordering::SeqCst);
 }
 
-/// Returns the line that reports a failure to the runner; `None` unless events are enabled.
+/// Returns the line that reports a failure to the runner; `None` unless the event is enabled.
 pub(crate) fn failed_event(message: &str) -> Option<String> {
-    let is_enabled = EVENTS_ENABLED.load(Ordering::SeqCst);
+    let is_enabled = FAILURE_EVENT_ENABLED.load(Ordering::SeqCst);
     is_enabled.then(|| Event::Failed { message: message.to_owned() }.line())
 }
 
-/// Progress of a long piece of work. Calls are cheap: at most ten reports a second are written.
+/// Progress of a long piece of work. Calls are cheap: at most ten reports per second are written.
 pub struct Progress {
     label: String,
     total: u64,
@@ -94,7 +95,7 @@ impl Progress {
     pub fn new(label: &str, total: u64, mode: ProgressMode) -> Self {
         let bar = (mode == ProgressMode::Plain && std::io::stderr().is_terminal()).then(|| {
             let style = indicatif::ProgressStyle::with_template(
-                "{prefix:>14} [{bar:30}] {percent:>3}% {msg} left",
+                "{prefix:>14} [{bar:30}] {percent:>3}% {msg}",
             )
             .expect("the template is constant");
             indicatif::ProgressBar::new(total)
@@ -178,7 +179,7 @@ impl Progress {
         let left = state.pace.time_left(done, self.total, estimate);
         if let Some(bar) = &self.bar {
             bar.set_position(done);
-            bar.set_message(format!("{} · {left}", state.note));
+            bar.set_message(join_parts(&[&state.note, &left]));
         } else if self.mode == ProgressMode::Json {
             Event::Progress {
                 label: self.label.clone(),
@@ -189,7 +190,8 @@ impl Progress {
             }
             .emit();
         } else {
-            report_line!("{}: {done} of {} {} · {left} left", self.label, self.total, state.note);
+            let steps = format!("{done} of {}", self.total);
+            report_line!("{}: {}", self.label, join_parts(&[&steps, &state.note, &left]));
         }
     }
 }
@@ -215,8 +217,8 @@ impl Pace {
         *self.first.get_or_insert_with(|| (Instant::now(), done))
     }
 
-    /// Returns the remaining time as text: the `estimate` in seconds if there is one, otherwise
-    /// from an even pace; `?` before the first finished step.
+    /// Returns the remaining time as text, such as "4.0 min left": the `estimate` in seconds if there
+    /// is one, otherwise from an even pace; empty until a step has finished since the first call.
     pub fn time_left(&mut self, done: u64, total: u64, estimate: Option<f64>) -> String {
         let (start, first) = self.start(done);
         if let Some(seconds) = estimate {
@@ -224,15 +226,25 @@ impl Pace {
         }
         let steps = done.saturating_sub(first);
         if steps == 0 {
-            return "?".to_owned();
+            return String::new();
         }
         let left = total.saturating_sub(done) as f64;
         format_seconds_left(start.elapsed().as_secs_f64() * left / steps as f64)
     }
 }
 
+/// Joins the parts of a progress line that aren't empty.
+pub fn join_parts(parts: &[&str]) -> String {
+    let parts: Vec<&str> = parts.iter().filter(|part| !part.is_empty()).copied().collect();
+    parts.join(" · ")
+}
+
 fn format_seconds_left(seconds: f64) -> String {
-    if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.1} min", seconds / 60.0) }
+    if seconds < 90.0 {
+        format!("{seconds:.0} s left")
+    } else {
+        format!("{:.1} min left", seconds / 60.0)
+    }
 }
 
 #[cfg(test)]
@@ -242,13 +254,13 @@ mod tests {
     #[test]
     fn time_left_follows_from_this_run_alone() {
         let mut pace = Pace { first: None };
-        assert_eq!(pace.time_left(900, 1000, None), "?");
+        assert_eq!(pace.time_left(900, 1000, None), "");
         let (since, _) = pace.first.unwrap();
         pace.first = Some((since.checked_sub(Duration::from_secs(60)).unwrap(), 900));
         assert_eq!(
             [(920, None), (901, None), (901, Some(61.4)), (900, Some(600.0))]
                 .map(|(done, estimate)| pace.time_left(done, 1000, estimate)),
-            ["4.0 min", "99.0 min", "61 s", "10.0 min"]
+            ["4.0 min left", "99.0 min left", "61 s left", "10.0 min left"]
         );
     }
 }

@@ -6,11 +6,12 @@ use std::time::{Duration, Instant};
 
 use artifact::{format_duration, printable, report_text};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
-use stage::{Event, Pace};
+use stage::{Event, Pace, join_parts};
 
 use crate::stage_call::call::Watcher;
 
-/// Maximum time without a line of a running stage, which would seem dead (docs/design/040).
+/// Maximum time without a line of a running stage: after a longer silence the stage would seem dead
+/// (docs/design/040).
 const MAX_SILENCE: Duration = Duration::from_secs(8);
 /// Interval between two movements of a bar's spinner.
 const SPINNER_INTERVAL: Duration = Duration::from_millis(500);
@@ -52,7 +53,7 @@ impl Display {
     }
 
     /// Starts displaying a stage.
-    pub fn start(&self, label: &str) -> StageView<'_> {
+    pub fn start(&self, label: &str) -> StageDisplay<'_> {
         let bar = self.bars.as_ref().map(|bars| {
             let template = "{spinner} {prefix} [{bar:30}] {percent:>3}% {msg}";
             let style = ProgressStyle::with_template(template).expect("the template is constant");
@@ -67,12 +68,12 @@ impl Display {
         if bar.is_none() {
             self.line(&format!("{label}: running"));
         }
-        StageView {
+        StageDisplay {
             display: self,
             label: label.to_owned(),
             bar,
             started: Instant::now(),
-            state: Mutex::new(ViewState {
+            state: Mutex::new(StageDisplayState {
                 last_line: Instant::now(),
                 task: String::new(),
                 text: None,
@@ -83,16 +84,16 @@ impl Display {
 }
 
 /// Display of one running stage.
-pub struct StageView<'a> {
+pub struct StageDisplay<'a> {
     display: &'a Display,
     label: String,
     bar: Option<ProgressBar>,
     started: Instant,
-    state: Mutex<ViewState>,
+    state: Mutex<StageDisplayState>,
 }
 
 /// State of a stage's display.
-struct ViewState {
+struct StageDisplayState {
     /// Time of the last line.
     last_line: Instant,
     /// Task of the last progress event.
@@ -103,7 +104,7 @@ struct ViewState {
     pace: Pace,
 }
 
-impl StageView<'_> {
+impl StageDisplay<'_> {
     /// Removes the stage's bar.
     pub fn end(&self) {
         if let Some(bar) = &self.bar {
@@ -112,12 +113,14 @@ impl StageView<'_> {
     }
 }
 
-impl Watcher for StageView<'_> {
+impl Watcher for StageDisplay<'_> {
     fn progress(&self, event: &Event) {
-        let Event::Progress { label, done, total, note, seconds_left } = event else { return };
+        let Event::Progress { label: task, done, total, note, seconds_left } = event else {
+            return;
+        };
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        if state.task != *label {
-            state.task.clone_from(label);
+        if state.task != *task {
+            state.task.clone_from(task);
             state.pace = Pace::default();
         }
         let estimate = seconds_left.map(|seconds| seconds as f64);
@@ -125,10 +128,10 @@ impl Watcher for StageView<'_> {
         if let Some(bar) = &self.bar {
             bar.set_length(*total);
             bar.set_position(*done);
-            bar.set_message(format!("{label} {note} · {left} left"));
+            bar.set_message(join_parts(&[task, note, &left]));
         } else {
-            let percent = done * 100 / total.max(&1);
-            state.text = Some(format!("{label} {percent}% {note} · {left} left"));
+            let percent = format!("{task} {} %", done * 100 / total.max(&1));
+            state.text = Some(join_parts(&[&percent, note, &left]));
         }
     }
 
@@ -146,6 +149,9 @@ impl Watcher for StageView<'_> {
     }
 
     fn stderr_line(&self, line: &str) {
+        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        state.last_line = Instant::now();
+        drop(state);
         self.display.line(&format!("{}: {line}", self.label));
     }
 }

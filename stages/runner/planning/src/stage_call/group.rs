@@ -15,8 +15,8 @@ use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process_group, wa
 use stage::stop_signals;
 use wait4::{ResUse, Wait4 as _};
 
-/// Process ids of the leaders of all running groups. No leader has been waited for, so that no
-/// other process can have the same id.
+/// Process ids of the leaders of all running groups. None of these leaders has been waited for, and
+/// therefore no other process can have one of these ids.
 static RUNNING: Mutex<BTreeSet<i32>> = Mutex::new(BTreeSet::new());
 
 fn running() -> MutexGuard<'static, BTreeSet<i32>> {
@@ -64,8 +64,8 @@ impl Group {
         kill_process_group(self.id, Signal::TERM).ok();
     }
 
-    /// Kills the remaining processes of the group, which would write unnoticed and keep pipes and
-    /// locks open. Returns the leader's exit status and resource usage.
+    /// Kills the remaining processes of the group, which could otherwise continue to write and
+    /// would keep pipes and locks open. Returns the leader's exit status and resource usage.
     pub(crate) fn kill(mut self) -> io::Result<ResUse> {
         let leader = self.leader.take().ok_or(io::ErrorKind::InvalidInput)?;
         kill_and_wait(self.id, leader)
@@ -80,8 +80,8 @@ impl Drop for Group {
     }
 }
 
-/// Returns the peak resident memory of a process, a number or `self`, in bytes; `None` without
-/// `/proc`.
+/// Returns the peak resident memory of a process in bytes; `None` without `/proc`. `process` is an
+/// id or `self`.
 pub(crate) fn peak_memory(process: impl Display) -> Option<u64> {
     let status = std::fs::read_to_string(format!("/proc/{process}/status")).ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;

@@ -47,7 +47,8 @@ impl ProgressFilter {
             return None;
         }
         self.tenth = tenth;
-        Some(format!("{task}: {}% {note}", tenth * 10).trim_end().to_owned())
+        let separator = if note.is_empty() { "" } else { " · " };
+        Some(format!("{task}: {} %{separator}{note}", tenth * 10))
     }
 }
 
@@ -64,12 +65,12 @@ mod tests {
         }
         assert_eq!(
             (lines.len(), lines[0].as_str(), lines[9].as_str()),
-            (10, "training: 10% PSNR 20", "training: 100% PSNR 20")
+            (10, "training: 10 % · PSNR 20", "training: 100 % · PSNR 20")
         );
         // Another task starts at 0; products of large counts must not overflow.
         assert_eq!(
             filter.line("rendering", u64::MAX / 2, u64::MAX, ""),
-            Some("rendering: 40%".to_owned())
+            Some("rendering: 40 %".to_owned())
         );
     }
 }

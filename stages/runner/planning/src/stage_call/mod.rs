@@ -50,6 +50,6 @@ mod log;
 
 pub use call::{Call, Usage, Watcher, read_summary};
 pub use describe::{Descriptions, Interrupted, ProgramError, describe_all};
-pub use display::{Display, StageView};
+pub use display::{Display, StageDisplay};
 pub use failure::StageFailure;
 pub use group::stop_on_signals;
