@@ -18,7 +18,7 @@ pub(crate) const SCENE: &str = "scene";
 pub(crate) struct Layout<'a> {
     pub(crate) params: &'a Params,
     pub(crate) figures: &'a Figures,
-    /// Keys whose values make a row.
+    /// Keys whose values identify a line.
     pub(crate) keys: Vec<String>,
     /// Value that others are compared with.
     pub(crate) reference: Option<f64>,
@@ -29,9 +29,9 @@ impl Layout<'_> {
     pub(crate) fn table(&self, rows: &[Row], is_part: bool) -> String {
         let params = self.params;
         let columns = distinct(rows, &params.columns);
-        let further = params.extra_rows.iter().filter(|row| !is_part || row.contains_key(SCENE));
-        let further: Vec<Row> = further.filter(|row| self.matches(row, rows)).cloned().collect();
-        let all = [rows, &further[..]].concat();
+        let extra = params.extra_rows.iter().filter(|row| !is_part || row.contains_key(SCENE));
+        let extra: Vec<Row> = extra.filter(|row| self.matches(row, rows)).cloned().collect();
+        let all = [rows, &extra[..]].concat();
         let values: Vec<&String> = params
             .values
             .iter()
@@ -44,9 +44,9 @@ impl Layout<'_> {
             self.add_front(&mut cells, &front);
             lines.push(cells);
         }
-        for line in distinct(&further, &self.keys) {
-            // Rows from other sources are never the best.
-            let mut cells = self.line(&further, &[], &line, (&columns, &values));
+        for line in distinct(&extra, &self.keys) {
+            // Extra rows are never the best.
+            let mut cells = self.line(&extra, &[], &line, (&columns, &values));
             self.add_front(&mut cells, &[]);
             lines.push(cells);
         }
@@ -63,7 +63,10 @@ impl Layout<'_> {
                 head.push(format!("{} ({})", column.join(", "), titles.join(" / ")));
             }
         }
-        head.extend(self.reference.is_some().then(|| "against the first".to_owned()));
+        head.extend(self.reference.map(|_| {
+            let values: Vec<&str> = self.params.relative_to.values().map(String::as_str).collect();
+            format!("against {}", values.join(", "))
+        }));
         head.extend(self.params.front.is_some().then(|| "front".to_owned()));
         head.extend(PROVENANCE.map(str::to_owned));
         head
@@ -104,7 +107,7 @@ impl Layout<'_> {
         axes.picture(&self.points(rows, &axes), self.figures)
     }
 
-    /// Adds the front's cell to a line, which starts with its keys, before its provenance.
+    /// Inserts the front's cell before a line's provenance. The line's first cells are its keys.
     fn add_front(&self, cells: &mut Vec<String>, front: &[String]) {
         if self.params.front.is_some() {
             let is_on_front = front.contains(&cells[..self.keys.len()].join(", "));
@@ -155,7 +158,7 @@ impl Layout<'_> {
         line
     }
 
-    /// Returns the rows with values in the same group.
+    /// Returns the rows that have values and belong to the group of `mine`.
     fn rivals(&self, rows: &[Row], mine: &[Row]) -> Vec<Row> {
         let group = mine.first().and_then(|row| row.get(GROUP));
         rows.iter()
@@ -188,13 +191,13 @@ impl Layout<'_> {
         }
     }
 
-    /// True if a row from another source belongs to some results: its rows' and columns' keys occur
-    /// among theirs, and its other keys are common to all of them.
-    fn matches(&self, further: &Row, rows: &[Row]) -> bool {
-        further.iter().filter(|(name, value)| self.is_key(name, value)).all(|(name, value)| {
+    /// True if an extra row belongs to some results. Each of the row's keys that identify lines or
+    /// columns has the value of some result; each other key has the value that all results share.
+    fn matches(&self, extra: &Row, rows: &[Row]) -> bool {
+        extra.iter().filter(|(name, value)| self.is_key(name, value)).all(|(name, value)| {
             let theirs = distinct(rows, std::slice::from_ref(name)).concat();
-            let is_column = self.params.columns.contains(name) || self.params.rows.contains(name);
-            theirs.contains(&plain(value)) && (is_column || theirs.len() == 1)
+            let is_compared = self.params.columns.contains(name) || self.keys.contains(name);
+            theirs.contains(&plain(value)) && (is_compared || theirs.len() == 1)
         })
     }
 

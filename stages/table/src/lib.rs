@@ -39,7 +39,11 @@ impl Stage for Table {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "run",
-            Input::required(&["run"], "folder with run.json, the record of the scored results"),
+            Input::required(
+                &["run"],
+                "in pipeline.yaml: a block that scores; nerf-sr passes a folder \
+                with its record, run.json",
+            ),
         )]
     }
 

@@ -66,7 +66,7 @@ fn results_of_one_row_are_averaged_and_the_best_is_marked() {
     let expected = "\
 # Ablation
 
-| variant | PSNR | LPIPS | training | against the first | commit | machine |
+| variant | PSNR | LPIPS | training | against as it is | commit | machine |
 | --- | --- | --- | --- | --- | --- | --- |
 | as it is | **31.00** | **0.0450** | **2.0 min** | +0.00 | abc1234 | 2 cores |
 | no warm-up | 30.88 | – | 3.3 min | -0.12 | abc1234 | 2 cores |

@@ -12,7 +12,7 @@ pub struct Params {
     /// Heading of the table.
     pub title: String,
     /// Keys whose values identify a row: axes of the run (`scene`, `protocol`, `variant`, a swept
-    /// parameter), or `method` for the scored block. Results that differ only in other keys are
+    /// parameter), or `method` for the scoring block. Results that differ only in other keys are
     /// averaged. Default: all keys that differ, except `scene`.
     #[schemars(extend("x-default" = "all keys that differ, except `scene`"))]
     pub rows: Vec<String>,
@@ -26,18 +26,18 @@ pub struct Params {
     /// the first of `values`.
     #[schemars(extend("x-default" = "no comparison"))]
     pub relative_to: BTreeMap<String, String>,
-    /// Value of a cost, such as `train_cpu_s`, `render_s` or `field_mb`. Column `front` marks rows
-    /// that no other row beats in both this cost and the first of `values`, and `front.svg` shows
-    /// all rows by both.
+    /// Name of a cost, such as `train_cpu_s`, `render_s` or `field_mb`, for a Pareto front: column
+    /// `front` marks rows that no other row beats in both this cost and the first of `values`, and
+    /// `front.svg` shows all rows by both.
     #[schemars(extend("x-default" = "no comparison"))]
     pub front: Option<String>,
-    /// Names of methods, by scored block: `{eval: rendered, eval-refined: refined}`. `{variant}` in
-    /// a name is replaced by the value of that key.
+    /// Names of methods, by scoring block: `{eval: rendered, eval-refined: refined}`. `{variant}`
+    /// in a name is replaced by the value of that key.
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
     /// Groups of comparable methods, in the order of the table: `[{name: LR images, methods:
-    /// [eval]}]`, with methods by scored block. Column `has seen` names the group, and the best
-    /// value is marked in each.
+    /// [eval]}]`, with methods by scoring block. Column `has seen` has the group's name, such
+    /// as the images that its methods were given; the best value of each group is marked.
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
     /// Rows from other sources, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:
@@ -57,7 +57,7 @@ pub struct Params {
 pub struct Group {
     /// Name of the group.
     pub name: String,
-    /// Scored blocks.
+    /// Scoring blocks.
     pub methods: Vec<String>,
 }
 
