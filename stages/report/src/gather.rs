@@ -10,9 +10,9 @@ pub(crate) struct Report<'a> {
     pub(crate) run: &'a RunRecord,
     /// Results, sorted by the number of their ancestors.
     pub(crate) rows: Vec<Row<'a>>,
-    /// Data sets that have results, in the rows' order.
+    /// Data sets with scored or unscored views, in the rows' order.
     pub(crate) scenes: Vec<SceneViews>,
-    /// Figures of the results.
+    /// Figures of the results: kinds of scores, such as PSNR.
     pub(crate) figures: Vec<ScoreFormat>,
     /// Views that a failed run has made but not scored.
     pub(crate) unscored: Vec<UnscoredViews>,
@@ -28,7 +28,7 @@ pub(crate) struct SceneViews {
     pub(crate) views: Vec<String>,
 }
 
-/// Result: scores of the views that one method rendered.
+/// Scores of the views that one method rendered: a result, and a row of the tables.
 pub(crate) struct Row<'a> {
     pub(crate) node: &'a RunNode,
     /// Index of the node in the run.
@@ -80,11 +80,10 @@ impl<'a> Report<'a> {
             }
         }
         for index in unscored_nodes(run) {
+            let Some(names) = UnscoredViews::read_names(run, index) else { continue };
             let scene = report.scene(index);
-            let method = views_label(&run.nodes[index]);
-            let Some(views) = UnscoredViews::read(run, index, &method, scene) else { continue };
-            report.add_views(scene, views.names.iter().map(String::as_str));
-            report.unscored.push(views);
+            report.add_views(scene, names.iter().map(String::as_str));
+            report.unscored.push(UnscoredViews::new(run, index, scene));
         }
         report.figures = figures(&report.rows);
         report.label_rows();
@@ -133,7 +132,7 @@ impl<'a> Report<'a> {
             .collect();
         for row in &mut self.rows {
             let own = method(self.run, row.node);
-            // Two blocks may score views of one kind.
+            // Two blocks may score views of the same method.
             let is_shared =
                 methods.iter().any(|(other, stage)| *other == own && *stage != row.node.stage);
             let method = if is_shared { row.node.stage.clone() } else { own };
@@ -228,7 +227,7 @@ fn method(run: &RunRecord, scored: &RunNode) -> String {
 }
 
 /// Returns what a stage has done with the views of its artifact, such as "rendered".
-fn views_label(node: &RunNode) -> String {
+pub(crate) fn views_label(node: &RunNode) -> String {
     match node.program.as_str() {
         "render-depth" => "rendered".to_owned(),
         "refine" => "refined".to_owned(),

@@ -48,7 +48,7 @@ fn joined(values: BTreeSet<String>) -> String {
 fn rays_of_field(run: &RunRecord, index: usize) -> Option<String> {
     let node = &run.nodes[index];
     let log: TrainingLog = read(node, TRAINING_FILE)?;
-    // A field of images shrunk once more, for internal learning, has other pixels.
+    // Only fields trained on `train` are listed: a field of `downscaled` has other LR pixels.
     let scene = node.inputs.get("scene").filter(|input| input.subtree.as_deref() == Some("train"));
     let scene = read_scene(&run.nodes[scene?.node?])?;
     let pixels = u64::from(scene.lr[0]) * u64::from(scene.lr[1]) * scene.train;

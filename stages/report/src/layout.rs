@@ -127,7 +127,8 @@ fn mean_x(items: &[Item], indices: &[usize]) -> f64 {
 /// lanes to free positions near the ends of their edges.
 fn settle(items: &mut [Item], layer: &[usize]) {
     let boxes = with_targets(items, layer, false);
-    // Boxes are pushed apart to the right and to the left; the mean of both keeps the distances.
+    // Overlaps are removed twice, by moving boxes only to the right and only to the left. The mean
+    // of both positions has no overlaps, either.
     let mut right: Vec<f64> = boxes.iter().map(|(_, target)| *target).collect();
     let mut left = right.clone();
     for i in 1..boxes.len() {

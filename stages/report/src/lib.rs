@@ -64,8 +64,8 @@ impl Stage for Report {
             "run",
             Input::required(
                 &["run"],
-                "folder with run.json, the record of a run; in pipeline.yaml: the scores, and \
-                further artifacts under any name",
+                "in pipeline.yaml: a block that scores, and further blocks under any names; \
+                nerf-sr passes a folder with their record, run.json",
             ),
         )]
     }

@@ -24,10 +24,11 @@ struct Block<'a> {
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum State {
     Failed,
-    Waiting,
+    NotRun,
     Ran,
     Cached,
-    Done,
+    /// Finished; whether in this run or an earlier one isn't recorded.
+    Finished,
 }
 
 impl State {
@@ -35,21 +36,21 @@ impl State {
         match node.is_cached {
             Some(true) => Self::Cached,
             Some(false) => Self::Ran,
-            None => Self::Done,
+            None => Self::Finished,
         }
     }
 
     fn of_unfinished(node: &UnfinishedNode) -> Self {
-        if node.message.is_some() { Self::Failed } else { Self::Waiting }
+        if node.message.is_some() { Self::Failed } else { Self::NotRun }
     }
 
     fn name(self) -> &'static str {
         match self {
             Self::Failed => "failed",
-            Self::Waiting => "not run",
+            Self::NotRun => "not run",
             Self::Ran => "ran",
             Self::Cached => "cached",
-            Self::Done => "done",
+            Self::Finished => "done",
         }
     }
 
@@ -57,8 +58,8 @@ impl State {
     fn symbol(self) -> &'static str {
         match self {
             Self::Failed => "✕",
-            Self::Waiting => "–",
-            Self::Ran | Self::Done => "●",
+            Self::NotRun => "–",
+            Self::Ran | Self::Finished => "●",
             Self::Cached => "○",
         }
     }
@@ -90,7 +91,7 @@ pub(crate) fn pipeline(run: &RunRecord) -> Markup {
 }
 
 /// Returns the blocks, the edges, and the input folders outside the store, which are the graph's
-/// first nodes.
+/// first boxes.
 fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>) {
     let mut blocks: Vec<Block<'_>> = Vec::new();
     let mut block_of: Vec<usize> = Vec::new();
@@ -103,8 +104,8 @@ fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>
         }));
     }
     let mut folders: Vec<&PathBuf> = Vec::new();
-    for folder in run.nodes.iter().flat_map(|node| node.inputs.values()) {
-        folders.extend(folder.folder.as_ref().filter(|folder| !folders.contains(folder)));
+    for input in run.nodes.iter().flat_map(|node| node.inputs.values()) {
+        folders.extend(input.folder.as_ref().filter(|folder| !folders.contains(folder)));
     }
     let first = folders.len();
     let mut edges: Vec<(usize, usize)> = Vec::new();
@@ -122,7 +123,7 @@ fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>
         blocks[block].undone.push(node);
         edges.extend(node.needs.iter().map(|&needed| (first + block_of[needed], first + block)));
     }
-    // Blocks follow their inputs, as nodes do.
+    // `draw` needs edges to later boxes. Edges within a block or to an earlier one are left out.
     edges.retain(|(from, to)| from < to);
     edges.sort_unstable();
     edges.dedup();
@@ -146,7 +147,7 @@ fn boxes(blocks: &[Block<'_>], folders: &[&PathBuf], drawing: &Drawing) -> Marku
                 }
             }
             @for (number, block) in blocks.iter().enumerate() {
-                @let state = block.states().next().map_or(State::Done, |(state, _)| state);
+                @let state = block.states().next().map_or(State::Finished, |(state, _)| state);
                 a class={ "box " (state.name().replace(' ', "-")) }
                     style=(box_style(boxes[folders.len() + number]))
                     href={ "#stage-" (number) } {
@@ -276,7 +277,10 @@ fn unfinished_details(node: &UnfinishedNode) -> Markup {
         @if let Some(message) = &node.message {
             p class="failure" { b { "Failed: " } (message) }
         } @else {
-            p { "Not run: an input's stage failed, or the run ended before." }
+            p {
+                "Not run: the stage of an input failed, or the run ended first. "
+                code { "nerf-sr run" } " continues."
+            }
         }
         (parameters(&node.parameters, &serde_json::Map::new()))
     }

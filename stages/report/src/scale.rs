@@ -1,4 +1,4 @@
-use pixels::{DepthMap, Palette, heat};
+use pixels::{DepthMap, Palette, palette_colour};
 use serde::Serialize;
 
 /// Colour scale of error or depth maps, with numbers.
@@ -30,7 +30,7 @@ impl Scale {
         Self {
             label: format!("{subject}, mean of R, G, B"),
             colours: (0..COLOURS)
-                .map(|i| css(heat(Palette::Error, i as f32 / (COLOURS - 1) as f32)))
+                .map(|i| css(palette_colour(Palette::Error, i as f32 / (COLOURS - 1) as f32)))
                 .collect(),
             ticks,
         }
@@ -100,8 +100,8 @@ mod tests {
     #[test]
     fn colours_are_those_of_the_maps() {
         let (error, depth) = (Scale::error(0.25, false), Scale::depth((1.0, 9.0)));
-        assert_eq!(error.colours[0], css(heat(Palette::Error, 0.0)));
-        assert_eq!(error.colours[COLOURS - 1], css(heat(Palette::Error, 1.0)));
+        assert_eq!(error.colours[0], css(palette_colour(Palette::Error, 0.0)));
+        assert_eq!(error.colours[COLOURS - 1], css(palette_colour(Palette::Error, 1.0)));
         let near = DepthMap { depth: &[1.0], opacity: &[1.0] }.draw(1, (1.0, 9.0)).data;
         assert_eq!(depth.colours[0], css([near[0], near[1], near[2]]));
         assert!(near[0] > near[2], "{near:?}");

@@ -34,7 +34,7 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
     }
 }
 
-/// Removes the arrow of the better direction from a label.
+/// Removes from a label the arrow that tells whether higher or lower values are better.
 fn without_arrow(label: &str) -> String {
     label.replace(['↑', '↓'], "").split_whitespace().collect::<Vec<_>>().join(" ")
 }
@@ -51,7 +51,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
         section id="scores" aria-labelledby="scores-heading" {
             h2 id="scores-heading" { "Scores" }
             p class="note" {
-                "Means over the test views. ↑ more is better, ↓ less is better."
+                "Means over the test views. ↑ higher is better, ↓ lower is better."
                 @if rows.len() > 1 { " ★ marks the best of each column." }
             }
             div class="wide tall" tabindex="0" role="region" aria-labelledby="scores-heading" {
@@ -71,7 +71,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
                             tr {
                                 th scope="row" { (breakable(&row.label)) }
                                 @if with_data_sets { td { (report.scenes[row.scene].data_set) } }
-                                @for figure in &known { (mean(figure, row, rows)) }
+                                @for figure in &known { (mean_cell(figure, row, rows)) }
                                 td class="n" { (row.view_count()) }
                                 td class="n" { (format_duration(row.training)) }
                                 td class="n" { (format_duration(row.rendering)) }
@@ -80,7 +80,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
                     }
                 }
             }
-            (missing(report))
+            (missing_note(report))
         }
     }
 }
@@ -103,7 +103,10 @@ pub(crate) fn definition<'a>(
     figure: &ScoreFormat,
 ) -> Option<(&'a str, &'a str)> {
     let metric = figure.path.split('/').next().unwrap_or_default();
-    let conventions = report.rows.first()?.metrics.conventions().as_object()?;
+    // A result without this figure may state why it isn't measured.
+    let measured = report.rows.iter().find(|row| row.mean(figure).is_some());
+    let row = measured.or(report.rows.first())?;
+    let conventions = row.metrics.conventions().as_object()?;
     // Networks of LPIPS share a definition.
     let (name, text) =
         conventions.iter().find(|(name, _)| metric == *name || is_variant(metric, name))?;
@@ -123,9 +126,9 @@ pub(crate) fn breakable(text: &str) -> Markup {
 }
 
 /// Cell of the table of means.
-fn mean(figure: &ScoreFormat, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
+fn mean_cell(figure: &ScoreFormat, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
     let Some(value) = row.mean(figure) else {
-        // Without HR truth, weights of LPIPS wouldn't help.
+        // Without HR truth, LPIPS can't be computed: the cell doesn't ask for weights.
         let has_truth = row.metrics.has_hr_truth();
         let missing = figure.missing.as_deref().filter(|_| has_truth);
         return html! { td class="n" { (missing.unwrap_or("–")) } };
@@ -142,7 +145,7 @@ fn mean(figure: &ScoreFormat, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
 }
 
 /// Note on figures that no result has, with the reasons.
-fn missing(report: &Report<'_>) -> Markup {
+fn missing_note(report: &Report<'_>) -> Markup {
     let has_truth = report.rows.iter().any(|row| row.metrics.has_hr_truth());
     let unknown = report.figures.iter().filter(|figure| !has_values(figure, &report.rows));
     let unknown: Vec<_> = unknown.filter_map(|f| Some((f, f.missing.as_ref()?))).collect();
@@ -160,7 +163,7 @@ fn missing(report: &Report<'_>) -> Markup {
     }
 }
 
-/// Table of every view's figures, which needs neither pointer nor script.
+/// Table of every view's figures, readable without mouse and JavaScript, unlike the plots.
 pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
     let known: Vec<&ScoreFormat> =
         report.figures.iter().filter(|figure| has_values(figure, &report.rows)).collect();

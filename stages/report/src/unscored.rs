@@ -5,6 +5,8 @@ use std::path::PathBuf;
 use artifact::{RunNode, RunRecord};
 use scene::Views;
 
+use crate::gather::views_label;
+
 /// Views without scores.
 pub(crate) struct UnscoredViews {
     pub(crate) label: String,
@@ -12,8 +14,6 @@ pub(crate) struct UnscoredViews {
     pub(crate) folder: PathBuf,
     /// Folder of the views' ground truth, which the scene of the views has.
     pub(crate) truth: Option<PathBuf>,
-    /// Names of the views.
-    pub(crate) names: Vec<String>,
     /// Index of the data set in [`Report::scenes`](crate::gather::Report::scenes).
     pub(crate) scene: usize,
 }
@@ -31,22 +31,25 @@ pub(crate) fn unscored_nodes(run: &RunRecord) -> Vec<usize> {
 }
 
 impl UnscoredViews {
-    /// Reads the list of views; `None` if the list can't be read.
-    pub(crate) fn read(run: &RunRecord, index: usize, method: &str, scene: usize) -> Option<Self> {
+    /// Reads the names of a node's views; `None` if their list can't be read.
+    pub(crate) fn read_names(run: &RunRecord, index: usize) -> Option<Vec<String>> {
+        let views = Views::read_folder(&run.nodes[index].folder).ok()?;
+        Some(views.views.into_iter().map(|view| view.camera.name).collect())
+    }
+
+    /// Describes a node's views; `scene` is the index of their data set.
+    pub(crate) fn new(run: &RunRecord, index: usize, scene: usize) -> Self {
         let node: &RunNode = &run.nodes[index];
-        let views = Views::read_folder(&node.folder).ok()?;
-        let names: Vec<String> = views.views.into_iter().map(|view| view.camera.name).collect();
         let ancestors = run.ancestors(index).into_iter().map(|index| &run.nodes[index]);
         let scenes = ancestors.filter(|node| node.kind == "scene");
         let mut truths = scenes.map(|node| node.folder.join("truth"));
         let truth = truths.find(|folder| folder.join(scene::VIEWS_FILE).is_file());
-        let label = artifact::label(method, &node.point);
-        Some(Self {
+        let label = artifact::label(&views_label(node), &node.point);
+        Self {
             label: format!("{label}, not scored"),
             folder: node.folder.clone(),
             truth,
-            names,
             scene,
-        })
+        }
     }
 }
