@@ -197,7 +197,10 @@ fn memory_is_looked_at_before_images_are_decoded() {
     let one = prepare("30000", "one");
     assert_eq!(one.code, 0, "{}", one.stderr);
     let said = format!("{}{}", one.stdout, one.stderr);
-    assert!(said.contains("1 of 2 threads: an image needs 20.5 kB of memory"), "{said}");
+    assert!(
+        said.contains("1 of 2 threads: preparing the largest image needs 20.5 kB of memory"),
+        "{said}"
+    );
     let both = prepare("4000000000", "both");
     assert_eq!(
         (both.code, common::manifest(&project.path("both"))),

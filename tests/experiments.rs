@@ -85,7 +85,7 @@ fn variants_stand_beside_the_first() {
         ["as it is", "supervision: average", "all pixels drawn alike"]
     );
     let text = table(&project, "ablation");
-    assert!(text.contains("against the first") && text.contains("| +0.00 |"), "{text}");
+    assert!(text.contains("against as it is") && text.contains("| +0.00 |"), "{text}");
     project.ok(&[
         "run",
         "tradeoff",

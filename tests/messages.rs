@@ -138,7 +138,7 @@ fn a_log_holds_what_a_stage_was_given_said_and_made() {
         assert!(lines.contains(&line), "{line}\n{log}");
     }
     let progress: Vec<&&str> = lines.iter().filter(|line| line.starts_with("talking: ")).collect();
-    assert_eq!((progress.len(), *progress[0]), (10, "talking: 10% PSNR 4"), "{log}");
+    assert_eq!((progress.len(), *progress[0]), (10, "talking: 10 % · PSNR 4"), "{log}");
     assert!(lines[lines.len() - 2].starts_with("done in "), "{log}");
 }
 
@@ -213,7 +213,7 @@ fn a_log_is_found_whatever_the_stage_was_run_with() {
     project.ok(&["run", "-p", "word=bye"]);
     for (stage, word) in [("other", "\"other\""), ("talk", "\"bye\"")] {
         let log = project.ok(&["log", stage]);
-        assert!(log.contains(word) && log.contains("not run with these arguments"), "{log}");
+        assert!(log.contains(word) && log.contains("no log for these arguments"), "{log}");
     }
     // What failed has no record, but said something.
     project.run(&["run", "-p", "word=bad"]).fails(3, &["talk failed"]);
@@ -303,7 +303,7 @@ fn nothing_that_a_stage_says_reaches_the_terminal_raw() {
     );
     let log = project.ok(&["log", "talk"]);
     assert!(
-        log.contains(r"\u{1b}[31mred two") && log.contains(r"\u{1b}[1ma: 100% \u{1b}[2mb"),
+        log.contains(r"\u{1b}[31mred two") && log.contains(r"\u{1b}[1ma: 100 % · \u{1b}[2mb"),
         "{log}"
     );
     // Of a bar that was drawn over and over, what stood there last.

@@ -242,7 +242,7 @@ fn exposures_are_found() {
     assert!(found > ignored + 2.0, "{found} dB with exposures, {ignored} dB without");
     let open =
         ["run", "-i", "dataset=./transforms", "-p", "exposure=true", "-p", "background=alpha"];
-    project.run(&open).fails(2, &["parameter exposure", "transparent background"]);
+    project.run(&open).fails(2, &["parameter exposure", "with prep.background alpha"]);
 }
 
 fn levels(image: &pixels::Rgba8, column: usize, row: usize) -> [f64; 4] {
@@ -375,7 +375,7 @@ fn poses_are_refined_and_test_views_registered() {
         "-p",
         "background=alpha",
     ];
-    project.run(&open).fails(2, &["parameter pose_refinement", "transparent background"]);
+    project.run(&open).fails(2, &["parameter pose_refinement", "with prep.background alpha"]);
 }
 
 fn psnr_with_masks(project: &Project, file: &Path, transforms: &mut Value, keep: bool) -> f64 {

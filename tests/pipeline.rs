@@ -200,7 +200,7 @@ fn a_stage_in_python_takes_evals_place() {
     let text = std::fs::read_to_string(project.path("my-eval.py")).unwrap();
     project.write("my-eval.py", &text.replace("scoring with Python", "scoring anew"));
     std::process::Command::new("chmod").arg("+x").arg(project.path("my-eval.py")).status().unwrap();
-    project.run(&["why", "eval"]).fails(2, &["my-eval.py", "read it first"]);
+    project.run(&["why", "eval"]).fails(2, &["my-eval.py", "check what the program does"]);
     assert!(project.ok(&["run"]).contains("1 of 5 stages ran, 4 were cached"));
 }
 

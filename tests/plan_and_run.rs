@@ -203,7 +203,7 @@ impl World {
     /// has.
     fn nodes(&self, verb: &[&str]) -> Vec<Value> {
         let finished = self.project.run(&self.words(verb));
-        if finished.stderr.contains("read it first, then start it") {
+        if finished.stderr.contains("check what the program does, then start it") {
             return Vec::new();
         }
         assert_eq!(finished.code, 0, "{}", finished.stderr);

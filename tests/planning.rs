@@ -63,7 +63,7 @@ fn only_run_starts_a_foreign_program() {
                 &[
                     "pipeline.yaml:3: stage mine",
                     "mine.sh",
-                    "read it first, then start it with `nerf-sr run`",
+                    "check what the program does, then start it with `nerf-sr run`",
                 ],
             );
         }
@@ -86,7 +86,7 @@ fn only_run_starts_a_foreign_program() {
     changed.set_modified(metadata.modified().unwrap()).unwrap();
     drop(changed);
     assert_eq!(std::fs::metadata(project.path("mine.sh")).unwrap().len(), metadata.len());
-    project.run(&["plan"]).fails(2, &["read it first"]);
+    project.run(&["plan"]).fails(2, &["check what the program does"]);
     assert_eq!(started(), by_run);
     project.ok(&["run"]);
     project.ok(&["plan"]);
@@ -199,7 +199,7 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         ),
         (
             &["-p", "background=alpha", "-p", "supervision=kernel"],
-            "stage train-ss: parameter supervision: kernel cannot be used over a transparent background",
+            "stage train-ss: parameter supervision: kernel cannot be used with prep.background",
         ),
         (
             &["-p", "background=white,alpha", "-p", "exposure=true"],

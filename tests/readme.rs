@@ -183,7 +183,7 @@ fn pipeline_blocks_are_valid() {
         project.write("pipeline.yaml", &format!("{}{block}{}", &text[..start], &after[end..]));
         if block.contains("run: ./") {
             // Somebody's program: it is for `run` to start.
-            project.run(&["plan"]).fails(2, &["read it first"]);
+            project.run(&["plan"]).fails(2, &["check what the program does"]);
             project.ok(&["run"]);
         }
         project.ok(&["plan"]);

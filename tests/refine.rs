@@ -1,4 +1,4 @@
-//! `nerf-sr run refined`: a network that has learnt one size down gives views the detail they lack.
+//! `nerf-sr run refined`: a network trained on downscaled images adds missing detail to views.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -120,7 +120,7 @@ fn a_block_follows_the_one_it_extends() {
     let own = "parameters: {rays: 40000}";
     for (more, words) in [
         ("extends: nothing", &["pipeline.yaml:", "extends: no stage \"nothing\""][..]),
-        ("extends: downscaled-views", &["itself extends a block"]),
+        ("extends: downscaled-views", &["itself extends \"render-depth\""]),
         ("extends: train-ss\n    run: train-ss", &["remove one of them"]),
         ("like: train-ss", &["pipeline.yaml:", "unknown field `like`"]),
     ] {

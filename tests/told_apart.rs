@@ -121,7 +121,7 @@ fn photographs_of_a_scene_that_goes_on_are_opaque_and_unbounded() {
     let folder = project.path("photographs");
     let (background, space, notes) = demo(&project, &folder, "around", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"), "{notes}");
-    assert!(notes.contains("of 12 sampled views: the scene continues behind"), "{notes}");
+    assert!(notes.contains("of 12 sampled views: the photographs show the scene up to"), "{notes}");
     let (background, space, notes) = demo(&project, &folder, "forward", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
     let (background, space, notes) = demo(&project, &folder, "around", false);

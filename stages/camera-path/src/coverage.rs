@@ -13,19 +13,19 @@ const BORDER_TOLERANCE: f64 = 0.0025;
 /// Cameras whose images cover the scene.
 pub(crate) struct Coverage<'a> {
     cameras: &'a [Camera],
-    /// Frame whose image size and lens all tested frames have.
-    frame: &'a Camera,
+    /// Camera with the image size and lens of all tested frames.
+    template: &'a Camera,
     depths: Vec<f64>,
 }
 
 impl<'a> Coverage<'a> {
     /// Creates the coverage of frames by cameras, for surfaces between two depths.
-    pub(crate) fn new(cameras: &'a [Camera], frame: &'a Camera, near: f64, far: f64) -> Self {
+    pub(crate) fn new(cameras: &'a [Camera], template: &'a Camera, near: f64, far: f64) -> Self {
         let depth = |i: u32| {
             let fraction = f64::from(i) / f64::from(DEPTH_SAMPLES - 1);
             1.0 / ((1.0 - fraction) / near + fraction / far)
         };
-        Self { cameras, frame, depths: (0..DEPTH_SAMPLES).map(depth).collect() }
+        Self { cameras, template, depths: (0..DEPTH_SAMPLES).map(depth).collect() }
     }
 
     /// Returns the number of points of a frame that are tested.
@@ -35,7 +35,7 @@ impl<'a> Coverage<'a> {
 
     /// Returns the number of tested points of a frame that no camera observes.
     pub(crate) fn count_unseen(&self, pose: Pose) -> usize {
-        let frame = Camera { camera_to_world: pose, ..self.frame.clone() };
+        let frame = Camera { camera_to_world: pose, ..self.template.clone() };
         let rays = frame.rays();
         let (width, height) =
             (f64::from(frame.intrinsics.width), f64::from(frame.intrinsics.height));

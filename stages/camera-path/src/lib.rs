@@ -69,7 +69,7 @@ impl Stage for CameraPath {
         let kinds =
             ["scene/train", "scene/cameras", "scene/truth", "scene/references", "cameras", "views"];
         let path = "folder with camera_path.json, as the viewer, nerfstudio or this stage writes \
-            it; replaces kind and frames";
+            it; used instead of `kind` and `frames`";
         vec![
             ("cameras", Input::required(&kinds, "folder with views.json: the scene's cameras")),
             ("path", Input::optional(&["cameras"], path)),
@@ -122,17 +122,17 @@ fn computed_path(
     scene: &Views,
     params: &Params,
 ) -> Result<(PathFile, String), Failure> {
-    let mut frame = scene.views[0].camera.clone();
+    let mut template = scene.views[0].camera.clone();
     // Frames have no lens distortion.
-    frame.intrinsics = frame.intrinsics.pinhole().unwrap_or(frame.intrinsics);
+    template.intrinsics = template.intrinsics.pinhole().unwrap_or(template.intrinsics);
     let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
     let hr_width = degradation.map(|degradation| degradation.hr[0]);
-    let width = params.size.or(hr_width).unwrap_or(frame.intrinsics.width);
-    let frame = frame.resized(width, height_at(width, &frame.intrinsics));
+    let width = params.size.or(hr_width).unwrap_or(template.intrinsics.width);
+    let template = template.resized(width, height_at(width, &template.intrinsics));
     let cameras: Vec<Camera> = scene.views.iter().map(|v| v.camera.clone()).collect();
     let kind = params.kind.unwrap_or_else(|| default_kind(&cameras));
-    let poses = poses(kind, params.frames, &frame, &cameras, &scene.bounds);
-    let path = PathFile::new(&frame.intrinsics, &poses, true);
+    let poses = poses(kind, params.frames, &template, &cameras, &scene.bounds);
+    let path = PathFile::new(&template.intrinsics, &poses, true);
     Ok((path, format!("{kind:?}").to_lowercase()))
 }
 

@@ -9,33 +9,33 @@ use crate::Kind;
 use crate::coverage::Coverage;
 use crate::orbit::Orbit;
 
-/// Disparity of the point that a spiral's frames look at, relative to the way from far to near: a
-/// quarter from near, where most of a scene is; chosen by hand.
+/// Disparity of the point that a spiral's frames face, as a fraction of the disparity range: 0 is
+/// far, 1 is near, where most of a scene is; chosen by hand.
 const FOCUS_FRACTION: f64 = 0.75;
 /// Shares of the focus's disparity that are tried; with 0 all frames look in one direction.
 const FOCUS_STEPS: [f64; 5] = [1.0, 0.75, 0.5, 0.25, 0.0];
-/// Maximum share of a frame's tested points that no camera observes. In frames of fern these are
-/// points in corners at its nearest depth, where the scene has no surface; with 0 its spiral would
-/// be 0.35 of the cameras' width instead of 0.95.
+/// Maximum share of a frame's tested points that no camera observes. In frames of scene fern, the
+/// unobserved points are in corners at the nearest depth, where fern has no surface. With a maximum
+/// of 0, fern's spiral would be 0.35 times as wide as the cameras' positions, not 0.95 times.
 const MAX_UNSEEN_FRACTION: f64 = 0.01;
 /// Number of sizes that are tried for a spiral; chosen by hand.
 const SIZE_STEPS: u32 = 20;
 /// Number of frames of a spiral that are tested; chosen by hand.
 const TESTED_FRAMES: u32 = 32;
 
-/// Computes the poses of a closed path: `camera_to_world` of each frame. `frame` has the frames'
+/// Computes the poses of a closed path: `camera_to_world` of each frame. `template` has the frames'
 /// image size and lens.
 pub fn poses(
     kind: Kind,
-    frames: u32,
-    frame: &Camera,
+    frame_count: u32,
+    template: &Camera,
     cameras: &[Camera],
     bounds: &Bounds,
 ) -> Vec<Pose> {
-    let fractions = (0..frames).map(|i| f64::from(i) / f64::from(frames));
+    let fractions = (0..frame_count).map(|i| f64::from(i) / f64::from(frame_count));
     match kind {
         Kind::Spiral => {
-            let spiral = Spiral::fit(cameras, frame, bounds);
+            let spiral = Spiral::fit(cameras, template, bounds);
             fractions.map(|fraction| spiral.pose(TAU * fraction)).collect()
         }
         Kind::Orbit => {
@@ -88,10 +88,10 @@ impl Spiral {
     /// Creates the largest spiral that stays where the cameras looked: at most
     /// [`MAX_UNSEEN_FRACTION`] of a frame is unobserved, or as much as at the mean camera. A
     /// farther focus is preferred to a smaller spiral.
-    fn fit(cameras: &[Camera], frame: &Camera, bounds: &Bounds) -> Self {
+    fn fit(cameras: &[Camera], template: &Camera, bounds: &Bounds) -> Self {
         let (near, far) = depth_range(bounds);
         let whole = Self::around(cameras, (near, far));
-        let coverage = Coverage::new(cameras, frame, near, far);
+        let coverage = Coverage::new(cameras, template, near, far);
         let at_mean = coverage.count_unseen(whole.scaled(0.0, 0.0).pose(0.0));
         let allowed = at_mean.max((MAX_UNSEEN_FRACTION * coverage.point_count() as f64) as usize);
         let angle = |i: u32| TAU * f64::from(i) / f64::from(TESTED_FRAMES);

@@ -30,7 +30,7 @@ enum ViewLens {
 impl ViewCamera {
     /// Creates the camera of test views, which is also the default for training views.
     pub(crate) fn of_test(params: &Params) -> Self {
-        Self::pinhole(params.sides(), params.angle_x())
+        Self::pinhole(params.test_image_size(), params.test_angle_x_radians())
     }
 
     /// Creates the camera of training views, with as many pixels per degree in the middle as in

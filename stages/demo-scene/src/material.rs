@@ -10,11 +10,11 @@ pub(crate) enum Material {
     /// Printed crate: framed cells, filled at random by a hash.
     Crate,
     /// Glossy red with pale veins.
-    Ball,
-    /// Matt stripes, for the ball inside the cage.
+    RedVeined,
+    /// Matt stripes.
     Stripes,
     /// Dark metal.
-    Rod,
+    DarkMetal,
     /// Copper.
     Copper,
     /// Rows of fine marks.
@@ -55,16 +55,16 @@ pub(crate) fn cell(x: f64) -> i64 {
 }
 
 /// Returns a material's reflectance at a point with a normal, both in the shape's own space
-/// (centred, about 1 in size).
+/// (centred, each coordinate about -1 to 1).
 pub(crate) fn reflectance(material: Material, p: DVec3, normal: DVec3, seed: u32) -> Reflectance {
     match material {
         Material::Tiles => matt(tiles(p, normal, seed)),
         Material::Crate => matt(printed_crate(p, normal, seed)),
-        Material::Ball => {
+        Material::RedVeined => {
             Reflectance { albedo: veins(p, seed), specular: 0.9, exponent: 120, mirror: 0.12 }
         }
         Material::Stripes => matt(stripes(p)),
-        Material::Rod => {
+        Material::DarkMetal => {
             Reflectance { albedo: DVec3::splat(0.12), specular: 0.35, exponent: 30, mirror: 0.0 }
         }
         Material::Copper => Reflectance {
@@ -78,7 +78,7 @@ pub(crate) fn reflectance(material: Material, p: DVec3, normal: DVec3, seed: u32
     }
 }
 
-/// Returns the reflectance of a surface without reflections and with a faint highlight.
+/// Returns the reflectance of a matt surface: a faint highlight and no mirror image.
 fn matt(albedo: DVec3) -> Reflectance {
     Reflectance { albedo, specular: 0.05, exponent: 12, mirror: 0.0 }
 }
@@ -92,10 +92,10 @@ fn tiles(p: DVec3, normal: DVec3, seed: u32) -> DVec3 {
         return DVec3::new(0.30, 0.17, 0.08) * (0.6 + 0.8 * plank);
     }
     let ring = cell(radius * 14.0);
-    let around = (2 * ring + 7) as f64;
+    let tile_count = (2 * ring + 7) as f64;
     let angle = libm::atan2(p.y, p.x) / std::f64::consts::TAU + 0.5;
-    let tile = cell(angle * around);
-    let is_joint = (radius * 14.0).fract().min((angle * around).fract()) < 0.08;
+    let tile = cell(angle * tile_count);
+    let is_joint = (radius * 14.0).fract().min((angle * tile_count).fract()) < 0.08;
     let tone = hash(ring, tile, 2, seed);
     let light = if (ring + tile) % 2 == 0 { 0.62 } else { 0.16 };
     let tint =

@@ -10,8 +10,8 @@ pub(crate) const CAMERA_ANGLE: f64 = 0.691_111_2;
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the images in pixels. With `projection` or `angle`, only test views have this
-    /// width; that of training views follows from their angle of view.
+    /// Width of the images in pixels. With `projection: fisheye` or `angle`, only test views have
+    /// this width; that of training views follows from their angle of view.
     #[schemars(range(min = 1, max = 2048))]
     pub size: u32,
     /// Width of the images divided by their height.
@@ -42,8 +42,8 @@ pub struct Params {
     pub generated: bool,
     /// Format of the data set.
     pub form: Form,
-    /// Difference in exposure between training views, from the mean exposure: 0.1 makes each about
-    /// 10 % brighter or darker. Test views have the mean exposure.
+    /// Deviation of each training view's exposure from the mean: 0.1 makes views about 10 %
+    /// brighter or darker. Test views have the mean exposure.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub exposure_difference: f64,
     /// Standard deviation of the errors in the training views' poses: rotation about each axis, in
@@ -78,13 +78,13 @@ impl Params {
     }
 
     /// Returns width and height of the test images in pixels.
-    pub(crate) fn sides(&self) -> [u32; 2] {
+    pub(crate) fn test_image_size(&self) -> [u32; 2] {
         [self.size, ((f64::from(self.size) / self.aspect).round() as u32).max(1)]
     }
 
     /// Returns the horizontal angle of view of the test images in radians.
-    pub(crate) fn angle_x(&self) -> f64 {
-        let [width, height] = self.sides();
+    pub(crate) fn test_angle_x_radians(&self) -> f64 {
+        let [width, height] = self.test_image_size();
         if width <= height {
             return CAMERA_ANGLE;
         }

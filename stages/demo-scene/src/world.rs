@@ -70,7 +70,7 @@ pub(crate) struct Hit {
     pub(crate) t: f64,
     /// Unit normal in world space.
     pub(crate) normal: DVec3,
-    /// Point in the object's own space, about 1 in size: coordinates of textures.
+    /// Point in the object's own space, each coordinate about -1 to 1: coordinates of textures.
     pub(crate) local: DVec3,
     /// Normal in the object's own space.
     pub(crate) local_normal: DVec3,
@@ -102,7 +102,7 @@ impl World {
         let mut clusters = vec![
             base(),
             printed_crate(foot(0, 0.62), 0.5 + turn),
-            Cluster::new(vec![Object::new(Shape::Ball(0.3), ball_centre, Material::Ball)]),
+            Cluster::new(vec![Object::new(Shape::Ball(0.3), ball_centre, Material::RedVeined)]),
             cage(foot(2, 0.64)),
         ];
         clusters.extend(spring(foot(3, 0.60)));
@@ -229,12 +229,16 @@ fn cage(foot: DVec3) -> Cluster {
     let on_circle = |k: usize, n: usize| 0.27 * horizontal_direction(k as f64 / n as f64 * TAU);
     for k in 0..12 {
         let p = on_circle(k, 12);
-        objects.push(Object::new(Shape::Rod(p, p + DVec3::Z * 0.7, 0.011), foot, Material::Rod));
+        objects.push(Object::new(
+            Shape::Rod(p, p + DVec3::Z * 0.7, 0.011),
+            foot,
+            Material::DarkMetal,
+        ));
     }
     for height in [0.02, 0.36, 0.7] {
         for k in 0..20 {
             let [a, b] = [k, k + 1].map(|k| on_circle(k, 20) + DVec3::Z * height);
-            objects.push(Object::new(Shape::Rod(a, b, 0.013), foot, Material::Rod));
+            objects.push(Object::new(Shape::Rod(a, b, 0.013), foot, Material::DarkMetal));
         }
     }
     Cluster::new(objects)
@@ -262,7 +266,8 @@ fn spring_point(fraction: f64) -> DVec3 {
 /// Creates the sign on a thin post.
 fn sign(foot: DVec3) -> Cluster {
     let facing = libm::atan2(foot.y, foot.x) + std::f64::consts::FRAC_PI_2;
-    let post = Object::new(Shape::Rod(DVec3::ZERO, DVec3::Z * 0.5, 0.014), foot, Material::Rod);
+    let post =
+        Object::new(Shape::Rod(DVec3::ZERO, DVec3::Z * 0.5, 0.014), foot, Material::DarkMetal);
     let board = Shape::Block(DVec3::new(0.27, 0.010, 0.19));
     let board = Object::new(board, foot + DVec3::Z * 0.62, Material::Sign);
     Cluster::new(vec![post, Object { to_local: vertical_rotation(facing), ..board }])

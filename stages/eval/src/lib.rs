@@ -23,7 +23,7 @@ mod scoring;
 use std::collections::BTreeMap;
 
 use metrics::{METRICS_FILE, Metrics, Scores, ViewScores};
-use pixels::{DEGRADATION_FILE, Degradation, Image, Palette, Rgba8, heat, write_png};
+use pixels::{DEGRADATION_FILE, Degradation, Image, Palette, Rgba8, palette_colour, write_png};
 use rayon::prelude::*;
 use scene::{Background, Views};
 use schemars::JsonSchema;
@@ -69,7 +69,8 @@ impl Stage for Eval {
                 "baseline",
                 Input::optional(
                     &["metrics"],
-                    "another method's scores of the same views, to compute the smallest gain of a view",
+                    "another method's scores of the same views, to compute the smallest gain in \
+                    PSNR of any view over that method",
                 ),
             ),
             (
@@ -83,8 +84,10 @@ impl Stage for Eval {
                 "weights",
                 Input::optional(
                     &["weights"],
-                    "folder with networks and their heads, for LPIPS: squeezenet1_1.safetensors \
-                    and lpips_linear_squeeze_v0.1.safetensors, also alexnet and vgg16",
+                    "folder with networks for LPIPS, each a pair of files: \
+                    squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors; \
+                    alexnet.safetensors and lpips_linear_alex_v0.1.safetensors; vgg16.safetensors \
+                    and lpips_linear_vgg_v0.1.safetensors",
                 ),
             ),
         ]
@@ -179,7 +182,7 @@ fn draw_error_map(render: &Image, truth: &Image, range: f32) -> Rgba8 {
     for (i, [r, g, b]) in render.data.as_chunks::<3>().0.iter().enumerate() {
         let truth = truth_pixels[i];
         let error = ((r - truth[0]).abs() + (g - truth[1]).abs() + (b - truth[2]).abs()) / 3.0;
-        data.extend(heat(Palette::Error, error / range));
+        data.extend(palette_colour(Palette::Error, error / range));
         data.push(255);
     }
     Rgba8::new(render.width, render.height, data)

@@ -30,7 +30,11 @@ impl Stage for CopyFiles {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "run",
-            Input::required(&["run"], "folder with run.json, the record of the artifacts"),
+            Input::required(
+                &["run"],
+                "in pipeline.yaml: a block whose artifact is copied; nerf-sr passes a folder \
+                with its record, run.json",
+            ),
         )]
     }
 

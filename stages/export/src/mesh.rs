@@ -21,9 +21,9 @@ impl Mesh {
         let mut sums = vec![DVec3::ZERO; self.positions.len()];
         for triangle in &self.triangles {
             let [a, b, c] = triangle.map(|v| self.positions[v as usize].as_dvec3());
-            let area = (b - a).cross(c - a);
+            let weighted_normal = (b - a).cross(c - a);
             for &vertex in triangle {
-                sums[vertex as usize] += area;
+                sums[vertex as usize] += weighted_normal;
             }
         }
         self.normals = sums.iter().map(|sum| sum.normalize_or(DVec3::Z).as_vec3()).collect();

@@ -4,15 +4,15 @@ use stage::Progress;
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 
-/// Extracts the surface between nodes with negative values, inside, and the others (naive surface
-/// nets, Gibson 1998). Each cell that the surface crosses gets a vertex, at the mean of the
+/// Extracts the surface between nodes inside, which have negative values, and the others (naive
+/// surface nets, Gibson 1998). Each cell that the surface crosses gets a vertex, at the mean of the
 /// crossings with the cell's edges; each crossed edge gets a quad around it. NaN is unknown: the
 /// surface has a hole there.
 pub(crate) fn extract(lattice: &Lattice, values: &[f32], progress: &Progress) -> Mesh {
     let cells = Cells { lattice, values, strides: lattice.strides() };
     let mut mesh = Mesh::default();
     let [nx, ny, nz] = lattice.counts;
-    // A quad connects cells of two neighbouring layers, so only the vertices of two are stored.
+    // A quad connects cells of two neighbouring layers, so only two layers' vertices are stored.
     let mut vertices = vec![u32::MAX; 2 * nx * ny];
     let stored = vertices.len();
     for k in 0..nz - 1 {
@@ -44,7 +44,7 @@ struct Cells<'a> {
 }
 
 impl Cells<'_> {
-    /// Returns the linear index of a node, or of the cell above it.
+    /// Returns the linear index of a node, or of the cell whose lowest node it is.
     fn index(&self, cell: [usize; 3]) -> usize {
         (0..3).map(|axis| cell[axis] * self.strides[axis]).sum()
     }
@@ -76,8 +76,8 @@ impl Cells<'_> {
         if count == 0 {
             return None;
         }
-        let node = sum / f64::from(count) + DVec3::from(cell.map(|i| i as f64));
-        Some(self.lattice.to_world(node.to_array()).as_vec3())
+        let position = sum / f64::from(count) + DVec3::from(cell.map(|i| i as f64));
+        Some(self.lattice.to_world(position.to_array()).as_vec3())
     }
 
     /// Adds two triangles between the four cells around the edge from a node along an axis, if the

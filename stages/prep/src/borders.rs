@@ -13,11 +13,11 @@ use crate::strips::Strips;
 /// varies more from corner to corner (docs/design/035).
 const MAX_NOISE_LEVELS: u8 = 8;
 
-/// Evidence of what is behind a scene.
+/// Evidence in the images' borders for the scene's background.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Backdrop {
+pub(crate) enum BorderEvidence {
     /// Images have alpha.
-    Transparent,
+    Alpha,
     /// Borders are one flat colour.
     Flat([u8; 3]),
     /// Borders show more of the scene.
@@ -28,7 +28,7 @@ pub(crate) enum Backdrop {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Border {
     /// The image has alpha.
-    Transparent,
+    Alpha,
     /// Nine tenths of the border's pixels are similar to their median.
     Flat([u8; 3]),
     /// Anything else.
@@ -39,7 +39,7 @@ impl Border {
     /// Classifies an image's border.
     pub(crate) fn of(image: &Rgba8) -> Self {
         if image.data.chunks_exact(4).any(|p| p[3] != u8::MAX) {
-            return Self::Transparent;
+            return Self::Alpha;
         }
         let (width, height) = (image.width, image.height);
         let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
@@ -55,7 +55,7 @@ impl Border {
 /// Combined borders of the sampled views.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Borders {
-    pub(crate) backdrop: Backdrop,
+    pub(crate) evidence: BorderEvidence,
     /// Number of views whose borders are the flat colour.
     flat: usize,
     /// Number of sampled views.
@@ -74,12 +74,12 @@ struct CommonStrips {
 }
 
 impl Borders {
-    /// Combines the borders of sampled views. One image with alpha makes the backdrop transparent;
-    /// nine in ten views must share a flat colour.
+    /// Combines the borders of sampled views. One image with alpha is evidence of alpha; nine in
+    /// ten views must share a flat colour.
     pub(crate) fn new(borders: &[Border]) -> Self {
         let views = borders.len();
-        if borders.contains(&Border::Transparent) {
-            return Self { backdrop: Backdrop::Transparent, flat: 0, views, strips: None };
+        if borders.contains(&Border::Alpha) {
+            return Self { evidence: BorderEvidence::Alpha, flat: 0, views, strips: None };
         }
         let mut colours: Vec<[u8; 3]> = Vec::new();
         for border in borders {
@@ -90,29 +90,30 @@ impl Borders {
         let median = median_colour(&colours);
         let flat = colours.iter().filter(|colour| is_similar(**colour, median)).count();
         let is_flat = views > 0 && 10 * flat >= 9 * views;
-        let backdrop = if is_flat { Backdrop::Flat(median) } else { Backdrop::Scene };
-        Self { backdrop, flat, views, strips: None }
+        let evidence = if is_flat { BorderEvidence::Flat(median) } else { BorderEvidence::Scene };
+        Self { evidence, flat, views, strips: None }
     }
 
-    /// Adds the strips that the views have in common. A frame of strips is not a background.
+    /// Adds the strips that the views have in common. If all four sides have strips, their flat
+    /// colour is no evidence for a background.
     pub(crate) fn with_strips(mut self, views: &[ViewBorder]) -> Self {
         let strips: Vec<Option<Strips>> = views.iter().map(|view| view.strips).collect();
-        let common = Strips::common(&strips).filter(|_| self.backdrop != Backdrop::Transparent);
+        let common = Strips::common(&strips).filter(|_| self.evidence != BorderEvidence::Alpha);
         if let Some((strips, count)) = common {
             let are_masked = views.iter().all(|view| view.strips.is_none() || view.are_masked);
             self.strips = Some(CommonStrips { strips, views: count, are_masked });
             if strips.is_frame() {
-                self.backdrop = Backdrop::Scene;
+                self.evidence = BorderEvidence::Scene;
             }
         }
         self
     }
 
     /// Returns the evidence for the background, one note per line, and the remedy for strips.
-    pub(crate) fn notes(&self) -> Vec<String> {
+    pub(crate) fn notes(&self, is_background_given: bool) -> Vec<String> {
         let mut notes = Vec::new();
         let is_frame = self.strips.as_ref().is_some_and(|common| common.strips.is_frame());
-        if self.backdrop != Backdrop::Transparent && !is_frame {
+        if !is_background_given && self.evidence != BorderEvidence::Alpha && !is_frame {
             notes.push(self.to_string());
         }
         if let Some(CommonStrips { strips, views, are_masked }) = &self.strips {
@@ -132,11 +133,12 @@ impl Borders {
     /// Returns the background that rays see behind the scene. A flat colour that is neither white
     /// nor black is a wall: part of the scene.
     pub(crate) fn background(&self) -> Background {
-        match self.backdrop {
-            Backdrop::Transparent => Background::White,
-            Backdrop::Flat(colour) if is_similar(colour, [u8::MAX; 3]) => Background::White,
-            Backdrop::Flat(colour) if is_similar(colour, [0; 3]) => Background::Black,
-            Backdrop::Flat(_) | Backdrop::Scene => Background::Opaque,
+        match self.evidence {
+            // Alpha is composited over white.
+            BorderEvidence::Alpha => Background::White,
+            BorderEvidence::Flat(colour) if is_similar(colour, [u8::MAX; 3]) => Background::White,
+            BorderEvidence::Flat(colour) if is_similar(colour, [0; 3]) => Background::Black,
+            BorderEvidence::Flat(_) | BorderEvidence::Scene => Background::Opaque,
         }
     }
 }
@@ -146,17 +148,17 @@ impl Display for Borders {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let flat = self.flat;
         let views = format_count(self.views, "sampled view");
-        match self.backdrop {
-            Backdrop::Transparent => write!(f, "images have alpha"),
-            Backdrop::Flat([r, g, b]) => write!(
+        match self.evidence {
+            BorderEvidence::Alpha => write!(f, "images have alpha"),
+            BorderEvidence::Flat([r, g, b]) => write!(
                 f,
                 "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of \
                 {views}"
             ),
-            Backdrop::Scene => write!(
+            BorderEvidence::Scene => write!(
                 f,
-                "images have no alpha; borders are one flat colour in {flat} of {views}: the scene \
-                continues behind the object, background opaque"
+                "images have no alpha; borders are one flat colour in {flat} of {views}: the \
+                photographs show the scene up to their borders, so background is opaque"
             ),
         }
     }
@@ -221,7 +223,7 @@ mod tests {
         assert_eq!(of(&views(&picture([3; 3], 3, 0), 1)).background(), Background::Black);
         // A tenth of a border may be something else, and a tenth of the views.
         let cut = views(&picture([255; 3], 0, 12), 3);
-        assert_eq!(of(&cut).backdrop, Backdrop::Scene);
+        assert_eq!(of(&cut).evidence, BorderEvidence::Scene);
         let mut most = views(&picture([255; 3], 0, 0), 9);
         most.push(picture([120; 3], 60, 0));
         assert_eq!(of(&most).background(), Background::White);
@@ -229,11 +231,11 @@ mod tests {
         assert_eq!(of(&most).background(), Background::Opaque);
         // Walls: each view has another flat colour, or all the same grey.
         let walls: Vec<Rgba8> = (0..5).map(|i| picture([50 * i; 3], 0, 0)).collect();
-        assert_eq!(of(&walls).backdrop, Backdrop::Scene);
+        assert_eq!(of(&walls).evidence, BorderEvidence::Scene);
         let grey = of(&views(&picture([128; 3], 0, 0), 5));
         assert_eq!(
-            (grey.backdrop, grey.background()),
-            (Backdrop::Flat([128; 3]), Background::Opaque)
+            (grey.evidence, grey.background()),
+            (BorderEvidence::Flat([128; 3]), Background::Opaque)
         );
         assert_eq!(of(&[]).background(), Background::Opaque);
     }
@@ -244,8 +246,8 @@ mod tests {
         image.data[7] = 254;
         let borders = of(&[picture([0; 3], 0, 0), image]);
         assert_eq!(
-            (borders.backdrop, borders.background()),
-            (Backdrop::Transparent, Background::White)
+            (borders.evidence, borders.background()),
+            (BorderEvidence::Alpha, Background::White)
         );
     }
 }

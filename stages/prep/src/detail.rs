@@ -1,5 +1,5 @@
 //! Measures how far the spectrum of photographs reaches: enlarged, blurred or unfocused photographs
-//! hold less detail than their pixels could (docs/design/035).
+//! contain less detail than their pixels could (docs/design/035).
 
 use artifact::WARNING;
 use pixels::Rgba8;
@@ -8,19 +8,20 @@ use pixels::Rgba8;
 const BLOCK_SIDE: usize = 32;
 /// Maximum number of blocks of an image; chosen by hand.
 const MAX_BLOCKS: usize = 256;
-/// Part of the blocks of largest variance that are measured: smooth areas have no detail.
-const DETAILED_PART: usize = 4;
+/// Divisor of the number of blocks: one in four is measured. These are the blocks of largest
+/// variance, since smooth areas have no detail.
+const MEASURED_DIVISOR: usize = 4;
 /// Frequencies that fix the expected spectrum.
 const REFERENCE_FREQUENCIES: [usize; 2] = [2, 3];
-/// Minimum power at [`REFERENCE_FREQUENCIES`] of images with structure, in squared levels; chosen by
-/// hand.
+/// Minimum flattened power (k² times the power at frequency k) of images with structure, in squared
+/// levels: the mean at [`REFERENCE_FREQUENCIES`], summed over all measured blocks; chosen by hand.
 const MIN_POWER: f64 = 1.0;
 /// First frequency that is compared with the expected spectrum.
 const FIRST_COMPARED: usize = 4;
-/// Minimum part of the expected power where there is detail: 6 dB less.
-const MIN_PART: f64 = 0.25;
-/// Part of the LR images' resolution below which detail is missing. Images from full-size sensors
-/// reach 0.78.
+/// Minimum ratio of power to expected power where there is detail: 6 dB less.
+const MIN_POWER_RATIO: f64 = 0.25;
+/// Fraction of the LR images' resolution below which detail is missing. Photographs at their
+/// camera's full resolution reach 0.78.
 const MIN_REACH: f64 = 0.7;
 
 /// Power of image blocks by frequency, in both directions.
@@ -40,7 +41,7 @@ impl Spectrum {
         }
         // The sort is stable, so that equal blocks keep their order.
         blocks.sort_by(|a, b| b.1.total_cmp(&a.1));
-        blocks.truncate(blocks.len().div_ceil(DETAILED_PART));
+        blocks.truncate(blocks.len().div_ceil(MEASURED_DIVISOR));
         let stride = blocks.len().div_ceil(MAX_BLOCKS).max(1);
         let waves = waves();
         let mut power = [0.0; BLOCK_SIDE];
@@ -61,29 +62,31 @@ impl Spectrum {
         sum
     }
 
-    /// Returns the part of the resolution that detail reaches, from 0 to 1. The power of sharp
+    /// Returns the fraction of the resolution that detail reaches, from 0 to 1. The power of sharp
     /// images falls with the square of the frequency (Field 1987, "Relations between the statistics
     /// of natural images and the response properties of cortical cells"). Noise counts as detail.
     /// Returns `None` for images without blocks or structure.
     pub(crate) fn reach(&self) -> Option<f64> {
-        let part = |k: usize| self.power[k] * (k * k) as f64;
-        let expected = REFERENCE_FREQUENCIES.map(part).iter().sum::<f64>()
+        let flattened_power = |k: usize| self.power[k] * (k * k) as f64;
+        let expected = REFERENCE_FREQUENCIES.map(flattened_power).iter().sum::<f64>()
             / REFERENCE_FREQUENCIES.len() as f64;
         if expected.is_nan() || expected <= MIN_POWER {
             return None;
         }
-        let mean = |k: usize| {
+        // Geometric mean over neighbouring frequencies.
+        let power_ratio = |k: usize| {
             let near = (k - 1)..=(k + 1).min(BLOCK_SIDE - 1);
-            let parts = near.clone().map(|k| (part(k) / expected).max(f64::MIN_POSITIVE).ln());
-            (parts.sum::<f64>() / near.count() as f64).exp()
+            let ratios = near.clone().map(|k| flattened_power(k) / expected);
+            let logarithms = ratios.map(|ratio| ratio.max(f64::MIN_POSITIVE).ln());
+            (logarithms.sum::<f64>() / near.count() as f64).exp()
         };
-        let end = (FIRST_COMPARED..BLOCK_SIDE).find(|&k| mean(k) < MIN_PART).unwrap_or(BLOCK_SIDE);
-        Some(end as f64 / BLOCK_SIDE as f64)
+        let end = (FIRST_COMPARED..BLOCK_SIDE).find(|&k| power_ratio(k) < MIN_POWER_RATIO);
+        Some(end.unwrap_or(BLOCK_SIDE) as f64 / BLOCK_SIDE as f64)
     }
 }
 
-/// Returns the part of the resolution of LR images that detail reaches, from that of photographs
-/// which are `factor` times as wide.
+/// Returns the fraction of the LR images' resolution that detail reaches. `reach` is the fraction
+/// for photographs, which are `factor` times as wide.
 pub(crate) fn lr_reach(reach: f64, factor: f64) -> f64 {
     (reach * factor).min(1.0)
 }
@@ -93,8 +96,8 @@ pub(crate) fn missing_detail_warning(lr_reach: f64, lr_width: u32) -> Option<Str
     (lr_reach < MIN_REACH).then(|| {
         let width = (lr_reach * f64::from(lr_width)).ceil();
         format!(
-            "{WARNING}detail reaches only {:.0} % of the LR images' resolution: enlarged, blurred \
-            or unfocused photographs show nothing new at a larger scale; lr_width {width} keeps \
+            "{WARNING}detail reaches only {:.0} % of the LR images' resolution: the photographs \
+            are enlarged, blurred or unfocused; lr_width {width} with lr_source downscaled keeps \
             all detail, in less time",
             100.0 * lr_reach
         )

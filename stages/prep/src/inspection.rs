@@ -35,7 +35,7 @@ impl Inspection {
         let count = frames.len().min(MAX_VIEWS);
         let mut views: Vec<(ViewBorder, Spectrum)> =
             frames.first().map(|first| inspect_view(first)).transpose()?.into_iter().collect();
-        if views.iter().any(|(view, _)| view.border != Border::Transparent) {
+        if views.iter().any(|(view, _)| view.border != Border::Alpha) {
             let others =
                 (1..count).into_par_iter().map(|i| inspect_view(frames[i * frames.len() / count]));
             views.extend(others.collect::<anyhow::Result<Vec<_>>>()?);
@@ -54,7 +54,7 @@ fn inspect_view(frame: &Frame) -> anyhow::Result<(ViewBorder, Spectrum)> {
     if matches!(border, Border::Flat(_)) && frame.intrinsics().has_cut_rays() {
         border = Border::Mixed;
     }
-    let strips = if border == Border::Transparent { None } else { Strips::of(&image) };
+    let strips = if border == Border::Alpha { None } else { Strips::of(&image) };
     let mut are_masked = false;
     if let Some(strips) = &strips {
         let mask = frame.mask().bad_input(frame_label(frame))?;

@@ -1,5 +1,5 @@
-//! `prep`: posed images → scene. Creates HR ground truth and, from it, the LR images that training
-//! may see.
+//! `prep`: posed images → scene. Creates the LR images that training may see, and HR ground truth
+//! if there is any.
 //!
 //! * [`Params`]; `split`: training views, test views, references; `image_plan`: image sizes and
 //!   kernel; `scene_plan`: all decisions before anything is written; `writer`: writes the scene,
@@ -100,6 +100,9 @@ impl Stage for Prep {
         if let Some(lr_width) = params.lr_width.filter(|_| !images.has_truth) {
             notes.push(format!("lr_width {lr_width} has no effect with lr_source photographs"));
         }
+        if params.hr_references > Params::default().hr_references && !images.has_truth {
+            notes.push("hr_references has no effect with lr_source photographs".to_owned());
+        }
         notes.extend(warnings);
         for note in &notes {
             context.log_line(note);
@@ -109,7 +112,7 @@ impl Stage for Prep {
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
         let Inspection { borders, spectrum } = threads.install(|| Inspection::of(&training))?;
         let background = params.background.unwrap_or(borders.background());
-        let border_notes = if params.background.is_some() { Vec::new() } else { borders.notes() };
+        let border_notes = borders.notes(params.background.is_some());
         let detail = spectrum.reach().map(|reach| detail::lr_reach(reach, images.lr_factor()));
         let detail_note =
             detail.and_then(|reach| detail::missing_detail_warning(reach, images.sizes.lr.0));
@@ -148,7 +151,8 @@ fn read_dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
     Ok(if needs_merge { set.without_split() } else { set })
 }
 
-/// Fails at the first frame whose distorted lens has no ray for some pixels.
+/// Fails at the first frame whose camera is invalid, for example if its distortion isn't invertible
+/// within the image. Pixels of a fisheye lens beyond 89° are masked instead.
 fn check_lenses(set: &Dataset) -> Result<(), Failure> {
     for frame in &set.frames {
         if let Err(error) = frame.camera().check() {

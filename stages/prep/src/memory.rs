@@ -67,7 +67,8 @@ pub(crate) fn thread_pool<'a>(
         count = largest.max_concurrent(free)?.min(context.threads);
         if count < context.threads {
             context.log_line(format!(
-                "using {count} of {} threads: an image needs {} of memory, and {} are free",
+                "using {count} of {} threads: preparing the largest image needs {} of memory, and \
+                {} are free",
                 context.threads,
                 format_size(largest.bytes),
                 format_size(free)

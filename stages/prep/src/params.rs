@@ -13,7 +13,7 @@ pub struct Params {
     /// `lr_source: photographs`. Default: the width of the data set's images divided by `scale`.
     #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub lr_width: Option<u32>,
-    /// HR width over LR width.
+    /// HR width divided by LR width.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "output"))]
     pub scale: f64,
     /// Source of the LR images: the `photographs` themselves, without HR ground truth, or images
@@ -25,35 +25,41 @@ pub struct Params {
     /// of the photographs. Default: `lanczos` for downscaled images, `box` for photographs.
     #[schemars(extend("x-group" = "data", "x-default" = "by `lr_source`"))]
     pub kernel: Option<Kernel>,
-    /// Treatment of lens distortion and of fisheye lenses that the data set describes.
+    /// Treatment of lens distortion and of fisheye lenses that the data set describes. `follow`:
+    /// rays follow the distortion. `undo`: photographs are resampled without it, which crops their
+    /// borders.
     #[schemars(extend("x-group" = "data"))]
     pub lens: LensHandling,
     /// Background of the scene. Default: `white` if images have alpha. Without alpha, `white` or
-    /// `black` if the borders of nine in ten views have that colour and are not strips of
+    /// `black` if the borders of nine in ten views have that colour and aren't empty margins from
     /// undistortion or letterboxing, otherwise `opaque`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub background: Option<Background>,
-    /// Distance along rays at which the scene starts. Default: derived from the cameras.
+    /// Distance along rays at which the scene starts. With `space: ndc` and known depths, it can
+    /// only shorten rays. Default: derived from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub near: Option<f64>,
-    /// Distance along rays at which the scene ends. Default: derived from the cameras.
+    /// Distance along rays at which the scene ends. With `space: ndc` and known depths, it can only
+    /// shorten rays. Default: derived from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub far: Option<f64>,
     /// Space of the field's unit cube. Default: `ndc` if all cameras face one direction, and either
-    /// depths are known or the background is `opaque`. Otherwise `contraction` if the background is
-    /// `opaque` and depths are unknown, and also if known points are far outside the region that
+    /// depths are known or the background is `opaque`. Otherwise `contraction` if depths are
+    /// unknown and the background is `opaque`, or if known points are far outside the region that
     /// the cameras face. Otherwise `box`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub space: Option<SpaceKind>,
-    /// Split into training and test views. Default: the data set's own split, or `holdout` if it
-    /// has none.
+    /// Split into training and test views. `given`: the data set's own. `holdout`: every eighth
+    /// view is a test view. `paper`: all views are trained on, and all except references are test
+    /// views. Default: `given` if the data set has a split, otherwise `holdout`.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub split: Option<SplitKind>,
     /// Maximum number of test views, chosen at even intervals.
     #[schemars(range(min = 1), extend("x-group" = "data", "x-default" = "all"))]
     pub test_views: Option<u32>,
-    /// Number of training views that are also stored at HR, as references. The first view is one;
-    /// each further reference has the camera farthest from the previous references.
+    /// Number of training views that are also stored at HR, as references. The first training view
+    /// is the first reference; each further one has the camera farthest from all previous ones.
+    /// There are no references with `lr_source: photographs`.
     #[schemars(extend("x-group" = "data"))]
     pub hr_references: u32,
 }
@@ -84,8 +90,8 @@ pub enum LensHandling {
     /// Rays follow the distortion: photographs are unchanged, and rendered views have the same
     /// distortion. Pixels more than 89° from the axis of a fisheye lens are masked.
     Follow,
-    /// Photographs are resampled to pinhole cameras, which crops their border. The field of view in
-    /// place of a fisheye lens is at most 100° along the longer side.
+    /// Photographs are resampled to pinhole cameras, which crops their border. The pinhole camera
+    /// that replaces a fisheye lens has a field of view of at most 100° along the longer side.
     Undo,
 }
 

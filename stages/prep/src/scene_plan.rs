@@ -89,6 +89,10 @@ fn bounds(
         }
     }
     if let (Some(far), Space::Ndc(frustum)) = (params.far, &mut bounds.space) {
+        if far <= frustum.near {
+            let [far, near] = [far, frustum.near].map(format_number);
+            bail_usage!("parameter far: {far} is nearer than the scene, which begins at {near}");
+        }
         frustum.far = frustum.far.min(far);
     }
     if bounds.near >= bounds.far || !bounds.is_valid() {
@@ -135,12 +139,12 @@ pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
             format_length(bounds.far, 3)
         ),
         Space::Ndc(f) => format!(
-            "space: NDC, since all cameras face one direction; depth from {} to {}",
+            "space: NDC, for cameras that face one direction, depth from {} to {}",
             format_length(f.near, 3),
             format_length(f.far, 3)
         ),
         Space::Contraction => format!(
-            "space: contraction around a ball of {side} units, rays up to {}",
+            "space: contraction around a ball of diameter {side}, rays up to {}",
             format_length(bounds.far, 0)
         ),
     };
@@ -250,8 +254,8 @@ mod tests {
             ),
             (
                 Space::Contraction,
-                "space: contraction around a ball of 6.00e-5 units, rays up to 9.00e-5; background \
-                black",
+                "space: contraction around a ball of diameter 6.00e-5, rays up to 9.00e-5; \
+                background black",
             ),
         ] {
             let bounds = Bounds { min: [-3e-5; 3], max: [3e-5; 3], near, far, space };

@@ -34,12 +34,12 @@ impl<'a> SceneWriter<'a> {
 
     /// Writes all subtrees.
     pub(crate) fn write(&self) -> anyhow::Result<()> {
-        self.write_training_images()?;
-        self.write_train_and_downscaled()?;
+        self.write_images_of_training_frames()?;
+        self.write_train_and_downscaled_views()?;
         self.write_train_cameras()?;
         self.write_references()?;
-        self.write_truth_images()?;
-        self.write_truth_and_cameras()
+        self.write_images_of_test_frames()?;
+        self.write_truth_and_camera_views()
     }
 
     /// Returns a warning about pixels brighter than 1, if any.
@@ -54,7 +54,7 @@ impl<'a> SceneWriter<'a> {
         }
         Some(format!(
             "{WARNING}{} of {} pixels ({:.2} %) are brighter than 1 and clipped to 1, in {count} of \
-            {} (first: frame {first})",
+            {} (first: frame {first}); to keep them, scale the files to at most 1",
             sum.clipped,
             sum.pixels,
             100.0 * sum.clipped as f64 / sum.pixels as f64,
@@ -79,9 +79,9 @@ impl<'a> SceneWriter<'a> {
         )
     }
 
-    /// Writes the views of `train` and of `downscaled`, the same task at a lower resolution, where
-    /// the solution is known.
-    fn write_train_and_downscaled(&self) -> anyhow::Result<()> {
+    /// Writes the views of `train`, the LR images, and of `downscaled`: LR images shrunk once more,
+    /// with the LR images as ground truth.
+    fn write_train_and_downscaled_views(&self) -> anyhow::Result<()> {
         let images = &self.plan.images;
         let train: Vec<View> = self.plan.train.iter().map(|f| self.training_view(f)).collect();
         let downscaled = train.iter().map(|view| self.downscaled_view(view)).collect();
@@ -97,7 +97,7 @@ impl<'a> SceneWriter<'a> {
         let images = &self.plan.images;
         View {
             image: Some(format!("images/{}.{}", frame.name, degrade::extension(images.kernel))),
-            mask: mask_name(frame),
+            mask: mask_path(frame),
             ..View::camera_only(images.lr_camera(&frame.camera()))
         }
     }
@@ -127,14 +127,14 @@ impl<'a> SceneWriter<'a> {
     fn reference(&self, frame: &Frame) -> View {
         View {
             image: Some(format!("images/{}.png", frame.name)),
-            mask: mask_name(frame),
+            mask: mask_path(frame),
             ..View::camera_only(self.plan.images.hr_camera(&frame.camera()))
         }
     }
 
     /// Writes the views of `truth`, test views at HR size with their LR photographs, and of
     /// `cameras`, their cameras.
-    fn write_truth_and_cameras(&self) -> anyhow::Result<()> {
+    fn write_truth_and_camera_views(&self) -> anyhow::Result<()> {
         let images = &self.plan.images;
         let truth: Vec<View> = self.plan.test.iter().map(|frame| self.test_view(frame)).collect();
         self.write_views(
@@ -149,7 +149,7 @@ impl<'a> SceneWriter<'a> {
         let images = &self.plan.images;
         View {
             image: images.has_truth.then(|| format!("images/{}.png", frame.name)),
-            mask: mask_name(frame),
+            mask: mask_path(frame),
             depth: frame
                 .depth
                 .as_ref()
@@ -164,7 +164,7 @@ impl<'a> SceneWriter<'a> {
         }
     }
 
-    fn write_training_images(&self) -> anyhow::Result<()> {
+    fn write_images_of_training_frames(&self) -> anyhow::Result<()> {
         self.plan.train.par_iter().enumerate().try_for_each(|(i, frame)| {
             self.context.check_interrupt()?;
             self.write_training_image(frame, self.plan.references.contains(&i))?;
@@ -173,7 +173,7 @@ impl<'a> SceneWriter<'a> {
         })
     }
 
-    fn write_truth_images(&self) -> anyhow::Result<()> {
+    fn write_images_of_test_frames(&self) -> anyhow::Result<()> {
         self.plan.test.par_iter().try_for_each(|frame| {
             self.context.check_interrupt()?;
             self.write_test_image(frame)?;
@@ -185,7 +185,7 @@ impl<'a> SceneWriter<'a> {
     /// Writes the images of a training frame: LR image, downscaled LR image, HR reference, and
     /// their masks.
     fn write_training_image(&self, frame: &Frame, is_reference: bool) -> anyhow::Result<()> {
-        let (hr, lr) = self.images(frame)?;
+        let (hr, lr) = self.create_images(frame)?;
         let name = &frame.name;
         self.write_lr("train/images", name, &lr)?;
         let mask = frame.mask().bad_input(frame_label(frame))?;
@@ -211,7 +211,7 @@ impl<'a> SceneWriter<'a> {
 
     /// Writes the images of a test frame: HR image, LR image, mask and depth.
     fn write_test_image(&self, frame: &Frame) -> anyhow::Result<()> {
-        let (hr, lr) = self.images(frame)?;
+        let (hr, lr) = self.create_images(frame)?;
         if let Some(hr) = &hr {
             self.write_hr("truth", &frame.name, hr)?;
         }
@@ -231,7 +231,7 @@ impl<'a> SceneWriter<'a> {
     }
 
     /// Creates a frame's HR image, if the plan has HR truth, and its LR image.
-    fn images(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LrImage)> {
+    fn create_images(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LrImage)> {
         let (image, clipping) = frame.photograph_and_clipping().bad_input(frame_label(frame))?;
         if clipping.pixels > 0 {
             let mut all = self.clipping.lock().unwrap_or_else(PoisonError::into_inner);
@@ -294,8 +294,8 @@ impl<'a> SceneWriter<'a> {
         Ok(())
     }
 
-    /// Writes true depth at HR size, sampled at the nearest native pixel centre: averaging depths
-    /// across an edge would invent surfaces.
+    /// Writes true depth at HR size, sampled at the depth file's nearest pixel centre: averaging
+    /// depths across an edge would invent surfaces.
     fn write_depth(
         &self,
         source: &Path,
@@ -335,6 +335,6 @@ fn nearest_index(i: usize, native: usize, count: usize) -> usize {
 }
 
 /// Returns the path of a frame's mask in its subtree; `None` without a mask.
-fn mask_name(frame: &Frame) -> Option<String> {
+fn mask_path(frame: &Frame) -> Option<String> {
     frame.is_masked().then(|| mask_file(&frame.name))
 }

@@ -99,7 +99,7 @@ impl Stage for Refine {
                 Input::optional(
                     &["views"],
                     "photographs enlarged to the views' size; a view with a photograph's camera is \
-                    averaged with the photograph",
+                    averaged with the enlarged photograph",
                 ),
             ),
         ]

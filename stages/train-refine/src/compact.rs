@@ -8,7 +8,7 @@ use stage::Context;
 
 use crate::examples::{Examples, lr_photographs};
 use crate::params::CompactParams;
-use crate::report_gain;
+use crate::report_psnr;
 use crate::steps::OnExamples;
 
 /// Trains our network by internal learning.
@@ -55,7 +55,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         data_consistent: photographs.is_some(),
     };
     context.write_json(REFINER_FILE, &file)?;
-    report_gain(context, "views left out of training", &file)
+    report_psnr(context, "views left out of training", &file)
 }
 
 /// Returns the size and inputs of a network that the parameters describe.

@@ -7,13 +7,14 @@
 //! For refinement by references, training uses references, too: other views of the downscaled
 //! field, each with its true image.
 //!
-//! If all views to be refined (input `cameras`) have LR photographs of their own, as in the paper's
-//! split, they will be consistent with these before refinement, and so are the training views.
+//! If each view to be refined (input `cameras`) has its own LR photograph, as in the paper's split,
+//! training views are made consistent with their LR photographs. Before refinement, `refine` then
+//! makes views consistent with their photographs in the same way.
 //!
 //! Every eighth view is left out of training; the network's gain on these views is stored with it.
 //!
-//! `net: paper` trains the published network on renders of the references' views (block
-//! `train-paper`), for comparison; this takes weeks on a CPU.
+//! With `net: paper` (block `train-paper`), the stage trains the paper's network on renders of the
+//! references' views, for comparison. This takes weeks on a CPU.
 
 mod compact;
 mod examples;
@@ -51,30 +52,32 @@ impl Stage for TrainRefine {
                 "photographs",
                 Input::optional(
                     &["scene/train"],
-                    "net: compact: LR photographs that the rendered field was trained on",
+                    "LR photographs that the rendered field was trained on (`net: compact` only)",
                 ),
             ),
             (
                 "cameras",
                 Input::optional(
                     &cameras,
-                    "net: compact: cameras of the views to be refined; if each has an LR photograph, \
-                    training views are made consistent with their own LR photographs, too",
+                    "cameras of the views to be refined (`net: compact` only); if each has an LR \
+                    photograph, training views, like refined ones, are made consistent with their \
+                    own LR photographs",
                 ),
             ),
             (
                 "prior",
                 Input::optional(
                     &["refiner"],
-                    "net: compact: network that training starts from; its size replaces features \
-                    and blocks",
+                    "network that training starts from (`net: compact` only); its size is used \
+                    instead of `features` and `blocks`",
                 ),
             ),
             (
                 "weights",
                 Input::optional(
                     &["weights"],
-                    "net: paper: folder with VGG-19 for the perceptual loss; without it, L1 alone",
+                    "folder with VGG-19 for the perceptual loss (`net: paper` only); without it, \
+                    the loss is L1",
                 ),
             ),
         ]
@@ -97,8 +100,8 @@ impl Stage for TrainRefine {
     }
 }
 
-/// Logs the network's gain on some views, and writes it as the stage's summary.
-fn report_gain(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
+/// Logs the PSNR of some views before and after refinement, and writes it as the stage's summary.
+fn report_psnr(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
     let RefinerFile { rendered_psnr, refined_psnr, residual_weight, .. } = file;
     let summary = format!(
         "{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight \

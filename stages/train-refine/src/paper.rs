@@ -9,7 +9,7 @@ use stage::{Context, Rule};
 
 use crate::examples::Examples;
 use crate::params::PaperParams;
-use crate::report_gain;
+use crate::report_psnr;
 use crate::steps::OnExamples;
 
 /// File names of VGG-19's weights: all layers with torchvision's names, or the first blocks in
@@ -66,7 +66,7 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
         data_consistent: false,
     };
     context.write_json(REFINER_FILE, &file)?;
-    report_gain(context, "training references", &file)
+    report_psnr(context, "training references", &file)
 }
 
 /// Returns the rule that the folder of weights must contain VGG-19.

@@ -90,7 +90,7 @@ pub struct PaperParams {
     /// Number of features of the first layer.
     #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
     pub features: u32,
-    /// Number of reference patches per patch.
+    /// Number of reference patches that the network gets with each patch.
     #[schemars(range(min = 1, max = 64), extend("x-group" = "data"))]
     pub patches: u32,
 }

@@ -31,7 +31,7 @@ pub use params::{
     Combine, Exposure, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
     ResolvedRegularisers, SceneFacts, Supervision,
 };
-use supervision::transparent_background;
+use supervision::alpha_background_error;
 pub use supervision::{Supersampling, supervision};
 use training::{InitField, Member, TrainingData, train_with_best_poses};
 
@@ -83,7 +83,7 @@ impl Stage for TrainSs {
             ("exposure", json!(true)),
         ];
         let conflicts = conflicts.map(|(parameter, value)| {
-            let message = transparent_background(parameter);
+            let message = alpha_background_error(parameter);
             Rule::new(&message)
                 .when("scene.background", json!({"const": "alpha"}))
                 .must(parameter, json!({"not": {"const": value}}))

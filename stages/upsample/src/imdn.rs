@@ -4,7 +4,8 @@ use tch::{TchError, Tensor};
 use crate::network::{Network, contrast, count_parts, integer_root, leaky_relu};
 
 /// IMDN (Hui et al. 2019, "Lightweight Image Super-Resolution with Information Multi-distillation
-/// Network"), by the names of its released weights. Width and scale are read from the file.
+/// Network"). Layers are read under the names in the released weights; width and scale are read
+/// from the file.
 pub(crate) struct Imdn {
     first: Conv,
     blocks: Vec<Block>,
@@ -14,14 +15,14 @@ pub(crate) struct Imdn {
     scale: i64,
 }
 
-/// Information multi-distillation block: each of three layers distils a quarter of the channels and
-/// passes the rest to the next layer; then channel attention weights all channels by their
-/// contrast.
+/// Information multi-distillation block: each of the first three layers distils a quarter of its
+/// channels and passes the rest on; the fourth layer's output is the last quarter. Then channel
+/// attention weights all channels by their contrast.
 struct Block {
     layers: [Conv; 4],
     attention: [Conv; 2],
     fuse: Conv,
-    /// Number of channels that each layer distils.
+    /// Number of channels that each of the first three layers distils.
     distilled: i64,
 }
 

@@ -4,8 +4,8 @@ use tch::{TchError, Tensor};
 use crate::network::{Linear, Network, count_parts};
 
 /// LIIF (Chen et al. 2021, "Learning Continuous Image Representation with Local Implicit Image
-/// Function") with EDSR's baseline encoder, by the names of its released weights: feature
-/// unfolding, local ensemble and cell decoding. Any scale.
+/// Function") with EDSR's baseline encoder, feature unfolding, local ensemble and cell decoding.
+/// Layers are read under the names that the released weights use. Any scale.
 pub(crate) struct Liif {
     head: Conv,
     blocks: Vec<[Conv; 2]>,
@@ -26,9 +26,9 @@ const CHUNK_PIXELS: usize = 16_384;
 impl Liif {
     /// Reads the network.
     pub(crate) fn read(weights: &Weights) -> Result<Self, WeightsError> {
-        let [width, ..] = weights.shape::<4>("encoder.head.0.weight")?;
+        let [channels, ..] = weights.shape::<4>("encoder.head.0.weight")?;
         let count = count_parts(weights, 0, |i| format!("encoder.body.{i}.body.0.weight"));
-        let shape = [width, width, 3, 3];
+        let shape = [channels, channels, 3, 3];
         let mut blocks = Vec::with_capacity(count);
         for i in 0..count {
             blocks.push([
@@ -39,7 +39,7 @@ impl Liif {
         let tail = Conv::read(weights, &format!("encoder.body.{count}"), shape)?;
         let name = |i: usize| format!("imnet.layers.{}", 2 * i);
         let count = count_parts(weights, 0, |i| format!("{}.weight", name(i)));
-        let mut inputs = UNFOLDED * width + 4;
+        let mut inputs = UNFOLDED * channels + 4;
         let mut layers = Vec::with_capacity(count);
         for i in 0..count {
             let [outputs, _] = weights.shape::<2>(&format!("{}.weight", name(i)))?;
@@ -51,7 +51,7 @@ impl Liif {
             weights.shape::<2>(&format!("{}.weight", name(0)))?;
         }
         Ok(Self {
-            head: Conv::read(weights, "encoder.head.0", [width, 3, 3, 3])?,
+            head: Conv::read(weights, "encoder.head.0", [channels, 3, 3, 3])?,
             blocks,
             tail,
             layers,
@@ -146,14 +146,15 @@ impl Network for Liif {
             .split_first()
             .ok_or_else(|| TchError::Shape("expected at least one layer".to_owned()))?;
         let features = self.features(image)?;
-        let width = features.size()[1];
+        let unfolded = features.size()[1];
         // The first layer is linear, so features and cell size pass through it once per LR pixel
         // instead of four times per HR pixel (design note 028).
-        let by_features = first.forward_columns(&features, 0, width)?;
+        let by_features = first.forward_columns(&features, 0, unfolded)?;
         let cell = [2.0 * lr_rows as f64 / rows as f64, 2.0 * lr_columns as f64 / columns as f64]
             .map(|c| c as f32);
         let cell = Tensor::f_from_slice(&cell)?.f_reshape([1, 2])?;
-        let constant = first.forward_columns(&cell, width + 2, width + 4)?.f_add(first.bias())?;
+        let constant =
+            first.forward_columns(&cell, unfolded + 2, unfolded + 4)?.f_add(first.bias())?;
         let sides = [-1.0, 1.0];
         let corners = Corners {
             rows: sides.map(|side| nearest_features(lr_rows, rows, side)),
@@ -174,7 +175,7 @@ impl Network for Liif {
                 let count = indices.len() as i64;
                 let offset = Tensor::f_from_slice(&offsets)?.f_reshape([count, 2])?;
                 let mut x = by_features.f_index_select(0, &Tensor::f_from_slice(&indices)?)?;
-                let by_offset = first.forward_columns(&offset, width, width + 2)?;
+                let by_offset = first.forward_columns(&offset, unfolded, unfolded + 2)?;
                 x = x.f_add(&by_offset)?.f_add(&constant)?;
                 for layer in others {
                     x = layer.forward(&x.f_relu()?)?;

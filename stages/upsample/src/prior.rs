@@ -1,4 +1,4 @@
-//! A network taught on random images, [dead leaves](leaves): a prior without anyone's photographs.
+//! A network trained on random images, [dead leaves](leaves), instead of photographs.
 
 mod leaves;
 mod stage;
@@ -13,13 +13,13 @@ pub use stage::{PriorParams, TrainPrior};
 
 /// Width of the network's features.
 const WIDTH: i64 = 64;
-/// Number of rotated and mirrored versions of an image whose enlargements are averaged.
-const ORIENTATIONS: i64 = 4;
+/// Number of versions of an image, each a quarter turn apart, whose enlargements are averaged.
+const QUARTER_TURNS: i64 = 4;
 /// Grey level that the network takes as 0.
 const MID_GREY: f64 = 0.5;
 
-/// Network of residual blocks at LR (Lim et al. 2017, EDSR's baseline with fewer blocks). Adds to
-/// the bicubic enlargement.
+/// Network of residual blocks at LR (Lim et al. 2017, EDSR's baseline with fewer blocks). Its
+/// output is added to the bicubic enlargement.
 pub(crate) struct Prior {
     first: Conv,
     blocks: Vec<[Conv; 2]>,
@@ -27,7 +27,7 @@ pub(crate) struct Prior {
     scale: i64,
 }
 
-/// Returns the contents of a file of weights that the program contains.
+/// Returns the contents of a weights file that is compiled into the program; `None` for others.
 pub(crate) fn embedded(file: &str) -> Option<&'static [u8]> {
     match file {
         "prior_x4.safetensors" => Some(include_bytes!("prior/prior_x4.safetensors")),
@@ -54,7 +54,7 @@ impl Prior {
         })
     }
 
-    /// Enlarges images (count × 3 × rows × columns) of one orientation.
+    /// Enlarges images (count × 3 × rows × columns) without the average over rotations.
     fn forward(&self, images: &Tensor) -> Result<Tensor, TchError> {
         let mut x = self.first.forward(&images.f_sub_scalar(MID_GREY)?, 1, 1)?;
         for [first, second] in &self.blocks {
@@ -73,7 +73,7 @@ impl Network for Prior {
 
     fn enlarge(&self, image: &Tensor, _: [i64; 2]) -> Result<Tensor, TchError> {
         let mut sum: Option<Tensor> = None;
-        for turns in 0..ORIENTATIONS {
+        for turns in 0..QUARTER_TURNS {
             let turned = image.f_rot90(turns, [2, 3])?.f_contiguous()?;
             let enlarged = self.forward(&turned)?.f_rot90(-turns, [2, 3])?;
             sum = Some(match sum {
@@ -81,7 +81,7 @@ impl Network for Prior {
                 None => enlarged,
             });
         }
-        sum.map_or_else(|| Ok(image.shallow_clone()), |sum| sum.f_div_scalar(ORIENTATIONS))
+        sum.map_or_else(|| Ok(image.shallow_clone()), |sum| sum.f_div_scalar(QUARTER_TURNS))
     }
 }
 

@@ -72,7 +72,7 @@ fn planes(volume: &Volume, bricks: &Bricks, components: &Components) -> Vec<u8> 
     let mut planes = vec![0; 4 * count];
     planes.resize(CHANNELS * count, 128);
     for voxel in &volume.voxels {
-        let Some(i) = bricks.voxel(voxel.position.map(usize::from)) else { continue };
+        let Some(i) = bricks.voxel_index(voxel.position.map(usize::from)) else { continue };
         planes[i] = to_byte(voxel.opacity.sqrt());
         // Root after rounding, which the page divides by.
         let root = f32::from(planes[i]) / 255.0;
@@ -117,7 +117,7 @@ mod tests {
         let count = atlas.bricks * VOXELS;
         let mut opaque = 0;
         for voxel in &volume.voxels {
-            let at = bricks.voxel(voxel.position.map(usize::from)).unwrap();
+            let at = bricks.voxel_index(voxel.position.map(usize::from)).unwrap();
             let byte = |plane: usize| f32::from(planes[plane * count + at]);
             opaque += usize::from(byte(0) > 0.0);
             assert!((byte(0) / 255.0 - voxel.opacity.sqrt()).abs() < 0.51 / 255.0);

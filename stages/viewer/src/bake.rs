@@ -117,7 +117,7 @@ impl Baker<'_> {
     /// Computes the voxels' opacities and the cameras that see each voxel.
     pub(crate) fn shape(&self, bricks: Bricks, progress: &Progress) -> Result<Shape, RenderError> {
         let mut opacity = vec![0.0; bricks.len() * VOXELS];
-        let parts = opacity.par_chunks_mut(VOXELS).zip(bricks.positions());
+        let parts = opacity.par_chunks_mut(VOXELS).zip(bricks.brick_positions());
         parts.try_for_each(|(opacity, &brick)| {
             progress.add(1);
             self.add_opacities(brick, opacity)
@@ -144,13 +144,14 @@ impl Baker<'_> {
         let bricks = &shape.bricks;
         let voxels: Vec<Vec<Voxel>> = (0..bricks.len())
             .into_par_iter()
-            .map(|slot| {
+            .map(|brick| {
                 progress.add(1);
-                let visible: Vec<usize> =
-                    (slot * VOXELS..(slot + 1) * VOXELS).filter(|&v| shape.is_visible(v)).collect();
-                let shaded = self.shade_brick(bricks.positions()[slot], &visible, &shape.seen)?;
+                let own = brick * VOXELS..(brick + 1) * VOXELS;
+                let visible: Vec<usize> = own.filter(|&v| shape.is_visible(v)).collect();
+                let position = bricks.brick_positions()[brick];
+                let shaded = self.shade_brick(position, &visible, &shape.seen)?;
                 let voxels = visible.into_iter().zip(shaded).map(|(voxel, shaded)| Voxel {
-                    position: bricks.position(voxel).map(|c| c as u16),
+                    position: bricks.voxel_position(voxel).map(|c| c as u16),
                     opacity: shape.opacity[voxel],
                     colour: shaded.colour,
                     view: shaded.view,
@@ -279,12 +280,13 @@ fn spread_to_neighbours(bricks: &Bricks, seen: &[u64]) -> Vec<u64> {
     (0..seen.len())
         .into_par_iter()
         .map(|voxel| {
-            let [x, y, z] = bricks.position(voxel).map(|c| c.saturating_sub(1)..=(c + 1).min(last));
+            let position = bricks.voxel_position(voxel);
+            let [x, y, z] = position.map(|c| c.saturating_sub(1)..=(c + 1).min(last));
             let mut all = 0;
             for k in z {
                 for j in y.clone() {
                     for i in x.clone() {
-                        all |= bricks.voxel([i, j, k]).map_or(0, |v| seen[v]);
+                        all |= bricks.voxel_index([i, j, k]).map_or(0, |v| seen[v]);
                     }
                 }
             }

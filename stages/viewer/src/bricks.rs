@@ -4,7 +4,7 @@
 pub(crate) const SIDE: usize = 8;
 /// Number of voxels in a brick.
 pub(crate) const VOXELS: usize = SIDE * SIDE * SIDE;
-/// Slot of a grid position without brick.
+/// Index at a grid position without brick.
 const NO_BRICK: u32 = u32::MAX;
 
 /// Existing bricks of a grid of `resolution`³ voxels. Voxel (x, y, z) has its centre at
@@ -14,7 +14,7 @@ const NO_BRICK: u32 = u32::MAX;
 pub(crate) struct Bricks {
     pub(crate) resolution: usize,
     /// Index of the brick at each grid position, or [`NO_BRICK`].
-    slots: Vec<u32>,
+    indices: Vec<u32>,
     /// Grid position of each brick.
     positions: Vec<[usize; 3]>,
 }
@@ -26,22 +26,22 @@ impl Bricks {
     /// When the resolution isn't a multiple of [`SIDE`].
     pub(crate) fn new(resolution: usize, is_kept: impl Fn([usize; 3]) -> bool) -> Self {
         assert_eq!(resolution % SIDE, 0, "whole bricks");
-        let mut bricks = Self { resolution, slots: Vec::new(), positions: Vec::new() };
-        let side = bricks.side();
+        let mut bricks = Self { resolution, indices: Vec::new(), positions: Vec::new() };
+        let side = bricks.bricks_per_side();
         for i in 0..side * side * side {
             let position = [i % side, i / side % side, i / (side * side)];
             if is_kept(position) {
-                bricks.slots.push(bricks.positions.len() as u32);
+                bricks.indices.push(bricks.positions.len() as u32);
                 bricks.positions.push(position);
             } else {
-                bricks.slots.push(NO_BRICK);
+                bricks.indices.push(NO_BRICK);
             }
         }
         bricks
     }
 
-    /// Returns the number of grid positions along each side.
-    pub(crate) fn side(&self) -> usize {
+    /// Returns the number of bricks' grid positions along each side.
+    pub(crate) fn bricks_per_side(&self) -> usize {
         self.resolution / SIDE
     }
 
@@ -51,25 +51,26 @@ impl Bricks {
     }
 
     /// Returns the bricks' grid positions, in their order.
-    pub(crate) fn positions(&self) -> &[[usize; 3]] {
+    pub(crate) fn brick_positions(&self) -> &[[usize; 3]] {
         &self.positions
     }
 
     /// Returns the index of the brick at a grid position, if any.
-    pub(crate) fn slot(&self, [x, y, z]: [usize; 3]) -> Option<usize> {
-        let slot = self.slots[x + self.side() * (y + self.side() * z)];
-        (slot != NO_BRICK).then_some(slot as usize)
+    pub(crate) fn brick_index(&self, [x, y, z]: [usize; 3]) -> Option<usize> {
+        let side = self.bricks_per_side();
+        let index = self.indices[x + side * (y + side * z)];
+        (index != NO_BRICK).then_some(index as usize)
     }
 
     /// Returns the index of a voxel among those of all bricks; `None` outside of bricks.
-    pub(crate) fn voxel(&self, position: [usize; 3]) -> Option<usize> {
-        let slot = self.slot(position.map(|c| c / SIDE))?;
+    pub(crate) fn voxel_index(&self, position: [usize; 3]) -> Option<usize> {
+        let brick = self.brick_index(position.map(|c| c / SIDE))?;
         let [x, y, z] = position.map(|c| c % SIDE);
-        Some(slot * VOXELS + x + SIDE * (y + SIDE * z))
+        Some(brick * VOXELS + x + SIDE * (y + SIDE * z))
     }
 
     /// Returns the position of a voxel by its index.
-    pub(crate) fn position(&self, voxel: usize) -> [usize; 3] {
+    pub(crate) fn voxel_position(&self, voxel: usize) -> [usize; 3] {
         let [x, y, z] = self.positions[voxel / VOXELS].map(|c| c * SIDE);
         let i = voxel % VOXELS;
         [x + i % SIDE, y + i / SIDE % SIDE, z + i / (SIDE * SIDE)]
@@ -78,10 +79,11 @@ impl Bricks {
     /// Returns the distance from each grid position to the nearest brick: the maximum of the
     /// differences along the axes, 0 in a brick, at most 255.
     pub(crate) fn distances(&self) -> Vec<u8> {
-        let side = self.side();
+        let side = self.bricks_per_side();
         let mut distances: Vec<u8> =
-            self.slots.iter().map(|&slot| if slot == NO_BRICK { 255 } else { 0 }).collect();
-        // The maximum of three differences can be found axis by axis, until nothing changes.
+            self.indices.iter().map(|&index| if index == NO_BRICK { 255 } else { 0 }).collect();
+        // Each pass takes the minimum over the 26 neighbours, one axis after the other, plus 1.
+        // Passes repeat until nothing changes.
         for _ in 0..side {
             let mut next = distances.clone();
             for axis in 0..3 {
@@ -114,12 +116,12 @@ mod tests {
     #[test]
     fn voxels_have_indices_and_positions() {
         let bricks = Bricks::new(32, |[x, y, z]| (x + y + z) % 3 == 1);
-        assert_eq!((bricks.side(), bricks.len()), (4, 21));
+        assert_eq!((bricks.bricks_per_side(), bricks.len()), (4, 21));
         for voxel in 0..bricks.len() * VOXELS {
-            assert_eq!(bricks.voxel(bricks.position(voxel)), Some(voxel));
+            assert_eq!(bricks.voxel_index(bricks.voxel_position(voxel)), Some(voxel));
         }
-        assert_eq!(bricks.voxel([7, 7, 7]), None);
-        assert!(bricks.voxel([8, 7, 7]).is_some());
+        assert_eq!(bricks.voxel_index([7, 7, 7]), None);
+        assert!(bricks.voxel_index([8, 7, 7]).is_some());
     }
 
     #[test]

@@ -11,8 +11,8 @@
 //! * `page`: the HTML file; script, style and shader are in `src/page/`.
 //! * `overview`: initial camera and centre of rotation.
 //!
-//! Positions are those of the field's unit cube ([`scene::Space`]; `space`), and the shader maps its
-//! rays into the cube as the field does (docs/design/042).
+//! Positions are those of the field's unit cube ([`scene::Space`]; `space`), and the shader maps
+//! its rays into the cube as the field does (docs/design/042).
 
 mod atlas;
 mod bake;
@@ -46,7 +46,7 @@ use crate::page::{ImageSize, PageCamera, PageScene};
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
     /// Voxels along each side of the field's unit cube; a multiple of 8. Memory and file size grow
-    /// with its square, the time to bake with its cube.
+    /// with the square of the resolution; the time to bake grows with its cube.
     #[schemars(range(min = 32, max = 512), extend("multipleOf" = 8))]
     pub resolution: u32,
     /// Maximum number of LR photographs in the page, spread evenly over the training views.
@@ -60,7 +60,8 @@ impl Default for Params {
     }
 }
 
-/// Maximum width in pixels of the LR photographs in the page; wider ones are shrunk; chosen by hand.
+/// Maximum width in pixels of the LR photographs in the page, to which wider ones are shrunk; chosen
+/// by hand.
 const MAX_PHOTOGRAPH_WIDTH: usize = 400;
 
 /// Remedy for short memory, as a sentence fragment.
@@ -78,7 +79,11 @@ impl Stage for Viewer {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "run",
-            Input::required(&["run"], "folder with run.json, the record of the field's training"),
+            Input::required(
+                &["run"],
+                "in pipeline.yaml: a block that trains a field; nerf-sr passes a folder \
+                with its record, run.json",
+            ),
         )]
     }
 

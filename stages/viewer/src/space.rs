@@ -6,7 +6,8 @@ use scene::{Bounds, Space};
 
 /// Maximum speed of a contracted ray in cube sides per unit of t, as in `radiance`.
 const MAX_SPEED: f32 = 2.0;
-/// Minimum speed of a contracted ray for which a step is chosen: slower rays are near the border.
+/// Lower limit of the speed that a step assumes for a contracted ray. Only rays near the border are
+/// slower.
 const MIN_SPEED: f32 = 1.0 / 64.0;
 /// Maximum distance from the middle of a contracted space in ball radii, 2 at infinity.
 const MAX_CONTRACTED_RADIUS: f64 = 2.0 - 1e-6;
@@ -29,7 +30,7 @@ pub(crate) fn to_world(bounds: &Bounds, position: DVec3) -> DVec3 {
     }
 }
 
-/// Returns whether rays can reach the box between two corners of the unit cube.
+/// Returns whether rays can reach any part of the box from `low` to `high` in the unit cube.
 pub(crate) fn is_reachable(bounds: &Bounds, low: [f32; 3], high: [f32; 3]) -> bool {
     match &bounds.space {
         Space::Box => {
@@ -48,8 +49,8 @@ pub(crate) fn is_reachable(bounds: &Bounds, low: [f32; 3], high: [f32; 3]) -> bo
     }
 }
 
-/// Returns the increase of t with which a ray at t moves by a distance in the unit cube. Rays near
-/// the border of a contracted space move less.
+/// Returns the increase of t with which a ray at t moves by about a distance in the unit cube. Rays
+/// near the border of a contracted space move less.
 pub(crate) fn step_along(ray: &NormalizedRay, t: f32, distance: f32) -> f32 {
     match ray.map {
         RayMap::Straight { .. } => distance,
@@ -61,7 +62,7 @@ pub(crate) fn step_along(ray: &NormalizedRay, t: f32, distance: f32) -> f32 {
     }
 }
 
-/// Returns an increase of t with which a ray moves by at most a distance in the unit cube.
+/// Returns an increase of t with which a ray surely moves by at most a distance in the unit cube.
 pub(crate) fn leap_along(ray: &NormalizedRay, distance: f32) -> f32 {
     match ray.map {
         RayMap::Straight { .. } => distance,

@@ -99,7 +99,7 @@ impl March<'_> {
 
     /// Returns the distance in bricks from a position in voxels to the nearest brick.
     fn distance(&self, position: [f32; 3]) -> u8 {
-        let side = self.bricks.side();
+        let side = self.bricks.bricks_per_side();
         let [x, y, z] = position.map(|c| (c.max(0.0) as usize / SIDE).min(side - 1));
         self.distances[x + side * (y + side * z)]
     }
@@ -118,7 +118,7 @@ impl March<'_> {
                 voxel[axis] = (floor as usize + upper).min(last);
                 weight *= if upper == 1 { fraction } else { 1.0 - fraction };
             }
-            match self.bricks.voxel(voxel) {
+            match self.bricks.voxel_index(voxel) {
                 Some(index) => (index, weight * self.opacity[index]),
                 None => (0, 0.0),
             }
@@ -145,7 +145,7 @@ mod tests {
         let bricks = Bricks::new(32, |_| true);
         let mut opacity = vec![0.0; 32 * 32 * 32];
         for voxel in 0..opacity.len() {
-            let [.., z] = bricks.position(voxel);
+            let [.., z] = bricks.voxel_position(voxel);
             // Two voxels thick: samples between the middles of two voxels still stop all light.
             opacity[voxel] = if [9, 10, 20, 21].contains(&z) { 1.0 } else { 0.0 };
         }
@@ -155,7 +155,7 @@ mod tests {
             let cameras = [camera_at(4.0), camera_at(-4.0)];
             let look = || visible_from(&bricks, &opacity, (&cameras, &bounds), &Progress::silent());
             let seen = look();
-            let at = |z: usize| seen[bricks.voxel([16, 16, z]).unwrap()];
+            let at = |z: usize| seen[bricks.voxel_index([16, 16, z]).unwrap()];
             assert_eq!([at(21), at(9), at(15)], [0b01, 0b10, 0], "{space:?}");
             let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
             assert!(alone.install(look) == seen);

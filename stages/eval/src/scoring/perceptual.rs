@@ -62,7 +62,7 @@ impl Perceptual {
             artifact::bail_bad_input!(
                 "input weights: {}: no LPIPS network found; {}",
                 folder.display(),
-                missing_files(&LpipsNetwork::ALL)
+                required_files(&LpipsNetwork::ALL)
             );
         }
         let mut pools = Vec::with_capacity(given.len());
@@ -107,7 +107,7 @@ impl Perceptual {
 
 /// Returns the rule that the folder of weights must contain a complete network.
 pub(crate) fn weights_rule() -> Rule {
-    let message = format!("no LPIPS network found; {}", missing_files(&LpipsNetwork::ALL));
+    let message = format!("no LPIPS network found; {}", required_files(&LpipsNetwork::ALL));
     let rule = Rule::new(&message);
     LpipsNetwork::ALL.iter().fold(rule, |rule, network| rule.or_files("weights", &network.files()))
 }
@@ -133,14 +133,14 @@ impl Metric for Perceptual {
         let mut lacking = LpipsNetwork::ALL.to_vec();
         lacking.retain(|network| !self.given.contains(network));
         if self.given.is_empty() {
-            return format!("{MISSING}: {}", missing_files(&lacking));
+            return format!("{MISSING}: {}", required_files(&lacking));
         }
         let given: Vec<&str> =
             self.given.iter().map(|network| network.labels().convention).collect();
         let missing = if lacking.is_empty() {
             String::new()
         } else {
-            format!("; {MISSING} for others: {}", missing_files(&lacking))
+            format!("; {MISSING} for others: {}", required_files(&lacking))
         };
         format!("v0.1, inputs in [-1, 1], by {}{missing}", given.join(", "))
     }
@@ -171,15 +171,15 @@ impl Metric for Perceptual {
 }
 
 /// Describes the files that networks need.
-fn missing_files(networks: &[LpipsNetwork]) -> String {
+fn required_files(networks: &[LpipsNetwork]) -> String {
     let pairs: Vec<String> = networks
         .iter()
         .map(|network| network.files())
         .map(|[weights, heads]| format!("{weights} and {heads}"))
         .collect();
     format!(
-        "-i eval.weights=FOLDER must have one of these pairs: {} (torchvision's and \
-        richzhang/PerceptualSimilarity's, as safetensors)",
+        "-i eval.weights=FOLDER needs a folder with one of these pairs of files: {} \
+        (torchvision's and richzhang/PerceptualSimilarity's, as safetensors)",
         pairs.join("; ")
     )
 }

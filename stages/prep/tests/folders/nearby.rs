@@ -128,7 +128,7 @@ fn llff_cases() -> Vec<Case> {
                 llff(folder);
                 binary_images(folder);
             },
-            paired("photographs with poses are listed by sparse"),
+            paired("photographs with poses are listed by COLMAP's model in sparse"),
         ),
         case(
             "DSNeRF#101: bounds of other views",

@@ -65,9 +65,9 @@ struct PlanArgs {
     /// Set a parameter. Several values run all combinations; stages that don't depend on the
     /// parameter run once. A value is JSON, such as a number, true or null, or plain text; an empty
     /// value is null, and whole numbers may end in k, M or G. If a parameter is given twice, the
-    /// last value wins. `quality` is `best`, `balanced` [default], `fast` or `draft`, which take a
-    /// third, a tenth and a thirtieth of the time of `best`. It sets those parameters of training,
-    /// rendering and refinement that are not set otherwise
+    /// last value wins. `quality` is `best`, `balanced` (default; a third of the time of `best`),
+    /// `fast` (a tenth) or `draft` (a thirtieth). It sets those parameters of training, rendering
+    /// and refinement that are not set otherwise
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
     /// Read an input from this folder, not from what the pipeline names, e.g. -i
@@ -110,8 +110,8 @@ struct RunOptions {
     /// Maximum number of stages that run at once [default: number of cores, at most 4]
     #[arg(short, long, value_name = "N")]
     jobs: Option<usize>,
-    /// Number of processors that all stages share; each stage starts as many threads. Results don't
-    /// depend on the number [default: processors of this process]
+    /// Number of processors that all stages share, and of threads that each stage starts. Results
+    /// don't depend on the number [default: processors of this process]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
     /// Memory limit for all stages together, such as 8G; each stage counts with the peak memory of

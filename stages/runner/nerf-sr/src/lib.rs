@@ -3,8 +3,12 @@
 //! also knows what the rays and pixels of some stages cost.
 //!
 //! * `cli`, `session`, `verbs`: the command line, its pipeline and store, and one function a verb.
+//! * `starter`: the pipeline file that `init` writes. `stage_inputs`: inputs that the command line
+//!   gives by a stage's name.
 //! * `execute`: carries out a plan on this machine or as a cluster's jobs, each node under its
 //!   key's lock. `unchanged` checks that programs and inputs stay the same while a stage runs.
+//!   `waiting` waits for locks; `run_messages` has the messages at the end of a run.
+//! * `garbage`: deletes the artifacts that nothing needs.
 //! * `estimates`: processor time of the stages to run.
 //! * `identities`: identities of nodes whose keys aren't known yet.
 //! * `node_report`: a plan's nodes as JSON. `state_text`: their states as text. `lineage`: two
@@ -43,7 +47,7 @@ use artifact::report_line;
 use planning::PlanError;
 use planning::stage_call::StageFailure;
 
-/// Runs the program. A closed stdout doesn't change the exit code:
+/// Runs the program and returns the exit code, which a closed stdout doesn't change:
 ///
 /// * 0: success
 /// * 1: other failures, such as those of the store
@@ -57,7 +61,7 @@ pub fn main() -> ExitCode {
     cli::run_command_line().unwrap_or_else(|error| {
         report_line!("nerf-sr: {}", artifact::one_line(&error));
         let plan_error = error.chain().find_map(|e| e.downcast_ref::<PlanError>());
-        ExitCode::from(plan_error.map_or_else(|| artifact::exit_code(&error), exit_code))
+        ExitCode::from(plan_error.map_or_else(|| artifact::exit_code(&error), plan_exit_code))
     })
 }
 
@@ -66,7 +70,7 @@ fn failure(error: impl std::fmt::Display) -> StageFailure {
     StageFailure { code: 1, message: error.to_string() }
 }
 
-fn exit_code(error: &PlanError) -> u8 {
+fn plan_exit_code(error: &PlanError) -> u8 {
     match error {
         PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
         PlanError::Store(_) => 1,

@@ -40,8 +40,8 @@ fn has_all_files(page: &Path) -> bool {
     Manifest::read(page).is_ok_and(|manifest| manifest.check_sizes(page).is_ok())
 }
 
-/// Publishes a sink's output, which contains its mark, as `target`. `kind` is the output's kind.
-/// Returns the new paths of earlier pages that were archived.
+/// Publishes a sink's output, which contains a [`PageMark`], as `target`. `kind` is the output's
+/// kind. Returns the new paths of earlier pages that were archived.
 pub(crate) fn publish(
     output: &Path,
     target: &Path,
@@ -96,8 +96,9 @@ impl Publishing<'_> {
         Ok(archived)
     }
 
-    /// Archives or deletes a leftover, as its own publishing would have done: the leftover either
-    /// was replaced by the target's page, or was to replace it.
+    /// Archives or deletes a page that a killed publishing left: an old page, or a new one that
+    /// never became the target's. The page is archived if it shows a result that the target's page
+    /// lacks.
     fn archive_or_delete_leftover(&self, leftover: &Path) -> io::Result<Option<PathBuf>> {
         let mark = PageMark::read(leftover)?.unwrap_or_default();
         if !has_all_files(leftover) || mark.identity == self.mark.identity {
@@ -110,16 +111,17 @@ impl Publishing<'_> {
     /// Replaces the target's page by a copy of `output`. Returns the new path of the old page if
     /// that was archived.
     fn replace(&self, output: &Path) -> Result<Option<PathBuf>, StageFailure> {
-        let (scrap, page) = (self.hidden("scrap"), self.hidden("new"));
+        let (scrap, swap) = (self.hidden("scrap"), self.hidden("new"));
         remove_folder(&scrap)
             .and_then(|()| copy_folder(output, &scrap))
-            .and_then(|()| fs::rename(&scrap, &page))
+            .and_then(|()| fs::rename(&scrap, &swap))
             .map_err(|e| StageFailure::at(&scrap, &e))?;
-        if let Err(refused) = self.exchange(&page) {
-            self.delete(&page).ok();
+        if let Err(refused) = self.exchange(&swap) {
+            self.delete(&swap).ok();
             return Err(refused);
         }
-        self.archive_or_delete(&page, &self.mark).map_err(|e| StageFailure::at(&page, &e))
+        // Now `swap` is the old page, or doesn't exist.
+        self.archive_or_delete(&swap, &self.mark).map_err(|e| StageFailure::at(&swap, &e))
     }
 
     /// Exchanges a page and the target's page. If the target doesn't exist, the page is moved.
@@ -169,8 +171,8 @@ impl Publishing<'_> {
     fn check_ownership(&self, folder: &Path) -> Result<(), StageFailure> {
         check_ownership(folder, self.kind).map_err(|reason| {
             failure(format!(
-                "{reason}; nothing was replaced: move this away, or choose another folder with \
-                --out"
+                "{reason}; nothing was replaced: move that file or folder away, or choose another \
+                folder with --out"
             ))
         })
     }

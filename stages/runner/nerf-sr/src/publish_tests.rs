@@ -225,7 +225,10 @@ fn leftovers_that_are_no_pages_are_not_archived() {
         fs::rename(page(dir.path(), "lego 1", "lego", true), &leftover).unwrap();
         fs::write(leftover.join(file), "precious").unwrap();
         let message = published(dir.path(), "chair 3").unwrap_err().message;
-        assert!(message.contains(words) && message.contains("move this away"), "{message}");
+        assert!(
+            message.contains(words) && message.contains("move that file or folder away"),
+            "{message}"
+        );
         assert_eq!(fs::read_to_string(leftover.join(file)).unwrap(), "precious");
         assert_eq!(page_text(dir.path(), "report"), "chair 2");
         remove_folder(&leftover).unwrap();

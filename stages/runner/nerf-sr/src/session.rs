@@ -47,7 +47,7 @@ impl Session {
     /// Creates a plan for a verb that runs no stage. Only the runner's own programs are started, to
     /// describe themselves.
     pub(crate) fn plan(&self, request: &Request) -> anyhow::Result<Plan> {
-        self.new_plan(request, Describing::Own)
+        self.new_plan(request, Describing::OwnOnly)
     }
 
     /// Creates a plan as [`Self::plan`] does, and finds the states of its nodes.

@@ -1,5 +1,6 @@
-//! Checks that a stage's program and inputs are those of its key from start to end; otherwise no
-//! result is recorded. Local runs and a cluster's jobs share these checks.
+//! Checks that a stage's program and inputs stay the same from the computation of the stage's key
+//! to the stage's end; otherwise no result is recorded. Local runs and a cluster's jobs share these
+//! checks.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -66,7 +67,8 @@ pub(crate) struct Inputs<'a> {
 }
 
 impl<'a> Inputs<'a> {
-    /// Reads the stamps of the artifacts' files. `output_of` returns a parent's artifact.
+    /// Reads the [`Stamp`]s of the artifacts' files, and compares the contents with the manifests
+    /// unless the program does so itself. `output_of` returns the hash of a parent's artifact.
     pub(crate) fn new(
         node: &'a Node,
         store: &'a Store,

@@ -104,7 +104,8 @@ impl Setting {
         PathBuf::from(self.value.as_str().unwrap_or_default())
     }
 
-    fn has_same_target(&self, other: &Self) -> bool {
+    /// Returns whether two settings set the same parameter or input.
+    fn sets_the_same(&self, other: &Self) -> bool {
         (&self.stage, self.kind, &self.name) == (&other.stage, other.kind, &other.name)
     }
 }
@@ -126,9 +127,9 @@ impl Axis {
     }
 
     /// Returns whether the first settings of two axes set the same parameter or input.
-    fn has_same_target(&self, other: &Self) -> bool {
+    fn sets_the_same(&self, other: &Self) -> bool {
         let first = self.settings().next();
-        first.is_some_and(|own| other.settings().next().is_some_and(|s| own.has_same_target(s)))
+        first.is_some_and(|own| other.settings().next().is_some_and(|s| own.sets_the_same(s)))
     }
 }
 
@@ -154,14 +155,14 @@ impl Scope<'_> {
         let inputs = request.inputs.iter().map(|text| (Kind::Input, text));
         for (kind, text) in parameters.chain(inputs) {
             let axis = self.parse_axis(kind, text, &mut notes)?;
-            if let Some(earlier) = axes.iter().position(|earlier| earlier.has_same_target(&axis)) {
+            if let Some(earlier) = axes.iter().position(|earlier| earlier.sets_the_same(&axis)) {
                 let overridden = axes.remove(earlier).argument;
                 notes.push(format!("{overridden}: overridden by {}", axis.argument));
             }
             // An axis with one setting per value is replaced. One with several stays, and the
             // command line overrides one of its settings.
             let count = experiment.len();
-            experiment.retain(|earlier| !earlier.is_single() || !earlier.has_same_target(&axis));
+            experiment.retain(|earlier| !earlier.is_single() || !earlier.sets_the_same(&axis));
             let is_named = axis.is_named || experiment.len() < count;
             axes.push(Axis { is_named, ..axis });
         }
@@ -229,7 +230,10 @@ impl Scope<'_> {
         });
         let values = distinct_values(&argument, settings, notes);
         if program.description.sink && kind == Kind::Input {
-            let problem = format!("{stage} is a sink, which shows results of the run, no folder");
+            let problem = format!(
+                "{stage} is a sink, which shows results of the run and reads no folder; remove the \
+                argument"
+            );
             return Err(usage_error(&argument, problem));
         }
         if program.description.sink && values.len() > 1 {
@@ -243,8 +247,8 @@ impl Scope<'_> {
     }
 
     /// Returns the stage that a name belongs to, and the name without the stage. If several stages
-    /// have the name, the one that the targets need is meant; a block that inherits the value
-    /// doesn't count.
+    /// have the name, the one that the targets need is meant; a block whose value is left to the
+    /// block that it extends doesn't count.
     fn find_owner(&self, kind: Kind, name: &str) -> Result<(String, String), PlanError> {
         // A stage's name may contain dots.
         let mut splits = name.match_indices('.').map(|(at, _)| (&name[..at], &name[at + 1..]));
@@ -256,8 +260,9 @@ impl Scope<'_> {
             return Ok((stage.to_owned(), own_name.to_owned()));
         }
         let stages = self.pipeline.stages.keys();
-        let all: Vec<&String> =
-            stages.filter(|s| self.has(s, kind, name) && !self.inherits(s, kind, name)).collect();
+        let all: Vec<&String> = stages
+            .filter(|s| self.has(s, kind, name) && !self.is_left_to_base(s, kind, name))
+            .collect();
         let needed: Vec<&String> =
             all.iter().copied().filter(|s| self.needed.contains(*s)).collect();
         match if needed.is_empty() { &all } else { &needed }[..] {
@@ -279,11 +284,12 @@ impl Scope<'_> {
         self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name))
     }
 
-    /// Returns whether a block inherits a value from the block that it extends.
-    fn inherits(&self, stage: &str, kind: Kind, name: &str) -> bool {
+    /// Returns whether a name is left to the block that a block extends: the extended block is
+    /// needed, or the block sets no value of its own.
+    fn is_left_to_base(&self, stage: &str, kind: Kind, name: &str) -> bool {
         let block = &self.pipeline.stages[stage];
-        block.extends.as_ref().is_some_and(|other| {
-            self.needed.contains(other) || !kind.is_given(self.programs.get(stage), block, name)
+        block.extends.as_ref().is_some_and(|base| {
+            self.needed.contains(base) || !kind.is_given(self.programs.get(stage), block, name)
         })
     }
 
@@ -314,7 +320,8 @@ impl Scope<'_> {
         );
         let unusable: Vec<&str> = self.programs.unusable().collect();
         if !unusable.is_empty() {
-            problem += &format!("; not described: {}", unusable.join(", "));
+            let stages = unusable.join(", ");
+            problem += &format!("; stages without a description were not searched: {stages}");
         }
         PlanError::Usage(problem)
     }

@@ -1,5 +1,5 @@
-//! Checks of a whole pipeline, whatever the targets: first of its names, then of its blocks against
-//! the descriptions of their stages.
+//! Checks a whole pipeline, independently of the targets: first names, then blocks against the
+//! descriptions of their programs.
 
 use std::collections::BTreeSet;
 
@@ -46,8 +46,13 @@ fn check_extends(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<
     let Some(other) = &block.extends else { return Ok(()) };
     let problem = match pipeline.stages.get(other) {
         None => format!("extends: no stage {other:?}; {}", known_stages(pipeline, other)),
-        Some(other_block) if other_block.extends.is_some() => {
-            format!("extends: {other:?} itself extends a block; extend that one instead")
+        Some(StageBlock { extends: Some(base), .. }) => {
+            let remedy = if base == name || base == other {
+                "remove one `extends`".to_owned()
+            } else {
+                format!("extend {base:?} instead")
+            };
+            format!("extends: {other:?} itself extends {base:?}; {remedy}")
         }
         Some(_) if block.run.is_some() => {
             "run: not allowed together with `extends`; remove one of them".to_owned()
@@ -60,8 +65,8 @@ fn check_extends(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<
 /// Checks every block with a usable program against the program's description, and the kinds of its
 /// inputs.
 pub(crate) fn check_blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), PipelineError> {
-    // Blocks that extend others come last: an inherited problem is reported for the inherited
-    // block.
+    // Blocks that extend others come last: a problem in an inherited entry is reported for the
+    // block that contains the entry.
     let (extending, own): (Vec<_>, Vec<_>) =
         pipeline.stages.iter().partition(|(_, block)| block.extends.is_some());
     for (name, block) in own.into_iter().chain(extending) {
@@ -71,11 +76,12 @@ pub(crate) fn check_blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(
             check_input(&program.description, input, source, programs)
                 .map_err(|problem| pipeline.error(name, Part::Input(input), problem))?;
         }
-        for (input, port) in &program.description.inputs {
+        for (input, declared) in &program.description.inputs {
             let is_given = block.inputs.contains_key(input)
                 || (program.description.sink && !block.inputs.is_empty());
-            if !port.optional && !is_given {
-                let problem = format!("input {input} is missing ({})", port.summary);
+            if !declared.optional && !is_given {
+                let problem =
+                    format!("input {input} is missing ({}); add it to `inputs`", declared.summary);
                 return Err(pipeline.error(name, Part::Block, problem));
             }
         }
@@ -108,9 +114,10 @@ fn check_input(
     source: &str,
     programs: &Programs,
 ) -> Result<(), String> {
-    // A sink has one input for the record of a run, and its block may choose the names of inputs.
+    // A sink's program has one input, `run`. Its block names inputs freely: the runner makes the
+    // record of the run from them.
     let run = description.inputs.get("run").filter(|_| description.sink);
-    let Some(port) = description.inputs.get(input).or(run) else {
+    let Some(declared) = description.inputs.get(input).or(run) else {
         let known = known_names(input, description.inputs.keys().map(String::as_str));
         return Err(format!("no input {input:?}; {known}"));
     };
@@ -139,9 +146,12 @@ fn check_input(
             format!("input {input}: {stage} has no subtree {subtree:?}; {known}")
         })?,
     };
-    if !port.kinds.contains(kind) {
-        let kinds = port.kinds.join(" or ");
-        return Err(format!("input {input} takes {kinds}, but {source} is {kind}"));
+    if !declared.kinds.contains(kind) {
+        let kinds = declared.kinds.join(" or ");
+        return Err(format!(
+            "input {input} takes kind {kinds}, but {source} has kind {kind}; name another stage or \
+            subtree"
+        ));
     }
     Ok(())
 }
@@ -184,7 +194,7 @@ pub(crate) fn topological_order(pipeline: &Pipeline) -> Result<Vec<String>, Pipe
     Ok(order)
 }
 
-/// Creates the error for a cycle among stages that all depend on one another.
+/// Creates the error for a cycle. Each of `stages` has an input among `stages`.
 fn cycle_error(pipeline: &Pipeline, stages: &BTreeSet<&str>) -> PipelineError {
     let mut path: Vec<&str> = stages.first().copied().into_iter().collect();
     // Follow inputs until a stage repeats.
@@ -193,7 +203,7 @@ fn cycle_error(pipeline: &Pipeline, stages: &BTreeSet<&str>) -> PipelineError {
     {
         if let Some(at) = path.iter().position(|s| *s == next) {
             let cycle = [&path[at..], &[next]].concat().join(" ← ");
-            let problem = format!("inputs form a cycle: {cycle}");
+            let problem = format!("inputs form a cycle: {cycle}; change one of these inputs");
             return pipeline.error(path[at], Part::Block, problem);
         }
         path.push(next);

@@ -185,7 +185,7 @@ impl<'a> Expansion<'a> {
     fn add_nodes(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
         for point in self.points(stage)? {
             let parameters = self.resolve(stage, program, &point)?;
-            if let Some(reason) = self.missing(stage, &point, &parameters) {
+            if let Some(reason) = self.reason_to_leave_out(stage, &point, &parameters) {
                 self.left_out.entry(stage.to_owned()).or_default().push((point, reason));
                 continue;
             }
@@ -225,8 +225,13 @@ impl<'a> Expansion<'a> {
 
     /// Returns the reason for leaving out a stage at a point, and notes it: a missing file, its own
     /// or a parent's.
-    fn missing(&mut self, stage: &str, point: &Point, parameters: &Value) -> Option<String> {
-        if let Some(reason) = self.required_files.missing(stage, parameters) {
+    fn reason_to_leave_out(
+        &mut self,
+        stage: &str,
+        point: &Point,
+        parameters: &Value,
+    ) -> Option<String> {
+        if let Some(reason) = self.required_files.reason_to_leave_out(stage, parameters) {
             let data = self.required_files.data.display();
             let note = format!("{stage}: left out: {reason} in {data}");
             if !self.notes.contains(&note) {

@@ -72,7 +72,7 @@ pub struct Selection {
 }
 
 impl Experiment {
-    /// Overrides parts with those of `other`, the experiment of a file that extends this one's.
+    /// Overrides the parts that `other` sets; presets, inputs, needs and sweeps entry by entry.
     pub fn override_with(&mut self, other: &Self) {
         replace_unless_empty(&mut self.folders, &other.folders);
         replace_unless_empty(&mut self.scenes, &other.scenes);

@@ -274,7 +274,7 @@ fn only_what_is_to_be_shown_is_made() {
     let unknown = plan_showing(data.path(), &["larg"]).map(|plan| labels(&plan));
     assert_eq!(
         unknown.unwrap_err().to_string(),
-        "--show larg: table has no such input; did you mean large? known: large, score, \
+        "--show larg: not an input of table; did you mean large? known: large, score, \
         score-large, small"
     );
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::file::{ParsedFile, PipelineError};
 use crate::pipeline::Pipeline;
 
-/// Maximum length of a chain of files that extend one another, chosen by hand.
+/// Maximum number of files in a chain in which each extends the next, chosen by hand.
 const MAX_CHAINED_FILES: usize = 8;
 
 /// Error returned when two pipelines have different blocks of the same name.
@@ -42,7 +42,9 @@ impl Pipeline {
         read_extended(file, &mut chain)
     }
 
-    /// Joins two pipelines. Fails if blocks of the same name differ.
+    /// Joins two pipelines. Fails if blocks of the same name differ. The default targets, and the
+    /// quality if both set one, are those of `self`; parts of the experiment that both set are
+    /// those of `other`.
     pub fn joined(mut self, other: Self) -> Result<Self, JoinError> {
         let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
         if let Some(name) = shared.find(|name| !self.has_equal_block(&other, name)) {
@@ -64,8 +66,8 @@ impl Pipeline {
     }
 }
 
-/// Joins the files that a file extends, and overrides them with the file. `chain` contains the
-/// files that extend one another down to this one.
+/// Joins the files that a file extends, and overrides them with the file. In `chain`, each file
+/// extends the next; the last one is this file.
 fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineError> {
     let mut joined: Option<Pipeline> = None;
     for extended in &file.content.extends {
@@ -74,13 +76,13 @@ fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline,
             extends_error(&file, extended, problem)
         })?;
         if chain.contains(&path) {
-            let problem = "the file extends itself, maybe through other files; remove it";
+            let problem = "the file extends itself, maybe through other files; remove this entry";
             return Err(extends_error(&file, extended, problem));
         }
         if chain.len() == MAX_CHAINED_FILES {
             let problem = format!(
-                "more than {MAX_CHAINED_FILES} files extend one another; extend a file further \
-                down the chain"
+                "more than {MAX_CHAINED_FILES} files in a chain of `extends`; extend the chain's \
+                last file directly"
             );
             return Err(extends_error(&file, extended, problem));
         }
@@ -90,9 +92,10 @@ fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline,
         chain.pop();
         joined = Some(match joined {
             None => pipeline,
-            Some(joined) => joined
-                .joined(pipeline)
-                .map_err(|e| extends_error(&file, extended, format!("{e}; extend one of them")))?,
+            Some(joined) => joined.joined(pipeline).map_err(|e| {
+                let problem = format!("{e}; extend only one of these files, or rename a block");
+                extends_error(&file, extended, problem)
+            })?,
         });
     }
     let mut pipeline = joined.unwrap_or_default();

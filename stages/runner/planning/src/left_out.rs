@@ -1,5 +1,5 @@
-//! Parts of a pipeline that a plan leaves out: inputs of sinks that aren't selected, and blocks
-//! whose files are missing.
+//! Parts of a pipeline that a plan leaves out: unselected inputs of sinks, and blocks whose files
+//! are missing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -14,7 +14,8 @@ use crate::file::InputSource;
 use crate::pipeline::Pipeline;
 use crate::request::PlanError;
 
-/// Returns the stages that a sink shows: its selected inputs, or all if none is selected.
+/// Returns the stages that a sink shows: the inputs that `--show` selects. Without `--show`, those
+/// that the file's `show` selects, or all if `show` names no input of this sink.
 pub(crate) fn shown_stages<'a>(
     pipeline: &'a Pipeline,
     sink: &str,
@@ -31,7 +32,7 @@ pub(crate) fn shown_stages<'a>(
             selected.push(stage);
         }
     }
-    // The file's selection may refer to another sink.
+    // The file's `show` may name only inputs of other sinks.
     if is_explicit || !selected.is_empty() { selected } else { all }
 }
 
@@ -56,7 +57,7 @@ pub(crate) fn check_show(
     let known: BTreeSet<&str> = names.collect();
     if let Some(name) = selection.show.iter().find(|name| !known.contains(name.as_str())) {
         let problem = format!(
-            "--show {name}: {} has no such input; {}",
+            "--show {name}: not an input of {}; {}",
             sinks.join(", "),
             known_names(name, known)
         );
@@ -65,7 +66,9 @@ pub(crate) fn check_show(
     if let Some(sink) = sinks.iter().find(|sink| shown_stages(pipeline, sink, selection).is_empty())
     {
         let show = selection.show.join(",");
-        let problem = format!("--show {show}: {sink} has none of these inputs; remove {sink}");
+        let problem = format!(
+            "--show {show}: {sink} has none of these inputs; remove {sink} from the targets"
+        );
         return Err(PlanError::Usage(problem));
     }
     Ok(())
@@ -92,7 +95,7 @@ impl RequiredFiles {
     }
 
     /// Returns the reason for leaving out a block; `None` if its file exists or it needs none.
-    pub(crate) fn missing(&self, stage: &str, parameters: &Value) -> Option<String> {
+    pub(crate) fn reason_to_leave_out(&self, stage: &str, parameters: &Value) -> Option<String> {
         let mut path = self.paths.get(stage)?.clone();
         for (name, value) in parameters.as_object().into_iter().flatten() {
             path = path.replace(&format!("{{{name}}}"), &plain(value));

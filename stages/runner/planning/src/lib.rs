@@ -20,7 +20,7 @@
 //! use planning::{Describing, Pipeline, Plan, Request};
 //! let pipeline = Pipeline::read("pipeline.yaml".as_ref())?;
 //! let store = store::Store::open(".nerf-sr".as_ref())?;
-//! let plan = Plan::new(&pipeline, &store, &Request::default(), Describing::Own)?;
+//! let plan = Plan::new(&pipeline, &store, &Request::default(), Describing::OwnOnly)?;
 //! println!("{} nodes", plan.nodes.len());
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```

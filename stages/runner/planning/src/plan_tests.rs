@@ -276,7 +276,7 @@ fn command_lines_that_cannot_be_meant() {
         (&["-p", "rays=18446744073709551616"], "maximum of 18446744073709551615"),
         (&["-p", "supersample="], "parameter supersample: null is not a number"),
         (&["-p", "views=1,2"], "report is a sink and shows all points of a sweep at once"),
-        (&["-i", "report.run=x"], "report is a sink, which shows results of the run, no folder"),
+        (&["-i", "report.run=x"], "report is a sink, which shows results of the run and reads no"),
         (
             &["-p", "kernel=average", "-p", "prep.scale=2,2.7"],
             "stage prep [scale=2.7]: average needs a whole scale",
@@ -353,7 +353,12 @@ fn files_that_cannot_be_used() {
             9,
             "prep has no subtree \"trian\"; did you mean train?",
         ),
-        ("truth: prep}", "truth: make}", 16, "input truth takes scene, but make is data"),
+        (
+            "truth: prep}",
+            "truth: make}",
+            16,
+            "input truth takes kind scene, but make has kind data",
+        ),
         (
             "{run: score}",
             "{run: score}\n  late: {run: report, inputs: {run: report}}",
@@ -398,7 +403,7 @@ fn files_that_cannot_be_used() {
     assert_eq!(unneeded.nodes.len(), 4);
     let problem = refused(&format!("{PIPELINE}  other: {{}}\n"), &["-p", "nothing=1"]).to_string();
     assert!(
-        problem.contains("has this parameter") && problem.contains("not described: other"),
+        problem.contains("has this parameter") && problem.contains("were not searched: other"),
         "{problem}"
     );
 }

@@ -106,7 +106,7 @@ impl Source {
     /// with preserved times has an equal one.
     pub fn times_hash(&self) -> String {
         let files: Vec<_> =
-            self.files.iter().map(|(path, file)| (path, file.stamp.of_content())).collect();
+            self.files.iter().map(|(path, file)| (path, file.stamp.size_and_modified())).collect();
         hash_json(&files)
     }
 

@@ -50,21 +50,21 @@ impl StageProgram {
         block.parameter_layers().any(|layer| self.schema.flattened(layer).contains_key(parameter))
     }
 
-    /// Overrides the `given` parameters with those of a block.
-    pub fn lay_over(&self, given: &mut Map<String, Value>, block: &StageBlock) {
+    /// Overrides the parameters `base` with those of a block.
+    pub fn lay_over(&self, base: &mut Map<String, Value>, block: &StageBlock) {
         for layer in block.parameter_layers() {
-            self.schema.override_with(given, layer);
+            self.schema.override_with(base, layer);
         }
     }
 }
 
-/// Programs that may be started to describe themselves.
+/// Limit to the programs that may be started to describe themselves.
 #[derive(Clone, Copy)]
 pub enum Describing<'a> {
     /// The runner's own programs, and users' files that are needed; setting the flag interrupts.
-    Needed(&'a AtomicBool),
+    OwnAndNeeded(&'a AtomicBool),
     /// The runner's own programs only.
-    Own,
+    OwnOnly,
 }
 
 /// Program of each stage, or the error that makes it unusable.
@@ -110,46 +110,49 @@ impl Programs {
         describing: Describing,
     ) -> Result<Self, Interrupted> {
         let mut cache = DescriptionCache::read(store);
-        let mut answers: BTreeMap<PathBuf, Result<Answer, ProgramError>> = BTreeMap::new();
+        let mut descriptions: BTreeMap<PathBuf, Result<IdentifiedDescription, ProgramError>> =
+            BTreeMap::new();
         let mut unknown = BTreeMap::new();
         let paths: BTreeMap<&str, PathBuf> =
             pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
         for (stage, path) in &paths {
             let is_needed =
                 paths.iter().any(|(stage, other)| other == path && needed.contains(*stage));
-            let answer = match identify(path, program_name(pipeline, stage)) {
+            let described = match identify(path, program_name(pipeline, stage)) {
                 Err(problem) => Err(problem),
                 Ok(identity) => match cache.description(path, &identity) {
-                    Some(description) => Ok(Answer { identity, description }),
+                    Some(description) => Ok(IdentifiedDescription { identity, description }),
                     None if identity.may_be_started(describing, is_needed) => {
                         unknown.insert(path.clone(), identity);
                         continue;
                     }
                     None => Err(ProgramError(format!(
-                        "{} isn't part of nerf-sr; read it first, then start it with `nerf-sr run`",
+                        "{} isn't part of nerf-sr; check what the program does, then start it with \
+                        `nerf-sr run`",
                         path.display()
                     ))),
                 },
             };
-            answers.insert(path.clone(), answer);
+            descriptions.insert(path.clone(), described);
         }
         let stop = match describing {
-            Describing::Needed(stop) => Some(stop),
-            Describing::Own => None,
+            Describing::OwnAndNeeded(stop) => Some(stop),
+            Describing::OwnOnly => None,
         };
         let unknown_paths: Vec<PathBuf> = unknown.keys().cloned().collect();
         for (path, description) in describe_all(&unknown_paths, stop)? {
-            let answer = check_answer(&path, unknown[&path].clone(), description);
-            if let Ok(answer) = &answer {
-                cache.0.insert(cache_key(&path), answer.clone());
+            let described = check_unchanged(&path, unknown[&path].clone(), description);
+            if let Ok(described) = &described {
+                cache.0.insert(cache_key(&path), described.clone());
             }
-            answers.insert(path, answer);
+            descriptions.insert(path, described);
         }
         if !unknown.is_empty() {
             cache.write(store);
         }
         Ok(Self::new(pipeline, |stage| {
-            let Answer { identity, description } = answers[&paths[stage]].clone()?;
+            let IdentifiedDescription { identity, description } =
+                descriptions[&paths[stage]].clone()?;
             let program = StageProgram::new(&paths[stage], description)?;
             Ok(StageProgram { stamp: Some(identity.stamp), ..program })
         }))
@@ -168,14 +171,14 @@ impl Programs {
 }
 
 /// Fails if a program's file has changed since it was identified.
-fn check_answer(
+fn check_unchanged(
     path: &Path,
-    identity: Identity,
+    identity: FileIdentity,
     description: Result<Description, ProgramError>,
-) -> Result<Answer, ProgramError> {
+) -> Result<IdentifiedDescription, ProgramError> {
     let description = description?;
     if Stamp::of(path).is_ok_and(|now| now.is_untouched_since(&identity.stamp)) {
-        Ok(Answer { identity, description })
+        Ok(IdentifiedDescription { identity, description })
     } else {
         let path = path.display();
         Err(ProgramError(format!("{path} changed while it was described; run again")))
@@ -184,19 +187,19 @@ fn check_answer(
 
 /// Cached descriptions by the program's path.
 #[derive(Default, Serialize, Deserialize)]
-pub(crate) struct DescriptionCache(BTreeMap<String, Answer>);
+pub(crate) struct DescriptionCache(BTreeMap<String, IdentifiedDescription>);
 
 /// Description of a program, with the identity of its file.
 #[derive(Clone, Serialize, Deserialize)]
-struct Answer {
+struct IdentifiedDescription {
     #[serde(flatten)]
-    identity: Identity,
+    identity: FileIdentity,
     description: Description,
 }
 
 /// Identity of a program's file.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-struct Identity {
+struct FileIdentity {
     #[serde(flatten)]
     stamp: Stamp,
     /// Hash of the bytes of a user's file; `None` for the runner's own programs.
@@ -230,13 +233,13 @@ impl DescriptionCache {
         }
     }
 
-    fn description(&self, path: &Path, identity: &Identity) -> Option<Description> {
-        let answer = self.0.get(&cache_key(path))?;
-        answer.identity.is_same(identity).then(|| answer.description.clone())
+    fn description(&self, path: &Path, identity: &FileIdentity) -> Option<Description> {
+        let described = self.0.get(&cache_key(path))?;
+        described.identity.is_same(identity).then(|| described.description.clone())
     }
 }
 
-impl Identity {
+impl FileIdentity {
     /// Returns whether two identities are equal. A user's file is identified by its bytes alone: a
     /// copy of a project has other times.
     fn is_same(&self, other: &Self) -> bool {
@@ -244,7 +247,7 @@ impl Identity {
     }
 
     fn may_be_started(&self, describing: Describing, is_needed: bool) -> bool {
-        self.blake3.is_none() || (is_needed && matches!(describing, Describing::Needed(_)))
+        self.blake3.is_none() || (is_needed && matches!(describing, Describing::OwnAndNeeded(_)))
     }
 }
 
@@ -287,14 +290,14 @@ fn runner_folder() -> PathBuf {
 }
 
 /// Returns the identity of a program's file.
-fn identify(path: &Path, name: &str) -> Result<Identity, ProgramError> {
+fn identify(path: &Path, name: &str) -> Result<FileIdentity, ProgramError> {
     let stamp =
         if path.is_dir() { Err(std::io::ErrorKind::IsADirectory.into()) } else { Stamp::of(path) };
     let is_unstamped = stamp.is_err();
     let error = match stamp {
-        Ok(stamp) if is_own(path) => return Ok(Identity { stamp, blake3: None }),
+        Ok(stamp) if is_own(path) => return Ok(FileIdentity { stamp, blake3: None }),
         Ok(stamp) => match hash_file(path) {
-            Ok(hash) => return Ok(Identity { stamp, blake3: Some(hash) }),
+            Ok(hash) => return Ok(FileIdentity { stamp, blake3: Some(hash) }),
             Err(error) => error,
         },
         Err(error) => error,

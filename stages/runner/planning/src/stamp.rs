@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 /// Maximum step of a file system's clock: FAT has two seconds.
 const MAX_TICK_SECONDS: u64 = 2;
 
-/// Size, times and inode of a file. If a settled stamp stays equal, so does the file's content
-/// (docs/design/002).
+/// Size, times and inode of a file. If a settled stamp (`is_settled`) equals a later stamp of the
+/// file, the content is unchanged (docs/design/002).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
     /// Size in bytes.
@@ -50,7 +50,7 @@ impl Stamp {
 
     /// Returns the size and the time of the content's last change, which copies of a file may
     /// preserve.
-    pub(crate) fn of_content(&self) -> (u64, (i64, i64)) {
+    pub(crate) fn size_and_modified(&self) -> (u64, (i64, i64)) {
         (self.size, self.modified)
     }
 }

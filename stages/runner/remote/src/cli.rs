@@ -66,7 +66,7 @@ enum Verb {
         /// Replace an existing regular file
         #[arg(long)]
         force: bool,
-        /// Write only the records of the history, without its artifacts
+        /// Write the artifact and the records of its history, but not the history's artifacts
         #[arg(long)]
         records_only: bool,
     },

@@ -64,6 +64,8 @@ pub(crate) fn export(
     stop: &Arc<AtomicBool>,
 ) -> anyhow::Result<()> {
     destination.check()?;
+    // A run that lists the artifacts protects them from `gc` during the export. The run is removed
+    // afterwards, so that `gc` doesn't keep the artifacts as those of a recent run.
     let run = store.begin_run(&enter(store, stop)?, std::env::args().collect())?;
     let id = run.id().to_owned();
     let written = History::find(store, start, records_only).and_then(|history| {
@@ -74,10 +76,10 @@ pub(crate) fn export(
         drop(entered);
         history.write(store, destination, stop)
     });
-    // An export must not prolong the life of artifacts.
-    run.end()?;
+    let ended = run.end();
     store.remove_run(&id).ok();
-    written
+    written?;
+    Ok(ended?)
 }
 
 /// Artifact with the records of its history and their stored objects.
@@ -88,7 +90,7 @@ struct History {
 }
 
 impl History {
-    /// Finds the history of the artifact or action whose name begins with `start`.
+    /// Finds the history of the artifact or action whose hash or key begins with `start`.
     fn find(store: &Store, start: &str, records_only: bool) -> anyhow::Result<Self> {
         let mut records = records_by_key(store)?;
         let location = store.root().display().to_string();
@@ -106,16 +108,17 @@ impl History {
         let history = with_history(&records, keys);
         records.retain(|key, _| history.contains(key));
         let mut objects = BTreeSet::from([artifact.clone()]);
-        let mut missing = BTreeSet::new();
+        let mut incomplete = BTreeSet::new();
         for record in records.values().filter(|_| !records_only) {
             let is_complete = store.is_complete(&record.output)?;
-            let group = if is_complete { &mut objects } else { &mut missing };
+            let group = if is_complete { &mut objects } else { &mut incomplete };
             group.insert(record.output.clone());
         }
-        if !missing.is_empty() {
+        if !incomplete.is_empty() {
             report_line!(
-                "{} of the history incomplete in this store: writing only their records",
-                format_count(missing.len(), "artifact")
+                "this store lacks all or part of {} of the history; only the record of each is \
+                written",
+                format_count(incomplete.len(), "artifact")
             );
         }
         Ok(Self { artifact, records, objects })
@@ -199,7 +202,7 @@ impl Writer {
             let name = path.display().to_string();
             let mut reader = CheckedReader {
                 file: File::open(&path).with_context(|| name.clone())?,
-                check: ContentCheck::new(entry),
+                check: ContentCheck::new(entry, STORE_REMEDY),
                 progress: &self.progress,
                 name: &name,
                 problem: None,
@@ -209,7 +212,7 @@ impl Writer {
             if let Some(problem) = reader.problem.take() {
                 return Err(problem);
             }
-            reader.check.finish(&name, STORE_REMEDY)?;
+            reader.check.finish(&name)?;
             written.with_context(|| self.name.clone())?;
         }
         Ok(())

@@ -215,13 +215,13 @@ impl<'a, R: Read> Reader<'a, R> {
         }
         let mut output = target.map(create_file).transpose()?;
         let name = self.entry_name(&path);
-        let mut check = ContentCheck::new(file);
+        let mut check = ContentCheck::new(file, REMEDY);
         let mut buffer = vec![0; BUFFER_BYTES];
         loop {
             let count =
                 entry.read(&mut buffer).map_err(|e| self.refuse(format!("{path:?}: {e}")))?;
             if count == 0 {
-                return check.finish(&name, REMEDY);
+                return check.finish(&name);
             }
             check.add(&buffer[..count], &self.progress, &name)?;
             if let Some(output) = &mut output {

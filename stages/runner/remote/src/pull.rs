@@ -57,15 +57,14 @@ pub(crate) async fn pull(
     match refused.len() {
         0 => Ok(()),
         count => Err(Failure::BadInput(format!(
-            "{} refused; the rest was pulled",
-            format_count(count, "file")
+            "refused {count} of the records and artifacts, listed above; the rest was pulled"
         ))
         .into()),
     }
 }
 
-/// Fetches the records of the selected actions that the store lacks. Returns them with the number
-/// of selected actions that the store has.
+/// Fetches records. Returns those of selected actions that the store lacks, and the number of
+/// selected actions that the store has.
 async fn fetch_missing_records(
     store: &Store,
     remote: &Remote,
@@ -80,7 +79,7 @@ async fn fetch_missing_records(
     }
     let count = keys.len();
     if selection.is_all() {
-        keys = keys_without_hit(store, keys)?;
+        keys = missing_keys(store, keys)?;
     } else if selection.artifacts.is_empty() && !selection.history {
         keys.retain(|key| selection.keys.iter().any(|start| key.starts_with(start)));
     }
@@ -94,13 +93,13 @@ async fn fetch_missing_records(
     let selected = selection.keys_among(&records, &remote.name(""))?;
     let count = selected.len();
     let missing: Vec<Record> =
-        keys_without_hit(store, selected)?.iter().filter_map(|key| records.remove(key)).collect();
+        missing_keys(store, selected)?.iter().filter_map(|key| records.remove(key)).collect();
     let existing = if selection.is_all() { existing } else { count - missing.len() };
     Ok((missing, existing))
 }
 
 /// Returns the keys of the actions that the store lacks.
-fn keys_without_hit(
+fn missing_keys(
     store: &Store,
     keys: impl IntoIterator<Item = String>,
 ) -> Result<Vec<String>, StoreError> {

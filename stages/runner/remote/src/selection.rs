@@ -1,6 +1,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 
-use artifact::{Failure, format_count};
+use artifact::Failure;
 use store::{Record, Store, StoreError};
 
 /// Selection of the actions to copy.
@@ -13,7 +13,7 @@ pub(crate) struct Selection {
     /// may be repeated
     #[arg(long = "artifact", value_name = "HASH")]
     pub(crate) artifacts: Vec<String>,
-    /// Also copy the actions that created their inputs, directly or not
+    /// Also copy the actions that created the inputs of the selected actions, directly or not
     #[arg(long)]
     pub(crate) history: bool,
 }
@@ -24,7 +24,8 @@ impl Selection {
         self.keys.is_empty() && self.artifacts.is_empty()
     }
 
-    /// Returns the keys of the selected actions among `records`, whose `location` messages name.
+    /// Returns the keys of the selected actions among `records`. Messages call the records' store
+    /// `location`.
     pub(crate) fn keys_among(
         &self,
         records: &BTreeMap<String, Record>,
@@ -39,8 +40,8 @@ impl Selection {
         }
         for start in &self.artifacts {
             let outputs = records.values().map(|record| &record.output);
-            let identity = find_unique(start, outputs, "artifact", location)?;
-            selected.extend(keys_of_artifact(records, &identity));
+            let hash = find_unique(start, outputs, "artifact", location)?;
+            selected.extend(keys_of_artifact(records, &hash));
         }
         Ok(if self.history { with_history(records, selected) } else { selected })
     }
@@ -52,11 +53,8 @@ pub(crate) fn records_by_key(store: &Store) -> Result<BTreeMap<String, Record>, 
 }
 
 /// Returns the keys of the actions that created an artifact.
-pub(crate) fn keys_of_artifact(
-    records: &BTreeMap<String, Record>,
-    identity: &str,
-) -> BTreeSet<String> {
-    let matching = records.iter().filter(|(_, record)| record.output == identity);
+pub(crate) fn keys_of_artifact(records: &BTreeMap<String, Record>, hash: &str) -> BTreeSet<String> {
+    let matching = records.iter().filter(|(_, record)| record.output == hash);
     matching.map(|(key, _)| key.clone()).collect()
 }
 
@@ -87,11 +85,12 @@ pub(crate) fn find_unique<'a>(
         names.filter(|name| !start.is_empty() && name.starts_with(start)).collect();
     let problem = match found.len() {
         1 => return Ok(found.into_iter().cloned().collect()),
-        0 => format!("{location}: no {noun} {start:?}; `nerf-sr status` lists the actions"),
-        count => format!(
-            "{location}: {} begin with {start:?}; give more characters",
-            format_count(count, noun)
+        0 => format!(
+            "{location}: no {noun} {start:?}; `nerf-sr status --json` lists keys and hashes"
         ),
+        count => {
+            format!("{location}: {count} matches for {noun} {start:?}; give more characters")
+        }
     };
     Err(Failure::Usage(problem).into())
 }
@@ -126,7 +125,7 @@ mod tests {
             (&["k3"], &[], true, Ok(&["k1", "k2", "k3"])),
             (&[], &["h1"], false, Ok(&["k1", "k2"])),
             (&["k1"], &["h3"], false, Ok(&["k1", "k3"])),
-            (&["k"], &[], false, Err("3 actions begin with \"k\"")),
+            (&["k"], &[], false, Err("3 matches for action \"k\"")),
             (&["x"], &[], false, Err("there: no action \"x\"")),
             (&[""], &[], false, Err("no action \"\"")),
             (&[], &["h2"], false, Err("no artifact \"h2\"")),

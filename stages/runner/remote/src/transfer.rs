@@ -16,8 +16,8 @@ use crate::remote::Remote;
 
 /// Maximum number of concurrent transfers, and number of threads. Chosen by hand.
 pub(crate) const MAX_CONCURRENT_FILES: usize = 8;
-/// Minimum size of a part in bytes; larger files are uploaded in parts. At most three parts of a
-/// file are in memory. S3 requires at least 5 MiB.
+/// Maximum size in bytes of a file that is uploaded in one piece, and minimum size of a part of a
+/// larger file. At most three parts of a file are in memory. S3 requires at least 5 MiB.
 const MIN_PART_BYTES: u64 = 6 << 20;
 /// Maximum number of parts of a file; S3 supports 10,000.
 const MAX_PARTS: u64 = 9_000;
@@ -48,13 +48,13 @@ impl Transfer {
         let _slot = self.slots.acquire().await?;
         let name = source.display();
         let file = File::open(source).with_context(|| name.to_string())?;
-        let mut check = ContentCheck::new(entry);
+        let mut check = ContentCheck::new(entry, STORE_REMEDY);
         if entry.size <= MIN_PART_BYTES {
             let mut bytes = Vec::new();
             let read = file.take(entry.size + 1).read_to_end(&mut bytes);
             read.with_context(|| name.to_string())?;
             check.add(&bytes, &self.progress, &name)?;
-            check.finish(&name, STORE_REMEDY)?;
+            check.finish(&name)?;
             return self.remote.write(target, bytes).await;
         }
         let part_bytes = MIN_PART_BYTES.max(entry.size.div_ceil(MAX_PARTS));
@@ -90,7 +90,7 @@ impl Transfer {
             let read = file.take(part_bytes).read_to_end(&mut bytes);
             read.with_context(|| name.to_string())?;
             if bytes.is_empty() {
-                return check.finish(&name, STORE_REMEDY);
+                return check.finish(&name);
             }
             check.add(&bytes, &self.progress, &name)?;
             upload.wait_for_capacity(2).await?;
@@ -112,14 +112,14 @@ impl Transfer {
             bail_bad_input!("{name}: not found; {REMOTE_REMEDY}");
         };
         let mut file = create_file(target)?;
-        let mut check = ContentCheck::new(entry);
+        let mut check = ContentCheck::new(entry, REMOTE_REMEDY);
         let mut stream = found.into_stream();
         while let Some(piece) = stream.next().await {
             let piece = piece.map_err(|error| self.remote.read_error(source, error))?;
             check.add(&piece, &self.progress, &name)?;
             file.write_all(&piece).with_context(|| target.display().to_string())?;
         }
-        check.finish(&name, REMOTE_REMEDY)
+        check.finish(&name)
     }
 }
 
@@ -132,13 +132,15 @@ const REMOTE_REMEDY: &str = "the artifact was not pulled; delete this file and t
 /// Comparison of a file's content with its manifest, piece by piece.
 pub(crate) struct ContentCheck<'a> {
     entry: &'a FileEntry,
+    /// Remedy in the messages about differences.
+    remedy: &'a str,
     size: u64,
     hasher: blake3::Hasher,
 }
 
 impl<'a> ContentCheck<'a> {
-    pub(crate) fn new(entry: &'a FileEntry) -> Self {
-        Self { entry, size: 0, hasher: blake3::Hasher::new() }
+    pub(crate) fn new(entry: &'a FileEntry, remedy: &'a str) -> Self {
+        Self { entry, remedy, size: 0, hasher: blake3::Hasher::new() }
     }
 
     /// Adds the next piece. Fails if the content is too long.
@@ -151,22 +153,23 @@ impl<'a> ContentCheck<'a> {
         self.size += piece.len() as u64;
         let expected = self.entry.size;
         if self.size > expected {
-            bail_bad_input!("{name}: more than the {expected} bytes in the manifest");
+            let remedy = self.remedy;
+            bail_bad_input!("{name}: more than the {expected} bytes in the manifest; {remedy}");
         }
         self.hasher.update(piece);
         progress.add(piece.len() as u64)
     }
 
     /// Fails if the complete content differs from the manifest.
-    pub(crate) fn finish(self, name: &dyn std::fmt::Display, remedy: &str) -> anyhow::Result<()> {
+    pub(crate) fn finish(self, name: &dyn std::fmt::Display) -> anyhow::Result<()> {
         let problem = if self.size != self.entry.size {
             format!("{} bytes, but {} in the manifest", self.size, self.entry.size)
         } else if self.hasher.finalize().to_hex().as_str() != self.entry.blake3 {
-            "the content has changed (blake3 differs)".to_owned()
+            "the content differs from the manifest (blake3)".to_owned()
         } else {
             return Ok(());
         };
-        Err(Failure::BadInput(format!("{name}: {problem}; {remedy}")).into())
+        Err(Failure::BadInput(format!("{name}: {problem}; {}", self.remedy)).into())
     }
 }
 

@@ -280,7 +280,7 @@ fn refused(dir: &Path, bytes: &[u8], reason: &str) {
     );
     let other = Store::open(&folder).unwrap();
     assert!(
-        other.objects().unwrap().is_empty() && other.action_files().unwrap().is_empty(),
+        other.objects().unwrap().is_empty() && other.action_keys().unwrap().is_empty(),
         "{reason}"
     );
     assert_tidy(&other);

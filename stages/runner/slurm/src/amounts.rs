@@ -1,4 +1,4 @@
-//! Human-readable amounts of memory and time: `8G`, `1h30m`.
+//! Human-readable amounts of memory and durations: `8G`, `1h30m`.
 
 use std::fmt::{self, Display, Formatter};
 use std::marker::PhantomData;
@@ -110,7 +110,8 @@ impl Display for Period {
     }
 }
 
-/// Reads an amount. A bare number gets the amount's own error, which asks for the missing unit.
+/// Reads an amount. A number without a unit fails with [`AmountError`], which asks for the unit,
+/// instead of with a type error.
 fn deserialize_amount<'de, D: Deserializer<'de>, T: FromStr<Err = AmountError>>(
     deserializer: D,
 ) -> Result<T, D::Error> {

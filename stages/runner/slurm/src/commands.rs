@@ -35,12 +35,13 @@ impl Slurm {
         let last = stdout.trim().lines().last().unwrap_or_default();
         let id = last.split(';').next().unwrap_or_default();
         if id.is_empty() || !id.bytes().all(|b| b.is_ascii_digit()) {
-            return Err(SlurmError(format!("sbatch: expected a job ID, found {last:?}")));
+            let problem = format!("sbatch: expected a job ID, found {last:?}");
+            return Err(SlurmError(format!("{problem}; check that sbatch works in this shell")));
         }
         Ok(id.to_owned())
     }
 
-    /// Lists the jobs of some users, one line a job in the given format.
+    /// Lists the jobs of some users, one line per job in the given format.
     pub(crate) fn squeue(&self, users: &[String], format: &str) -> Result<String, SlurmError> {
         self.call("squeue", &["--noheader", "--user", &users.join(","), "--format", format])
     }

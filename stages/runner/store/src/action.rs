@@ -137,14 +137,14 @@ impl Store {
     /// Returns all undamaged records, sorted by key.
     pub fn records(&self) -> Result<Vec<Record>, StoreError> {
         let mut records = Vec::new();
-        for key in self.action_files()? {
+        for key in self.action_keys()? {
             records.extend(self.record(&key)?);
         }
         Ok(records)
     }
 
     /// Returns the keys of all records and logs, sorted; including those of damaged records.
-    pub fn action_files(&self) -> Result<Vec<String>, StoreError> {
+    pub fn action_keys(&self) -> Result<Vec<String>, StoreError> {
         let mut keys = Vec::new();
         for name in self.list_names("actions")? {
             // Other files don't belong to the store.
@@ -210,20 +210,20 @@ mod tests {
     use artifact::{Damage, MANIFEST_FILE};
 
     use super::*;
-    use crate::testing::{UNREADABLE, begin, entered, make};
+    use crate::testing::{UNREADABLE, begin, entered, finish_action};
 
     #[test]
     fn a_lost_file_is_a_miss_and_a_flipped_byte_is_found() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let done = make(&store, "a", "1234");
+        let done = finish_action(&store, "a", "1234");
         fs::write(store.object(&done.output).join("x"), "1235").unwrap();
         assert!(matches!(store.verify(&done.output), Err(Damage::Content { .. })));
         fs::remove_file(store.object(&done.output).join("x")).unwrap();
         assert_eq!(store.hit(&done.key()).unwrap(), None);
         assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text").unwrap(), None);
         // Creating the artifact again replaces the damaged object.
-        make(&store, "a", "1234");
+        finish_action(&store, "a", "1234");
         store.verify(&done.output).unwrap();
     }
 
@@ -233,7 +233,7 @@ mod tests {
         for damage in UNREADABLE {
             let dir = tempfile::tempdir().unwrap();
             let store = Store::open(dir.path()).unwrap();
-            let key = make(&store, "a", "1234").key();
+            let key = finish_action(&store, "a", "1234").key();
             damage(&store.action(&key, "json"));
             for problem in [
                 store.record(&key).err(),
@@ -252,7 +252,7 @@ mod tests {
     fn damaged_records_are_no_hits() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let (a, b) = (make(&store, "a", "1234"), make(&store, "b", "5678"));
+        let (a, b) = (finish_action(&store, "a", "1234"), finish_action(&store, "b", "5678"));
         let path = store.action(&a.key(), "json");
         for (bytes, words) in [
             (Vec::new(), "the record is damaged"),
@@ -269,7 +269,7 @@ mod tests {
         fs::write(dir.path().join("actions/notes.json"), "mine").unwrap();
         let mut keys = [a.key(), b.key()];
         keys.sort();
-        assert_eq!(store.action_files().unwrap(), keys, "other files are foreign");
+        assert_eq!(store.action_keys().unwrap(), keys, "other files are foreign");
     }
 
     #[test]
@@ -298,7 +298,8 @@ mod tests {
     fn manifests_are_repaired_and_objects_replaced() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let (done, other) = (make(&store, "a", "1234"), make(&store, "b", "other"));
+        let (done, other) =
+            (finish_action(&store, "a", "1234"), finish_action(&store, "b", "other"));
         let (object, manifest) =
             (store.object(&done.output), store.object(&done.output).join(MANIFEST_FILE));
         let foreign = fs::read(store.object(&other.output).join(MANIFEST_FILE)).unwrap();
@@ -315,9 +316,9 @@ mod tests {
         fs::remove_dir_all(&object).unwrap();
         fs::write(&object, "a file").unwrap();
         assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text").unwrap(), None);
-        assert_eq!(make(&store, "a", "1234"), done);
+        assert_eq!(finish_action(&store, "a", "1234"), done);
         fs::remove_file(&manifest).unwrap();
-        assert_eq!(make(&store, "a", "1234"), done);
+        assert_eq!(finish_action(&store, "a", "1234"), done);
         store.verify(&done.output).unwrap();
         store.empty_trash().unwrap();
         assert_eq!(fs::read_dir(dir.path().join("trash")).unwrap().count(), 0);

@@ -19,7 +19,7 @@ pub struct Arrival {
 
 impl Store {
     /// Checks an artifact from another store, its files against the manifest and the manifest
-    /// against the identity, and makes it durable. This step is slow, so that
+    /// against the identity, and makes it durable. All slow work is done here, so that
     /// [`Store::import_object`] is fast.
     pub fn check_arrival(&self, folder: &Path, identity: &str) -> Result<Arrival, StoreError> {
         let manifest = Manifest::read(folder)?;

@@ -13,7 +13,7 @@ use crate::folder::{Store, remove_if_found};
 use crate::lock::Entered;
 use crate::objects::make_durable;
 
-/// Paths of an action in progress.
+/// Paths of one attempt at an action.
 #[derive(Debug)]
 pub struct Attempt {
     /// `--output` of the stage; doesn't exist yet.
@@ -38,7 +38,7 @@ pub struct CheckedOutput {
 
 impl Attempt {
     /// Replaces hard links by copies, since writing to a file by its other name would change the
-    /// artifact. Fails for anything but folders and regular files.
+    /// artifact. Fails if there is anything other than folders and regular files.
     fn copy_hard_links(&self) -> Result<(), StoreError> {
         let files = list_output_files(&self.output).map_err(|problem| match problem {
             OutputFileError::Kind { .. } => StoreError::NoArtifact(problem.to_string()),
@@ -81,12 +81,15 @@ impl Store {
         Ok(attempt)
     }
 
-    /// Checks the manifest of an attempt's output against the files, and makes both durable. Fails
-    /// for links and special files. This step is slow, so that [`Store::publish`] is fast.
+    /// Does all slow work of publishing an attempt's output, so that [`Store::publish`] is fast.
+    /// Replaces hard links by copies, writes the manifest if the stage wrote none, checks the
+    /// manifest against the files, and makes both durable. Fails for symbolic links and special
+    /// files.
     pub fn check(&self, attempt: Attempt, kind: &str) -> Result<CheckedOutput, StoreError> {
         let output = &attempt.output;
         if output.symlink_metadata().is_err() {
-            return Err(StoreError::NoArtifact("--output was not created".to_owned()));
+            let problem = "the stage has not created the folder --output";
+            return Err(StoreError::NoArtifact(problem.to_owned()));
         }
         attempt.copy_hard_links()?;
         let found = with_path(output, Manifest::of_folder(kind, output))?;
@@ -96,13 +99,20 @@ impl Store {
             with_path(&path, write_json(&path, &found))?;
         }
         let stated = Manifest::read(output)?;
+        if stated.kind != kind {
+            return Err(StoreError::NoArtifact(format!(
+                "{MANIFEST_FILE}: expected kind {kind:?}, found {:?}",
+                stated.kind
+            )));
+        }
         if stated != found {
             return Err(StoreError::NoArtifact(format!(
-                "{MANIFEST_FILE} differs from the files, or the kind in it is not {kind:?}"
+                "{MANIFEST_FILE} differs from the files; write it last, or leave it to the runner"
             )));
         }
         if found.files.is_empty() {
-            return Err(StoreError::NoArtifact("--output has no files".to_owned()));
+            let problem = "the stage has written no files to --output";
+            return Err(StoreError::NoArtifact(problem.to_owned()));
         }
         make_durable(output, &found)?;
         let identity = found.identity();
@@ -139,13 +149,13 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::testing::{begin, entered, make};
+    use crate::testing::{begin, entered, finish_action};
 
     #[test]
     fn two_actions_may_end_in_one_object() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let (a, b) = (make(&store, "a", "same"), make(&store, "b", "same"));
+        let (a, b) = (finish_action(&store, "a", "same"), finish_action(&store, "b", "same"));
         assert_eq!(a.output, b.output);
         assert_ne!(a.key(), b.key());
         assert_eq!(store.objects().unwrap(), std::slice::from_ref(&a.output));
@@ -181,7 +191,7 @@ mod tests {
             assert!(message.contains(words) && !message.contains('\n'), "{words}: {message}");
         }
         assert_eq!(fs::read_dir(&own).unwrap().count(), 1);
-        assert_eq!(store.hit(&make(&store, "k", "1").key()).unwrap().unwrap().stage, "k");
+        assert_eq!(store.hit(&finish_action(&store, "k", "1").key()).unwrap().unwrap().stage, "k");
     }
 
     /// Writing to a file by its other name doesn't change the artifact.

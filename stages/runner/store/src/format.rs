@@ -79,7 +79,7 @@ mod tests {
     use std::thread::ScopedJoinHandle;
 
     use super::*;
-    use crate::testing::{begin, entered, make};
+    use crate::testing::{begin, entered, finish_action};
 
     #[test]
     fn a_newer_store_is_refused_in_one_line() {
@@ -102,7 +102,7 @@ mod tests {
     fn an_older_program_at_work_stops_when_a_newer_one_comes() {
         let dir = tempfile::tempdir().unwrap();
         let older = Store::open_as(dir.path(), 1).unwrap();
-        let done = make(&older, "a", "1234");
+        let done = finish_action(&older, "a", "1234");
         let checked = older.check(begin(&older, "b", Some("5678")), "text").unwrap();
         let newer = Store::open_as(dir.path(), 2).unwrap();
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");
@@ -124,7 +124,7 @@ mod tests {
             (vec![done.output.clone()], Some(done))
         );
         // The newer program completes the action of the older one.
-        let made = make(&newer, "b", "5678");
+        let made = finish_action(&newer, "b", "5678");
         assert_eq!(newer.hit(&made.key()).unwrap(), Some(made));
         Store::open_as(dir.path(), 2).unwrap();
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");

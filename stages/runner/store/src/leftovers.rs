@@ -10,7 +10,7 @@ const FOLDERS: [&str; 5] = ["", "actions", "cache", "cache/sources", "pins"];
 impl Store {
     /// Returns the keys of finished actions whose folder in `partial/` remains, sorted: their
     /// runners were killed right after writing the record.
-    pub fn finished_partials(&self) -> Result<Vec<String>, StoreError> {
+    pub fn leftover_partials(&self) -> Result<Vec<String>, StoreError> {
         let locked = self.locked_keys()?;
         let mut finished = Vec::new();
         for key in self.partials()? {
@@ -21,9 +21,9 @@ impl Store {
         Ok(finished)
     }
 
-    /// Removes the temporary files of killed processes. Only processes inside the store write
-    /// records, pins and the format, and `Closed` excludes such processes. Files of `cache` may be
-    /// in use; a deleted cache file is created again.
+    /// Removes the temporary files of killed processes. Records, pins and the file `format` are
+    /// written only under the lock [`Entered`](crate::Entered), which `Closed` excludes. Temporary
+    /// files of `cache` may belong to a live process; a cache file that is lost is created again.
     pub fn remove_leftovers(&self, _: &Closed) -> Result<(), StoreError> {
         for folder in FOLDERS {
             let folder = self.root().join(folder);
@@ -47,13 +47,13 @@ fn is_temporary(name: &str) -> bool {
 mod tests {
     use super::*;
     use crate::lock::Locked;
-    use crate::testing::{begin, make};
+    use crate::testing::{begin, finish_action};
 
     #[test]
     fn temporary_files_of_killed_writers_go() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let done = make(&store, "a", "1234");
+        let done = finish_action(&store, "a", "1234");
         for folder in FOLDERS {
             fs::create_dir_all(dir.path().join(folder)).unwrap();
             fs::write(dir.path().join(folder).join(".aB3xYz.partial"), "half").unwrap();
@@ -69,6 +69,6 @@ mod tests {
             assert!(dir.path().join(folder).join("notes").exists(), "{folder}");
         }
         assert_eq!(store.hit(&key).unwrap(), Some(done));
-        assert_eq!(store.finished_partials().unwrap(), [key]);
+        assert_eq!(store.leftover_partials().unwrap(), [key]);
     }
 }

@@ -53,7 +53,7 @@ impl Store {
     pub fn run_or_pin(&self, name: &str) -> Result<Option<Run>, StoreError> {
         for kind in [FileKind::Run, FileKind::Pin] {
             // The name is compared with existing ones first, since it may be any text.
-            if self.run_names(kind)?.iter().any(|id| id == name) {
+            if self.names(kind)?.iter().any(|id| id == name) {
                 return Run::read(self, kind, name);
             }
         }
@@ -62,17 +62,18 @@ impl Store {
 
     /// Returns the names of all pins, including damaged ones, sorted.
     pub fn pin_names(&self) -> Result<Vec<String>, StoreError> {
-        self.run_names(FileKind::Pin)
+        self.names(FileKind::Pin)
     }
 
-    fn run_names(&self, kind: FileKind) -> Result<Vec<String>, StoreError> {
+    /// Returns the names of all runs or pins, sorted.
+    fn names(&self, kind: FileKind) -> Result<Vec<String>, StoreError> {
         let names = self.list_names(kind.folder())?;
         Ok(names.iter().filter_map(|name| Some(name.strip_suffix(EXTENSION)?.to_owned())).collect())
     }
 
     fn read_all(&self, kind: FileKind) -> Result<Vec<Run>, StoreError> {
         let mut runs = Vec::new();
-        for id in self.run_names(kind)? {
+        for id in self.names(kind)? {
             runs.extend(Run::read(self, kind, &id)?);
         }
         Ok(runs)

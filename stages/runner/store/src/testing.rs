@@ -11,7 +11,8 @@ use crate::attempt::Attempt;
 use crate::folder::Store;
 use crate::lock::{Entered, Locked};
 
-/// Replacements of a file that not even root can read: a folder, and a loop of links.
+/// Functions that replace a file by something that not even root can read: a folder, or a link to
+/// itself.
 pub(crate) const UNREADABLE: [fn(&Path); 2] = [
     |path| {
         fs::remove_file(path).ok();
@@ -48,7 +49,8 @@ pub(crate) fn begin(store: &Store, name: &str, content: Option<&str>) -> Attempt
     attempt
 }
 
-pub(crate) fn make(store: &Store, name: &str, content: &str) -> Record {
+/// Finishes an action whose output is `content`.
+pub(crate) fn finish_action(store: &Store, name: &str, content: &str) -> Record {
     let checked = store.check(begin(store, name, Some(content)), "text").unwrap();
     let Unfinished { stage, key_parts, .. } = unfinished(name);
     let record = Record { stage, key_parts, threads: 1, ..Record::default() };

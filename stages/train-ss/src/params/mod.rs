@@ -41,8 +41,9 @@ pub struct Params {
     #[schemars(range(min = 1, max = 1_048_576))]
     #[schemars(extend("x-group" = "sampling", "x-default" = "by `field`"))]
     pub max_rays_per_step: Option<u32>,
-    /// Learning rate at its peak, of the grid's coarsest level or of the paper's MLPs. Default:
-    /// 0.06, or 0.0005 with `field: mlp`.
+    /// Highest learning rate of the paper's MLPs, or of the grid's coarsest level. The rate of each
+    /// finer level is 0.8 times that of the level before. Default: 0.06, or 0.0005 with
+    /// `field: mlp`.
     #[schemars(range(min = 0.0, max = 1.0))]
     #[schemars(extend("x-group" = "optimiser", "x-default" = "by `field`"))]
     pub learning_rate: Option<f64>,
@@ -52,10 +53,10 @@ pub struct Params {
     pub supervision: Option<Supervision>,
     /// Estimates a gain for red, green and blue of each photograph, for photographs with several
     /// exposures or white balances. Rendered views have the mean exposure of the photographs.
-    /// Default: the first 512 steps measure the gains. If they differ by more than a fifth of the
-    /// field's relative error, usually 2 to 4 %, the training starts over with exposures.
-    /// Fine-tuning (input `init`) follows the initial field. False for `field: mlp`, background
-    /// `alpha` and `pose_refinement`.
+    /// Default: the first 512 steps measure the gains. If the gains differ by more than a limit,
+    /// usually 2 to 4 % (a fifth of the field's relative error), training starts over with
+    /// exposures. Fine-tuning (input `init`) follows the initial field. False for `field: mlp`,
+    /// background `alpha` and `pose_refinement`.
     #[schemars(extend("x-group" = "data", "x-default" = BY_SCENE))]
     pub exposure: Option<bool>,
     /// Optimises camera poses during training, for poses that aren't exact. Motion that all cameras
@@ -63,9 +64,9 @@ pub struct Params {
     /// `nerf-sr run registered` then renders test views from registered cameras.
     #[schemars(extend("x-group" = "data"))]
     pub pose_refinement: bool,
-    /// Carves the visual hull: cells stay empty if they lie behind transparent pixels alone in at
-    /// least one photograph. For `field: grid`, photographs with alpha and space `box`, unless
-    /// `pose_refinement` moves the cameras.
+    /// Carves the visual hull: a cell stays empty if at least one photograph has only transparent
+    /// pixels there. Has an effect only with `field: grid`, photographs with alpha and space `box`,
+    /// and not if `pose_refinement` moves the cameras.
     #[schemars(extend("x-group" = "data"))]
     pub silhouettes: bool,
     /// Maximum number of HR references: the first ones of input `references` are used.
@@ -77,7 +78,7 @@ pub struct Params {
     pub ensemble: u32,
     /// Combination of the initial field (input `init`) with the fine-tuned field. Default:
     /// `average_weights` in NDC, where all cameras observe the same side of the scene; otherwise
-    /// `ensemble`, since a reference gives no information about the other sides.
+    /// `ensemble`, since fine-tuning on a reference gives no information about the other sides.
     #[schemars(extend("x-group" = "output", "x-default" = BY_SCENE))]
     pub combine: Option<Combine>,
     /// Seed of all random numbers.
@@ -129,9 +130,9 @@ impl Default for FieldParams {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GridParams {
-    /// Rays for each LR pixel of all views, unless `rays` is given. With `background: opaque`,
-    /// where each ray hits a surface and costs more, 0.6 times as many; fine-tuning (input `init`)
-    /// takes half.
+    /// Rays for each LR pixel of all views, unless `rays` is given. The value is multiplied by 0.6
+    /// with `background: opaque`, where each ray hits a surface and costs more. Fine-tuning (input
+    /// `init`) halves the resulting number of rays, even below `min_rays`.
     #[schemars(range(min = 0.001, max = 100_000.0), extend("x-group" = "sampling"))]
     pub rays_per_pixel: f64,
     /// Minimum of the rays that follow from `rays_per_pixel`.

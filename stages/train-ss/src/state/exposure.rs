@@ -212,7 +212,7 @@ impl fmt::Display for ExposureDifference {
         let (order, decision) = if self.is_clear() {
             ("at least", "starting over with exposures")
         } else {
-            ("less than", "no exposures are estimated")
+            ("less than", "continuing without exposures")
         };
         write!(
             f,

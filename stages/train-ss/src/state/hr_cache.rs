@@ -124,9 +124,9 @@ impl HrCache {
 
     /// Computes the kernel's residuals around an LR pixel, with freshly rendered `colours` in the
     /// pixel's block and cached ones elsewhere, and back-projects them to the block: writes
-    /// P·residual, where P = Kᵀ·(s²·K·Kᵀ)⁻¹ is the pseudo-inverse without its factor s². Returns
-    /// the residual of the pixel itself. `residual_of` returns the residual for a channel, a
-    /// prediction and its target.
+    /// P·residual, where P = K⁺ / s², with the pseudo-inverse K⁺ = Kᵀ·(K·Kᵀ)⁻¹. Returns the
+    /// residual of the pixel itself. `residual_of` returns the residual for a channel, a prediction
+    /// and its target.
     pub(crate) fn back_project(
         &self,
         pixel: LrPixel,
@@ -159,15 +159,15 @@ impl HrCache {
             }
         }
         for (b, back_projected) in back_projected.chunks_exact_mut(block.columns).enumerate() {
-            let mut columns = [[0.0f32; 3]; MAX_NEIGHBOURS];
+            let mut column_sums = [[0.0f32; 3]; MAX_NEIGHBOURS];
             for (j, row) in residuals.iter().enumerate().take(ys.len()) {
                 let weight = inverse.y.weight(ys.start + j, top + b);
-                add_scaled(columns.as_flattened_mut(), row.as_flattened(), weight);
+                add_scaled(column_sums.as_flattened_mut(), row.as_flattened(), weight);
             }
-            for (a, projection) in back_projected.iter_mut().enumerate() {
-                *projection = [0.0; 3];
-                for (i, column) in columns.iter().enumerate().take(xs.len()) {
-                    add_scaled(projection, column, inverse.x.weight(xs.start + i, left + a));
+            for (a, back_projection) in back_projected.iter_mut().enumerate() {
+                *back_projection = [0.0; 3];
+                for (i, sum) in column_sums.iter().enumerate().take(xs.len()) {
+                    add_scaled(back_projection, sum, inverse.x.weight(xs.start + i, left + a));
                 }
             }
         }

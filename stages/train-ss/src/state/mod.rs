@@ -11,7 +11,7 @@ pub(crate) use hr_cache::{HrCache, KernelOperator, LrPixel};
 pub(crate) use moving_cameras::MovingCameras;
 
 /// State estimated during training; each part is `None` unless enabled.
-pub(crate) struct TrainingState {
+pub(crate) struct SupervisionState {
     /// HR pixels as last rendered.
     pub(crate) cache: Option<HrCache>,
     /// Gains of each photograph's channels.
@@ -22,7 +22,7 @@ pub(crate) struct TrainingState {
     pub(crate) cameras: Option<MovingCameras>,
 }
 
-impl TrainingState {
+impl SupervisionState {
     /// Writes the state for a checkpoint.
     pub(crate) fn write(&self, to: &mut impl io::Write) -> io::Result<()> {
         if let Some(cache) = &self.cache {
@@ -40,7 +40,7 @@ impl TrainingState {
         Ok(())
     }
 
-    /// Returns the number of bytes that [`TrainingState::write`] writes.
+    /// Returns the number of bytes that [`SupervisionState::write`] writes.
     pub(crate) fn byte_length(&self) -> usize {
         self.cache.as_ref().map_or(0, HrCache::byte_length)
             + self.exposures.as_ref().map_or(0, |exposures| exposures.to_bytes().len())
@@ -48,7 +48,7 @@ impl TrainingState {
             + self.cameras.as_ref().map_or(0, |cameras| cameras.to_bytes().len())
     }
 
-    /// Restores the output of [`TrainingState::write`].
+    /// Restores the output of [`SupervisionState::write`].
     pub(crate) fn restore(&mut self, from: &mut impl io::Read) -> io::Result<()> {
         if let Some(cache) = &mut self.cache {
             cache.restore(from)?;
@@ -83,7 +83,7 @@ mod tests {
     use crate::photographs::{Photographs, PixelMemory};
 
     /// State of one photograph from `height` above the scene.
-    fn state(height: f64) -> TrainingState {
+    fn state(height: f64) -> SupervisionState {
         let image = Image::new(24, 24, 3, vec![0.5; 24 * 24 * 3]);
         let kernel = Arc::new(KernelOperator::new(Filter::Lanczos, (24, 24), (12, 12)));
         let mut cache = HrCache::new([2, 2]);
@@ -95,7 +95,7 @@ mod tests {
         };
         let cameras =
             MovingCameras::new([Photographs::taken_by(camera, image).over_background()].iter());
-        TrainingState {
+        SupervisionState {
             cache: Some(cache),
             exposures: Some(Exposures::new(1)),
             measurement: Some(ExposureMeasurement::new(1, false)),
@@ -103,7 +103,7 @@ mod tests {
         }
     }
 
-    fn written(state: &TrainingState) -> Vec<u8> {
+    fn written(state: &SupervisionState) -> Vec<u8> {
         let mut bytes = Vec::new();
         state.write(&mut bytes).unwrap();
         bytes
@@ -124,7 +124,7 @@ mod tests {
         assert_ne!(written(&other), bytes);
         other.restore(&mut &bytes[..]).unwrap();
         assert_eq!(written(&other), bytes);
-        let cameras = |state: &TrainingState| state.cameras.as_ref().unwrap().cameras().to_vec();
+        let cameras = |state: &SupervisionState| state.cameras.as_ref().unwrap().cameras().to_vec();
         assert_eq!(cameras(&other), cameras(&first));
         assert!(other.restore(&mut &bytes[1..]).is_err());
     }
@@ -133,7 +133,7 @@ mod tests {
     #[test]
     fn disabled_parts_write_nothing() {
         let nothing =
-            TrainingState { cache: None, exposures: None, measurement: None, cameras: None };
+            SupervisionState { cache: None, exposures: None, measurement: None, cameras: None };
         assert_eq!((written(&nothing).len(), nothing.byte_length()), (0, 0));
     }
 }

@@ -48,7 +48,7 @@ impl MovingCameras {
     }
 
     /// True if the next round is due at `progress`, the fraction of the training that is done.
-    pub(crate) fn are_due(&self, progress: f64) -> bool {
+    pub(crate) fn is_round_due(&self, progress: f64) -> bool {
         let range = LAST_PROGRESS - FIRST_PROGRESS;
         self.rounds < ROUNDS
             && progress >= FIRST_PROGRESS + range * f64::from(self.rounds) / f64::from(ROUNDS)
@@ -79,7 +79,7 @@ impl MovingCameras {
 
     /// Measures the motion of the first `count` cameras since the start, relative to the depth that
     /// the field renders for each camera.
-    pub(crate) fn moved(
+    pub(crate) fn mean_motion(
         &self,
         field: &dyn RayField,
         count: usize,
@@ -152,16 +152,16 @@ mod tests {
             [0.0, 0.5].map(|x| Photographs::taken_by(camera(x), image.clone()).over_background());
         let new = || MovingCameras::new(photographs.iter());
         let mut moving = new();
-        assert!(!moving.are_due(0.01) && moving.are_due(0.02));
+        assert!(!moving.is_round_due(0.01) && moving.is_round_due(0.02));
         moving.step(&field, 0.02, 1.0, |_| [1.0; 3]).unwrap();
-        assert!(!moving.are_due(0.02) && moving.are_due(0.05));
+        assert!(!moving.is_round_due(0.02) && moving.is_round_due(0.05));
         let mut count = 1;
-        while moving.are_due(1.0) {
+        while moving.is_round_due(1.0) {
             (moving.rounds, count) = (moving.rounds + 1, count + 1);
         }
         assert_eq!(count, ROUNDS);
         moving.current[1].camera_to_world[2][3] = 4.25;
-        let moved = moving.moved(&field, 2, 1.0).unwrap();
+        let moved = moving.mean_motion(&field, 2, 1.0).unwrap();
         assert!((moved.distance - 0.125).abs() < 0.05 && moved.pixels.is_finite(), "{moved:?}");
         let mut other = new();
         let bytes = moving.to_bytes();

@@ -11,7 +11,7 @@ use super::{Supersampling, TrainingView};
 use crate::params::Exposure;
 use crate::photographs::{PackedPhotograph, Photographs, PixelMemory, PixelSet};
 use crate::state::{
-    ExposureMeasurement, Exposures, HrCache, KernelOperator, MovingCameras, TrainingState,
+    ExposureMeasurement, Exposures, HrCache, KernelOperator, MovingCameras, SupervisionState,
 };
 use crate::supersample::SupersampleSchedule;
 
@@ -47,7 +47,7 @@ impl Supersampling {
         let order = (params.in_epochs, params.precrop_bundles());
         Ok(Self {
             sampler: PixelSampler::new(numbers, count, importance, order, params.seed),
-            state: TrainingState {
+            state: SupervisionState {
                 cache,
                 exposures: (params.exposure == Exposure::On).then(|| Exposures::new(views.len())),
                 measurement: (params.exposure == Exposure::ByScene)

@@ -56,7 +56,7 @@ pub(crate) fn pixel_memory(
 pub(crate) fn memory_text(need: &TrainingMemory, budget: u64) -> String {
     let in_memory = need.pixels.min(budget);
     let mut text = format!(
-        "memory: about {}, of which {} for the field and {} for pixels",
+        "memory: about {}, of which {} for the field, {} for pixels, the rest for the program",
         format_size(need.minimum(PROGRAM_BYTES) + in_memory),
         format_size(need.field),
         format_size(in_memory)
@@ -153,14 +153,17 @@ mod tests {
         assert_eq!(
             memory_text(&need, MAX_PIXEL_BYTES),
             format!(
-                "memory: about {total}, of which 300.0 MB for the field and 4.0 GB for pixels; \
-                1.0 GB of pixels in a file"
+                "memory: about {total}, of which 300.0 MB for the field, 4.0 GB for pixels, the \
+                rest for the program; 1.0 GB of pixels in a file"
             )
         );
         let total = format_size(minimum + 2_000_000);
         assert_eq!(
             memory_text(&TrainingMemory { pixels: 2_000_000, ..need }, MAX_PIXEL_BYTES),
-            format!("memory: about {total}, of which 300.0 MB for the field and 2.0 MB for pixels")
+            format!(
+                "memory: about {total}, of which 300.0 MB for the field, 2.0 MB for pixels, the \
+                rest for the program"
+            )
         );
     }
 }

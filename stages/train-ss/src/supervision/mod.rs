@@ -21,28 +21,29 @@ use crate::params::Supervision;
 use crate::photographs::{PackedPhotograph, PixelMemory};
 use crate::state::{
     ExposureDifference, ExposureMeasurement, Exposures, HrCache, LrPixel, MovingCameras,
-    TrainingState,
+    SupervisionState,
 };
 use crate::supersample::SupersampleSchedule;
 
 use assembly::block_start;
 use pixel_sampler::PixelSampler;
-use residual::{LossContext, is_clipped};
+use residual::{LossContext, may_be_clipped};
+pub(crate) use setup::alpha_background_error;
 pub use setup::supervision;
-pub(crate) use setup::transparent_background;
 
 /// Supersampling: draws a training pixel, more often where the image has detail, and casts
 /// sub-pixel rays through it.
 ///
 /// `average` compares the rays' mean with the LR pixel, by the mean squared error over the three
-/// channels. `kernel` minimises |K⁺·(K·c - y)|², the squared distance of the HR pixels c from the
-/// nearest ones whose degradation by K is the LR image y: the HR pixels of the drawn LR pixel are
-/// rendered and those around it cached ([`HrCache`]), so that the kernel's whole footprint costs no
-/// more rays than the average. Each sub-pixel ray gets its own component of K⁺·(K·c - y). The
-/// gradient of |K·c - y|² would have Kᵀ instead, which attenuates fine detail once more (design
-/// note 009). If K is the mean of whole pixels, both supervisions are equal and nothing is cached.
+/// channels. `kernel` minimises |K⁺·(K·c - y)|², the squared distance between the rendered HR image
+/// c and the nearest HR image whose degradation by K is the LR image y. The HR pixels of the drawn
+/// LR pixel are rendered, and those around it are read from a cache ([`HrCache`]), so that the
+/// kernel's whole footprint costs no more rays than the average. Each sub-pixel ray gets its own
+/// component of K⁺·(K·c - y). The gradient of |K·c - y|² would have Kᵀ instead, which attenuates
+/// fine detail once more (design note 009). If K is the mean of whole pixels, both supervisions are
+/// equal and nothing is cached.
 ///
-/// Draws from an HR reference are blocks of pixels, one for each sub-pixel ray (design note 019).
+/// A draw from an HR reference is a block with one pixel for each sub-pixel ray (design note 019).
 pub struct Supersampling {
     /// LR photographs, then references.
     pub(crate) views: Vec<TrainingView>,
@@ -51,13 +52,13 @@ pub struct Supersampling {
     pub(crate) schedule: SupersampleSchedule,
     pub(crate) supervision: Supervision,
     pub(crate) seed: u64,
-    pub(crate) state: TrainingState,
+    pub(crate) state: SupervisionState,
     pub(crate) memory: PixelMemory,
 }
 
 /// View whose pixels are drawn and compared.
 pub(crate) struct TrainingView {
-    /// Pixels to draw: those of an LR photograph, or the means over blocks of a reference.
+    /// Pixels to sample: those of an LR photograph, or the means over blocks of a reference.
     pub(crate) image: PackedPhotograph,
     /// Pixels of a reference; `None` for an LR photograph.
     pub(crate) hr: Option<PackedPhotograph>,
@@ -66,7 +67,8 @@ pub(crate) struct TrainingView {
 
 /// Comparison of a bundle's colours with a photograph.
 enum Comparison<'a> {
-    /// Compares LR pixels, from rays and cached HR pixels through the kernel.
+    /// Compares the LR pixels that the kernel makes of rays and cached HR pixels with the
+    /// photograph's.
     Kernel(&'a HrCache),
     /// Compares each ray with a pixel of the reference.
     Reference(&'a PackedPhotograph),
@@ -107,7 +109,7 @@ impl Supersampling {
         [block_start(pixel.x, columns, hr.width), block_start(pixel.y, rows, hr.height)]
     }
 
-    /// Restores the state that [`TrainingState::write`] wrote.
+    /// Restores the state that [`SupervisionState::write`] wrote.
     pub(crate) fn restore(&mut self, from: &mut impl io::Read) -> io::Result<()> {
         self.state.restore(from)?;
         self.update_rays();
@@ -120,14 +122,15 @@ impl Supersampling {
     }
 
     /// Moves cameras towards the poses at which the field's renders fit the photographs, if pose
-    /// refinement is enabled and a round is due. `field` is only called then.
+    /// refinement is enabled and its next round is due. `field` is only called then.
     pub(crate) fn refine_poses<'a>(
         &mut self,
         progress: f64,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<()> {
-        let TrainingState { cameras, exposures, .. } = &mut self.state;
-        let Some(cameras) = cameras.as_mut().filter(|cameras| cameras.are_due(progress)) else {
+        let SupervisionState { cameras, exposures, .. } = &mut self.state;
+        let Some(cameras) = cameras.as_mut().filter(|cameras| cameras.is_round_due(progress))
+        else {
             return Ok(());
         };
         cameras
@@ -139,7 +142,7 @@ impl Supersampling {
         Ok(())
     }
 
-    /// Casts rays from the current cameras.
+    /// Replaces each view's rays by those of its current camera.
     fn update_rays(&mut self) {
         let cameras = self.state.cameras.as_ref().map_or(&[][..], MovingCameras::cameras);
         for (i, camera) in cameras.iter().enumerate() {
@@ -149,15 +152,15 @@ impl Supersampling {
 
     /// Measures the motion of the photographs' cameras, if pose refinement is enabled. `field` is
     /// only called then.
-    pub(crate) fn moved<'a>(
+    pub(crate) fn mean_motion<'a>(
         &self,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<Option<MeanMotion>> {
         let Some(cameras) = &self.state.cameras else { return Ok(None) };
-        let moved = cameras
-            .moved(&*field()?, self.lr_views(), self.background.grey_level())
+        let motion = cameras
+            .mean_motion(&*field()?, self.lr_views(), self.background.grey_level())
             .map_err(fields::rendering_failure)?;
-        Ok(Some(moved))
+        Ok(Some(motion))
     }
 
     /// Returns the refined cameras of the photographs; empty without pose refinement.
@@ -183,14 +186,14 @@ impl Supersampling {
         self.sampler.draw(bundle, |view, pixel| self.views[view].image.is_valid(pixel))
     }
 
-    /// Returns the column and row of a view's pixel.
+    /// Returns the view, column and row of a pixel.
     fn position(&self, view: usize, pixel: usize) -> LrPixel {
         let width = self.views[view].image.width;
         LrPixel { view, x: pixel % width, y: pixel / width }
     }
 
-    /// Returns the background colour of a bundle's rays: random for transparent and opaque scenes,
-    /// so that opacity is trained.
+    /// Returns the background colour of a bundle's rays: random with background `alpha` or
+    /// `opaque`, so that opacity is trained.
     fn ray_background(&self, bundle: u64) -> [f32; 3] {
         if matches!(self.background, Background::Alpha | Background::Opaque) {
             let mut rng = CounterRng::new(self.seed, BACKGROUND_STREAM, bundle);
@@ -201,7 +204,7 @@ impl Supersampling {
     }
 }
 
-/// Pixels of bundles in sequence, and the 8-bit levels of their sub-pixel rays.
+/// Pixels of consecutive bundles, and the 8-bit levels of their sub-pixel rays.
 struct RenderedPixels {
     pixels: Vec<RenderedPixel>,
     levels: Vec<[u8; 3]>,
@@ -227,7 +230,7 @@ impl Supersampling {
             RenderedPixel {
                 position: self.position(view, pixel),
                 photographed: [0, 1, 2]
-                    .map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] }),
+                    .map(|c| if may_be_clipped(sample[c]) { f32::NAN } else { sample[c] }),
                 rendered: [0, 1, 2].map(|c| {
                     colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
                 }),
@@ -261,18 +264,19 @@ impl radiance::Supervisor for Supersampling {
 
     fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
         let (view, pixel) = self.drawn_pixel(bundle);
-        let pixel = self.position(view, pixel);
+        let position = self.position(view, pixel);
         let background = self.ray_background(bundle);
         let SupersampleSchedule { supersample, current_supersample, .. } = self.schedule;
         // Start of the sub-pixel rays and distance between them, in pixels of the view's camera.
         let (start, spacing) = match self.comparison(view) {
-            Comparison::Kernel(cache) => cache.block_in_lr_pixels(pixel),
+            Comparison::Kernel(cache) => cache.block_in_lr_pixels(position),
             Comparison::Reference(hr) | Comparison::ReferenceMean(hr) => (
-                self.reference_block(hr, pixel).map(|start| start as f64),
+                self.reference_block(hr, position).map(|start| start as f64),
                 [0, 1].map(|i| supersample[i] as f64 / current_supersample[i] as f64),
             ),
             Comparison::Mean => {
-                ([pixel.x as f64, pixel.y as f64], current_supersample.map(|n| 1.0 / n as f64))
+                let start = [position.x as f64, position.y as f64];
+                (start, current_supersample.map(|n| 1.0 / n as f64))
             }
         };
         for (k, ray) in rays.iter_mut().enumerate() {
@@ -290,11 +294,11 @@ impl radiance::Supervisor for Supersampling {
     ) -> f64 {
         let (index, pixel) = self.drawn_pixel(bundle);
         let view = &self.views[index];
-        let target = LossContext {
-            exposure: exposure_correction(self.state.exposures.as_ref(), index),
+        let context = LossContext {
+            inverse_gains: exposure_correction(self.state.exposures.as_ref(), index),
             background: self.ray_background(bundle),
             weight: self.sampler.weight(bundle, (index, pixel)),
-            may_be_clipped: self.supervision == Supervision::Kernel && view.hr.is_none(),
+            allows_clipping: self.supervision == Supervision::Kernel && view.hr.is_none(),
         };
         let position = self.position(index, pixel);
         match self.comparison(index) {
@@ -303,20 +307,20 @@ impl radiance::Supervisor for Supersampling {
                     position,
                     colours,
                     &view.image,
-                    |c, prediction, sample| target.unclipped_residual(c, prediction, sample),
+                    |c, prediction, sample| context.unclipped_residual(c, prediction, sample),
                     gradients,
                 );
-                target.back_projected_loss(residual, gradients)
+                context.back_projected_loss(residual, gradients)
             }
             Comparison::Reference(hr) => {
                 let columns = self.schedule.supersample[0];
                 let [left, top] = self.reference_block(hr, position);
                 let sample_of =
                     |k: usize| hr.pixel((top + k / columns) * hr.width + left + k % columns);
-                target.mean_of_losses(colours, sample_of, gradients)
+                context.mean_of_losses(colours, sample_of, gradients)
             }
             Comparison::ReferenceMean(_) | Comparison::Mean => {
-                target.loss_of_mean(colours, view.image.pixel(pixel), gradients)
+                context.loss_of_mean(colours, view.image.pixel(pixel), gradients)
             }
         }
     }

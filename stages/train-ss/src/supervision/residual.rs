@@ -2,8 +2,8 @@
 /// complement is the maximum level of one that may have been clipped to black.
 const SATURATION: f32 = 254.5 / 255.0;
 
-/// True if the true value of an LR sample may lie beyond the sample.
-pub(crate) fn is_clipped(sample: f32) -> bool {
+/// Returns whether an LR sample is at the limit, so that the value before clipping may lie beyond.
+pub(crate) fn may_be_clipped(sample: f32) -> bool {
     sample >= SATURATION || sample <= 1.0 - SATURATION
 }
 
@@ -15,34 +15,35 @@ fn residual(prediction: f32, target: f32) -> f32 {
 /// Context of a bundle's loss, besides the photograph's samples. A bundle is the sub-pixel rays of
 /// one LR pixel. Losses are means over the three channels.
 pub(crate) struct LossContext {
-    /// Factors from the photograph to the field's colours: reciprocals of its gains.
-    pub(crate) exposure: [f32; 3],
+    /// Factors from the photograph's colours to the field's: reciprocals of the photograph's gains.
+    pub(crate) inverse_gains: [f32; 3],
     /// Background colour of the bundle's rays.
     pub(crate) background: [f32; 3],
     /// Weight of the bundle's loss.
     pub(crate) weight: f32,
-    /// True if samples at 0 or 1 may have been clipped, and so bound the true value from one side
-    /// only.
-    pub(crate) may_be_clipped: bool,
+    /// True if a sample at 0 or 1 may have been clipped; such a sample is only an upper or lower
+    /// bound.
+    pub(crate) allows_clipping: bool,
 }
 
 impl LossContext {
     /// Returns the target colour of a photograph's sample: premultiplied RGBA over the background.
-    fn colour(&self, sample: [f32; 4]) -> [f32; 3] {
-        [0, 1, 2].map(|c| self.exposure[c] * (sample[c] + (1.0 - sample[3]) * self.background[c]))
+    fn target_colour(&self, sample: [f32; 4]) -> [f32; 3] {
+        [0, 1, 2]
+            .map(|c| self.inverse_gains[c] * (sample[c] + (1.0 - sample[3]) * self.background[c]))
     }
 
     /// Returns the residual of a prediction; 0 if the sample may have been clipped and the
     /// prediction lies beyond it.
     pub(crate) fn unclipped_residual(&self, channel: usize, prediction: f32, sample: f32) -> f32 {
-        let residual = residual(prediction, self.exposure[channel] * sample);
+        let residual = residual(prediction, self.inverse_gains[channel] * sample);
         let is_beyond = (sample >= SATURATION && residual > 0.0)
             || (sample <= 1.0 - SATURATION && residual < 0.0);
         if is_beyond { 0.0 } else { residual }
     }
 
-    /// Returns the loss of an LR pixel's residual, and scales back-projected residuals to the
-    /// loss's gradient.
+    /// Returns the loss of an LR pixel's residual. `gradients` contains back-projected residuals,
+    /// which are multiplied in place to become the loss's gradient.
     pub(crate) fn back_projected_loss(
         &self,
         residual: [f32; 3],
@@ -64,7 +65,7 @@ impl LossContext {
         let share = 1.0 / colours.len() as f32;
         let mut loss = 0.0;
         for (k, colour) in colours.iter().enumerate() {
-            let target = self.colour(sample_of(k));
+            let target = self.target_colour(sample_of(k));
             for c in 0..3 {
                 let residual = residual(colour[c], target[c]);
                 loss += f64::from(self.weight * share) * f64::from(residual) * f64::from(residual)
@@ -83,11 +84,11 @@ impl LossContext {
         gradients: &mut [[f32; 3]],
     ) -> f64 {
         let share = 1.0 / colours.len() as f32;
-        let target = self.colour(sample);
+        let target = self.target_colour(sample);
         let mut loss = 0.0;
         for c in 0..3 {
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
-            let residual = if self.may_be_clipped {
+            let residual = if self.allows_clipping {
                 self.unclipped_residual(c, mean, sample[c])
             } else {
                 residual(mean, target[c])
@@ -106,10 +107,10 @@ mod tests {
     use super::*;
 
     const PLAIN: LossContext = LossContext {
-        exposure: [1.0; 3],
+        inverse_gains: [1.0; 3],
         background: [0.0; 3],
         weight: 1.0,
-        may_be_clipped: false,
+        allows_clipping: false,
     };
 
     /// A clipped sample bounds the true value from one side only.
@@ -129,13 +130,13 @@ mod tests {
                 "{prediction} {sample}"
             );
         }
-        assert!(is_clipped(1.0) && is_clipped(0.0) && !is_clipped(0.99));
+        assert!(may_be_clipped(1.0) && may_be_clipped(0.0) && !may_be_clipped(0.99));
         // White in a photograph half as bright as the scene is a lower bound of the scene's colour.
-        let bright = LossContext { exposure: [0.5; 3], may_be_clipped: true, ..PLAIN };
+        let bright = LossContext { inverse_gains: [0.5; 3], allows_clipping: true, ..PLAIN };
         let mut gradients = [[9.0; 3]; 2];
         assert_eq!(bright.loss_of_mean(&[[0.9; 3]; 2], [1.0; 4], &mut gradients), 0.0);
         assert_eq!(gradients, [[0.0; 3]; 2]);
-        let plain = LossContext { may_be_clipped: false, ..bright };
+        let plain = LossContext { allows_clipping: false, ..bright };
         assert!(plain.loss_of_mean(&[[0.9; 3]; 2], [1.0; 4], &mut gradients) > 0.1);
     }
 
@@ -155,9 +156,9 @@ mod tests {
     /// Exposure is corrected, and transparent samples show the background.
     #[test]
     fn samples_become_target_colours() {
-        let target =
-            LossContext { exposure: [2.0, 1.0, 0.5], background: [0.4, 0.8, 1.0], ..PLAIN };
-        let colour = target.colour([0.1, 0.2, 0.3, 0.75]);
+        let context =
+            LossContext { inverse_gains: [2.0, 1.0, 0.5], background: [0.4, 0.8, 1.0], ..PLAIN };
+        let colour = context.target_colour([0.1, 0.2, 0.3, 0.75]);
         assert!(
             colour.iter().zip([0.4, 0.4, 0.275]).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6),
             "{colour:?}"

@@ -12,19 +12,19 @@ use super::options::SupersamplingOptions;
 use crate::params::{Exposure, Resolved, Supervision};
 use crate::photographs::{NO_SPACE, PackedPhotograph, Photographs, check_references};
 
-/// Returns the error message for a parameter that conflicts with a transparent background.
-pub(crate) fn transparent_background(parameter: &str) -> String {
+/// Returns the error message for a parameter that conflicts with background `alpha`.
+pub(crate) fn alpha_background_error(parameter: &str) -> String {
     let problem = match parameter {
         "supervision" => {
-            "kernel cannot be used over a transparent background; choose average, or \
+            "kernel cannot be used with prep.background alpha; choose average, or \
             prep.background white or opaque"
         }
         "exposure" => {
-            "exposure cannot be estimated over a transparent background; choose prep.background \
+            "exposure cannot be estimated with prep.background alpha; choose prep.background \
             white or opaque"
         }
         _ => {
-            "renders cannot be compared with photographs over a transparent background; choose \
+            "with prep.background alpha, renders cannot be compared with photographs; choose \
             prep.background white or opaque"
         }
     };
@@ -60,7 +60,8 @@ pub fn supervision(
     log(memory_text(&need, memory.left()));
     let photographs = Photographs::read(input, usize::MAX, &mut memory)?;
     if !photographs.images.iter().any(PackedPhotograph::has_valid_pixels) {
-        let message = "scene: masks exclude every pixel of every photograph; white pixels count";
+        let message = "scene: masks exclude every pixel of every photograph; a mask's black pixels \
+            are excluded, so check whether the masks are inverted";
         return Err(Failure::BadInput(message.to_owned()).into());
     }
     let references = match references {
@@ -95,7 +96,7 @@ fn kernel(input: &GivenInput, params: &Resolved, background: Background) -> anyh
     if background == Background::Alpha
         && let Some((parameter, _)) = enabled.iter().find(|(_, is_enabled)| *is_enabled)
     {
-        return Err(Failure::Usage(transparent_background(parameter)).into());
+        return Err(Failure::Usage(alpha_background_error(parameter)).into());
     }
     Ok(degradation.map_or(Kernel::Lanczos, |degradation| degradation.kernel))
 }

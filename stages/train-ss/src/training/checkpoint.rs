@@ -92,8 +92,8 @@ impl Checkpoints {
             log(&format!("{}: incomplete checkpoint; starting over", path.display()));
             return Ok(Curve::default());
         };
-        // The trainer has been restored: without its state the training would be neither the
-        // earlier one nor a new one.
+        // The trainer is already restored. Without the supervision's state, training would neither
+        // continue the earlier run nor start over.
         supervision.restore(&mut state).with_context(|| {
             let path = folder.join(state_name(trainer.steps()));
             format!("cannot read {}; delete it to start the training over", path.display())
@@ -102,8 +102,8 @@ impl Checkpoints {
         Ok(curve)
     }
 
-    /// Writes a checkpoint if there is a work folder and one is due. Fails if the run is
-    /// interrupted.
+    /// Writes a checkpoint if one is due or the run is interrupted, and there is a work folder.
+    /// Then fails if the run is interrupted.
     pub(crate) fn write_if_due(
         &mut self,
         is_interrupted: bool,

@@ -229,10 +229,10 @@ impl<'a> Member<'a> {
     fn finish(&self, training: Training, bounds: Bounds) -> anyhow::Result<TrainingLog> {
         let Training { trainer, supervision, curve, .. } = training;
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
-        if let Some(moved) = supervision.moved(|| trainer.field())? {
-            self.context.log_line(format!("cameras have {moved}"));
-            if moved.is_far() {
-                log.warnings.push(far_warning(&moved));
+        if let Some(motion) = supervision.mean_motion(|| trainer.field())? {
+            self.context.log_line(format!("cameras have {motion}"));
+            if motion.is_far() {
+                log.warnings.push(far_warning(&motion));
             }
         }
         log.exposures = supervision.exposures().to_vec();

@@ -90,11 +90,11 @@ impl<'a> PoseJudge<'a> {
         let cameras: Vec<Camera> = (self.data.views.views.iter().zip(&log.poses))
             .map(|(view, pose)| Camera { camera_to_world: *pose, ..view.camera.clone() })
             .collect();
-        let mut shots = Vec::with_capacity(cameras.len());
+        let mut posed = Vec::with_capacity(cameras.len());
         for (i, camera) in cameras.iter().enumerate() {
             let exposure = log.exposures.get(i).map_or([1.0; 3], |gain| gain.map(f32::recip));
-            shots.push(PosedPhotograph { camera, photograph: &self.photographs[i], exposure });
+            posed.push(PosedPhotograph { camera, image: &self.photographs[i], exposure });
         }
-        photometric_error(&*field, &shots, self.background).map_err(fields::rendering_failure)
+        photometric_error(&*field, &posed, self.background).map_err(fields::rendering_failure)
     }
 }

@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use artifact::{Failure, bail_usage};
+use artifact::Failure;
 use pixels::psnr_of;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -12,7 +12,8 @@ use super::training::{PriorTrainer, TrainingError, TrainingImages};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PriorParams {
-    /// Factor by which the network enlarges images: 2, 4 or 8.
+    /// Factor by which the network enlarges images.
+    #[schemars(extend("enum" = [2, 4, 8]))]
     pub scale: u32,
     /// Number of training steps.
     #[schemars(range(min = 1))]
@@ -48,9 +49,6 @@ impl Stage for TrainPrior {
 
     fn run(context: &Context, params: &PriorParams) -> anyhow::Result<()> {
         nets::deterministic();
-        if ![2, 4, 8].contains(&params.scale) {
-            bail_usage!("parameter scale: expected 2, 4 or 8, found {}", params.scale);
-        }
         let scale = params.scale as usize;
         context.log_line(format!("drawing {} images", params.images));
         let images =

@@ -158,7 +158,7 @@ impl World {
         for object in &objects {
             store.verify(object).expect("a whole object");
         }
-        let files = store.action_files().expect("records");
+        let files = store.action_keys().expect("records");
         assert!(imported.is_ok() || (objects.is_empty() && files.is_empty()), "{imported:?}");
         let left = fs::read_dir(self.path("store/sinks")).expect("a folder").count();
         assert_eq!(left, 0, "a scratch folder is left");

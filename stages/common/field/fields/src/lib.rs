@@ -27,8 +27,9 @@ use scene::{Background, Bounds, Camera};
 
 pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel};
 
-/// Environment variables that change renders, in builds with and without libtorch. If 1, libtorch's
-/// variable lets CUDA multiply in TensorFloat-32, with a mantissa of ten bits.
+/// Environment variables that change renders. Builds without libtorch list them, too, so that keys
+/// agree. If 1, `TORCH_ALLOW_TF32_CUBLAS_OVERRIDE` lets CUDA multiply in TensorFloat-32, with a
+/// mantissa of ten bits.
 pub const ENVIRONMENT: &[&str] = &["TORCH_ALLOW_TF32_CUBLAS_OVERRIDE"];
 
 /// Fields of an artifact.
@@ -96,18 +97,18 @@ pub fn read_field_file(input: &GivenInput) -> Result<FieldFile, Failure> {
     Ok(file)
 }
 
-/// Renders the mean of all members. The median depth is the median of theirs: a mean would invent a
-/// surface between two.
+/// Renders the mean of all members. The median depth is the median of the members' median depths: a
+/// mean would invent a surface between two surfaces.
 impl RayField for Members {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         let renders: Vec<Vec<Pixel>> =
             self.fields.iter().map(|field| field.render(rays)).collect::<Result<_, _>>()?;
-        let mut members = Vec::with_capacity(renders.len());
+        let mut of_ray = Vec::with_capacity(renders.len());
         let pixels: Vec<Pixel> = (0..rays.len())
             .map(|ray| {
-                members.clear();
-                members.extend(renders.iter().map(|pixels| pixels[ray]));
-                average_pixels(&mut members)
+                of_ray.clear();
+                of_ray.extend(renders.iter().map(|pixels| pixels[ray]));
+                average_pixels(&mut of_ray)
             })
             .collect();
         if pixels.iter().all(Pixel::is_finite) { Ok(pixels) } else { Err(RenderError::NotFinite) }
@@ -154,8 +155,8 @@ pub fn mean<T>(items: &[T], number: impl Fn(&T) -> f32) -> f32 {
     share * items.iter().map(number).sum::<f32>()
 }
 
-/// Returns the item with the median distance, of two the nearer. NaN is beyond all numbers, on the
-/// side of its sign.
+/// Sorts the items by distance and returns the middle one; of two, the nearer. NaN is beyond all
+/// numbers, on the side of its sign.
 pub fn lower_median<T>(items: &mut [T], distance: impl Fn(&T) -> f32) -> Option<&T> {
     items.sort_unstable_by(|a, b| distance(a).total_cmp(&distance(b)));
     items.get(items.len().saturating_sub(1) / 2)

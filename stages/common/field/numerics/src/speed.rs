@@ -1,22 +1,24 @@
-//! A fixed piece of work like that of a field: dense layers and reads of hashed entries.
+//! Fixed work like that of a field: dense layers and reads of hashed entries.
 
 use crate::kernel;
 use crate::simd::{LANES, Quad};
 
-/// Width of the layer, and number of samples.
+/// Number of inputs and of outputs of a layer.
 const WIDTH: usize = 64;
-/// Vectors of samples, and outputs, of a tile.
-const TILE: usize = 4;
-/// Base-2 logarithm of the number of table entries, 16 MB: more than most caches.
+/// Number of samples.
+const SAMPLES: usize = 64;
+/// Number of outputs of a tile.
+const TILE_OUTPUTS: usize = 4;
+/// Base-2 logarithm of the number of table entries. The table has 16 MB, more than most caches.
 const LOG2_ENTRIES: u32 = 20;
-/// Layers of a piece of work. Layers and reads take about equal times on two cores with AVX-512.
+/// Number of layers per call. Layers and reads take about equal times on two cores with AVX-512.
 const LAYERS: usize = 40;
-/// Table reads of a piece of work.
+/// Number of table reads per call.
 const READS: u32 = 32_768;
 /// Multiplier of the hash (Knuth).
 const HASH: u32 = 2_654_435_761;
 
-/// Data of the work, for a measurement of a machine's speed.
+/// Fixed work, with its data, whose running time measures a machine's speed.
 #[derive(Clone, Debug)]
 pub struct SpeedTest {
     weights: Vec<f32>,
@@ -30,17 +32,16 @@ impl Default for SpeedTest {
     fn default() -> Self {
         Self {
             weights: vec![0.01; WIDTH * WIDTH],
-            samples: vec![0.5; WIDTH * WIDTH],
+            samples: vec![0.5; WIDTH * SAMPLES],
             table: vec![[0.25; 4]; 1 << LOG2_ENTRIES],
-            outputs: vec![0.0; WIDTH * WIDTH],
+            outputs: vec![0.0; WIDTH * SAMPLES],
             sum: [0.0; 4],
         }
     }
 }
 
 impl SpeedTest {
-    /// Carries out one piece of work, of less than a millisecond. Returns a number that depends on
-    /// all of it.
+    /// Does the work once, in less than a millisecond. Returns a number that depends on all of it.
     pub fn work(&mut self) -> f32 {
         for _ in 0..LAYERS {
             layer(&self.weights, &self.samples, &mut self.outputs);
@@ -55,24 +56,24 @@ impl SpeedTest {
 kernel! {
     /// Multiplies 64 samples by a layer of 64 inputs and outputs.
     fn layer<L>(weights: &[f32], samples: &[f32], outputs: &mut [f32]) {
-        for first in (0..WIDTH).step_by(TILE) {
-            let mut sums = [[L::splat(0.0); WIDTH / LANES]; TILE];
+        for first in (0..WIDTH).step_by(TILE_OUTPUTS) {
+            let mut sums = [[L::splat(0.0); SAMPLES / LANES]; TILE_OUTPUTS];
             for input in 0..WIDTH {
-                let row = &samples[input * WIDTH..(input + 1) * WIDTH];
-                for output in 0..TILE {
+                let row = &samples[input * SAMPLES..(input + 1) * SAMPLES];
+                for output in 0..TILE_OUTPUTS {
                     let weight = L::splat(weights[input * WIDTH + first + output]);
-                    for lane in 0..WIDTH / LANES {
-                        let values = row[lane * LANES..(lane + 1) * LANES].try_into();
+                    for vector in 0..SAMPLES / LANES {
+                        let values = row[vector * LANES..(vector + 1) * LANES].try_into();
                         let values = L::load(values.expect("a row has whole vectors"));
-                        sums[output][lane] = values.mul_add(weight, sums[output][lane]);
+                        sums[output][vector] = values.mul_add(weight, sums[output][vector]);
                     }
                 }
             }
-            for output in 0..TILE {
-                for lane in 0..WIDTH / LANES {
-                    let at = (first + output) * WIDTH + lane * LANES;
+            for output in 0..TILE_OUTPUTS {
+                for vector in 0..SAMPLES / LANES {
+                    let at = (first + output) * SAMPLES + vector * LANES;
                     let to = (&mut outputs[at..at + LANES]).try_into();
-                    sums[output][lane].store(to.expect("a row has whole vectors"));
+                    sums[output][vector].store(to.expect("a row has whole vectors"));
                 }
             }
         }
@@ -104,7 +105,7 @@ mod tests {
         by_every_family(|_| {
             let mut test = SpeedTest::default();
             results.push(test.work());
-            assert!((test.outputs[WIDTH] - 0.01 * 0.5 * WIDTH as f32).abs() < 0.01);
+            assert!((test.outputs[SAMPLES] - 0.01 * 0.5 * WIDTH as f32).abs() < 0.01);
             assert!((test.sum[3] - 0.5).abs() < 1e-6);
         });
         assert!(results.iter().all(|result| *result == results[0]), "{results:?}");

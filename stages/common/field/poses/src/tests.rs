@@ -314,15 +314,11 @@ fn judged(
     cameras: &[Camera],
     exposure: &dyn Fn(usize) -> [f32; 3],
 ) -> Option<f64> {
-    let shots = cameras.iter().zip(photographs).enumerate();
-    let shots: Vec<PosedPhotograph> = shots
-        .map(|(i, (camera, photograph))| PosedPhotograph {
-            camera,
-            photograph,
-            exposure: exposure(i),
-        })
+    let posed = cameras.iter().zip(photographs).enumerate();
+    let posed: Vec<PosedPhotograph> = posed
+        .map(|(i, (camera, image))| PosedPhotograph { camera, image, exposure: exposure(i) })
         .collect();
-    photometric_error(&BallAndWall, &shots, 1.0).unwrap()
+    photometric_error(&BallAndWall, &posed, 1.0).unwrap()
 }
 
 /// With the true surfaces the photometric error is small for the true cameras and large for moved

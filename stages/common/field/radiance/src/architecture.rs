@@ -41,7 +41,7 @@ impl Default for Architecture {
 
 impl Architecture {
     /// Returns the distance between samples, in cube sides.
-    pub fn step(&self) -> f32 {
+    pub fn march_step(&self) -> f32 {
         3.0f32.sqrt() / self.march_steps as f32
     }
 

@@ -160,7 +160,7 @@ impl Chunk {
         self.sums.clear();
         self.sums.resize(rays.len(), RaySum { transmittance: 1.0, ..RaySum::default() });
         let march =
-            March { occupancy: &field.occupancy, rays, offsets, step: field.step(), strides };
+            March { occupancy: &field.occupancy, rays, offsets, step: field.march_step(), strides };
         self.samples.march(field, &march, &mut self.counted, &mut self.sums);
         self.counted.collect(&self.samples, rays.len());
         self.shading.forward(field, rays, &self.samples, &self.counted, &mut self.sums);

@@ -57,8 +57,8 @@ impl Field {
     }
 
     /// Returns the distance between samples, in cube sides.
-    pub fn step(&self) -> f32 {
-        self.architecture.step()
+    pub fn march_step(&self) -> f32 {
+        self.architecture.march_step()
     }
 
     /// Returns the number of floats in the grid.
@@ -66,8 +66,8 @@ impl Field {
         self.grid.len()
     }
 
-    /// Returns grid entries, network weights and occupancy, for the libtorch twin. Grid entries are
-    /// ordered by level; weights by layer and input, padded with 0 to whole vectors.
+    /// Returns grid entries, network weights and occupancy, for torch-field's hash grid. Grid
+    /// entries are ordered by level; weights by layer and input, padded with 0 to whole vectors.
     pub fn parts(&self) -> (&[f32], &[f32], &Occupancy) {
         (&self.grid, &self.network, &self.occupancy)
     }

@@ -8,9 +8,9 @@
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that
 //!   casts rays and computes the loss of their colours.
 //! * [`TrainingState`], [`Occupancy`], [`NormalizedRay`]: training progress, occupied cells and
-//!   rays in the unit cube, shared with the libtorch twin in `torch-field`.
+//!   rays in the unit cube, shared with the hash grid of `torch-field`.
 //! * [`regularisers`]: losses on a ray other than its colour error.
-//! * [`spec`]: constants shared with the libtorch twin.
+//! * [`spec`]: constants shared with the hash grid of `torch-field`.
 //! * [`Passes`]: one forward and backward pass without an optimiser, for benchmarks.
 //! * [`PointField`]: trait of fields that are evaluated at points, for baking.
 //! * [`Architecture`]: sizes of a field; [`scene::Bounds`]: its position in the world.

@@ -8,14 +8,14 @@ use crate::shading::{NetworkGradients, RayGradients};
 use crate::spec::Strides;
 
 /// Forward and backward pass of one worker without an optimiser, for benchmarks and for comparison
-/// with the libtorch twin.
+/// with torch-field's hash grid (docs/design/023).
 #[derive(Debug)]
 pub struct Passes {
     chunk: Chunk,
     transposed: Aligned,
-    network: Vec<f32>,
-    features: FeatureGradients,
-    grid: Vec<LevelGradients>,
+    network_gradients: Vec<f32>,
+    feature_gradients: FeatureGradients,
+    grid_gradients: Vec<LevelGradients>,
 }
 
 impl Passes {
@@ -28,18 +28,18 @@ impl Passes {
         Self {
             chunk: Chunk::default(),
             transposed,
-            network: vec![0.0; field.network.len()],
-            features: FeatureGradients::default(),
-            grid: field.levels.iter().map(LevelGradients::zeros).collect(),
+            network_gradients: vec![0.0; field.network.len()],
+            feature_gradients: FeatureGradients::default(),
+            grid_gradients: field.levels.iter().map(LevelGradients::zeros).collect(),
         }
     }
 
     /// Renders rays in this thread; if `backward`, also backpropagates a gradient of 1 for every
-    /// colour channel to the grid's features. Returns the numbers of samples marched and of samples
-    /// with a colour.
+    /// colour channel to the grid's features and the networks' weights. Returns the numbers of
+    /// samples marched and of samples with a colour.
     pub fn run(&mut self, field: &Field, rays: &[Ray], backward: bool) -> [usize; 2] {
         let mut samples = [0; 2];
-        self.features.clear();
+        self.feature_gradients.clear();
         for rays in rays.chunks(CHUNK_RAYS) {
             let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
             self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Single);
@@ -52,14 +52,16 @@ impl Passes {
                     backgrounds: &ones,
                     regularisers: Regularisers::default(),
                 };
-                let mut network =
-                    NetworkGradients { transposed: &self.transposed, sums: &mut self.network };
+                let mut network = NetworkGradients {
+                    transposed: &self.transposed,
+                    sums: &mut self.network_gradients,
+                };
                 self.chunk.backward(
                     field,
                     upstream,
                     Roulette::default(),
                     &mut network,
-                    &mut self.features,
+                    &mut self.feature_gradients,
                 );
             }
         }
@@ -68,27 +70,29 @@ impl Passes {
 
     /// Adds the last backward pass's gradients of the grid's features to their sums.
     pub fn scatter(&mut self, field: &Field) {
-        arrange_in_rows(&self.features.positions, &mut self.features.rows);
-        let levels = field.levels.iter().zip(&self.features.levels).zip(&mut self.grid);
+        arrange_in_rows(&self.feature_gradients.positions, &mut self.feature_gradients.rows);
+        let levels =
+            field.levels.iter().zip(&self.feature_gradients.levels).zip(&mut self.grid_gradients);
         for ((level, gradients), sums) in levels {
             for half in &mut sums.halves {
-                half.scatter(level, &self.features.rows, gradients);
+                half.scatter(level, &self.feature_gradients.rows, gradients);
             }
         }
     }
 
-    /// Returns the gradient by the grid's features, summed by all calls of [`Passes::scatter`].
+    /// Returns the gradient with respect to the grid's features, summed by all calls of
+    /// [`Passes::scatter`].
     pub fn grid_gradient(&self, field: &Field) -> Vec<f32> {
         let mut table = vec![0.0; field.grid_len()];
-        for (level, gradients) in field.levels.iter().zip(&self.grid) {
+        for (level, gradients) in field.levels.iter().zip(&self.grid_gradients) {
             gradients.add_to(&mut table[level.range()]);
         }
         table
     }
 
-    /// Returns the gradient by the networks' weights, by layer and input, summed over all backward
-    /// passes so far.
+    /// Returns the gradient with respect to the networks' weights, ordered by layer and input, and
+    /// summed over all backward passes so far.
     pub fn network_gradient(&self) -> &[f32] {
-        &self.network
+        &self.network_gradients
     }
 }

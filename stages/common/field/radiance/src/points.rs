@@ -194,7 +194,7 @@ mod tests {
             background: [1.0; 3],
         };
         let clipped = clip(&bounds, &ray);
-        let step = field.step();
+        let step = field.march_step();
         let t = (0..).map(|k| (k as f32 + 0.5).mul_add(step, clipped.enter));
         let places: Vec<[f32; 3]> =
             t.take_while(|&t| t < clipped.leave).map(|t| clipped.position(t)).collect();

@@ -92,7 +92,7 @@ impl Judge<'_> {
     /// Returns weight and colour of each sample that counts, and the ray's transmittance. Other
     /// samples attenuate light but have no colour, as in the fused pass.
     fn shaded(&self, ray: &Ray, samples: &[Sample]) -> (Vec<(f64, [f64; 3])>, f64) {
-        let step = f64::from(self.field.step());
+        let step = f64::from(self.field.march_step());
         let (mut depth, mut counted) = (0.0f64, Vec::new());
         let mut composited = vec![0.0; DENSITY_OUTPUTS];
         for sample in samples {
@@ -146,7 +146,7 @@ pub(crate) fn samples(
             occupancy: &field.occupancy,
             rays: &[ray],
             offsets: &[offset],
-            step: field.step(),
+            step: field.march_step(),
             strides,
         };
         march(&one, 9999, &[0], &mut [0], &mut marched);

@@ -315,7 +315,7 @@ impl Shading {
         gradients.resize(m, [0.0; DENSITY_OUTPUTS]);
         let along = &mut self.along;
         along.grow(counted.max_samples_per_ray());
-        let step = field.step();
+        let step = field.march_step();
         let channels: [&[f32]; 3] = std::array::from_fn(|c| &colour[c * m..(c + 1) * m]);
         for (column, &r) in counted.rays.iter().enumerate() {
             let (g, background) = (upstream.colours[r as usize], upstream.backgrounds[r as usize]);

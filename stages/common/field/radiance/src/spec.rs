@@ -1,4 +1,5 @@
-//! Constants of the field, shared by the fused passes, the f64 reference and the libtorch twin.
+//! Constants of the field, shared by the fused passes, the f64 reference and torch-field's hash
+//! grid.
 
 /// Number of features of a grid vertex.
 pub const FEATURES: usize = 4;

@@ -52,30 +52,31 @@ pub enum TrainingError {
     },
 }
 
-/// Number of rays of a shard (docs/design/047): fewer fill the vectors badly.
+/// Target number of rays of a shard, unless [`SHARDS`] limits their number (docs/design/047). Fewer
+/// rays leave many SIMD lanes empty.
 const RAYS_PER_SHARD: usize = 40;
 /// Minimum and maximum number of shards of a step (docs/design/047).
 const SHARDS: RangeInclusive<usize> = 32..=128;
-/// Number of networks' weights per task that sums their gradients; chosen by hand.
+/// Number of network weights whose gradients one task sums; chosen by hand.
 const SUMS_PIECE: usize = 64;
-/// Number of a level's bricks per task of the optimiser; chosen by hand.
+/// Number of a level's bricks that one task of the optimiser updates; chosen by hand.
 const ADAM_BRICKS: usize = 1 << 9;
-/// Number of cells per task that evaluates their densities; chosen by hand.
+/// Number of cells whose densities one task evaluates; chosen by hand.
 const CELLS_PER_TASK: usize = 1024;
-/// Number of weights per task that updates their average; chosen by hand.
+/// Number of weights whose average one task updates; chosen by hand.
 const AVERAGE_PIECE: usize = 1 << 16;
 
 /// Trains a [`Field`] by Adam.
 pub struct Trainer {
     field: Field,
     options: TrainingOptions,
-    first: Moments,
-    second: Moments,
+    first_moments: ParameterBuffers,
+    second_moments: ParameterBuffers,
     network_gradients: Aligned,
     /// Gradients of the grid's levels.
     grid_gradients: Vec<LevelGradients>,
     /// Running average of the weights, created by the first update.
-    average: Option<Moments>,
+    average: Option<ParameterBuffers>,
     transposed: Aligned,
     state: TrainingState,
     samples_per_ray: f64,
@@ -85,12 +86,12 @@ pub struct Trainer {
 }
 
 /// One float per parameter.
-struct Moments {
+struct ParameterBuffers {
     grid: Aligned,
     network: Aligned,
 }
 
-impl Moments {
+impl ParameterBuffers {
     fn zeros(field: &Field) -> Self {
         Self {
             grid: Aligned::zeros(field.grid.len()),
@@ -103,8 +104,8 @@ impl Trainer {
     /// Creates a trainer that is initialised from a field.
     pub fn new(field: Field, options: TrainingOptions) -> Self {
         Self {
-            first: Moments::zeros(&field),
-            second: Moments::zeros(&field),
+            first_moments: ParameterBuffers::zeros(&field),
+            second_moments: ParameterBuffers::zeros(&field),
             network_gradients: Aligned::zeros(field.network.len()),
             grid_gradients: field.levels.iter().map(LevelGradients::zeros).collect(),
             average: None,
@@ -146,27 +147,26 @@ impl Trainer {
     /// Takes a step; returns `None` after all rays have been cast.
     pub fn step(
         &mut self,
-        supervision: &mut impl Supervisor,
+        supervisor: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TrainingError> {
-        supervision.set_progress(self.state.progress(self.options.rays));
-        let bundle = supervision.rays_per_bundle();
+        supervisor.set_progress(self.state.progress(self.options.rays));
+        let rays_per_bundle = supervisor.rays_per_bundle();
         let target_rays = self.options.rays_of_step(&self.state, self.samples_per_ray);
-        let Some(bundles) = self.state.bundles_of_step(self.options.rays, target_rays, bundle)
-        else {
-            return Ok(None);
-        };
+        let bundles = self.state.bundles_of_step(self.options.rays, target_rays, rays_per_bundle);
+        let Some(bundles) = bundles else { return Ok(None) };
         self.phase(Phase::Occupancy, Self::update_occupancy);
         for layer in self.field.layers.all() {
             layer.transpose(&self.field.network, &mut self.transposed);
         }
 
         let first_bundle = self.state.bundles;
-        self.phase(Phase::Passes, |t, clock| t.run_shards(&*supervision, bundles, clock));
+        self.phase(Phase::Passes, |t, clock| t.run_shards(&*supervisor, bundles, clock));
         self.phase(Phase::Sums, Self::sum_network_gradients);
         let samples: usize = self.shards.iter().map(|s| s.samples).sum();
         let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / bundles as f64;
-        self.state.count(bundles, bundle);
-        self.samples_per_ray = samples as f64 / (bundles * bundle) as f64;
+        self.state.count(bundles, rays_per_bundle);
+        let rays = bundles * rays_per_bundle;
+        self.samples_per_ray = samples as f64 / rays as f64;
         let nonfinite = self.find_nonfinite(loss);
         if let Some(tensor) = nonfinite {
             self.network_gradients.fill(0.0);
@@ -178,12 +178,12 @@ impl Trainer {
             self.phase(Phase::Adam, Self::apply_gradients);
             self.phase(Phase::Average, Self::update_average);
             self.phase(Phase::Records, |trainer, clock| {
-                trainer.record(supervision, first_bundle, bundle, clock);
+                trainer.record(supervisor, first_bundle, rays_per_bundle, clock);
             });
         }
         self.state.steps += 1;
         let skipped = nonfinite.is_some();
-        Ok(Some(StepReport { loss, rays: bundles * bundle, samples, skipped }))
+        Ok(Some(StepReport { loss, rays, samples, skipped }))
     }
 
     /// Returns the time spent in each phase so far.
@@ -200,11 +200,11 @@ impl Trainer {
     }
 
     /// Runs the forward and backward pass of a step's bundles, a range of them per shard.
-    fn run_shards(&mut self, supervision: &impl Supervisor, bundles: usize, clock: &PhaseClock) {
+    fn run_shards(&mut self, supervisor: &impl Supervisor, bundles: usize, clock: &PhaseClock) {
         let work = StepWork {
             field: &self.field,
             transposed: &self.transposed,
-            supervision,
+            supervisor,
             options: &self.options,
             strides: self.field.occupancy.strides(self.state.steps),
             first_bundle: self.state.bundles,
@@ -212,7 +212,7 @@ impl Trainer {
             bundles,
         };
         // Independent of the number of threads, so that sums have one order.
-        let shards = (bundles * supervision.rays_per_bundle() / RAYS_PER_SHARD)
+        let shards = (bundles * supervisor.rays_per_bundle() / RAYS_PER_SHARD)
             .clamp(*SHARDS.start(), *SHARDS.end());
         self.shards.resize_with(shards, Shard::default);
         let workers = &self.workers;
@@ -277,22 +277,22 @@ impl Trainer {
     /// Takes an Adam step of networks and grid.
     fn apply_gradients(&mut self, clock: &PhaseClock) {
         let options = &self.options;
-        let (schedule, step) = (options.schedule(&self.state), self.state.steps + 1);
-        let network_step = AdamStep::new(step, options.mlp_learning_rate * schedule, NETWORK_DECAY);
+        let (factor, step) = (options.learning_rate_factor(&self.state), self.state.steps + 1);
+        let network_step = AdamStep::new(step, options.mlp_learning_rate * factor, NETWORK_DECAY);
         adam(
             &network_step,
             &mut self.network_gradients,
             &mut self.field.network,
-            &mut self.first.network,
-            &mut self.second.network,
+            &mut self.first_moments.network,
+            &mut self.second_moments.network,
         );
 
         let (mut weights, mut first, mut second) =
-            (&mut *self.field.grid, &mut *self.first.grid, &mut *self.second.grid);
+            (&mut *self.field.grid, &mut *self.first_moments.grid, &mut *self.second_moments.grid);
         let mut tasks = Vec::new();
         let levels = self.field.levels.iter().zip(&mut self.grid_gradients);
         for (i, (level, gradients)) in levels.enumerate() {
-            let level_step = AdamStep::new(step, options.rate_of_level(i, schedule), 0.0);
+            let level_step = AdamStep::new(step, options.rate_of_level(i, factor), 0.0);
             let [w, m, v] = [&mut weights, &mut first, &mut second].map(|parameters| {
                 let (part, rest) = std::mem::take(parameters).split_at_mut(level.range().len());
                 *parameters = rest;
@@ -316,7 +316,7 @@ impl Trainer {
             return;
         }
         let field = &self.field;
-        let average = self.average.get_or_insert_with(|| Moments {
+        let average = self.average.get_or_insert_with(|| ParameterBuffers {
             grid: field.grid.clone(),
             network: field.network.clone(),
         });
@@ -331,13 +331,13 @@ impl Trainer {
         }
     }
 
-    /// Raises cells' densities to those of the step's samples, and passes the rendered colours to
-    /// the supervision.
+    /// Raises the densities recorded in the occupancy grid to those of the step's samples, and
+    /// passes the rendered colours to the supervisor.
     fn record(
         &mut self,
-        supervision: &mut impl Supervisor,
+        supervisor: &mut impl Supervisor,
         first_bundle: u64,
-        bundle: usize,
+        rays_per_bundle: usize,
         clock: &PhaseClock,
     ) {
         let occupancy = &self.field.occupancy;
@@ -351,11 +351,11 @@ impl Trainer {
             .map(|shard| {
                 let colours = &shard.colours[..];
                 let first_bundle = next;
-                next += (colours.len() / bundle) as u64;
+                next += (colours.len() / rays_per_bundle) as u64;
                 RenderedBundles { first_bundle, colours }
             })
             .collect();
-        supervision.record_colours(&rendered, clock);
+        supervisor.record_colours(&rendered, clock);
     }
 
     /// Evaluates the density of the cells that are due, and updates the occupancy.
@@ -369,7 +369,7 @@ impl Trainer {
         pieces.for_each_init(CellBuffers::default, |buffers, (cells, densities)| {
             clock.task(|| buffers.evaluate(field, cells, (seed, step), densities));
         });
-        let distance = field.step();
+        let distance = field.march_step();
         self.field.occupancy.update(&cells, &densities, distance, clock);
     }
 }

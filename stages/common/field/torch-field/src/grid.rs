@@ -285,8 +285,8 @@ impl TorchGrid {
     }
 
     /// Returns the distance between samples in sides of the cube.
-    pub(crate) fn step(&self) -> f64 {
-        f64::from(self.architecture.step())
+    pub(crate) fn march_step(&self) -> f64 {
+        f64::from(self.architecture.march_step())
     }
 
     /// Returns densities, per side of the cube, at positions in the unit cube (n × 3).
@@ -389,10 +389,10 @@ impl TorchGrid {
         strides: Strides,
     ) -> Result<Marched, TchError> {
         let longest = maps.leave.f_sub(&maps.enter)?.f_max()?.f_double_value(&[])?;
-        let count = ((longest / self.step()).ceil() as i64).max(1);
+        let count = ((longest / self.march_step()).ceil() as i64).max(1);
         let steps = Tensor::f_arange(count, (Kind::Float, self.device))?;
         let k = steps.f_add(&offsets.f_unsqueeze(-1)?)?;
-        let step = k.f_full_like(self.step())?;
+        let step = k.f_full_like(self.march_step())?;
         let t = multiply_add(&k, &step, &maps.enter)?;
         let states = self
             .cell_states(&maps.positions(&t)?)?
@@ -412,7 +412,8 @@ impl TorchGrid {
         let inside = inside.f_logical_and(&is_double.f_logical_and(&is_odd)?.f_logical_not()?)?;
         let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
         let positions = maps.positions(&t)?.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
-        let length = length.f_reshape([-1])?.f_index_select(0, &kept)?.f_mul_scalar(self.step())?;
+        let length =
+            length.f_reshape([-1])?.f_index_select(0, &kept)?.f_mul_scalar(self.march_step())?;
         Ok(Marched { t, kept, positions, length, count })
     }
 

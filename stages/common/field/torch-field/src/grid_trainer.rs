@@ -92,17 +92,17 @@ impl GridTrainer {
     /// Takes one step; returns `None` after all rays are used.
     pub fn step(
         &mut self,
-        supervision: &mut impl Supervisor,
+        supervisor: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
-        supervision.set_progress(self.state.progress(self.options.rays));
-        let rays_per_bundle = supervision.rays_per_bundle();
+        supervisor.set_progress(self.state.progress(self.options.rays));
+        let rays_per_bundle = supervisor.rays_per_bundle();
         let target = self.options.rays_of_step(&self.state, self.samples_per_ray);
         let bundles = self.state.bundles_of_step(self.options.rays, target, rays_per_bundle);
         let Some(bundles) = bundles else { return Ok(None) };
         self.update_occupancy()?;
         let step = Step::new(&self.state, bundles, rays_per_bundle);
         let rays = step.rays();
-        let pieces = step.run_in_pieces(|range| self.run(&*supervision, step, range))?;
+        let pieces = step.run_in_pieces(|range| self.run(&*supervisor, step, range))?;
         self.state.count(bundles, rays_per_bundle);
         let (mut samples, mut loss) = (0, 0.0);
         let (mut hits, mut colours, mut sum) = (Vec::new(), Vec::new(), Vec::new());
@@ -127,7 +127,7 @@ impl GridTrainer {
         } else {
             no_grad(|| self.apply_gradients(&sum))?;
             self.occupancy.raise_densities(&hits);
-            step.record_colours(supervision, &colours);
+            step.record_colours(supervisor, &colours);
         }
         self.state.steps += 1;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
@@ -136,11 +136,11 @@ impl GridTrainer {
     /// Runs the forward and backward pass of a range of bundles.
     fn run(
         &self,
-        supervision: &impl Supervisor,
+        supervisor: &impl Supervisor,
         step: Step,
         range: Range<usize>,
     ) -> Result<GridPiece, TchError> {
-        let rays = step.sample_rays(supervision, &range);
+        let rays = step.sample_rays(supervisor, &range);
         let first = step.first_ray(&range);
         let offsets: Vec<f32> =
             (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
@@ -153,13 +153,13 @@ impl GridTrainer {
             .f_unsqueeze(-1)?
             .f_mul(&backgrounds)?
             .f_add(&forward.premultiplied)?;
-        let loss = step.loss(supervision, &range, &colour)?;
+        let loss = step.loss(supervisor, &range, &colour)?;
         let surrogate = add_regularisers(
             loss.surrogate,
             &self.options.regularisers,
             &forward,
             &backgrounds,
-            self.grid.step(),
+            self.grid.march_step(),
             step.rays(),
         )?;
         let gradients = if surrogate.requires_grad() {
@@ -180,10 +180,10 @@ impl GridTrainer {
     /// Updates the parameters and, late in the training, their average.
     fn apply_gradients(&mut self, gradients: &[Tensor]) -> Result<(), TchError> {
         let options = &self.options;
-        let schedule = options.schedule(&self.state);
+        let factor = options.learning_rate_factor(&self.state);
         let t = self.state.steps + 1;
         for (i, level) in self.grid.levels.iter().enumerate() {
-            let learning_rate = options.rate_of_level(i, schedule);
+            let learning_rate = options.rate_of_level(i, factor);
             lazy_adam(
                 t,
                 learning_rate,
@@ -196,7 +196,7 @@ impl GridTrainer {
         for (i, layer) in self.grid.layers.iter().enumerate() {
             lazy_adam(
                 t,
-                options.mlp_learning_rate * schedule,
+                options.mlp_learning_rate * factor,
                 radiance::NETWORK_DECAY,
                 layer.shallow_clone(),
                 &gradients[i + 1],
@@ -232,7 +232,12 @@ impl GridTrainer {
             })?;
             densities.extend(to_host(&self.grid.densities(&positions)?)?);
         }
-        self.occupancy.update(&cells, &densities, self.grid.step() as f32, &PhaseClock::start());
+        self.occupancy.update(
+            &cells,
+            &densities,
+            self.grid.march_step() as f32,
+            &PhaseClock::start(),
+        );
         self.grid.set_occupancy(&self.occupancy)
     }
 

@@ -147,11 +147,11 @@ impl MlpTrainer {
     /// Takes one step; returns `None` after all rays are used.
     pub fn step(
         &mut self,
-        supervision: &mut impl Supervisor,
+        supervisor: &mut impl Supervisor,
     ) -> Result<Option<StepReport>, TorchFieldError> {
         let done = self.state.progress(self.options.rays);
-        supervision.set_progress(done);
-        let rays_per_bundle = supervision.rays_per_bundle();
+        supervisor.set_progress(done);
+        let rays_per_bundle = supervisor.rays_per_bundle();
         let Some(bundles) = self.state.bundles_of_step(
             self.options.rays,
             self.options.max_rays_per_step,
@@ -161,7 +161,7 @@ impl MlpTrainer {
         };
         let step = Step::new(&self.state, bundles, rays_per_bundle);
         let rays = step.rays();
-        let pieces = self.run_step(&*supervision, step)?;
+        let pieces = self.run_step(&*supervisor, step)?;
         self.state.count(bundles, rays_per_bundle);
         let Some(sum) = sum_in_order(pieces.into_iter().map(Ok))? else { return Ok(None) };
         let loss = sum.loss / bundles as f64;
@@ -172,7 +172,7 @@ impl MlpTrainer {
             }
         } else {
             self.apply_gradients(&sum.gradients, done)?;
-            step.record_colours(supervision, &[sum.colours]);
+            step.record_colours(supervisor, &[sum.colours]);
         }
         self.state.steps += 1;
         self.check_collapse(sum.weights, rays)?;
@@ -206,7 +206,7 @@ impl MlpTrainer {
     /// few pieces as its memory allows.
     fn run_step(
         &self,
-        supervision: &impl Supervisor,
+        supervisor: &impl Supervisor,
         step: Step,
     ) -> Result<Vec<MlpPiece>, TorchFieldError> {
         let context = StepContext {
@@ -215,7 +215,7 @@ impl MlpTrainer {
             noise_std: self.options.density_noise_std,
         };
         if self.field.device != Device::Cpu {
-            return step.run_in_pieces(|range| context.run(&self.field, supervision, range));
+            return step.run_in_pieces(|range| context.run(&self.field, supervisor, range));
         }
         let (bundles, count) = (step.bundles, shard_count(step.rays()));
         let shards: Vec<(Mlp, Range<usize>)> = (0..count)
@@ -223,7 +223,7 @@ impl MlpTrainer {
             .collect();
         let pieces: Result<Vec<Option<MlpPiece>>, TchError> = shards
             .into_par_iter()
-            .map(|(field, range)| context.run_shard(&field, supervision, range))
+            .map(|(field, range)| context.run_shard(&field, supervisor, range))
             .collect();
         Ok(pieces?.into_iter().flatten().collect())
     }
@@ -294,7 +294,7 @@ impl StepContext {
     fn run_shard(
         self,
         field: &Mlp,
-        supervision: &impl Supervisor,
+        supervisor: &impl Supervisor,
         range: Range<usize>,
     ) -> Result<Option<MlpPiece>, TchError> {
         let samples =
@@ -304,7 +304,7 @@ impl StepContext {
             range
                 .clone()
                 .step_by(chunk)
-                .map(|start| self.run(field, supervision, start..(start + chunk).min(range.end))),
+                .map(|start| self.run(field, supervisor, start..(start + chunk).min(range.end))),
         )
     }
 
@@ -312,10 +312,10 @@ impl StepContext {
     fn run(
         self,
         field: &Mlp,
-        supervision: &impl Supervisor,
+        supervisor: &impl Supervisor,
         range: Range<usize>,
     ) -> Result<MlpPiece, TchError> {
-        let rays = self.step.sample_rays(supervision, &range);
+        let rays = self.step.sample_rays(supervisor, &range);
         let draws = SampleDraws::new(
             field,
             self.seed,
@@ -324,8 +324,8 @@ impl StepContext {
             self.noise_std,
         )?;
         let forward = field.forward(&Batch::new(&rays, field)?, Some(&draws))?;
-        let coarse = self.step.loss(supervision, &range, &forward.coarse.colour)?;
-        let fine = self.step.loss(supervision, &range, &forward.fine.colour)?;
+        let coarse = self.step.loss(supervisor, &range, &forward.coarse.colour)?;
+        let fine = self.step.loss(supervisor, &range, &forward.fine.colour)?;
         let parameters: Vec<Tensor> = field.parameters().collect();
         let gradients = Tensor::f_run_backward(
             &[coarse.surrogate.f_add(&fine.surrogate)?],

@@ -59,12 +59,12 @@ impl Step {
     /// Samples the rays of a range of the step's bundles.
     pub(crate) fn sample_rays(
         self,
-        supervision: &impl Supervisor,
+        supervisor: &impl Supervisor,
         range: &Range<usize>,
     ) -> Vec<Ray> {
         let mut rays = vec![Ray::default(); range.len() * self.rays_per_bundle];
         for (i, rays) in rays.chunks_exact_mut(self.rays_per_bundle).enumerate() {
-            supervision.sample_rays(self.first_bundle + (range.start + i) as u64, rays);
+            supervisor.sample_rays(self.first_bundle + (range.start + i) as u64, rays);
         }
         rays
     }
@@ -72,7 +72,7 @@ impl Step {
     /// Computes the loss of the colours (n × 3) of a range of the step's bundles.
     pub(crate) fn loss(
         self,
-        supervision: &impl Supervisor,
+        supervisor: &impl Supervisor,
         range: &Range<usize>,
         colour: &Tensor,
     ) -> Result<StepLoss, TchError> {
@@ -83,7 +83,7 @@ impl Step {
             .map(|(i, gradients)| {
                 let colours = &colours[i * self.rays_per_bundle..][..self.rays_per_bundle];
                 let bundle = self.first_bundle + (range.start + i) as u64;
-                supervision.loss_and_gradient(bundle, colours, gradients)
+                supervisor.loss_and_gradient(bundle, colours, gradients)
             })
             .sum();
         let scaled: Vec<f32> =
@@ -95,19 +95,15 @@ impl Step {
         Ok(StepLoss { sum, colours, surrogate })
     }
 
-    /// Passes the rendered colours of all pieces, in order, to the supervision.
-    pub(crate) fn record_colours(
-        self,
-        supervision: &mut impl Supervisor,
-        pieces: &[Vec<[f32; 3]>],
-    ) {
+    /// Passes the rendered colours of all pieces, in order, to the supervisor.
+    pub(crate) fn record_colours(self, supervisor: &mut impl Supervisor, pieces: &[Vec<[f32; 3]>]) {
         let mut first_bundle = self.first_bundle;
         let mut rendered = Vec::with_capacity(pieces.len());
         for colours in pieces {
             rendered.push(RenderedBundles { first_bundle, colours });
             first_bundle += (colours.len() / self.rays_per_bundle) as u64;
         }
-        supervision.record_colours(&rendered, &PhaseClock::start());
+        supervisor.record_colours(&rendered, &PhaseClock::start());
     }
 
     /// Runs the step's bundles in as few pieces as memory allows.
@@ -137,7 +133,7 @@ pub(crate) fn run_in_pieces<T>(
                 next = range.end;
             }
             Err(error) if size > min_size && nets::is_out_of_memory(&error) => {
-                size = size.div_ceil(2);
+                size = size.div_ceil(2).max(min_size);
             }
             Err(error) => return Err(error.into()),
         }

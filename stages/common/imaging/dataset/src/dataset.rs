@@ -47,17 +47,17 @@ impl Dataset {
         let (mut pixels, mut photographs) = (0, 0);
         for frame in &self.frames {
             let lens = frame.intrinsics();
-            let cut = match known.iter().find(|(other, _)| *other == lens) {
-                Some((_, cut)) => *cut,
+            let masked_pixels = match known.iter().find(|(other, _)| *other == lens) {
+                Some((_, masked_pixels)) => *masked_pixels,
                 None => {
-                    let counts = lens.lens_mask().map(|mask| mask.counts).unwrap_or_default();
-                    let cut = counts.iter().filter(|counts| !**counts).count();
-                    known.push((lens, cut));
-                    cut
+                    let has_ray = lens.lens_mask().map(|mask| mask.counts).unwrap_or_default();
+                    let masked_pixels = has_ray.iter().filter(|has_ray| !**has_ray).count();
+                    known.push((lens, masked_pixels));
+                    masked_pixels
                 }
             };
-            pixels += cut;
-            photographs += usize::from(cut > 0);
+            pixels += masked_pixels;
+            photographs += usize::from(masked_pixels > 0);
         }
         if pixels > 0 {
             self.notes.push(format!(
@@ -70,7 +70,8 @@ impl Dataset {
     }
 
     /// Makes images be read without lens distortion: resampled to pinhole cameras of the same size,
-    /// which crops their border. The field of view in place of a fisheye lens is at most 100°.
+    /// which crops their border. The pinhole camera that replaces a fisheye lens has a field of
+    /// view of at most 100°.
     pub fn undistorted(mut self) -> Result<Self, DatasetError> {
         let (mut undistorted, mut angles) = (0, Vec::new());
         for frame in self.frames.iter_mut().filter(|f| f.has_distortion()) {
@@ -125,7 +126,7 @@ impl Dataset {
         let fisheye = frames.iter().filter(|f| f.stored_intrinsics.distortion.is_fisheye()).count();
         let distorted = frames.iter().filter(|f| f.has_distortion()).count() - fisheye;
         let upright = frames.iter().filter(|f| f.turn == Turn::Upright).count();
-        let assumed = frames.iter().filter(|f| f.turn == Turn::Assumed).count();
+        let assumed = frames.iter().filter(|f| f.turn == Turn::AssumedStored).count();
         for (count, verbs, text) in [
             (distorted, ["has", "have"], "lens distortion"),
             (fisheye, ["was", "were"], "taken with a fisheye lens"),

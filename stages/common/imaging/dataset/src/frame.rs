@@ -20,7 +20,7 @@ pub enum Turn {
     /// Pixels turned as EXIF requires.
     Upright,
     /// Stored pixels by assumption: EXIF requires a turn, and both shapes fit the camera.
-    Assumed,
+    AssumedStored,
 }
 
 /// Posed photograph.

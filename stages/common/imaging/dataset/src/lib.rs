@@ -3,15 +3,15 @@
 //!
 //! A new format needs a module with its reader; in `format`, a variant of [`Format`], its place in
 //! `Format::ALL` and its description; in this file, its recognition and the call of its reader.
-//! Readers share `lookup`, which finds files, `frame`, `photograph` and `text`; `masks` finds masks
-//! next to images, `nearby` explains folders that are no data set.
+//! Readers share the modules `frame`, `photograph`, `text` and `lookup`, which finds files. `masks`
+//! finds masks next to images; `nearby` explains why a folder is no data set.
 //!
 //! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left
 //! corner, scene units) with lens distortion; [`Frame::photograph`] reads the image, and turns it
-//! as EXIF requires only if the camera's width and height are turned. After
+//! as EXIF requires only if the camera's width and height are those of the turned image. After
 //! [`Dataset::undistorted`], images are read with lens distortion removed.
 //!
-//! Lengths are in the units of the poses; pixel coordinates start at the stored image's top left
+//! Scene units are those of the poses; pixel coordinates start at the stored image's top left
 //! corner, so that the first pixel's centre is (0.5, 0.5). All content of files is checked: sizes
 //! before allocations, paths before files are opened.
 //!

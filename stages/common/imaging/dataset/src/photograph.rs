@@ -69,8 +69,12 @@ impl ImageHeader {
 
     /// Returns the treatment of the EXIF orientation for a camera whose shape fits both the stored
     /// and the turned image.
-    pub(crate) fn assumed_turn(self) -> Turn {
-        if self.orientation == Orientation::NoTransforms { Turn::Stored } else { Turn::Assumed }
+    pub(crate) fn turn_if_both_fit(self) -> Turn {
+        if self.orientation == Orientation::NoTransforms {
+            Turn::Stored
+        } else {
+            Turn::AssumedStored
+        }
     }
 }
 
@@ -101,11 +105,11 @@ pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> Result<(Intrinsi
     let is_turned_fit = stored.is_sideways() && has_aspect_of(&k, height, width);
     let is_turned_exactly = stored.is_sideways() && (k.height, k.width) == stored.size;
     if (k.width, k.height) == stored.size {
-        let is_settled = stored.is_sideways() && width != height;
-        Ok((k, if is_settled { Turn::Stored } else { stored.assumed_turn() }))
+        let rules_out_turn = stored.is_sideways() && width != height;
+        Ok((k, if rules_out_turn { Turn::Stored } else { stored.turn_if_both_fit() }))
     } else if has_aspect_of(&k, width, height) && !is_turned_exactly {
-        let is_settled = stored.is_sideways() && !is_turned_fit;
-        let turn = if is_settled { Turn::Stored } else { stored.assumed_turn() };
+        let rules_out_turn = stored.is_sideways() && !is_turned_fit;
+        let turn = if rules_out_turn { Turn::Stored } else { stored.turn_if_both_fit() };
         Ok((k.resized(width, height), turn))
     } else if is_turned_fit {
         Ok((k.resized(height, width), Turn::Upright))
@@ -121,7 +125,7 @@ pub(crate) fn fit_camera(k: Intrinsics, stored: ImageHeader) -> Result<(Intrinsi
 /// chosen by hand.
 const MAX_ASPECT_DEVIATION: f64 = 0.01;
 
-/// True if an image of a size may be a resized copy of the camera's.
+/// True if an image of a size may be a resized copy of the camera's image.
 pub(crate) fn has_aspect_of(k: &Intrinsics, width: u32, height: u32) -> bool {
     let x_scale = f64::from(width) / f64::from(k.width.max(1));
     let y_scale = f64::from(height) / f64::from(k.height.max(1));
@@ -130,7 +134,7 @@ pub(crate) fn has_aspect_of(k: &Intrinsics, width: u32, height: u32) -> bool {
 }
 
 /// Reads an image, as stored or turned upright by EXIF. Fails if the image is incomplete.
-fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelError> {
+fn read_image(path: &Path, turn_upright: bool) -> Result<(Rgba8, Clipping), PixelError> {
     if is_exr(path) {
         return read_exr_photograph(path);
     }
@@ -147,14 +151,15 @@ fn read_image(path: &Path, is_upright: bool) -> Result<(Rgba8, Clipping), PixelE
     if !has_image_data {
         return Err(PixelError::format(path, "damaged JPEG: headers and image data don't match"));
     }
-    if is_upright {
+    if turn_upright {
         image.apply_orientation(orientation);
     }
     Ok((image.into(), Clipping::default()))
 }
 
-/// Fails if a JPEG lacks image data, which its decoder would replace by grey. Adds a missing end
-/// marker, without which the decoder omits the last rows. Returns whether image data were found.
+/// Fails if rows or scans of a JPEG are missing, which its decoder would replace by grey. Adds a
+/// missing end marker, without which the decoder omits the last rows. Returns false if the file has
+/// no scan at all.
 fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<bool, String> {
     match extent(jpeg) {
         Extent::Whole => Ok(true),
@@ -186,7 +191,7 @@ fn read_exr_photograph(path: &Path) -> Result<(Rgba8, Clipping), PixelError> {
     for i in 0..r.len() {
         let (colour, alpha) = ([r[i], g[i], b[i]], a.map_or(1.0, |a| a[i]));
         data.extend(encode_pixel(colour, alpha));
-        clipped += u64::from(is_clipped(colour, alpha));
+        clipped += u64::from(exceeds_one(colour, alpha));
     }
     let clipping = Clipping { clipped, pixels: r.len() as u64 };
     Ok((Rgba8::new(image.width, image.height, data), clipping))
@@ -208,7 +213,7 @@ fn encode_pixel(colour: [f32; 3], alpha: f32) -> [u8; 4] {
 /// can cause.
 const HALF_ROUNDING: f32 = 1.0 / 1024.0;
 
-/// Counts of pixels whose colour is clipped to 1. Only EXR files have brighter pixels.
+/// Counts of pixels whose colour is clipped to 1. Only EXR files can have values above 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Clipping {
     /// Number of clipped pixels.
@@ -226,7 +231,7 @@ impl Clipping {
 }
 
 /// True if a premultiplied colour is brighter than its alpha.
-fn is_clipped(colour: [f32; 3], alpha: f32) -> bool {
+fn exceeds_one(colour: [f32; 3], alpha: f32) -> bool {
     let limit = alpha * (1.0 + HALF_ROUNDING);
     alpha > 0.0 && colour.iter().any(|value| *value > limit)
 }
@@ -236,7 +241,7 @@ const RGBA_BYTES: u64 = 4;
 /// Additional bytes per pixel while a JPEG is decoded: coefficients of a progressive one.
 const COEFFICIENT_BYTES: u64 = 6;
 
-/// Returns the peak memory of reading an image in bytes, estimated from its header.
+/// Returns the peak memory in bytes while an image is read, estimated from the image's header.
 fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
     if is_exr(path) {
         let (width, height) = exr_size(path)?;
@@ -250,7 +255,7 @@ fn reading_bytes(path: &Path) -> Result<u64, PixelError> {
 }
 
 impl Frame {
-    /// Returns the peak memory of [`Frame::photograph`] in bytes, estimated from the image's
+    /// Returns the peak memory in bytes during [`Frame::photograph`], estimated from the image's
     /// header.
     pub fn reading_bytes(&self) -> Result<u64, DatasetError> {
         Ok(reading_bytes(&self.image)?)
@@ -276,8 +281,8 @@ impl Frame {
     }
 
     /// Returns the mask of [`Frame::photograph`]: pixels that count in its mask file and have a
-    /// ray. `None` if all pixels count. A mask file of a different size is resampled by nearest
-    /// neighbour.
+    /// ray. `None` if there is no mask file and every pixel has a ray. A mask file of a different
+    /// size is resampled by nearest neighbour.
     pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
         let lens = self.intrinsics().lens_mask();
         let Some(file) = &self.mask else { return Ok(lens) };

@@ -100,7 +100,7 @@ fn intrinsics(entry: &LensEntry, stored: ImageHeader) -> Result<(Intrinsics, Tur
     let (k, turn) = fit_camera(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)?;
     // Without w and h the camera has the stored shape by assumption, which settles no turn.
     let is_assumed = turn == Turn::Stored && (entry.w.is_none() || entry.h.is_none());
-    Ok((k, if is_assumed { stored.assumed_turn() } else { turn }))
+    Ok((k, if is_assumed { stored.turn_if_both_fit() } else { turn }))
 }
 
 /// Returns a side of the image in pixels; `stored` is the default.

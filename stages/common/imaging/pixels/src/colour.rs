@@ -36,7 +36,7 @@ pub enum Palette {
 }
 
 /// Returns a palette's colour for a value, clamped to [0, 1].
-pub fn heat(palette: Palette, value: f32) -> [u8; 3] {
+pub fn palette_colour(palette: Palette, value: f32) -> [u8; 3] {
     let gradient = match palette {
         Palette::Error => colorous::INFERNO,
         Palette::Depth => colorous::TURBO,

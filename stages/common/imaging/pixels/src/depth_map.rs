@@ -1,4 +1,4 @@
-use crate::colour::{Palette, heat};
+use crate::colour::{Palette, palette_colour};
 use crate::exr_file::ExrImage;
 use crate::image_buffer::Rgba8;
 
@@ -57,7 +57,7 @@ impl<'a> DepthMap<'a> {
             let alpha = self.opacity[i];
             let value = 1.0 - (scaled_depth(*z, range) - low) / (high - low).max(f32::MIN_POSITIVE);
             // Without the palette's darkest ends.
-            let colour = heat(Palette::Depth, 0.08 + 0.84 * value.clamp(0.0, 1.0));
+            let colour = palette_colour(Palette::Depth, 0.08 + 0.84 * value.clamp(0.0, 1.0));
             for c in colour {
                 data.push((f32::from(c) * alpha + 255.0 * (1.0 - alpha)).round() as u8);
             }

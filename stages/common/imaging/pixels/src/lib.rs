@@ -15,7 +15,7 @@
 //! * [`Mask`]: pixels of an image that count.
 //! * [`sample_cubic`], [`Image::colour_at`]: cubic interpolation.
 //! * [`psnr_of`]: a mean squared error in dB.
-//! * [`heat`]: colour scales of depth and error maps.
+//! * [`palette_colour`]: colour scales of depth and error maps.
 //!
 //! Colours are display-encoded sRGB in [0, 1] throughout.
 //!
@@ -38,7 +38,7 @@ mod operator;
 mod pillow_resample;
 mod png_file;
 
-pub use colour::{Palette, heat, linear_from_srgb, srgb_from_linear, to_u8};
+pub use colour::{Palette, linear_from_srgb, palette_colour, srgb_from_linear, to_u8};
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel, average_pool};
 pub use depth_map::{DepthMap, common_range};

@@ -14,15 +14,16 @@ pub enum Space {
     /// Normalised device coordinates of a virtual camera (NDC; NeRF, appendix C): for
     /// forward-facing photographs.
     Ndc(Frustum),
-    /// All of space: the ball in the bounds' box unscaled, everything outside contracted to a shell
-    /// around it (mip-NeRF 360, eq. 10): for unbounded scenes.
+    /// All of space: the ball around the middle of the bounds whose diameter is their longest side,
+    /// undistorted, and everything outside contracted to a shell around this ball (mip-NeRF 360,
+    /// eq. 10): for unbounded scenes.
     Contraction,
 }
 
 /// Frustum of a virtual camera between two planes. A point (X, Y, Z) in camera space, Z the depth,
 /// has projective coordinates (X/Z, Y/Z) between `min` and `max` and disparity 1/Z between `1/far`
-/// and `1/near`. Straight lines stay straight, and even steps along them are finest near the
-/// camera, as its resolution is.
+/// and `1/near`. Straight lines stay straight. Equal steps along a line in the cube are shorter in
+/// the world near the camera, where images resolve more.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Frustum {
@@ -70,22 +71,22 @@ impl Frustum {
         DVec3::new(x[i], y[i], z[i])
     }
 
-    /// Returns the wider of both ranges of slopes.
-    fn slope_range(&self) -> f64 {
+    /// Returns the side of the cube in slopes: the width of the wider range.
+    fn cube_side(&self) -> f64 {
         (self.max[0] - self.min[0]).max(self.max[1] - self.min[1])
     }
 
-    /// Converts a point of the virtual camera's space to the unit cube: slopes over the wider of
-    /// their ranges, and z from 0 at the near plane to 1 at the far plane.
+    /// Converts a point of the virtual camera's space to the unit cube: slopes divided by the wider
+    /// of their ranges, and z from 0 at the near plane to 1 at the far plane.
     pub fn to_cube(&self, p: DVec3) -> DVec3 {
-        let side = self.slope_range();
-        let depth = (1.0 / self.near - 1.0 / p.z) / (1.0 / self.near - 1.0 / self.far);
-        DVec3::new((p.x / p.z - self.min[0]) / side, (p.y / p.z - self.min[1]) / side, depth)
+        let side = self.cube_side();
+        let z = (1.0 / self.near - 1.0 / p.z) / (1.0 / self.near - 1.0 / self.far);
+        DVec3::new((p.x / p.z - self.min[0]) / side, (p.y / p.z - self.min[1]) / side, z)
     }
 
     /// Converts a position in the unit cube to a world point.
     pub fn to_world(&self, position: DVec3) -> DVec3 {
-        let side = self.slope_range();
+        let side = self.cube_side();
         let depth = 1.0 / (1.0 / self.near - position.z * (1.0 / self.near - 1.0 / self.far));
         let [x, y] = [0, 1].map(|i| (position[i] * side + self.min[i]) * depth);
         self.column(3) + x * self.column(0) + y * self.column(1) - depth * self.column(2)
@@ -100,14 +101,14 @@ impl Frustum {
     ///
     /// [`Bounds::rounded`]: crate::Bounds::rounded
     pub(crate) fn rounded(&self, anchor: DVec3) -> Self {
-        let side = self.slope_range();
+        let side = self.cube_side();
         let slope_step = rounding_step(side);
         // The frustum is narrowest at its near plane, so the centre matters most there.
         let centre = rounded_offset(self.centre(), anchor, rounding_step(self.near * side));
         Self {
             camera_to_world: pose_of(rotation_of(&self.camera_to_world), centre),
-            min: self.min.map(|slope| multiple(slope, slope_step)),
-            max: self.max.map(|slope| multiple(slope, slope_step)),
+            min: self.min.map(|slope| nearest_multiple(slope, slope_step)),
+            max: self.max.map(|slope| nearest_multiple(slope, slope_step)),
             near: rounded(self.near),
             far: rounded(self.far),
         }
@@ -130,17 +131,17 @@ pub(crate) fn rounding_step(magnitude: f64) -> f64 {
 }
 
 /// Returns the nearest multiple of a step; the number itself if the step is 0.
-pub(crate) fn multiple(value: f64, step: f64) -> f64 {
+pub(crate) fn nearest_multiple(value: f64, step: f64) -> f64 {
     if step > 0.0 { (value / step).round() * step } else { value }
 }
 
 /// Rounds a number to 26 binary digits after the leading one.
 pub(crate) fn rounded(value: f64) -> f64 {
-    multiple(value, rounding_step(value))
+    nearest_multiple(value, rounding_step(value))
 }
 
 /// Rounds a point's offset from an anchor.
 pub(crate) fn rounded_offset(point: DVec3, anchor: DVec3, step: f64) -> DVec3 {
-    let offset = (point - anchor).to_array().map(|x| multiple(x, step));
+    let offset = (point - anchor).to_array().map(|x| nearest_multiple(x, step));
     anchor + DVec3::from(offset)
 }

@@ -3,7 +3,7 @@ use pixels::DepthMap;
 
 use crate::camera::Camera;
 
-/// Surfaces of a view: camera, depth and opacity.
+/// Depth and opacity of a view's surfaces, with the view's camera.
 #[derive(Clone, Copy, Debug)]
 pub struct Surface<'a> {
     /// Camera of the view, with the map's size.
@@ -12,28 +12,28 @@ pub struct Surface<'a> {
     pub map: DepthMap<'a>,
 }
 
-/// Projection of a surface point of one view in another view.
+/// Projection of a view's surface point to another view.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Visibility {
+pub struct PointProjection {
     /// Position in the other image, in pixels from the top left corner.
     pub position: [f32; 2],
     /// Cosine of the angle between both lines of sight.
     pub cosine: f32,
     /// Resolution of the other view relative to this one at the point, in pixels per pixel; slant
     /// is ignored.
-    pub detail: f32,
+    pub relative_resolution: f32,
 }
 
 /// Maximum relative difference between two depths of one surface; chosen by hand.
 const MAX_DEPTH_DIFFERENCE: f64 = 0.02;
-/// Maximum reprojection error at which two views' points are one surface whatever their depths;
-/// chosen by hand. Nearby cameras determine the depth of a far wall poorly, but such an error of
-/// depth hardly moves the wall in the image.
+/// Maximum reprojection error at which two views' points count as one surface, even if their depths
+/// differ by more than [`MAX_DEPTH_DIFFERENCE`]; chosen by hand. Nearby cameras determine the depth
+/// of a far wall poorly, but such an error of depth hardly moves the wall in the image.
 const MAX_REPROJECTION_ERROR_PIXELS: f64 = 0.5;
 
 impl Surface<'_> {
     /// Returns, row by row, the position of each pixel's surface point in another view; `None`
-    /// where [`Surface::visibility`] is.
+    /// where [`Surface::visible_projection`] returns `None`.
     ///
     /// # Panics
     /// If the map doesn't have one number per pixel.
@@ -41,40 +41,51 @@ impl Surface<'_> {
         let k = &self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         (0..width * height)
-            .map(|i| self.visibility(i % width, i / width, other).map(|s| s.position))
+            .map(|i| self.visible_projection(i % width, i / width, other).map(|p| p.position))
             .collect()
     }
 
-    /// Returns the visibility of a pixel's surface point in another view. `None` if the pixel has
+    /// Returns the projection of a pixel's surface point to another view. `None` if the pixel has
     /// no surface, or the point is outside the other image or occluded.
     ///
     /// # Panics
     /// If the map doesn't have one number per pixel, or the pixel is outside.
-    pub fn visibility(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Visibility> {
-        let (visibility, point) = self.project(column, row, other.camera)?;
+    pub fn visible_projection(
+        &self,
+        column: usize,
+        row: usize,
+        other: &Surface<'_>,
+    ) -> Option<PointProjection> {
+        let (projection, point) = self.project(column, row, other.camera)?;
         let pixel = [column as f64 + 0.5, row as f64 + 0.5];
         other
-            .has_point(point, visibility.position.map(f64::from), (self.camera, pixel))
-            .then_some(visibility)
+            .has_point(point, projection.position.map(f64::from), (self.camera, pixel))
+            .then_some(projection)
     }
 
-    /// Returns the visibility of a pixel's surface point in another camera, regardless of
-    /// occlusion. `None` if the pixel has no surface, or the point is outside the camera's image.
+    /// Returns the projection of a pixel's surface point to another camera, even if the point is
+    /// occluded there. `None` if the pixel has no surface, or the point is outside the camera's
+    /// image.
     ///
     /// # Panics
     /// If the map doesn't have one number per pixel, or the pixel is outside.
-    pub fn unoccluded_visibility(
+    pub fn projection_ignoring_occlusion(
         &self,
         column: usize,
         row: usize,
         other: &Camera,
-    ) -> Option<Visibility> {
-        self.project(column, row, other).map(|(visibility, _)| visibility)
+    ) -> Option<PointProjection> {
+        self.project(column, row, other).map(|(projection, _)| projection)
     }
 
-    /// Projects a pixel's surface point to another camera, regardless of occlusion; returns the
-    /// world point, too.
-    fn project(&self, column: usize, row: usize, other: &Camera) -> Option<(Visibility, DVec3)> {
+    /// Projects a pixel's surface point to another camera, even if the point is occluded there.
+    /// Returns the world point, too.
+    fn project(
+        &self,
+        column: usize,
+        row: usize,
+        other: &Camera,
+    ) -> Option<(PointProjection, DVec3)> {
         let i = row * self.camera.intrinsics.width as usize + column;
         if !self.map.has_surface(i) {
             return None;
@@ -87,23 +98,25 @@ impl Surface<'_> {
         // NaN is outside.
         let is_inside = (0.0..=width).contains(&x) && (0.0..=height).contains(&y);
         let line = point - other.centre();
-        let visibility = Visibility {
+        let projection = PointProjection {
             position: [x as f32, y as f32],
             cosine: (ray.direction.dot(line) / line.length()) as f32,
-            detail: (other.intrinsics.fx * distance / (self.camera.intrinsics.fx * line.length()))
+            relative_resolution: (other.intrinsics.fx * distance
+                / (self.camera.intrinsics.fx * line.length()))
                 as f32,
         };
-        is_inside.then_some((visibility, point))
+        is_inside.then_some((projection, point))
     }
 
     /// Returns whether this view's surface at position (x, y) contains `point`, which the camera
-    /// `other` observes at `pixel`. One of the four pixels around (x, y) must have the depth of
-    /// `point`, or a depth that `other` projects to `pixel`.
+    /// `observer` observes at `pixel`. One of the four pixels around (x, y) must have the depth of
+    /// `point`, or a depth at which the point on the same line of sight is also observed at
+    /// `pixel`.
     fn has_point(
         &self,
         point: DVec3,
         [x, y]: [f64; 2],
-        (other, pixel): (&Camera, [f64; 2]),
+        (observer, pixel): (&Camera, [f64; 2]),
     ) -> bool {
         let k = &self.camera.intrinsics;
         let line = point - self.camera.centre();
@@ -112,9 +125,10 @@ impl Surface<'_> {
             for column in nearest_pixels(x, k.width as usize) {
                 let i = row * k.width as usize + column;
                 let own = f64::from(self.map.depth[i]);
+                let own_point = self.camera.centre() + line * (own / depth);
                 if self.map.has_surface(i)
                     && ((own - depth).abs() <= MAX_DEPTH_DIFFERENCE * depth
-                        || observes_at(other, self.camera.centre() + line * (own / depth), pixel))
+                        || observes_at(observer, own_point, pixel))
                 {
                     return true;
                 }
@@ -189,8 +203,8 @@ mod tests {
                 let hidden = has_plate && point.z < 0.5 && at_plate.x.abs() <= 0.3;
                 let at_edge = has_plate && (at_plate.x.abs() - 0.3).abs() < 0.1;
                 let through = from_a
-                    .unoccluded_visibility(i % 64, i / 64, &b)
-                    .map(|visibility| visibility.position);
+                    .projection_ignoring_occlusion(i % 64, i / 64, &b)
+                    .map(|projection| projection.position);
                 assert!(
                     through.is_some() == inside && (place.is_none() || place == through),
                     "pixel {i} through what hides it"

@@ -4,14 +4,16 @@ use sysinfo::{MemoryRefreshKind, System};
 /// Phrases of allocators before the requested amount: Rust, libtorch, CUDA and NumPy.
 const PHRASES_WITH_AMOUNT: [&str; 4] =
     ["memory allocation of ", "tried to allocate ", "Tried to allocate ", "Unable to allocate "];
-/// Phrases without an amount: C++, libtorch, the system (failed call, failed load of a library) and
-/// Python.
-const PHRASES_WITHOUT_AMOUNT: [&str; 5] = [
+/// Phrases without an amount: C++, libtorch, the system (failed call, failed load of a library),
+/// Python and CUDA.
+const PHRASES_WITHOUT_AMOUNT: [&str; 7] = [
     "std::bad_alloc",
     "can't allocate memory",
     "Cannot allocate memory",
     "failed to map segment from shared object",
     "MemoryError",
+    "CUDA error: out of memory",
+    "CUBLAS_STATUS_ALLOC_FAILED",
 ];
 
 /// Translates an allocator's message to one with the requested amount, if known, and a remedy;

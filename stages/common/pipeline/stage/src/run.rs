@@ -22,7 +22,7 @@ use crate::context::Context;
 use crate::help::render_help;
 use crate::panics::install_panic_hook;
 use crate::processors::{Processors, processors, start_threads};
-use crate::progress::{ProgressMode, enable_events, failed_event};
+use crate::progress::{ProgressMode, enable_failure_event, failed_event};
 use crate::signals::{EndClaim, stop_on_signals};
 use crate::stage::Stage;
 use crate::staging::Staging;
@@ -141,7 +141,7 @@ impl Program {
     fn execute(&self, arguments: Arguments) -> anyhow::Result<()> {
         let is_for_runner = arguments.progress == ProgressMode::Json;
         if is_for_runner {
-            enable_events();
+            enable_failure_event();
         }
         let CheckedArguments { params, work, threads, inputs } =
             self.check_arguments(&arguments)?;

@@ -2,9 +2,9 @@
 //! lack.
 //!
 //! A field trained on LR images renders edges too soft, and in the same way everywhere in a scene.
-//! The network takes a rendered view and predicts the residual. It learns this one size down, where
-//! ground truth is known: a field trained on LR images that were downscaled once more renders views
-//! of LR size, whose ground truth is the LR images.
+//! The network takes a rendered view and predicts the residual. Its training views are smaller: a
+//! field trained on LR images that were downscaled once more renders views of LR size, whose ground
+//! truth is the LR images.
 //!
 //! If HR images of some views are known (references), a reference-based network also takes the
 //! references' colours at each pixel's surface point. The field's depth gives the point's position

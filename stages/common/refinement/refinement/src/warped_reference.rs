@@ -193,18 +193,18 @@ fn warp_by_depth(
     let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
     let mut warped = Vec::with_capacity(width * rows.len());
     for (column, row) in rows.flat_map(|row| (0..width).map(move |column| (column, row))) {
-        let visibility = if occlusion {
-            surface.visibility(column, row, &theirs)
+        let projection = if occlusion {
+            surface.visible_projection(column, row, &theirs)
         } else {
-            surface.unoccluded_visibility(column, row, theirs.camera)
+            surface.projection_ignoring_occlusion(column, row, theirs.camera)
         };
-        let Some(visibility) = visibility else {
+        let Some(projection) = projection else {
             warped.push(WarpedPixel::default());
             continue;
         };
-        let weight = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
+        let visibility = projection.cosine.max(0.0) * projection.relative_resolution.min(1.0);
         let pixel = &rendered.view.data[(row * width + column) * INPUTS..];
-        warped.push(WarpedPixel::new(reference, visibility.position, weight, pixel));
+        warped.push(WarpedPixel::new(reference, projection.position, visibility, pixel));
     }
     warped
 }

@@ -16,7 +16,8 @@ impl Estimate {
 }
 
 fn cost_text(processor_seconds: f64, memory: u64) -> String {
-    format!("{} of processor time, {}", format_duration(processor_seconds), format_size(memory))
+    let time = format_duration(processor_seconds);
+    format!("{time} of processor time, {} of memory", format_size(memory))
 }
 
 impl Estimates {
@@ -54,7 +55,7 @@ pub(crate) fn run_text(plan: &Plan, estimates: &Estimates, processors: usize) ->
         .iter()
         .map(|(name, seconds)| format!("{name} {}", format_duration(*seconds)))
         .collect();
-    Some(format!("{total} ({})", blocks.join(", ")))
+    Some(format!("{total}; processor time by stage: {}", blocks.join(", ")))
 }
 
 /// Returns the cost of a node's run, and the estimate.
@@ -138,7 +139,8 @@ mod tests {
         };
         assert_eq!(
             comparison_text(&estimate(10.0, 2_000_000), &record(12.0)).unwrap(),
-            "12.0 s of processor time, 3.0 MB; estimated 10.0 s of processor time, 2.0 MB"
+            "12.0 s of processor time, 3.0 MB of memory; estimated 10.0 s of processor time, \
+            2.0 MB of memory"
         );
         assert_eq!(comparison_text(&estimate(10.0, 1), &Record::default()), None);
         let (first, other) = (record(12.0), record(99.0));

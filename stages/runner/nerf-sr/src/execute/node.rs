@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{format_duration, hash_json, unix_time};
-use planning::stage_call::{Call, Display, StageFailure, StageView, Usage, read_summary};
+use planning::stage_call::{Call, Display, StageDisplay, StageFailure, Usage, read_summary};
 use planning::{HashedInputs, Node, Origin, hash_inputs};
 use serde_json::{Map, Value};
 use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
@@ -150,7 +150,7 @@ impl NodeJob<'_> {
         let record = self.run.store.publish(&self.enter()?, checked, record).map_err(failure)?;
         let estimate = self.estimate.and_then(|estimate| comparison_text(&estimate, &record));
         self.report(&format!(
-            "done in {} → {}{}",
+            "done in {}, artifact {}{}",
             format_duration(record.seconds),
             &record.output[..10],
             estimate.map_or_else(String::new, |text| format!(" ({text})"))
@@ -192,11 +192,11 @@ impl NodeJob<'_> {
             threads: self.threads,
             lock: Some(lock.file()),
         };
-        let view = self.display.start(&label);
+        let stage_display = self.display.start(&label);
         let started = Instant::now();
-        let result = self.run_watched(&call, attempt, &view);
+        let result = self.run_watched(&call, attempt, &stage_display);
         let time = started.elapsed();
-        view.end();
+        stage_display.end();
         let usage = result?;
         program.confirm_again()?;
         inputs.check(self.run.stop).inspect_err(|_| {
@@ -211,10 +211,10 @@ impl NodeJob<'_> {
         &self,
         call: &Call<'_>,
         attempt: &Attempt,
-        view: &StageView<'_>,
+        stage_display: &StageDisplay<'_>,
     ) -> Result<Usage, StageFailure> {
         let Some((watch, chain)) = &self.watch else {
-            return call.run(&attempt.log, view, self.run.stop);
+            return call.run(&attempt.log, stage_display, self.run.stop);
         };
         let is_over = AtomicBool::new(false);
         let scratch =
@@ -223,7 +223,7 @@ impl NodeJob<'_> {
         let watching = Watching { watch, chain, label, scratch, display, is_over };
         std::thread::scope(|scope| {
             scope.spawn(|| watching.run(call));
-            let result = call.run(&attempt.log, view, self.run.stop);
+            let result = call.run(&attempt.log, stage_display, self.run.stop);
             is_over.store(true, Ordering::Relaxed);
             result
         })

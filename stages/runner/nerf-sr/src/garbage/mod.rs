@@ -97,7 +97,7 @@ impl Collection {
     /// The store must be closed meanwhile. [`Store::empty_trash`] can run after it is open again.
     pub(crate) fn carry_out(&self, store: &Store, closed: &Closed) -> Result<(), StoreError> {
         let Self { contents, kept, old_runs } = self;
-        for key in contents.action_files.iter().filter(|key| !kept.records.contains_key(*key)) {
+        for key in contents.action_keys.iter().filter(|key| !kept.records.contains_key(*key)) {
             store.remove_record(key)?;
         }
         for identity in contents.objects.keys().filter(|id| !kept.objects.contains_key(*id)) {
@@ -105,7 +105,7 @@ impl Collection {
         }
         let unfinished = contents.unfinished.keys();
         let garbage = unfinished.filter(|key| !kept.unfinished.contains_key(*key));
-        for key in garbage.chain(&contents.finished_partials) {
+        for key in garbage.chain(&contents.leftover_partials) {
             store.remove_partial(key)?;
         }
         for run in old_runs {

@@ -3,12 +3,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::garbage::contents::Contents;
 use crate::garbage::roots::Root;
 
-/// Entries of a store that some root reaches, each with the reason of the first such root.
+/// Entries of a store that some root reaches, each with a reason: that of the first such root, or
+/// `input of STAGE`.
 #[derive(Debug, Default)]
 pub(crate) struct Kept {
     /// Reasons by key.
     pub(crate) records: BTreeMap<String, String>,
-    /// Reasons by identity.
+    /// Reasons by identity (content hash).
     pub(crate) objects: BTreeMap<String, String>,
     /// Reasons by key.
     pub(crate) unfinished: BTreeMap<String, String>,

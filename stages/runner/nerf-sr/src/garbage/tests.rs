@@ -304,7 +304,7 @@ proptest! {
         store.empty_trash().unwrap();
 
         let left = |names: Vec<String>| -> BTreeSet<String> { names.into_iter().collect() };
-        prop_assert_eq!(left(store.action_files().unwrap()), records);
+        prop_assert_eq!(left(store.action_keys().unwrap()), records);
         prop_assert_eq!(left(store.objects().unwrap()), objects);
         prop_assert_eq!(left(store.partials().unwrap()), unfinished);
         for object in store.objects().unwrap() {
@@ -338,7 +338,7 @@ fn orphans_go() {
     let decision = collection.decisions()[0].to_string();
     assert!(decision.ends_with("no record names it: delete"), "{decision}");
     collection.carry_out(&store, &held(|| store.try_close())).unwrap();
-    assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
+    assert!(store.objects().unwrap().is_empty() && store.action_keys().unwrap().is_empty());
 }
 
 /// An unreadable entry may be needed, or may name needed ones. A loop of links is unreadable even
@@ -408,6 +408,6 @@ fn what_an_older_version_made_stays_until_it_is_dropped() {
             .count();
         assert_eq!(reason, expected.len());
         collection.carry_out(&store, &held(|| store.try_close())).unwrap();
-        assert_eq!(store.action_files().unwrap(), expected);
+        assert_eq!(store.action_keys().unwrap(), expected);
     }
 }

@@ -22,7 +22,7 @@ use unposed::UnposedImages;
 /// Maximum width, in pixels, of images that keep their size. Chosen by hand: a CPU trains on larger
 /// ones for hours.
 pub(crate) const MAX_WIDTH: u32 = 800;
-/// HR width over LR width, chosen by hand.
+/// HR width divided by LR width, chosen by hand.
 const SCALE: u32 = 2;
 /// Folders, file names and texts of the shipped targets (`pipelines/` and `experiments/` of the
 /// repository).

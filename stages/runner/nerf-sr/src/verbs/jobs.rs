@@ -53,7 +53,7 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let result = begin_run(&store, &plan, &stop).and_then(|(file, _)| {
         let command = submission_command(&store, folder);
         let (plan, store, out) = (&plan, &store, frozen.out.as_path());
-        // The submitting machine may differ from this one.
+        // No estimates: those of the submitting machine may not be valid on this one.
         let estimates = &Estimates::default();
         let run = Run { plan, store, file: &file, out, estimates, stop: &stop };
         let result = run_task(&run, &command);
@@ -82,10 +82,14 @@ fn requeue(plan: &Plan, store: &Store) -> anyhow::Result<()> {
     let state = plan.states(store, None)?.pop();
     let key = state.and_then(|state| state.key());
     let has_checkpoint = key.map_or(Ok(false), |key| store.has_checkpoint(&key))?;
-    let Some(id) = slurm::current_job_id().filter(|_| has_checkpoint) else {
+    if !has_checkpoint {
         report_line!(
             "nerf-sr: time limit reached without a checkpoint; raise the limit (resources: time)"
         );
+        return Ok(());
+    }
+    let Some(id) = slurm::current_job_id() else {
+        report_line!("nerf-sr: interrupted; run again to resume from the checkpoint");
         return Ok(());
     };
     report_line!("nerf-sr: time limit reached; job {id} will resume from the checkpoint");

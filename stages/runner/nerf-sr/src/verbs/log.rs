@@ -11,7 +11,7 @@ use store::{Store, StoreError};
 use crate::identities::node_identities;
 use crate::session::{Session, nodes_of_stage};
 
-/// Prints the logs of a stage's nodes, or the log of the stage's last run with other arguments.
+/// Prints the logs of a stage's nodes, or the log of the stage's last run with any arguments.
 pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::Result<ExitCode> {
     let plan = session.plan(request)?;
     let nodes = nodes_of_stage(&plan, stage);
@@ -29,7 +29,7 @@ pub(crate) fn log(session: &Session, stage: &str, request: &Request) -> anyhow::
         return Ok(ExitCode::SUCCESS);
     };
     print_line!(
-        "{stage}: not run with these arguments; this is the log of its last run, {}",
+        "{stage}: no log for these arguments; this is the log of its last run, {}",
         format_utc(unix)
     );
     log.print()?;
@@ -64,7 +64,7 @@ fn find_logs(session: &Session, plan: &Plan, nodes: &[usize]) -> anyhow::Result<
     for &node in nodes {
         let stage_log = states[node].key().map(|key| match states[node] {
             State::Cached(_) => store.action(&key, "log"),
-            _ => attempt_log(store, &key),
+            _ => unfinished_log(store, &key),
         });
         let job_log = job_logs.get(node).cloned().flatten();
         for path in [stage_log, job_log].into_iter().flatten().filter(|path| path.is_file()) {
@@ -78,7 +78,7 @@ fn find_logs(session: &Session, plan: &Plan, nodes: &[usize]) -> anyhow::Result<
 fn find_job_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
     let logs = slurm::newest_logs(session.store.root()).unwrap_or_default();
     if logs.is_empty() {
-        // Identities would hash the input folders.
+        // The computation of identities reads the input folders.
         return Vec::new();
     }
     let identities = node_identities(plan, &session.store, None).unwrap_or_default();
@@ -86,7 +86,7 @@ fn find_job_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
 }
 
 /// Returns the path of the log of an unfinished action.
-fn attempt_log(store: &Store, key: &str) -> PathBuf {
+fn unfinished_log(store: &Store, key: &str) -> PathBuf {
     store.partial(key).join("log")
 }
 
@@ -100,7 +100,7 @@ fn find_last_log(store: &Store, stage: &str) -> Result<Option<(u64, NodeLog)>, S
         logs.push((ended_unix, NodeLog { label: label(&record.stage, &record.point), path }));
     }
     for key in store.partials()? {
-        let path = attempt_log(store, &key);
+        let path = unfinished_log(store, &key);
         if let Some(action) = store.unfinished(&key)?.filter(|action| action.stage == stage)
             && let Some(unix) = modified_unix(&path)
         {

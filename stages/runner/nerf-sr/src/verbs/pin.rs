@@ -49,8 +49,8 @@ fn check_name(name: &str) -> Result<(), PlanError> {
     let is_plain = name.chars().all(|c| c.is_alphanumeric() || "-_.".contains(c));
     if name.is_empty() || name.starts_with('.') || name.len() > MAX_NAME_BYTES || !is_plain {
         return Err(PlanError::Usage(format!(
-            "invalid pin name {name:?}; use letters, digits, -, _ and ., but no dot at the \
-            beginning"
+            "invalid pin name {name:?}; use at most {MAX_NAME_BYTES} bytes of letters, digits, -, \
+            _ and ., and no dot at the beginning"
         )));
     }
     Ok(())

@@ -21,7 +21,7 @@ pub(crate) fn run(
     executor: &dyn Executor,
 ) -> anyhow::Result<ExitCode> {
     let stop = stop_on_signals()?;
-    let plan = session.new_plan(request, Describing::Needed(&stop))?;
+    let plan = session.new_plan(request, Describing::OwnAndNeeded(&stop))?;
     check_not_in_input(&plan, "the folder of pages", out)?;
     plan.check_folders()?;
     let (file, states) = match begin_run(&session.store, &plan, &stop) {

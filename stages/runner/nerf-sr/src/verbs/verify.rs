@@ -26,7 +26,7 @@ pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
         verification.check_object(object)?;
         bar.inc(*bytes);
     }
-    for key in store.action_files()? {
+    for key in store.action_keys()? {
         verification.check_record(&key)?;
     }
     bar.finish_and_clear();

@@ -9,7 +9,7 @@ const PIXEL_SECONDS: f64 = 8e-6;
 
 /// Budget of the looks at one training run, in processor time.
 pub(super) struct LookBudget {
-    /// Threads of the training: processor seconds per second.
+    /// Number of threads of the training, and so its processor seconds per second.
     threads: f64,
     /// Processor seconds that looks have used.
     spent: f64,

@@ -16,7 +16,7 @@ impl RayKind for Curved {
     fn crossing(_: &Occupancy, ray: &NormalizedRay, _: &[f32; 3]) -> Option<[f32; 2]> {
         match ray.map {
             RayMap::Contracted { .. } => Some([ray.enter, ray.leave]),
-            // A ray that misses the cube has the map of a straight one.
+            // Rays that miss the cube have this map, too.
             RayMap::Straight { .. } => {
                 debug_assert!(ray.enter >= ray.leave);
                 None
@@ -57,7 +57,8 @@ impl RayKind for Curved {
             let cube = EmptyCube::around(lane_of(&lane_positions.cells, i), sizes[i]);
             let inside =
                 cube.time_inside(&lane_of(&lane_positions.positions, i), &lane_of(&velocities, i));
-            // Half a cell is about a step long, and every ray advances by a step anyway.
+            // In a cube of one cell, half a cell is ahead of a ray on average. This is about one
+            // step, by which every ray advances anyway.
             exits[i] =
                 if sizes[i] == 0 { lane_positions.t[i] } else { inside + lane_positions.t[i] };
         }
@@ -80,35 +81,36 @@ pub(super) struct EmptyCube {
 }
 
 impl EmptyCube {
-    /// Returns the cube of 2^`size` cells per side that contains a cell.
+    /// Returns the cube of 2^`log2_side` cells per side that contains a cell.
     #[inline(always)]
-    pub(super) fn around(cell: [u32; 3], size: u32) -> Self {
-        Self { low: cell.map(|c| c >> size << size), side: 1 << size }
+    pub(super) fn around(cell: [u32; 3], log2_side: u32) -> Self {
+        Self { low: cell.map(|c| c >> log2_side << log2_side), side: 1 << log2_side }
     }
 
-    /// Returns a lower bound of the range of t in which a ray stays inside, from its position and
-    /// velocity, [`MAX_SPEED`] and [`MAX_ACCELERATION`].
+    /// Returns a lower bound of the time, in units of t, that a ray stays inside, from its position
+    /// and velocity, [`MAX_SPEED`] and [`MAX_ACCELERATION`].
     #[inline(always)]
     pub(super) fn time_inside(&self, position: &[f32; 3], velocity: &[f32; 3]) -> f32 {
-        let (mut nearest, mut stay) = (f32::INFINITY, f32::INFINITY);
+        let (mut nearest_face, mut min_time) = (f32::INFINITY, f32::INFINITY);
         for i in 0..3 {
             let low = self.low[i] as i32 as f32 / GRID as f32;
             let high = (self.low[i] + self.side) as i32 as f32 / GRID as f32;
             // Rounding may move a position outside the unit cube.
             let (below, above) = ((position[i] - low).max(0.0), (high - position[i]).max(0.0));
-            nearest = nearest.min(below.min(above));
+            nearest_face = nearest_face.min(below.min(above));
             let (ahead, behind) = if velocity[i] > 0.0 { (above, below) } else { (below, above) };
             let speed = velocity[i].abs();
-            // Roots of v·Δ + a·Δ²/2 = ahead and v·Δ - a·Δ²/2 = -behind.
+            // Times Δ with v·Δ + a·Δ²/2 = ahead and v·Δ - a·Δ²/2 = -behind, for the speed v and the
+            // maximum acceleration a.
             let to_ahead = 2.0 * ahead
                 / (speed + (2.0 * MAX_ACCELERATION).mul_add(ahead, speed * speed).sqrt());
             let to_behind = (speed
                 + (2.0 * MAX_ACCELERATION).mul_add(behind, speed * speed).sqrt())
                 * (1.0 / MAX_ACCELERATION);
             // NaN where the ray moves along a face; `max` turns it into 0.
-            stay = stay.min(to_ahead.max(0.0)).min(to_behind);
+            min_time = min_time.min(to_ahead.max(0.0)).min(to_behind);
         }
-        // The velocity's rounding error is below a thousandth.
-        (nearest * (1.0 / MAX_SPEED)).max(stay * 0.999)
+        // The velocity's relative rounding error is below 0.001.
+        (nearest_face * (1.0 / MAX_SPEED)).max(min_time * 0.999)
     }
 }

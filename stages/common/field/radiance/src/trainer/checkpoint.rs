@@ -2,7 +2,7 @@ use std::path::Path;
 
 use safetensors::SafeTensors;
 
-use super::{Moments, Trainer};
+use super::{ParameterBuffers, Trainer};
 use crate::field::Field;
 use crate::occupancy::CELLS;
 use crate::tensors::{
@@ -29,13 +29,13 @@ impl Trainer {
             .chain([
                 ("counters", Tensor::of_bytes(&counters)),
                 ("density", Tensor::of_floats(&density)),
-                ("first.grid", Tensor::of_floats(&self.first.grid)),
-                ("first.network", Tensor::of_floats(&self.first.network)),
+                ("first.grid", Tensor::of_floats(&self.first_moments.grid)),
+                ("first.network", Tensor::of_floats(&self.first_moments.network)),
                 ("grid", Tensor::of_floats(&self.field.grid)),
                 ("network", Tensor::of_floats(&self.field.network)),
                 ("occupied", Tensor::of_bytes(&occupied)),
-                ("second.grid", Tensor::of_floats(&self.second.grid)),
-                ("second.network", Tensor::of_floats(&self.second.network)),
+                ("second.grid", Tensor::of_floats(&self.second_moments.grid)),
+                ("second.network", Tensor::of_floats(&self.second_moments.network)),
             ])
             .collect();
         write_tensors(path, &tensors)
@@ -52,17 +52,17 @@ impl Trainer {
         read_tensors(path, |tensors| {
             let [state @ .., samples_per_ray] = read_counters(tensors)?;
             let field = &mut self.field;
-            let first = read_moments(tensors, "first.", field)?;
-            let second = read_moments(tensors, "second.", field)?;
-            let weights = read_moments(tensors, "", field)?;
+            let first = read_parameters(tensors, "first.", field)?;
+            let second = read_parameters(tensors, "second.", field)?;
+            let weights = read_parameters(tensors, "", field)?;
             let is_averaged = tensors.names().contains(&"average.grid");
             let average =
-                is_averaged.then(|| read_moments(tensors, "average.", field)).transpose()?;
+                is_averaged.then(|| read_parameters(tensors, "average.", field)).transpose()?;
             let mut density = vec![0.0; CELLS];
             read_f32(tensors, "density", &mut density)?;
             let occupied = read_u8(tensors, "occupied", CELLS)?;
             // Nothing fails from here on.
-            (self.first, self.second, self.average) = (first, second, average);
+            (self.first_moments, self.second_moments, self.average) = (first, second, average);
             (field.grid, field.network) = (weights.grid, weights.network);
             field.occupancy.restore(density, &occupied);
             self.state = TrainingState::from_counters(state);
@@ -73,15 +73,15 @@ impl Trainer {
 }
 
 /// Reads the tensors `{prefix}grid` and `{prefix}network`.
-fn read_moments(
+fn read_parameters(
     tensors: &SafeTensors<'_>,
     prefix: &str,
     field: &Field,
-) -> Result<Moments, FieldProblem> {
-    let mut moments = Moments::zeros(field);
-    read_f32(tensors, &format!("{prefix}grid"), &mut moments.grid)?;
-    read_f32(tensors, &format!("{prefix}network"), &mut moments.network)?;
-    Ok(moments)
+) -> Result<ParameterBuffers, FieldProblem> {
+    let mut parameters = ParameterBuffers::zeros(field);
+    read_f32(tensors, &format!("{prefix}grid"), &mut parameters.grid)?;
+    read_f32(tensors, &format!("{prefix}network"), &mut parameters.network)?;
+    Ok(parameters)
 }
 
 /// Reads a checkpoint's six counters.

@@ -11,15 +11,15 @@ const AVERAGE_INTERVAL_STEPS: u64 = 4;
 /// Fraction of the rays after which weights are averaged (docs/design/007).
 const AVERAGE_START: f64 = 0.7;
 
-/// Samples of the last step over those of the first (docs/design/037): small steps find the shape
-/// early, large ones have less noise.
+/// Samples of the last step divided by those of the first (docs/design/037): small steps find the
+/// shape early, large ones have less noise.
 const STEP_GROWTH: f64 = 8.0 / 3.0;
 
-/// Minimum number of rays of a step while rays have many samples; chosen by hand.
+/// Minimum number of rays per step, even if `max_rays_per_step` is smaller; chosen by hand.
 const MIN_RAYS_PER_STEP: usize = 256;
 
 /// Ratio of a level's learning rate to that of the next coarser level; chosen by hand.
-const LEVEL_RATE: f64 = 0.8;
+const LEVEL_RATE_RATIO: f64 = 0.8;
 /// Weight decay of the networks; chosen by hand.
 pub const NETWORK_DECAY: f32 = 1e-6;
 
@@ -37,7 +37,7 @@ pub struct TrainingOptions {
     pub learning_rate: f64,
     /// Maximum learning rate of the MLPs.
     pub mlp_learning_rate: f64,
-    /// Final learning rate over the maximum.
+    /// Final learning rate divided by the maximum.
     pub learning_rate_decay: f64,
     /// Number of steps of linear warm-up.
     pub warm_up: u64,
@@ -45,9 +45,10 @@ pub struct TrainingOptions {
     pub ema_decay: f32,
     /// Weights of the losses other than the colour error.
     pub regularisers: Regularisers,
-    /// Threshold of Russian roulette, as a multiple m of the mean gradient norm in a chunk; 0
-    /// propagates all gradients. A sample whose norm g is below m propagates its gradient with
-    /// probability g/m, multiplied by m/g, so the expected gradient is unchanged.
+    /// Threshold of Russian roulette, as a multiple of the mean gradient norm in a chunk; 0
+    /// propagates all gradients. A sample whose gradient norm is a fraction f < 1 of the threshold
+    /// propagates its gradient with probability f, divided by f, so the expected gradient is
+    /// unchanged.
     pub roulette: f32,
     /// Seed of all random numbers.
     pub seed: u64,
@@ -63,7 +64,7 @@ impl TrainingOptions {
     }
 
     /// Returns the factor of all learning rates in a step: linear warm-up, then exponential decay.
-    pub fn schedule(&self, state: &TrainingState) -> f64 {
+    pub fn learning_rate_factor(&self, state: &TrainingState) -> f64 {
         let warm = ((state.steps + 1) as f64 / self.warm_up.max(1) as f64).min(1.0);
         state.learning_rate_scale
             * warm
@@ -81,9 +82,9 @@ impl TrainingOptions {
         Roulette { limit: self.roulette, draw: uniform(self.seed, 5, ray) }
     }
 
-    /// Returns the learning rate of a level, given [`TrainingOptions::schedule`].
-    pub fn rate_of_level(&self, level: usize, schedule: f64) -> f64 {
-        self.learning_rate * schedule * LEVEL_RATE.powi(level as i32)
+    /// Returns the learning rate of a level, given [`TrainingOptions::learning_rate_factor`].
+    pub fn rate_of_level(&self, level: usize, factor: f64) -> f64 {
+        self.learning_rate * factor * LEVEL_RATE_RATIO.powi(level as i32)
     }
 
     /// Returns whether the averaged weights are updated after this step.
@@ -94,18 +95,19 @@ impl TrainingOptions {
     }
 }
 
-/// Source of training rays and of the loss of their colours. Rays come in bundles, each with one
+/// Source of training rays, and loss function of their colours. Rays come in bundles, each with one
 /// loss: the s×s sub-pixel rays of an LR pixel are a pixel bundle.
 pub trait Supervisor: Sync {
     /// Sets the fraction of the training's rays that have been cast. Called before every step; the
-    /// size of a bundle may depend on it alone.
+    /// size of a bundle may depend on nothing but this fraction.
     fn set_progress(&mut self, _progress: f64) {}
     /// Returns the number of rays per bundle in this step.
     fn rays_per_bundle(&self) -> usize;
     /// Casts the rays of a bundle. `bundle` counts from 0 over the whole training; random numbers
-    /// may depend on it alone.
+    /// may depend on nothing but `bundle`.
     fn sample_rays(&self, bundle: u64, rays: &mut [Ray]);
-    /// Returns the bundle's loss, given its rays' colours, and writes the gradient by each colour.
+    /// Returns the bundle's loss, given its rays' colours, and writes the gradient with respect to
+    /// each colour.
     fn loss_and_gradient(
         &self,
         bundle: u64,
@@ -113,11 +115,11 @@ pub trait Supervisor: Sync {
         gradients: &mut [[f32; 3]],
     ) -> f64;
     /// Stores a step's rendered colours. Called after each step that was applied, with all bundles
-    /// in order. Parallel tasks are run by the clock.
+    /// in order. Parallel tasks must be run by [`PhaseClock::task`], which measures them.
     fn record_colours(&mut self, _rendered: &[RenderedBundles<'_>], _clock: &PhaseClock) {}
 }
 
-/// Rendered colours of bundles in sequence.
+/// Rendered colours of consecutive bundles.
 #[derive(Clone, Copy, Debug)]
 pub struct RenderedBundles<'a> {
     /// Number of the first bundle.

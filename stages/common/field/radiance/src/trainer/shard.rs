@@ -14,7 +14,7 @@ pub(super) struct StepWork<'a, S> {
     pub(super) field: &'a Field,
     /// Transposed weights of the networks.
     pub(super) transposed: &'a [f32],
-    pub(super) supervision: &'a S,
+    pub(super) supervisor: &'a S,
     pub(super) options: &'a TrainingOptions,
     pub(super) strides: Strides,
     pub(super) first_bundle: u64,
@@ -63,7 +63,7 @@ impl Shard {
         self.network.resize(work.field.network.len(), 0.0);
         self.network.fill(0.0);
         (self.loss, self.samples) = (0.0, 0);
-        let chunk_bundles = (CHUNK_RAYS / work.supervision.rays_per_bundle()).max(1);
+        let chunk_bundles = (CHUNK_RAYS / work.supervisor.rays_per_bundle()).max(1);
         let mut next = range.start;
         while next < range.end {
             let here = next..(next + chunk_bundles).min(range.end);
@@ -82,34 +82,34 @@ impl Shard {
         work: &StepWork<'_, impl Supervisor>,
         here: Range<usize>,
     ) {
-        let StepWork { field, supervision, options, .. } = *work;
-        let bundle = supervision.rays_per_bundle();
-        let rays = here.len() * bundle;
+        let StepWork { field, supervisor, options, .. } = *work;
+        let rays_per_bundle = supervisor.rays_per_bundle();
+        let rays = here.len() * rays_per_bundle;
         worker.rays.resize(rays, Ray::default());
         worker.colours.resize(rays, [0.0; 3]);
         worker.gradients.resize(rays, [0.0; 3]);
         let first_bundle = work.first_bundle + here.start as u64;
-        for (i, rays) in worker.rays.chunks_exact_mut(bundle).enumerate() {
-            supervision.sample_rays(first_bundle + i as u64, rays);
+        for (i, rays) in worker.rays.chunks_exact_mut(rays_per_bundle).enumerate() {
+            supervisor.sample_rays(first_bundle + i as u64, rays);
         }
         worker.clipped.clear();
         worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
         worker.backgrounds.clear();
         worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
-        let first_ray = work.first_ray + (here.start * bundle) as u64;
+        let first_ray = work.first_ray + (here.start * rays_per_bundle) as u64;
         worker.offsets.clear();
         worker.offsets.extend((0..rays as u64).map(|r| options.offset(first_ray + r)));
         worker.chunk.forward(field, &worker.clipped, &worker.offsets, work.strides);
         self.samples += worker.chunk.samples();
-        worker.chunk.list_hits(field.step(), &mut self.hits);
+        worker.chunk.list_hits(field.march_step(), &mut self.hits);
         for (r, sum) in worker.chunk.sums.iter().enumerate() {
             let background = worker.backgrounds[r];
             worker.colours[r] =
                 std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
         }
-        for (i, colours) in worker.colours.chunks_exact(bundle).enumerate() {
-            let gradients = &mut worker.gradients[i * bundle..][..bundle];
-            self.loss += supervision.loss_and_gradient(first_bundle + i as u64, colours, gradients);
+        for (i, colours) in worker.colours.chunks_exact(rays_per_bundle).enumerate() {
+            let gradients = &mut worker.gradients[i * rays_per_bundle..][..rays_per_bundle];
+            self.loss += supervisor.loss_and_gradient(first_bundle + i as u64, colours, gradients);
         }
         self.colours.extend_from_slice(&worker.colours);
         let scale = 1.0 / work.bundles as f32;
@@ -119,7 +119,7 @@ impl Shard {
         let upstream = RayGradients {
             colours: &worker.gradients,
             backgrounds: &worker.backgrounds,
-            regularisers: options.regularisers.per_ray(scale, bundle),
+            regularisers: options.regularisers.per_ray(scale, rays_per_bundle),
         };
         let mut network = NetworkGradients { transposed: work.transposed, sums: &mut self.network };
         worker.chunk.backward(

@@ -120,6 +120,9 @@ fn allowed_text(property: &Value, present: &Value, choices: &[(String, String)])
     if !choices.is_empty() {
         return choices.iter().map(|(value, _)| value.as_str()).collect::<Vec<_>>().join(", ");
     }
+    if let Some(Value::Array(values)) = property.get("enum") {
+        return values.iter().map(plain).collect::<Vec<_>>().join(", ");
+    }
     let types: Vec<&str> = match present.get("type") {
         Some(Value::String(one)) => vec![one],
         Some(Value::Array(several)) => {

@@ -25,8 +25,8 @@ pub struct Rule {
     /// Parameters with JSON Schemas that their values must match if the rule applies.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub must: BTreeMap<String, Value>,
-    /// Files that the folder of an input must contain if the rule applies: by input, alternative
-    /// lists, of which one must be complete. A parameter's name in braces stands for its value. The
+    /// Alternative lists of files by input: if the rule applies, the input's folder must contain
+    /// all files of at least one list. A parameter's name in braces stands for its value. The
     /// runner checks the folders that the pipeline file or the command line names.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub files: BTreeMap<String, Vec<Vec<String>>>,
@@ -71,8 +71,8 @@ impl Rule {
         self
     }
 
-    /// Requires that the folder of an input, if given, contains a list of files, or those of an
-    /// earlier call.
+    /// Adds an alternative: the folder of an input, if given, must contain all files of at least
+    /// one of the input's alternatives.
     #[must_use]
     pub fn or_files(mut self, input: &str, files: &[&str]) -> Self {
         let files = files.iter().map(ToString::to_string).collect();

@@ -121,12 +121,14 @@ fn matching_patches(
         .flat_map(|j| (0..PROBES_PER_SIDE).map(move |i| (i * step + step / 2, j * step + step / 2)))
     {
         for (r, other) in surfaces.iter().enumerate() {
-            let Some(visibility) = surface.visibility(x + dx, y + dy, other) else { continue };
+            let projection = surface.visible_projection(x + dx, y + dy, other);
+            let Some(projection) = projection else { continue };
             let truth = &references[r].truth;
-            let [column, row] = visibility.position;
+            let [column, row] = projection.position;
             let corner =
                 (matching_start(column, dx, truth.width), matching_start(row, dy, truth.height));
-            candidates.push((visibility.cosine.max(0.0) * visibility.detail.min(1.0), r, corner));
+            let visibility = projection.cosine.max(0.0) * projection.relative_resolution.min(1.0);
+            candidates.push((visibility, r, corner));
         }
     }
     candidates.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)).then(a.2.cmp(&b.2)));
