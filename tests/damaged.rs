@@ -163,7 +163,7 @@ const DAMAGES: &[Damage] = &[
         },
         &[
             "frame 2 (train/._r_2.png)",
-            "._r_2.png is named like an editor or system file, which are ignored; rename the file",
+            "._r_2.png is named like editor and system files, which are ignored; rename the file",
         ],
     ),
 ];

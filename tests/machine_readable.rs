@@ -128,7 +128,7 @@ fn diff_tells_what_differs() {
             "a sweep has several results",
         ),
         (["diff", "prep --kernel box", "prep"], 2, "expected -p or -i, found --kernel"),
-        (["diff", "", "prep"], 2, "expected a stage, an artifact's hash, or a run"),
+        (["diff", "", "prep"], 2, "expected a stage, an artifact's hash, a run or a pin"),
         (["diff", "nothing", "prep"], 2, "no stage \"nothing\""),
     ] {
         project.run(&arguments).fails(code, &[words]);

@@ -164,8 +164,10 @@ fn a_missing_program_is_missed_where_it_is_needed() {
     }
     run_installed(&project, &["plan"])
         .fails(2, &["pipeline.yaml:9: stage train-ss: ", "train-ss isn't built; run `make build`"]);
-    run_installed(&project, &["plan", "prep", "-p", "rays=1"])
-        .fails(2, &["no stage has this parameter", "not described: "]);
+    run_installed(&project, &["plan", "prep", "-p", "rays=1"]).fails(
+        2,
+        &["no stage has this parameter", "stages without a description were not searched: "],
+    );
     project.replace("  demo-scene:\n", "  demo-secne:\n");
     project.replace("{dataset: demo-scene}", "{dataset: demo-secne}");
     run_installed(&project, &["plan"])
@@ -207,7 +209,7 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         ),
         (
             &["-p", "background=alpha", "-p", "pose_refinement=true"],
-            "parameter pose_refinement: renders cannot be compared with photographs",
+            "parameter pose_refinement: with prep.background alpha, renders cannot be compared with photographs",
         ),
         (&["--device", "gpu"], "--device gpu: no such device; expected cpu, cuda or cuda:N"),
         (&["--device", "cuda:"], "--device cuda:: no such device"),
@@ -316,7 +318,7 @@ fn a_run_is_compared_with_its_estimate() {
     assert_eq!(run.code, 0, "{}", run.stderr);
     let mut lines = run.stderr.lines();
     let before = lines.find(|line| line.starts_with("nerf-sr: about ")).unwrap();
-    assert!(before.contains("(demo-scene ") && before.contains(", train-ss "), "{before}");
+    assert!(before.contains("by stage: demo-scene ") && before.contains(", train-ss "), "{before}");
     for stage in ["demo-scene", "prep", "train-ss", "render-depth", "eval"] {
         let done = format!("{stage}: done in ");
         let line = run.stderr.lines().find(|line| line.starts_with(&done)).unwrap();

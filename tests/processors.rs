@@ -62,7 +62,7 @@ fn affinity_limits_threads_of_stages_and_runs() {
     assert_eq!(said, "1 thread: the CPU affinity of this process");
     let help = Command::new(through[0]).args(&through[1..]).arg(bin("eval")).arg("--help").output();
     let help = Finished::of(help.unwrap()).stdout;
-    assert!(help.contains("[default: 1, the CPU affinity of this process]"), "{help}");
+    assert!(help.contains("[default: the CPU affinity of this process, here 1]"), "{help}");
     let nerf_sr = project.command(&["run", "prep"]);
     let mut run = Command::new(through[0]);
     run.args(&through[1..]).arg(nerf_sr.get_program()).args(nerf_sr.get_args());

@@ -82,7 +82,7 @@ fn memory_gives_places() {
         1,
         &[
             "hungry: failed: needs 2",
-            "MB of memory, as in its last run, but the limit is 104.9 MB; change the limit with",
+            "MB of memory, as in its most similar earlier run, but the limit is 104.9 MB; change",
         ],
     );
     let sweep = ["-p", "x=1,2"];

@@ -149,7 +149,7 @@ fn missing_detail_is_told() {
     }
     let (_, _, notes) =
         prepared(&project, &folder, &json!({"lr_source": "photographs", "split": "holdout"}));
-    let words = "of the LR images' resolution: enlarged, blurred";
+    let words = "of the LR images' resolution: the photographs are enlarged, blurred";
     assert!(notes.contains(words), "{notes}");
     let summary = std::fs::read_to_string(project.path("scene/scene.json")).unwrap();
     let detail = serde_json::from_str::<Value>(&summary).unwrap()["detail"].as_f64().unwrap();

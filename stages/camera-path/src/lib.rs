@@ -25,7 +25,8 @@ pub use crate::paths::poses;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Kind of path. Default: `spiral` for cameras that look in one direction, otherwise `orbit`.
+    /// Kind of path; `between` passes through all cameras of the scene, in order. Default: `spiral`
+    /// for cameras that look in one direction, otherwise `orbit`.
     #[schemars(extend("x-default" = "by cameras"))]
     pub kind: Option<Kind>,
     /// Number of frames.

@@ -1,5 +1,5 @@
 //! `demo-scene`: renders a small procedural scene in linear light and writes a data set: in
-//! Blender's format with exact depth, or like photographs, as JPEG with a `transforms.json`.
+//! Blender's format with exact depth, or JPEG files with a `transforms.json`, like photographs.
 //!
 //! The scene separates good methods from bad ones: it has fine texture (base, crate, sign), thin
 //! parts (cage, spring), gloss (ball, copper) and occlusion (a striped ball inside the cage). It
@@ -39,7 +39,7 @@ const CAMERA_DISTANCE: f64 = 4.0;
 /// Number of bytes per pixel while an image is rendered and written: colour, depth, and a copy of
 /// the colour for the PNG or JPEG encoder.
 const BYTES_PER_PIXEL: u64 = 16;
-/// Remedy for short memory, as a sentence fragment.
+/// Remedy if memory is insufficient, as a sentence fragment.
 const REMEDY: &str = "choose a smaller size, or end other programs";
 
 /// The stage.
@@ -70,6 +70,7 @@ impl Stage for DemoScene {
         for (split, count, camera) in splits {
             let poses: Vec<[[f64; 4]; 4]> =
                 (0..count).map(|i| camera_pose(params.layout, split, i, count)).collect();
+            // Creates the folder.
             context.output_path(&format!("{}/.", params.form.folder(split)))?;
             (0..count)
                 .into_par_iter()
@@ -84,11 +85,11 @@ impl Stage for DemoScene {
                     params.form.write_view(context, split, i, &image)
                 })
                 .collect::<anyhow::Result<Vec<()>>>()?;
-            let written = (0..).zip(&poses).map(|(i, pose)| match split {
+            let stated_poses = (0..).zip(&poses).map(|(i, pose)| match split {
                 "train" => disturbance::with_error(pose, params, i),
                 _ => *pose,
             });
-            writer.add_split(context, split, &camera, &written.collect::<Vec<_>>())?;
+            writer.add_split(context, split, &camera, &stated_poses.collect::<Vec<_>>())?;
         }
         writer.finish(context)?;
         let [width, height] = splits[0].2.sides;
@@ -111,9 +112,9 @@ fn check_memory(context: &Context, splits: &[(&str, u32, ViewCamera)]) -> anyhow
 
 /// Returns the pose of camera `i` of `count`.
 ///
-/// Around: training views are evenly spread over the upper hemisphere, test views are on a wavy
-/// circle between them. Forward: training views fill a square by the golden ratio, test views are
-/// on a circle in this square.
+/// Around: training views are evenly spread over the upper hemisphere and slightly below it, test
+/// views are on a wavy circle between them. Forward: training views fill a square evenly (a
+/// golden-ratio sequence), test views are on a circle in this square.
 fn camera_pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     use std::f64::consts::{PI, TAU};
     let fraction = (f64::from(i) + 0.5) / f64::from(count);
@@ -134,8 +135,8 @@ fn camera_pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4]
     } else {
         (TAU * fraction, 0.42 + 0.28 * libm::sin(3.0 * TAU * fraction))
     };
-    let level = (1.0 - height * height).sqrt();
-    let direction = DVec3::new(level * libm::cos(azimuth), level * libm::sin(azimuth), height);
+    let radius = (1.0 - height * height).sqrt();
+    let direction = DVec3::new(radius * libm::cos(azimuth), radius * libm::sin(azimuth), height);
     let centre = CAMERA_DISTANCE * direction;
     let back = centre.normalize();
     let right = DVec3::Z.cross(back).normalize();

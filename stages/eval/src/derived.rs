@@ -1,4 +1,5 @@
-//! Figures over all views that compare them with another result or with references.
+//! Scores over several views: the smallest gain over another result, and the mean scores of the
+//! views near a reference.
 
 use artifact::{GivenInput, bail_bad_input};
 use metrics::{METRICS_FILE, Metrics, NearReferences, ViewScores};

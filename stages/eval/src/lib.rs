@@ -69,8 +69,8 @@ impl Stage for Eval {
                 "baseline",
                 Input::optional(
                     &["metrics"],
-                    "another method's scores of the same views, to compute the smallest gain in \
-                    PSNR of any view over that method",
+                    "another method's scores of the same views; the output then has the \
+                    smallest gain of a view in PSNR over these scores",
                 ),
             ),
             (

@@ -5,18 +5,18 @@ use pixels::Rgba8;
 
 use crate::scored_view::{ScoredScene, ScoredView};
 
-/// Metric that scores views. A new metric is a type in `scoring/mod.rs` and a line in the list
-/// there; `metrics.json`, the page and the summary follow from its methods.
+/// Metric that scores views. A new metric is a type that implements this trait, and a line in the
+/// list of `scoring/mod.rs`; `metrics.json`, the page and the summary follow from its methods.
 pub(crate) trait Metric: Sync {
     /// Returns the key of the metric's convention, which is also the name of its pictures.
     fn name(&self) -> &'static str;
-    /// Returns the metric's figures, the most important first.
+    /// Returns the formats of the metric's scores, the most important first.
     fn figures(&self) -> Vec<ScoreFormat>;
-    /// Describes the definition of the figures.
+    /// Describes the definition of the scores.
     fn convention(&self, scene: &ScoredScene<'_>) -> String;
-    /// Scores a view; without scores if the view lacks an image that the metric needs. Pixels that
-    /// don't count are equal in both images, so a mean error over all pixels must be divided by the
-    /// `counted_share` of that resolution.
+    /// Scores a view. Returns no scores if the view lacks an image that the metric needs. Pixels
+    /// that don't count are equal in both images, so a mean error over all pixels must be divided
+    /// by the `counted_share` of the images' resolution, HR or LR.
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement>;
     /// Returns the title of the metric's pictures on the page: a caption, and a note in brackets.
     /// Pictures without a title don't appear.

@@ -39,8 +39,10 @@ impl<'a> ScoredView<'a> {
     pub(crate) fn read(scene: &'a ScoredScene<'a>, true_view: &'a View) -> anyhow::Result<Self> {
         let name = &true_view.camera.name;
         let view = scene.views.views.iter().find(|view| view.camera.name == *name);
-        let view = view
-            .ok_or_else(|| Failure::BadInput(format!("views: no view {name} as in the truth")))?;
+        let view = view.ok_or_else(|| {
+            let problem = "is missing, but the truth has it; render the same scene's cameras";
+            Failure::BadInput(format!("views: view {name} {problem}"))
+        })?;
         let file = view.image.as_ref().with_context(|| format!("view {name} has no image"));
         let render = read_image(scene.views_input, scene.views, view, file.bad_input("views")?)?;
         let truth = read_true_image(scene, true_view, true_view.image.as_deref())?;
@@ -108,7 +110,7 @@ fn check_sizes(true_view: &View, render: &Image, truth: Option<&Image>) -> anyho
     }
     if let Some(truth) = truth.filter(|truth| (truth.width, truth.height) != expected) {
         bail_bad_input!(
-            "view {name}: the image has {}×{} pixels, its camera {}×{}",
+            "truth: view {name}: the image has {}×{} pixels, its camera {}×{}; run prep again",
             truth.width,
             truth.height,
             k.width,

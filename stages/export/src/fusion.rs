@@ -10,7 +10,7 @@ use crate::surface_view::{PointState, SurfaceView};
 /// objects (design note 043).
 const TRUNCATION_SPACINGS: f64 = 2.5;
 /// Maximum distance along the surface between a vertex and a pixel's point, in pixel widths: about
-/// half of a pixel's diagonal. Below a cell's width, that width applies, the accuracy of a mesh.
+/// half of a pixel's diagonal. The limit is at least a cell's width, the accuracy of a mesh.
 const MAX_PIXEL_DISTANCE: f64 = 0.75;
 /// Minimum cosine between a vertex's normal and a view's normal at which the view observes the
 /// vertex's side of the surface; chosen by hand.

@@ -27,8 +27,8 @@ type Sample = ([u32; 3], u32, u32);
 const _: () = assert!(size_of::<Sample>() as u64 == workload::SURFEL_SAMPLE_BYTES);
 
 /// Merges the surface pixels of all views into one surfel per cell of a grid over the field's unit
-/// cube. Cells are half as wide as the median pixel, or wider to limit the number of surfels to
-/// `max_surfels` (design note 043). Surfels are sorted by cell.
+/// cube. Cells are half the median width of surface pixels, or wider to limit the number of
+/// surfels to `max_surfels` (design note 043). Surfels are sorted by cell.
 pub(crate) fn merge(views: &[SurfaceView], bounds: &Bounds, max_surfels: usize) -> Vec<Surfel> {
     let mut edge = finest_edge(views, bounds);
     loop {
@@ -70,12 +70,12 @@ fn collect_samples(views: &[SurfaceView], bounds: &Bounds, edge: f64) -> Vec<Sam
     let mut samples: Vec<Sample> = views
         .par_iter()
         .enumerate()
-        .flat_map_iter(|(number, view)| {
+        .flat_map_iter(|(view_index, view)| {
             view.surface_pixels().filter_map(move |(index, _)| {
                 let point = bounds.to_cube(view.world_point(index));
                 let is_inside = point.cmpge(DVec3::ZERO).all() && point.cmple(DVec3::ONE).all();
                 let cell = (point / edge).to_array().map(|x| x as u32);
-                is_inside.then_some((cell, number as u32, index as u32))
+                is_inside.then_some((cell, view_index as u32, index as u32))
             })
         })
         .collect();
@@ -84,7 +84,7 @@ fn collect_samples(views: &[SurfaceView], bounds: &Bounds, edge: f64) -> Vec<Sam
 }
 
 /// Returns a cell's surfel: the mean of the cell's pixels, weighted by pixel density on the surface
-/// and viewing angle. `None` if all pixels are at silhouettes.
+/// and viewing angle. `None` if all pixels are at silhouettes, or if the normals cancel.
 fn mean_surfel(
     views: &[SurfaceView],
     bounds: &Bounds,
@@ -95,9 +95,9 @@ fn mean_surfel(
     let margins = group.iter().map(|&(_, view, i)| views[view as usize].pixel(i as usize).margin);
     let margin = margins.max().filter(|margin| *margin > 0)?;
     let (mut position, mut normal, mut colour) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
-    let (mut opacity, mut width_sum, mut cell, mut weights) = (0.0, 0.0, 0.0, 0.0);
-    for &(_, number, index) in group {
-        let (view, index) = (&views[number as usize], index as usize);
+    let (mut opacity, mut width_sum, mut cell_width_sum, mut weights) = (0.0, 0.0, 0.0, 0.0);
+    for &(_, view_index, index) in group {
+        let (view, index) = (&views[view_index as usize], index as usize);
         let pixel = view.pixel(index);
         let width = view.pixel_width(index);
         let weight = f64::from(view.cosine(index)).max(0.05).powi(2) / (width * width);
@@ -106,7 +106,7 @@ fn mean_surfel(
         colour += weight * DVec3::from(pixel.colour.map(f64::from));
         opacity += weight * f64::from(pixel.opacity);
         width_sum += weight * width;
-        cell += weight * edge / cube_scale(view, bounds, index);
+        cell_width_sum += weight * edge / cube_scale(view, bounds, index);
         weights += weight;
     }
     // The normals of both sides of a thin object in one cell may cancel.
@@ -118,6 +118,6 @@ fn mean_surfel(
         margin,
         colour: (colour * scale).as_vec3().to_array(),
         opacity: (opacity * scale) as f32,
-        spacing: (cell / weights).max(width_sum / weights / (group.len() as f64).sqrt()),
+        spacing: (cell_width_sum / weights).max(width_sum / weights / (group.len() as f64).sqrt()),
     })
 }

@@ -9,7 +9,8 @@ use crate::detail::Spectrum;
 use crate::frame_label;
 use crate::strips::Strips;
 
-/// Maximum number of views to sample, spread evenly: enough to tell nine in ten (docs/design/035).
+/// Maximum number of views to sample, spread evenly: enough to decide whether nine in ten have the
+/// same border (docs/design/035).
 const MAX_VIEWS: usize = 20;
 
 /// Findings in the sampled views.

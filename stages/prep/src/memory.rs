@@ -89,10 +89,10 @@ mod tests {
         assert_eq!(need.max_concurrent(1_000_000_000).unwrap(), 1);
         assert_eq!(need.max_concurrent(7_900_000_000).unwrap(), 7);
         assert_eq!(
-            need.max_concurrent(999_999_999).unwrap_err().to_string(),
+            need.max_concurrent(900_000_000).unwrap_err().to_string(),
             format!(
                 "frame r_1: preparing its image of 9000×8000 pixels needs 1.0 GB of memory, and \
-                1000.0 MB are free; {MEMORY_REMEDY}"
+                900.0 MB are free; {MEMORY_REMEDY}"
             )
         );
     }

@@ -4,15 +4,15 @@ use artifact::format_count;
 use glam::DVec3;
 use scene::{Camera, Intrinsics, format_length};
 
-/// Distance of an outlier camera from the centre, relative to the median distance. Walks through a
-/// room have 2 to 5; the threshold is chosen by hand.
+/// Distance of an outlier camera from the centre, relative to the median distance. For
+/// photographs from a walk through a room, it is 2 to 5; the threshold is chosen by hand.
 pub(crate) const MIN_OUTLIER_RATIO: f64 = 20.0;
 /// Minimum number of cameras whose median distance is meaningful; chosen by hand.
 const MIN_CAMERAS: usize = 4;
 /// Maximum offset of a plausible principal point from the image centre, relative to the image side.
-/// Real lenses have 0.01; the threshold is chosen by hand.
+/// For real lenses, it is about 0.01; the threshold is chosen by hand.
 const MAX_CENTRE_OFFSET: f64 = 0.2;
-/// Relative error of coordinates that a few operations in double precision computed.
+/// Relative error of coordinates after a few operations in double precision.
 const DOUBLE_ERROR: f64 = 8.0 * f64::EPSILON;
 /// Relative error of coordinates that were rounded to single precision.
 const SINGLE_ERROR: f64 = f32::EPSILON as f64;
@@ -20,8 +20,7 @@ const SINGLE_ERROR: f64 = f32::EPSILON as f64;
 /// sharp field: 0.001 is about one pixel.
 const MAX_CENTRE_ERROR: f64 = 1e-3;
 
-/// Returns whether several views all have the same pose: they don't observe one scene from several
-/// sides.
+/// Returns whether several views all have the same pose, so that the poses are unusable.
 pub(crate) fn have_equal_poses(training: &[Camera]) -> bool {
     let [first, others @ ..] = training else { return false };
     !others.is_empty() && others.iter().all(|c| c.camera_to_world == first.camera_to_world)
@@ -37,7 +36,7 @@ pub(crate) fn warnings(training: &[Camera], test: &[Camera]) -> Vec<String> {
                 .to_owned(),
         );
     }
-    found.extend(single_position(training));
+    found.extend(unresolved_positions(training));
     let mut all: Vec<LabelledCamera> = Vec::new();
     for (cameras, split) in [(training, "training"), (test, "test")] {
         all.extend(cameras.iter().map(|camera| LabelledCamera { camera, split }));
@@ -60,9 +59,9 @@ impl std::fmt::Display for LabelledCamera<'_> {
     }
 }
 
-/// Detects cameras at one position up to rounding, and cameras whose centres are rounded too
-/// coarsely, such as georeferenced poses in single precision.
-fn single_position(cameras: &[Camera]) -> Option<String> {
+/// Detects cameras at one position, apart from rounding errors, and cameras whose centres are
+/// rounded too coarsely, such as georeferenced poses in single precision.
+fn unresolved_positions(cameras: &[Camera]) -> Option<String> {
     let [first, others @ ..] = cameras else { return None };
     let distances = others.iter().map(|camera| camera.centre().distance(first.centre()));
     let (extent, error) = (distances.fold(0.0, f64::max), rounding_error(cameras));
@@ -71,11 +70,14 @@ fn single_position(cameras: &[Camera]) -> Option<String> {
     }
     let count = cameras.len();
     Some(if extent <= error {
-        format!("all {count} training cameras are at the same position: depth cannot be estimated")
+        format!(
+            "all {count} training cameras are at the same position: depth cannot be estimated; \
+            take photographs from several positions"
+        )
     } else {
         format!(
             "the {count} training cameras are up to {} units apart, but their centres are rounded \
-            to {}: subtract an offset from all centres before rounding",
+            to {}: subtract the first centre from all centres before rounding",
             format_length(extent, 3),
             format_length(error, 3)
         )
@@ -105,8 +107,7 @@ fn outliers(all: &[LabelledCamera]) -> Option<String> {
     let first = *far.first()?;
     let more = if far.len() > 1 { format!(" (and {} more)", far.len() - 1) } else { String::new() };
     Some(format!(
-        "{} is {:.0} times as far from the cameras' centre as the median camera{more}; check its \
-        pose",
+        "{} is {:.0} times as far from the middle of all cameras as usual{more}; check its pose",
         all[first],
         distances[first] / usual
     ))
@@ -127,7 +128,7 @@ fn off_centre(all: &[LabelledCamera]) -> Option<String> {
     let k = &first.camera.intrinsics;
     Some(format!(
         "{} of {} have a principal point far from the image centre (first: {first} with \
-        ({:.1}, {:.1}) in {}×{} pixels); do cx, cy, w and h refer to the same size?",
+        ({:.1}, {:.1}) in {}×{} pixels); check that cx and cy belong to this size",
         off.len(),
         format_count(all.len(), "view"),
         k.cx,
@@ -261,11 +262,7 @@ mod tests {
         far[5].camera_to_world[0][3] = 1e6;
         assert_one_warning(&far, &ring(3, 1.0, 0.0), "training view r_5 is 3");
         far[6].camera_to_world[0][3] = -1e6;
-        assert_one_warning(
-            &far,
-            &ring(3, 1.0, 0.0),
-            "as the median camera (and 1 more); check its pose",
-        );
+        assert_one_warning(&far, &ring(3, 1.0, 0.0), "as usual (and 1 more); check its pose");
         let mut far = ring(3, 1.0, 0.0);
         far[0].camera_to_world[1][3] = 500.0;
         assert_one_warning(&ring(8, 1.0, 0.0), &far, "test view r_0 is ");

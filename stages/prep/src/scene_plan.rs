@@ -134,7 +134,7 @@ pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
     let side = format_length(bounds.longest_side(), 3);
     let space = match bounds.space {
         Space::Box => format!(
-            "space: box of {side} units, rays from {} to {}",
+            "space: box, longest side {side} units, rays from {} to {}",
             format_length(bounds.near, 3),
             format_length(bounds.far, 3)
         ),
@@ -250,7 +250,8 @@ mod tests {
         for (space, note) in [
             (
                 Space::Box,
-                "space: box of 6.00e-5 units, rays from 2.00e-5 to 9.00e-5; background black",
+                "space: box, longest side 6.00e-5 units, rays from 2.00e-5 to 9.00e-5; \
+                background black",
             ),
             (
                 Space::Contraction,

@@ -1,7 +1,7 @@
 //! `refine`: adds the detail that rendered views systematically lack, by a network of
 //! `train-refine`.
 //!
-//! A network trained with references takes them from the inputs `references` (true images at HR)
+//! A network trained with references takes them from the inputs `references` (HR images)
 //! and `reference-views` (renders of the same views, for depth).
 //!
 //! The paper's network (`net: paper` of `train-refine`) redraws patches from references' patches
@@ -11,8 +11,9 @@
 //! network, whose errors are partly independent (design note 021).
 //!
 //! A view with an LR photograph of its own (input `photographs`; in the paper's split every view
-//! has one) is then projected to the nearest image that is consistent with the photograph (design
-//! note 016); also before refinement, if the network was trained on consistent views.
+//! has one) is then changed as little as possible, so that the view is consistent with the
+//! photograph (design note 016). If the network was trained on consistent views, this is also done
+//! before refinement.
 //!
 //! Colours change; opacity, depth and cameras stay unchanged.
 
@@ -82,7 +83,7 @@ impl Stage for Refine {
                 "references",
                 Input::optional(
                     &["scene/references", "scene/truth"],
-                    "true images of some other views, at HR",
+                    "HR images of some views of the scene",
                 ),
             ),
             ("reference-views", Input::optional(&["views"], "renders of the references' views")),
@@ -139,8 +140,8 @@ impl Stage for Refine {
     }
 }
 
-/// Returns the references to refine by: the first `max_references` given, consistent with their LR
-/// photographs if the network was trained on such views, without misleading ones.
+/// Reads the first `max_references` references. Makes them consistent with their LR photographs if
+/// the network was trained on consistent views, and removes misleading references.
 fn usable_references(
     job: &RefineJob<'_>,
     views: &Views,
@@ -167,7 +168,7 @@ fn refine_all(
     let mut summary = Summary {
         views: views.views.len(),
         consistent: 0,
-        means: 0,
+        averaged: 0,
         residual_weight: job.application.residual_weight,
         is_reference_based: job.network.warp_options().is_some(),
         statistics: vec![ReferenceStatistics::default(); references.len()],
@@ -181,7 +182,7 @@ fn refine_all(
             .context
             .part(name, &[&image, &preview], || job.refine(view, references, [&image, &preview]))?;
         summary.consistent += usize::from(refined.is_consistent);
-        summary.means +=
+        summary.averaged +=
             usize::from(job.enlarged.as_ref().is_some_and(|enlarged| enlarged.has(&view.camera)));
         network::add_statistics(&mut summary.statistics, &refined.statistics);
         view.depth = view.depth.as_ref().map(|_| image.clone());
@@ -191,7 +192,7 @@ fn refine_all(
     if job.expects_consistent && summary.consistent < summary.views {
         job.context.log_line(
             "the network was trained on views consistent with LR photographs of their own, but \
-            some of these views have none; train a network without input photographs",
+            some of these views have none; train a network without the input `photographs`",
         );
     }
     Ok(summary)

@@ -8,7 +8,7 @@ pub(crate) struct Summary {
     /// Number of views made consistent with their own LR photographs.
     pub(crate) consistent: usize,
     /// Number of views averaged with their enlarged photographs.
-    pub(crate) means: usize,
+    pub(crate) averaged: usize,
     /// Fraction of the predicted residual that was added.
     pub(crate) residual_weight: f32,
     /// True if the network reports statistics of references.
@@ -26,8 +26,8 @@ impl Summary {
             self.references(),
             self.residual_weight
         );
-        if self.means > 0 {
-            text += &format!("; {} averaged with their enlarged photographs", self.means);
+        if self.averaged > 0 {
+            text += &format!("; {} averaged with their enlarged photographs", self.averaged);
         }
         if self.consistent > 0 {
             text += &format!("; {} consistent with their own photographs", self.consistent);
@@ -64,7 +64,7 @@ mod tests {
         let plain = Summary {
             views: 1,
             consistent: 0,
-            means: 0,
+            averaged: 0,
             residual_weight: 0.8,
             is_reference_based: false,
             statistics: Vec::new(),
@@ -74,7 +74,7 @@ mod tests {
         let by_references = Summary {
             views: 3,
             consistent: 2,
-            means: 1,
+            averaged: 1,
             is_reference_based: true,
             statistics: vec![seen, ReferenceStatistics::default()],
             ..plain

@@ -151,7 +151,7 @@ fn summary(registered: &[Registered]) -> (String, Option<String>) {
         "cameras have {moved}; unless the given poses are that far off, check that the field and \
         the photographs are of the same scene"
     );
-    (summary, moved.is_far().then_some(warning))
+    (summary, moved.exceeds_usual_error().then_some(warning))
 }
 
 #[cfg(test)]

@@ -9,11 +9,11 @@ use serde_json::Value;
 
 use crate::gather::{Report, Row};
 
-/// Pictures of a data set, one per view, such as ground truth or a method's error maps.
+/// Pictures of a scene, one per view, such as ground truth or a method's error maps.
 pub(crate) struct Layer<'a> {
     pub(crate) label: String,
     pub(crate) group: Group,
-    /// Index of the data set in the report.
+    /// Index of the scene in the report.
     pub(crate) scene: usize,
     /// Indices of the rows that made the pictures: several if their pictures are equal, none for
     /// observations.
@@ -43,7 +43,7 @@ pub(crate) enum Group {
 
 /// Location of a layer's pictures.
 enum Source<'a> {
-    /// Files of a folder of views, which the layer's group names.
+    /// Files of a folder of views; see [`Group::file`].
     Views(Arc<Folder>),
     /// Files of a result, and the JSON pointer of their names in a view's scores.
     Scored(&'a Row<'a>, String),
@@ -142,7 +142,7 @@ impl Layer<'_> {
             }
             Source::Scored(row, pointer) => {
                 let file = row.view(view).and_then(|scores| scores.pointer(pointer)?.as_str());
-                // Without truth of equal size the named error map doesn't exist.
+                // Scores of other programs may name files that don't exist.
                 let path = file.map(|file| row.node.folder.join(file)).filter(|path| path.exists());
                 Ok(path.map(|path| read_png(&path)).transpose()?)
             }
@@ -203,7 +203,7 @@ pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>
             add_observations(&mut layers, views.scene, &Folder::read(truth)?, &views.label);
         }
     }
-    let mut layers = without_equal(layers);
+    let mut layers = merge_equal(layers);
     name_observations(&mut layers);
     let mut made = Vec::new();
     for index in 0..report.rows.len() {
@@ -213,7 +213,7 @@ pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>
         let folder = Folder::read(views.folder.clone())?;
         add_views(&mut made, &folder, &views.label, views.scene, &[]);
     }
-    let mut made = without_equal(made);
+    let mut made = merge_equal(made);
     for layer in made.iter_mut().filter(|layer| layer.rows.len() > 1) {
         layer.label = format!("{} and {} more", layer.label, layer.rows.len() - 1);
     }
@@ -223,7 +223,7 @@ pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>
 
 /// Merges layers of one kind with equal pictures, such as those of a sweep over a parameter of the
 /// scores.
-fn without_equal(layers: Vec<Layer<'_>>) -> Vec<Layer<'_>> {
+fn merge_equal(layers: Vec<Layer<'_>>) -> Vec<Layer<'_>> {
     let mut different: Vec<Layer<'_>> = Vec::new();
     for layer in layers {
         let same = different.iter_mut().find(|other| {
@@ -238,14 +238,14 @@ fn without_equal(layers: Vec<Layer<'_>>) -> Vec<Layer<'_>> {
     different
 }
 
-/// Names observations, whose labels are the results that they belong to: by their kind alone if the
-/// data set has one of the kind.
+/// Labels observations by kind, and by result if the scene has several of the kind: "Ground truth"
+/// or "Ground truth of RESULT". Their labels must be the results' names.
 fn name_observations(layers: &mut [Layer<'_>]) {
     let kinds: Vec<(usize, Group)> =
         layers.iter().map(|layer| (layer.scene, layer.group.clone())).collect();
     for layer in layers {
         let name = match layer.group {
-            Group::LowResolution => "LR photograph",
+            Group::LowResolution => "LR image",
             _ => "Ground truth",
         };
         let same = kinds.iter().filter(|kind| **kind == (layer.scene, layer.group.clone()));
@@ -367,7 +367,7 @@ impl Group {
         }
     }
 
-    /// Returns the identifier of the layers that the page lists together.
+    /// Returns the identifier of the kind of pictures.
     pub(crate) fn kind(&self) -> String {
         match self {
             Self::Metric { name, .. } => format!("metric-{name}"),

@@ -57,15 +57,15 @@ impl Stage for Report {
     const NAME: &'static str = "report";
     const SUMMARY: &'static str = "Writes the record of a run as one HTML page.";
     const SINK: bool = true;
-    const PARTIAL: bool = true;
+    const ACCEPTS_FAILURES: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "run",
             Input::required(
                 &["run"],
-                "in pipeline.yaml: a block that scores, and further blocks under any names; \
-                nerf-sr passes a folder with their record, run.json",
+                "in pipeline.yaml: a block of `eval`, and further blocks, each under a name of \
+                your choice; nerf-sr passes a folder with their record, run.json",
             ),
         )]
     }

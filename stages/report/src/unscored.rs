@@ -45,11 +45,6 @@ impl UnscoredViews {
         let mut truths = scenes.map(|node| node.folder.join("truth"));
         let truth = truths.find(|folder| folder.join(scene::VIEWS_FILE).is_file());
         let label = artifact::label(&views_label(node), &node.point);
-        Self {
-            label: format!("{label}, not scored"),
-            folder: node.folder.clone(),
-            truth,
-            scene,
-        }
+        Self { label: format!("{label}, not scored"), folder: node.folder.clone(), truth, scene }
     }
 }

@@ -34,7 +34,7 @@ impl Stage for Table {
     const NAME: &'static str = "table";
     const SUMMARY: &'static str = "Writes an experiment's scores as Markdown, CSV and JSON.";
     const SINK: bool = true;
-    const PARTIAL: bool = true;
+    const ACCEPTS_FAILURES: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(

@@ -33,28 +33,28 @@ pub(crate) fn document(
     let is_by_seed = keys == ["seed"];
     let scene = SCENE.to_owned();
     let is_averaged = !keys.contains(&scene) && !params.columns.contains(&scene);
-    // With a reference, the tables of scenes would compare with the mean over scenes.
-    let mut parts = if is_averaged && reference.is_none() {
+    // With `relative_to`, there are no tables per scene: they would be compared with the mean.
+    let mut scenes = if is_averaged && reference.is_none() {
         distinct(rows, std::slice::from_ref(&scene)).concat()
     } else {
         Vec::new()
     };
-    if parts.len() < 2 {
-        parts.clear();
+    if scenes.len() < 2 {
+        scenes.clear();
     }
     let layout = Layout { params, figures, keys, reference };
     let mut text = format!("# {}\n\n", params.title);
-    if !parts.is_empty() {
-        text += &format!("Means over {}:\n\n", parts.join(", "));
+    if !scenes.is_empty() {
+        text += &format!("Means over {}:\n\n", scenes.join(", "));
     }
     text += &layout.table(rows, false);
     let picture = layout.front_picture(rows);
     if picture.is_some() {
         text += &format!("\n![The results by cost and score]({PICTURE})\n");
     }
-    for part in parts {
-        let selected = select(rows, std::slice::from_ref(&scene), std::slice::from_ref(&part));
-        text += &format!("\n## {part}\n\n{}", layout.table(&selected, true));
+    for name in scenes {
+        let selected = select(rows, std::slice::from_ref(&scene), std::slice::from_ref(&name));
+        text += &format!("\n## {name}\n\n{}", layout.table(&selected, true));
     }
     text += &gains(params, rows);
     if is_by_seed {
@@ -70,7 +70,7 @@ pub(crate) fn document(
     Ok(Document { text, picture })
 }
 
-/// Returns the keys whose values make a row: the given ones, or all that differ; and the group.
+/// Returns the keys that identify a row: the given ones, or else all that differ; and the group.
 fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, Failure> {
     let mut known: Vec<&String> = Vec::new();
     for (name, value) in rows.iter().flatten() {
@@ -181,9 +181,10 @@ fn spread(rows: &[Row], figures: &Figures, name: &str) -> Option<String> {
     let min = values.iter().copied().fold(f64::INFINITY, f64::min);
     let max = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let title = figures.title(name);
-    let [mean, min, max] = [mean, min, max].map(|value| figures.format(name, value));
+    let [mean, deviation, min, max] =
+        [mean, deviation, min, max].map(|value| figures.format(name, value));
     Some(format!(
-        "\n{title} over {} results: {mean} ± {deviation:.2}, from {min} to {max}\n",
+        "\n{title} over {} results: {mean} ± {deviation}, from {min} to {max}\n",
         values.len()
     ))
 }

@@ -22,8 +22,8 @@ pub struct Params {
     /// Values in the table, in this order: `psnr`, `ssim`, `lpips`, `train_s`, `render_s`, or any
     /// other value of `rows.json`.
     pub values: Vec<String>,
-    /// Keys of the row that others are compared with. An additional column has the difference in
-    /// the first of `values`.
+    /// Keys and values of the row that others are compared with, such as `{method: rendered}`. An
+    /// additional column has the difference in the first of `values`.
     #[schemars(extend("x-default" = "no comparison"))]
     pub relative_to: BTreeMap<String, String>,
     /// Name of a cost, such as `train_cpu_s`, `render_s` or `field_mb`, for a Pareto front: column
@@ -36,8 +36,9 @@ pub struct Params {
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
     /// Groups of comparable methods, in the order of the table: `[{name: LR images, methods:
-    /// [eval]}]`, with methods by scoring block. Column `has seen` has the group's name, such
-    /// as the images that its methods were given; the best value of each group is marked.
+    /// [eval]}]`, with methods by scoring block. Column `has seen` displays the group's name,
+    /// which should say what images the group's methods were given. The best value of each group is
+    /// marked.
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
     /// Rows from other sources, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:

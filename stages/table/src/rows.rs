@@ -18,8 +18,8 @@ pub(crate) const MISSING: &str = "missing";
 /// Key of a method's group: the images that its training has seen.
 pub(crate) const GROUP: &str = "has seen";
 
-/// Returns a row for every result of a run and for every left-out one, in the order of the groups
-/// and then of the run. Figures of their metrics are added to `figures`.
+/// Returns a row for every result of a run and for every left-out one, in the order of the groups,
+/// then by the number of stages before them. Figures of their metrics are added to `figures`.
 pub(crate) fn rows(
     run: &RunRecord,
     params: &Params,
@@ -30,7 +30,7 @@ pub(crate) fn rows(
     let mut scored: Vec<(usize, &RunNode)> =
         run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
     // Blocks with fewer stages before them come first: rendered views before refined ones.
-    scored.sort_by_key(|(_, node)| depth(run, &node.stage));
+    scored.sort_by_key(|(_, node)| ancestor_count(run, &node.stage));
     let mut rows: Vec<(usize, Row)> = Vec::new();
     for (finished, (index, node)) in scored.into_iter().enumerate() {
         progress.set(finished as u64, "");
@@ -40,20 +40,20 @@ pub(crate) fn rows(
         row.extend(seconds_per_view(&row));
         row.insert("commit".to_owned(), json!(commit));
         row.insert("machine".to_owned(), json!(node.host));
-        rows.push((group_rank(params, &node.stage), row));
+        rows.push((table_rank(params, &node.stage), row));
     }
     for point in &run.failed {
         let Some(reason) = &point.reason else { continue };
         let mut row = keys(params, &point.stage, &point.values);
         row.insert(MISSING.to_owned(), json!(reason));
-        rows.push((group_rank(params, &point.stage), row));
+        rows.push((table_rank(params, &point.stage), row));
     }
     rows.sort_by_key(|(rank, _)| *rank);
     Ok(rows.into_iter().map(|(_, row)| row).collect())
 }
 
 /// Returns the maximum number of nodes that a stage's results depend on.
-fn depth(run: &RunRecord, stage: &str) -> Option<usize> {
+fn ancestor_count(run: &RunRecord, stage: &str) -> Option<usize> {
     let nodes = run.nodes.iter().enumerate().filter(|(_, node)| node.stage == stage);
     nodes.map(|(index, _)| run.ancestors(index).len()).max()
 }
@@ -73,8 +73,8 @@ fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> R
     row
 }
 
-/// Returns the rank of a method in the table; methods without a group are last.
-fn group_rank(params: &Params, stage: &String) -> usize {
+/// Returns the position of a method in the table; methods without a group are last.
+fn table_rank(params: &Params, stage: &String) -> usize {
     let mut all = params.groups.iter().flat_map(|group| &group.methods);
     all.position(|method| method == stage).unwrap_or(usize::MAX)
 }
@@ -137,15 +137,15 @@ fn read<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
 }
 
 /// Returns the seconds of training, rendering and refining, the processor seconds of training, the
-/// peak memory, the size of the field, and the training's speed. Views that a
-/// field or refiner depends on count as training; other views count as rendering, and those of them
-/// that weren't rendered from a field also as refining.
+/// peak memory, and the size and training speed of the field that the views show. Views that a
+/// field or refiner depends on count as training; all other views count as rendering. Their seconds
+/// also count as refining if the views weren't rendered from a field.
 fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     let ancestors = run.ancestors(index);
     let mut trained = ancestors.clone();
     trained.retain(|&i| ["field", "refiner"].contains(&run.nodes[i].kind.as_str()));
     let in_training: Vec<usize> = trained.iter().flat_map(|&i| run.ancestors(i)).collect();
-    // The sums start from 0.0 since that of nothing is -0.
+    // Not `Iterator::sum`, whose result is -0.0 without elements.
     let [mut training, mut rendering, mut refining, mut processor] = [0.0; 4];
     let mut peak_memory = 0;
     for &i in &ancestors {
@@ -173,9 +173,11 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     if peak_memory > 0 {
         row.insert("peak_mb".to_owned(), json!(peak_memory as f64 / 1e6));
     }
-    // The first field of the run is the one that the views show; a refiner's field is later.
-    let field = trained.iter().map(|&i| &run.nodes[i]).find(|node| node.kind == "field");
-    if let Some(field) = field {
+    let views = ancestors.iter().filter(|i| run.nodes[**i].kind == "views");
+    let rendered_from =
+        views.filter(|i| !in_training.contains(i)).flat_map(|&i| run.nodes[i].inputs.values());
+    let mut parents = rendered_from.filter_map(|input| Some(&run.nodes[input.node?]));
+    if let Some(field) = parents.find(|node| node.kind == "field") {
         row.insert("field_mb".to_owned(), json!(weights_bytes(&field.folder)? as f64 / 1e6));
         let path = field.folder.join(TRAINING_FILE);
         if path.exists() {

@@ -9,7 +9,7 @@ use stage::Context;
 use crate::examples::{Examples, lr_photographs};
 use crate::params::CompactParams;
 use crate::report_psnr;
-use crate::steps::OnExamples;
+use crate::steps::ExampleTraining;
 
 /// Trains our network by internal learning.
 pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::Result<()> {
@@ -39,7 +39,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         seed,
     };
     let trainer = RefinerTrainer::new(refiner, options);
-    let mut training = OnExamples { trainer, examples: &examples.training };
+    let mut training = ExampleTraining { trainer, examples: &examples.training };
     context.train(options.steps, &mut training, |error| {
         format!("PSNR of training patches {:.2} dB", psnr_of(error))
     })?;
@@ -76,8 +76,8 @@ fn read_prior(prior: &GivenInput, net: &CompactParams) -> Result<Refiner, Failur
             Refiner::read(&prior.path(WEIGHTS_FILE), architecture).bad_input("input prior")
         }
         _ => Err(Failure::BadInput(
-            "input prior: a network of other inputs; give one that was trained with the same \
-            net and references_per_view"
+            "input prior: a network of other inputs; give a compact network trained with \
+            references if references_per_view is above 0, otherwise without"
                 .to_owned(),
         )),
     }

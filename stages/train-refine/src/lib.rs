@@ -59,9 +59,9 @@ impl Stage for TrainRefine {
                 "cameras",
                 Input::optional(
                     &cameras,
-                    "cameras of the views to be refined (`net: compact` only); if each has an LR \
-                    photograph, training views, like refined ones, are made consistent with their \
-                    own LR photographs",
+                    "cameras of the views to be refined (`net: compact` only); if each camera \
+                    has an LR photograph, the training views are made consistent with their LR \
+                    photographs, like the refined views",
                 ),
             ),
             (

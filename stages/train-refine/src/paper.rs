@@ -10,7 +10,7 @@ use stage::{Context, Rule};
 use crate::examples::Examples;
 use crate::params::PaperParams;
 use crate::report_psnr;
-use crate::steps::OnExamples;
+use crate::steps::ExampleTraining;
 
 /// File names of VGG-19's weights: all layers with torchvision's names, or the first blocks in
 /// Caffe's scaling.
@@ -38,7 +38,7 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     let width = params.features;
     let network = PaperRefiner::new(width, seed)?;
     let trainer = PaperTrainer::new(network, options, perceptual)?;
-    let mut training = OnExamples { trainer, examples: &known };
+    let mut training = ExampleTraining { trainer, examples: &known };
     context.train(options.steps, &mut training, |error| {
         format!("L1 of training patches {error:.4}")
     })?;

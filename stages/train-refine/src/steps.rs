@@ -3,13 +3,13 @@ use std::path::Path;
 use artifact::Failure;
 use refinement::{KnownView, RefinementError};
 
-/// Trainer with the examples that it is trained on.
-pub(crate) struct OnExamples<'a, T> {
+/// A trainer and the examples on which it trains its network.
+pub(crate) struct ExampleTraining<'a, T> {
     pub(crate) trainer: T,
     pub(crate) examples: &'a [KnownView],
 }
 
-impl<T: refinement::Training> stage::Training for OnExamples<'_, T> {
+impl<T: refinement::Training> stage::Training for ExampleTraining<'_, T> {
     fn steps(&self) -> u64 {
         self.trainer.steps()
     }

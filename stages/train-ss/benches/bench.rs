@@ -271,7 +271,7 @@ fn passes(rows: &mut Rows) {
         rows.add(format!("forward_backward_ns_per_sample{name}"), both, "ns");
         if name.is_empty() {
             rows.add("coloured_share", 100.0 * coloured as f64 / marched as f64, "%");
-            let flops = (3 * 2 * field.network_multiplications()) as f64;
+            let flops = (3 * 2 * field.density_multiplications()) as f64;
             rows.add("networks_gflops_of_forward_backward", flops / both, "GFLOP/s");
             rows.add(
                 "networks_share_of_sgemm_one_core",

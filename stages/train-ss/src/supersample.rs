@@ -19,13 +19,13 @@ impl SupersampleSchedule {
     pub(crate) fn set_progress(&mut self, progress: f64) {
         self.current_supersample = self.supersample;
         if progress < self.warmup {
-            let stages = warmup_stages(self.supersample[0].max(self.supersample[1]) as u64);
-            let limit = 1 << (progress / self.warmup * f64::from(stages)) as u32;
+            let doublings = warmup_doublings(self.supersample[0].max(self.supersample[1]) as u64);
+            let limit = 1 << (progress / self.warmup * f64::from(doublings)) as u32;
             self.current_supersample = self.supersample.map(|rays| rays.min(limit));
         }
     }
 
-    /// True after the warm-up.
+    /// True if all sub-pixel rays are cast.
     pub(crate) fn is_warmed_up(&self) -> bool {
         self.current_supersample == self.supersample
     }
@@ -42,8 +42,8 @@ pub(crate) fn whole_supersample(supersample: f64) -> u64 {
     (supersample - 1e-6).ceil() as u64
 }
 
-/// Returns the number of warm-up stages: the doublings from one ray per side to `supersample`.
-pub(crate) fn warmup_stages(supersample: u64) -> u32 {
+/// Returns the number of doublings in the warm-up, from one ray per side to `supersample`.
+pub(crate) fn warmup_doublings(supersample: u64) -> u32 {
     supersample.next_power_of_two().trailing_zeros()
 }
 

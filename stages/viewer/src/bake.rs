@@ -35,7 +35,7 @@ pub(crate) struct Voxel {
     pub(crate) position: [u16; 3],
     /// Share of the light that a step of a voxel's length stops.
     pub(crate) opacity: f32,
-    /// Display-encoded sRGB, the mean over the directions of cameras that see the voxel.
+    /// Display-encoded sRGB at the mean logit over the directions of cameras that see the voxel.
     pub(crate) colour: [f32; 3],
     /// View dependence of the colour's logit: see [`crate::view`].
     pub(crate) view: [f32; COEFFICIENTS],
@@ -69,7 +69,7 @@ impl Shape {
     }
 }
 
-/// Bakes the mean of some sources where cameras see it.
+/// Bakes the mean of an ensemble's fields into the voxels that cameras see.
 pub(crate) struct Baker<'a> {
     pub(crate) sources: &'a [Box<dyn PointField>],
     pub(crate) bounds: &'a Bounds,
@@ -78,8 +78,8 @@ pub(crate) struct Baker<'a> {
 }
 
 impl Baker<'_> {
-    /// Returns the number of positions at which bricks may be.
-    pub(crate) fn brick_positions(&self) -> u64 {
+    /// Returns the maximum number of bricks.
+    pub(crate) fn max_bricks(&self) -> u64 {
         (self.resolution / SIDE).pow(3) as u64
     }
 
@@ -273,8 +273,8 @@ fn stopped_along(axis: u32, densities: &[f32; SAMPLES_PER_VOXEL], length: f32) -
     stopped / (SAMPLES_PER_SIDE * SAMPLES_PER_SIDE) as f32
 }
 
-/// Adds to each voxel the cameras that see its neighbours, so that no holes appear between the
-/// cameras' positions.
+/// Adds to each voxel the cameras that see its neighbours, so that surfaces have no holes when they
+/// are viewed from between the cameras.
 fn spread_to_neighbours(bricks: &Bricks, seen: &[u64]) -> Vec<u64> {
     let last = bricks.resolution - 1;
     (0..seen.len())

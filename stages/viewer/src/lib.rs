@@ -60,8 +60,7 @@ impl Default for Params {
     }
 }
 
-/// Maximum width in pixels of the LR photographs in the page, to which wider ones are shrunk; chosen
-/// by hand.
+/// Maximum width in pixels of the LR photographs in the page; chosen by hand. Wider ones are shrunk.
 const MAX_PHOTOGRAPH_WIDTH: usize = 400;
 
 /// Remedy for short memory, as a sentence fragment.
@@ -165,7 +164,7 @@ fn film_width(folder: &Path, cameras: &[&Camera]) -> anyhow::Result<u32> {
 
 /// Bakes a field. Fails if memory is short.
 fn bake(context: &Context, baker: &Baker<'_>) -> anyhow::Result<Volume> {
-    let bricks = baker.bricks(&context.progress("finding density", baker.brick_positions()))?;
+    let bricks = baker.bricks(&context.progress("finding density", baker.max_bricks()))?;
     context.check_memory("baking", Shape::memory_need(&bricks), REMEDY)?;
     let progress = context.progress("baking", baker.steps(&bricks));
     let shape = baker.shape(bricks, &progress)?;

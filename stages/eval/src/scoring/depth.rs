@@ -7,7 +7,7 @@ pub struct DepthError {
     pub mean_absolute: f64,
     /// Median absolute error in scene units, typical of surfaces.
     pub median_absolute: f64,
-    /// Fraction of these pixels where the render's opacity is below one half.
+    /// Fraction of the truth's surface pixels where the render's opacity is below one half.
     pub missed: f64,
 }
 

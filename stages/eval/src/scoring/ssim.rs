@@ -1,6 +1,6 @@
 use pixels::Image;
 
-/// Mean structural similarity with either treatment of the border.
+/// Mean structural similarity with both treatments of the border.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ssim {
     /// Mean over all pixels; the image is mirrored without repeating its edge, like PyTorch's

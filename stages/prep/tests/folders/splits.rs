@@ -84,14 +84,14 @@ pub(crate) fn cases() -> Vec<Case> {
             "ns PR#3054: a list without frames",
             |folder| listed(folder, json!(["x/1.png", "x/2.png"]), names([0]), json!([])),
             Expected::Refused(
-                "dataset: DIR/transforms.json: none of the 2 names in train_filenames is that of a frame (first: x/1.png)",
+                "dataset: DIR/transforms.json: no name in train_filenames is that of a frame (first of 2: x/1.png); correct the names, or remove train_filenames",
             ),
         ),
         case(
             "a validation list without frames",
             |folder| listed(folder, names([1]), json!(["x/1.png"]), names([0])),
             Expected::Refused(
-                "dataset: DIR/transforms.json: none of the 1 names in val_filenames is that of a frame (first: x/1.png)",
+                "dataset: DIR/transforms.json: no name in val_filenames is that of a frame (first of 1: x/1.png); correct the names, or remove val_filenames",
             ),
         ),
         case(
@@ -102,12 +102,12 @@ pub(crate) fn cases() -> Vec<Case> {
         case(
             "test views alone",
             |folder| listed(folder, Value::Null, json!([]), names([3, 5])),
-            split([0, 1, 2, 4, 6, 7, 8, 9], [3, 5], &["8 training views: the frames in no list"]),
+            split([0, 1, 2, 4, 6, 7, 8, 9], [3, 5], &["8 training views: all unlisted frames"]),
         ),
         case(
             "training views alone",
             |folder| listed(folder, names(0..9), json!([]), Value::Null),
-            split(0..9, [9], &["1 test view: the frames in no list"]),
+            split(0..9, [9], &["1 test view: all unlisted frames"]),
         ),
         case(
             "all views for training",

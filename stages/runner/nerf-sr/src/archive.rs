@@ -1,5 +1,6 @@
 //! Archiving of pages that a new one replaces, by one rule: a page is archived if it shows a result
-//! that the new page lacks. A result is a stage's point for a data set.
+//! that the new page lacks. A result is a stage with parameter values
+//! and a data set.
 
 use std::ffi::OsStr;
 use std::io;
@@ -8,8 +9,8 @@ use std::path::{Path, PathBuf};
 use crate::page::{PageMark, check_ownership};
 
 impl PageMark {
-    /// True if the page shows each result that another page shows. An earlier version's page, whose
-    /// results are unknown, counts as showing others.
+    /// True if the page shows each result that another page shows. False if either page is of an
+    /// earlier version, whose results are unknown.
     fn has_results_of(&self, other: &Self) -> bool {
         match (&self.results, &other.results) {
             (Some(own), Some(others)) => others.is_subset(own),
@@ -34,15 +35,16 @@ pub(crate) fn archive_path(
     let name = format!("{name}-{}", data_sets_name(&old.data_sets));
     let mut path = target.with_file_name(&name);
     let mut number = 1;
-    while !is_free(&path, &old, kind) {
+    while !can_replace(&path, &old, kind) {
         number += 1;
         path = target.with_file_name(format!("{name}-{number}"));
     }
     Ok(Some(path))
 }
 
-/// True if a page with the mark `old` may be archived as `path`.
-fn is_free(path: &Path, old: &PageMark, kind: &str) -> bool {
+/// True if nothing is at `path`, or only an archived page whose results a page with the mark `old`
+/// also shows.
+fn can_replace(path: &Path, old: &PageMark, kind: &str) -> bool {
     match PageMark::read(path) {
         Ok(Some(mark)) => old.has_results_of(&mark) && check_ownership(path, kind).is_ok(),
         _ => path.symlink_metadata().is_err(),
@@ -51,10 +53,11 @@ fn is_free(path: &Path, old: &PageMark, kind: &str) -> bool {
 
 /// Maximum number of data sets in a folder's name; chosen by hand.
 const MAX_NAMED_DATA_SETS: usize = 3;
-/// Maximum length of a data set's name in characters; chosen by hand.
-const MAX_NAME_CHARS: usize = 60;
+/// Maximum length of a data set's name in bytes, so that three names fit into a file name; chosen by
+/// hand.
+const MAX_NAME_BYTES: usize = 60;
 
-/// Returns a name for data sets that is valid on every file system.
+/// Returns a folder name for data sets, without special characters.
 fn data_sets_name(data_sets: &[String]) -> String {
     let mut names: Vec<String> =
         data_sets.iter().take(MAX_NAMED_DATA_SETS).map(|path| plain_file_name(path)).collect();
@@ -71,7 +74,12 @@ fn plain_file_name(path: &str) -> String {
     let name = Path::new(path).file_name().and_then(OsStr::to_str).unwrap_or("data");
     let plain =
         name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' });
-    plain.take(MAX_NAME_CHARS).collect()
+    let mut bytes = 0;
+    let fits = |c: &char| {
+        bytes += c.len_utf8();
+        bytes <= MAX_NAME_BYTES
+    };
+    plain.take_while(fits).collect()
 }
 
 #[cfg(test)]

@@ -114,8 +114,8 @@ struct RunOptions {
     /// don't depend on the number [default: processors of this process]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
-    /// Memory limit for all stages together, such as 8G; each stage counts with the peak memory of
-    /// its last run [default: all memory]
+    /// Memory limit for all stages together, such as 8G. A stage needs the peak memory of its last
+    /// run [default: all memory]
     #[arg(long, value_name = "AMOUNT")]
     memory: Option<Memory>,
     /// Continue with stages that don't depend on a failed one
@@ -173,8 +173,8 @@ enum Verb {
         #[arg(long)]
         json: bool,
     },
-    /// Describe the scenes, estimate time and memory of each quality, and print the command that
-    /// fits
+    /// Describe the scenes, estimate time and memory of each quality, and print the command of
+    /// the best quality within the given limits
     Advise {
         #[command(flatten)]
         plan: PlanArgs,
@@ -182,7 +182,7 @@ enum Verb {
         /// balanced]
         #[arg(long, value_name = "N")]
         minutes: Option<f64>,
-        /// Memory that a stage may use, such as 8G; the best quality within it is chosen
+        /// Memory limit of the run, such as 8G; the best quality whose largest stage fits is chosen
         #[arg(long, value_name = "AMOUNT")]
         memory: Option<Memory>,
     },

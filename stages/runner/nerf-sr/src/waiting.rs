@@ -82,7 +82,7 @@ pub(crate) fn holder_text(holder: Option<&Holder>) -> String {
         format!(" by process {pid}")
     } else {
         // A killed runner's stage inherited the lock.
-        format!(" by a stage of process {pid} (ended)")
+        format!(" by a child of process {pid} (ended)")
     }
 }
 

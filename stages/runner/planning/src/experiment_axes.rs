@@ -10,7 +10,7 @@ use crate::request::{PlanError, Request};
 
 /// Scene with the pipeline's own data set.
 const DEMO: &str = "demo";
-/// Preset of protocols of the form WIDTHxSCALE that have no preset.
+/// Preset of protocols WIDTHxSCALE without a preset of their own.
 const OTHER: &str = "other";
 /// Preset that all protocols inherit.
 const EVERY: &str = "every";
@@ -19,12 +19,13 @@ const EVERY: &str = "every";
 pub(crate) fn axes(scope: &Scope<'_>, request: &Request) -> Result<Vec<Axis>, PlanError> {
     let (experiment, selection) = (&scope.pipeline.experiment, &request.selection);
     if experiment.is_empty() {
-        let Selection { scenes, protocols, variants, .. } = selection;
-        if scenes.is_empty() && protocols.is_empty() && variants.is_empty() {
+        let Selection { scenes, protocols, variants, max_variants, .. } = selection;
+        let is_any = !scenes.is_empty() || !protocols.is_empty() || !variants.is_empty();
+        if !is_any && max_variants.is_none() {
             return Ok(Vec::new());
         }
-        let problem = "--scene, --protocol and --variant are for experiments; name one as target, \
-            such as quality";
+        let problem = "--scene, --protocol, --variant and --first-variants are for experiments; \
+            give an experiment as target, such as paper-table";
         return Err(PlanError::Usage(problem.to_owned()));
     }
     let selected = SelectedExperiment { scope, experiment, selection };
@@ -203,7 +204,8 @@ fn is_protocol(preset: &str) -> bool {
 /// Parses the LR width and scale of a protocol WIDTHxSCALE.
 fn parse_sizes(name: &str) -> Option<(u32, f64)> {
     let (width, scale) = name.split_once('x')?;
-    Some((width.parse().ok()?, scale.parse().ok()?))
+    let scale = scale.parse().ok().filter(|scale: &f64| scale.is_finite())?;
+    Some((width.parse().ok()?, scale))
 }
 
 /// Replaces placeholders in a text by a protocol's sizes. If the result is a number, the value

@@ -351,7 +351,7 @@ fn what_there_is_not_is_refused() {
         (
             EXPERIMENT.split("experiment:").next().unwrap().to_owned(),
             &|c| c.scenes = vec!["demo".to_owned()],
-            "--scene, --protocol and --variant are for experiments",
+            "--scene, --protocol, --variant and --first-variants are for experiments",
         ),
     ] {
         let plan = plan_of(&text, data.path(), |request| change(&mut request.selection));

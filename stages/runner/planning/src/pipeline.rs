@@ -39,9 +39,9 @@ impl Pipeline {
         layers.fold(Resources::default(), |resources, layer| resources.overridden_by(layer))
     }
 
-    /// Returns the project's folder, which contains the store, pages and `pipelines/`: the folder
-    /// of the file, or the parent of `pipelines/` and `experiments/` for a file in them that
-    /// extends another.
+    /// Returns the project's folder, which contains the store, pages and `pipelines/`. For a file
+    /// in `pipelines/` or `experiments/` that extends another, it is the parent folder; otherwise
+    /// the file's own folder.
     pub fn project_folder(&self) -> PathBuf {
         let folder = self.files[0].folder();
         let is_inside = folder.canonicalize().is_ok_and(|folder| is_target_folder(&folder));
@@ -52,7 +52,7 @@ impl Pipeline {
         }
     }
 
-    /// Resolves a path of a stage's block from the folder of its file.
+    /// Resolves a path in a part of a stage's block from the folder of the file with this part.
     pub fn resolve_path(&self, stage: &str, part: Part, path: impl AsRef<Path>) -> PathBuf {
         self.file_of_part(stage, part).folder().join(path)
     }

@@ -33,7 +33,7 @@ pub enum Quality {
 type Rows = BTreeMap<Quality, BTreeMap<String, Map<String, Value>>>;
 
 static ROWS: LazyLock<Rows> = LazyLock::new(|| {
-    serde_yaml::from_str(include_str!("qualities.yaml")).expect("a test reads qualities.yaml")
+    serde_yaml::from_str(include_str!("qualities.yaml")).expect("qualities.yaml is valid")
 });
 
 impl Quality {
@@ -65,8 +65,8 @@ impl Quality {
         ROWS.values().any(|row| row.contains_key(&program.description.name))
     }
 
-    /// Adds the quality's parameters to the `given` ones, which win. Qualities set parameters of
-    /// default variants alone, such as `field: grid`.
+    /// Adds the quality's parameters to the `given` ones, which win. Qualities only set
+    /// parameters of default variants, such as `field: grid`.
     pub(crate) fn fill(self, program: &StageProgram, given: &mut Map<String, Value>) {
         if !program.schema.is_default_variant(given) {
             return;

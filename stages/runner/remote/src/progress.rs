@@ -7,11 +7,11 @@ use artifact::{Failure, format_size, report_line};
 use indicatif::{ProgressBar, ProgressStyle};
 use stage::Pace;
 
-/// Interval between reports without a terminal.
+/// Interval between lines if stderr isn't a terminal.
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Progress in bytes with the remaining time: a bar on a terminal, otherwise a line at intervals.
-/// Signals are checked as well, since both are due between two pieces of data.
+/// [`Progress::add`] also checks for signals, because it is called after each piece of data.
 pub(crate) struct Progress {
     label: &'static str,
     total: u64,
@@ -23,7 +23,7 @@ pub(crate) struct Progress {
 struct State {
     done: u64,
     pace: Pace,
-    /// Time of the last report without a terminal.
+    /// Time of the last line if stderr isn't a terminal.
     last_report: Instant,
 }
 

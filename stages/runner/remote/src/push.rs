@@ -69,7 +69,10 @@ async fn push_records(
     }
     if skipped > 0 {
         let actions = format_count(skipped, "action");
-        report_line!("{actions} skipped: their artifacts are incomplete in this store");
+        report_line!(
+            "{actions} skipped: their artifacts are incomplete in this store; \
+            `nerf-sr verify --remove`, then run again"
+        );
     }
     let actions = by_output.values().map(Vec::len).sum();
     let total = sizes.values().sum();
@@ -92,7 +95,7 @@ async fn push_object(
     let folder = store.object(&output);
     let object = format!("objects/{output}");
     let mut files = Manifest::read(&folder)?.files;
-    for existing in transfer.remote.remove_existing(&object, &mut files).await? {
+    for existing in transfer.remote.take_existing(&object, &mut files).await? {
         transfer.progress.add(existing.size)?;
     }
     run_all(files.into_iter().map(|entry| {
@@ -106,6 +109,7 @@ async fn push_object(
     let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
     transfer.remote.write(&format!("{object}/{MANIFEST_FILE}"), bytes).await?;
     for record in records {
+        // Fails after a signal.
         transfer.progress.add(0)?;
         let mut bytes = serde_json::to_vec_pretty(&record)?;
         bytes.push(b'\n');

@@ -222,9 +222,9 @@ impl Remote {
         entries.try_collect().await.with_context(|| self.name_with_hint(folder))
     }
 
-    /// Removes the files from the list that the remote has in the folder `object`, with the same
-    /// size. Returns the removed files.
-    pub(crate) async fn remove_existing(
+    /// Takes those files out of the list that the remote has in the folder `object` with the same
+    /// size, and returns them.
+    pub(crate) async fn take_existing(
         &self,
         object: &str,
         files: &mut Vec<FileEntry>,

@@ -94,7 +94,7 @@ fn what_is_not_whole_is_not_exported() {
         &store,
         &records[3].key(),
         3,
-        "metrics.json: the content has changed",
+        "metrics.json: the content differs from the manifest",
     );
     fs::remove_file(&path).unwrap();
     assert_not_exported(dir.path(), &store, &records[3].key(), 3, "the artifact is incomplete");
@@ -232,7 +232,7 @@ const HARM: &[(&str, Harm)] = &[
     ("has 9000000000 bytes, more than", |s| s.entries[INDEX].size = Some(9_000_000_000)),
     ("has 9000000000 bytes, more than", |s| s.entries[RECORD].size = Some(9_000_000_000)),
     ("the archive ends within", |s| s.entries[RECORD].size = Some(1_000_000)),
-    ("metrics.json: the content has changed", |s| s.entries[FILE].bytes[3] ^= 1),
+    ("metrics.json: the content differs from the manifest", |s| s.entries[FILE].bytes[3] ^= 1),
     ("its blake3 differs from the artifact's name", |s| {
         let manifest = Manifest { kind: "other".into(), ..s.manifest.clone() };
         s.entries[MANIFEST].bytes = serde_json::to_vec(&manifest).unwrap();

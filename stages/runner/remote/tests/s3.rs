@@ -135,7 +135,8 @@ fn two_machines_share_a_store_through_s3() {
     server.request("PUT", &path, &content);
     let (code, _, err) = said(&mut server.command(&place("third"), &["pull", REMOTE]));
     assert!(
-        code == 3 && err.contains(&format!("{REMOTE}/{file}: the content has changed")),
+        code == 3
+            && err.contains(&format!("{REMOTE}/{file}: the content differs from the manifest")),
         "{err}"
     );
     let third = Store::open(&place("third")).unwrap();

@@ -27,6 +27,7 @@ pub struct Job {
     /// The job's task; the default task if the submission can't be read.
     #[serde(skip)]
     pub task: Task,
+    /// Index of the job's task in the submission.
     #[serde(skip)]
     number: usize,
 }

@@ -8,7 +8,7 @@ use crate::site::Site;
 /// reach the command.
 pub(crate) fn script(site: &Site, command: &[&OsStr]) -> Vec<u8> {
     let mut text =
-        b"#!/bin/bash\n# One task of a submission; its number is the argument.\nset -e\n".to_vec();
+        b"#!/bin/bash\n# Runs one task of a submission; $1 is its index.\nset -e\n".to_vec();
     for line in &site.setup {
         text.extend_from_slice(line.as_bytes());
         text.push(b'\n');

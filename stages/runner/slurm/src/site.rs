@@ -59,11 +59,11 @@ impl Site {
         }
     }
 
-    /// Returns the reason why jobs with these resources could never make progress.
+    /// Returns why jobs with these resources could never make progress; `None` if they can.
     pub fn problem_with(&self, resources: &Resources) -> Option<String> {
         let time = resources.time.filter(|time| time.seconds <= self.notice.seconds)?;
         Some(format!(
-            "resources: time: {time} must be longer than the site's notice of {}",
+            "resources: time: {time} must be longer than `notice` of the site file, {}",
             self.notice
         ))
     }
@@ -111,7 +111,8 @@ mod tests {
             site.problem_with(&serde_yaml::from_str(&format!("time: {time}")).unwrap())
         };
         assert!(
-            problem("6m").is_none() && problem("5m").unwrap().contains("the site's notice of 5m")
+            problem("6m").is_none()
+                && problem("5m").unwrap().contains("`notice` of the site file, 5m")
         );
         for (text, words) in [
             ("partitions: gpu", "unknown field `partitions`"),

@@ -30,7 +30,7 @@ pub struct SubmitOptions<'a> {
 pub struct Submitted {
     /// Task index and job ID of each new job.
     pub jobs: Vec<(usize, String)>,
-    /// Number of tasks for which a job was queued before.
+    /// Number of tasks with a job that was queued before, or submitted for an equal task.
     pub already_queued: usize,
     /// Number of unfinished tasks without a job: the queue is full, submitting failed or was
     /// stopped, or a parent has no job.
@@ -51,7 +51,7 @@ impl Submission {
         find_done: impl FnOnce() -> Result<Vec<bool>, E>,
     ) -> Result<Submitted, E> {
         let Some(_lock) = lock_submissions(root, options.is_stopped)? else {
-            return Ok(Submitted::default());
+            return Ok(Submitted { remaining: self.tasks.len(), ..Submitted::default() });
         };
         let queue = Queue::read(options.slurm, root)?;
         let done = find_done()?;
@@ -92,7 +92,7 @@ impl Submission {
         Ok(submitted)
     }
 
-    /// Submits the job of one task and returns its ID. `ids` are the jobs of earlier tasks.
+    /// Submits the job of one task and returns its ID. `ids` are earlier tasks' job IDs.
     fn submit_task(
         &self,
         number: usize,

@@ -12,7 +12,7 @@ use crate::error::{StoreError, if_found, with_path};
 use crate::folder::Store;
 use crate::lock::{Entered, Holder, is_locked};
 
-/// Line of a run's file, which grows as the needed actions become known.
+/// Line of a run's file. Lines are appended as the needed actions become known.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum RunLine {
@@ -36,7 +36,7 @@ pub struct PartialKey {
 }
 
 impl PartialKey {
-    /// Returns whether a record may belong to the node.
+    /// Returns whether a record has these parts, so that it may have the key.
     pub fn matches(&self, record: &Record) -> bool {
         let mut count = 0;
         for (name, value) in &record.key_parts {
@@ -72,8 +72,8 @@ pub struct Run {
 }
 
 impl Run {
-    /// Returns the last time at which the run is known to have been in progress, in seconds since
-    /// 1970.
+    /// Returns the end of the run, or its start if no end is recorded, in seconds since 1970; 0 if
+    /// neither is known.
     pub fn last_used_unix(&self) -> u64 {
         self.ended_unix.or(self.holder.as_ref().map(|h| h.since_unix)).unwrap_or_default()
     }

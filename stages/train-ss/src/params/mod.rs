@@ -20,9 +20,9 @@ pub struct Params {
     #[schemars(extend("x-group" = "field"))]
     pub field: FieldParams,
     /// Sub-pixel rays along each side of an LR pixel, called s in the paper; 1 is plain NeRF. The
-    /// number may differ from the scale of the views: with fewer rays per pixel, the same `rays`
-    /// cover more pixels. With `supervision: kernel`, it is the number of HR pixels along each side
-    /// of an LR pixel, and may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
+    /// number may differ from the views' scale; a smaller number covers more pixels with the same
+    /// `rays`. With `supervision: kernel`, it is the number of HR pixels along each side of an LR
+    /// pixel, and may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "sampling"))]
     pub supersample: f64,
     /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
@@ -55,12 +55,13 @@ pub struct Params {
     /// exposures or white balances. Rendered views have the mean exposure of the photographs.
     /// Default: the first 512 steps measure the gains. If the gains differ by more than a limit,
     /// usually 2 to 4 % (a fifth of the field's relative error), training starts over with
-    /// exposures. Fine-tuning (input `init`) follows the initial field. False for `field: mlp`,
-    /// background `alpha` and `pose_refinement`.
+    /// exposures. Fine-tuning (input `init`) follows the initial field. The default is
+    /// false for `field: mlp`, background `alpha` and `pose_refinement`.
     #[schemars(extend("x-group" = "data", "x-default" = BY_SCENE))]
     pub exposure: Option<bool>,
-    /// Optimises camera poses during training, for poses that aren't exact. Motion that all cameras
-    /// share is removed. Each field of an `ensemble` estimates its own poses.
+    /// Optimises camera poses during training, for poses that aren't exact. Trains the first field
+    /// twice, with refined and with given poses, and keeps the better poses. Motion that all
+    /// cameras share is removed. Each field of an `ensemble` estimates its own poses.
     /// `nerf-sr run registered` then renders test views from registered cameras.
     #[schemars(extend("x-group" = "data"))]
     pub pose_refinement: bool,

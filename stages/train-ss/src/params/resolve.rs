@@ -47,7 +47,7 @@ impl Params {
         } else {
             Supervision::Average
         };
-        // Moving cameras change gains as exposures do (design note 026).
+        // While cameras move, measured gains differ even if exposures don't (design note 026).
         let can_measure = is_grid
             && scene.background != Background::Alpha
             && !scene.is_fine_tuning

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use torch_field::MlpArchitecture;
 
 use super::{Combine, GridParams, Supervision};
-use crate::supersample::{warmup_stages, whole_supersample};
+use crate::supersample::{warmup_doublings, whole_supersample};
 
 /// Steps over which a grid's learning rates rise to their maximum; chosen by hand.
 const LEARNING_RATE_WARMUP_STEPS: u64 = 100;
@@ -166,7 +166,7 @@ impl Resolved {
     pub fn precrop_bundles(&self) -> u64 {
         let batch = u64::from(self.max_rays_per_step);
         let supersample = whole_supersample(self.supersample);
-        let doublings = warmup_stages(supersample);
+        let doublings = warmup_doublings(supersample);
         let stage_steps = (self.supersample_warmup * self.rays as f64 / f64::from(doublings.max(1)))
             as u64
             / batch;

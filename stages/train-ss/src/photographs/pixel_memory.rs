@@ -6,8 +6,8 @@ use std::os::unix::fs::FileExt as _;
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 
-/// Storage of pixels: memory up to a budget, then an unnamed file, which the kernel deletes when
-/// the process ends and caches while memory is free (design note 038).
+/// Storage of pixels: memory up to a budget, then an unnamed file. The operating system deletes
+/// the file when the process ends, and caches it while memory is free (design note 038).
 #[derive(Debug)]
 pub(crate) struct PixelMemory {
     /// Bytes of memory left.
@@ -104,8 +104,8 @@ impl Bytes {
         }
     }
 
-    /// Loads the first and the last byte of a range in memory: most rows span two cache lines. The
-    /// cache misses of consecutive calls overlap; reads with work between them would not.
+    /// Reads the first and the last byte of a range: most rows span two cache lines. The cache
+    /// misses of consecutive calls overlap, unlike those of reads with work between them.
     pub(crate) fn prefetch(&self, range: &Range<usize>) {
         if let Self::Memory(bytes) = self
             && let Some(row) = bytes.get(range.clone())

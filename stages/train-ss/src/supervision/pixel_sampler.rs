@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::photographs::PixelSet;
 
 /// Sampler of the pixel that a bundle trains on. Pixels are numbered over all views in order; a
-/// pixel that is drawn more often has several numbers.
+/// pixel of an HR reference has several numbers, so that it is drawn more often.
 pub(crate) struct PixelSampler {
     views: Vec<PixelNumbers>,
     /// Total number of pixel numbers.
@@ -63,20 +63,26 @@ impl PixelSampler {
             let (epoch, index) = (bundle / self.count, bundle % self.count);
             return self.pixel(permuted(self.seed, epoch, index, self.count));
         }
-        let (mut view, mut pixel) = self.pixel(self.importance.draw(self.count, &mut rng));
+        let mut drawn = self.draw_once(is_precrop, &mut rng);
         for _ in 1..MAX_DRAWS {
-            if counts(view, pixel) {
+            if counts(drawn.0, drawn.1) {
                 break;
             }
-            (view, pixel) = self.pixel(self.importance.draw(self.count, &mut rng));
+            drawn = self.draw_once(is_precrop, &mut rng);
         }
-        if is_precrop {
-            let PixelNumbers { width, height, .. } = self.views[view];
-            let [x, y] = [width, height]
-                .map(|length| length / 4 + rng.below((length as u64 / 2).max(1)) as usize);
-            return (view, y * width + x);
+        drawn
+    }
+
+    /// Draws a view and a pixel; with `is_precrop`, from the middle half of its width and height.
+    fn draw_once(&self, is_precrop: bool, rng: &mut CounterRng) -> (usize, usize) {
+        let (view, pixel) = self.pixel(self.importance.draw(self.count, rng));
+        if !is_precrop {
+            return (view, pixel);
         }
-        (view, pixel)
+        let PixelNumbers { width, height, .. } = self.views[view];
+        let [x, y] = [width, height]
+            .map(|length| length / 4 + rng.below((length as u64 / 2).max(1)) as usize);
+        (view, y * width + x)
     }
 
     /// Returns the view and pixel of a pixel number.
@@ -103,8 +109,8 @@ impl PixelSampler {
 }
 
 /// Importance sampling: pixels with detail around them are drawn more often than flat ones, and
-/// each pixel's loss is weighted by the uniform over the actual draw rate, so that the expected
-/// loss and gradient are those of uniform draws (design note 010).
+/// each pixel's loss is multiplied by the ratio of the uniform to the actual draw rate, so that the
+/// expected loss and gradient are those of uniform draws (design note 010).
 pub(crate) struct Importance {
     /// Numbers of the pixels with detail.
     detailed: PixelSet,

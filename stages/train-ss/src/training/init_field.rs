@@ -14,10 +14,11 @@ pub(crate) struct InitField<'a> {
 }
 
 impl<'a> InitField<'a> {
-    /// Reads the description of the field and fails if it differs from `file`, the field to train.
-    /// Older versions neither rounded bounds nor scaled positions. So that their fields can still
-    /// be trained, the initial field's bounds replace those of `file` if they are equal after
-    /// rounding around `anchor`, and its `scaled_positions` replaces that of `file`.
+    /// Reads the initial field's description and fails if it differs from `file`, the description
+    /// of the field to train. Older versions neither rounded bounds nor scaled positions. So that
+    /// their fields can still be trained, the initial field's bounds replace those of `file` if
+    /// they are equal after rounding around `anchor`, the first camera's centre, and its
+    /// `scaled_positions` replaces that of `file`.
     pub(crate) fn read(
         input: &'a GivenInput,
         file: &mut FieldFile,
@@ -31,9 +32,11 @@ impl<'a> InitField<'a> {
             mlp.scaled_positions = init.scaled_positions;
         }
         let problem = if init.bounds != file.bounds {
-            "the field's bounds differ from the scene's; train both from one run of prep"
+            "the field's bounds differ from the scene's; give the scene that the field was \
+            trained on"
         } else if init.background != file.background {
-            "the field's background differs from the scene's; train both from one run of prep"
+            "the field's background differs from the scene's; give the scene that the field was \
+            trained on"
         } else if init.field != file.field {
             "the field's architecture differs from the parameters; give the parameters that the \
             field was trained with"
@@ -43,8 +46,8 @@ impl<'a> InitField<'a> {
         Err(Failure::BadInput(format!("input init: {problem}")).into())
     }
 
-    /// Returns the path of the weights that a member is initialised from. An ensemble with more
-    /// members than the initial field uses its members in turn.
+    /// Returns the path of the weights that a member is initialised from. If the ensemble has more
+    /// members than the initial field, the initial field's members are reused in turn.
     pub(crate) fn member(&self, index: u32) -> PathBuf {
         self.input.path(&FieldFile::member_file(index % self.members))
     }

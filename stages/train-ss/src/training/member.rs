@@ -55,7 +55,7 @@ pub(crate) struct Member<'a> {
     /// Path of the field's weights.
     pub(super) output: PathBuf,
     work: Option<PathBuf>,
-    /// Number of rays of the previous members.
+    /// Number of rays of the trainings before this one, for the progress.
     rays_before: u64,
 }
 
@@ -75,8 +75,8 @@ impl<'a> Member<'a> {
         Ok(Self { context, params, model, init, output, work, rays_before })
     }
 
-    /// Returns a copy with or without pose refinement, with its checkpoints in the subfolder
-    /// `name`, its weights at `output`, and `more_rays` additional rays before it.
+    /// Returns a copy with or without pose refinement, with checkpoints in the subfolder `name` and
+    /// weights at `output`. The copy is trained after `more_rays` further rays of other trainings.
     pub(crate) fn variant(
         &self,
         pose_refinement: bool,
@@ -147,6 +147,12 @@ impl<'a> Member<'a> {
         member
     }
 
+    /// Returns the folder of the file of training pixels.
+    fn pixel_folder(&self) -> &Path {
+        let folder = self.work.as_deref().or_else(|| self.output.parent());
+        folder.unwrap_or(Path::new("."))
+    }
+
     /// True if an earlier run has started this training.
     fn has_started(&self) -> bool {
         self.work.as_ref().is_some_and(|work| work.is_dir())
@@ -156,7 +162,7 @@ impl<'a> Member<'a> {
     fn start(&self, data: &TrainingData<'_>) -> anyhow::Result<Training> {
         let (params, work) = (&self.params, self.work.as_deref());
         let TrainingData { input, references, views, cells, .. } = *data;
-        let folder = work.unwrap_or_else(|| self.output.parent().unwrap_or(Path::new(".")));
+        let folder = self.pixel_folder();
         if let Some(work) = work {
             std::fs::create_dir_all(work)
                 .with_context(|| format!("cannot create {}", work.display()))?;
@@ -166,12 +172,13 @@ impl<'a> Member<'a> {
         let bundle: usize = supervision.supersample().iter().product();
         if params.rays < bundle as u64 {
             let message = format!(
-                "parameter rays: {} rays for a field, but one pixel needs {bundle}",
+                "parameter rays: {} rays for each field, but one LR pixel needs {bundle}; raise \
+                rays, or lower ensemble or supersample",
                 params.rays
             );
             return Err(Failure::Usage(message).into());
         }
-        // Moving cameras would carve wrongly.
+        // While cameras move, their silhouettes would empty wrong cells.
         let cells = cells.filter(|_| !params.pose_refinement);
         let mut trainer = self.new_trainer(views.bounds, cells)?;
         let checkpoints = Checkpoints::new(work);
@@ -195,7 +202,11 @@ impl<'a> Member<'a> {
             checkpoints.write_if_due(is_interrupted, &**trainer, supervision, curve)?;
             let Some(report) = trainer.step(supervision)? else { return Ok(Outcome::Complete) };
             if let Some(error) = supervision.first_error() {
-                anyhow::bail!("cannot read or write the file of pixels: {error}");
+                let folder = self.pixel_folder().display();
+                anyhow::bail!(
+                    "cannot read or write the training pixels in {folder}: {error}; check the \
+                    disk's space and permissions"
+                );
             }
             if report.skipped {
                 self.context.log_line(format!(
@@ -231,7 +242,7 @@ impl<'a> Member<'a> {
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
         if let Some(motion) = supervision.mean_motion(|| trainer.field())? {
             self.context.log_line(format!("cameras have {motion}"));
-            if motion.is_far() {
+            if motion.exceeds_usual_error() {
                 log.warnings.push(far_warning(&motion));
             }
         }

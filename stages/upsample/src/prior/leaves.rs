@@ -9,7 +9,7 @@ use pixels::Rgba8;
 
 /// Samples per pixel and axis.
 const SAMPLES_PER_AXIS: usize = 2;
-/// Fraction of images with a white background, like that of objects.
+/// Fraction of images with a white background, as photographs of single objects have.
 const WHITE_FRACTION: f32 = 0.3;
 /// Ranges of the number of shapes, and of the smallest radius in pixels; chosen by hand.
 const SHAPES: [f32; 2] = [25.0, 250.0];
@@ -24,11 +24,11 @@ const LARGEST_RADIUS: f32 = 0.4;
 /// Number of different patterns in an image.
 const PATTERNS: u64 = 6;
 /// Stream of random numbers.
-const LEAVES: u64 = 340;
+const LEAVES_STREAM: u64 = 340;
 
 /// Draws the `number`-th image, a square of `side` pixels.
 pub(super) fn draw(seed: u64, number: u64, side: usize) -> Rgba8 {
-    let mut rng = CounterRng::new(seed, LEAVES, number);
+    let mut rng = CounterRng::new(seed, LEAVES_STREAM, number);
     let side = side * SAMPLES_PER_AXIS;
     let palette = Palette::draw(&mut rng);
     let patterns: Vec<Pattern> = (0..PATTERNS).map(|_| Pattern::draw(&palette, &mut rng)).collect();
@@ -107,7 +107,7 @@ fn log_uniform([low, high]: [f32; 2], rng: &mut CounterRng) -> f32 {
     low * (high / low).powf(rng.uniform())
 }
 
-/// Few colours that an image's patterns have in common.
+/// Colours that all patterns of an image share.
 struct Palette(Vec<[f32; 3]>);
 
 impl Palette {
@@ -130,7 +130,7 @@ impl Palette {
     }
 }
 
-/// Position in rotated axes.
+/// Rotation of axes.
 #[derive(Clone, Copy)]
 struct Rotation {
     cosine: f32,
@@ -155,11 +155,11 @@ struct Pattern {
     rotation: Rotation,
     /// Period in samples.
     period: f32,
-    /// Fraction of a period that has the second colour.
+    /// Width of stripes, diameter of dots, width of joints or threshold of patches, from 0 to 1.
     duty: f32,
     /// Strength of the second colour.
     strength: f32,
-    /// Decrease of brightness per sample along the rotated axes.
+    /// Decrease of brightness per sample along the image's axes.
     shading: [f32; 2],
     seed: u64,
 }
@@ -267,7 +267,7 @@ struct Shape {
     radius: f32,
     /// Ratio of the axes, or of a ring's radii.
     ratio: f32,
-    /// Period of a grid in samples, and the fraction that its bars fill.
+    /// Period of a fence or grid in samples, and the fraction that its rails fill.
     period: f32,
     duty: f32,
     /// Angles and distances of a polygon's sides.
@@ -347,7 +347,7 @@ impl Shape {
         }
         let (p, q) = self.rotation.apply(dx, dy);
         let (u, v) = (p / self.radius, q / self.radius);
-        let is_bar = |s: f32| (s / self.period).rem_euclid(1.0) < self.duty;
+        let is_on_rail = |s: f32| (s / self.period).rem_euclid(1.0) < self.duty;
         let is_within = |ratio: f32| u.abs() <= 1.0 && v.abs() <= ratio;
         match self.kind {
             ShapeKind::Ellipse => u.hypot(v / self.ratio) <= 1.0,
@@ -357,8 +357,8 @@ impl Shape {
                     && u.hypot(v) <= 1.2
             }
             ShapeKind::Ring => (self.ratio..=1.0).contains(&u.hypot(v)),
-            ShapeKind::Fence => is_within(1.0) && is_bar(p),
-            ShapeKind::Grid => is_within(1.0) && (is_bar(p) || is_bar(q)),
+            ShapeKind::Fence => is_within(1.0) && is_on_rail(p),
+            ShapeKind::Grid => is_within(1.0) && (is_on_rail(p) || is_on_rail(q)),
         }
     }
 }

@@ -37,7 +37,8 @@ pub struct TrainPrior;
 impl Stage for TrainPrior {
     type Params = PriorParams;
     const NAME: &'static str = "train-prior";
-    const SUMMARY: &'static str = "Trains upsample's network on random images, for method prior.";
+    const SUMMARY: &'static str =
+        "Trains the network of upsample's `method: prior` on random images.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
         Vec::new()

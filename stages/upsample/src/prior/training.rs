@@ -38,7 +38,7 @@ const MIN_CONTRAST: f32 = 0.1;
 /// Maximum number of times that a patch is drawn again; chosen by hand.
 const MAX_REDRAWS: usize = 8;
 /// Streams of random numbers.
-const WEIGHTS: u64 = 341;
+const WEIGHTS_STREAM: u64 = 341;
 const PATCHES: u64 = 342;
 
 /// Error of training.
@@ -136,7 +136,7 @@ impl PriorTrainer {
 
     /// Returns the number of steps taken.
     pub(super) fn steps(&self) -> u64 {
-        self.adam.updates()
+        self.adam.steps_taken()
     }
 
     /// Takes a step. Returns the mean squared error of its patches, or `None` after the last step.
@@ -223,7 +223,7 @@ fn initial_tensors(scale: i64, seed: u64) -> Vec<(String, Tensor)> {
     layers.push(("last".to_owned(), WIDTH, 3 * scale * scale, false));
     let mut tensors = Vec::new();
     for (number, (name, inputs, outputs, is_random)) in layers.into_iter().enumerate() {
-        let mut rng = CounterRng::new(seed, WEIGHTS, number as u64);
+        let mut rng = CounterRng::new(seed, WEIGHTS_STREAM, number as u64);
         // He et al. 2015.
         let deviation = if is_random { (2.0 / (9 * inputs) as f64).sqrt() } else { 0.0 };
         let values: Vec<f32> =

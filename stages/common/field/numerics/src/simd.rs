@@ -87,6 +87,7 @@ pub fn by_every_family(mut test: impl FnMut(Family)) {
             eprintln!("skipped: this machine has no {family:?}");
         }
     }
+    // Restores the best family: unsupported ones are ignored, and the last call wins.
     for family in [Family::Portable, Family::Avx2, Family::Avx512] {
         set_family(family);
     }
@@ -127,7 +128,7 @@ impl Quad for [f32; 4] {
 pub trait Lanes: Copy {
     /// Four `f32` of the same family.
     type Quad: Quad;
-    /// True if 24 values fit into registers at once.
+    /// True if 24 `Self` fit into registers at once, as a matrix tile needs.
     const WIDE: bool;
     /// Returns a number in all lanes.
     fn splat(value: f32) -> Self;
@@ -196,9 +197,9 @@ impl Lanes for Portable {
 #[cfg(target_arch = "x86_64")]
 pub mod x86 {
     //! Lanes in registers of x86-64. Intrinsics fix the vector width: with auto-vectorisation the
-    //! accumulators of a matrix tile spill. The `unsafe` is sound because these types are only used
-    //! in functions compiled for their features (see `kernel!`). There are no closures: a closure
-    //! wouldn't inherit the features, and its intrinsics would be calls.
+    //! accumulators of a matrix tile spill. Use these types only in functions compiled for their
+    //! features (see `kernel!`): elsewhere, the `unsafe` is unsound on machines without them. There
+    //! are no closures: a closure wouldn't inherit the features, and its intrinsics would be calls.
 
     use std::arch::x86_64::*;
 

@@ -7,13 +7,13 @@
 //!   damping.
 //! * [`MeanMotion`]: mean motion of cameras, for a log; [`photometric_error`]: quality of poses.
 //! * [`remove_common_motion`]: removes the motion that all cameras share, which photographs can't
-//!   tell from a motion of the scene.
+//!   distinguish from a motion of the scene.
 //!
 //! A photograph's gradient is the derivative of each pixel by its position in the image; the
 //! rendered depth gives the derivative of this position by the camera's motion (Lucas and Kanade
 //! 1981; the gradient is that of the template, as in Baker and Matthews 2004). A step renders a few
 //! thousand pixels and needs no derivative of the field, so any field that renders colour and depth
-//! will do.
+//! is sufficient.
 //!
 //! Lengths are in scene units, angles in radians; camera axes are those of `scene` (x right, y up,
 //! looking along -z).
@@ -83,8 +83,9 @@ pub struct Refinement {
     pub depth: Option<f64>,
 }
 
-/// Moves a camera to the pose with the least error at a pyramid's level. Its intrinsics may have
-/// any size. The camera is unchanged if too few pixels are informative, and the error never grows.
+/// Moves a camera to the pose with the least error at a pyramid's level. The camera's
+/// intrinsics may be of another image size. The camera is unchanged if too few informative pixels
+/// have a depth, and the error never grows.
 pub fn refine(
     field: &dyn RayField,
     camera: &Camera,
@@ -122,7 +123,7 @@ const MIN_DEPTH_OPACITY: f32 = 0.02;
 struct Equations {
     matrix: NormalMatrix,
     /// Right-hand sides of rotation and translation.
-    right: [DVec3; 2],
+    right_sides: [DVec3; 2],
     /// Median depth of the pixels, if any has one.
     depth: Option<f64>,
     /// Unit of translation: the median depth, so that rotation and translation have equal weight.
@@ -141,20 +142,20 @@ impl Equations {
         options: &Options,
     ) -> Result<Self, RenderError> {
         let camera = camera.resized(level.width as u32, level.height as u32);
-        let lines: Vec<CameraRay> =
+        let camera_rays: Vec<CameraRay> =
             level.pixels.iter().map(|p| camera.ray(p.x as f64 + 0.5, p.y as f64 + 0.5)).collect();
         let rays: Vec<Ray> =
-            lines.iter().map(|line| Ray::new(line, [options.background; 3])).collect();
+            camera_rays.iter().map(|ray| Ray::new(ray, [options.background; 3])).collect();
         let renders = field.render(&rays)?;
         let depths: Vec<Option<f64>> = (0..renders.len())
-            .map(|i| trusted_depth(&renders[i], camera.depth_per_distance(&lines[i])))
+            .map(|i| trusted_depth(&renders[i], camera.depth_per_distance(&camera_rays[i])))
             .collect();
         let mut sorted: Vec<f64> = depths.iter().flatten().copied().collect();
         sorted.sort_unstable_by(f64::total_cmp);
         let depth = sorted.get(sorted.len() / 2).copied();
         let mut equations = Self {
             matrix: NormalMatrix::ZERO,
-            right: [DVec3::ZERO; 2],
+            right_sides: [DVec3::ZERO; 2],
             depth,
             unit: depth.unwrap_or(1.0),
             error: 0.0,
@@ -183,13 +184,13 @@ impl Equations {
         let motion = image_motion(camera, pixel.centre(), depth, self.unit);
         for (c, error) in errors.into_iter().enumerate() {
             let [right, down] = pixel.gradient[c].map(|g| f64::from(g * exposure[c]));
-            // The surface would have to move by the negative error over the gradient.
+            // The surface's image must move by -error / gradient to remove the error.
             let row = [0, 1].map(|part| -(motion[0][part] * right + motion[1][part] * down));
             let weight =
                 if error.abs() > HUBER_THRESHOLD { HUBER_THRESHOLD / error.abs() } else { 1.0 };
             self.matrix.add(weight, row);
             for (part, row) in row.into_iter().enumerate() {
-                self.right[part] += weight * error * row;
+                self.right_sides[part] += weight * error * row;
             }
         }
     }
@@ -199,12 +200,13 @@ impl Equations {
         if self.pixels < MIN_PIXELS || !self.error.is_finite() {
             return None;
         }
-        let [rotation, translation] = self.matrix.damped(damping).solve(self.right)?;
+        let [rotation, translation] = self.matrix.damped(damping).solve(self.right_sides)?;
         Some(Motion { rotation, translation: self.unit * translation })
     }
 }
 
-/// Returns a pixel's z-depth: median depth of an opaque pixel, expected depth of another.
+/// Returns a pixel's z-depth: the median depth above an opacity of 0.5, otherwise the expected
+/// depth. `None` if the opacity is too small or the depth isn't positive and finite.
 fn trusted_depth(render: &Pixel, depth_per_distance: f64) -> Option<f64> {
     let distance = if render.opacity > 0.5 { render.median_depth } else { render.depth };
     let depth = f64::from(distance) * depth_per_distance;
@@ -253,7 +255,7 @@ fn with_pose(camera: &Camera, rotation: DQuat, centre: DVec3) -> Camera {
     Camera { camera_to_world: pose_of(axes, centre), ..camera.clone() }
 }
 
-/// Motion of one camera.
+/// A camera before and after a motion.
 #[derive(Clone, Copy, Debug)]
 pub struct CameraMotion<'a> {
     /// Camera before the motion, of the photograph's size.
@@ -302,7 +304,7 @@ impl MeanMotion {
 
     /// Returns whether the motion exceeds the usual error of given poses: 1°, or 3 pixels of the
     /// photographs.
-    pub fn is_far(&self) -> bool {
+    pub fn exceeds_usual_error(&self) -> bool {
         self.angle.to_degrees() > MAX_TRUSTED_ANGLE_DEGREES || self.pixels > MAX_TRUSTED_PIXELS
     }
 }
@@ -320,13 +322,13 @@ impl fmt::Display for MeanMotion {
 }
 
 /// Removes the mean rotation, translation and scaling of all cameras relative to `before`. A motion
-/// that all cameras share is a motion of the scene: the scene would leave its bounds, and test
-/// views would be off.
+/// that all cameras share would move the scene out of its bounds, and test views would no longer
+/// match their cameras.
 pub fn remove_common_motion(cameras: &mut [Camera], before: &[Camera]) {
     let share = 1.0 / cameras.len().max(1) as f64;
     let rotations = cameras.iter().zip(before).map(|(camera, before)| {
         let relative = rotation(camera) * rotation(before).inverse();
-        // Of q and -q, the same rotation, the one with the smaller angle.
+        // q and -q are the same rotation; the one with the smaller angle is used.
         (if relative.w < 0.0 { -relative } else { relative }).to_scaled_axis()
     });
     let inverse = DQuat::from_scaled_axis(-share * rotations.sum::<DVec3>());

@@ -272,10 +272,10 @@ fn motions_are_told() {
         told.to_string(),
         "turned by 0.286° and moved by 0.2500 (4.4 pixels of the photographs) on average"
     );
-    for (angle, pixels, is_far) in [(0.9f64, 2.9, false), (1.1, 0.0, true), (0.0, 3.1, true)] {
+    for (angle, pixels, exceeds) in [(0.9f64, 2.9, false), (1.1, 0.0, true), (0.0, 3.1, true)] {
         assert_eq!(
-            MeanMotion { angle: angle.to_radians(), pixels, distance: 0.0 }.is_far(),
-            is_far,
+            MeanMotion { angle: angle.to_radians(), pixels, distance: 0.0 }.exceeds_usual_error(),
+            exceeds,
             "{angle}° {pixels}"
         );
     }

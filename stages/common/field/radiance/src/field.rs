@@ -79,13 +79,13 @@ impl Field {
 
     /// Returns the number of multiplications of the density network per sample of a forward pass; a
     /// backward pass has twice as many.
-    pub fn network_multiplications(&self) -> usize {
+    pub fn density_multiplications(&self) -> usize {
         self.layers.density.iter().map(|l| l.inputs * l.outputs).sum()
     }
 
-    /// Replaces every parameter by its mean with another field's of the same architecture; the
-    /// occupancy is unchanged. If one field was fine-tuned from the other, the result renders
-    /// nearly the mean of both renders (Wortsman et al. 2022, "Robust fine-tuning").
+    /// Replaces every parameter by the mean of this field's and of `other`'s, a field of the same
+    /// architecture; the occupancy is unchanged. If one field was fine-tuned from the other, the
+    /// result renders nearly the mean of both renders (Wortsman et al. 2022, "Robust fine-tuning").
     pub fn average_with(&mut self, other: &Self) {
         for (own, other) in [(&mut self.grid, &other.grid), (&mut self.network, &other.network)] {
             for i in 0..own.len().min(other.len()) {
@@ -94,9 +94,9 @@ impl Field {
         }
     }
 
-    /// Limits fine-tuning of this field to its occupied cells and their neighbours. No image has
-    /// evidence of other cells, or the images show them empty: reopened, they would fill with
-    /// density of the background's colour.
+    /// Limits fine-tuning of this field to its occupied cells and their neighbours. All other cells
+    /// are empty in the images, or unseen. If fine-tuning could occupy these cells, they would fill
+    /// with density of the background's colour.
     pub fn limit_to_occupied(&mut self) {
         self.occupancy.limit_to_occupied();
     }

@@ -2,7 +2,7 @@
 //! autograd, no torch.
 //!
 //! * [`RayField`]: trait of fields that render rays.
-//! * [`TrainingLog`]: course of a training, a file of a field artifact.
+//! * [`TrainingLog`]: record of a training, stored as a file in a field artifact.
 //! * [`Field`]: parameters and occupancy grid; [`Field::render`] returns colour, opacity and depth
 //!   of rays.
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that
@@ -16,8 +16,9 @@
 //! * [`Architecture`]: sizes of a field; [`scene::Bounds`]: its position in the world.
 //!
 //! Shading is deferred (SNeRG, Hedman et al. 2021): a sample has a density, a raw colour and view
-//! features. A ray composites its samples' view features. From these and the direction the view
-//! network computes a raw colour, which is added to the raw colour of each of the ray's samples.
+//! features. A ray composites its samples' view features. From the composited features and the
+//! ray's direction, the view network computes a raw colour. This colour is added to the raw colour
+//! of each of the ray's samples.
 //!
 //! A step's rays are cut into shards by index. A shard's samples go through encoding, density,
 //! compositing, shading and back in chunks that fit the cache. Gradients of the grid are stored and

@@ -19,7 +19,7 @@ use crate::spec::{
     BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS,
 };
 
-/// Parameters in f64.
+/// Field with f64 parameters, as a reference for the fused passes.
 pub(crate) struct Judge<'a> {
     pub(crate) field: &'a Field,
     pub(crate) grid: Vec<f64>,
@@ -89,21 +89,21 @@ impl Judge<'_> {
         self.layer(third, &self.layer(second, &self.layer(first, &input, true), true), false)
     }
 
-    /// Returns weight and colour of each sample that counts, and the ray's transmittance. Other
+    /// Returns weight and colour of each coloured sample, and the ray's transmittance. Other
     /// samples attenuate light but have no colour, as in the fused pass.
     fn shaded(&self, ray: &Ray, samples: &[Sample]) -> (Vec<(f64, [f64; 3])>, f64) {
         let step = f64::from(self.field.march_step());
-        let (mut depth, mut counted) = (0.0f64, Vec::new());
+        let (mut optical_depth, mut counted) = (0.0f64, Vec::new());
         let mut composited = vec![0.0; DENSITY_OUTPUTS];
         for sample in samples {
             let outputs = self.density(sample.position.map(f64::from));
             let tau = outputs[0].exp() * step * f64::from(sample.length);
-            if sample.counts {
-                let weight = (-depth).exp() * -(-tau).exp_m1();
+            if sample.is_coloured {
+                let weight = (-optical_depth).exp() * -(-tau).exp_m1();
                 composited.iter_mut().zip(&outputs).for_each(|(sum, value)| *sum += weight * value);
                 counted.push((weight, outputs));
             }
-            depth += tau;
+            optical_depth += tau;
         }
         let view_colour = self.view_colour(&composited, ray.direction.map(|x| x as f32));
         (
@@ -111,12 +111,12 @@ impl Judge<'_> {
                 .iter()
                 .map(|(weight, outputs)| (*weight, colour_of(outputs, &view_colour)))
                 .collect(),
-            (-depth).exp(),
+            (-optical_depth).exp(),
         )
     }
 
-    /// Colour of a ray over its background.
-    pub(crate) fn ray(&self, ray: &Ray, samples: &[Sample]) -> [f64; 3] {
+    /// Returns the colour of a ray over its background.
+    pub(crate) fn ray_colour(&self, ray: &Ray, samples: &[Sample]) -> [f64; 3] {
         let (shaded, transmittance) = self.shaded(ray, samples);
         let sum = |c: usize| shaded.iter().map(|(weight, colour)| weight * colour[c]).sum::<f64>();
         std::array::from_fn(|c| transmittance.mul_add(f64::from(ray.background[c]), sum(c)))
@@ -127,10 +127,10 @@ impl Judge<'_> {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sample {
     position: [f32; 3],
-    /// Steps that it stands for.
+    /// Number of steps that the sample represents.
     length: f32,
     /// True if the sample has a colour and a gradient.
-    counts: bool,
+    is_coloured: bool,
 }
 
 /// Returns all samples of each ray; each ray is marched alone, by a single call.
@@ -151,12 +151,13 @@ pub(crate) fn samples(
         };
         march(&one, 9999, &[0], &mut [0], &mut marched);
         let samples = marched.positions.into_iter().zip(marched.lengths);
-        samples.map(|(position, length)| Sample { position, length, counts: true }).collect()
+        samples.map(|(position, length)| Sample { position, length, is_coloured: true }).collect()
     });
     rays_alone.collect()
 }
 
-/// Runs the fused backward pass: gradients by the grid and by the networks.
+/// Returns the gradients of the grid and of the networks by the fused backward pass, and the number
+/// of samples with a gradient.
 fn fused_gradients(
     field: &Field,
     chunk: &mut Chunk,
@@ -231,10 +232,11 @@ fn fused_passes_equal_the_plain_ones() {
     chunk.forward(&field, &clipped, &[0.5; 20], Strides::ByCell);
     let mut samples = samples(&field, &clipped, &[0.5; 20], Strides::ByCell);
     for (all, kept) in samples.iter_mut().zip(chunk.kept_positions()) {
-        all.iter_mut().for_each(|sample| sample.counts = kept.contains(&sample.position));
+        all.iter_mut().for_each(|sample| sample.is_coloured = kept.contains(&sample.position));
     }
-    let of_length =
-        |length: f32| samples.iter().flatten().filter(|s| s.length == length && s.counts).count();
+    let of_length = |length: f32| {
+        samples.iter().flatten().filter(|s| s.length == length && s.is_coloured).count()
+    };
     assert!(
         of_length(1.0) > 100 && of_length(2.0) > 20,
         "{} and {}",
@@ -277,14 +279,14 @@ fn fused_passes_equal_the_plain_ones() {
                 .zip(&likenesses[i])
                 .map(|((weight, _), background_likeness)| weight * background_likeness)
                 .sum();
-            let colour = judge.ray(&rays[i], &samples[i]);
+            let colour = judge.ray_colour(&rays[i], &samples[i]);
             colour.iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum::<f64>()
                 + f64::from(regularisers.floater_loss) * floaters
         };
         (0..rays.len()).map(dot).sum()
     };
     for (i, sum) in chunk.sums.iter().enumerate() {
-        let exact = judge.ray(&rays[i], &samples[i]);
+        let exact = judge.ray_colour(&rays[i], &samples[i]);
         for c in 0..3 {
             let ours = f64::from(sum.transmittance.mul_add(rays[i].background[c], sum.colour[c]));
             assert!((ours - exact[c]).abs() < 2e-6, "ray {i}: {ours} {}", exact[c]);
@@ -374,8 +376,8 @@ fn roulette_keeps_the_expected_gradient() {
     assert!((0.1..0.8).contains(&share) && error < 0.01, "{share} {error}");
 }
 
-/// Rays that end where it is dark see what the whole rays would, but for the share of light that
-/// was left.
+/// A ray that stops early has the colour of the whole ray, up to the share of light that was
+/// left.
 #[test]
 fn stopping_early_loses_no_more_than_the_light_that_was_left() {
     let (mut field, rays) = example();
@@ -391,7 +393,7 @@ fn stopping_early_loses_no_more_than_the_light_that_was_left() {
     let mut stopped = 0;
     for (r, sum) in chunk.sums.iter().enumerate() {
         stopped += usize::from(sum.transmittance < 1e-4);
-        let exact = judge.ray(&rays[r], &samples[r]);
+        let exact = judge.ray_colour(&rays[r], &samples[r]);
         for c in 0..3 {
             let ours = f64::from(sum.transmittance.mul_add(rays[r].background[c], sum.colour[c]));
             assert!((ours - exact[c]).abs() < 1e-3, "ray {r}: {ours} {}", exact[c]);

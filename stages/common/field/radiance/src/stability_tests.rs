@@ -168,7 +168,7 @@ fn parameters(figures: &mut Vec<Figure>) {
         let samples = samples(&field, &clipped, &offsets, Strides::Single);
         let mut error: f64 = 0.0;
         for (r, sum) in chunk.sums.iter().enumerate() {
-            let exact = judge.ray(&rays[r], &samples[r]);
+            let exact = judge.ray_colour(&rays[r], &samples[r]);
             for c in 0..3 {
                 let ours = sum.transmittance.mul_add(rays[r].background[c], sum.colour[c]);
                 assert!(ours.is_finite() && exact[c].is_finite(), "{factor}: {ours} {}", exact[c]);

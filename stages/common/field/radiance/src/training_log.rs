@@ -19,10 +19,10 @@ pub struct TrainingLog {
     pub rays: u64,
     /// Mean number of samples per ray.
     pub samples_per_ray: f64,
-    /// Values in use of the parameters whose default depends on the scene, by name.
+    /// Final values of the parameters whose default depends on the scene, by name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub resolved: BTreeMap<String, Value>,
-    /// Training PSNR over the rays, about a hundred points per member.
+    /// PSNR of the training pixels against the number of rays, about a hundred points per member.
     pub curve: Vec<CurvePoint>,
     /// RGB gain of each training view relative to the field, in the order of `views.json`; empty
     /// unless exposures are estimated. From the first member.
@@ -39,7 +39,8 @@ pub struct TrainingLog {
 }
 
 impl TrainingLog {
-    /// Appends the log of the next training.
+    /// Appends the log of the next member. `resolved` stays unchanged, and exposures and poses are
+    /// those of the first member.
     pub fn append(&mut self, next: TrainingLog) {
         let samples =
             self.samples_per_ray * self.rays as f64 + next.samples_per_ray * next.rays as f64;
@@ -68,6 +69,6 @@ impl TrainingLog {
 pub struct CurvePoint {
     /// Number of rays cast so far.
     pub rays: u64,
-    /// PSNR over the training pixels since the previous point, in dB.
+    /// PSNR of the pixels trained on since the previous point, in dB.
     pub psnr: f64,
 }

@@ -21,7 +21,7 @@ type Layer = (String, i64, i64);
 const SKIP_LAYER: u32 = 4;
 
 /// Stream of random numbers for the initial weights.
-const WEIGHTS: u64 = 200;
+const WEIGHTS_STREAM: u64 = 200;
 
 /// Returns the number of outputs of [`encode`] for `dims` inputs.
 fn encoded_dims(dims: i64, octaves: u32) -> i64 {
@@ -85,7 +85,7 @@ impl MlpNetwork {
         index: u64,
         device: Device,
     ) -> Result<Self, TchError> {
-        let mut rng = CounterRng::new(seed, WEIGHTS, index);
+        let mut rng = CounterRng::new(seed, WEIGHTS_STREAM, index);
         let mut parameters = Vec::new();
         for (_, inputs, outputs) in Self::layers(&architecture) {
             let deviation = (2.0 / inputs as f64).sqrt();

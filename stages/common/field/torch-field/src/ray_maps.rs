@@ -77,8 +77,8 @@ fn view_direction(ray: &NormalizedRay) -> [f32; 3] {
     if ray.view.iter().all(|x| x.is_finite()) { ray.view } else { [0.0; 3] }
 }
 
-/// Computes a·b + c rounded once, through f64, like the fused multiply-add of the hand-written
-/// field.
+/// Computes a·b + c in f64 and rounds it to f32: except for rare double rounding, the fused
+/// multiply-add of crate `radiance`.
 pub(crate) fn multiply_add(a: &Tensor, b: &Tensor, c: &Tensor) -> Result<Tensor, TchError> {
     a.f_to_kind(Kind::Double)?
         .f_mul(&b.f_to_kind(Kind::Double)?)?

@@ -33,7 +33,7 @@ pub(crate) enum FileProblem {
     /// Link that can't be followed, at the path or above it.
     #[error("{} is a symbolic link that cannot be followed: {error}", path_text(link))]
     BrokenLink { link: PathBuf, error: io::Error },
-    #[error("{} is named like an editor or system file, which are ignored", path_text(path))]
+    #[error("{} is named like editor and system files, which are ignored", path_text(path))]
     IgnoredName { path: PathBuf },
 }
 
@@ -75,7 +75,10 @@ pub(crate) fn file_status(path: &Path, expected: &str) -> FileStatus {
             FileProblem::DanglingLink { link: link.to_path_buf(), target }
         }
         (Some(link), _) => FileProblem::BrokenLink { link: link.to_path_buf(), error },
-        (None, ErrorKind::InvalidFilename) => too_long(),
+        (None, ErrorKind::InvalidFilename) => FileProblem::Other(format!(
+            "{}: a name in the path is too long (usual maximum 255 bytes)",
+            shortened(&name)
+        )),
         (None, ErrorKind::NotFound | ErrorKind::NotADirectory) => {
             return FileStatus::Missing(FileProblem::Other(format!("{name} not found")));
         }
@@ -160,8 +163,8 @@ mod tests {
             ("loop/x.png", "loop is a symbolic link that cannot be followed"),
             ("dangling/x.png", "dangling is a symbolic link to gone, which does not exist"),
             ("dangling", "dangling is a symbolic link to gone, which does not exist"),
-            ("._x.png", "._x.png is named like an editor or system file"),
-            (&"y".repeat(300), ": path is too long"),
+            ("._x.png", "._x.png is named like editor and system files"),
+            (&"y".repeat(300), ": a name in the path is too long"),
             (&"z/".repeat(1 << 20), ": path is too long"),
         ] {
             let FileStatus::Unusable(problem) = found(name) else {

@@ -61,7 +61,7 @@ pub use masks::{MaskFile, MaskKind};
 use nearby::find_nearby;
 pub use photograph::{Clipping, is_image_name};
 pub use split::Split;
-pub use unsupported::{is_unsupported_name, unsupported_images};
+pub use unsupported::{is_unsupported_name, unsupported_summary};
 
 impl Dataset {
     /// Reads a folder in any format. Of the images only the headers are read.

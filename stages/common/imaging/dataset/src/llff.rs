@@ -17,7 +17,7 @@ use crate::masks::without_dynamic_masks;
 use crate::npy::{read_matrix, shape_reason};
 use crate::photograph::{ImageHeader, fit_camera, is_image_name, read_header};
 use crate::text::read_text;
-use crate::unsupported::unsupported_images;
+use crate::unsupported::unsupported_summary;
 
 /// Numbers per photograph: a 3×5 matrix (axes down, right and back; centre; height, width and focal
 /// length), near and far.
@@ -192,7 +192,7 @@ fn list_images(folder: &Path, name: &str) -> Option<(Vec<PathBuf>, ImageFolder)>
     let entries = std::fs::read_dir(&path).ok()?.flatten().map(|entry| entry.path());
     let mut files: Vec<PathBuf> = entries.filter(|path| !is_hidden(path)).collect();
     files.sort();
-    let unsupported = unsupported_images(&files);
+    let unsupported = unsupported_summary(&files);
     files.retain(|path| is_image_name(path));
     let mut files = without_dynamic_masks(files);
     let mut unusable = None;

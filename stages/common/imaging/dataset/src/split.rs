@@ -16,13 +16,13 @@ pub struct Split {
 }
 
 impl Split {
-    /// Uses every frame for both training and testing: the paper's protocol for photographs.
+    /// Uses every frame for both training and testing, as the paper does with photographs.
     pub fn all(count: usize) -> Self {
         Self { train: (0..count).collect(), test: (0..count).collect() }
     }
 
-    /// Holds out every `every`-th frame, starting with the first, for testing: LLFF's protocol. A
-    /// single frame is used for both.
+    /// Holds out every `every`-th frame, starting with the first, for testing, as LLFF does. A
+    /// single frame is used for both training and testing.
     pub fn hold_out(count: usize, every: usize) -> Self {
         let (test, train): (Vec<_>, Vec<_>) = (0..count).partition(|i| i % every.max(1) == 0);
         if train.is_empty() { Self::all(count) } else { Self { train, test } }
@@ -87,7 +87,7 @@ impl SplitLists<'_> {
             let is_missing = split[side].is_empty() && !split[1 - side].is_empty();
             if is_missing && !unlisted.is_empty() {
                 let views = format_count(unlisted.len(), noun);
-                notes.push(format!("{views}: the frames in no list"));
+                notes.push(format!("{views}: all unlisted frames"));
                 split[side].clone_from(&unlisted);
             }
         }
@@ -120,7 +120,8 @@ fn listed_frames(
         if found.is_empty() {
             let count = unknown.len();
             return Err(Reason::new(format!(
-                "none of the {count} names in {list} is that of a frame (first: {first})"
+                "no name in {list} is that of a frame (first of {count}: {first}); correct the \
+                names, or remove {list}"
             )));
         }
         let names = format_count(list_names.len(), "name");

@@ -1,5 +1,6 @@
 //! Image formats that aren't supported, and the commands that convert them.
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
@@ -53,15 +54,21 @@ impl UnsupportedFormat {
         }
     }
 
-    /// Returns the command that converts all files in a file's folder with its extension.
-    fn command(self, path: &Path) -> String {
-        let folder = path.parent().unwrap_or(Path::new(".")).display().to_string();
-        let files = match path.extension().and_then(|extension| extension.to_str()) {
-            Some(extension) => format!("*.{extension}"),
-            None => "*".to_owned(),
-        };
-        let folder = folder.replace('\'', r"'\''");
-        format!("magick mogrify -format {} '{folder}'/{files}", self.target)
+    /// Returns the command that converts all files with the folder and extension of one of `paths`.
+    fn command<'a>(self, paths: impl Iterator<Item = &'a Path>) -> String {
+        let patterns: BTreeSet<String> = paths.map(pattern_of).collect();
+        let patterns: Vec<String> = patterns.into_iter().collect();
+        format!("magick mogrify -format {} {}", self.target, patterns.join(" "))
+    }
+}
+
+/// Returns the shell pattern of the files with the same folder and extension as `path`.
+fn pattern_of(path: &Path) -> String {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let folder = folder.unwrap_or(Path::new(".")).display().to_string().replace('\'', r"'\''");
+    match path.extension().and_then(|extension| extension.to_str()) {
+        Some(extension) => format!("'{folder}'/*.{extension}"),
+        None => format!("'{folder}'/*"),
     }
 }
 
@@ -81,23 +88,24 @@ pub(crate) fn unsupported_error(path: &Path) -> Option<PixelError> {
         "{} is a {} image, which is not supported; convert: {}",
         path.display(),
         format.name,
-        format.command(path)
+        format.command([path].into_iter())
     )))
 }
 
 /// Returns the format of the first unsupported image among files, the number of images in that
 /// format, and the command that converts them; `None` if there are none.
-pub fn unsupported_images(files: &[PathBuf]) -> Option<String> {
+pub fn unsupported_summary(files: &[PathBuf]) -> Option<String> {
     let first = files.iter().find(|path| is_unsupported_name(path))?;
     let format = UnsupportedFormat::from_name(first)?;
     let is_same = |path: &&PathBuf| {
         UnsupportedFormat::from_name(path).is_some_and(|other| other.name == format.name)
     };
-    let count = files.iter().filter(is_same).count();
+    let images: Vec<&PathBuf> = files.iter().filter(is_same).collect();
     Some(format!(
-        "{count} in {}, which is not supported; convert: {}",
+        "{} in {}, which is not supported; convert: {}",
+        images.len(),
         format.name,
-        format.command(first)
+        format.command(images.iter().map(|path| path.as_path()))
     ))
 }
 
@@ -133,8 +141,15 @@ mod tests {
     #[test]
     fn commands_are_quoted() {
         assert_eq!(
-            HEIC.command(Path::new("/data/Tom's set/IMG 1.HEIC")),
+            HEIC.command([Path::new("/data/Tom's set/IMG 1.HEIC")].into_iter()),
             r"magick mogrify -format jpg -quality 98 '/data/Tom'\''s set'/*.HEIC"
+        );
+        let files = ["a.HEIC", "b.heic", "c.HEIC"].map(PathBuf::from);
+        assert_eq!(
+            unsupported_summary(&files).unwrap(),
+            "3 in HEIC, which is not supported; convert: magick mogrify -format jpg -quality 98 \
+            './'*.HEIC './'*.heic"
+                .replace("'./'", "'.'/")
         );
     }
 }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use crate::image_buffer::{Image, Rgba8};
 use crate::pillow_resample::Filter;
 
-/// Degradation kernel from HR to LR images.
+/// Degradation kernel from HR to LR images. Pillow's kernels resample premultiplied colour.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Kernel {
@@ -12,11 +12,10 @@ pub enum Kernel {
     Lanczos,
     /// Pillow's bicubic.
     Bicubic,
-    /// Pillow's box: the mean of whole pixels, premultiplied.
+    /// Pillow's box: the unweighted mean of the pixels whose centres are in the box.
     Box,
     /// Averages as the paper's code does: colour and alpha separately, without rounding. Requires
-    /// an integer
-    /// scale.
+    /// an integer scale.
     Average,
 }
 
@@ -45,8 +44,8 @@ pub struct Degradation {
 }
 
 /// Computes the mean of `sx`×`sy` blocks, colour and alpha separately and without rounding, as
-/// `--ds_method avg`
-/// of the paper's code does. `None` if the image size isn't a multiple of (sx, sy).
+/// `--ds_method avg` of the paper's code does. `None` if the image size isn't a multiple of
+/// (sx, sy).
 ///
 /// Like the paper's code it pools *straight* colour, so that colours of transparent pixels bleed
 /// into edges.

@@ -6,14 +6,14 @@ use crate::image_buffer::Rgba8;
 /// slices have the same length.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthMap<'a> {
-    /// Camera-space z-depth in scene units: positive before the camera, undefined where opacity is
-    /// 0.
+    /// Camera-space z-depth in scene units: positive in front of the camera. Where opacity is
+    /// 0, renders have the far end.
     pub depth: &'a [f32],
     /// Opacity in [0, 1].
     pub opacity: &'a [f32],
 }
 
-/// Minimum opacity of a surface: the median depth is defined from one half on.
+/// Minimum opacity of a surface: the median depth is only defined for an opacity of at least 0.5.
 const MIN_SURFACE_OPACITY: f32 = 0.5;
 
 fn is_surface(opacity: f32) -> bool {
@@ -45,18 +45,19 @@ impl<'a> DepthMap<'a> {
     }
 
     /// Draws depth from near (warm) to far (cold) over white. `width` is in pixels, the range in
-    /// scene units; a range with a ratio above 4 is drawn linearly in disparity.
+    /// scene units; if far is more than 4 times near, values are drawn linearly in disparity.
     ///
     /// # Panics
     /// If the number of pixels isn't a multiple of `width`, or depths and opacities differ in
     /// number.
     pub fn draw(&self, width: usize, range: (f32, f32)) -> Rgba8 {
-        let (low, high) = (scaled_depth(range.0, range), scaled_depth(range.1, range));
+        let (low, high) = (display_depth(range.0, range), display_depth(range.1, range));
         let mut data = Vec::with_capacity(4 * self.depth.len());
         for (i, z) in self.depth.iter().enumerate() {
             let alpha = self.opacity[i];
-            let value = 1.0 - (scaled_depth(*z, range) - low) / (high - low).max(f32::MIN_POSITIVE);
-            // Without the palette's darkest ends.
+            let value =
+                1.0 - (display_depth(*z, range) - low) / (high - low).max(f32::MIN_POSITIVE);
+            // Leaves out the dark colours at both ends of the palette.
             let colour = palette_colour(Palette::Depth, 0.08 + 0.84 * value.clamp(0.0, 1.0));
             for c in colour {
                 data.push((f32::from(c) * alpha + 255.0 * (1.0 - alpha)).round() as u8);
@@ -67,8 +68,8 @@ impl<'a> DepthMap<'a> {
     }
 }
 
-/// Returns depth, or negated disparity for a range with a ratio above 4.
-fn scaled_depth(z: f32, (near, far): (f32, f32)) -> f32 {
+/// Returns depth, or negated disparity if far is more than 4 times near.
+fn display_depth(z: f32, (near, far): (f32, f32)) -> f32 {
     if far > 4.0 * near && near > 0.0 { -1.0 / z.max(near) } else { z }
 }
 

@@ -35,13 +35,13 @@ pub enum PixelError {
         y: usize,
         /// Value of the sample.
         value: f32,
-        /// Consequence or remedy.
+        /// Consequence for the file, or remedy for the user.
         remedy: &'static str,
     },
 }
 
 impl PixelError {
-    /// Returns a conversion of an error of the operating system.
+    /// Returns a function that adds the path to an error of the operating system.
     pub fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { path: path.to_path_buf(), source }
     }
@@ -55,11 +55,11 @@ impl PixelError {
         ))
     }
 
-    /// Creates the error of a file in another or a damaged format.
+    /// Creates the error of a file that is damaged or has another format.
     pub fn format(path: &Path, reason: impl Into<String>) -> Self {
         Self::Format { path: path.to_path_buf(), reason: reason.into() }
     }
 }
 
-/// Maximum number of pixels of an image: a header that claims more is damaged or hostile.
+/// Maximum number of pixels of an image. A header with more is usually damaged or hostile.
 pub const MAX_PIXELS: usize = 1 << 28;

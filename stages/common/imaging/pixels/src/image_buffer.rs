@@ -28,7 +28,8 @@ impl Rgba8 {
 impl From<DynamicImage> for Rgba8 {
     fn from(image: DynamicImage) -> Self {
         let (width, height) = (image.width() as usize, image.height() as usize);
-        // Faster than `into_rgba8`: `image` is compiled with little optimisation (Cargo.toml).
+        // Faster than `into_rgba8`: crate `image` is compiled with little optimisation
+        // (Cargo.toml).
         let data = match image {
             DynamicImage::ImageRgb8(image) => rgba_from_rgb(&image),
             DynamicImage::ImageLuma8(image) => rgba_from_grey(&image),
@@ -126,8 +127,12 @@ impl Image {
 }
 
 /// Returns the peak signal-to-noise ratio in dB (peak 1) of a mean squared error, at most 100 dB,
-/// which stands for equal images.
+/// which stands for equal images; NaN for NaN.
 pub fn psnr_of(mean_squared_error: f64) -> f64 {
+    // `min` would return 100 for NaN.
+    if mean_squared_error.is_nan() {
+        return f64::NAN;
+    }
     (-10.0 * mean_squared_error.log10()).min(100.0)
 }
 

@@ -53,11 +53,11 @@ impl AxisTaps {
         self.firsts.len()
     }
 
-    /// Computes the weights P = (s·K·Kᵀ)⁻¹·K of the pseudo-inverse K⁺ = s·Pᵀ, with
-    /// s = inputs/outputs: along one axis, the smallest change of the inputs that adds r to the
-    /// outputs is K⁺·r. The factor s makes P sum to 1 as K does, so that a constant r changes every
-    /// input as much as Kᵀ·r does; detail that K attenuates is amplified. Weights farther than
-    /// `reach` outputs from an input are omitted.
+    /// Computes the weights P = (s·K·Kᵀ + ρ)⁻¹·K, with s = inputs/outputs and the ridge ρ. For
+    /// ρ = 0, s·Pᵀ is the pseudo-inverse K⁺ along one axis: K⁺·r is the smallest change of the
+    /// inputs that adds r to the outputs. Rows of P sum to nearly 1, as those of K do: a constant r
+    /// changes every input as much by Pᵀ·r as by Kᵀ·r. Detail that K attenuates is amplified.
+    /// Weights farther than `reach` outputs from an input are omitted.
     pub fn inverse(&self, reach: usize) -> Self {
         let (n, scale) = (self.outputs(), self.inputs as f64 / self.outputs() as f64);
         // The Gram matrix is banded: a run overlaps few others.
@@ -95,10 +95,10 @@ impl AxisTaps {
                     (a + 1..n.min(a + band + 1)).map(|b| factor[b][a + band - b] * z[b]).sum();
                 z[a] = (z[a] - sum) / factor[a][band];
             }
-            let centre = ((q as f64 + 0.5) * scale - 0.5 * length as f64).round().max(0.0) as usize;
-            let first = centre.min(self.inputs - length);
+            let start = ((q as f64 + 0.5) * scale - 0.5 * length as f64).round().max(0.0) as usize;
+            let first = start.min(self.inputs - length);
             firsts.push(first);
-            // Beyond 2·reach z vanishes, and no run reaches here from farther away.
+            // z vanishes farther than 2·reach outputs from q; 4·reach is a safe limit.
             let near = q.saturating_sub(4 * reach)..(q + 4 * reach + 1).min(n);
             weights.extend((first..first + length).map(|i| {
                 let distance = ((i as f64 + 0.5) / scale - (q as f64 + 0.5)).abs();

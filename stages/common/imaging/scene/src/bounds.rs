@@ -95,8 +95,8 @@ impl Bounds {
             Space::Contraction => {
                 let u = (point - self.middle()) / (0.5 * self.longest_side());
                 let length = u.length();
-                let inside = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
-                0.25 * inside * u + 0.5
+                let shrink = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
+                0.25 * shrink * u + 0.5
             }
         }
     }

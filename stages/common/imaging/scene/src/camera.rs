@@ -43,7 +43,7 @@ impl CameraRay {
 pub struct CameraRays {
     intrinsics: Intrinsics,
     origin: DVec3,
-    /// Direction of the pinhole's image position (0, 0), not of unit length.
+    /// Direction through the undistorted image position (0, 0), not of unit length.
     corner: DVec3,
     /// Change of the direction per pixel to the right.
     right: DVec3,
@@ -181,7 +181,7 @@ impl Camera {
             let problem = format!("camera_to_world[{}][{}] is {value}", index / 4, index % 4);
             return Err(CameraError::Pose(format!("{problem}; poses must be finite")));
         }
-        if !self.intrinsics.has_rays() {
+        if !self.intrinsics.has_unique_rays() {
             return Err(CameraError::distortion(self.intrinsics.distortion));
         }
         let r = self.rotation();

@@ -32,8 +32,8 @@ const MAX_ZOOM: f64 = 4.0;
 /// hand.
 const BORDER_SAMPLES: u32 = 64;
 
-/// Number of intervals on the way from the centre to a border position in which the order of rays
-/// is checked; chosen by hand.
+/// Number of intervals on the way from the centre to a border position in which it is checked that
+/// the distortion doesn't fold the image; chosen by hand.
 const ORDER_SAMPLES: u32 = 16;
 
 /// Maximum tangent of the half field of view of a pinhole camera that replaces a fisheye: tan 50°.
@@ -94,8 +94,8 @@ impl Intrinsics {
     }
 
     /// Returns the pinhole camera of the same size with the widest view inside this camera's; in
-    /// place of a fisheye lens the view is at most 100° across its longer side. `None` if the
-    /// pinhole would have to zoom by more than 4.
+    /// place of a centred fisheye lens the view is at most 100° across its longer side. `None` if
+    /// the pinhole would have to zoom by more than 4.
     pub fn pinhole(&self) -> Option<Self> {
         if self.distortion.is_none() {
             return Some(self.zoomed_pinhole(1.0));
@@ -170,8 +170,7 @@ impl Intrinsics {
         self.distortion.is_cut(self.to_plane(position))
     }
 
-    /// Returns the position in this camera's image of a position in the image of another camera
-    /// with the same pose.
+    /// Converts an image position of `other`, a camera with the same pose, to this camera's image.
     pub fn source_position(&self, other: &Self, position: [f64; 2]) -> [f64; 2] {
         self.distort(self.to_image(other.to_plane(other.undistort(position))))
     }
@@ -192,16 +191,17 @@ impl Intrinsics {
         })
     }
 
-    /// Returns whether every image position has exactly one ray.
-    pub(crate) fn has_rays(&self) -> bool {
+    /// Returns whether the distortion is invertible along the image's border, and hence every image
+    /// position has exactly one ray.
+    pub(crate) fn has_unique_rays(&self) -> bool {
         self.distortion.is_none()
             || self
                 .border()
                 .all(|position| self.distortion.is_invertible_at(self.to_plane(position)))
     }
 
-    /// Returns whether the border of a pinhole's image is inside this camera's image, and the order
-    /// of rays is the same.
+    /// Returns whether the border of a pinhole's image is inside this camera's image, and the
+    /// distortion doesn't fold it.
     fn contains_view(&self, pinhole: &Self) -> bool {
         // With this camera's distortion, `border` samples each side.
         Self { distortion: self.distortion, ..*pinhole }.border().all(|position| {
@@ -287,10 +287,10 @@ mod tests {
         let bent = |radial, tangential| camera(Distortion::brown(radial, tangential));
         let folded = bent([-40.0, 0.0, 0.0], [0.0; 2]);
         assert_eq!(folded.pinhole(), None);
-        assert!(!folded.has_rays());
-        assert!(!bent([f64::NAN, 0.0, 0.0], [0.0; 2]).has_rays());
+        assert!(!folded.has_unique_rays());
+        assert!(!bent([f64::NAN, 0.0, 0.0], [0.0; 2]).has_unique_rays());
         // Bent a little further than any mild lens, the image folds in one corner alone.
-        assert!(!bent([-0.193, -0.047, -0.0156], [-0.0056, 0.0078]).has_rays());
+        assert!(!bent([-0.193, -0.047, -0.0156], [-0.0056, 0.0078]).has_unique_rays());
     }
 
     /// Creates a fisheye camera without distortion whose view is `degrees` wide.
@@ -303,7 +303,7 @@ mod tests {
     #[test]
     fn pixels_beyond_the_last_ray_are_masked() {
         let wide = fisheye(200.0);
-        assert!(wide.has_rays());
+        assert!(wide.has_unique_rays());
         let mask = wide.lens_mask().unwrap();
         for (i, counts) in mask.counts.iter().enumerate() {
             let (x, y) = ((i % 400) as f64 + 0.5 - wide.cx, (i / 400) as f64 + 0.5 - wide.cy);
@@ -345,7 +345,7 @@ mod tests {
         #[test]
         fn undistorting_undoes_distorting(camera in mild(), x in 0.0..400.0f64,
             y in 0.0..300.0f64) {
-            prop_assert!(camera.has_rays());
+            prop_assert!(camera.has_unique_rays());
             let [u, v] = camera.distort(camera.undistort([x, y]));
             prop_assert!((u - x).hypot(v - y) < 1e-9, "{u} {v}");
         }

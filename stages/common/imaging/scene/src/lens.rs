@@ -29,12 +29,11 @@ pub struct Distortion {
     pub denominator: [f64; 3],
 }
 
-/// Maximum error of undistortion, in focal lengths: a hundred-thousandth of a pixel at
-/// 10,000 pixels.
+/// Maximum error of undistortion, in focal lengths: 10⁻⁵ pixels at a focal length of 10,000 pixels.
 const UNDISTORT_TOLERANCE: f64 = 1e-9;
 
-/// Number of intervals of [`MAX_FISHEYE_ANGLE`] in which an angle is bracketed; chosen by hand. A
-/// lens that folds back within one interval is rejected if the fold is in the image.
+/// Number of intervals from 0 to [`MAX_FISHEYE_ANGLE`], one of which brackets an angle; chosen by
+/// hand. A lens that folds back within one interval is rejected if the fold is in the image.
 const ANGLE_INTERVALS: u32 = 16;
 
 fn is_zero(terms: &[f64; 3]) -> bool {
@@ -97,7 +96,7 @@ impl Distortion {
         self.projection == Projection::Fisheye
     }
 
-    /// True if all coefficients are numbers.
+    /// True if all coefficients are finite.
     pub fn is_finite(&self) -> bool {
         let radial = self.radial.iter().chain(&self.denominator);
         radial.chain(&self.tangential).all(|k| k.is_finite())
@@ -108,7 +107,8 @@ impl Distortion {
         self.distorted_position(self.projection.plane_position(slopes))
     }
 
-    /// Returns the Jacobian of [`Distortion::distort`]: [[∂x/∂x, ∂x/∂y], [∂y/∂x, ∂y/∂y]].
+    /// Returns the Jacobian of [`Distortion::distort`], [[∂u/∂x, ∂u/∂y], [∂v/∂x, ∂v/∂y]], of the
+    /// distorted position (u, v) by the slopes (x, y).
     pub fn jacobian(&self, slopes: [f64; 2]) -> [[f64; 2]; 2] {
         let [a, b, c] = self.position_jacobian(self.projection.plane_position(slopes));
         if self.projection.is_perspective() {
@@ -119,13 +119,13 @@ impl Distortion {
     }
 
     /// Returns the slopes of the ray at a distorted plane position. Beyond the radius at which a
-    /// perspective lens folds back, the result is meaningless. A fisheye ray is cut to 89° from the
-    /// axis.
+    /// perspective lens folds back, the result is meaningless. A fisheye ray's angle from the axis
+    /// is clamped to 89°.
     pub fn undistort(&self, distorted: [f64; 2]) -> [f64; 2] {
         self.projection.slopes(self.undistorted_position(distorted))
     }
 
-    /// True if a fisheye ray is cut to 89° from the axis at a position.
+    /// True if the fisheye ray at a position is cut: its angle from the axis is clamped to 89°.
     pub(crate) fn is_cut(&self, distorted: [f64; 2]) -> bool {
         self.is_fisheye() && is_at_limit(self.undistorted_position(distorted))
     }
@@ -141,15 +141,15 @@ impl Distortion {
         ]
     }
 
-    /// Returns the Jacobian of [`Distortion::distorted_position`], a symmetric matrix: ∂x/∂x,
-    /// ∂x/∂y and ∂y/∂y.
+    /// Returns the Jacobian of [`Distortion::distorted_position`], a symmetric matrix: ∂u/∂x,
+    /// ∂u/∂y and ∂v/∂y.
     fn position_jacobian(&self, [x, y]: [f64; 2]) -> [f64; 3] {
         let [p1, p2] = self.tangential;
-        let (radial, growth) = self.radial_factor(x * x + y * y);
+        let (radial, derivative) = self.radial_factor(x * x + y * y);
         [
-            radial + 2.0 * x * x * growth + 2.0 * p1 * y + 6.0 * p2 * x,
-            2.0 * x * y * growth + 2.0 * p1 * x + 2.0 * p2 * y,
-            radial + 2.0 * y * y * growth + 6.0 * p1 * y + 2.0 * p2 * x,
+            radial + 2.0 * x * x * derivative + 2.0 * p1 * y + 6.0 * p2 * x,
+            2.0 * x * y * derivative + 2.0 * p1 * x + 2.0 * p2 * y,
+            radial + 2.0 * y * y * derivative + 6.0 * p1 * y + 2.0 * p2 * x,
         ]
     }
 
@@ -186,17 +186,17 @@ impl Distortion {
         [x, y]
     }
 
-    /// Returns the smallest angle whose distorted radius, without tangential terms, is `distorted`,
-    /// or [`MAX_FISHEYE_ANGLE`] if there is none below. Newton's method within a bracket: a step
-    /// that leaves the bracket or is longer than half the last one is replaced by bisection, so the
-    /// loop ends.
-    fn undistorted_angle(&self, distorted: f64) -> f64 {
+    /// Returns the smallest angle whose distorted radius, without tangential terms, is `radius`, or
+    /// [`MAX_FISHEYE_ANGLE`] if there is none below. Newton's method within a bracket: a step that
+    /// leaves the bracket or is longer than half the last one is replaced by bisection, so the loop
+    /// ends.
+    fn undistorted_angle(&self, radius: f64) -> f64 {
         let mut low = 0.0;
         let mut high = 0.0;
         for i in 1..=ANGLE_INTERVALS {
             low = high;
             high = MAX_FISHEYE_ANGLE * f64::from(i) / f64::from(ANGLE_INTERVALS);
-            if self.distorted_angle(high).0 >= distorted {
+            if self.distorted_radius(high).0 >= radius {
                 break;
             }
             if i == ANGLE_INTERVALS {
@@ -206,13 +206,13 @@ impl Distortion {
         let mut angle = 0.5 * (low + high);
         let mut last = high - low;
         while last > f64::EPSILON * high {
-            let (value, growth) = self.distorted_angle(angle);
-            if value < distorted {
+            let (value, derivative) = self.distorted_radius(angle);
+            if value < radius {
                 low = angle;
             } else {
                 high = angle;
             }
-            let newton = angle - (value - distorted) / growth;
+            let newton = angle - (value - radius) / derivative;
             let is_good = low <= newton && newton <= high && (newton - angle).abs() <= 0.5 * last;
             let next = if is_good { newton } else { 0.5 * (low + high) };
             (angle, last) = (next, (next - angle).abs());
@@ -221,26 +221,26 @@ impl Distortion {
     }
 
     /// Returns the distorted radius of an angle, without tangential terms, and the derivative.
-    fn distorted_angle(&self, angle: f64) -> (f64, f64) {
+    fn distorted_radius(&self, angle: f64) -> (f64, f64) {
         let square = angle * angle;
-        let (radial, growth) = self.radial_factor(square);
-        (angle * radial, radial + 2.0 * square * growth)
+        let (radial, derivative) = self.radial_factor(square);
+        (angle * radial, radial + 2.0 * square * derivative)
     }
 
     /// Returns r and its derivative by ρ.
     fn radial_factor(&self, square: f64) -> (f64, f64) {
         let [k1, k2, k3, k4] = self.radial;
         let numerator = 1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4)));
-        let numerator_growth =
+        let numerator_derivative =
             k1 + square * (2.0 * k2 + square * 3.0 * k3 + square * square * 4.0 * k4);
         if is_zero(&self.denominator) {
-            return (numerator, numerator_growth);
+            return (numerator, numerator_derivative);
         }
         let [d1, d2, d3] = self.denominator;
         let denominator = 1.0 + square * (d1 + square * (d2 + square * d3));
-        let denominator_growth = d1 + square * (2.0 * d2 + square * (3.0 * d3));
+        let denominator_derivative = d1 + square * (2.0 * d2 + square * (3.0 * d3));
         let radial = numerator / denominator;
-        (radial, (numerator_growth - radial * denominator_growth) / denominator)
+        (radial, (numerator_derivative - radial * denominator_derivative) / denominator)
     }
 
     /// True if a position has exactly one ray: undoing the distortion succeeds, or a fisheye ray is
@@ -249,7 +249,7 @@ impl Distortion {
         let position = self.undistorted_position(distorted);
         let [u, v] = self.distorted_position(position);
         let is_found = (u - distorted[0]).abs().max((v - distorted[1]).abs()) < UNDISTORT_TOLERANCE;
-        // All positions at which rays are cut fraction one path, so the path has more samples.
+        // All positions with a cut ray share one path, so the path has more samples.
         let samples = if self.is_fisheye() { 64u32 } else { 16 };
         (is_found || self.is_fisheye() && is_at_limit(position))
             && (0..=samples).all(|i| {
@@ -261,7 +261,7 @@ impl Distortion {
     }
 }
 
-/// Cuts a fisheye plane position to [`MAX_FISHEYE_ANGLE`]; returns `otherwise` for one that isn't
+/// Clamps a fisheye plane position to [`MAX_FISHEYE_ANGLE`]; returns `otherwise` for one that isn't
 /// finite.
 fn clamped_angle(position: [f64; 2], otherwise: [f64; 2]) -> [f64; 2] {
     let angle = libm::hypot(position[0], position[1]);

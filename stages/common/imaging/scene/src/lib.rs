@@ -9,8 +9,8 @@
 //!   `[R | t]`, row by row.
 //! * **Pixels**: pixel (i, j) is column i of row j, row 0 on top, and covers the square [i, i+1) ×
 //!   [j, j+1): its **centre** is (i + 0.5, j + 0.5). The principal point of a centred camera is
-//!   (width/2, height/2). So resizing an image from W to W' multiplies `fx` and `cx` by W'/W and
-//!   nothing else; a half-pixel shift caps PSNR at 25–28 dB at 200 pixels.
+//!   (width/2, height/2). So resizing from W×H to W'×H' multiplies `fx`, `cx` by W'/W and `fy`,
+//!   `cy` by H'/H, without an offset; a half-pixel offset caps PSNR at 25–28 dB at 200 pixels.
 //! * **Distortion** is part of the intrinsics: [`Camera::ray`] and [`Camera::project`] apply it, so
 //!   photographs aren't resampled. A fisheye lens's rays end 89° from the axis, so that depth is
 //!   positive: pixels beyond are masked.

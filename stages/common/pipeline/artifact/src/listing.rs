@@ -95,7 +95,7 @@ fn is_dangling(path: &Path) -> bool {
 #[derive(Debug, thiserror::Error)]
 pub enum OutputFileError {
     /// A link or a special file, whose content is elsewhere or endless.
-    #[error("{path} is {kind}; write folders and regular files only")]
+    #[error("{path} is {kind}; an output is a folder of folders and regular files only")]
     Kind {
         /// Path of the file, or of the output itself.
         path: PathBuf,
@@ -155,7 +155,7 @@ pub fn relative_path(text: &str) -> Result<PathBuf, PathError> {
     let stays_inside =
         path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
     if text.is_empty() || !stays_inside || text.contains('\0') {
-        // A hostile path may be as long as its file.
+        // A hostile file may consist of one long path.
         return Err(PathError(text.chars().take(200).collect()));
     }
     Ok(path.components().filter(|part| matches!(part, Component::Normal(_))).collect())

@@ -104,8 +104,8 @@ pub fn format_amount(number: u64) -> String {
 pub fn format_size(bytes: u64) -> String {
     match bytes {
         0..1_000 => format_count(bytes as usize, "byte"),
-        1_000..1_000_000 => format!("{:.1} kB", bytes as f64 / 1e3),
-        1_000_000..1_000_000_000 => format!("{:.1} MB", bytes as f64 / 1e6),
+        1_000..999_950 => format!("{:.1} kB", bytes as f64 / 1e3),
+        999_950..999_950_000 => format!("{:.1} MB", bytes as f64 / 1e6),
         _ => format!("{:.1} GB", bytes as f64 / 1e9),
     }
 }
@@ -121,8 +121,8 @@ pub fn format_number(value: f64) -> String {
 /// hostile name. Chosen by hand.
 const MAX_NAME_BYTES: usize = 64;
 
-/// Returns the most similar known name, if at most one letter in three is wrong, missing, extra or
-/// swapped with the next.
+/// Returns the most similar known name, ignoring case, if at most a third of the letters, or one
+/// letter, is wrong, missing, extra or swapped with the next.
 pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     if name.len() > MAX_NAME_BYTES {
         return None;

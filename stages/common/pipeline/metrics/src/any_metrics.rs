@@ -21,8 +21,8 @@ impl AnyMetrics {
         serde_json::from_slice(&bytes).map(Self).map_err(|e| named(e.into()))
     }
 
-    /// Returns the numbers to display; `None` if the list is missing or contains anything but a
-    /// [`ScoreFormat`].
+    /// Returns the formats of the scores to display; `None` if the list is missing or contains
+    /// anything but a [`ScoreFormat`].
     pub fn figures(&self) -> Option<Vec<ScoreFormat>> {
         serde_json::from_value(self.0["figures"].clone()).ok()
     }
@@ -48,7 +48,7 @@ impl AnyMetrics {
         self.0["views"].as_array().map(Vec::as_slice).unwrap_or_default()
     }
 
-    /// Returns the methods of the metrics as text; null if missing.
+    /// Returns the metrics' definitions as text; null if missing.
     pub fn conventions(&self) -> &Value {
         &self.0["conventions"]
     }

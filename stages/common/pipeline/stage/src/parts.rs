@@ -9,8 +9,9 @@ use serde::de::DeserializeOwned;
 
 use crate::context::Context;
 
-/// Folder of `--work` with finished parts of outputs, by the stage's identity and the part's name.
-/// Each part is a folder with a manifest, so that an incomplete part is recognised.
+/// Folder of `--work` with finished parts of outputs, by the hash of the stage's code, inputs and
+/// parameters, and by the part's name. Each part is a folder with a manifest, so that an
+/// incomplete part is recognised.
 const PARTS_FOLDER: &str = "parts";
 /// File of a part's folder with the value that `create` returned.
 const VALUE_FILE: &str = "value.json";
@@ -55,8 +56,8 @@ impl Context {
         Ok(value)
     }
 
-    /// Copies a stored part's files to the output and returns its value; `None` if the part is
-    /// incomplete.
+    /// Links, or copies, a stored part's files into the output and returns the part's value; `None`
+    /// if the part is incomplete.
     fn restore_part<T: DeserializeOwned>(&self, folder: &Path, files: &[&str]) -> Option<T> {
         Manifest::read(folder).ok()?.check_contents(folder).ok()?;
         let value = serde_json::from_slice(&fs::read(folder.join(VALUE_FILE)).ok()?).ok()?;

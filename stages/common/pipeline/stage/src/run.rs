@@ -125,7 +125,7 @@ impl Program {
 /// Returns the help of `--threads`, with the default in this process.
 fn threads_help() -> String {
     let Processors { count, limit } = processors();
-    format!("Number of threads; doesn't affect the result [default: {count}, {limit}]")
+    format!("Number of threads; doesn't affect the result [default: {limit}, here {count}]")
 }
 
 /// Arguments of a run.

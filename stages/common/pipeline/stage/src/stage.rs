@@ -18,7 +18,7 @@ pub trait Stage {
     /// True if the stage is a sink, which presents a run and is never cached.
     const SINK: bool = false;
     /// True if the sink accepts a run with failed nodes.
-    const PARTIAL: bool = false;
+    const ACCEPTS_FAILURES: bool = false;
     /// True if the stage accepts `--from-checkpoint` ([`Context::from_checkpoint`]).
     const FROM_CHECKPOINT: bool = false;
     /// Environment variables that change the result.
@@ -58,7 +58,7 @@ pub trait Stage {
             output: Self::output(),
             environment: Self::ENVIRONMENT.iter().map(|&name| name.to_owned()).collect(),
             sink: Self::SINK,
-            partial: Self::PARTIAL,
+            partial: Self::ACCEPTS_FAILURES,
             from_checkpoint: Self::FROM_CHECKPOINT,
             rules: Self::rules(),
         }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use artifact::{Failure, MANIFEST_FILE, Manifest, bail_usage, write_json};
 
-/// Unpublished output: a folder next to the final one, which is removed unless published.
+/// Unpublished output: a folder next to the final one. Unless published, the folder is removed.
 pub(crate) struct Staging {
     folder: PathBuf,
 }

@@ -3,7 +3,7 @@
 pub struct TrainingMemory {
     /// Field, optimiser state, and the copy that a checkpoint is written from.
     pub field: u64,
-    /// Packed photographs and cached HR pixels, in memory or in the pixel file.
+    /// Packed photographs and cached HR pixels; those beyond `MAX_PIXEL_BYTES` are in a file.
     pub pixels: u64,
     /// Photographs in the form that pose refinement compares.
     pub poses: u64,
@@ -47,7 +47,7 @@ impl TrainingMemory {
     /// Adds an LR photograph, with the size of its HR image.
     pub fn add_photograph(&mut self, storage: PixelStorage, size: ImageSize, hr_size: ImageSize) {
         let cached = if storage.has_cache { hr_size.0 * hr_size.1 } else { 0 };
-        // Enlarged along one axis, then along both, in floats and in 8 bits.
+        // Buffers of the image enlarged along one axis (floats) and both (floats and 8 bits).
         let enlarged = if storage.has_cache {
             BYTES_PER_RGB_PIXEL * hr_size.0 * size.1 + (BYTES_PER_RGB_PIXEL + 3) * cached
         } else {
@@ -65,7 +65,7 @@ impl TrainingMemory {
     fn add(&mut self, storage: PixelStorage, (width, height): ImageSize, enlarged: u64) {
         let pixels = width * height;
         let packed = if storage.is_opaque { 3 } else { 4 };
-        // One bit per pixel for the mask and one for its detail.
+        // Two bits per pixel: whether the pixel is masked, and whether it has detail.
         self.pixels += packed * pixels + pixels / 4;
         let reading = (BYTES_PER_RGBA_PIXEL + BYTES_PER_RGB_PIXEL) * pixels + enlarged;
         self.reading = self.reading.max(reading);
@@ -74,27 +74,27 @@ impl TrainingMemory {
         }
     }
 
-    /// Returns the need of a program of `program` bytes with all pixels in the file.
+    /// Returns the bytes needed with all pixels in the file; `program` is from [`program_bytes`].
     pub fn minimum(&self, program: u64) -> u64 {
         program + self.poses + self.field.max(self.reading)
     }
 
-    /// Returns the need of a program of `program` bytes with unlimited memory.
+    /// Returns the bytes needed with unlimited memory; `program` is from [`program_bytes`].
     pub fn total(&self, program: u64) -> u64 {
         self.minimum(program) + self.pixels.min(MAX_PIXEL_BYTES)
     }
 }
 
-/// Returns the bytes of a training's program and of the samples of a step, with or without
-/// libtorch: the rest of the peak memory of small scenes.
+/// Returns the bytes that a training needs besides field, poses and pixels, with or without
+/// libtorch: for the program and the samples of a step. Measured with small scenes.
 pub const fn program_bytes(has_torch: bool) -> u64 {
     if has_torch { 175_000_000 } else { 35_000_000 }
 }
 
-/// Returns the bytes of a grid of `floats` in training.
-pub fn grid_training_bytes(floats: u64, has_checkpoints: bool) -> u64 {
+/// Returns the bytes of a grid with the given number of parameters in training.
+pub fn grid_training_bytes(parameters: u64, has_checkpoints: bool) -> u64 {
     let copied = if has_checkpoints { COPIED_FLOATS_PER_PARAMETER } else { 0 };
-    4 * (FLOATS_PER_PARAMETER + copied) * floats
+    4 * (FLOATS_PER_PARAMETER + copied) * parameters
 }
 
 #[cfg(test)]

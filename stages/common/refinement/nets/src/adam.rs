@@ -24,7 +24,7 @@ impl Adam {
     }
 
     /// Returns the number of steps taken.
-    pub fn updates(&self) -> u64 {
+    pub fn steps_taken(&self) -> u64 {
         self.updates
     }
 
@@ -38,13 +38,13 @@ impl Adam {
         self.updates += 1;
         let t = i32::try_from(self.updates).unwrap_or(i32::MAX);
         let bias_correction1 = 1.0 - 0.9f64.powi(t);
-        let bias_correction2 = (1.0 - 0.999f64.powi(t)).sqrt();
+        let sqrt_correction2 = (1.0 - 0.999f64.powi(t)).sqrt();
         no_grad(|| {
             for (i, (mut parameter, g)) in parameters.zip(gradients).enumerate() {
                 let (first, second) = (&mut self.first[i], &mut self.second[i]);
                 let _ = first.f_mul_scalar_(0.9)?.f_add_(&g.f_mul_scalar(0.1)?)?;
                 let _ = second.f_mul_scalar_(0.999)?.f_addcmul_(g, &g.f_mul_scalar(0.001)?)?;
-                let size = second.f_sqrt()?.f_div_scalar(bias_correction2)?.f_add_scalar(1e-8)?;
+                let size = second.f_sqrt()?.f_div_scalar(sqrt_correction2)?.f_add_scalar(1e-8)?;
                 let scale = -learning_rate / bias_correction1;
                 let _ = parameter.f_add_(&first.f_div(&size)?.f_mul_scalar(scale)?)?;
             }
@@ -113,7 +113,7 @@ fn read_counts<const N: usize>(weights: &Weights) -> Result<([u64; N], u64), Wei
     Ok((std::array::from_fn(|i| all[i] as u64), all[N] as u64))
 }
 
-/// Reads the `first` or `second` moments of trainable tensors to those tensors' devices.
+/// Reads the `first` or `second` moments of trainable tensors, each on its tensor's device.
 fn read_moments(
     weights: &Weights,
     kind: &str,
@@ -133,8 +133,8 @@ fn trainable(network: &[(String, Tensor)]) -> Vec<(String, Tensor)> {
     trainable.map(|(name, tensor)| (name.clone(), tensor.shallow_clone())).collect()
 }
 
-/// Returns the learning rate of step 0, 1, …: it rises to `highest` during the warm-up, and follows
-/// a cosine to 0.
+/// Returns the learning rate of step 0, 1, …: `highest` times a linear warm-up, times a cosine from
+/// 1 to 0.
 pub fn cosine_rate(highest: f64, step: u64, steps: u64, warm_up_steps: u64) -> f64 {
     let warm_up = ((step + 1) as f64 / warm_up_steps as f64).min(1.0);
     let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
@@ -154,7 +154,6 @@ pub fn add_gradients(sum: &mut [Tensor], gradients: &[Tensor]) -> Result<(), Tch
 /// Returns whether all elements of all tensors are finite.
 pub fn all_finite(tensors: &[Tensor]) -> Result<bool, TchError> {
     for tensor in tensors {
-        // A sum of finite elements may overflow, but such a gradient is useless, too.
         if !tensor.f_sum(Kind::Double)?.f_double_value(&[])?.is_finite() {
             return Ok(false);
         }

@@ -30,7 +30,7 @@ impl Adam {
     }
 
     /// Returns the number of steps taken.
-    pub(crate) fn updates(&self) -> u64 {
+    pub(crate) fn steps_taken(&self) -> u64 {
         self.updates
     }
 

@@ -2,27 +2,27 @@
 //! lack.
 //!
 //! A field trained on LR images renders edges too soft, and in the same way everywhere in a scene.
-//! The network takes a rendered view and predicts the residual. Its training views are smaller: a
-//! field trained on LR images that were downscaled once more renders views of LR size, whose ground
-//! truth is the LR images.
+//! The network takes a rendered view and predicts the residual. The network is trained
+//! at a smaller size, at which ground truth exists: a second field, trained on LR images that are
+//! downscaled once more, renders views of LR size, whose ground truth is the LR images.
 //!
 //! If HR images of some views are known (references), a reference-based network also takes the
 //! references' colours at each pixel's surface point. The field's depth gives the point's position
 //! in a reference, and whether it is visible there.
 //!
 //! * [`Rendered`]: a view rendered from a field; [`KnownView`]: a rendered view with its ground
-//!   truth, an example or a reference.
+//!   truth; serves as an example or as a reference.
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
 //! * [`with_references`]: adds reference features to a view; [`WarpOptions`] has the options.
 //! * [`LrObservations`]: LR photographs that views are made consistent with (data consistency).
-//! * [`RefinerTrainer`], [`RefinerTraining`]: training on examples, a [`Training`].
+//! * [`RefinerTrainer`]: a [`Training`] on examples; [`RefinerTraining`] has its options.
 //! * [`RefinerFile`]: description of a refiner in its artifact.
 //! * [`paper`]: the paper's own network, for comparison.
 //!
 //! Colours are display-encoded sRGB, composited on the background.
 //!
-//! Convolutions are Winograd's, on kernels of sixteen lanes. Gradients of shards are added in
-//! order, so bytes don't depend on the number of threads.
+//! Convolutions use Winograd's algorithm in SIMD code of sixteen lanes. Gradients of shards are
+//! added in order, so bytes don't depend on the number of threads.
 //!
 //! ```
 //! use pixels::Image;

@@ -72,8 +72,8 @@ pub struct RefinerFile {
     pub rendered_psnr: f64,
     /// Mean PSNR of the refined validation views, in dB.
     pub refined_psnr: f64,
-    /// Confidence in references as a fraction of their visibility in the validation views; absent
-    /// if the network takes no references.
+    /// Sum of the confidence over the sum of the visibility of references in the validation views:
+    /// 1 if references agree with renders. Absent if the network takes no references.
     #[serde(default)]
     pub confidence: Option<f64>,
     /// True if the network's input views are made consistent with their own LR photographs.
@@ -99,13 +99,13 @@ const MAX_CHANNELS: u32 = 4096;
 /// Maximum number of blocks of a network that is read from a file.
 const MAX_BLOCKS: u32 = 4096;
 /// Stream of random numbers for the initial weights.
-const WEIGHTS: u64 = 300;
+const WEIGHTS_STREAM: u64 = 300;
 
 impl Refiner {
     /// Creates an untrained network, whose residual is 0.
     pub fn new(architecture: RefinerArchitecture, seed: u64) -> Self {
-        let mut rng = CounterRng::new(seed, WEIGHTS, 0);
-        let layers = layers(architecture);
+        let mut rng = CounterRng::new(seed, WEIGHTS_STREAM, 0);
+        let layers = layer_sizes(architecture);
         let mut parameters = Vec::with_capacity(2 * layers.len());
         for (i, (_, inputs, outputs)) in layers.iter().enumerate() {
             // PyTorch's initialisation, so that blocks start with small residuals. The last layer
@@ -227,7 +227,8 @@ impl Refiner {
 }
 
 /// Predicts the residual in a window of a view, the mean over orientations: row by row,
-/// channels interleaved. It is 0 where the view is transparent as far as the network sees.
+/// channels interleaved. Without references, the residual is 0 if the view is transparent in the
+/// window and its receptive field.
 fn predict_residual(
     architecture: RefinerArchitecture,
     layers: &Layers,
@@ -268,7 +269,7 @@ fn predict_residual(
 }
 
 /// Returns name, inputs and outputs of each layer.
-pub(crate) fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
+pub(crate) fn layer_sizes(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
     let width = architecture.channels as usize;
     let blocks = (0..architecture.blocks).flat_map(|i| {
         [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]
@@ -285,7 +286,7 @@ fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
 
 /// Returns names and shapes of the parameters.
 fn parameter_shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
-    let shapes = layers(architecture).into_iter().flat_map(|(name, inputs, outputs)| {
+    let shapes = layer_sizes(architecture).into_iter().flat_map(|(name, inputs, outputs)| {
         [
             (format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()),
             (format!("{name}.bias"), vec![outputs as i64]),

@@ -9,7 +9,7 @@ use crate::adam::Adam;
 use crate::error::RefinementError;
 use crate::folded::{FOLD, Orientation, Window};
 use crate::network::{Layers, Pass};
-use crate::refiner::{Refiner, RefinerArchitecture, layers};
+use crate::refiner::{Refiner, RefinerArchitecture, layer_sizes};
 use crate::view::{KnownView, OUTPUTS, REFERENCE_INPUTS};
 use crate::warped_reference::{ReferenceStatistics, WarpOptions, with_references};
 
@@ -243,7 +243,7 @@ impl RefinerTrainer {
 
 impl Training for RefinerTrainer {
     fn steps(&self) -> u64 {
-        self.adam.updates()
+        self.adam.steps_taken()
     }
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
@@ -343,7 +343,7 @@ fn residual_samples(options: &RefinerTraining) -> usize {
 /// Adds the shards' gradients in order, and returns those of the parameters.
 fn merge_gradients(shards: &mut [Shard], architecture: RefinerArchitecture) -> Vec<Vec<f32>> {
     let [first, others @ ..] = shards else { return Vec::new() };
-    let layers = layers(architecture);
+    let layers = layer_sizes(architecture);
     let sums = first.pass.gradients.par_iter_mut().enumerate();
     let gradients = sums.map(|(i, sum)| {
         for other in &*others {

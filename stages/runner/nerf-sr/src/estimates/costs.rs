@@ -130,7 +130,7 @@ fn rendering_memory(work: &Work) -> Option<u64> {
 }
 
 fn scoring(work: &Work) -> (f64, u64) {
-    let (seconds, bytes) = if work.has_weights {
+    let (seconds, bytes) = if work.computes_lpips {
         (LPIPS_PIXEL_SECONDS, LPIPS_PIXEL_BYTES)
     } else {
         (SCORED_PIXEL_SECONDS, SCORED_PIXEL_BYTES)
@@ -194,7 +194,7 @@ mod tests {
             preparation_bytes: 0,
             field: Some(training(1)),
             is_fine_tuning: false,
-            has_weights: false,
+            computes_lpips: false,
             threads: 2,
         }
     }
@@ -297,7 +297,7 @@ mod tests {
         let fern = Work { pixels_across: 170.7, ..work(opaque, 17, 109) };
         let fern_field = Work { pixels_across: 170.7, ..work(opaque, 3, 218) };
         let lego = work(object, 50, 800);
-        let scored = Work { has_weights: true, ..lego.clone() };
+        let scored = Work { computes_lpips: true, ..lego.clone() };
         let photographs = |bytes| Work { preparation_bytes: bytes, ..work(object, 20, 1) };
         let refiner = json!({
             "net": "compact", "patch_size": 64, "batch_size": 8, "steps": 1, "self_ensemble": 1,

@@ -198,7 +198,7 @@ impl<'a> Estimator<'a> {
             preparation_bytes: scene.preparation_bytes,
             field: training.map(|training| training.parameters.clone()),
             is_fine_tuning: has_input("init"),
-            has_weights: has_input("weights"),
+            computes_lpips: has_input("weights"),
             threads: self.threads,
         })
     }

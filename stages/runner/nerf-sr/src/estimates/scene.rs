@@ -10,9 +10,10 @@ use super::work::{Images, SceneKind};
 
 /// Test views of a data set without a split: every eighth (`prep`'s `split: holdout`).
 const HOLDOUT: usize = 8;
-/// LR pixels across the field's cube over the width of an LR image: in NDC before the frustum is
-/// known (fern: 1.35), and in a contraction, as in `train-ss`.
+/// Width of the field's cube in NDC, in widths of an LR image, before the frustum is known: that of
+/// `fern`.
 const NDC_WIDTHS: f64 = 1.35;
+/// Width of the field's cube in a contraction, in widths of an LR image, as in `train-ss`.
 const CONTRACTION_WIDTHS: f64 = 2.0;
 /// Bytes per pixel of reading an 8-bit image, as in `dataset`.
 const READING_BYTES: u64 = 14;
@@ -21,7 +22,7 @@ const READING_BYTES: u64 = 14;
 #[derive(Clone, Debug)]
 pub(crate) struct SceneImages {
     pub(crate) kind: SceneKind,
-    /// LR pixels across the field's cube over the width of an LR image.
+    /// Width of the field's cube, in widths of an LR image.
     pub(crate) widths_across: f64,
     /// True if the kernel of the LR images is a mean.
     pub(crate) has_box_kernel: bool,
@@ -38,7 +39,7 @@ const FOLDERS: [&str; 6] =
     ["train", "downscaled", "train-cameras", "cameras", "truth", "references"];
 
 /// Scene that `prep` will read.
-struct Planned {
+struct PlannedScene {
     kind: SceneKind,
     widths_across: f64,
     /// Sizes of all photographs.
@@ -89,13 +90,13 @@ impl SceneImages {
             (_, Some(split)) => split,
         };
         let background = parameters["background"].as_str();
-        // LLFF's photographs have no background of one colour.
+        // Only Blender's images are taken as objects; `prep` also examines images with alpha.
         let is_object = set.format == Format::Blender;
         let is_opaque = background.map_or(!is_object, |background| background == "opaque");
         let space = parameters["space"].as_str();
         let is_ndc = space.map_or(set.format == Format::Llff, |space| space == "ndc");
         let kind = kind_of(is_opaque, is_ndc);
-        let planned = Planned {
+        let planned = PlannedScene {
             kind,
             widths_across: planned_widths_across(kind, space),
             sizes: set.frames.iter().map(size_of).collect(),
@@ -104,7 +105,7 @@ impl SceneImages {
         };
         // A file that can't be read is reported by `prep`.
         let reading = |index: usize| set.frames[index].reading_bytes().unwrap_or(0);
-        Some(Self::planned(&planned, parameters, reading))
+        Some(Self::from_plan(&planned, parameters, reading))
     }
 
     /// Predicts the images that `prep` makes of the demo scene.
@@ -115,7 +116,7 @@ impl SceneImages {
         let train = train as usize;
         let all = train + test as usize;
         let kind = kind_of(demo["backdrop"].as_bool()?, false);
-        let planned = Planned {
+        let planned = PlannedScene {
             kind,
             widths_across: planned_widths_across(kind, parameters["space"].as_str()),
             sizes: vec![size; all],
@@ -123,15 +124,15 @@ impl SceneImages {
             is_benchmark: true,
         };
         let reading = READING_BYTES * (size.0 * size.1) as u64;
-        Some(Self::planned(&planned, parameters, |_| reading))
+        Some(Self::from_plan(&planned, parameters, |_| reading))
     }
 
-    fn planned(
-        planned: &Planned,
+    fn from_plan(
+        planned: &PlannedScene,
         parameters: &Value,
         reading_bytes: impl Fn(usize) -> u64,
     ) -> Self {
-        let Planned { kind, widths_across, sizes, split, is_benchmark } = planned;
+        let PlannedScene { kind, widths_across, sizes, split, is_benchmark } = planned;
         let number = |name: &str| parameters[name].as_f64();
         let lr_width = number("lr_width");
         let is_downscaled = match parameters["lr_source"].as_str() {
@@ -153,10 +154,10 @@ impl SceneImages {
             images_of(&scaled.collect::<Vec<_>>())
         };
         let test: Vec<usize> = split.test.iter().copied().take(max_test).collect();
-        let references = number("hr_references").unwrap_or(0.0) as usize;
+        let references = number("hr_references").filter(|_| is_downscaled).unwrap_or(0.0) as usize;
         let references = &split.train[..references.min(split.train.len())];
         let mut read = [&split.train[..], &test].concat();
-        // Both parts of the paper's split are all views.
+        // With the paper's split, a view may be in both parts.
         read.sort_unstable();
         read.dedup();
         let preparation = read.iter().map(|&i| {
@@ -189,13 +190,13 @@ impl SceneImages {
             (images.count, images.pixels as f64 / 1e6)
         });
         let kind = match self.kind {
-            SceneKind::Object => "object before a plain background",
-            SceneKind::Frustum => "opaque scene that faces the cameras",
+            SceneKind::Object => "object in front of a plain background",
+            SceneKind::Frustum => "opaque scene, photographed from one side",
             SceneKind::Unbounded => "opaque scene around the cameras",
         };
         format!(
             "{kind}: {} training views of {:.2} million LR pixels in all, {} views of {:.2} \
-            million pixels to render",
+            million pixels in all to render",
             train.0, train.1, test.0, test.1
         )
     }
@@ -214,7 +215,7 @@ fn kind_of(is_opaque: bool, is_ndc: bool) -> SceneKind {
     }
 }
 
-/// Returns the LR pixels across the field's cube over the width of a view, as in `train-ss`.
+/// Returns the width of the field's cube, in widths of a view, as in `train-ss`.
 fn widths_across(space: &Value, views: &[Value]) -> Option<f64> {
     if space == "contraction" {
         return Some(CONTRACTION_WIDTHS);
@@ -234,7 +235,7 @@ fn planned_widths_across(kind: SceneKind, space: Option<&str>) -> f64 {
     }
 }
 
-/// Returns whether a kernel is a mean; without a given kernel, the default.
+/// Returns whether a kernel is a mean, or `by_default` if no kernel is given.
 fn is_box(kernel: &Value, by_default: bool) -> bool {
     kernel.as_str().map_or(by_default, |kernel| kernel != "lanczos" && kernel != "bicubic")
 }
@@ -275,8 +276,8 @@ mod tests {
         assert_eq!(sizes(&scene), expected);
         assert_eq!(
             scene.summary(),
-            "opaque scene around the cameras: 80 training views of 0.80 million LR pixels in all, 10 views of 0.40 \
-            million pixels to render"
+            "opaque scene around the cameras: 80 training views of 0.80 million LR pixels in all, \
+            10 views of 0.40 million pixels in all to render"
         );
 
         let smaller = json!({"scale": 4, "lr_width": 30, "test_views": 3, "hr_references": 0});
@@ -294,14 +295,14 @@ mod tests {
     /// Photographs keep their size for training, and views are larger.
     #[test]
     fn photographs_are_the_lr_images() {
-        let planned = Planned {
+        let planned = PlannedScene {
             kind: SceneKind::Unbounded,
             widths_across: 2.0,
             sizes: vec![(640.0, 480.0); 9],
             split: Split::hold_out(9, HOLDOUT),
             is_benchmark: false,
         };
-        let scene = SceneImages::planned(&planned, &json!({"scale": 2}), |_| 7);
+        let scene = SceneImages::from_plan(&planned, &json!({"scale": 2}), |_| 7);
         let images = |count, factor: u64| {
             let largest_size = (factor * 640, factor * 480);
             Some(Images { count, pixels: count * largest_size.0 * largest_size.1, largest_size })
@@ -311,7 +312,7 @@ mod tests {
         assert_eq!(scene.preparation_bytes, preparation_bytes(7, 640 * 480, 0));
         assert!(scene.has_box_kernel);
         let lanczos = json!({"scale": 2, "kernel": "lanczos", "lr_width": 320});
-        let scene = SceneImages::planned(&planned, &lanczos, |_| 7);
+        let scene = SceneImages::from_plan(&planned, &lanczos, |_| 7);
         assert_eq!(scene.preparation_bytes, preparation_bytes(7, 640 * 480, 640 * 480));
         assert!(!scene.has_box_kernel);
     }

@@ -39,7 +39,7 @@ impl Images {
         self.largest_size.0 * self.largest_size.1
     }
 
-    /// Returns as many images of another width.
+    /// Returns the same number of images, scaled to another width.
     pub(crate) fn resized(&self, width: f64) -> Self {
         let factor = width / self.largest_size.0.max(1) as f64;
         let scaled = |side: u64| (side as f64 * factor).round() as u64;
@@ -68,7 +68,7 @@ pub(crate) struct Work {
     /// True if a training is initialised from a field.
     pub(crate) is_fine_tuning: bool,
     /// True if views are scored by LPIPS.
-    pub(crate) has_weights: bool,
+    pub(crate) computes_lpips: bool,
     /// Number of threads.
     pub(crate) threads: u64,
 }
@@ -87,12 +87,12 @@ impl Work {
         Some(Self { kind, images, threads, ..Self::default() })
     }
 
-    /// Returns the part of the LR pixels' area that a field of limited size resolves.
+    /// Returns the fraction of the wanted cells per LR pixel, by area, that the limited field has.
     pub(crate) fn resolved_part(&self, training: &Value) -> Option<f64> {
         let sizes = GivenSizes::deserialize(training).ok()?;
-        let cells = sizes.for_scene(self.pixels_across, self.kind == SceneKind::Frustum);
+        let architecture = sizes.for_scene(self.pixels_across, self.kind == SceneKind::Frustum);
         let wanted = radiance::CELLS_PER_PIXEL * self.pixels_across.max(1.0);
-        Some((f64::from(cells.max_resolution) / wanted).powi(2).min(1.0))
+        Some((f64::from(architecture.max_resolution) / wanted).powi(2).min(1.0))
     }
 
     /// Returns the number of floats of a grid that is trained with some parameters.

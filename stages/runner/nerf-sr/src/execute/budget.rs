@@ -47,12 +47,13 @@ impl Demand {
 pub(crate) struct Budget {
     /// Maximum number of stages.
     pub(crate) stages: usize,
-    /// Number of cores of all stages, and number of threads of each stage: stages share the cores
-    /// through the kernel, and a stage that runs alone uses all of them.
+    /// Number of cores of all stages, and number of threads of each stage: the operating system
+    /// divides the cores among the stages, and a stage that runs alone uses all cores.
     pub(crate) threads: usize,
     /// Memory in bytes.
     pub(crate) memory: u64,
-    /// Limit below the machine's number of processors, if the number of threads is due to one.
+    /// Limit that makes `threads` less than the machine's number of processors, such as a cgroup;
+    /// `None` if there is no such limit, or with `--threads`.
     pub(crate) limit: Option<ProcessorLimit>,
 }
 
@@ -88,8 +89,8 @@ impl Budget {
         let (needed, limit) = (format_size(demand.memory), format_size(self.memory));
         if demand.memory > self.memory {
             return Admission::TooLarge(format!(
-                "needs {needed} of memory, as in its last run, but the limit is {limit}; change \
-                the limit with --memory"
+                "needs {needed} of memory, as in its most similar earlier run, but the limit is \
+                {limit}; change the limit with --memory"
             ));
         }
         let cores: usize = running.values().map(|demand| demand.cores).sum();
@@ -102,7 +103,8 @@ impl Budget {
             return Admission::Start;
         }
         Admission::WaitForMemory(format!(
-            "needs {needed} of memory, as in its last run, but {} of {limit} are free",
+            "needs {needed} of memory, as in its most similar earlier run, but {} of {limit} are \
+            free",
             format_size(free)
         ))
     }
@@ -160,13 +162,14 @@ mod tests {
         assert_eq!(admission_beside(&[demand(3, 0)], demand(4, 0)), Admission::Start);
         assert_eq!(admission_beside(&[demand(4, 0)], demand(1, 0)), Admission::Wait);
         assert_eq!(admission_beside(&[DEFAULT_DEMAND; 3], DEFAULT_DEMAND), Admission::Wait);
-        let wait = "needs 4.0 GB of memory, as in its last run, but 3.0 GB of 8.0 GB are free";
+        let wait = "needs 4.0 GB of memory, as in its most similar earlier run, but 3.0 GB of \
+            8.0 GB are free";
         assert_eq!(
             admission_beside(&[demand(1, 5)], demand(1, 4)),
             Admission::WaitForMemory(wait.to_owned())
         );
-        let too_large = "needs 9.0 GB of memory, as in its last run, but the limit is 8.0 GB; \
-            change the limit with --memory";
+        let too_large = "needs 9.0 GB of memory, as in its most similar earlier run, but the limit \
+            is 8.0 GB; change the limit with --memory";
         assert_eq!(admission_beside(&[], demand(1, 9)), Admission::TooLarge(too_large.to_owned()));
     }
 

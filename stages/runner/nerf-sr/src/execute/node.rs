@@ -53,8 +53,8 @@ impl NodeJob<'_> {
         }
     }
 
-    /// Looks up the node's record. Either way, the run's file gets the node's key first, which
-    /// protects the artifact from garbage collection.
+    /// Looks up the node's record. Cached or not, the node's key is first written to the run's
+    /// file, which protects the artifact from garbage collection.
     pub(crate) fn look_up(&self) -> Result<Lookup, StageFailure> {
         let inputs = hash_inputs(self.node, self.run.store, Some(self.run.stop), |index| {
             self.output_of(index)
@@ -159,7 +159,7 @@ impl NodeJob<'_> {
     }
 
     /// Calls the stage and returns its usage and running time. Fails if the program or an input
-    /// differs from the key's at any time from start to end.
+    /// differs from the one in the key, before or after the call.
     fn call(
         &self,
         lock: &KeyLock,

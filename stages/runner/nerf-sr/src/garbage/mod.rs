@@ -43,7 +43,8 @@ impl Collection {
     pub(crate) fn new(store: &Store, plan: Root, policy: Policy) -> Result<Self, StoreError> {
         let contents = Contents::read(store)?;
         let runs = store.runs()?;
-        // Read after the runs: a run that was submitted and has ended by then has left jobs.
+        // Submissions are read after the runs: if a run submits jobs and ends between the two
+        // reads, its jobs are found.
         let submissions = roots::outstanding_submissions(store)?;
         let roots = roots::find_roots(store, &contents, plan, policy, &runs, &submissions)?;
         let kept = reach::reach(&contents, &roots);

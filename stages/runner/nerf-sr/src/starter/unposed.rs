@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use artifact::format_count;
-use dataset::{is_image_name, is_unsupported_name, unsupported_images};
+use dataset::{is_image_name, is_unsupported_name, unsupported_summary};
 
 /// Images of a folder, or of its subfolder `images`.
 pub(crate) struct UnposedImages {
@@ -26,7 +26,7 @@ impl UnposedImages {
     /// formats.
     pub(crate) fn summary(&self) -> String {
         let images = format_count(self.files.len(), "image");
-        match unsupported_images(&self.files) {
+        match unsupported_summary(&self.files) {
             Some(unsupported) => format!("{images} ({unsupported})"),
             None => images,
         }

@@ -40,8 +40,10 @@ struct QualityCosts {
     total: Cost,
     /// Memory below which a stage of the plan fails.
     min_memory: u64,
-    /// Number of stages that would run without an estimate.
+    /// Number of stages that would run and have no estimate.
     unknown: usize,
+    /// True if the total excludes refining, because the plan doesn't refine.
+    excludes_refining: bool,
 }
 
 /// Columns of the table, and the programs whose cost is in each.
@@ -104,6 +106,9 @@ fn print_table(all: &[QualityCosts], processors: usize) {
         let (name, total) = (costs.quality.name(), costs.total.text(processors));
         print_line!("{name:<9} {} {total}", parts.join(" "));
     }
+    if all.iter().any(|costs| costs.excludes_refining) {
+        print_line!("in all is without refining, which `nerf-sr run {REFINING_TARGET}` adds");
+    }
     let unknown = all[0].unknown;
     if unknown > 0 {
         print_line!("without {}, whose cost isn't known", format_count(unknown, "stage"));
@@ -153,6 +158,7 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
         total: Cost::default(),
         min_memory: 0,
         unknown: estimates.unknown,
+        excludes_refining: false,
     };
     for (index, estimate) in estimates.iter() {
         let program = plan.nodes[index].program.description.name.as_str();
@@ -166,6 +172,7 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
         && let Some(refining) = refining_cost(session, &request, &plan)
     {
         costs.parts[REFINING] = refining;
+        costs.excludes_refining = true;
     }
     Ok(costs)
 }
@@ -204,6 +211,7 @@ mod tests {
                 total: Cost { seconds: 60.0 * f64::from(size), memory: 200_000_000 },
                 min_memory: 100_000_000 * u64::from(size),
                 unknown: 0,
+                excludes_refining: false,
             })
             .collect()
     }

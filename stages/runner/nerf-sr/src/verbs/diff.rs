@@ -39,7 +39,7 @@ fn lines(difference: &StageDifference) -> Vec<String> {
     let (files, mut listed): (Vec<&Change>, Vec<&Change>) =
         difference.changes.iter().partition(|change| change.name.starts_with("file "));
     let summary = (files.len() > MAX_LISTED_FILES).then(|| {
-        let first = files[0].name.trim_start_matches("file ");
+        let first = files[0].name.strip_prefix("file ").unwrap_or_default();
         format!("{stage}: {} files differ, such as {first}", files.len())
     });
     if summary.is_none() {
@@ -60,7 +60,10 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
         records.retain(|r| r.output.starts_with(text) || r.key().starts_with(text));
         if let Some(record) = records.first() {
             if records.iter().any(|other| other.output != record.output) {
-                return Err(usage(text, "several artifacts begin with this; give more characters"));
+                return Err(usage(
+                    text,
+                    "several artifacts' hashes begin with this; give more characters",
+                ));
             }
             return Lineage::read(store, [record.key()]);
         }
@@ -72,7 +75,7 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
 fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let mut words = text.split_whitespace();
     let Some(stage) = words.next() else {
-        return Err(usage(text, "expected a stage, an artifact's hash, or a run"));
+        return Err(usage(text, "expected a stage, an artifact's hash, a run or a pin"));
     };
     let mut request = Request { targets: vec![stage.to_owned()], ..Request::default() };
     while let Some(word) = words.next() {
@@ -80,8 +83,10 @@ fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
             "-p" => &mut request.parameters,
             "-i" => &mut request.inputs,
             _ => {
-                let problem =
-                    format!("expected -p or -i, found {word}; quote each side as one word");
+                let problem = format!(
+                    "expected -p or -i, found {word}; quote each result, such as \
+                    \"eval -p kernel=box\""
+                );
                 return Err(usage(text, &problem));
             }
         };

@@ -1,8 +1,8 @@
 //! The caller's half of the stage contract; the crate `stage` is the other half.
 //!
 //! * [`describe_all`]: descriptions of programs, from `STAGE describe`.
-//! * [`Call`]: one run of a stage, with its log and its [`Usage`]. If it is stopped, the stage is
-//!   asked to end, so that it can write a checkpoint.
+//! * [`Call`]: one run of a stage, with its log and its [`Usage`]. If a call is stopped, the stage
+//!   is asked to end and can write a checkpoint.
 //! * [`StageFailure`]: cause of a failure, found from the stage's messages, its allocator's
 //!   messages, and the signal that ended its process.
 //! * [`stop_on_signals`]: the first signal sets a flag, the second kills all child processes.

@@ -1,5 +1,5 @@
-//! Rays march in parallel lanes. Leaps of one ray depend on each other, so a ray alone would wait
-//! for each.
+//! Marches as many rays at a time as there are lanes. A leap of a ray depends on the ray's previous
+//! leap, so the processor would idle with one ray.
 
 use super::marched::{DONE, March, MarchedSamples};
 use crate::math::floor;
@@ -20,13 +20,14 @@ pub(super) trait RayKind {
     /// Returns the rays' positions at t, one array per axis.
     fn positions(rays: &LaneRays, t: &[f32; LANES]) -> [[f32; LANES]; 3];
 
-    /// Returns a t at which each ray is inside, or leaves, the empty cube of 2^size cells per side
-    /// around its position.
+    /// Returns for each ray a t that is not beyond the ray's exit from the empty cube around the
+    /// ray's position. The cube has 2^size cells per side.
     fn exits(rays: &LaneRays, lane_positions: &LanePositions, sizes: &[u32; LANES])
     -> [f32; LANES];
 }
 
-/// Mask of an empty cube's size, at most 7: shifts known to be below 32 vectorise without a check.
+/// Mask of the exponent of an empty cube's side, at most 7: shifts known to be below 32 vectorise
+/// without a check.
 const SIZE_MASK: u32 = 0b111;
 
 /// The rays of all lanes.
@@ -36,9 +37,11 @@ pub(super) struct LaneRays {
     pub(super) direction: [[f32; LANES]; 3],
     /// 1 over the direction.
     pub(super) inverse: [[f32; LANES]; 3],
-    /// `radii` of a curved ray's map.
+    /// Ball radii per sinh(4t) of curved rays; 0 for straight ones.
     pub(super) radii: [f32; LANES],
+    /// Offset of the first step, in steps.
     offset: [f32; LANES],
+    /// Range of t in the unit cube.
     enter: [f32; LANES],
     leave: [f32; LANES],
 }
@@ -61,7 +64,7 @@ struct RayLanes<'a> {
     /// Index in `active` of the next ray without a lane.
     next_active: usize,
     /// Bits of the lanes that have a ray.
-    occupied_lanes: u32,
+    busy_lanes: u32,
     /// Index in `active` of each lane's ray.
     active_index: [usize; LANES],
     rays: LaneRays,
@@ -85,7 +88,7 @@ pub(super) fn march<K: RayKind>(
     for lane in 0..LANES {
         lanes.assign_ray::<K>(lane, next);
     }
-    while lanes.occupied_lanes != 0 {
+    while lanes.busy_lanes != 0 {
         let (lane_positions, mut stops) = lanes.advance::<K>();
         while stops != 0 {
             let lane = stops.trailing_zeros() as usize;
@@ -151,7 +154,7 @@ impl<'a> RayLanes<'a> {
             max_samples,
             active,
             next_active: 0,
-            occupied_lanes: 0,
+            busy_lanes: 0,
             active_index: [0; LANES],
             rays: LaneRays::new(),
             until: [0.0; LANES],
@@ -162,7 +165,7 @@ impl<'a> RayLanes<'a> {
     /// Assigns to a lane the next active ray that crosses occupied cells.
     #[inline(always)]
     fn assign_ray<K: RayKind>(&mut self, lane: usize, next: &mut [u32]) {
-        self.occupied_lanes &= !(1 << lane);
+        self.busy_lanes &= !(1 << lane);
         while let Some(&r) = self.active.get(self.next_active) {
             let (ray, offset) = (&self.march.rays[r as usize], self.march.offsets[r as usize]);
             let inverse = ray.direction.map(|d| 1.0 / d);
@@ -173,10 +176,10 @@ impl<'a> RayLanes<'a> {
             };
             self.rays.set(lane, ray, inverse, offset);
             self.until[lane] = until;
-            let first = first_step((from - ray.enter).mul_add(1.0 / self.march.step, -offset));
+            let first = ceil_steps((from - ray.enter).mul_add(1.0 / self.march.step, -offset));
             self.k[lane] = first.max(next[r as usize]);
             self.active_index[lane] = self.next_active - 1;
-            self.occupied_lanes |= 1 << lane;
+            self.busy_lanes |= 1 << lane;
             return;
         }
     }
@@ -201,16 +204,17 @@ impl<'a> RayLanes<'a> {
         let exits = K::exits(&self.rays, &lane_positions, &sizes.map(|size| size & SIZE_MASK));
         let mut stops = 0;
         for i in 0..LANES {
-            let leap = first_step((exits[i] - enter[i]).mul_add(1.0 / step, -offset[i]));
+            let exit_step = ceil_steps((exits[i] - enter[i]).mul_add(1.0 / step, -offset[i]));
             let stop = (lane_positions.t[i] >= self.until[i]) | (sizes[i] == OCCUPIED);
-            self.k[i] = if stop { self.k[i] } else { leap.max(self.k[i] + 1) };
+            self.k[i] = if stop { self.k[i] } else { exit_step.max(self.k[i] + 1) };
             stops |= u32::from(stop) << i;
         }
-        (lane_positions, stops & self.occupied_lanes)
+        (lane_positions, stops & self.busy_lanes)
     }
 
-    /// Advances a lane's ray by a step, and stores the sample of that step, if its strides have
-    /// one. Returns whether the ray may have more samples.
+    /// Stores the sample of a lane's current step and advances the ray by a step. With double
+    /// strides, only even-numbered steps have a sample. Returns whether the ray may have more
+    /// samples.
     #[inline(always)]
     fn take_sample(
         &mut self,
@@ -235,8 +239,8 @@ impl<'a> RayLanes<'a> {
     }
 }
 
-/// Returns the cells along one axis. A function per axis, since the compiler would vectorise a loop
-/// over axes.
+/// Returns the cells along one axis. Called once per axis: in a loop over the axes, the compiler
+/// would vectorise across axes instead of lanes.
 #[inline(always)]
 fn cells_along(positions: &[f32; LANES]) -> [u32; LANES] {
     let mut cells = [0; LANES];
@@ -251,7 +255,7 @@ const MAX_STEPS: f32 = 4_194_304.0;
 
 /// Rounds a number of steps up; 0 for NaN.
 #[inline(always)]
-pub(super) fn first_step(steps: f32) -> u32 {
+pub(super) fn ceil_steps(steps: f32) -> u32 {
     let steps = steps.max(0.0).min(MAX_STEPS);
     let (below, step) = floor(steps);
     step + u32::from(steps > below)
@@ -275,7 +279,7 @@ mod tests {
             (1e9, 4_194_304),
             (f32::INFINITY, 4_194_304),
         ] {
-            assert_eq!(first_step(number), step, "{number}");
+            assert_eq!(ceil_steps(number), step, "{number}");
         }
     }
 }

@@ -4,7 +4,7 @@ use crate::occupancy::Occupancy;
 use crate::ray::NormalizedRay;
 use crate::spec::Strides;
 
-/// Number of a ray's next step after it has left the box.
+/// Value that replaces the number of a ray's next step after the ray has left the cube.
 pub(crate) const DONE: u32 = u32::MAX;
 
 /// Rays to march, and their sampling.
@@ -19,7 +19,8 @@ pub(crate) struct March<'a> {
     pub(crate) strides: Strides,
 }
 
-/// Samples found by marching, by round, then by ray; padding follows each round's samples.
+/// Samples found by marching, in the order of rounds, then of rays. Padding follows each round's
+/// samples.
 #[derive(Debug, Default)]
 pub(crate) struct MarchedSamples {
     /// Ray parameter of each sample.
@@ -28,7 +29,8 @@ pub(crate) struct MarchedSamples {
     pub(crate) lengths: Vec<f32>,
     /// Position of each sample in the unit cube.
     pub(crate) positions: Vec<[f32; 3]>,
-    /// Index of each active ray's first sample in the last round, and the end without padding.
+    /// Index of each active ray's first sample in the last round. An additional last element is
+    /// the end of the round's samples, without padding.
     pub(crate) starts: Vec<usize>,
     pub(super) slots: SampleSlots,
 }

@@ -63,7 +63,7 @@ impl<'a> Bytes<'a> {
         if count > (self.rest.len() / size.max(1)) as u64 {
             let left = self.rest.len();
             let problem = format!("{count} {what} don't fit into the remaining {left} bytes");
-            return Err(self.error(problem));
+            return Err(self.error(format!("{problem}; copy the file again")));
         }
         Ok(count as usize)
     }
@@ -71,7 +71,7 @@ impl<'a> Bytes<'a> {
     /// Reads null-terminated text.
     pub(super) fn text(&mut self, what: &str) -> Result<&'a str, DatasetError> {
         let Some(end) = self.rest.iter().position(|b| *b == 0) else {
-            return Err(self.error(format!("{what} is not terminated")));
+            return Err(self.error(format!("{what} is not terminated; copy the file again")));
         };
         let bytes = &self.take(end + 1, what)?[..end];
         std::str::from_utf8(bytes).map_err(|_| {

@@ -122,7 +122,8 @@ impl Output {
 }
 
 impl Description {
-    /// Checks the schema, and that rules refer to existing names and folders are inside the output.
+    /// Checks that the schema is valid, the stage has a name, folders are inside the output, and
+    /// rules refer to existing names.
     pub fn check(&self) -> Result<(), ContractError> {
         let schema = Schema::new(&self.parameters)
             .map_err(|e| ContractError(format!("parameter schema: {e}")))?;

@@ -45,7 +45,7 @@ pub(crate) struct Validator {
 /// Value that violates the schema.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Misfit {
-    /// JSON pointer from the checked value to the invalid one.
+    /// Keys and indices from the checked value to the invalid one, each after a `/`.
     pub(crate) path: String,
     /// Invalid value.
     pub(crate) value: Value,
@@ -92,8 +92,8 @@ fn check_schema(root: &Value, schema: &Value) -> Result<(), ContractError> {
             "minLength" | "maxLength" | "minItems" | "maxItems" => value.is_u64(),
             "$ref" => resolve_reference(root, value).is_some(),
             "properties" | "$defs" | "definitions" => value.is_object(),
-            // Further keywords are descriptions, defaults, formats, and extensions such as
-            // `x-group`.
+            // Any value is allowed for `const`, descriptions, defaults, formats and extensions such
+            // as `x-group`. `items`, `additionalProperties` and `not` are checked below.
             other if !UNSUPPORTED.contains(&other) => true,
             other => {
                 let problem = format!("keyword {other} isn't supported; leave it out");
@@ -200,15 +200,15 @@ impl<'a> Check<'a> {
     fn check_number(&mut self, keywords: &Map<String, Value>, number: &Number, value: &Value) {
         use Ordering::{Equal, Greater, Less};
         for (keyword, wrong, problem) in [
-            ("minimum", &[Less][..], "less than the minimum"),
-            ("maximum", &[Greater], "greater than the maximum"),
-            ("exclusiveMinimum", &[Less, Equal], "less than or equal to the minimum"),
-            ("exclusiveMaximum", &[Greater, Equal], "greater than or equal to the maximum"),
+            ("minimum", &[Less][..], "less than the minimum of"),
+            ("maximum", &[Greater], "greater than the maximum of"),
+            ("exclusiveMinimum", &[Less, Equal], "not greater than"),
+            ("exclusiveMaximum", &[Greater, Equal], "not less than"),
         ] {
             if let Some(Value::Number(bound)) = keywords.get(keyword)
                 && compare(number, bound).is_none_or(|order| wrong.contains(&order))
             {
-                self.report(value, format!("{value} is {problem} of {bound}"));
+                self.report(value, format!("{value} is {problem} {bound}"));
             }
         }
         if let Some(Value::Number(step)) = keywords.get("multipleOf")

@@ -62,7 +62,7 @@ const EPSILON: f64 = 1e-5;
 /// Maximum width of a network that is read from a file.
 const MAX_WIDTH: u32 = 1024;
 /// Stream of random numbers for the initial weights.
-const WEIGHTS: u64 = 320;
+const WEIGHTS_STREAM: u64 = 320;
 
 impl PaperRefiner {
     /// Creates an untrained network, initialised as in the authors' code (He et al. 2015; scales of
@@ -71,7 +71,7 @@ impl PaperRefiner {
         let mut number = 0;
         Self::build(width, |_, shape, kind| {
             number += 1;
-            let mut rng = CounterRng::new(seed, WEIGHTS, number);
+            let mut rng = CounterRng::new(seed, WEIGHTS_STREAM, number);
             let count = shape.iter().product::<i64>();
             let inputs = shape[1..].iter().product::<i64>() as f64;
             let values: Vec<f32> = match kind {

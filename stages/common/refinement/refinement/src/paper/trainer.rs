@@ -65,7 +65,7 @@ impl PaperTrainer {
 
 impl Training for PaperTrainer {
     fn steps(&self) -> u64 {
-        self.adam.updates()
+        self.adam.steps_taken()
     }
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
