@@ -136,7 +136,8 @@ impl<'a> Estimator<'a> {
         let program = &node.program.description.name;
         let work = self.work(node)?;
         let model = model_cost(program, &node.parameters, &work)?;
-        let earlier = self.nearest(node, state, model).and_then(corrections);
+        let earlier =
+            self.nearest(node, state, model).and_then(|record| corrections(record, model));
         let (time, memory) = earlier.unwrap_or_else(|| (machine::slowness(), 1.0));
         let min_memory = min_memory(program, &node.parameters, &work)?;
         Some(Estimate {
@@ -261,11 +262,16 @@ fn partial_key_parts(node: &Node) -> Map<String, Value> {
     parts
 }
 
-/// Returns the factors from the model's time and memory to the measured ones.
-fn corrections(record: &Record) -> Option<(f64, f64)> {
-    let model = record.model?;
-    let time = record.processor_seconds? / model.processor_seconds;
-    let memory = record.peak_memory? as f64 / model.peak_memory as f64;
+/// Returns the factors by which the model's time and memory are corrected after an earlier run.
+fn corrections(record: &Record, model: ModelCost) -> Option<(f64, f64)> {
+    let other = record.model?;
+    let time = record.processor_seconds? / other.processor_seconds;
+    let (measured, expected) = (record.peak_memory? as f64, other.peak_memory as f64);
+    let mut memory = measured / expected;
+    if memory < 1.0 {
+        // A smaller program, such as one without libtorch, saves no more in a larger training.
+        memory = memory.max(1.0 - (expected - measured) / model.peak_memory as f64);
+    }
     // The time's factor has no limit, because it contains the speed of the machine.
     Some((time, memory.clamp(1.0 / MAX_CORRECTION, MAX_CORRECTION)))
 }
@@ -307,8 +313,11 @@ mod tests {
             model: Some(model),
             ..Record::default()
         };
-        assert_eq!(corrections(&record(15.0, 500)), Some((1.5, 0.5)));
-        assert_eq!(corrections(&record(100.0, 9000)), Some((10.0, MAX_CORRECTION)));
-        assert_eq!(corrections(&Record { model: None, ..record(15.0, 500) }), None);
+        assert_eq!(corrections(&record(15.0, 500), model), Some((1.5, 0.5)));
+        assert_eq!(corrections(&record(100.0, 9000), model), Some((10.0, MAX_CORRECTION)));
+        assert_eq!(corrections(&Record { model: None, ..record(15.0, 500) }, model), None);
+        let size = |peak_memory| ModelCost { peak_memory, ..model };
+        assert_eq!(corrections(&record(15.0, 500), size(2000)), Some((1.5, 0.75)));
+        assert_eq!(corrections(&record(15.0, 500), size(600)), Some((1.5, 0.5)));
     }
 }
