@@ -150,7 +150,7 @@ fn rates(case: &'static str, grid: f64, mlps: f64) -> Change {
 fn training() -> Vec<Row> {
     use Expected::{Like, Psnr};
     vec![
-        rays("1", 1).fast().expect(Expected::Refused(2, "one pixel needs 4"), ""),
+        rays("1", 1).fast().expect(Expected::Refused(2, "one LR pixel needs 4"), ""),
         rays("4", 4).expect(Psnr(3.0), "one step"),
         rays("1 M", 1_000_000).expect(Psnr(20.0), "longer"),
         rays("4 M", 4_000_000).expect(Psnr(20.0), "longer"),
