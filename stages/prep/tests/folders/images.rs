@@ -264,7 +264,7 @@ pub(crate) fn cases() -> Vec<Case> {
             Expected::Scene(with_lines(
                 held_out("a#", 3, &[THREE]),
                 &[
-                    "warning: 16 of 768 pixels (2.08 %) are brighter than 1 and clipped to 1, in 1 of 3 EXR photographs (first: frame a1); to keep them, scale the files' values to at most 1",
+                    "warning: 16 of 768 pixels (2.08 %) are brighter than 1 and clipped to 1, in 1 of 3 EXR photographs (first: frame a1); to keep them, scale the files to at most 1",
                 ],
             ))
         }),
