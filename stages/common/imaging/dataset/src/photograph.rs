@@ -91,9 +91,7 @@ pub(crate) fn read_header(path: &Path) -> Result<ImageHeader, PixelError> {
     if width == 0 || height == 0 {
         return Err(PixelError::format(path, format!("{width}×{height} pixels")));
     }
-    if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 {
-        return Err(PixelError::too_large(path, width as usize, height as usize));
-    }
+    PixelError::check_size(path, (width as usize, height as usize))?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     Ok(ImageHeader { size: (width, height), orientation })
 }

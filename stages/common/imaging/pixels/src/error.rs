@@ -46,13 +46,16 @@ impl PixelError {
         move |source| Self::Io { path: path.to_path_buf(), source }
     }
 
-    /// Creates the error of an image with more than [`MAX_PIXELS`] pixels.
-    pub fn too_large(path: &Path, width: usize, height: usize) -> Self {
-        Self::Unsupported(format!(
+    /// Fails if an image has more than [`MAX_PIXELS`] pixels.
+    pub fn check_size(path: &Path, (width, height): (usize, usize)) -> Result<(), Self> {
+        if width.saturating_mul(height) <= MAX_PIXELS {
+            return Ok(());
+        }
+        Err(Self::Unsupported(format!(
             "{}: {width}×{height} pixels exceed the limit of {MAX_PIXELS} (such as 16384×16384); \
             make the image smaller",
             path.display()
-        ))
+        )))
     }
 
     /// Creates the error of a file that is damaged or has another format.

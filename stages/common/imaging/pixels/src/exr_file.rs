@@ -9,7 +9,7 @@ use exr::meta::header::Header;
 use exr::meta::{BlockDescription, MetaData};
 use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
 
-use crate::error::{MAX_PIXELS, PixelError};
+use crate::error::PixelError;
 use crate::image_buffer::Image;
 use crate::png_file::read_png;
 
@@ -227,7 +227,7 @@ fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
     File::open(path).map(BufReader::new).map_err(PixelError::io(path))
 }
 
-/// Reads width and height of the first layer from the header; fails above [`MAX_PIXELS`].
+/// Reads width and height of the first layer from the header; fails above [`MAX_PIXELS`](crate::MAX_PIXELS).
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
     let meta = read_header(path)?;
     let first = meta.headers.first().ok_or_else(|| PixelError::format(path, "no layer"))?;
@@ -250,9 +250,8 @@ fn read_header(path: &Path) -> Result<MetaData, PixelError> {
     let length = file.get_ref().metadata().map(|metadata| metadata.len());
     let length = length.map_err(PixelError::io(path))?;
     let meta = MetaData::read_from_buffered(file, false).map_err(|e| exr_error(path, e))?;
-    if let Some(header) = meta.headers.iter().find(|h| h.layer_size.area() > MAX_PIXELS) {
-        let (width, height) = (header.layer_size.width(), header.layer_size.height());
-        return Err(PixelError::too_large(path, width, height));
+    for header in &meta.headers {
+        PixelError::check_size(path, (header.layer_size.width(), header.layer_size.height()))?;
     }
     // Decoding would first allocate memory for the whole table, and for all pixels.
     let chunks: u64 = meta.headers.iter().map(|header| header.chunk_count as u64).sum();

@@ -17,9 +17,7 @@ pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
     reader.limits(limits);
     let decoder = reader.into_decoder().map_err(damaged)?;
     let (width, height) = decoder.dimensions();
-    if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 {
-        return Err(PixelError::too_large(path, width as usize, height as usize));
-    }
+    PixelError::check_size(path, (width as usize, height as usize))?;
     let image = image::DynamicImage::from_decoder(decoder).map_err(damaged)?;
     Ok(image.into())
 }
