@@ -351,7 +351,10 @@ mod tests {
         for (text, words) in [
             ("1 SIMPLE_RADIAL 160 120 150 80 60 0.02\n", "a different focal length"),
             ("1 SIMPLE_RADIAL 160 120 nothing\n", "distortion is unknown"),
-            ("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n2 PINHOLE 160 120 140 140 80 60\n", "LLFF"),
+            (
+                "1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n2 PINHOLE 160 120 140 140 80 60\n",
+                "2 cameras",
+            ),
             ("1 SIMPLE_PINHOLE 160 120 140 80 60\n", "LLFF"),
         ] {
             cameras(text);
