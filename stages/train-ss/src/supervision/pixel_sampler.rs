@@ -250,6 +250,19 @@ mod tests {
         }
     }
 
+    /// Bundles of the precrop come from the middle half, and skip masked pixels there.
+    #[test]
+    fn precrop_draws_pixels_that_count() {
+        let view = PixelNumbers { width: 8, height: 8, start: 0 };
+        let importance = Importance::new(1.0, 64, PixelSet::default());
+        let sampler = PixelSampler::new(vec![view], 64, importance, (true, 1000), 3);
+        for bundle in 0..1000 {
+            let (_, pixel) = sampler.draw(bundle, |_, pixel| pixel % 8 < 4);
+            let (x, y) = (pixel % 8, pixel / 8);
+            assert!((2..4).contains(&x) && (2..6).contains(&y), "{bundle}: {x}, {y}");
+        }
+    }
+
     #[test]
     fn an_epoch_has_every_number_once() {
         for n in [1, 2, 3, 17, 1000] {
