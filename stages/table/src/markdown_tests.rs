@@ -177,6 +177,15 @@ fn methods() -> Vec<Row> {
 
 /// The best is marked among those that have seen the same; what is known from elsewhere competes
 /// with none.
+/// An extra row belongs to results whose keys it shares, also without a given list of keys.
+#[test]
+fn extra_rows_match_default_keys() {
+    let extra = json!([{"method": "paper: SS", "variant": "no warm-up", "psnr": 27.5}]);
+    let params = params(json!({"values": ["psnr"], "extra_rows": extra}));
+    let text = markdown(&params, &rows(), &figures(), &[]).unwrap();
+    assert!(text.contains("| 27.50 |"), "{text}");
+}
+
 #[test]
 fn groups_further_rows_and_gains() {
     let params = Params {
