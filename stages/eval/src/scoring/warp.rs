@@ -9,9 +9,10 @@ use crate::scored_view::{ScoredView, read_image};
 /// of the depths' accuracy.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct WarpScore {
-    /// Peak signal-to-noise ratio in dB over the pixels that are visible from the neighbour.
+    /// Peak signal-to-noise ratio in dB over the pixels that are visible from the neighbour and
+    /// that neither view's mask excludes.
     pub psnr: f64,
-    /// Fraction of the pixels that are visible from the neighbour.
+    /// Fraction of the view's pixels that are compared.
     pub seen: f64,
 }
 
