@@ -109,7 +109,8 @@ impl Borders {
         self
     }
 
-    /// Returns the evidence for the background, one note per line, and the remedy for strips.
+    /// Returns the evidence for the background, unless the background is given, and the remedy for
+    /// strips.
     pub(crate) fn notes(&self, is_background_given: bool) -> Vec<String> {
         let mut notes = Vec::new();
         let is_frame = self.strips.as_ref().is_some_and(|common| common.strips.is_frame());

@@ -9,11 +9,11 @@ use serde_json::Value;
 
 use crate::gather::{Report, Row};
 
-/// Pictures of a scene, one per view, such as ground truth or a method's error maps.
+/// Pictures of a data set, one per view, such as ground truth or a method's error maps.
 pub(crate) struct Layer<'a> {
     pub(crate) label: String,
     pub(crate) group: Group,
-    /// Index of the scene in the report.
+    /// Index of the data set in the report.
     pub(crate) scene: usize,
     /// Indices of the rows that made the pictures: several if their pictures are equal, none for
     /// observations.
@@ -238,7 +238,7 @@ fn merge_equal(layers: Vec<Layer<'_>>) -> Vec<Layer<'_>> {
     different
 }
 
-/// Labels observations by kind, and by result if the scene has several of the kind: "Ground truth"
+/// Labels observations by kind, and by result if the data set has several of the kind: "Ground truth"
 /// or "Ground truth of RESULT". Their labels must be the results' names.
 fn name_observations(layers: &mut [Layer<'_>]) {
     let kinds: Vec<(usize, Group)> =
