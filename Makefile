@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 # Folder with real scenes and network weights, read by the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff parts seeds stability bench bench-runner compare-engines fuzz clean reference prior goldens
+.PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff parts seeds stability bench bench-runner compare-engines fuzz clean reference goldens
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -157,7 +157,7 @@ endif
 
 # Data sets whose test views are withheld training views; settings are chosen on them. `prep` itself holds photographs out.
 held-out:
-	@mkdir -p out/held-out; for scene in $(or $(SCENES),lego chair); do for folder in nerf_synthetic nerf_llff_data .; do \
+	@mkdir -p out/held-out; if [ -d $(DATA)/weights ]; then ln -sfn "$$(realpath $(DATA)/weights)" out/held-out/weights; fi; for scene in $(or $(SCENES),lego chair); do for folder in nerf_synthetic nerf_llff_data .; do \
 	  if [ -f $(DATA)/$$folder/$$scene/transforms_train.json ]; then python3 scripts/hold-out.py $(DATA)/$$folder/$$scene out/held-out/$$scene; break; \
 	  elif [ -d $(DATA)/$$folder/$$scene ]; then ln -sfn "$$(realpath $(DATA)/$$folder/$$scene)" out/held-out/$$scene; break; fi; done; done >/dev/null
 
@@ -199,11 +199,6 @@ compare-engines: build ## Compare training and rendering of this build and of AG
 
 reference: build ## Regenerate schemas/ and docs/reference/ from the types and the built programs
 	UPDATE=1 cargo test --release --workspace --exclude $(REMOTE) --test schemas
-
-prior: build ## Train upsample's own network again: stages/upsample/src/prior/prior_x4.safetensors
-	rm -rf out/prior && mkdir -p out
-	target/release/train-prior --output out/prior
-	cp out/prior/prior_x4.safetensors stages/upsample/src/prior/
 
 goldens: ## Regenerate the golden files with pinned versions of Pillow, scikit-image and PyTorch
 	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens/requirements.txt && .venv/bin/python scripts/goldens

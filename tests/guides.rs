@@ -17,7 +17,7 @@ const ON_A_CLUSTER: &str = "slurm.md";
 const GPU: &str = "--device cuda";
 /// Parts of commands and what takes their place, so that each command takes a second. Commands end
 /// in a space.
-const SMALL: [(&str, &str); 24] = [
+const SMALL: [(&str, &str); 23] = [
     ("rays=30M", "rays=5000"),
     ("rays=2000000", "rays=500 -p layers=2 -p hidden_dim=16"),
     ("run seeds ", "run seeds -p train-ss.rays=4000 "),
@@ -27,7 +27,6 @@ const SMALL: [(&str, &str); 24] = [
     (" -p frames=300", ""),
     ("run refined-video ", "run refined-video -p frames=2 -p train-refine.steps=2 "),
     ("run refined ", "run refined -p train-refine.steps=2 "),
-    ("run prior-refine ", "run prior-refine -p train-refine.steps=2 "),
     ("run sisr-fuse ", "run sisr-fuse -p train-refine.steps=2 "),
     ("camera-path.size=400", "camera-path.size=24"),
     ("lr_width=100", "lr_width=12"),

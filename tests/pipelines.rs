@@ -24,7 +24,6 @@ fn every_verb_finds_a_target_of_its_own_file() {
         ),
         (&["plan", "hr-finetune"], &["finetuned-views"]),
         (&["plan", "sisr-fuse", "-p", "upsample.method=bicubic"], &["refine-sisr"]),
-        (&["plan", "prior-refine", "-p", "scale=4"], &["enlarged-field", "refine-by-prior"]),
         (&["plan", "paper-refine"], &["train-paper"]),
         (&["plan", "registered"], &["register ", "registered-views"]),
         (&["plan", "report", "refined", "video"], &["report", "eval-refined", "path-views"]),

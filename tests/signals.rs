@@ -87,12 +87,6 @@ const CASES: &[Case] = &[
     Case { stage: "table", inputs: &[("run", "many-results")], ..CASE },
     Case { stage: "copy", inputs: &[("run", "large-film")], is_short: true, ..CASE },
     Case {
-        stage: "train-prior",
-        params: r#"{"steps": 1000000000, "images": 4}"#,
-        goes_on: Some("resuming from step"),
-        ..CASE
-    },
-    Case {
         stage: "train-refine",
         params: r#"{"steps": 1000000000, "patch_size": 16, "features": 8, "blocks": 1}"#,
         inputs: &[("views", "views"), ("truth", "scene/train")],

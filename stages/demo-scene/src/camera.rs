@@ -74,7 +74,7 @@ impl ViewCamera {
         let [half_x, half_y] = self.sides.map(|side| 0.5 * f64::from(side));
         let [x, y] = match self.lens {
             ViewLens::Pinhole { .. } => [x, y],
-            ViewLens::Fisheye(intrinsics) if intrinsics.is_cut([x, y]) => return None,
+            ViewLens::Fisheye(intrinsics) if intrinsics.is_clamped([x, y]) => return None,
             ViewLens::Fisheye(intrinsics) => intrinsics.undistort([x, y]),
         };
         let across = (x - half_x) / self.focal;

@@ -7,7 +7,6 @@
 //!
 //! * `world`: the objects, their shapes, and intersection with rays.
 //! * `material`: albedo and gloss at a surface point.
-//! * `generated`, `pattern`: random objects and their materials, for training networks.
 //! * `camera`: pinhole camera, or a fisheye lens for training views.
 //! * `render`: light, shadow, reflection, anti-aliasing.
 //! * `disturbance`: exposures that differ, and poses that aren't exact.
@@ -16,10 +15,8 @@
 mod camera;
 mod dataset_writer;
 mod disturbance;
-mod generated;
 mod material;
 mod params;
-mod pattern;
 mod render;
 mod world;
 
@@ -56,8 +53,7 @@ impl Stage for DemoScene {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let world =
-            if params.generated { World::generated(params.seed) } else { World::new(params.seed) };
+        let world = World::new(params.seed);
         let world = if params.backdrop { world.with_backdrop() } else { world };
         let splits = [
             ("train", params.train, ViewCamera::of_training(params)),
@@ -224,30 +220,6 @@ mod tests {
                 }
             }
         }
-    }
-
-    /// Random objects are inside every view, and differ by seed. At most a quarter of their pixels
-    /// are white.
-    #[test]
-    fn generated_scenes_are_seen_whole() {
-        let camera = test_camera(40, 1.0);
-        let mut views = Vec::new();
-        for seed in 0..12 {
-            let pose = camera_pose(Layout::Around, "test", seed, 12);
-            let world = World::generated(seed);
-            let frame = render::render(&world, &pose, &camera, 1, &Progress::silent());
-            let alpha = |x: u32, y: u32| frame.colour.data[((y * 40 + x) * 4 + 3) as usize];
-            let border = (0..40).flat_map(|i| [(i, 0), (i, 39), (0, i), (39, i)]);
-            assert!(border.into_iter().all(|(x, y)| alpha(x, y) == 0), "seed {seed} is cut off");
-            let colours = frame.colour.data.chunks_exact(4).filter(|p| p[3] > 0);
-            let (seen, white) = colours.fold((0, 0), |(seen, white), p| {
-                (seen + 1, white + usize::from(p[..3] == [255; 3]))
-            });
-            assert!(seen > 80 && white < seen / 4, "seed {seed}: {white} of {seen} are white");
-            views.push(frame.colour.data);
-        }
-        views.dedup();
-        assert_eq!(views.len(), 12);
     }
 
     fn view(seed: u32) -> pixels::Rgba8 {

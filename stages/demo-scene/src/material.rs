@@ -1,7 +1,5 @@
 use glam::DVec3;
 
-use crate::pattern::PatternedMaterial;
-
 /// Material of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Material {
@@ -19,8 +17,6 @@ pub(crate) enum Material {
     Copper,
     /// Rows of fine marks.
     Sign,
-    /// Material of a generated scene.
-    Patterned(PatternedMaterial),
 }
 
 /// Albedo and gloss at a surface point, in linear light.
@@ -36,7 +32,7 @@ pub(crate) struct Reflectance {
 }
 
 /// Hashes a lattice cell to [0, 1).
-pub(crate) fn hash(x: i64, y: i64, z: i64, seed: u32) -> f64 {
+fn hash(x: i64, y: i64, z: i64, seed: u32) -> f64 {
     let mut h = (x as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
         ^ (y as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F)
         ^ (z as u64).wrapping_mul(0x1656_67B1_9E37_79F9)
@@ -50,7 +46,7 @@ pub(crate) fn hash(x: i64, y: i64, z: i64, seed: u32) -> f64 {
 }
 
 /// Returns the index of a unit cell along an axis.
-pub(crate) fn cell(x: f64) -> i64 {
+fn cell(x: f64) -> i64 {
     x.floor() as i64
 }
 
@@ -74,7 +70,6 @@ pub(crate) fn reflectance(material: Material, p: DVec3, normal: DVec3, seed: u32
             mirror: 0.05,
         },
         Material::Sign => matt(marks(p, seed)),
-        Material::Patterned(material) => material.reflectance(p),
     }
 }
 

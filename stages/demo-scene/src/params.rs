@@ -38,8 +38,6 @@ pub struct Params {
     pub layout: Layout,
     /// Adds an unbounded background: ground, distant towers, and sky.
     pub backdrop: bool,
-    /// Replaces the objects by random ones, for training networks on many scenes.
-    pub generated: bool,
     /// Format of the data set.
     pub form: Form,
     /// Deviation of each training view's exposure from the mean: 0.1 makes views about 10 %
@@ -104,7 +102,6 @@ impl Default for Params {
             angle: None,
             layout: Layout::Around,
             backdrop: false,
-            generated: false,
             form: Form::Blender,
             exposure_difference: 0.0,
             pose_error: 0.0,

@@ -2,7 +2,6 @@ use std::f64::consts::TAU;
 
 use glam::{DMat3, DVec3};
 
-use crate::generated::SceneDraws;
 use crate::material::Material;
 
 /// Shape in its own space.
@@ -107,13 +106,6 @@ impl World {
         ];
         clusters.extend(spring(foot(3, 0.60)));
         clusters.push(sign(foot(4, 0.66)));
-        Self { clusters, seed, has_sky: false }
-    }
-
-    /// Creates a scene of random objects, for training networks.
-    pub fn generated(seed: u32) -> Self {
-        let groups = SceneDraws::new(seed).groups();
-        let clusters = groups.into_iter().map(Cluster::new).collect();
         Self { clusters, seed, has_sky: false }
     }
 

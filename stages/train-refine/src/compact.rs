@@ -1,8 +1,8 @@
-use artifact::{Failure, FailureExt as _, GivenInput, bail_bad_input, bail_usage};
+use artifact::{bail_bad_input, bail_usage};
 use pixels::psnr_of;
 use refinement::{
     Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer,
-    RefinerTraining, WEIGHTS_FILE, WarpOptions,
+    RefinerTrainingOptions, WEIGHTS_FILE, WarpOptions,
 };
 use stage::Context;
 
@@ -25,12 +25,13 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
             truth"
         );
     }
-    let refiner = match context.optional_input("prior") {
-        Some(prior) => read_prior(prior, net)?,
-        None => Refiner::new(architecture(net), seed),
+    let architecture = RefinerArchitecture {
+        channels: net.features,
+        blocks: net.blocks,
+        guidance: (net.references_per_view > 0).then_some(WarpOptions::default()),
     };
-    let architecture = refiner.architecture();
-    let options = RefinerTraining {
+    let refiner = Refiner::new(architecture, seed);
+    let options = RefinerTrainingOptions {
         steps: net.steps,
         batch_size: net.batch_size as usize,
         patch_size: net.patch_size as usize,
@@ -56,29 +57,4 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     };
     context.write_json(REFINER_FILE, &file)?;
     report_psnr(context, "views left out of training", &file)
-}
-
-/// Returns the size and inputs of a network that the parameters describe.
-fn architecture(net: &CompactParams) -> RefinerArchitecture {
-    RefinerArchitecture {
-        channels: net.features,
-        blocks: net.blocks,
-        guidance: (net.references_per_view > 0).then_some(WarpOptions::default()),
-    }
-}
-
-/// Reads the network that training starts from.
-fn read_prior(prior: &GivenInput, net: &CompactParams) -> Result<Refiner, Failure> {
-    let file: RefinerFile = prior.read_json(REFINER_FILE)?;
-    let guidance = architecture(net).guidance;
-    match file.network {
-        Network::Compact(architecture) if architecture.guidance == guidance => {
-            Refiner::read(&prior.path(WEIGHTS_FILE), architecture).bad_input("input prior")
-        }
-        _ => Err(Failure::BadInput(
-            "input prior: a network of other inputs; give a compact network trained with \
-            references if references_per_view is above 0, otherwise without"
-                .to_owned(),
-        )),
-    }
 }

@@ -35,6 +35,7 @@ impl Stage for TrainRefine {
     const NAME: &'static str = "train-refine";
     const SUMMARY: &'static str =
         "Trains the network that refines rendered views, from views with ground truth.";
+    const LIBTORCH: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         let cameras =
@@ -62,14 +63,6 @@ impl Stage for TrainRefine {
                     "cameras of the views to be refined (`net: compact` only); if each camera \
                     has an LR photograph, the training views are made consistent with their LR \
                     photographs, like the refined views",
-                ),
-            ),
-            (
-                "prior",
-                Input::optional(
-                    &["refiner"],
-                    "network that training starts from (`net: compact` only); its size is used \
-                    instead of `features` and `blocks`",
                 ),
             ),
             (

@@ -1,8 +1,6 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
 use pixels::{Image, psnr_of};
-use refinement::paper::{
-    DEFAULT_OVERLAP_PIXELS, PaperRefiner, PaperTrainer, PaperTraining, PerceptualLoss,
-};
+use refinement::paper::{PaperRefiner, PaperTrainer, PaperTrainingOptions, PerceptualLoss};
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 use serde_json::json;
 use stage::{Context, Rule};
@@ -19,7 +17,7 @@ const VGG_FILES: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetens
 /// Trains the published network on all given views; the publication uses one.
 pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow::Result<()> {
     let known = Examples::read_all(context.input("views")?, context.input("truth")?, None)?;
-    let options = PaperTraining {
+    let options = PaperTrainingOptions {
         steps: params.steps,
         batch_size: params.batch_size as usize,
         patch_size: params.patch_size as usize,
@@ -47,12 +45,7 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     let (mut rendered, mut refined) = (0.0, 0.0);
     let share = 1.0 / known.len() as f64;
     for view in &known {
-        let redrawn = trainer.network().refine(
-            &view.rendered,
-            &[view],
-            options.references,
-            DEFAULT_OVERLAP_PIXELS,
-        )?;
+        let redrawn = trainer.network().refine(&view.rendered, &[view], options.references)?;
         rendered += share * psnr(&view.rendered.colours(), &view.truth);
         refined += share * psnr(&redrawn, &view.truth);
     }

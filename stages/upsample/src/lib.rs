@@ -4,10 +4,8 @@
 //! * `bicubic`: Pillow's filter on 8 bits, bit-exact.
 //! * `imdn`, `swinir`: networks with a fixed scale, which is read from their weights.
 //! * `liif`: a network for any scale.
-//! * `prior`: a network that `train-prior` taught on random images; the program contains its
-//!   weights for scale 4.
 //!
-//! Other weights are safetensors files with the tensors' published names, converted from released
+//! Weights are safetensors files with the tensors' published names, converted from released
 //! checkpoints by `scripts/convert-weights.py`; every tensor's shape is checked. Images are
 //! composited on their background and enlarged as display-encoded sRGB. The enlarged views are
 //! opaque and have no depth. A photograph's mask is enlarged with it.
@@ -19,7 +17,6 @@ mod goldens;
 mod imdn;
 mod liif;
 mod network;
-mod prior;
 mod swinir;
 
 use anyhow::Context as _;
@@ -39,16 +36,14 @@ use tch::no_grad;
 
 use network::Network;
 
-pub use prior::{PriorParams, TrainPrior};
-
 /// Parameters of `upsample`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
     /// Method that enlarges views.
     pub method: Method,
-    /// Name of the network's file in input `weights`. Default: `imdn_xS.safetensors`,
-    /// `swinir_xS.safetensors` or `prior_xS.safetensors` for scale S, or `liif.safetensors`.
+    /// Name of the network's file in input `weights`. Default: `imdn_xS.safetensors` or
+    /// `swinir_xS.safetensors` for scale S, or `liif.safetensors`.
     #[schemars(extend("x-default" = "by method"))]
     pub file: Option<String>,
 }
@@ -67,9 +62,6 @@ pub enum Method {
     Liif,
     /// SwinIR, a transformer (Liang et al. 2021).
     Swinir,
-    /// A network of `train-prior`, taught on random images instead of photographs. The program
-    /// contains one for scale 4.
-    Prior,
 }
 
 /// Remedy for missing weights, as a sentence fragment.
@@ -82,6 +74,7 @@ impl Stage for Upsample {
     type Params = Params;
     const NAME: &'static str = "upsample";
     const SUMMARY: &'static str = "Enlarges views by a 2-D method, as a baseline.";
+    const LIBTORCH: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         let cameras = ["scene/cameras", "scene/truth", "cameras"];
@@ -123,14 +116,6 @@ impl Stage for Upsample {
         let mut rules = vec![needs_weights, named, liif];
         rules.extend(scale_rules("imdn", &[2, 3, 4]));
         rules.extend(scale_rules("swinir", &[2, 3, 4, 8]));
-        let own_prior = "parameter method: the program's own prior enlarges 4 times only; for other \
-            scales, give a network of train-prior as input weights and its name as parameter file";
-        rules.push(
-            Rule::new(own_prior)
-                .when("method", json!({"const": "prior"}))
-                .when("file", json!({"type": "null"}))
-                .must("cameras.scale", json!({"anyOf": [{"type": "null"}, {"const": 4}]})),
-        );
         rules
     }
 
@@ -241,15 +226,9 @@ fn read_networks(
         Method::Liif => {
             ("liif.safetensors".to_owned(), |weights| Ok(Box::new(liif::Liif::read(weights)?)))
         }
-        Method::Prior => (format!("prior_x{scale}.safetensors"), |weights| {
-            Ok(Box::new(prior::Prior::read(weights)?))
-        }),
     };
     let file = params.file.as_ref().unwrap_or(&default);
-    let weights = match context.optional_input("weights") {
-        None if params.method == Method::Prior => embedded_weights(file)?,
-        _ => read_weights(context.input("weights")?, file)?,
-    };
+    let weights = read_weights(context.input("weights")?, file)?;
     let networks =
         (0..context.threads).map(|_| read(&weights).map(Some)).collect::<Result<Vec<_>, _>>();
     let networks = networks.bad_input("input weights")?;
@@ -282,17 +261,6 @@ fn check_scale(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), Wro
         Some(scale) if lr.map(|size| size * scale) != hr => Err(WrongScale { scale, lr, hr }),
         _ => Ok(()),
     }
-}
-
-/// Returns the tensors of one of the program's own networks.
-fn embedded_weights(file: &str) -> Result<Weights, Failure> {
-    let bytes = prior::embedded(file).ok_or_else(|| {
-        Failure::BadInput(format!(
-            "method prior has no network {file} of its own; train one with train-prior and give \
-            it as input weights, or choose method bicubic"
-        ))
-    })?;
-    Weights::parse(file.as_ref(), bytes).bad_input("method prior")
 }
 
 /// Reads the network's tensors from a file of this name in the input.

@@ -38,13 +38,8 @@ impl Weights {
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
         let bytes = std::fs::read(path)
             .map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })?;
-        Self::parse(path, &bytes)
-    }
-
-    /// Parses the contents of a file; `path` is its path in messages.
-    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self, WeightsError> {
         let file =
-            SafeTensors::deserialize(bytes).map_err(|e| format_error(path, e.to_string()))?;
+            SafeTensors::deserialize(&bytes).map_err(|e| format_error(path, e.to_string()))?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.tensors() {
             let shape: Vec<i64> = view.shape().iter().map(|&d| d as i64).collect();
@@ -66,12 +61,6 @@ impl Weights {
             );
         }
         Ok(Self { path: path.to_path_buf(), tensors })
-    }
-
-    /// Returns the tensors of a network in training, which stay shared with the network.
-    pub fn share(tensors: &[(String, Tensor)]) -> Self {
-        let tensors = tensors.iter().map(|(name, tensor)| (name.clone(), tensor.shallow_clone()));
-        Self { path: PathBuf::from("a network in training"), tensors: tensors.collect() }
     }
 
     /// Returns the i64 tensor of this name, which must have `count` elements.
@@ -130,8 +119,8 @@ fn format_error(path: &Path, reason: String) -> WeightsError {
     WeightsError::Format { path: path.to_path_buf(), reason }
 }
 
-/// Writes named tensors of f32, f16, i64 or u8 as safetensors without metadata, so that equal
-/// tensors give equal bytes.
+/// Writes named tensors of f32, i64 or u8 as safetensors without metadata, so that equal tensors
+/// give equal bytes.
 pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
     let bytes = serialized(tensors)
         .map_err(std::io::Error::other)
@@ -148,7 +137,6 @@ fn serialized(
         let dtype = match tensor.kind() {
             Kind::Int64 => Dtype::I64,
             Kind::Uint8 => Dtype::U8,
-            Kind::Half => Dtype::F16,
             _ => Dtype::F32,
         };
         let flat = tensor.f_detach()?.f_to_device(Device::Cpu)?.f_contiguous()?;
