@@ -17,6 +17,8 @@ SLOWEST = 3
 SELECTIONS = [["--workspace", "--exclude", "nerf-sr-remote"], ["-p", "nerf-sr-remote"]]
 # Seconds of each binary in the last run; slow binaries start first.
 TIMES = pathlib.Path("target/test-times.json")
+# Binaries that take minutes: they start first where no last run is known, since the last one would run alone.
+SLOW = ["viewer", "page", "export", "refine", "results", "photographs", "faults", "pipeline"]
 
 
 def build() -> list[tuple[str, str, str]]:
@@ -36,7 +38,8 @@ def build() -> list[tuple[str, str, str]]:
             folder = os.path.dirname(message["manifest_path"])
             package = os.path.basename(folder) if kind != "test" else "tests"
             found.append((kind == "test", f"{package}::{message['target']['name']}", message["executable"], folder))
-    known = json.loads(TIMES.read_text()) if TIMES.exists() else {}
+    known = {f"tests::{name}": len(SLOW) - i for i, name in enumerate(SLOW)}
+    known |= json.loads(TIMES.read_text()) if TIMES.exists() else {}
     found.sort(key=lambda entry: (entry[0], -known.get(entry[1], 0) if entry[0] else 0, entry[1]))
     return [entry[1:] for entry in found]
 

@@ -210,7 +210,7 @@ fn what_a_fisheye_cannot_see_is_masked() {
         .unwrap();
         for (i, counts) in mask.counts.iter().enumerate() {
             let at = [i % mask.width, i / mask.width].map(|v| v as f64 + 0.5);
-            assert_eq!(*counts, !k.is_cut(at), "pixel {i} of {}", view.camera.name);
+            assert_eq!(*counts, !k.is_clamped(at), "pixel {i} of {}", view.camera.name);
         }
         masked += mask.counts.iter().filter(|counts| !**counts).count();
     }

@@ -63,11 +63,11 @@ fn equal_bytes_with_one_and_two_threads() {
 #[test]
 fn a_sweep_shares_what_it_can() {
     let project = Project::tiny();
-    let sweep = ["-p", "supersample=1,2", "-p", "error_range=0.25,0.5"];
+    let sweep = ["-p", "supersample=1,2", "-p", "render-depth.samples_per_axis=1,2"];
     let run = project.ok(&[&["run"][..], &sweep].concat());
-    // demo-scene and prep once, training and rendering twice, eval four times.
-    assert!(run.contains("10 of 10 stages ran"), "{run}");
-    assert!(run.contains("eval [supersample=2, error_range=0.5]: PSNR"), "{run}");
+    // demo-scene and prep once, training twice, rendering and eval four times.
+    assert!(run.contains("12 of 12 stages ran"), "{run}");
+    assert!(run.contains("eval [supersample=2, samples_per_axis=2]: PSNR"), "{run}");
     assert_eq!(project.output_of("train-ss", &sweep).len(), 2);
     // A single point of it is cached.
     assert!(project.ok(&["run", "-p", "supersample=1"]).contains("nothing to run"));

@@ -72,18 +72,6 @@ fn refined_views_stand_beside_rendered_ones() {
             .count();
         assert!(changed > 100, "{changed} pixels changed");
     }
-    // Nothing of what the network predicts is nothing at all, but for half precision.
-    let none = project.path("none");
-    let inputs = [("views", rendered.as_path()), ("refiner", &folder("train-refine"))];
-    assert_eq!(stage("refine", r#"{"residual_weight": 0}"#, &inputs, &none, &[]).code, 0);
-    let first = rendered.join("images").read_dir().unwrap().next().unwrap().unwrap();
-    let file = Path::new("images").join(first.file_name());
-    assert!(
-        green(&none.join(&file))
-            .iter()
-            .zip(green(&rendered.join(&file)))
-            .all(|(a, b)| (a - b).abs() < 2e-3)
-    );
     // The network is for views.
     let views = rendered.as_path();
     stage("refine", "{}", &[("views", views), ("refiner", views)], &project.path("no"), &[])
@@ -254,27 +242,6 @@ fn views_are_means_with_their_enlarged_photographs() {
     refine_enlarged(&project, &views, &refiner, "no", Some(&photographs))
         .0
         .fails(3, &["input enlarged: view", "24×24 pixels, but the view to refine has 48×48"]);
-}
-
-/// A second field, trained on images that the prior enlarges, changes the refined views. Other
-/// scales are refused before anything runs.
-#[test]
-fn a_prior_enlarges_images_for_a_second_field() {
-    let (blocks, _) = REFINED.split_once("  upsample:").unwrap();
-    let project = Project::shipped(&["prior-refine"], blocks);
-    project.run(&["run", "prior-refine"]).fails(2, &["the program's own prior enlarges 4 times"]);
-    let sizes = ["-p", "scale=4", "-p", "lr_width=12", "-p", "enlarged-field.rays=40000"];
-    let target = [&["prior-refine"], &sizes[..]].concat();
-    project.ok(&[&["run"], &target[..]].concat());
-    let folder = |stage: &str| project.artifact(stage, &target);
-    let summary = std::fs::read_to_string(folder("refine-by-prior").join("summary.txt")).unwrap();
-    assert!(summary.contains("averaged with"), "{summary}");
-    let [refined, enlarged, mean] = ["refine", "enlarged-views", "refine-by-prior"]
-        .map(|stage| green_over_white(&folder(stage), "r_0"));
-    for (i, mean) in mean.iter().enumerate() {
-        let expected = 0.5 * (refined[i] + enlarged[i]);
-        assert!((mean - expected).abs() < 2e-3, "pixel {i}: {mean} instead of {expected}");
-    }
 }
 
 fn refine_with(
@@ -842,30 +809,6 @@ fn wrong_views_are_refused_in_a_line() {
         .fails(3, &["24×24 pixels, but its image has 12×12"]);
     train(&project, "{}", &views, &truth.with_file_name("truth"))
         .fails(3, &["no view has an image in input truth with the same name and pose"]);
-}
-
-/// A training starts from the network of input `prior`, whose size replaces that of the parameters.
-#[test]
-fn a_training_starts_from_a_prior() {
-    let project = project();
-    let (views, truth, _) = training(&project);
-    let inputs = [("views", views.as_path()), ("truth", truth.as_path())];
-    let weights = |name: &str, params: &str, prior: Option<&Path>| {
-        let inputs: Vec<_> = inputs.into_iter().chain(prior.map(|path| ("prior", path))).collect();
-        let output = project.path(name);
-        let trained = stage("train-refine", params, &inputs, &output, &[]);
-        assert_eq!(trained.code, 0, "{}", trained.stderr);
-        std::fs::read(output.join("refiner.safetensors")).unwrap()
-    };
-    let small = r#""batch_size": 4, "patch_size": 16, "blocks": 1"#;
-    let trained = weights("prior", &format!(r#"{{{small}, "features": 8, "steps": 20}}"#), None);
-    let prior = project.path("prior");
-    // A step that changes nothing.
-    let still = format!(r#"{{{small}, "features": 5, "steps": 1, "learning_rate": 0}}"#);
-    assert!(weights("from-prior", &still, Some(&prior)) == trained);
-    assert!(weights("from-nothing", &still, None) != trained);
-    let inputs = [inputs[0], inputs[1], ("prior", prior.as_path())];
-    fails_to_train(&project, &inputs, r#"{"references_per_view": 1}"#, &["input prior:"]);
 }
 
 #[track_caller]

@@ -23,7 +23,7 @@ mod scoring;
 
 use std::collections::BTreeMap;
 
-use metrics::{METRICS_FILE, Metrics, Scores, ViewScores};
+use metrics::{ERROR_MAP_RANGE, METRICS_FILE, Metrics, Scores, ViewScores};
 use pixels::{DEGRADATION_FILE, Degradation, Image, Palette, Rgba8, palette_colour, write_png};
 use rayon::prelude::*;
 use scene::{Background, Views};
@@ -39,20 +39,10 @@ pub use scoring::Lpips;
 pub use scoring::{DepthError, LpipsNetwork, Ssim, WarpScore, depth_error, psnr, ssim};
 use scoring::{Perceptual, metrics, weights_rule};
 
-/// Parameters of `eval`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Parameters of `eval`: none.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Params {
-    /// Absolute error that error maps display in the brightest colour.
-    #[schemars(range(min = 0.001, max = 1.0))]
-    pub error_range: f64,
-}
-
-impl Default for Params {
-    fn default() -> Self {
-        Self { error_range: 0.25 }
-    }
-}
+pub struct Params {}
 
 /// Stage `eval`.
 pub struct Eval;
@@ -61,6 +51,7 @@ impl Stage for Eval {
     type Params = Params;
     const NAME: &'static str = "eval";
     const SUMMARY: &'static str = "Scores views against ground truth and draws error maps.";
+    const LIBTORCH: bool = cfg!(feature = "torch");
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
@@ -102,7 +93,7 @@ impl Stage for Eval {
         vec![weights_rule()]
     }
 
-    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+    fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
         let (views_input, truth_input) = (context.input("views")?, context.input("truth")?);
         let (views, truth) = (Views::read(views_input)?, Views::read(truth_input)?);
         let metrics = metrics(Perceptual::new(context.optional_input("weights"))?);
@@ -112,7 +103,7 @@ impl Stage for Eval {
         let progress = context.progress("scoring", truth.views.len() as u64);
         let scored = truth.views.par_iter().map(|true_view| {
             context.check_interrupt()?;
-            let scores = score(context, params, &metrics, &ScoredView::read(&scene, true_view)?)?;
+            let scores = score(context, &metrics, &ScoredView::read(&scene, true_view)?)?;
             progress.add(1);
             anyhow::Ok(scores)
         });
@@ -123,7 +114,7 @@ impl Stage for Eval {
         let near_references =
             references.and_then(|references| near_references(&scored, &truth, &references));
         let result = Metrics {
-            conventions: conventions(params, &scene, &metrics),
+            conventions: conventions(&scene, &metrics),
             figures: metrics.iter().flat_map(|metric| metric.figures()).collect(),
             picture_titles: picture_titles(&metrics),
             mean: mean_of(scored.iter().map(|view| &view.scores)),
@@ -152,14 +143,13 @@ fn picture_titles(metrics: &[Box<dyn Metric>]) -> BTreeMap<String, String> {
 /// Scores a view by every metric, and writes its error map and the metrics' pictures.
 fn score(
     context: &Context,
-    params: &Params,
     metrics: &[Box<dyn Metric>],
     view: &ScoredView<'_>,
 ) -> anyhow::Result<ViewScores> {
     let name = &view.true_view.camera.name;
     let error_map = format!("errors/{name}.png");
     if let Some((render, truth)) = view.compared_images() {
-        let map = draw_error_map(render, truth, params.error_range as f32);
+        let map = draw_error_map(render, truth);
         write_png(&context.output_path(&error_map)?, &map)?;
     }
     let mut scores = Scores::new();
@@ -177,30 +167,25 @@ fn score(
 }
 
 /// Draws the mean absolute error of the three channels as a colour.
-fn draw_error_map(render: &Image, truth: &Image, range: f32) -> Rgba8 {
+fn draw_error_map(render: &Image, truth: &Image) -> Rgba8 {
     let truth_pixels = truth.data.as_chunks::<3>().0;
     let mut data = Vec::with_capacity(4 * truth_pixels.len());
     for (i, [r, g, b]) in render.data.as_chunks::<3>().0.iter().enumerate() {
         let truth = truth_pixels[i];
         let error = ((r - truth[0]).abs() + (g - truth[1]).abs() + (b - truth[2]).abs()) / 3.0;
-        data.extend(palette_colour(Palette::Error, error / range));
+        data.extend(palette_colour(Palette::Error, error / ERROR_MAP_RANGE as f32));
         data.push(255);
     }
     Rgba8::new(render.width, render.height, data)
 }
 
-fn conventions(
-    params: &Params,
-    scene: &ScoredScene<'_>,
-    metrics: &[Box<dyn Metric>],
-) -> BTreeMap<String, String> {
+fn conventions(scene: &ScoredScene<'_>, metrics: &[Box<dyn Metric>]) -> BTreeMap<String, String> {
     let background = match scene.truth.background {
         Background::Black => "black",
         Background::White | Background::Alpha => "white",
         Background::Opaque => "none: the pictures are opaque",
     };
-    let range = params.error_range;
-    let error_maps = format!("mean absolute error of R, G, B; brightest at {range}");
+    let error_maps = format!("mean absolute error of R, G, B; brightest at {ERROR_MAP_RANGE}");
     let mut conventions = BTreeMap::from([
         ("background".to_owned(), background.to_owned()),
         ("error_maps".to_owned(), error_maps),

@@ -1,4 +1,4 @@
-use fields::{Members, rendering_failure};
+use fields::{FieldArtifact, rendering_failure};
 use glam::{DVec3, Vec3};
 use radiance::{Ray, RayField};
 use rayon::prelude::*;
@@ -13,7 +13,7 @@ use crate::surface_view::{PointState, SurfaceView};
 /// to the camera. Other vertices get the colour that the field renders against the normal. `offset`
 /// is the origin of the mesh's frame, in the world.
 pub(crate) fn vertex_colours(
-    field: &Members,
+    field: &FieldArtifact,
     views: &[SurfaceView],
     mesh: &Mesh,
     lattice: &Lattice,

@@ -39,7 +39,7 @@ use std::io::{self, BufWriter, Write as _};
 
 use anyhow::Context as _;
 use artifact::{Failure, format_amount, format_count};
-use fields::Members;
+use fields::FieldArtifact;
 use glam::DVec3;
 use scene::{Bounds, Camera, Views};
 use schemars::JsonSchema;
@@ -112,6 +112,7 @@ impl Stage for Export {
     const NAME: &'static str = "export";
     const SUMMARY: &'static str =
         "Writes a field as points, Gaussian splats, mesh and cameras that other programs open.";
+    const LIBTORCH: bool = cfg!(feature = "torch");
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
@@ -127,7 +128,7 @@ impl Stage for Export {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let field = Members::read(context.input("field")?, &context.device)?;
+        let field = FieldArtifact::read(context.input("field")?, &context.device)?;
         let views = Views::read(context.input("cameras")?)?;
         let cameras: Vec<Camera> = views.views.into_iter().map(|view| view.camera).collect();
         for note in lens_notes(&cameras) {
@@ -208,7 +209,7 @@ fn pixel_count(camera: &Camera) -> u64 {
 /// Renders the field from every camera, in the frame whose origin in the world is `offset`.
 fn render_views(
     context: &Context,
-    field: &Members,
+    field: &FieldArtifact,
     cameras: &[Camera],
     offset: DVec3,
 ) -> anyhow::Result<Vec<SurfaceView>> {
@@ -232,7 +233,7 @@ fn memory_need(cameras: &[Camera], lattice: Option<&Lattice>) -> u64 {
 struct ExportJob<'a> {
     context: &'a Context,
     params: &'a Params,
-    field: Members,
+    field: FieldArtifact,
     cameras: Vec<Camera>,
     views: Vec<SurfaceView>,
     coordinates: Coordinates,

@@ -23,7 +23,6 @@ mod references;
 mod summary;
 mod view;
 
-use refinement::paper::DEFAULT_OVERLAP_PIXELS;
 use refinement::{KnownView, LrObservations, REFINER_FILE, ReferenceStatistics, RefinerFile};
 use scene::{VIEWS_FILE, Views, image_file, preview_file};
 use schemars::JsonSchema;
@@ -40,10 +39,6 @@ use view::{RefineJob, RefinedView};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Factor of the predicted residual, which is added to the view. Default: the best factor for
-    /// the views that were left out of the refiner's training.
-    #[schemars(range(min = 0.0, max = 2.0), extend("x-default" = "by refiner"))]
-    pub residual_weight: Option<f64>,
     /// Maximum number of HR references: the first ones of input `references` are used.
     #[schemars(extend("x-default" = "all"))]
     pub max_references: Option<u32>,
@@ -51,19 +46,11 @@ pub struct Params {
     /// self-ensemble). The running time is proportional to this number.
     #[schemars(range(min = 1, max = 8))]
     pub self_ensemble: u32,
-    /// For refiners of `net: paper`: pixels by which patches of 64 pixels overlap.
-    #[schemars(range(min = 0, max = 32))]
-    pub overlap: u32,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self {
-            residual_weight: None,
-            max_references: None,
-            self_ensemble: 2,
-            overlap: DEFAULT_OVERLAP_PIXELS as u32,
-        }
+        Self { max_references: None, self_ensemble: 2 }
     }
 }
 
@@ -74,6 +61,7 @@ impl Stage for Refine {
     type Params = Params;
     const NAME: &'static str = "refine";
     const SUMMARY: &'static str = "Adds the detail that rendered views systematically lack.";
+    const LIBTORCH: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![

@@ -18,22 +18,16 @@ pub(crate) enum AnyRefiner {
 
 /// Settings for applying a network to every view.
 pub(crate) struct Application {
-    /// Fraction of the predicted residual that is added.
+    /// Fraction of the predicted residual that is added: the best one in training.
     pub(crate) residual_weight: f32,
     /// Number of rotated and mirrored versions whose residuals are averaged.
     pub(crate) self_ensemble: u32,
-    /// Pixels by which patches of the paper's network overlap.
-    pub(crate) overlap: usize,
 }
 
 impl Application {
-    /// Returns the parameters' settings; the default residual weight is the best one in training.
+    /// Returns the settings of the parameters and of the trained network.
     pub(crate) fn new(params: &Params, file: &RefinerFile) -> Self {
-        Self {
-            residual_weight: params.residual_weight.unwrap_or(file.residual_weight) as f32,
-            self_ensemble: params.self_ensemble,
-            overlap: params.overlap as usize,
-        }
+        Self { residual_weight: file.residual_weight as f32, self_ensemble: params.self_ensemble }
     }
 }
 
@@ -69,7 +63,7 @@ impl AnyRefiner {
         statistics: &mut [ReferenceStatistics],
     ) -> anyhow::Result<Image> {
         let references: Vec<&KnownView> = references.iter().collect();
-        let &Application { residual_weight, self_ensemble, overlap } = application;
+        let &Application { residual_weight, self_ensemble } = application;
         match self {
             Self::Compact(network) => {
                 let Some(warp_options) = self.warp_options() else {
@@ -84,9 +78,8 @@ impl AnyRefiner {
                 Ok(network.refine_weighted(&conditioned.view, residual_weight, self_ensemble)?)
             }
             Self::Paper(network, patches) => {
-                let mut drawn = network
-                    .refine(rendered, &references, *patches, overlap)
-                    .bad_input("input views")?;
+                let mut drawn =
+                    network.refine(rendered, &references, *patches).bad_input("input views")?;
                 blend(&rendered.view, &mut drawn, residual_weight);
                 Ok(drawn)
             }

@@ -33,6 +33,7 @@ impl Stage for Register {
     type Params = Params;
     const NAME: &'static str = "register";
     const SUMMARY: &'static str = "Estimates the cameras of photographs from a trained field.";
+    const LIBTORCH: bool = cfg!(feature = "torch");
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
@@ -48,7 +49,7 @@ impl Stage for Register {
     }
 
     fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
-        let members = fields::Members::read(context.input("field")?, &context.device)?;
+        let members = fields::FieldArtifact::read(context.input("field")?, &context.device)?;
         let input = context.input("photographs")?;
         let given = Views::read(input)?;
         let background = members.file.background.grey_level();

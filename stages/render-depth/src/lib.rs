@@ -13,7 +13,7 @@ use std::ops::Range;
 
 use anyhow::Context as _;
 use artifact::{format_amount, format_count};
-use fields::{Members, lower_median, mean, pixel_rays};
+use fields::{FieldArtifact, lower_median, mean, pixel_rays};
 use pixels::{PngRows, to_u8};
 use radiance::RayField;
 use rayon::prelude::*;
@@ -57,6 +57,7 @@ impl Stage for RenderDepth {
     const NAME: &'static str = "render-depth";
     const SUMMARY: &'static str =
         "Renders colour, opacity and depth of a field for a list of cameras.";
+    const LIBTORCH: bool = cfg!(feature = "torch");
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
@@ -73,7 +74,8 @@ impl Stage for RenderDepth {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let Members { file, fields } = Members::read(context.input("field")?, &context.device)?;
+        let FieldArtifact { file, fields } =
+            FieldArtifact::read(context.input("field")?, &context.device)?;
         let cameras = Views::read(context.input("cameras")?)?;
         let resized: Vec<Camera> =
             cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();

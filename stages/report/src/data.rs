@@ -1,10 +1,10 @@
 use std::collections::BTreeMap;
 
 use artifact::RunNode;
+use metrics::ERROR_MAP_RANGE;
 use radiance::{TRAINING_FILE, TrainingLog};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use stage::Context;
 
 use crate::gather::{Report, Row, has_values};
@@ -229,8 +229,7 @@ fn layer_data(
 
 /// Returns the scale of a row's error maps; without HR truth they show errors at LR.
 fn error_scale(row: &Row<'_>) -> Scale {
-    let range = row.node.parameters.get("error_range").and_then(Value::as_f64);
-    Scale::error(range.unwrap_or(0.25), !row.metrics.has_hr_truth())
+    Scale::error(ERROR_MAP_RANGE, !row.metrics.has_hr_truth())
 }
 
 fn figures(report: &Report<'_>) -> Vec<FigureData> {

@@ -304,8 +304,14 @@ impl Scene {
     fn train(&self, params: &Params) -> anyhow::Result<Trained> {
         let Self { input, views } = self;
         let params = params.resolve(&SceneFacts::of(views, true));
-        let mut supervision =
-            train_ss::supervision(input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
+        let mut supervision = train_ss::set_up_supervision(
+            input,
+            &params,
+            None,
+            &std::env::temp_dir(),
+            false,
+            &|_| (),
+        )?;
         let ResolvedField::Grid { architecture, regularisers, given } = &params.field else {
             anyhow::bail!("a grid is measured here");
         };
@@ -451,7 +457,7 @@ fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()>
     };
     nets::deterministic();
     let mut supervision =
-        train_ss::supervision(input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
+        train_ss::set_up_supervision(input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
     let field =
         torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
     let weights = field.parameter_count() / 2;

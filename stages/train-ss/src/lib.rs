@@ -32,7 +32,7 @@ pub use params::{
     ResolvedRegularisers, SceneFacts, Supervision,
 };
 use supervision::alpha_background_error;
-pub use supervision::{Supersampling, supervision};
+pub use supervision::{Supersampling, set_up_supervision};
 use training::{InitField, Member, TrainingData, train_with_best_poses};
 
 /// Stage `train-ss`.
@@ -42,6 +42,7 @@ impl Stage for TrainSs {
     type Params = Params;
     const NAME: &'static str = "train-ss";
     const SUMMARY: &'static str = "Trains a radiance field from LR images by supersampling.";
+    const LIBTORCH: bool = cfg!(feature = "torch");
     const FROM_CHECKPOINT: bool = true;
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 

@@ -73,6 +73,7 @@ impl Stage for Viewer {
     type Params = Params;
     const NAME: &'static str = "viewer";
     const SUMMARY: &'static str = "Bakes a field into one HTML page to look around in.";
+    const LIBTORCH: bool = cfg!(feature = "torch");
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {

@@ -1,6 +1,6 @@
 use artifact::{FailureExt as _, GivenInput};
 use pixels::{DepthMap, ExrImage, Image, Mask, Rgba8, psnr_of, to_u8};
-use scene::{Camera, Surface, View};
+use scene::{Camera, SurfaceMap, View};
 
 use super::read_depth;
 use crate::scored_view::{ScoredView, read_image};
@@ -69,8 +69,8 @@ const CUBIC_MARGIN: usize = 2;
 fn warp(view: &TrueView<'_>, neighbour: &TrueView<'_>) -> Option<(WarpScore, Rgba8)> {
     const INVISIBLE_COLOUR: [u8; 4] = [120, 20, 30, 255];
     let (truth, other_truth) = (view.truth, neighbour.truth);
-    let surface = Surface { camera: view.camera, map: DepthMap::of(view.depth)? };
-    let other = Surface { camera: neighbour.camera, map: DepthMap::of(neighbour.depth)? };
+    let surface = SurfaceMap { camera: view.camera, map: DepthMap::of(view.depth)? };
+    let other = SurfaceMap { camera: neighbour.camera, map: DepthMap::of(neighbour.depth)? };
     let mut positions = surface.positions_in(&other);
     if let Some(mask) = &view.mask {
         for (position, _) in positions.iter_mut().zip(&mask.counts).filter(|(_, counts)| !**counts)

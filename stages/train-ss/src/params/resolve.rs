@@ -78,7 +78,7 @@ impl Params {
 }
 
 /// Parameters of a training that follow from the kind of field.
-struct TrainingDefaults {
+struct FieldDefaults {
     rays: u64,
     max_rays_per_step: u32,
     learning_rate: f64,
@@ -88,7 +88,7 @@ struct TrainingDefaults {
 }
 
 impl GridParams {
-    fn training_defaults(&self, rays: Option<u64>, scene: &SceneFacts) -> TrainingDefaults {
+    fn training_defaults(&self, rays: Option<u64>, scene: &SceneFacts) -> FieldDefaults {
         let budget = RayBudget {
             rays,
             rays_per_pixel: self.rays_per_pixel,
@@ -96,7 +96,7 @@ impl GridParams {
             max_rays: self.max_rays,
         };
         let is_opaque = scene.background == Background::Opaque;
-        TrainingDefaults {
+        FieldDefaults {
             rays: budget.total(scene.lr_pixels, is_opaque, scene.is_fine_tuning),
             // Design note 007.
             max_rays_per_step: 8_192,
@@ -141,10 +141,10 @@ impl MlpParams {
         rays: Option<u64>,
         scene: &SceneFacts,
         epoch: u64,
-    ) -> TrainingDefaults {
+    ) -> FieldDefaults {
         let (epochs, precrop_steps) =
             if scene.is_ndc() { (EPOCHS_IN_NDC, 0) } else { (EPOCHS, PRECROP_STEPS) };
-        TrainingDefaults {
+        FieldDefaults {
             rays: rays.unwrap_or(epochs * epoch),
             // As in the paper's code.
             max_rays_per_step: 2_048,

@@ -29,7 +29,7 @@ use assembly::block_start;
 use pixel_sampler::PixelSampler;
 use residual::{LossContext, may_be_clipped};
 pub(crate) use setup::alpha_background_error;
-pub use setup::supervision;
+pub use setup::set_up_supervision;
 
 /// Supersampling: draws a training pixel, more often where the image has detail, and casts
 /// sub-pixel rays through it.

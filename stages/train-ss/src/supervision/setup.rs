@@ -34,7 +34,7 @@ pub(crate) fn alpha_background_error(parameter: &str) -> String {
 /// Reads and checks photographs and references, and sets up the supervision of training. Pixels
 /// beyond the memory budget go into a file in `folder`. `log` reports the memory need, and
 /// references that are corrected or dropped.
-pub fn supervision(
+pub fn set_up_supervision(
     input: &GivenInput,
     params: &Resolved,
     references: Option<&GivenInput>,

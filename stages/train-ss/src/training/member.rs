@@ -12,7 +12,7 @@ use super::checkpoint::{Checkpoints, Curve, read_latest};
 use super::field_trainer::{FieldTrainer, average_weights, new_trainer};
 use super::time_left::{TimeLeft, TrainingRays};
 use crate::params::{Combine, Exposure, Resolved};
-use crate::supervision::{Supersampling, supervision};
+use crate::supervision::{Supersampling, set_up_supervision};
 
 /// Inputs of a training run, and its progress bar.
 #[derive(Clone, Copy)]
@@ -168,7 +168,8 @@ impl<'a> Member<'a> {
                 .with_context(|| format!("cannot create {}", work.display()))?;
         }
         let log = |text: String| self.context.log_line(text);
-        let mut supervision = supervision(input, params, references, folder, work.is_some(), &log)?;
+        let mut supervision =
+            set_up_supervision(input, params, references, folder, work.is_some(), &log)?;
         let bundle: usize = supervision.supersample().iter().product();
         if params.rays < bundle as u64 {
             let message = format!(

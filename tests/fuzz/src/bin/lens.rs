@@ -33,7 +33,7 @@ fn check_ray(camera: &Camera, at: [f64; 2], seen: Option<(f64, f64, f64)>) {
     assert!((ray.direction.length() - 1.0).abs() < 1e-12, "{ray:?}");
     let cosine = camera.depth_per_distance(&ray);
     assert!(cosine > 0.0174, "{cosine}");
-    if camera.intrinsics.is_cut(at) {
+    if camera.intrinsics.is_clamped(at) {
         return;
     }
     let (x, y, _) = seen.expect("a ray that isn't cut is seen");

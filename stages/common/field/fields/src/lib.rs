@@ -1,6 +1,6 @@
 //! Loader of field artifacts for stages that render: hash-grid fields and the paper's field.
 //!
-//! * [`Members`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
+//! * [`FieldArtifact`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
 //!   cancels errors where images don't determine the scene (docs/design/011). [`read_field`] reads
 //!   one of them.
 //! * [`read_point_fields`]: all fields of an artifact at points, for baking.
@@ -11,7 +11,7 @@
 //! ```no_run
 //! use artifact::GivenInput;
 //! let input = GivenInput::open("field", "field".as_ref())?;
-//! let members = fields::Members::read(&input, "cpu")?;
+//! let members = fields::FieldArtifact::read(&input, "cpu")?;
 //! println!("{} fields over {:?}", members.fields.len(), members.file.background);
 //! # Ok::<(), artifact::Failure>(())
 //! ```
@@ -33,14 +33,14 @@ pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldM
 pub const ENVIRONMENT: &[&str] = &["TORCH_ALLOW_TF32_CUBLAS_OVERRIDE"];
 
 /// Fields of an artifact.
-pub struct Members {
+pub struct FieldArtifact {
     /// Description of the fields.
     pub file: FieldFile,
     /// Fields on the requested device.
     pub fields: Vec<Box<dyn RayField>>,
 }
 
-impl Members {
+impl FieldArtifact {
     /// Reads all fields of an input onto device `cpu` or `cuda:N`.
     ///
     /// # Errors
@@ -58,7 +58,7 @@ impl Members {
 /// Reads all fields of an input, to be evaluated at points by the CPU.
 ///
 /// # Errors
-/// Those of [`Members::read`].
+/// Those of [`FieldArtifact::read`].
 pub fn read_point_fields(
     input: &GivenInput,
 ) -> Result<(FieldFile, Vec<Box<dyn PointField>>), Failure> {
@@ -99,7 +99,7 @@ pub fn read_field_file(input: &GivenInput) -> Result<FieldFile, Failure> {
 
 /// Renders the mean of all members. The median depth is the median of the members' median depths: a
 /// mean would invent a surface between two surfaces.
-impl RayField for Members {
+impl RayField for FieldArtifact {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         let renders: Vec<Vec<Pixel>> =
             self.fields.iter().map(|field| field.render(rays)).collect::<Result<_, _>>()?;
@@ -174,7 +174,7 @@ pub fn rendering_failure(error: RenderError) -> anyhow::Error {
 /// Reads the weights of one field onto device `cpu` or `cuda:N`.
 ///
 /// # Errors
-/// Those of [`Members::read`].
+/// Those of [`FieldArtifact::read`].
 pub fn read_field(
     model: FieldModel,
     bounds: Bounds,
@@ -248,7 +248,7 @@ mod tests {
             bounds: Bounds::default(),
             background: Background::White,
         };
-        let members = Members { file, fields: vec![Box::new(Even(opacity))] };
+        let members = FieldArtifact { file, fields: vec![Box::new(Even(opacity))] };
         members.render(&[Ray::default()])
     }
 
@@ -329,7 +329,8 @@ mod tests {
         for (i, field) in (0..).zip(&fields) {
             field.write(&folder.path().join(FieldFile::member_file(i))).unwrap();
         }
-        let read = || Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu");
+        let read =
+            || FieldArtifact::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu");
         let rays: Vec<Ray> = [-0.5, 0.0, 0.7].map(ray).into();
         write_file(folder.path(), architecture, bounds, 2);
         let together = RayField::render(&read().unwrap(), &rays).unwrap();

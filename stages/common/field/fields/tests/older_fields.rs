@@ -7,7 +7,7 @@
 use std::path::Path;
 
 use artifact::GivenInput;
-use fields::Members;
+use fields::FieldArtifact;
 use fields::{FIELD_FILE, FieldFile};
 use radiance::{Ray, RayField as _};
 use scene::{Camera, Intrinsics, Views};
@@ -40,7 +40,8 @@ fn rays(camera: &Camera) -> Vec<Ray> {
 /// Compares a render with the older build's EXR file, whose colours have half precision.
 fn renders_as_before(name: &str) {
     let folder = artifact(name);
-    let members = Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").unwrap();
+    let members =
+        FieldArtifact::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").unwrap();
     let views: Views =
         serde_json::from_slice(&std::fs::read(goldens().join("views.json")).unwrap()).unwrap();
     let expected = pixels::read_exr(&goldens().join(format!("{name}.exr"))).unwrap();
@@ -75,8 +76,9 @@ fn a_grid_of_the_first_format_is_refused() {
     // Files of the first format have no `format`.
     description.as_object_mut().unwrap().remove("format").unwrap();
     std::fs::write(&file, description.to_string()).unwrap();
-    let error =
-        Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").err().unwrap();
+    let error = FieldArtifact::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu")
+        .err()
+        .unwrap();
     let line = format!("{error:#}");
     assert!(
         line.ends_with(

@@ -75,7 +75,7 @@ pub fn set_family(family: Family) {
 }
 
 /// Runs a test with every family that the machine supports, and prints the others.
-pub fn by_every_family(mut test: impl FnMut(Family)) {
+pub fn test_every_family(mut test: impl FnMut(Family)) {
     // Tests run in parallel, and the family is global.
     static ALONE_HERE: std::sync::Mutex<()> = std::sync::Mutex::new(());
     let _alone = ALONE_HERE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);

@@ -96,13 +96,13 @@ kernel! {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::by_every_family;
+    use crate::simd::test_every_family;
 
     /// Layers sum 64 products, and the table's sum approaches a fixed point.
     #[test]
     fn the_work_has_equal_results_in_every_family() {
         let mut results = Vec::new();
-        by_every_family(|_| {
+        test_every_family(|_| {
             let mut test = SpeedTest::default();
             results.push(test.work());
             assert!((test.outputs[SAMPLES] - 0.01 * 0.5 * WIDTH as f32).abs() < 0.01);

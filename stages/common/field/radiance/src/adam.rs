@@ -147,7 +147,7 @@ mod tests {
     use numerics::uniform;
 
     use super::*;
-    use numerics::simd::by_every_family;
+    use numerics::simd::test_every_family;
 
     #[test]
     fn equals_adam_in_f64_where_touched() {
@@ -224,7 +224,7 @@ mod tests {
             let begin = uniform(7, 0, (block * LANES) as u64);
             assert_eq!(numbers[0] != begin, is_touched(block), "block {block}");
         }
-        by_every_family(|family| {
+        test_every_family(|family| {
             for pieces in [1, 127, 2048] {
                 assert!(after_step(pieces) == whole, "{family:?}, pieces of {pieces}");
             }

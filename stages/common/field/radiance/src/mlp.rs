@@ -275,7 +275,7 @@ impl Layers {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use numerics::simd::by_every_family;
+    use numerics::simd::test_every_family;
     use numerics::uniform;
 
     fn numbers(seed: u64, len: usize) -> Vec<f32> {
@@ -345,6 +345,6 @@ mod tests {
     #[test]
     fn all_families_give_equal_bits() {
         let best = outcome();
-        by_every_family(|family| assert_eq!(outcome(), best, "{family:?}"));
+        test_every_family(|family| assert_eq!(outcome(), best, "{family:?}"));
     }
 }

@@ -421,10 +421,10 @@ fn outcome(field: &Field, rays: &[Ray]) -> Vec<u32> {
 
 #[test]
 fn every_family_renders_and_trains_to_equal_bits() {
-    use numerics::simd::by_every_family;
+    use numerics::simd::test_every_family;
     let (field, rays) = example();
     let best = outcome(&field, &rays);
-    by_every_family(|family| {
+    test_every_family(|family| {
         assert!(outcome(&field, &rays) == best, "{family:?} gives other bits");
     });
 }

@@ -419,7 +419,7 @@ mod tests {
     use numerics::CounterRng;
     use scene::{Bounds, Space};
 
-    use numerics::simd::by_every_family;
+    use numerics::simd::test_every_family;
 
     /// Rays through the cube, before black or white, that should all be white.
     struct White {
@@ -568,7 +568,7 @@ mod tests {
                 bits(&trained(field, 0.0, 1e-3, 40).0)
             };
             let best = train();
-            by_every_family(|family| assert!(train() == best, "{family:?} in {space:?}"));
+            test_every_family(|family| assert!(train() == best, "{family:?} in {space:?}"));
         }
     }
 

@@ -10,7 +10,7 @@ use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
 use crate::error::TorchFieldError;
-use crate::ray_maps::{RayMaps, matrix, multiply_add, to_host};
+use crate::ray_tensors::{RayTensors, matrix, multiply_add, to_host};
 use crate::step::run_in_pieces;
 
 /// The hash-grid field, [`radiance::Field`], in libtorch: an independent implementation with the
@@ -125,7 +125,7 @@ pub(crate) struct GridForward {
     pub(crate) hits: Vec<CellHit>,
     /// Number of samples in occupied cells; only in training.
     pub(crate) samples: usize,
-    maps: RayMaps,
+    maps: RayTensors,
 }
 
 /// Returns the cells in which samples absorb light, from the samples' weights (s × 1), positions (s
@@ -334,7 +334,7 @@ impl TorchGrid {
         strides: Strides,
     ) -> Result<GridForward, TchError> {
         let n = rays.len() as i64;
-        let maps = RayMaps::new(&self.bounds, rays, self.device)?;
+        let maps = RayTensors::new(&self.bounds, rays, self.device)?;
         let Marched { t, kept, positions, length, count } = self.march(&maps, offsets, strides)?;
 
         let outputs = self.outputs(&positions)?;
@@ -384,7 +384,7 @@ impl TorchGrid {
     /// Returns the samples of rays in occupied cells.
     fn march(
         &self,
-        maps: &RayMaps,
+        maps: &RayTensors,
         offsets: &Tensor,
         strides: Strides,
     ) -> Result<Marched, TchError> {
@@ -421,7 +421,7 @@ impl TorchGrid {
     /// its ray's (deferred shading).
     fn shade(
         &self,
-        maps: &RayMaps,
+        maps: &RayTensors,
         outputs: &Tensor,
         weight: &Tensor,
         ray: &Tensor,

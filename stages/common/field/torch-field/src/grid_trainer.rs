@@ -9,7 +9,7 @@ use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::error::TorchFieldError;
 use crate::grid::TorchGrid;
-use crate::ray_maps::{columns, to_host};
+use crate::ray_tensors::{columns, to_host};
 use crate::regularisers::add_regularisers;
 use crate::step::Step;
 

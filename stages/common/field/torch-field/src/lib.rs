@@ -47,7 +47,7 @@ mod mlp_trainer;
 #[cfg(feature = "torch")]
 mod network;
 #[cfg(feature = "torch")]
-mod ray_maps;
+mod ray_tensors;
 #[cfg(feature = "torch")]
 mod regularisers;
 #[cfg(feature = "torch")]

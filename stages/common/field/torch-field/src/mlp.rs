@@ -13,7 +13,7 @@ use crate::architecture::MlpArchitecture;
 use crate::composite::{Composite, composite};
 use crate::error::TorchFieldError;
 use crate::network::{MlpNetwork, encode};
-use crate::ray_maps::{RayMaps, columns, matrix, to_host};
+use crate::ray_tensors::{RayTensors, columns, matrix, to_host};
 use crate::sampling::{importance, midpoints, stratified};
 use crate::step::run_in_pieces;
 
@@ -66,7 +66,7 @@ pub(crate) struct Batch {
     pub(crate) direction: Tensor,
     pub(crate) background: Tensor,
     /// Rays in the unit cube, unless the field's space is a box.
-    pub(crate) maps: Option<RayMaps>,
+    pub(crate) maps: Option<RayTensors>,
 }
 
 /// Composites of both networks along n rays.
@@ -143,7 +143,7 @@ impl Batch {
             direction: columns(rays, device, |r| r.direction.map(|x| x as f32))?,
             background: columns(rays, device, |r| r.background)?,
             maps: (bounds.space != Space::Box)
-                .then(|| RayMaps::new(&bounds, rays, device))
+                .then(|| RayTensors::new(&bounds, rays, device))
                 .transpose()?,
         })
     }

@@ -9,7 +9,7 @@ use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::mlp::Mlp;
 use crate::network::encode;
-use crate::ray_maps::{matrix, to_host};
+use crate::ray_tensors::{matrix, to_host};
 
 /// Number of points per pass, whose activations fit the cache; chosen by hand.
 const POINTS_PER_PASS: usize = 1024;

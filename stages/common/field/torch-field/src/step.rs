@@ -4,7 +4,7 @@ use radiance::{PhaseClock, Ray, RenderedBundles, Supervisor, TrainingState};
 use tch::{TchError, Tensor};
 
 use crate::error::TorchFieldError;
-use crate::ray_maps::to_host;
+use crate::ray_tensors::to_host;
 
 /// Number of final epochs during which the learning rate decays.
 const FALLING_EPOCHS: u64 = 10;

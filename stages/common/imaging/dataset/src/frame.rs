@@ -85,7 +85,7 @@ impl Frame {
 
     /// True if some pixels may not count.
     pub fn is_masked(&self) -> bool {
-        self.mask.is_some() || self.intrinsics().has_cut_rays()
+        self.mask.is_some() || self.intrinsics().has_clamped_rays()
     }
 
     pub(crate) fn has_distortion(&self) -> bool {

@@ -147,27 +147,27 @@ impl Intrinsics {
     }
 
     /// Returns the mask of pixels with valid rays; `None` if all are valid. A cut ray (see
-    /// [`Intrinsics::is_cut`]) is not valid.
+    /// [`Intrinsics::is_clamped`]) is not valid.
     pub fn lens_mask(&self) -> Option<Mask> {
-        if !self.has_cut_rays() {
+        if !self.has_clamped_rays() {
             return None;
         }
         let (width, height) = (self.width as usize, self.height as usize);
         let counts = (0..width * height)
-            .map(|i| !self.is_cut([(i % width) as f64 + 0.5, (i / width) as f64 + 0.5]))
+            .map(|i| !self.is_clamped([(i % width) as f64 + 0.5, (i / width) as f64 + 0.5]))
             .collect();
         Some(Mask { width, height, counts })
     }
 
-    /// True if a ray of the image is cut (see [`Intrinsics::is_cut`]).
-    pub fn has_cut_rays(&self) -> bool {
-        self.border().any(|position| self.is_cut(position))
+    /// True if a ray of the image is clamped (see [`Intrinsics::is_clamped`]).
+    pub fn has_clamped_rays(&self) -> bool {
+        self.border().any(|position| self.is_clamped(position))
     }
 
     /// True if the fisheye ray at a position, in pixels, is more than 89° from the axis and is
     /// clamped.
-    pub fn is_cut(&self, position: [f64; 2]) -> bool {
-        self.distortion.is_cut(self.to_plane(position))
+    pub fn is_clamped(&self, position: [f64; 2]) -> bool {
+        self.distortion.is_clamped(self.to_plane(position))
     }
 
     /// Converts an image position of `other`, a camera with the same pose, to this camera's image.

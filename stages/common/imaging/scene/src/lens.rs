@@ -125,8 +125,8 @@ impl Distortion {
         self.projection.slopes(self.undistorted_position(distorted))
     }
 
-    /// True if the fisheye ray at a position is cut: its angle from the axis is clamped to 89°.
-    pub(crate) fn is_cut(&self, distorted: [f64; 2]) -> bool {
+    /// True if the fisheye ray at a position is clamped to 89° from the axis.
+    pub(crate) fn is_clamped(&self, distorted: [f64; 2]) -> bool {
         self.is_fisheye() && is_at_limit(self.undistorted_position(distorted))
     }
 

@@ -49,4 +49,4 @@ pub use projection::Projection;
 pub use space::{Frustum, Space, power_of_two_below};
 pub use view_image::{VIEW_CHANNELS, image_file, mask_file, preview_file, write_view_image};
 pub use views::{Background, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
-pub use warp::{PointProjection, Surface};
+pub use warp::{PointProjection, SurfaceMap};

@@ -5,7 +5,7 @@ use crate::camera::Camera;
 
 /// Depth and opacity of a view's surfaces, with the view's camera.
 #[derive(Clone, Copy, Debug)]
-pub struct Surface<'a> {
+pub struct SurfaceMap<'a> {
     /// Camera of the view, with the map's size.
     pub camera: &'a Camera,
     /// Depth and opacity at each pixel's centre.
@@ -31,13 +31,13 @@ const MAX_DEPTH_DIFFERENCE: f64 = 0.02;
 /// of a far wall poorly, but such an error of depth hardly moves the wall in the image.
 const MAX_REPROJECTION_ERROR_PIXELS: f64 = 0.5;
 
-impl Surface<'_> {
+impl SurfaceMap<'_> {
     /// Returns, row by row, the position of each pixel's surface point in another view; `None`
-    /// where [`Surface::visible_projection`] returns `None`.
+    /// where [`SurfaceMap::visible_projection`] returns `None`.
     ///
     /// # Panics
     /// If the map doesn't have one number per pixel.
-    pub fn positions_in(&self, other: &Surface<'_>) -> Vec<Option<[f32; 2]>> {
+    pub fn positions_in(&self, other: &SurfaceMap<'_>) -> Vec<Option<[f32; 2]>> {
         let k = &self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         (0..width * height)
@@ -54,7 +54,7 @@ impl Surface<'_> {
         &self,
         column: usize,
         row: usize,
-        other: &Surface<'_>,
+        other: &SurfaceMap<'_>,
     ) -> Option<PointProjection> {
         let (projection, point) = self.project(column, row, other.camera)?;
         let pixel = [column as f64 + 0.5, row as f64 + 0.5];
@@ -188,8 +188,8 @@ mod tests {
         for has_plate in [false, true] {
             let (da, db) = (depths(&a, has_plate), depths(&b, has_plate));
             let (from_a, from_b) = (
-                Surface { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } },
-                Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } },
+                SurfaceMap { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } },
+                SurfaceMap { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } },
             );
             let mut seen = 0;
             for (i, place) in from_a.positions_in(&from_b).into_iter().enumerate() {
@@ -224,8 +224,8 @@ mod tests {
         }
         let nothing = vec![0.0; 64 * 48];
         let (da, db) = (depths(&a, false), depths(&b, false));
-        let empty = Surface { camera: &a, map: DepthMap { depth: &da, opacity: &nothing } };
-        let other = Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
+        let empty = SurfaceMap { camera: &a, map: DepthMap { depth: &da, opacity: &nothing } };
+        let other = SurfaceMap { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
         assert!(empty.positions_in(&other).iter().all(Option::is_none));
     }
 
@@ -236,8 +236,8 @@ mod tests {
         let b = camera(DVec3::new(baseline, 0.0, 4.0), 0.0);
         let (da, db): (Vec<f32>, Vec<f32>) =
             (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
-        let other = Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
-        let from = Surface { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } };
+        let other = SurfaceMap { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
+        let from = SurfaceMap { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } };
         from.positions_in(&other).iter().flatten().count()
     }
 
@@ -263,7 +263,7 @@ mod tests {
         let opacity = vec![1.0; 64 * 48];
         for depth in [f32::NAN, f32::INFINITY, -1.0, 0.0, 1e38, 1e-38] {
             let map = DepthMap { depth: &vec![depth; 64 * 48], opacity: &opacity };
-            Surface { camera: &a, map }.positions_in(&Surface { camera: &b, map });
+            SurfaceMap { camera: &a, map }.positions_in(&SurfaceMap { camera: &b, map });
         }
     }
 }

@@ -94,6 +94,7 @@ mod tests {
             sink: false,
             partial: false,
             from_checkpoint: false,
+            libtorch: false,
             rules: Vec::new(),
         };
         let expected = "\

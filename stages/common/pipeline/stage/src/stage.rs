@@ -21,6 +21,8 @@ pub trait Stage {
     const ACCEPTS_FAILURES: bool = false;
     /// True if the stage accepts `--from-checkpoint` ([`Context::from_checkpoint`]).
     const FROM_CHECKPOINT: bool = false;
+    /// True if this build of the program contains libtorch.
+    const LIBTORCH: bool = false;
     /// Environment variables that change the result.
     const ENVIRONMENT: &'static [&'static str] = &[];
 
@@ -60,6 +62,7 @@ pub trait Stage {
             sink: Self::SINK,
             partial: Self::ACCEPTS_FAILURES,
             from_checkpoint: Self::FROM_CHECKPOINT,
+            libtorch: Self::LIBTORCH,
             rules: Self::rules(),
         }
     }

@@ -765,7 +765,7 @@ kernel! {
 #[cfg(test)]
 mod tests {
     use numerics::CounterRng;
-    use numerics::simd::by_every_family;
+    use numerics::simd::test_every_family;
 
     use super::*;
 
@@ -834,7 +834,7 @@ mod tests {
             let mut other = Maps::default();
             other.fill(width + 2, height + 2, &numbers((width + 2) * (height + 2) * outputs, 6));
             let mut first: Option<Vec<Vec<f32>>> = None;
-            by_every_family(|_| {
+            test_every_family(|_| {
                 let (mut y, mut scratch) = (Maps::default(), Scratch::default());
                 let mut results = Vec::new();
                 for after in [After::Linear, After::Relu, After::Add(&other)] {
@@ -878,7 +878,7 @@ mod tests {
                 let i = (y * out_width + x) * outputs + output;
                 if is_open[i] { f64::from(weights[i]) } else { 0.0 }
             };
-            by_every_family(|_| {
+            test_every_family(|_| {
                 let mut gradients = LayerGradients::default();
                 gradients.reset(&layer);
                 let (mut dx, mut scratch) = (Maps::default(), Scratch::default());

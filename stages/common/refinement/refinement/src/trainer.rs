@@ -31,7 +31,7 @@ pub trait Training {
 
 /// Options for training a [`Refiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RefinerTraining {
+pub struct RefinerTrainingOptions {
     /// Total number of steps.
     pub steps: u64,
     /// Number of patches per step.
@@ -51,7 +51,7 @@ pub struct RefinerTraining {
 /// the scene's colours and transfers to another size (design note 015).
 pub struct RefinerTrainer {
     refiner: Refiner,
-    options: RefinerTraining,
+    options: RefinerTrainingOptions,
     adam: Adam,
     /// Current training views of a reference-based network.
     pool: Option<Pool>,
@@ -70,7 +70,7 @@ impl Pool {
     /// Draws the views of a round.
     fn new(
         round: u64,
-        options: &RefinerTraining,
+        options: &RefinerTrainingOptions,
         guidance: WarpOptions,
         examples: &[KnownView],
     ) -> Self {
@@ -83,7 +83,7 @@ impl Pool {
 /// Draws the `number`-th example of the training run, with random references.
 fn draw_view(
     number: u64,
-    options: &RefinerTraining,
+    options: &RefinerTrainingOptions,
     guidance: WarpOptions,
     examples: &[KnownView],
 ) -> (usize, Image) {
@@ -137,7 +137,7 @@ pub struct RefinerScores {
 
 impl RefinerTrainer {
     /// Creates a trainer of `refiner`.
-    pub fn new(refiner: Refiner, options: RefinerTraining) -> Self {
+    pub fn new(refiner: Refiner, options: RefinerTrainingOptions) -> Self {
         let adam = Adam::new(&refiner);
         let shards = (0..SHARDS).map(|_| Shard::default()).collect();
         Self { refiner, options, adam, pool: None, shards }
@@ -248,7 +248,7 @@ impl Training for RefinerTrainer {
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
         let options = self.options;
-        let RefinerTraining { steps, batch_size, learning_rate, .. } = options;
+        let RefinerTrainingOptions { steps, batch_size, learning_rate, .. } = options;
         let step = self.steps();
         if step >= steps {
             return Ok(None);
@@ -303,7 +303,7 @@ impl Shard {
         &mut self,
         architecture: RefinerArchitecture,
         layers: &Layers,
-        options: &RefinerTraining,
+        options: &RefinerTrainingOptions,
         step: u64,
         range: Range<usize>,
         views: &[TrainingView<'_>],
@@ -336,7 +336,7 @@ impl Shard {
 }
 
 /// Returns the number of samples of a patch's residual.
-fn residual_samples(options: &RefinerTraining) -> usize {
+fn residual_samples(options: &RefinerTrainingOptions) -> usize {
     options.patch_size * options.patch_size * OUTPUTS
 }
 
@@ -376,7 +376,7 @@ struct TrainingPatch<'a> {
 
 impl<'a> TrainingPatch<'a> {
     /// Draws the `number`-th patch of the training run.
-    fn draw(options: &RefinerTraining, number: u64, views: &[TrainingView<'a>]) -> Self {
+    fn draw(options: &RefinerTrainingOptions, number: u64, views: &[TrainingView<'a>]) -> Self {
         let mut rng = CounterRng::new(options.seed, PATCHES, number);
         let (mut view, mut square) = draw_square(views, options.patch_size, &mut rng);
         for _ in 0..MAX_REDRAWS {
@@ -510,7 +510,7 @@ mod tests {
 
     fn trained(guidance: Option<WarpOptions>) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
-        let options = RefinerTraining {
+        let options = RefinerTrainingOptions {
             steps: 300,
             batch_size: 8,
             patch_size: 16,

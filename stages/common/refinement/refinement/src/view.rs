@@ -1,6 +1,6 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
 use pixels::{DepthMap, Exposure, ExrImage, Image, read_exr};
-use scene::{Camera, Photograph, Surface, View};
+use scene::{Camera, Photograph, SurfaceMap, View};
 
 use crate::error::RefinementError;
 
@@ -92,9 +92,9 @@ impl Rendered {
     }
 
     /// Returns the surfaces that the view's depth describes.
-    pub fn surface(&self) -> Surface<'_> {
+    pub fn surface(&self) -> SurfaceMap<'_> {
         let map = DepthMap { depth: &self.depth, opacity: &self.opacity };
-        Surface { camera: &self.camera, map }
+        SurfaceMap { camera: &self.camera, map }
     }
 }
 

@@ -22,6 +22,8 @@ const RENDERED_BYTES_PER_FLOAT: u64 = 7;
 const RENDERER_BYTES: u64 = 143_000_000;
 /// Bytes of any other program with libtorch, without data; as in the tests below.
 const PROGRAM_BYTES: u64 = 120_000_000;
+/// Bytes of libtorch in a program, as in the tests below.
+const LIBTORCH_BYTES: u64 = 115_000_000;
 /// Seconds per pixel of `eval` without and with LPIPS: lego 100×2, 12 views.
 const SCORED_PIXEL_SECONDS: f64 = 1.4e-6;
 const LPIPS_PIXEL_SECONDS: f64 = 2.2e-6;
@@ -67,6 +69,12 @@ pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Opti
         "camera-path" => (0.0, CAMERA_PATH_BYTES),
         _ => return None,
     };
+    let can_lack_libtorch = matches!(program, "train-ss" | "render-depth" | "eval" | "export");
+    let peak_memory = if can_lack_libtorch && !work.has_libtorch {
+        peak_memory - LIBTORCH_BYTES
+    } else {
+        peak_memory
+    };
     let start = if matches!(program, "prep" | "demo-scene") { 0.0 } else { START_SECONDS };
     Some(ModelCost { processor_seconds: start + seconds, peak_memory })
 }
@@ -76,7 +84,9 @@ pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Opti
 pub(crate) fn min_memory(program: &str, parameters: &Value, work: &Work) -> Option<u64> {
     match program {
         "prep" => Some(work.preparation_bytes),
-        "train-ss" => Some(training_need(parameters, work)?.minimum(program_bytes(true))),
+        "train-ss" => {
+            Some(training_need(parameters, work)?.minimum(program_bytes(work.has_libtorch)))
+        }
         _ => Some(model_cost(program, parameters, work)?.peak_memory),
     }
 }
@@ -195,6 +205,7 @@ mod tests {
             field: Some(training(1)),
             is_fine_tuning: false,
             computes_lpips: false,
+            has_libtorch: true,
             threads: 2,
         }
     }
@@ -269,8 +280,6 @@ mod tests {
             (json!({"size": 100}), 2.62),
             (json!({"size": 400, "train": 20, "test": 5}), 11.04),
             (json!({"backdrop": true, "train": 40}), 10.71),
-            (json!({"generated": true, "train": 40}), 6.19),
-            (json!({"generated": true, "backdrop": true, "train": 20}), 8.39),
             (json!({"form": "transforms", "train": 40}), 5.66),
             (json!({"samples_per_axis": 1}), 1.39),
         ] {
@@ -299,16 +308,23 @@ mod tests {
         let lego = work(object, 50, 800);
         let scored = Work { computes_lpips: true, ..lego.clone() };
         let photographs = |bytes| Work { preparation_bytes: bytes, ..work(object, 20, 1) };
+        let without = |work: Work| Work { has_libtorch: false, ..work };
+        let [demo_100, demo_200] = [work(object, 80, 100), work(object, 10, 200)].map(without);
+        let demo_200 = Work { pixels_across: 100.0, ..demo_200 };
         let refiner = json!({
             "net": "compact", "patch_size": 64, "batch_size": 8, "steps": 1, "self_ensemble": 1,
         });
         let render = json!({"samples_per_axis": 1, "tolerance": 0.005});
+        let (train, render_demo) = (training(12_000_000), render.clone());
         for (name, program, parameters, work, measured) in [
             ("fern, trained", "train-ss", training(500_000), &fern, 476.0),
             ("demo 32, trained", "train-ss", training(150_000), &work(object, 80, 32), 183.0),
             ("demo 100, trained", "train-ss", training(150_000), &work(object, 80, 100), 272.0),
             ("fern, rendered", "render-depth", render.clone(), &fern_field, 212.0),
             ("demo 32, rendered", "render-depth", render, &work(object, 12, 32), 144.0),
+            ("demo 100, trained without libtorch", "train-ss", train, &demo_100, 194.5),
+            ("demo 200, rendered without libtorch", "render-depth", render_demo, &demo_200, 42.5),
+            ("demo 200, scored without libtorch", "eval", json!({}), &demo_200, 14.7),
             ("lego 800, LPIPS", "eval", json!({}), &scored, 865.0),
             ("demo 200, no LPIPS", "eval", json!({}), &work(object, 10, 200), 130.0),
             ("lego 800, refined", "refine", refiner.clone(), &lego, 202.0),

@@ -200,6 +200,7 @@ impl<'a> Estimator<'a> {
             field: training.map(|training| training.parameters.clone()),
             is_fine_tuning: has_input("init"),
             computes_lpips: has_input("weights"),
+            has_libtorch: node.program.description.libtorch,
             threads: self.threads,
         })
     }

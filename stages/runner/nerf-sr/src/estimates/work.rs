@@ -69,6 +69,8 @@ pub(crate) struct Work {
     pub(crate) is_fine_tuning: bool,
     /// True if views are scored by LPIPS.
     pub(crate) computes_lpips: bool,
+    /// True if the stage's program contains libtorch.
+    pub(crate) has_libtorch: bool,
     /// Number of threads.
     pub(crate) threads: u64,
 }

@@ -71,7 +71,7 @@ fn higher_terms_are_those_of_the_formula() {
     }
 }
 
-/// OpenCV's fisheye formula, term by term, out to the limit; beyond it rays are cut.
+/// OpenCV's fisheye formula, term by term, out to the limit; beyond it rays are clamped.
 #[test]
 fn a_fisheye_ray_is_seen_at_the_polynomial_of_its_angle() {
     let lens = Distortion::fisheye([-0.02, 0.006, -0.003, 0.0005]);
@@ -83,12 +83,15 @@ fn a_fisheye_ray_is_seen_at_the_polynomial_of_its_angle() {
                 + 0.0005 * angle.powi(8));
         assert!((distorted[0].hypot(distorted[1]) - expected).abs() < 1e-13, "{degrees}");
         let [x, y] = lens.undistort(distorted);
-        assert!((x.hypot(y).atan() - angle).abs() < 1e-13 && !lens.is_cut(distorted), "{degrees}");
+        assert!(
+            (x.hypot(y).atan() - angle).abs() < 1e-13 && !lens.is_clamped(distorted),
+            "{degrees}"
+        );
     }
     for radius in [1.6, 2.0, 10.0, 1e9] {
         let distorted = scaled([0.6, -0.8], radius);
         let [x, y] = lens.undistort(distorted);
-        assert!((x.hypot(y).atan().to_degrees() - 89.0).abs() < 1e-9 && lens.is_cut(distorted));
+        assert!((x.hypot(y).atan().to_degrees() - 89.0).abs() < 1e-9 && lens.is_clamped(distorted));
         assert!(x > 0.0 && y < 0.0);
     }
 }
@@ -146,7 +149,7 @@ proptest! {
     fn fisheye_rays_come_back(d in fisheye(), degrees in 0.0..88.9f64, azimuth in 0.0..6.3f64) {
         let ray = at_angle(degrees, azimuth);
         let distorted = d.distort(ray);
-        prop_assert!(d.is_invertible_at(distorted) && !d.is_cut(distorted));
+        prop_assert!(d.is_invertible_at(distorted) && !d.is_clamped(distorted));
         let [x, y] = d.undistort(distorted);
         let off = (x - ray[0]).hypot(y - ray[1]) * degrees.to_radians().cos().powi(2);
         prop_assert!(off < 1e-10, "off by {off} radians");

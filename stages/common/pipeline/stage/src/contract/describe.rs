@@ -43,6 +43,9 @@ pub struct Description {
     /// checkpoint.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub from_checkpoint: bool,
+    /// True if the program contains libtorch, which takes memory of its own.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub libtorch: bool,
     /// Constraints between parameters and inputs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub rules: Vec<Rule>,
@@ -181,6 +184,7 @@ mod tests {
             sink: false,
             partial: false,
             from_checkpoint: false,
+            libtorch: false,
             rules: vec![
                 Rule::new("weights are needed").when("method", methods).needs("weights"),
                 Rule::new("the scale must be whole")

@@ -8,7 +8,7 @@
 //! * [`PaperRefiner`]: the network (Choi et al. 2019's maximum over references, batch
 //!   normalisation, tanh). [`PaperRefiner::refine`] redraws a view in overlapping patches and
 //!   blends them; depth gives the positions of the reference patches.
-//! * [`PaperTrainer`], [`PaperTraining`]: training with L1 and, if VGG-19's weights are given,
+//! * [`PaperTrainer`], [`PaperTrainingOptions`]: training with L1 and, if VGG-19's weights are given,
 //!   [`PerceptualLoss`].
 //!
 //! Colours are display-encoded sRGB composited on the background, 0..1 outside and -1..1 inside.
@@ -33,5 +33,4 @@ mod trainer;
 
 pub use loss::PerceptualLoss;
 pub use network::PaperRefiner;
-pub use patches::DEFAULT_OVERLAP_PIXELS;
-pub use trainer::{PaperTrainer, PaperTraining};
+pub use trainer::{PaperTrainer, PaperTrainingOptions};

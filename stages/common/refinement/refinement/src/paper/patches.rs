@@ -3,15 +3,15 @@ use std::collections::BTreeSet;
 use crate::{KnownView, RefinementError, Rendered};
 use pixels::Image;
 use rayon::prelude::*;
-use scene::Surface;
+use scene::SurfaceMap;
 use tch::{TchError, no_grad};
 
 use super::network::{PaperRefiner, patch_tensor};
 
 /// Side of a patch in pixels, as published.
 pub(crate) const PATCH_PIXELS: usize = 64;
-/// Default overlap of neighbouring patches in pixels: a quarter of a patch (design note 024).
-pub const DEFAULT_OVERLAP_PIXELS: usize = 16;
+/// Overlap of neighbouring patches in pixels: a quarter of a patch (design note 024).
+const OVERLAP_PIXELS: usize = 16;
 /// Number of probes along each side of a patch: pixels whose depth locates reference patches;
 /// chosen by hand.
 const PROBES_PER_SIDE: usize = 4;
@@ -20,8 +20,7 @@ const PROBES_PER_SIDE: usize = 4;
 type Corner = (usize, usize);
 
 impl PaperRefiner {
-    /// Redraws a view in patches of 64×64 pixels, blended over an overlap of `overlap` pixels, at
-    /// most half a patch. Each patch gets at most `max_references` reference patches, at positions
+    /// Redraws a view in patches of 64×64 pixels, blended where they overlap. Each patch gets at most `max_references` reference patches, at positions
     /// where the patch's pixels are visible in the references. A patch without reference patches is
     /// its own reference, as in the paper's code. Returns an image of three channels in 0..1.
     pub fn refine(
@@ -29,7 +28,6 @@ impl PaperRefiner {
         rendered: &Rendered,
         references: &[&KnownView],
         max_references: usize,
-        overlap: usize,
     ) -> Result<Image, RefinementError> {
         let view = &rendered.view;
         if view.width < PATCH_PIXELS || view.height < PATCH_PIXELS {
@@ -46,9 +44,9 @@ impl PaperRefiner {
             let reason = format!("reference of fewer than {PATCH_PIXELS}×{PATCH_PIXELS} pixels");
             return Err(RefinementError::view(&small.rendered.camera.name, reason));
         }
-        let corners: Vec<(Corner, Self)> = patch_starts(view.height, overlap)
+        let corners: Vec<(Corner, Self)> = patch_starts(view.height)
             .into_iter()
-            .flat_map(|y| patch_starts(view.width, overlap).into_iter().map(move |x| (x, y)))
+            .flat_map(|y| patch_starts(view.width).into_iter().map(move |x| (x, y)))
             .map(|corner| (corner, self.shallow_clone()))
             .collect();
         let patches = corners
@@ -84,10 +82,9 @@ impl PaperRefiner {
 }
 
 /// Returns the starts of patches along an axis; the last patch ends at the border.
-fn patch_starts(size: usize, overlap: usize) -> Vec<usize> {
+fn patch_starts(size: usize) -> Vec<usize> {
     let last = size - PATCH_PIXELS;
-    let mut all: Vec<usize> =
-        (0..last).step_by(PATCH_PIXELS - overlap.min(PATCH_PIXELS / 2)).collect();
+    let mut all: Vec<usize> = (0..last).step_by(PATCH_PIXELS - OVERLAP_PIXELS).collect();
     all.push(last);
     all
 }
@@ -114,7 +111,7 @@ fn matching_patches(
     max_count: usize,
 ) -> Vec<(usize, Corner)> {
     let surface = rendered.surface();
-    let surfaces: Vec<Surface<'_>> = references.iter().map(|r| r.rendered.surface()).collect();
+    let surfaces: Vec<SurfaceMap<'_>> = references.iter().map(|r| r.rendered.surface()).collect();
     let step = PATCH_PIXELS / PROBES_PER_SIDE;
     let mut candidates = Vec::new();
     for (dx, dy) in (0..PROBES_PER_SIDE)
@@ -187,28 +184,24 @@ mod tests {
 
     #[test]
     fn patches_that_do_nothing_are_stitched_to_the_image() {
-        for (width, height, overlap) in
-            [(64, 64, 16), (65, 200, 0), (150, 112, 16), (150, 112, 0), (129, 300, 100)]
-        {
+        for (width, height) in [(64, 64), (65, 200), (150, 112), (129, 300)] {
             let whole = image(width, height, 3);
-            let corners = patch_starts(height, overlap)
+            let corners = patch_starts(height)
                 .into_iter()
-                .flat_map(|y| patch_starts(width, overlap).into_iter().map(move |x| (x, y)));
+                .flat_map(|y| patch_starts(width).into_iter().map(move |x| (x, y)));
             let patches: Vec<_> = corners.map(|corner| (corner, patch(&whole, corner))).collect();
             let again = blend(width, height, &patches);
             let worst =
                 whole.data.iter().zip(&again.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(worst < 1e-6, "{width}×{height} by {overlap}: {worst}");
+            assert!(worst < 1e-6, "{width}×{height}: {worst}");
         }
     }
 
     #[test]
-    fn patches_overlap_by_as_much_as_asked() {
-        assert_eq!(patch_starts(256, 0), [0, 64, 128, 192]);
-        assert_eq!(patch_starts(256, DEFAULT_OVERLAP_PIXELS), [0, 48, 96, 144, 192]);
-        assert_eq!(patch_starts(150, 32), [0, 32, 64, 86]);
-        // Never by more than half.
-        assert_eq!(patch_starts(150, 64), patch_starts(150, 32));
+    fn patches_overlap_by_a_quarter() {
+        assert_eq!(patch_starts(256), [0, 48, 96, 144, 192]);
+        // The last patch ends at the border.
+        assert_eq!(patch_starts(150), [0, 48, 86]);
     }
 
     /// Creates the view of a wall at distance 2 by a camera moved along it by a number of pixels.
@@ -258,19 +251,12 @@ mod tests {
         let network = PaperRefiner::new(4, 1).unwrap();
         let (view, other) = (known(0.0), known(20.0));
         for references in [vec![], vec![&other]] {
-            let drawn =
-                network.refine(&view.rendered, &references, 8, DEFAULT_OVERLAP_PIXELS).unwrap();
+            let drawn = network.refine(&view.rendered, &references, 8).unwrap();
             assert_eq!((drawn.width, drawn.height, drawn.channels), (160, 96, 3));
             assert!(drawn.data.iter().all(|v| (0.0..=1.0).contains(v)));
         }
         let mut small = view.rendered.clone();
         small.view = image(63, 96, 4);
-        assert!(
-            network
-                .refine(&small, &[], 8, DEFAULT_OVERLAP_PIXELS)
-                .unwrap_err()
-                .to_string()
-                .contains("64×64")
-        );
+        assert!(network.refine(&small, &[], 8).unwrap_err().to_string().contains("64×64"));
     }
 }

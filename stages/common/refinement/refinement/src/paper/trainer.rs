@@ -12,7 +12,7 @@ use super::perspective::Perspective;
 
 /// Options for training a [`PaperRefiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PaperTraining {
+pub struct PaperTrainingOptions {
     /// Total number of steps; 46,875 as published.
     pub steps: u64,
     /// Number of patches per step; 32 as published.
@@ -33,7 +33,7 @@ pub struct PaperTraining {
 /// colours in -1..1.
 pub struct PaperTrainer {
     network: PaperRefiner,
-    options: PaperTraining,
+    options: PaperTrainingOptions,
     perceptual: Option<PerceptualLoss>,
     adam: Adam,
 }
@@ -50,7 +50,7 @@ impl PaperTrainer {
     /// Creates a trainer of `network`.
     pub fn new(
         network: PaperRefiner,
-        options: PaperTraining,
+        options: PaperTrainingOptions,
         perceptual: Option<PerceptualLoss>,
     ) -> Result<Self, RefinementError> {
         let adam = Adam::new(network.parameters())?;
@@ -69,7 +69,7 @@ impl Training for PaperTrainer {
     }
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
-        let PaperTraining { steps, batch_size, patch_size, references, learning_rate, seed } =
+        let PaperTrainingOptions { steps, batch_size, patch_size, references, learning_rate, seed } =
             self.options;
         if self.steps() >= steps {
             return Ok(None);
@@ -147,7 +147,7 @@ impl<'a> TrainingPatch<'a> {
     fn draw(
         example: &'a KnownView,
         index: u64,
-        options: &PaperTraining,
+        options: &PaperTrainingOptions,
         rng: &mut CounterRng,
     ) -> Self {
         let (width, height) = (example.truth.width, example.truth.height);
@@ -210,7 +210,7 @@ fn draw_near(start: usize, last: usize, rng: &mut CounterRng) -> usize {
     draw_between(low, (start + MAX_REFERENCE_OFFSET_PIXELS).min(last), rng)
 }
 
-impl PaperTraining {
+impl PaperTrainingOptions {
     /// Fails if the network can't halve patches three times, or if an example is smaller than a
     /// patch.
     pub fn check(&self, examples: &[KnownView]) -> Result<(), RefinementError> {
@@ -263,7 +263,7 @@ mod tests {
         KnownView { rendered, truth: Image::new(48, 40, 3, truth) }
     }
 
-    const OPTIONS: PaperTraining = PaperTraining {
+    const OPTIONS: PaperTrainingOptions = PaperTrainingOptions {
         steps: 60,
         batch_size: 4,
         patch_size: 16,
@@ -304,7 +304,7 @@ mod tests {
     #[test]
     fn patches_must_fit() {
         let error = |patch_size| {
-            let options = PaperTraining { patch_size, ..OPTIONS };
+            let options = PaperTrainingOptions { patch_size, ..OPTIONS };
             options.check(&[example()]).unwrap_err().to_string()
         };
         assert!(error(64).contains("64×64") && error(20).contains("multiple of 8"));

@@ -5,7 +5,7 @@ use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
 /// Rays in the unit cube as tensors, from `radiance`'s [`NormalizedRay`]s, which are clipped on the
 /// host in f64.
 #[derive(Debug)]
-pub(crate) struct RayMaps {
+pub(crate) struct RayTensors {
     origin: Tensor,
     direction: Tensor,
     /// View directions in the world, of unit length, on which colours depend (n × 3).
@@ -19,7 +19,7 @@ pub(crate) struct RayMaps {
     is_contracted: bool,
 }
 
-impl RayMaps {
+impl RayTensors {
     /// Clips rays to the unit cube of `bounds`.
     pub(crate) fn new(bounds: &Bounds, rays: &[Ray], device: Device) -> Result<Self, TchError> {
         let rays: Vec<NormalizedRay> = rays.iter().map(|r| clip(bounds, r)).collect();
