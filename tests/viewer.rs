@@ -192,7 +192,7 @@ struct Compared {
 fn grid() -> Compared {
     let field = "rays: 300000, n_levels: 8, cells_per_pixel: 2.56, log2_hashmap_size: null, \
         hidden_dim: 64, march_steps: null, max_rays_per_step: 8192, samples_per_step: 24576";
-    Compared { field: field.to_owned(), resolution: 128, views: (512, 2), max_reads: 64.0 }
+    Compared { field: field.to_owned(), resolution: 128, views: (320, 2), max_reads: 64.0 }
 }
 
 /// The paper's field in miniature, which is rendered slowly. After so few rays the field has haze,
