@@ -1,8 +1,8 @@
 //! Loader of field artifacts for stages that render: hash-grid fields and the paper's field.
 //!
-//! * [`FieldArtifact`]: all fields of an artifact, rendered as an ensemble. The mean of their renders
-//!   cancels errors where images don't determine the scene (docs/design/011). [`read_field`] reads
-//!   one of them.
+//! * [`FieldArtifact`]: all fields of an artifact, rendered as an ensemble. The mean of their
+//!   renders cancels errors where images don't determine the scene (docs/design/011).
+//!   [`read_field`] reads one of them.
 //! * [`read_point_fields`]: all fields of an artifact at points, for baking.
 //! * [`FieldFile`]: description of a field artifact.
 //! * [`pixel_rays`]: the rays of a view's pixels.

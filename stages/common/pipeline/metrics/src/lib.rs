@@ -38,10 +38,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use any_metrics::{AnyMetrics, METRICS_FILE};
+pub use score_format::ScoreFormat;
 
 /// Absolute error that error maps display in the brightest colour; chosen by hand.
 pub const ERROR_MAP_RANGE: f64 = 0.25;
-pub use score_format::ScoreFormat;
 
 /// `metrics.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -20,9 +20,10 @@ const PROBES_PER_SIDE: usize = 4;
 type Corner = (usize, usize);
 
 impl PaperRefiner {
-    /// Redraws a view in patches of 64×64 pixels, blended where they overlap. Each patch gets at most `max_references` reference patches, at positions
-    /// where the patch's pixels are visible in the references. A patch without reference patches is
-    /// its own reference, as in the paper's code. Returns an image of three channels in 0..1.
+    /// Redraws a view in patches of 64×64 pixels, blended where they overlap. Each patch gets at
+    /// most `max_references` reference patches, at positions where the patch's pixels are visible
+    /// in the references. A patch without reference patches is its own reference, as in the paper's
+    /// code. Returns an image of three channels in 0..1.
     pub fn refine(
         &self,
         rendered: &Rendered,
