@@ -316,9 +316,9 @@ fn nothing_that_a_stage_says_reaches_the_terminal_raw() {
 #[test]
 fn describe_prints_a_stages_help() {
     let project = Project::tiny();
-    let help = project.ok(&["describe", "eval"]);
+    let help = project.ok(&["describe", "render-depth"]);
     assert!(
-        help.contains("Usage: eval ")
+        help.contains("Usage: render-depth ")
             && help.contains("\nParameters, ")
             && help.contains("\nInputs, "),
         "{help}"
