@@ -48,13 +48,7 @@ impl Stage for TrainSs {
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
-            (
-                "scene",
-                Input::required(
-                    &["scene/train", "views"],
-                    "LR images with cameras and bounds, or enlarged images of upsample",
-                ),
-            ),
+            ("scene", Input::required(&["scene/train"], "LR images with cameras and bounds")),
             (
                 "references",
                 Input::optional(

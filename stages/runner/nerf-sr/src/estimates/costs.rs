@@ -17,13 +17,12 @@ const OBJECT_DETAILED_PIXELS: f64 = 0.31;
 const OPAQUE_DETAILED_PIXELS: f64 = 0.39;
 /// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
 const RENDERED_BYTES_PER_FLOAT: u64 = 7;
-/// Bytes of `render-depth` without its field, but with the rays of a band of rows; as in the tests
+/// Bytes of `render-depth` without its field and libtorch, but with the rays of a band of rows; as
+/// in the tests below.
+const RENDERER_BYTES: u64 = 28_000_000;
+/// Bytes of any other program that can contain libtorch, without it and data; as in the tests
 /// below.
-const RENDERER_BYTES: u64 = 143_000_000;
-/// Bytes of any other program with libtorch, without data; as in the tests below.
-const PROGRAM_BYTES: u64 = 120_000_000;
-/// Bytes of libtorch in a program, as in the tests below.
-const LIBTORCH_BYTES: u64 = 115_000_000;
+const PROGRAM_BYTES: u64 = 5_000_000;
 /// Seconds per pixel of `eval` without and with LPIPS: lego 100×2, 12 views.
 const SCORED_PIXEL_SECONDS: f64 = 1.4e-6;
 const LPIPS_PIXEL_SECONDS: f64 = 2.2e-6;
@@ -69,12 +68,6 @@ pub(crate) fn model_cost(program: &str, parameters: &Value, work: &Work) -> Opti
         "camera-path" => (0.0, CAMERA_PATH_BYTES),
         _ => return None,
     };
-    let can_lack_libtorch = matches!(program, "train-ss" | "render-depth" | "eval" | "export");
-    let peak_memory = if can_lack_libtorch && !work.has_libtorch {
-        peak_memory - LIBTORCH_BYTES
-    } else {
-        peak_memory
-    };
     let start = if matches!(program, "prep" | "demo-scene") { 0.0 } else { START_SECONDS };
     Some(ModelCost { processor_seconds: start + seconds, peak_memory })
 }
@@ -93,6 +86,11 @@ pub(crate) fn min_memory(program: &str, parameters: &Value, work: &Work) -> Opti
 
 fn number(parameters: &Value, name: &str) -> Option<f64> {
     parameters[name].as_f64()
+}
+
+/// Returns the bytes that libtorch takes in a program that contains it.
+fn libtorch_bytes(work: &Work) -> u64 {
+    program_bytes(work.has_libtorch) - program_bytes(false)
 }
 
 /// Returns the bytes of data of the views that are processed at a time, one by each thread.
@@ -136,7 +134,7 @@ fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
 fn rendering_memory(work: &Work) -> Option<u64> {
     let field = work.field.as_ref().filter(|field| field["field"] != "mlp")?;
     let floats = number(field, "ensemble")? as u64 * work.grid_floats(field)?;
-    Some(RENDERER_BYTES + RENDERED_BYTES_PER_FLOAT * floats)
+    Some(RENDERER_BYTES + libtorch_bytes(work) + RENDERED_BYTES_PER_FLOAT * floats)
 }
 
 fn scoring(work: &Work) -> (f64, u64) {
@@ -145,7 +143,8 @@ fn scoring(work: &Work) -> (f64, u64) {
     } else {
         (SCORED_PIXEL_SECONDS, SCORED_PIXEL_BYTES)
     };
-    let memory = PROGRAM_BYTES + concurrent_bytes(work, &work.images, bytes);
+    let program = PROGRAM_BYTES + libtorch_bytes(work);
+    let memory = program + concurrent_bytes(work, &work.images, bytes);
     (work.images.pixels as f64 * seconds, memory)
 }
 
@@ -155,13 +154,15 @@ fn refiner_training(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     }
     let patch = number(parameters, "patch_size")?.powi(2) * number(parameters, "batch_size")?;
     let seconds = number(parameters, "steps")? * patch * PATCH_PIXEL_SECONDS;
-    Some((seconds, PROGRAM_BYTES + EXAMPLE_PIXEL_BYTES * work.images.pixels))
+    let program = PROGRAM_BYTES + libtorch_bytes(work);
+    Some((seconds, program + EXAMPLE_PIXEL_BYTES * work.images.pixels))
 }
 
 fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let versions = number(parameters, "self_ensemble")?;
     let seconds = versions * work.images.pixels as f64 * REFINED_PIXEL_SECONDS;
-    Some((seconds, PROGRAM_BYTES + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
+    let program = PROGRAM_BYTES + libtorch_bytes(work);
+    Some((seconds, program + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
 }
 
 /// Returns the cost of an export: the time of its rendering, and the memory as `export` computes

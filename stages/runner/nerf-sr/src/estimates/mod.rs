@@ -209,7 +209,7 @@ impl<'a> Estimator<'a> {
     fn images(&self, node: &Node) -> Option<(usize, Images)> {
         let input = match node.program.description.name.as_str() {
             "train-ss" => "scene",
-            "render-depth" | "export" | "upsample" => "cameras",
+            "render-depth" | "export" => "cameras",
             "eval" => "truth",
             "train-refine" | "refine" => "views",
             _ => return None,
@@ -220,10 +220,7 @@ impl<'a> Estimator<'a> {
             Some(scene) => (index, scene.images(subtree?)?),
             None if parent.program.description.name == "camera-path" => self.frames(parent)?,
             // Views are as many and as large as the cameras that they were rendered from.
-            None => {
-                let has_views = matches!(input, "views" | "scene");
-                return self.images(parent).filter(|_| has_views);
-            }
+            None => return self.images(parent).filter(|_| input == "views"),
         };
         if input == "cameras"
             && node.program.description.name == "render-depth"

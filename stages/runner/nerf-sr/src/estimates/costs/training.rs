@@ -95,7 +95,7 @@ fn first_steps(rays: f64) -> f64 {
 }
 
 pub(super) fn training_memory(parameters: &Value, work: &Work) -> Option<u64> {
-    Some(training_need(parameters, work)?.total(program_bytes(true)))
+    Some(training_need(parameters, work)?.total(program_bytes(work.has_libtorch)))
 }
 
 /// Returns the memory of a training as `train-ss` computes it, with each image as large
