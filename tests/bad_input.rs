@@ -233,7 +233,7 @@ fn pipelines_that_cannot_be_used() {
             "prep/train}",
             "prep/truth}",
             10,
-            "takes kind scene/train or views, but prep/truth has kind scene/truth",
+            "takes kind scene/train, but prep/truth has kind scene/truth",
         ),
         (
             "{dataset: demo-scene}",
