@@ -144,8 +144,8 @@ pub trait Lanes: Copy {
     fn where_positive(self, gate: Self) -> Self;
     /// Sums each of four values over its lanes by halves: first lanes 0 and 8, 1 and 9, ….
     fn sums(four: [Self; 4]) -> Self::Quad;
-    /// Prefetches floats that are needed soon.
-    fn prefetch(_soon: &[f32]) {}
+    /// Prefetches the first cache line of elements that are needed soon.
+    fn prefetch<T>(_soon: &[T]) {}
 }
 
 /// Sixteen floats for the compilation target.
@@ -310,7 +310,7 @@ pub mod x86 {
             }
         }
         #[inline(always)]
-        fn prefetch(soon: &[f32]) {
+        fn prefetch<T>(soon: &[T]) {
             // SAFETY: it reads nothing that the program sees.
             unsafe { _mm_prefetch::<_MM_HINT_T0>(soon.as_ptr().cast()) }
         }
@@ -385,7 +385,7 @@ pub mod x86 {
             }
         }
         #[inline(always)]
-        fn prefetch(soon: &[f32]) {
+        fn prefetch<T>(soon: &[T]) {
             // SAFETY: it reads nothing that the program sees.
             unsafe { _mm_prefetch::<_MM_HINT_T0>(soon.as_ptr().cast()) }
         }

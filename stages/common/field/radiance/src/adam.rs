@@ -1,6 +1,6 @@
 use std::ops::Range;
 
-use crate::spec::{ADAM_BETA, ADAM_EPSILON};
+use crate::spec::{ADAM_BETA, ADAM_EPSILON, ADAM_ROUNDED_BITS};
 use numerics::kernel;
 use numerics::simd::LANES;
 
@@ -34,9 +34,49 @@ impl AdamStep {
 }
 
 /// Number of bricks whose marks are scanned together; chosen by hand.
-const BRICKS_PER_SCAN: usize = 128;
+const BRICKS_PER_SCAN: usize = 512;
 /// Number of touched blocks that are prefetched before their use; chosen by hand.
-const BLOCKS_AHEAD: usize = 8;
+const BLOCKS_AHEAD: usize = 16;
+
+const FIRST_BITS: u32 = ADAM_ROUNDED_BITS[0];
+const SECOND_BITS: u32 = ADAM_ROUNDED_BITS[1];
+
+/// Both moments of a weight, 16 bits each, so that a step reads and writes less memory
+/// (docs/design/006). The upper half is the first moment's bfloat16; the lower half is the second
+/// moment, which is never negative: eight bits of exponent, eight of fraction.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(transparent)]
+pub(crate) struct Moments(u32);
+
+impl Moments {
+    /// Rounds both moments.
+    #[inline(always)]
+    pub(crate) fn new(first: f32, second: f32) -> Self {
+        let [first, second] = [first.to_bits(), second.to_bits()];
+        let first = first.wrapping_add(1 << (FIRST_BITS - 1)) >> FIRST_BITS << FIRST_BITS;
+        Self(first | second.wrapping_add(1 << (SECOND_BITS - 1)) >> SECOND_BITS)
+    }
+
+    #[inline(always)]
+    fn first(self) -> f32 {
+        f32::from_bits(self.0 >> FIRST_BITS << FIRST_BITS)
+    }
+
+    #[inline(always)]
+    fn second(self) -> f32 {
+        f32::from_bits((self.0 & 0xffff) << SECOND_BITS)
+    }
+
+    /// Returns the moments as an integer for a checkpoint.
+    pub(crate) fn to_bits(self) -> u32 {
+        self.0
+    }
+
+    /// Creates moments from the integer of [`Moments::to_bits`].
+    pub(crate) fn from_bits(bits: u32) -> Self {
+        Self(bits)
+    }
+}
 
 /// Takes the Adam step of sixteen weights. Weights whose gradient is 0 keep value and moments.
 #[inline(always)]
@@ -44,18 +84,16 @@ fn update_block(
     step: &AdamStep,
     gradients: &[f32; LANES],
     weights: &mut [f32; LANES],
-    first: &mut [f32; LANES],
-    second: &mut [f32; LANES],
+    moments: &mut [Moments; LANES],
 ) {
     for i in 0..LANES {
         let touched = gradients[i] != 0.0;
         let gradient = step.decay.mul_add(weights[i], gradients[i]);
-        let m1 = (first[i] - gradient).mul_add(step.beta1, gradient);
+        let m1 = (moments[i].first() - gradient).mul_add(step.beta1, gradient);
         let square = gradient * gradient;
-        let v1 = (second[i] - square).mul_add(step.beta2, square);
+        let v1 = (moments[i].second() - square).mul_add(step.beta2, square);
         let w1 = (-step.rate).mul_add(m1 / (v1.sqrt() + step.epsilon), weights[i]);
-        first[i] = if touched { m1 } else { first[i] };
-        second[i] = if touched { v1 } else { second[i] };
+        moments[i] = if touched { Moments::new(m1, v1) } else { moments[i] };
         weights[i] = if touched { w1 } else { weights[i] };
     }
 }
@@ -64,15 +102,13 @@ kernel! {
     /// Takes an Adam step of the networks' weights, and clears the gradients. Lengths are equal
     /// multiples of 16.
     pub(crate) fn adam<L>(
-        step: &AdamStep, gradients: &mut [f32], weights: &mut [f32], first: &mut [f32],
-        second: &mut [f32],
+        step: &AdamStep, gradients: &mut [f32], weights: &mut [f32], moments: &mut [Moments],
     ) {
-        let (weights, gradients) = (weights.as_chunks_mut::<LANES>().0,
-            gradients.as_chunks_mut::<LANES>().0);
-        let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
-        let blocks = gradients.iter_mut().zip(weights).zip(first.iter_mut().zip(second));
-        for ((gradients, weights), (first, second)) in blocks {
-            update_block(step, gradients, weights, first, second);
+        let gradients = gradients.as_chunks_mut::<LANES>().0;
+        let weights = weights.as_chunks_mut::<LANES>().0;
+        let moments = moments.as_chunks_mut::<LANES>().0;
+        for ((gradients, weights), moments) in gradients.iter_mut().zip(weights).zip(moments) {
+            update_block(step, gradients, weights, moments);
             *gradients = [0.0; LANES];
         }
     }
@@ -87,10 +123,10 @@ kernel! {
     /// and moments. Visits only touched halves of bricks, and clears their gradients and marks.
     pub(crate) fn adam_of_bricks<L>(
         step: &AdamStep, halves: &mut [HalfPiece<'_>; 2], weights: &mut [f32],
-        first: &mut [f32], second: &mut [f32],
+        moments: &mut [Moments],
     ) {
         let weights = weights.as_chunks_mut::<LANES>().0;
-        let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
+        let moments = moments.as_chunks_mut::<LANES>().0;
         let n_bricks = weights.len() / 2;
         let mut list = [0; 2 * BRICKS_PER_SCAN];
         for start in (0..n_bricks).step_by(BRICKS_PER_SCAN) {
@@ -101,12 +137,10 @@ kernel! {
                 let ahead = list[(at + BLOCKS_AHEAD).min(count - 1)];
                 L::prefetch(&weights[ahead]);
                 L::prefetch(&halves[ahead % 2].0[ahead / 2 * LANES..]);
-                L::prefetch(&first[ahead]);
-                L::prefetch(&second[ahead]);
+                L::prefetch(&moments[ahead]);
                 let block = list[at];
                 let sums = &mut halves[block % 2].0.as_chunks_mut::<LANES>().0[block / 2];
-                update_block(step, sums, &mut weights[block], &mut first[block],
-                    &mut second[block]);
+                update_block(step, sums, &mut weights[block], &mut moments[block]);
                 *sums = [0.0; LANES];
             }
         }
@@ -149,11 +183,27 @@ mod tests {
     use super::*;
     use numerics::simd::test_every_family;
 
+    /// Rounded moments differ by at most half of their last bit from a random one.
+    #[test]
+    fn moments_are_rounded_to_nearest() {
+        for i in 0..10_000 {
+            let power = (160.0 * uniform(3, 0, i) - 80.0).exp2();
+            let [first, second] = [uniform(3, 1, i) - 0.5, uniform(3, 2, i)].map(|x| x * power);
+            let rounded = Moments::new(first, second);
+            assert!((rounded.first() - first).abs() <= first.abs() / 256.0, "{first}");
+            assert!((rounded.second() - second).abs() <= second / 512.0, "{second}");
+            assert_eq!(Moments::new(rounded.first(), rounded.second()), rounded);
+        }
+        assert_eq!(Moments::new(0.0, f32::INFINITY).second(), f32::INFINITY);
+        assert_eq!(Moments::default(), Moments::new(0.0, 0.0));
+    }
+
+    /// Moments of 16 bits change each step of about 0.01 by less than 0.5 %.
     #[test]
     fn equals_adam_in_f64_where_touched() {
         let n = 32;
         let mut w: Vec<f32> = (0..n).map(|i| i as f32 / 10.0).collect();
-        let (mut m, mut v) = (vec![0.0f32; n], vec![0.0f32; n]);
+        let mut moments = vec![Moments::default(); n];
         let mut exact: Vec<[f64; 3]> = w.iter().map(|&w| [f64::from(w), 0.0, 0.0]).collect();
         for t in 1..=3 {
             let mut g: Vec<f32> =
@@ -170,11 +220,11 @@ mod tests {
                     e[0] -= 0.01 * mh / (vh.sqrt() + 1e-15);
                 }
             }
-            adam(&AdamStep::new(t as u64, 0.01, 0.0), &mut g, &mut w, &mut m, &mut v);
+            adam(&AdamStep::new(t as u64, 0.01, 0.0), &mut g, &mut w, &mut moments);
             assert!(g.iter().all(|&g| g == 0.0));
         }
         for (i, (w, e)) in w.iter().zip(&exact).enumerate() {
-            assert!((f64::from(*w) - e[0]).abs() < 1e-6, "{i}");
+            assert!((f64::from(*w) - e[0]).abs() < 1.5e-4, "{i}");
         }
         assert_eq!(w[3], 0.3);
     }
@@ -188,10 +238,11 @@ mod tests {
 
     /// Returns weights and moments of many bricks, few of whose halves are touched, after a step in
     /// pieces of `bricks` bricks.
-    fn after_step(bricks: usize) -> [Vec<f32>; 3] {
-        let [mut w, mut m, mut v] = [0, 1, 2].map(|purpose| -> Vec<f32> {
-            (0..(2 * BRICKS * LANES) as u64).map(|i| uniform(7, purpose, i)).collect()
-        });
+    fn after_step(bricks: usize) -> (Vec<f32>, Vec<Moments>) {
+        let n = (2 * BRICKS * LANES) as u64;
+        let mut weights: Vec<f32> = (0..n).map(|i| uniform(7, 0, i)).collect();
+        let mut moments: Vec<Moments> =
+            (0..n).map(|i| Moments::new(uniform(7, 1, i), uniform(7, 2, i))).collect();
         let mut marks = [0, 1].map(|half| -> Vec<u8> {
             (0..BRICKS).map(|brick| u8::from(is_touched(2 * brick + half))).collect()
         });
@@ -203,24 +254,24 @@ mod tests {
             let here = first..(first + bricks).min(BRICKS);
             let blocks = here.start * LANES..here.end * LANES;
             let table = 2 * blocks.start..2 * blocks.end;
-            let [w, m, v] = [&mut w, &mut m, &mut v].map(|n| &mut n[table.clone()]);
+            let (weights, moments) = (&mut weights[table.clone()], &mut moments[table]);
             let [even, odd] = &mut sums;
             let [even_marks, odd_marks] = &mut marks;
             let mut halves = [
                 (&mut even[blocks.clone()], &mut even_marks[here.clone()]),
                 (&mut odd[blocks], &mut odd_marks[here]),
             ];
-            adam_of_bricks(&step, &mut halves, w, m, v);
+            adam_of_bricks(&step, &mut halves, weights, moments);
         }
         assert!(marks.iter().flatten().all(|mark| *mark == 0));
         assert!(sums.iter().flatten().all(|sum| *sum == 0.0));
-        [w, m, v]
+        (weights, moments)
     }
 
     #[test]
     fn pieces_and_families_give_equal_bits_and_leave_what_is_untouched() {
         let whole = after_step(BRICKS);
-        for (block, numbers) in whole[0].chunks(LANES).enumerate() {
+        for (block, numbers) in whole.0.chunks(LANES).enumerate() {
             let begin = uniform(7, 0, (block * LANES) as u64);
             assert_eq!(numbers[0] != begin, is_touched(block), "block {block}");
         }

@@ -5,34 +5,35 @@ use crate::spec::{BRICK, FEATURES};
 
 /// Alignment in bytes: the size of a brick, two cache lines.
 const ALIGNMENT: usize = BRICK * FEATURES * size_of::<f32>();
-/// Maximum number of floats before the first aligned one.
+/// Maximum number of elements before the first aligned one.
 const MAX_PADDING: usize = ALIGNMENT / size_of::<f32>() - 1;
 
-/// Growable array of floats that is aligned to bricks, so that a vector is in one cache line and a
-/// brick in two. A large `Vec` usually begins 16 bytes after a page boundary: vectors would be in
+/// Growable array of floats, or of other elements of 32 bits, that is aligned to bricks, so that a
+/// vector is in one cache line and a brick in two. A large `Vec` usually begins 16 bytes after a page boundary: vectors would be in
 /// two cache lines and bricks in three.
 ///
 /// Large pages are requested from the system: samples access tables of many MiB at random, and the
 /// processor's TLB has few entries.
 #[derive(Default)]
-pub(crate) struct Aligned {
-    memory: Vec<f32>,
+pub(crate) struct Aligned<T = f32> {
+    memory: Vec<T>,
     start: usize,
     len: usize,
 }
 
-impl Aligned {
+impl<T: Copy + Default> Aligned<T> {
     /// Creates an array of `len` zeros.
     pub(crate) fn zeros(len: usize) -> Self {
-        let mut memory = vec![0.0; len + MAX_PADDING];
+        const { assert!(size_of::<T>() == size_of::<f32>()) };
+        let mut memory = vec![T::default(); len + MAX_PADDING];
         request_large_pages(&mut memory);
         // `align_offset` may return usize::MAX, as in const evaluation.
         let start = memory.as_ptr().align_offset(ALIGNMENT).min(MAX_PADDING);
         Self { memory, start, len }
     }
 
-    /// Returns the first `len` floats with their old content; grows the array if it is shorter.
-    pub(crate) fn grow(&mut self, len: usize) -> &mut [f32] {
+    /// Returns the first `len` elements with their old content; grows the array if it is shorter.
+    pub(crate) fn grow(&mut self, len: usize) -> &mut [T] {
         if self.len < len {
             let mut grown = Self::zeros(len.max(2 * self.len));
             grown[..self.len].copy_from_slice(self);
@@ -42,21 +43,21 @@ impl Aligned {
     }
 }
 
-impl Deref for Aligned {
-    type Target = [f32];
+impl<T> Deref for Aligned<T> {
+    type Target = [T];
 
-    fn deref(&self) -> &[f32] {
+    fn deref(&self) -> &[T] {
         &self.memory[self.start..][..self.len]
     }
 }
 
-impl DerefMut for Aligned {
-    fn deref_mut(&mut self) -> &mut [f32] {
+impl<T> DerefMut for Aligned<T> {
+    fn deref_mut(&mut self) -> &mut [T] {
         &mut self.memory[self.start..][..self.len]
     }
 }
 
-impl Clone for Aligned {
+impl<T: Copy + Default> Clone for Aligned<T> {
     fn clone(&self) -> Self {
         let mut copy = Self::zeros(self.len);
         copy.copy_from_slice(self);
@@ -64,7 +65,7 @@ impl Clone for Aligned {
     }
 }
 
-impl fmt::Debug for Aligned {
+impl<T: fmt::Debug> fmt::Debug for Aligned<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.deref().fmt(f)
     }
@@ -72,7 +73,7 @@ impl fmt::Debug for Aligned {
 
 /// Requests large pages for an array; does nothing for an array smaller than one such page.
 #[cfg(target_os = "linux")]
-fn request_large_pages(numbers: &mut [f32]) {
+fn request_large_pages<T>(numbers: &mut [T]) {
     const LARGE_PAGE_BYTES: usize = 2 << 20;
     if size_of_val(numbers) < LARGE_PAGE_BYTES {
         return;
@@ -88,7 +89,7 @@ fn request_large_pages(numbers: &mut [f32]) {
 }
 
 #[cfg(not(target_os = "linux"))]
-fn request_large_pages(_: &mut [f32]) {}
+fn request_large_pages<T>(_: &mut [T]) {}
 
 #[cfg(test)]
 mod tests {
@@ -96,7 +97,7 @@ mod tests {
 
     #[test]
     fn numbers_begin_at_a_brick_and_stay_when_they_grow() {
-        let mut numbers = Aligned::default();
+        let mut numbers = Aligned::<f32>::default();
         for len in [1, 31, 32, 33, 5000, 4, 1 << 20] {
             let last = numbers.last().copied();
             let was = numbers.len();

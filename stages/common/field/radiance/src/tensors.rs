@@ -3,6 +3,7 @@ use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView, View};
 
+use crate::adam::Moments;
 use crate::architecture::OutOfRange;
 
 /// Error returned when a field or checkpoint can't be read or written.
@@ -49,12 +50,17 @@ pub(crate) struct Tensor<'a> {
 
 enum TensorData<'a> {
     F32(&'a [f32]),
+    Moments(&'a [Moments]),
     U8(&'a [u8]),
 }
 
 impl<'a> Tensor<'a> {
     pub(crate) fn of_floats(data: &'a [f32]) -> Self {
         Self { data: TensorData::F32(data), shape: [data.len()] }
+    }
+
+    pub(crate) fn of_moments(data: &'a [Moments]) -> Self {
+        Self { data: TensorData::Moments(data), shape: [data.len()] }
     }
 
     pub(crate) fn of_bytes(data: &'a [u8]) -> Self {
@@ -66,6 +72,7 @@ impl View for &Tensor<'_> {
     fn dtype(&self) -> Dtype {
         match self.data {
             TensorData::F32(_) => Dtype::F32,
+            TensorData::Moments(_) => Dtype::U32,
             TensorData::U8(_) => Dtype::U8,
         }
     }
@@ -78,6 +85,9 @@ impl View for &Tensor<'_> {
         match self.data {
             TensorData::F32(floats) => {
                 Cow::Owned(floats.iter().flat_map(|x| x.to_le_bytes()).collect())
+            }
+            TensorData::Moments(moments) => {
+                Cow::Owned(moments.iter().flat_map(|m| m.to_bits().to_le_bytes()).collect())
             }
             TensorData::U8(bytes) => Cow::Borrowed(bytes),
         }
@@ -115,13 +125,34 @@ pub(crate) fn read_f32(
     name: &str,
     into: &mut [f32],
 ) -> Result<(), FieldProblem> {
+    read_elements(tensors, name, Dtype::F32, into, f32::from_le_bytes)
+}
+
+/// Reads a tensor of as many moments as `into` has.
+pub(crate) fn read_moments(
+    tensors: &SafeTensors<'_>,
+    name: &str,
+    into: &mut [Moments],
+) -> Result<(), FieldProblem> {
+    let convert = |bytes| Moments::from_bits(u32::from_le_bytes(bytes));
+    read_elements(tensors, name, Dtype::U32, into, convert)
+}
+
+/// Reads a tensor of elements of 32 bits.
+fn read_elements<T>(
+    tensors: &SafeTensors<'_>,
+    name: &str,
+    kind: Dtype,
+    into: &mut [T],
+    convert: impl Fn([u8; 4]) -> T,
+) -> Result<(), FieldProblem> {
     let tensor = find_tensor(tensors, name)?;
     let (data, rest) = tensor.data().as_chunks::<4>();
-    if tensor.dtype() != Dtype::F32 || data.len() != into.len() || !rest.is_empty() {
-        return Err(unexpected_tensor(&tensor, name, into.len(), "f32"));
+    if tensor.dtype() != kind || data.len() != into.len() || !rest.is_empty() {
+        return Err(unexpected_tensor(&tensor, name, into.len(), kind));
     }
     for (value, bytes) in into.iter_mut().zip(data) {
-        *value = f32::from_le_bytes(*bytes);
+        *value = convert(*bytes);
     }
     Ok(())
 }
@@ -134,7 +165,7 @@ pub(crate) fn read_u8(
 ) -> Result<Vec<u8>, FieldProblem> {
     let tensor = find_tensor(tensors, name)?;
     if tensor.dtype() != Dtype::U8 || tensor.data().len() != len {
-        return Err(unexpected_tensor(&tensor, name, len, "u8"));
+        return Err(unexpected_tensor(&tensor, name, len, Dtype::U8));
     }
     Ok(tensor.data().to_vec())
 }
@@ -149,10 +180,10 @@ fn unexpected_tensor(
     tensor: &TensorView<'_>,
     name: &str,
     count: usize,
-    expected: &str,
+    expected: Dtype,
 ) -> FieldProblem {
     let (found, shape) = (tensor.dtype(), tensor.shape());
     FieldProblem::Unusable(format!(
-        "tensor {name}: expected {count} {expected}, found {found:?} {shape:?}"
+        "tensor {name}: expected {count} {expected:?}, found {found:?} {shape:?}"
     ))
 }

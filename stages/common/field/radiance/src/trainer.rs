@@ -4,11 +4,12 @@ mod phases;
 mod shard;
 
 use std::ops::RangeInclusive;
+use std::slice::ChunksMut;
 use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use crate::adam::{AdamStep, adam, adam_of_bricks, update_average};
+use crate::adam::{AdamStep, Moments, adam, adam_of_bricks, update_average};
 use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::grid::LevelGradients;
@@ -70,8 +71,7 @@ const AVERAGE_PIECE: usize = 1 << 16;
 pub struct Trainer {
     field: Field,
     options: TrainingOptions,
-    first_moments: ParameterBuffers,
-    second_moments: ParameterBuffers,
+    moments: ParameterBuffers<Moments>,
     network_gradients: Aligned,
     /// Gradients of the grid's levels.
     grid_gradients: Vec<LevelGradients>,
@@ -85,13 +85,13 @@ pub struct Trainer {
     times: [PhaseTimes; Phase::ALL.len()],
 }
 
-/// One float per parameter.
-struct ParameterBuffers {
-    grid: Aligned,
-    network: Aligned,
+/// One element per parameter.
+struct ParameterBuffers<T = f32> {
+    grid: Aligned<T>,
+    network: Aligned<T>,
 }
 
-impl ParameterBuffers {
+impl<T: Copy + Default> ParameterBuffers<T> {
     fn zeros(field: &Field) -> Self {
         Self {
             grid: Aligned::zeros(field.grid.len()),
@@ -104,8 +104,7 @@ impl Trainer {
     /// Creates a trainer that is initialised from a field.
     pub fn new(field: Field, options: TrainingOptions) -> Self {
         Self {
-            first_moments: ParameterBuffers::zeros(&field),
-            second_moments: ParameterBuffers::zeros(&field),
+            moments: ParameterBuffers::zeros(&field),
             network_gradients: Aligned::zeros(field.network.len()),
             grid_gradients: field.levels.iter().map(LevelGradients::zeros).collect(),
             average: None,
@@ -283,29 +282,24 @@ impl Trainer {
             &network_step,
             &mut self.network_gradients,
             &mut self.field.network,
-            &mut self.first_moments.network,
-            &mut self.second_moments.network,
+            &mut self.moments.network,
         );
 
-        let (mut weights, mut first, mut second) =
-            (&mut *self.field.grid, &mut *self.first_moments.grid, &mut *self.second_moments.grid);
+        let (mut weights, mut moments) = (&mut *self.field.grid, &mut *self.moments.grid);
         let mut tasks = Vec::new();
         let levels = self.field.levels.iter().zip(&mut self.grid_gradients);
         for (i, (level, gradients)) in levels.enumerate() {
             let level_step = AdamStep::new(step, options.rate_of_level(i, factor), 0.0);
-            let [w, m, v] = [&mut weights, &mut first, &mut second].map(|parameters| {
-                let (part, rest) = std::mem::take(parameters).split_at_mut(level.range().len());
-                *parameters = rest;
-                part.chunks_mut(ADAM_BRICKS * BRICK * FEATURES)
-            });
+            let weights = take_pieces(&mut weights, level.range().len());
+            let moments = take_pieces(&mut moments, level.range().len());
             let [even, odd] = gradients.halves.each_mut().map(|half| {
                 half.sums.chunks_mut(ADAM_BRICKS * LANES).zip(half.touched.chunks_mut(ADAM_BRICKS))
             });
-            let pieces = even.zip(odd).zip(w.zip(m.zip(v)));
+            let pieces = even.zip(odd).zip(weights.zip(moments));
             tasks.extend(pieces.map(|((even, odd), tables)| (level_step, [even, odd], tables)));
         }
-        tasks.into_par_iter().for_each(|(step, mut halves, (w, (m, v)))| {
-            clock.task(|| adam_of_bricks(&step, &mut halves, w, m, v));
+        tasks.into_par_iter().for_each(|(step, mut halves, (weights, moments))| {
+            clock.task(|| adam_of_bricks(&step, &mut halves, weights, moments));
         });
     }
 
@@ -404,6 +398,13 @@ impl CellBuffers {
         self.rows.densities(field, &self.positions, n, &mut self.densities[..n]);
         densities.copy_from_slice(&self.densities[..cells.len()]);
     }
+}
+
+/// Takes the next `len` parameters off a slice, in pieces of one task of the optimiser.
+fn take_pieces<'a, T>(parameters: &mut &'a mut [T], len: usize) -> ChunksMut<'a, T> {
+    let (part, rest) = std::mem::take(parameters).split_at_mut(len);
+    *parameters = rest;
+    part.chunks_mut(ADAM_BRICKS * BRICK * FEATURES)
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {

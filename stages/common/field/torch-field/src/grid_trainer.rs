@@ -1,11 +1,11 @@
 use std::ops::Range;
 use std::path::Path;
 
-use radiance::spec::{ADAM_BETA, ADAM_EPSILON};
+use radiance::spec::{ADAM_BETA, ADAM_EPSILON, ADAM_ROUNDED_BITS};
 use radiance::{
     CellHit, Field, Occupancy, PhaseClock, StepReport, Supervisor, TrainingOptions, TrainingState,
 };
-use tch::{Device, TchError, Tensor, no_grad};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::error::TorchFieldError;
 use crate::grid::TorchGrid;
@@ -351,10 +351,22 @@ fn lazy_adam(
         first1.f_div(&second1.f_sqrt()?.f_add_scalar(ADAM_EPSILON)?)?.f_mul_scalar(rate)?;
     let updated = parameter.f_sub(&change)?.f_where_self(&touched, &parameter)?;
     parameter.f_copy_(&updated)?;
+    let [first1, second1] =
+        [round(&first1, ADAM_ROUNDED_BITS[0])?, round(&second1, ADAM_ROUNDED_BITS[1])?];
     let updated = first1.f_where_self(&touched, &first)?;
     first.f_copy_(&updated)?;
     let updated = second1.f_where_self(&touched, &second)?;
     second.f_copy_(&updated)
+}
+
+/// Rounds floats by their `bits` lowest bits.
+fn round(floats: &Tensor, bits: u32) -> Result<Tensor, TchError> {
+    let half = 1 << (bits - 1);
+    floats
+        .f_view_dtype(Kind::Int)?
+        .f_add_scalar(half)?
+        .f_bitwise_and(-2 * half)?
+        .f_view_dtype(Kind::Float)
 }
 
 #[cfg(test)]

@@ -28,10 +28,10 @@ pub struct PixelStorage {
 /// Maximum bytes of pixels in memory, so that a stage with many photographs leaves memory to other
 /// programs (design note 038).
 const MAX_PIXEL_BYTES: u64 = 4_000_000_000;
-/// Floats per parameter of the grid: value, gradient, two moments, moving average.
-const FLOATS_PER_PARAMETER: u64 = 5;
-/// Floats per parameter that a checkpoint copies: all but the gradient.
-const COPIED_FLOATS_PER_PARAMETER: u64 = 4;
+/// Numbers of 32 bits per parameter of the grid: value, gradient, moments, moving average.
+const NUMBERS_PER_PARAMETER: u64 = 4;
+/// Numbers per parameter that a checkpoint copies: all but the gradient.
+const COPIED_NUMBERS_PER_PARAMETER: u64 = 3;
 /// Bytes per RGBA pixel of a photograph in floats.
 const BYTES_PER_RGBA_PIXEL: u64 = 16;
 /// Bytes per RGB pixel of a photograph in floats.
@@ -94,8 +94,8 @@ pub const fn program_bytes(has_torch: bool) -> u64 {
 
 /// Returns the bytes of a grid with the given number of parameters in training.
 pub fn grid_training_bytes(parameters: u64, has_checkpoints: bool) -> u64 {
-    let copied = if has_checkpoints { COPIED_FLOATS_PER_PARAMETER } else { 0 };
-    4 * (FLOATS_PER_PARAMETER + copied) * parameters
+    let copied = if has_checkpoints { COPIED_NUMBERS_PER_PARAMETER } else { 0 };
+    4 * (NUMBERS_PER_PARAMETER + copied) * parameters
 }
 
 #[cfg(test)]
@@ -130,6 +130,6 @@ mod tests {
         assert_eq!((memory.minimum(10), memory.total(10)), (22, 122));
         let many = TrainingMemory { pixels: 2 * MAX_PIXEL_BYTES, ..memory };
         assert_eq!(many.total(10), 22 + MAX_PIXEL_BYTES);
-        assert_eq!([false, true].map(|copied| grid_training_bytes(10, copied)), [200, 360]);
+        assert_eq!([false, true].map(|copied| grid_training_bytes(10, copied)), [160, 280]);
     }
 }

@@ -318,12 +318,12 @@ mod tests {
         let render = json!({"samples_per_axis": 1, "tolerance": 0.005});
         let (train, render_demo) = (training(12_000_000), render.clone());
         for (name, program, parameters, work, measured) in [
-            ("fern, trained", "train-ss", training(500_000), &fern, 476.0),
-            ("demo 32, trained", "train-ss", training(150_000), &work(object, 80, 32), 183.0),
-            ("demo 100, trained", "train-ss", training(150_000), &work(object, 80, 100), 272.0),
+            ("fern, trained", "train-ss", training(500_000), &fern, 415.6),
+            ("demo 32, trained", "train-ss", training(150_000), &work(object, 80, 32), 180.4),
+            ("demo 100, trained", "train-ss", training(150_000), &work(object, 80, 100), 250.9),
             ("fern, rendered", "render-depth", render.clone(), &fern_field, 212.0),
             ("demo 32, rendered", "render-depth", render, &work(object, 12, 32), 144.0),
-            ("demo 100, trained without libtorch", "train-ss", train, &demo_100, 194.5),
+            ("demo 100, trained without libtorch", "train-ss", train, &demo_100, 172.0),
             ("demo 200, rendered without libtorch", "render-depth", render_demo, &demo_200, 42.5),
             ("demo 200, scored without libtorch", "eval", json!({}), &demo_200, 14.7),
             ("lego 800, LPIPS", "eval", json!({}), &scored, 865.0),

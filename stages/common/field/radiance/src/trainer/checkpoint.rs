@@ -6,7 +6,7 @@ use super::{ParameterBuffers, Trainer};
 use crate::field::Field;
 use crate::occupancy::CELLS;
 use crate::tensors::{
-    FieldError, FieldProblem, Tensor, read_f32, read_tensors, read_u8, write_tensors,
+    FieldError, FieldProblem, Tensor, read_f32, read_moments, read_tensors, read_u8, write_tensors,
 };
 use crate::training_state::TrainingState;
 
@@ -29,13 +29,11 @@ impl Trainer {
             .chain([
                 ("counters", Tensor::of_bytes(&counters)),
                 ("density", Tensor::of_floats(&density)),
-                ("first.grid", Tensor::of_floats(&self.first_moments.grid)),
-                ("first.network", Tensor::of_floats(&self.first_moments.network)),
                 ("grid", Tensor::of_floats(&self.field.grid)),
+                ("moments.grid", Tensor::of_moments(&self.moments.grid)),
+                ("moments.network", Tensor::of_moments(&self.moments.network)),
                 ("network", Tensor::of_floats(&self.field.network)),
                 ("occupied", Tensor::of_bytes(&occupied)),
-                ("second.grid", Tensor::of_floats(&self.second_moments.grid)),
-                ("second.network", Tensor::of_floats(&self.second_moments.network)),
             ])
             .collect();
         write_tensors(path, &tensors)
@@ -52,8 +50,9 @@ impl Trainer {
         read_tensors(path, |tensors| {
             let [state @ .., samples_per_ray] = read_counters(tensors)?;
             let field = &mut self.field;
-            let first = read_parameters(tensors, "first.", field)?;
-            let second = read_parameters(tensors, "second.", field)?;
+            let mut moments = ParameterBuffers::zeros(field);
+            read_moments(tensors, "moments.grid", &mut moments.grid)?;
+            read_moments(tensors, "moments.network", &mut moments.network)?;
             let weights = read_parameters(tensors, "", field)?;
             let is_averaged = tensors.names().contains(&"average.grid");
             let average =
@@ -62,7 +61,7 @@ impl Trainer {
             read_f32(tensors, "density", &mut density)?;
             let occupied = read_u8(tensors, "occupied", CELLS)?;
             // Nothing fails from here on.
-            (self.first_moments, self.second_moments, self.average) = (first, second, average);
+            (self.moments, self.average) = (moments, average);
             (field.grid, field.network) = (weights.grid, weights.network);
             field.occupancy.restore(density, &occupied);
             self.state = TrainingState::from_counters(state);
