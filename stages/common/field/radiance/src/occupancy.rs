@@ -37,8 +37,11 @@ fn word_and_bit_u32([x, y, z]: [u32; 3], words: usize) -> (u32, u32) {
     (word, x % side + side * (y % side + side * (z % side)))
 }
 
-/// Number of training steps between updates (docs/design/037).
+/// Number of training steps between updates until the end of the warm-up (docs/design/037).
 const STEPS_PER_UPDATE: u64 = 32;
+/// Number of training steps between later updates, since cells change slowly and rays raise
+/// densities meanwhile (docs/design/037).
+const STEPS_PER_LATE_UPDATE: u64 = 64;
 /// Number of updates in which every occupied cell is evaluated once (docs/design/037).
 const OCCUPIED_PERIOD: usize = 4;
 /// Number of updates in which every empty cell is evaluated once (docs/design/037).
@@ -193,6 +196,12 @@ impl PartialEq for CellDensities {
     }
 }
 
+/// Returns the number of the update at a training step; `None` if the step has none.
+fn update_at(step: u64) -> Option<usize> {
+    let interval = if step <= WARM_UP_STEPS { STEPS_PER_UPDATE } else { STEPS_PER_LATE_UPDATE };
+    (step > 0 && step.is_multiple_of(interval)).then(|| (step / interval) as usize)
+}
+
 /// Slowly decaying maximum of each cell's density, and the cell's kind: 128³ cells over the unit
 /// cube, x fastest.
 #[derive(Clone, Debug, PartialEq)]
@@ -255,23 +264,19 @@ impl Occupancy {
 
     /// Lists the cells to evaluate at a training step; at most steps there are none.
     pub fn cells_to_update(&self, step: u64) -> Vec<u32> {
-        if step == 0 || !step.is_multiple_of(STEPS_PER_UPDATE) {
-            return Vec::new();
-        }
+        let Some(update) = update_at(step) else { return Vec::new() };
         // Cells due as empty are a subset of those due as occupied, so only the latter are visited.
         const { assert!(EMPTY_PERIOD.is_multiple_of(OCCUPIED_PERIOD)) };
         const { assert!(GRID.is_multiple_of(OCCUPIED_PERIOD)) };
-        let update = (step / STEPS_PER_UPDATE) as usize;
         let planes = (0..GRID).into_par_iter().flat_map_iter(|z| {
             let first = (update + GRID - z) % OCCUPIED_PERIOD;
             (z * GRID * GRID + first..(z + 1) * GRID * GRID).step_by(OCCUPIED_PERIOD)
         });
-        planes.filter(|&cell| self.is_due(cell, step)).map(|cell| cell as u32).collect()
+        planes.filter(|&cell| self.is_due(cell, step, update)).map(|cell| cell as u32).collect()
     }
 
-    /// Returns whether a cell is evaluated at an update step.
-    fn is_due(&self, cell: usize, step: u64) -> bool {
-        let update = (step / STEPS_PER_UPDATE) as usize;
+    /// Returns whether a cell is evaluated by the given update at a training step.
+    fn is_due(&self, cell: usize, step: u64, update: usize) -> bool {
         let [.., z] = cell_coordinates(cell, GRID);
         let period = if step <= WARM_UP_STEPS || self.is_occupied(cell) {
             OCCUPIED_PERIOD
@@ -527,13 +532,16 @@ mod tests {
             STEPS_PER_UPDATE,
             3 * STEPS_PER_UPDATE,
             WARM_UP_STEPS,
-            WARM_UP_STEPS + STEPS_PER_UPDATE,
-            WARM_UP_STEPS + 7 * STEPS_PER_UPDATE,
+            WARM_UP_STEPS + STEPS_PER_LATE_UPDATE,
+            WARM_UP_STEPS + 7 * STEPS_PER_LATE_UPDATE,
         ] {
-            let expected = (0..CELLS).filter(|&cell| occupancy.is_due(cell, step));
+            let update = update_at(step).unwrap();
+            let expected = (0..CELLS).filter(|&cell| occupancy.is_due(cell, step, update));
             let found = occupancy.cells_to_update(step);
+            assert!(!found.is_empty());
             assert!(found.into_iter().map(|cell| cell as usize).eq(expected), "step {step}");
         }
+        assert!(occupancy.cells_to_update(WARM_UP_STEPS + STEPS_PER_UPDATE).is_empty());
     }
 
     /// A cell becomes empty when updates miss its surface, unless rays meet the surface.
