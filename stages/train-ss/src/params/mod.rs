@@ -153,7 +153,8 @@ pub struct GridParams {
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
     pub pixel_importance: f64,
     /// Samples along the diagonal of the unit cube. Default: 256 in NDC, where every ray crosses
-    /// the whole cube; otherwise 512. Fewer, in proportion, for `cells_per_pixel` below 2.56.
+    /// the whole cube; otherwise 512. Fewer for `cells_per_pixel` below 2.56: in proportion
+    /// or, in NDC, with the power of 1.5.
     #[schemars(range(min = 16, max = 8192), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub march_steps: Option<u32>,
     /// Weight of the distortion loss, which concentrates the sample weights along a ray. Default:

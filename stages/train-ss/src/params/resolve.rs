@@ -227,6 +227,7 @@ mod tests {
             |field: GridParams| Params { field: FieldParams::Grid(field), ..Params::default() };
         let own =
             GridParams { distortion: Some(0.5), march_steps: Some(999), ..GridParams::default() };
+        let coarse = with_grid(GridParams { cells_per_pixel: 1.28, ..GridParams::default() });
         let forward = facts(ndc(), Background::Opaque);
         let boxed = facts(Space::Box, Background::White);
         let open = facts(Space::Box, Background::Alpha);
@@ -234,6 +235,8 @@ mod tests {
             (&grid, forward, "distortion", json!(0.004)),
             (&grid, forward, "floater_loss", json!(0.0)),
             (&grid, forward, "march_steps", json!(256)),
+            (&coarse, forward, "march_steps", json!(91)),
+            (&coarse, boxed, "march_steps", json!(256)),
             (&grid, forward, "combine", json!("average_weights")),
             (&grid, boxed, "distortion", json!(0.0)),
             (&grid, boxed, "floater_loss", json!(0.001)),
