@@ -88,12 +88,16 @@ fn update_block(
 ) {
     for i in 0..LANES {
         let touched = gradients[i] != 0.0;
+        let (first, second) = (moments[i].first(), moments[i].second());
         let gradient = step.decay.mul_add(weights[i], gradients[i]);
-        let m1 = (moments[i].first() - gradient).mul_add(step.beta1, gradient);
+        let m1 = (first - gradient).mul_add(step.beta1, gradient);
         let square = gradient * gradient;
-        let v1 = (moments[i].second() - square).mul_add(step.beta2, square);
+        let v1 = (second - square).mul_add(step.beta2, square);
         let w1 = (-step.rate).mul_add(m1 / (v1.sqrt() + step.epsilon), weights[i]);
-        moments[i] = if touched { Moments::new(m1, v1) } else { moments[i] };
+        // Rounding changes no rounded number. A choice between old and new bits would become a
+        // masked store, which is slow on AMD processors (docs/design/006).
+        let [m1, v1] = [if touched { m1 } else { first }, if touched { v1 } else { second }];
+        moments[i] = Moments::new(m1, v1);
         weights[i] = if touched { w1 } else { weights[i] };
     }
 }
