@@ -41,41 +41,21 @@ const BLOCKS_AHEAD: usize = 16;
 const FIRST_BITS: u32 = ADAM_ROUNDED_BITS[0];
 const SECOND_BITS: u32 = ADAM_ROUNDED_BITS[1];
 
-/// Both moments of a weight, 16 bits each, so that a step reads and writes less memory
+/// Rounds both moments of a weight to 16 bits each, so that a step reads and writes less memory
 /// (docs/design/006). The upper half is the first moment's bfloat16; the lower half is the second
 /// moment, which is never negative: eight bits of exponent, eight of fraction.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[repr(transparent)]
-pub(crate) struct Moments(u32);
+#[inline(always)]
+fn pack_moments([first, second]: [f32; 2]) -> u32 {
+    let [first, second] = [first.to_bits(), second.to_bits()];
+    let first = first.wrapping_add(1 << (FIRST_BITS - 1)) >> FIRST_BITS << FIRST_BITS;
+    first | second.wrapping_add(1 << (SECOND_BITS - 1)) >> SECOND_BITS
+}
 
-impl Moments {
-    /// Rounds both moments.
-    #[inline(always)]
-    pub(crate) fn new(first: f32, second: f32) -> Self {
-        let [first, second] = [first.to_bits(), second.to_bits()];
-        let first = first.wrapping_add(1 << (FIRST_BITS - 1)) >> FIRST_BITS << FIRST_BITS;
-        Self(first | second.wrapping_add(1 << (SECOND_BITS - 1)) >> SECOND_BITS)
-    }
-
-    #[inline(always)]
-    fn first(self) -> f32 {
-        f32::from_bits(self.0 >> FIRST_BITS << FIRST_BITS)
-    }
-
-    #[inline(always)]
-    fn second(self) -> f32 {
-        f32::from_bits((self.0 & 0xffff) << SECOND_BITS)
-    }
-
-    /// Returns the moments as an integer for a checkpoint.
-    pub(crate) fn to_bits(self) -> u32 {
-        self.0
-    }
-
-    /// Creates moments from the integer of [`Moments::to_bits`].
-    pub(crate) fn from_bits(bits: u32) -> Self {
-        Self(bits)
-    }
+/// Returns the first and second moment of [`pack_moments`].
+#[inline(always)]
+fn unpack_moments(packed: u32) -> [f32; 2] {
+    let [first, second] = [packed >> FIRST_BITS << FIRST_BITS, (packed & 0xffff) << SECOND_BITS];
+    [f32::from_bits(first), f32::from_bits(second)]
 }
 
 /// Takes the Adam step of sixteen weights. Weights whose gradient is 0 keep value and moments.
@@ -84,11 +64,11 @@ fn update_block(
     step: &AdamStep,
     gradients: &[f32; LANES],
     weights: &mut [f32; LANES],
-    moments: &mut [Moments; LANES],
+    moments: &mut [u32; LANES],
 ) {
     for i in 0..LANES {
         let touched = gradients[i] != 0.0;
-        let (first, second) = (moments[i].first(), moments[i].second());
+        let [first, second] = unpack_moments(moments[i]);
         let gradient = step.decay.mul_add(weights[i], gradients[i]);
         let m1 = (first - gradient).mul_add(step.beta1, gradient);
         let square = gradient * gradient;
@@ -96,8 +76,8 @@ fn update_block(
         let w1 = (-step.rate).mul_add(m1 / (v1.sqrt() + step.epsilon), weights[i]);
         // Rounding changes no rounded number. A choice between old and new bits would become a
         // masked store, which is slow on AMD processors (docs/design/006).
-        let [m1, v1] = [if touched { m1 } else { first }, if touched { v1 } else { second }];
-        moments[i] = Moments::new(m1, v1);
+        moments[i] =
+            pack_moments([if touched { m1 } else { first }, if touched { v1 } else { second }]);
         weights[i] = if touched { w1 } else { weights[i] };
     }
 }
@@ -106,7 +86,7 @@ kernel! {
     /// Takes an Adam step of the networks' weights, and clears the gradients. Lengths are equal
     /// multiples of 16.
     pub(crate) fn adam<L>(
-        step: &AdamStep, gradients: &mut [f32], weights: &mut [f32], moments: &mut [Moments],
+        step: &AdamStep, gradients: &mut [f32], weights: &mut [f32], moments: &mut [u32],
     ) {
         let gradients = gradients.as_chunks_mut::<LANES>().0;
         let weights = weights.as_chunks_mut::<LANES>().0;
@@ -127,7 +107,7 @@ kernel! {
     /// and moments. Visits only touched halves of bricks, and clears their gradients and marks.
     pub(crate) fn adam_of_bricks<L>(
         step: &AdamStep, halves: &mut [HalfPiece<'_>; 2], weights: &mut [f32],
-        moments: &mut [Moments],
+        moments: &mut [u32],
     ) {
         let weights = weights.as_chunks_mut::<LANES>().0;
         let moments = moments.as_chunks_mut::<LANES>().0;
@@ -193,13 +173,14 @@ mod tests {
         for i in 0..10_000 {
             let power = (160.0 * uniform(3, 0, i) - 80.0).exp2();
             let [first, second] = [uniform(3, 1, i) - 0.5, uniform(3, 2, i)].map(|x| x * power);
-            let rounded = Moments::new(first, second);
-            assert!((rounded.first() - first).abs() <= first.abs() / 256.0, "{first}");
-            assert!((rounded.second() - second).abs() <= second / 512.0, "{second}");
-            assert_eq!(Moments::new(rounded.first(), rounded.second()), rounded);
+            let packed = pack_moments([first, second]);
+            let rounded = unpack_moments(packed);
+            assert!((rounded[0] - first).abs() <= first.abs() / 256.0, "{first}");
+            assert!((rounded[1] - second).abs() <= second / 512.0, "{second}");
+            assert_eq!(pack_moments(rounded), packed);
         }
-        assert_eq!(Moments::new(0.0, f32::INFINITY).second(), f32::INFINITY);
-        assert_eq!(Moments::default(), Moments::new(0.0, 0.0));
+        assert_eq!(unpack_moments(pack_moments([0.0, f32::INFINITY])), [0.0, f32::INFINITY]);
+        assert_eq!(pack_moments([0.0, 0.0]), 0);
     }
 
     /// Moments of 16 bits change each step of about 0.01 by less than 0.5 %.
@@ -207,7 +188,7 @@ mod tests {
     fn equals_adam_in_f64_where_touched() {
         let n = 32;
         let mut w: Vec<f32> = (0..n).map(|i| i as f32 / 10.0).collect();
-        let mut moments = vec![Moments::default(); n];
+        let mut moments = vec![0; n];
         let mut exact: Vec<[f64; 3]> = w.iter().map(|&w| [f64::from(w), 0.0, 0.0]).collect();
         for t in 1..=3 {
             let mut g: Vec<f32> =
@@ -242,11 +223,11 @@ mod tests {
 
     /// Returns weights and moments of many bricks, few of whose halves are touched, after a step in
     /// pieces of `bricks` bricks.
-    fn after_step(bricks: usize) -> (Vec<f32>, Vec<Moments>) {
+    fn after_step(bricks: usize) -> (Vec<f32>, Vec<u32>) {
         let n = (2 * BRICKS * LANES) as u64;
         let mut weights: Vec<f32> = (0..n).map(|i| uniform(7, 0, i)).collect();
-        let mut moments: Vec<Moments> =
-            (0..n).map(|i| Moments::new(uniform(7, 1, i), uniform(7, 2, i))).collect();
+        let mut moments: Vec<u32> =
+            (0..n).map(|i| pack_moments([uniform(7, 1, i), uniform(7, 2, i)])).collect();
         let mut marks = [0, 1].map(|half| -> Vec<u8> {
             (0..BRICKS).map(|brick| u8::from(is_touched(2 * brick + half))).collect()
         });

@@ -3,7 +3,6 @@ use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView, View};
 
-use crate::adam::Moments;
 use crate::architecture::OutOfRange;
 
 /// Error returned when a field or checkpoint can't be read or written.
@@ -50,7 +49,7 @@ pub(crate) struct Tensor<'a> {
 
 enum TensorData<'a> {
     F32(&'a [f32]),
-    Moments(&'a [Moments]),
+    U32(&'a [u32]),
     U8(&'a [u8]),
 }
 
@@ -59,8 +58,8 @@ impl<'a> Tensor<'a> {
         Self { data: TensorData::F32(data), shape: [data.len()] }
     }
 
-    pub(crate) fn of_moments(data: &'a [Moments]) -> Self {
-        Self { data: TensorData::Moments(data), shape: [data.len()] }
+    pub(crate) fn of_integers(data: &'a [u32]) -> Self {
+        Self { data: TensorData::U32(data), shape: [data.len()] }
     }
 
     pub(crate) fn of_bytes(data: &'a [u8]) -> Self {
@@ -72,7 +71,7 @@ impl View for &Tensor<'_> {
     fn dtype(&self) -> Dtype {
         match self.data {
             TensorData::F32(_) => Dtype::F32,
-            TensorData::Moments(_) => Dtype::U32,
+            TensorData::U32(_) => Dtype::U32,
             TensorData::U8(_) => Dtype::U8,
         }
     }
@@ -86,8 +85,8 @@ impl View for &Tensor<'_> {
             TensorData::F32(floats) => {
                 Cow::Owned(floats.iter().flat_map(|x| x.to_le_bytes()).collect())
             }
-            TensorData::Moments(moments) => {
-                Cow::Owned(moments.iter().flat_map(|m| m.to_bits().to_le_bytes()).collect())
+            TensorData::U32(integers) => {
+                Cow::Owned(integers.iter().flat_map(|x| x.to_le_bytes()).collect())
             }
             TensorData::U8(bytes) => Cow::Borrowed(bytes),
         }
@@ -128,14 +127,13 @@ pub(crate) fn read_f32(
     read_elements(tensors, name, Dtype::F32, into, f32::from_le_bytes)
 }
 
-/// Reads a tensor of as many moments as `into` has.
-pub(crate) fn read_moments(
+/// Reads a tensor of as many integers as `into` has.
+pub(crate) fn read_u32(
     tensors: &SafeTensors<'_>,
     name: &str,
-    into: &mut [Moments],
+    into: &mut [u32],
 ) -> Result<(), FieldProblem> {
-    let convert = |bytes| Moments::from_bits(u32::from_le_bytes(bytes));
-    read_elements(tensors, name, Dtype::U32, into, convert)
+    read_elements(tensors, name, Dtype::U32, into, u32::from_le_bytes)
 }
 
 /// Reads a tensor of elements of 32 bits.

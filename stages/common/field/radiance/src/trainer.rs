@@ -9,7 +9,7 @@ use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use crate::adam::{AdamStep, Moments, adam, adam_of_bricks, update_average};
+use crate::adam::{AdamStep, adam, adam_of_bricks, update_average};
 use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::grid::LevelGradients;
@@ -71,7 +71,8 @@ const AVERAGE_PIECE: usize = 1 << 16;
 pub struct Trainer {
     field: Field,
     options: TrainingOptions,
-    moments: ParameterBuffers<Moments>,
+    /// Both moments of Adam, packed.
+    moments: ParameterBuffers<u32>,
     network_gradients: Aligned,
     /// Gradients of the grid's levels.
     grid_gradients: Vec<LevelGradients>,

@@ -6,7 +6,7 @@ use super::{ParameterBuffers, Trainer};
 use crate::field::Field;
 use crate::occupancy::CELLS;
 use crate::tensors::{
-    FieldError, FieldProblem, Tensor, read_f32, read_moments, read_tensors, read_u8, write_tensors,
+    FieldError, FieldProblem, Tensor, read_f32, read_tensors, read_u8, read_u32, write_tensors,
 };
 use crate::training_state::TrainingState;
 
@@ -30,8 +30,8 @@ impl Trainer {
                 ("counters", Tensor::of_bytes(&counters)),
                 ("density", Tensor::of_floats(&density)),
                 ("grid", Tensor::of_floats(&self.field.grid)),
-                ("moments.grid", Tensor::of_moments(&self.moments.grid)),
-                ("moments.network", Tensor::of_moments(&self.moments.network)),
+                ("moments.grid", Tensor::of_integers(&self.moments.grid)),
+                ("moments.network", Tensor::of_integers(&self.moments.network)),
                 ("network", Tensor::of_floats(&self.field.network)),
                 ("occupied", Tensor::of_bytes(&occupied)),
             ])
@@ -51,8 +51,8 @@ impl Trainer {
             let [state @ .., samples_per_ray] = read_counters(tensors)?;
             let field = &mut self.field;
             let mut moments = ParameterBuffers::zeros(field);
-            read_moments(tensors, "moments.grid", &mut moments.grid)?;
-            read_moments(tensors, "moments.network", &mut moments.network)?;
+            read_u32(tensors, "moments.grid", &mut moments.grid)?;
+            read_u32(tensors, "moments.network", &mut moments.network)?;
             let weights = read_parameters(tensors, "", field)?;
             let is_averaged = tensors.names().contains(&"average.grid");
             let average =
