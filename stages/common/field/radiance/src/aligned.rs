@@ -25,7 +25,7 @@ impl<T: Copy + Default> Aligned<T> {
     /// Creates an array of `len` zeros.
     pub(crate) fn zeros(len: usize) -> Self {
         const { assert!(size_of::<T>() == size_of::<f32>()) };
-        // For numbers, `vec!` writes nothing: memory isn't touched before large pages are requested.
+        // For numbers, `vec!` touches no memory before large pages are requested.
         let mut memory = vec![T::default(); len + MAX_PADDING];
         request_large_pages(&mut memory);
         // `align_offset` may return usize::MAX, as in const evaluation.
