@@ -89,8 +89,8 @@ pub const CELLS_PER_PIXEL: f64 = 2.56;
 /// whole cube (design note 008).
 const MARCH_STEPS: f64 = 512.0;
 const MARCH_STEPS_IN_NDC: f64 = 256.0;
-/// Exponents by which these samples decrease with the resolution of a coarser field. In NDC, where
-/// most samples are in empty space, fewer cost little accuracy (design note 048).
+/// Exponents by which these samples decrease with the resolution of a coarser field; in NDC fewer
+/// samples cost little accuracy (design note 048).
 const MARCH_STEPS_EXPONENT: f64 = 1.0;
 const MARCH_STEPS_EXPONENT_IN_NDC: f64 = 1.5;
 /// Range of the finest level's cells along an axis; chosen by hand.
