@@ -224,7 +224,7 @@ mod tests {
     /// Published times (docs/results/engine.md), twice the minutes of two cores.
     #[test]
     fn published_times_are_estimated_within_30_percent() {
-        let rendering = |samples: u32| json!({"samples_per_axis": samples, "tolerance": 0.005});
+        let rendering = |samples: u32| json!({"samples_per_axis": samples, "tolerance": 0.0025});
         let (object, opaque) = (SceneKind::Object, SceneKind::Frustum);
         let (lego, fern) = (work(object, 100, 100), work(opaque, 17, 218));
         let views = |kind, count| work(kind, count, 200);
@@ -315,7 +315,7 @@ mod tests {
         let refiner = json!({
             "net": "compact", "patch_size": 64, "batch_size": 8, "steps": 1, "self_ensemble": 1,
         });
-        let render = json!({"samples_per_axis": 1, "tolerance": 0.005});
+        let render = json!({"samples_per_axis": 1, "tolerance": 0.0025});
         let (train, render_demo) = (training(12_000_000), render.clone());
         for (name, program, parameters, work, measured) in [
             ("fern, trained", "train-ss", training(500_000), &fern, 415.6),
