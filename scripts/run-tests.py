@@ -19,6 +19,10 @@ SELECTIONS = [["--workspace", "--exclude", "nerf-sr-remote"], ["-p", "nerf-sr-re
 TIMES = pathlib.Path("target/test-times.json")
 # Binaries that take minutes: they start first where no last run is known, since the last one would run alone.
 SLOW = ["viewer", "page", "export", "refine", "results", "photographs", "faults", "pipeline"]
+# Binaries whose expectations depend on the number of processors; the others get one each, because trainings that share
+# processors wait for each other's threads.
+UNBOUND = ["tests::processors", "tests::scheduling", "tests::slurm"]
+PROCESSORS = os.sched_getaffinity(0)
 
 
 def build() -> list[tuple[str, str, str]]:
@@ -53,9 +57,15 @@ class Outcome:
         self.output = ""
 
 
-def run(name: str, path: str, folder: str, test_filter: list[str]) -> Outcome:
-    """Runs a binary's tests one after the other, so that each test is timed; returns the results."""
+def run(name: str, path: str, folder: str, test_filter: list[str], free: list[int]) -> Outcome:
+    """Runs a binary's tests one after the other, so that each test is timed; returns the results.
+
+    The tests run on one processor of `free`, unless they need all.
+    """
     outcome = Outcome(name)
+    processor = free.pop()
+    # Child processes inherit the processors of this thread.
+    os.sched_setaffinity(0, PROCESSORS if name in UNBOUND else {processor})
     environment = dict(os.environ, CARGO_MANIFEST_DIR=folder)
     command = [path, "--test-threads=1", "--show-output", *test_filter]
     process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
@@ -77,6 +87,7 @@ def run(name: str, path: str, folder: str, test_filter: list[str]) -> Outcome:
                 said_by = text[5:-13]
             elif text.startswith("skipped: ") and said_by:
                 outcome.skipped.append(f"{name}::{said_by}: {text.strip()}")
+    free.append(processor)
     if process.wait() and not outcome.failed:
         outcome.failed.append(f"{name} exited with {process.returncode}" + (f" in {test}" if test else ""))
     return outcome
@@ -85,8 +96,9 @@ def run(name: str, path: str, folder: str, test_filter: list[str]) -> Outcome:
 def main() -> int:
     test_filter = sys.argv[1:]
     outcomes = []
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        runs = {pool.submit(run, name, path, folder, test_filter): name for name, path, folder in build()}
+    free = sorted(PROCESSORS)
+    with concurrent.futures.ThreadPoolExecutor(len(free)) as pool:
+        runs = {pool.submit(run, name, path, folder, test_filter, free): name for name, path, folder in build()}
         for done in concurrent.futures.as_completed(runs):
             outcome = done.result()
             outcomes.append(outcome)

@@ -59,7 +59,9 @@ fn ended(place: &str, backtrace: &str) -> std::process::Output {
     let folder = tempfile::tempdir().unwrap();
     let mut command = Command::new(std::env::current_exe().unwrap());
     command.env(OUTPUT, folder.path().join("output"));
+    // With one thread, libtest would print the test's name in front of the stage's first line.
     command.args(["panic_tests::a_process_that_panics", "--exact", "--ignored", "--nocapture"]);
+    command.arg("--test-threads=2");
     command
         .env(WHERE, place)
         .env("RUST_BACKTRACE", backtrace)
