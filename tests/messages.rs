@@ -469,6 +469,8 @@ fn run_in_a_group(project: &Project, more: &[(&str, &str)]) -> Finished {
 #[test]
 fn a_group_can_share_a_store() {
     let project = Project::tiny();
+    // The fixture's files have no group's mode.
+    std::fs::remove_dir_all(project.path(".nerf-sr")).unwrap();
     // Once with checkpoints and parts lying there, once whole.
     let stopped = run_in_a_group(&project, &[("NERF_SR_STOP_AFTER", "30000")]);
     assert_eq!(stopped.code, 130, "{}", stopped.stderr);

@@ -13,6 +13,7 @@ pub mod surfaces;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::LazyLock;
 use std::time::{Duration, Instant, SystemTime};
 
 /// Returns the root folder of the repository.
@@ -121,6 +122,28 @@ stages:
     inputs: {run: eval}
 ";
 
+/// Path of a store's cache of descriptions, within a project.
+const DESCRIPTIONS: &str = ".nerf-sr/cache/describe.json";
+
+/// Cached descriptions of all stages. Without these, each project's runner starts every stage's
+/// program once, and programs with libtorch take half a second to start.
+static STAGE_DESCRIPTIONS: LazyLock<String> = LazyLock::new(|| {
+    let file = Path::new(env!("CARGO_TARGET_TMPDIR")).join("describe.json");
+    let changed = |path: &Path| path.metadata().and_then(|found| found.modified());
+    let built = stage_names().iter().map(|stage| changed(&bin(stage)).unwrap()).max().unwrap();
+    if changed(&file).is_ok_and(|written| written > built) {
+        return std::fs::read_to_string(file).unwrap();
+    }
+    let project = Project { dir: tempfile::tempdir().unwrap() };
+    let blocks = stage_names().iter().map(|stage| format!("  {stage}: {{}}\n")).collect::<String>();
+    project.write("pipeline.yaml", &format!("default: [prep]\nstages:\n{blocks}"));
+    // The blocks lack their inputs, which the runner finds after it has read the descriptions.
+    assert_ne!(project.run(&["plan"]).code, 0);
+    let cached = project.path(DESCRIPTIONS);
+    artifact::write_atomically(&file, &std::fs::read(&cached).unwrap()).unwrap();
+    std::fs::read_to_string(cached).unwrap()
+});
+
 /// Temporary folder with a pipeline.
 pub struct Project {
     dir: tempfile::TempDir,
@@ -130,6 +153,7 @@ impl Project {
     pub fn new(pipeline: &str) -> Self {
         let project = Self { dir: tempfile::tempdir().unwrap() };
         project.write("pipeline.yaml", pipeline);
+        project.write(DESCRIPTIONS, &STAGE_DESCRIPTIONS);
         project
     }
 
@@ -144,7 +168,7 @@ impl Project {
     /// Creates a project with the tiny pipeline and shipped targets; `blocks` are stage blocks that
     /// change theirs or are added.
     pub fn shipped(targets: &[&str], blocks: &str) -> Self {
-        let project = Self { dir: tempfile::tempdir().unwrap() };
+        let project = Self::tiny();
         project.write("base/pipeline.yaml", TINY);
         project.copy_folder("pipelines", "base");
         let files: Vec<String> =
