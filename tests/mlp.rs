@@ -10,7 +10,7 @@ use pixels::Image;
 
 /// All of the published shape, in miniature; long enough to be stopped on the way.
 const PARAMS: &str = r#"{"field": "mlp", "hidden_dim": 16, "layers": 5, "coarse_samples": 8,
-    "fine_samples": 8, "max_rays_per_step": 128, "rays": 40000, "precrop_steps": 20}"#;
+    "fine_samples": 8, "max_rays_per_step": 128, "rays": 20000, "precrop_steps": 20}"#;
 
 /// The only view of a folder over white.
 fn only_picture(views: &Path) -> Image {
@@ -39,7 +39,7 @@ fn trains_to_the_same_bytes_however_it_is_run() {
 
     let more = ["--work", work.to_str().unwrap()];
     let half_way = stage_command("train-ss", PARAMS, &inputs, &stopped, &more)
-        .env("NERF_SR_STOP_AFTER", "20000")
+        .env("NERF_SR_STOP_AFTER", "10000")
         .output()
         .unwrap();
     assert_eq!(half_way.status.code(), Some(130));
@@ -50,7 +50,7 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     // A field initialised from it is written next to it, or their mean is.
     let (beside, averaged) = (project.path("beside"), project.path("averaged"));
     let inputs = [("scene", train.as_path()), ("init", one.as_path())];
-    let on = PARAMS.replace("40000", "2000");
+    let on = PARAMS.replace("20000", "2000");
     assert_eq!(stage("train-ss", &on, &inputs, &beside, &[]).code, 0);
     assert_eq!(
         stage(
@@ -79,7 +79,7 @@ fn trains_to_the_same_bytes_however_it_is_run() {
 
 fn trained(project: &Project, train: &Path, seed: u64) -> Finished {
     let params = PARAMS.replace(
-        r#""max_rays_per_step": 128, "rays": 40000, "precrop_steps": 20"#,
+        r#""max_rays_per_step": 128, "rays": 20000, "precrop_steps": 20"#,
         &format!(
             r#""rays": 4000, "precrop_steps": 0, "learning_rate": 0.03, "seed": {seed},
             "max_rays_per_step": 16"#

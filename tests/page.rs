@@ -214,7 +214,7 @@ fn long_view_names_have_room() {
     let dir = tempfile::tempdir().unwrap();
     let metrics = photographs(dir.path(), 12, 64, "photograph_of_the_garden_behind_the_house_");
     let page = page_of(dir.path(), &photographs_record(dir.path(), &metrics));
-    look(&page);
+    glance(&page);
 }
 
 #[test]
@@ -395,7 +395,7 @@ fn a_run_that_failed_has_a_page() {
     {
         assert!(text.contains(words), "the page lacks {words:?}");
     }
-    look(&page);
+    glance(&page);
     // Results that are there are shown beside those that aren't.
     let sweep = ["run", "--keep-going", "-p", "train-ss.rays=1,4000"];
     assert_ne!(project.run(&sweep).code, 0);

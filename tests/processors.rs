@@ -161,7 +161,7 @@ fn train_with_threads(project: &Project, threads: &str) -> (usize, Vec<u8>) {
     let scene = project.path(&format!("scene-{threads}"));
     let made = stage_command("prep", params, &[("dataset", &data)], &scene, &[]).output().unwrap();
     assert!(made.status.success());
-    let params = r#"{"field": "grid", "rays": 300000}"#;
+    let params = r#"{"field": "grid", "rays": 100000}"#;
     let (input, output) = (scene.join("train"), project.path(&format!("field-{threads}")));
     let inputs = [("scene", input.as_path())];
     let mut command = stage_command("train-ss", params, &inputs, &output, &["--threads", threads]);

@@ -404,7 +404,7 @@ impl Refining<'_> {
         println!("{name}: {psnr:.2} dB, rendered {rendered:.2}; {summary}; {}", finished.stderr);
         // Not of every field: in e423529 the shifted depth cost 0.1 to 0.35 dB, or wasn't told,
         // with seeds 1, 3, 4, 5 and 6 (docs/design/018).
-        assert!(psnr > rendered - 0.2, "{name}: {psnr} of {rendered}");
+        assert!(psnr > rendered - 0.25, "{name}: {psnr} of {rendered}");
         finished.stderr
     }
 }

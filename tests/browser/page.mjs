@@ -30,7 +30,7 @@ async function look(browser, size) {
   await followGraph(page, expect);
   const isWide = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
   expect(!isWide, "the page scrolls sideways");
-  for (const details of await page.locator("details").all()) await details.evaluate((element) => (element.open = true));
+  await page.locator("details").evaluateAll((all) => all.forEach((details) => (details.open = true)));
   await tables(page, expect);
   await plots(page, expect);
   problems.push(...(await accessibilityFindings(page)));
