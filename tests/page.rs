@@ -14,21 +14,11 @@ use serde_json::{Value, json};
 /// Maximum size of a page with 50 views of 800 pixels.
 const PAGE_BYTES: u64 = 15_000_000;
 
-/// Returns the browser's reports on a phone and a desktop, light and dark; fails on any problem.
+/// Returns the browser's reports on a dark phone, a light desktop, a light phone and a dark
+/// desktop, or on the first `count` of these; fails on any problem.
 #[track_caller]
-fn look(page: &Path) -> Option<Vec<Value>> {
-    seen(page, "all", 4)
-}
-
-/// Returns the browser's reports on a dark phone and a light desktop.
-#[track_caller]
-fn glance(page: &Path) -> Option<Vec<Value>> {
-    seen(page, "some", 2)
-}
-
-#[track_caller]
-fn seen(page: &Path, sizes: &str, count: usize) -> Option<Vec<Value>> {
-    let found = run_in_browser("page.mjs", [page.as_os_str(), sizes.as_ref()])?;
+fn look(page: &Path, count: usize) -> Option<Vec<Value>> {
+    let found = run_in_browser("page.mjs", [page.as_os_str(), count.to_string().as_ref()])?;
     let looks = found.as_array().unwrap().clone();
     assert_eq!(looks.len(), count);
     for look in &looks {
@@ -125,7 +115,7 @@ fn a_page_shows_a_sweep_as_eval_scored_it() {
         .map(|output| metrics_of(&project, output))
         .collect();
     metrics.iter().for_each(figures_name_all_numbers);
-    let Some(looks) = look(&page) else { return };
+    let Some(looks) = look(&page, 4) else { return };
     for (metrics, result) in metrics.iter().zip(["supersample=1", "supersample=2"]) {
         assert!(metrics["mean"]["psnr"].is_number());
         looks.iter().for_each(|look| says(look, result, metrics));
@@ -133,7 +123,7 @@ fn a_page_shows_a_sweep_as_eval_scored_it() {
     // Without the originals the page works.
     let alone = project.path("alone.html");
     std::fs::copy(&page, &alone).unwrap();
-    glance(&alone);
+    look(&alone, 1);
 }
 
 fn record_node(project: &Project, stage: &str, kind: &str, point: &str, inputs: &Value) -> Value {
@@ -205,7 +195,7 @@ fn a_failed_run_shows_the_renders_that_it_finished() {
     assert_eq!(layers(&text, "render"), ["rendered, not scored"]);
     assert_eq!(layers(&text, "ground-truth"), ["Ground truth"]);
     assert_eq!(std::fs::read_dir(folder.path().join("page/views")).unwrap().count(), 2);
-    glance(&page);
+    look(&page, 1);
 }
 
 /// Names of photographs may be long: plots and tables have room for them, or shorten them.
@@ -214,7 +204,7 @@ fn long_view_names_have_room() {
     let dir = tempfile::tempdir().unwrap();
     let metrics = photographs(dir.path(), 12, 64, "photograph_of_the_garden_behind_the_house_");
     let page = page_of(dir.path(), &photographs_record(dir.path(), &metrics));
-    glance(&page);
+    look(&page, 2);
 }
 
 #[test]
@@ -223,10 +213,10 @@ fn one_result_and_a_hundred_have_readable_pages() {
     project.ok(&["run"]);
     let metrics = project.json("eval", "metrics.json", &[]);
     let long = ", experiment=photographs of the garden behind the house";
-    for (results, constant, last) in [
-        (1, "", "rendered".to_owned()),
-        (12, "", "rays=1011".to_owned()),
-        (100, long, format!("rays=1099{long}")),
+    for (results, constant, last, sizes) in [
+        (1, "", "rendered".to_owned(), 1),
+        (12, "", "rays=1011".to_owned(), 1),
+        (100, long, format!("rays=1099{long}"), 2),
     ] {
         let folder = tempfile::tempdir().unwrap();
         let page = page_of(folder.path(), &record(&project, results, constant));
@@ -237,7 +227,7 @@ fn one_result_and_a_hundred_have_readable_pages() {
         let renders: Vec<String> = layers(&text, "render");
         assert_eq!(renders.len(), 1, "{renders:?}");
         assert_eq!(renders[0].ends_with(&format!("and {} more", results - 1)), results > 1);
-        let Some(looks) = glance(&page) else { return };
+        let Some(looks) = look(&page, sizes) else { return };
         looks.iter().for_each(|look| says(look, &last, &metrics));
     }
 }
@@ -395,13 +385,13 @@ fn a_run_that_failed_has_a_page() {
     {
         assert!(text.contains(words), "the page lacks {words:?}");
     }
-    glance(&page);
+    look(&page, 2);
     // Results that are there are shown beside those that aren't.
     let sweep = ["run", "--keep-going", "-p", "train-ss.rays=1,4000"];
     assert_ne!(project.run(&sweep).code, 0);
     let text = std::fs::read_to_string(&page).unwrap();
     assert!(text.contains("This run failed") && text.contains("<b>train-ss [rays=1]</b>"));
-    let Some(looks) = glance(&page) else { return };
+    let Some(looks) = look(&page, 1) else { return };
     let metrics = project.json("eval", "metrics.json", &[]);
     looks.iter().for_each(|look| says(look, "rays=4000", &metrics));
 }
@@ -422,7 +412,7 @@ fn a_page_without_scores_to_read_says_so() {
     let page = page_of(folder.path(), &record);
     let text = std::fs::read_to_string(&page).unwrap();
     assert!(text.contains("Scores that can't be read") && text.contains("0.2500"), "no such page");
-    let looks: Option<Vec<Value>> = glance(&page);
+    let looks = look(&page, 1);
     let summary = json!(["0.2500"]);
     looks.into_iter().flatten().for_each(|look| assert_eq!(look["summary"][0], summary[0]));
 }

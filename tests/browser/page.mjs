@@ -1,14 +1,18 @@
-// Operates a report page like a user, in phone and desktop size, light and dark: page.mjs PAGE
+// Operates a report page like a user, in up to four sizes and colour schemes: page.mjs PAGE COUNT
 //
-// Prints for each of the four combinations the `problems` and the page's content (`summary`, and `numbers` by view,
+// Prints for each of them the `problems` and the page's content (`summary`, and `numbers` by view,
 // result and metric).
 import { accessibilityFindings, open, report } from "./browser.mjs";
 
 const PAGE = process.argv[2];
-const SIZES = [390, 1440].flatMap((width) =>
-  [false, true].map((dark) => ({ width, dark, height: width === 390 ? 844 : 900 })),
-)
-  .filter(({ width, dark }) => process.argv[3] !== "some" || (width === 390) === dark);
+const PHONE = { width: 390, height: 844 };
+const DESKTOP = { width: 1440, height: 900 };
+const SIZES = [
+  { ...PHONE, dark: true },
+  { ...DESKTOP, dark: false },
+  { ...PHONE, dark: false },
+  { ...DESKTOP, dark: true },
+].slice(0, Number(process.argv[3]));
 
 async function look(browser, size) {
   const { page, problems } = await open(browser, PAGE, size);

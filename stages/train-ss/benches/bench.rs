@@ -363,24 +363,35 @@ fn median(values: &mut [f64]) -> f64 {
     values[values.len() / 2]
 }
 
+fn print_phase_head(unit: &str) {
+    println!(
+        "{:<16} {:>12} {:>12} {:>14} {:>16}",
+        "phase",
+        format!("ms per {unit}"),
+        "tasks",
+        "longest task",
+        format!("serial of {unit}")
+    );
+}
+
+/// Prints a phase on one core: the mean time over `units`, and the serial share of `total` seconds.
+fn print_phase(name: &str, times: &PhaseTimes, units: f64, total: f64) {
+    println!(
+        "{name:<16} {:>12.3} {:>12.1} {:>12.1} % {:>14.2} %",
+        1e3 * times.elapsed / units,
+        times.tasks as f64 / times.steps.max(1) as f64,
+        100.0 * times.in_longest_tasks / times.in_tasks.max(f64::MIN_POSITIVE),
+        100.0 * (times.elapsed - times.in_tasks) / total
+    );
+}
+
 /// Adds the phases of a training run's steps. On one core, time outside of tasks is serial.
 fn add_phases(rows: &mut Rows, one_core: &Trained) {
     let steps = one_core.phases.iter().map(|phase| phase.steps).max().unwrap_or(1).max(1) as f64;
     let total: f64 = one_core.phases.iter().map(|phase| phase.elapsed).sum();
-    println!(
-        "{:<16} {:>12} {:>12} {:>14} {:>16}",
-        "phase", "ms per step", "tasks", "longest task", "serial of step"
-    );
+    print_phase_head("step");
     for (phase, times) in Phase::ALL.iter().zip(&one_core.phases) {
-        let serial = times.elapsed - times.in_tasks;
-        println!(
-            "{:<16} {:>12.3} {:>12.1} {:>12.1} % {:>14.2} %",
-            format!("{phase:?}"),
-            1e3 * times.elapsed / steps,
-            times.tasks as f64 / times.steps.max(1) as f64,
-            100.0 * times.in_longest_tasks / times.in_tasks.max(f64::MIN_POSITIVE),
-            100.0 * serial / total
-        );
+        print_phase(&format!("{phase:?}"), times, steps, total);
     }
     let in_tasks: f64 = one_core.phases.iter().map(|phase| phase.in_tasks).sum();
     rows.add("serial_share_of_step", 100.0 * (total - in_tasks) / total, "%");
@@ -439,6 +450,10 @@ fn rendering(rows: &mut Rows, folder: &Path, field: &Field) -> anyhow::Result<()
     render("render_rays_per_s_one_core", own, true);
     render("render_rays_per_s_half_size", own / 2, false);
     render("render_rays_per_s_twice_the_size", own * 2, false);
+    let rays = camera_rays(&cameras[0]);
+    let times = one_core(|| field.render_timed(&rays).1);
+    print_phase_head("view");
+    print_phase("Rendering", &times, 1.0, times.elapsed);
     rows.sgemm("after_rendering");
     Ok(())
 }

@@ -8,6 +8,7 @@ use crate::ray::{NormalizedRay, Ray, clip};
 use crate::samples::RaySum;
 use crate::spec::MIN_TOTAL_WEIGHT;
 use crate::spec::Strides;
+use crate::trainer::{PhaseClock, PhaseTimes};
 
 /// Render of one ray.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -73,8 +74,17 @@ impl Field {
     /// Renders colour, opacity and depth of each ray, in parallel; the result doesn't depend on the
     /// number of threads.
     pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
+        self.render_timed(rays).0
+    }
+
+    /// Renders like [`Field::render`]; also returns the tasks' times.
+    pub fn render_timed(&self, rays: &[Ray]) -> (Vec<Pixel>, PhaseTimes) {
+        let clock = PhaseClock::start();
         let chunks = rays.par_chunks(CHUNK_RAYS);
-        chunks.flat_map_iter(|rays| self.render_chunk(rays)).collect()
+        let pixels = chunks.flat_map_iter(|rays| clock.task(|| self.render_chunk(rays))).collect();
+        let mut times = PhaseTimes::default();
+        times.add(&clock);
+        (pixels, times)
     }
 
     /// Renders at most [`CHUNK_RAYS`] rays.

@@ -34,7 +34,8 @@ impl Phase {
     ];
 }
 
-/// Time spent in a phase, summed over all steps of a training. All times are in seconds.
+/// Time spent in a phase, summed over all steps of a training, or in rendering. All times are in
+/// seconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PhaseTimes {
     /// Time from the phase's start to its end.
@@ -83,7 +84,7 @@ impl PhaseClock {
 
 impl PhaseTimes {
     /// Adds a step's phase, which ends now.
-    pub(super) fn add(&mut self, clock: &PhaseClock) {
+    pub(crate) fn add(&mut self, clock: &PhaseClock) {
         let seconds = |counter: &AtomicU64| counter.load(Ordering::Relaxed) as f64 / 1e9;
         self.elapsed += clock.start.elapsed().as_secs_f64();
         self.in_tasks += seconds(&clock.in_tasks);
