@@ -24,6 +24,7 @@ fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
     project.replace("{lr_width: 24, scale: 2}", "{scale: 2, lr_width: 24}");
     assert!(project.ok(&["run", "--threads", "1"]).contains("nothing to run"));
     let moved = Project::new(&std::fs::read_to_string(project.path("pipeline.yaml")).unwrap());
+    std::fs::remove_dir_all(moved.path(".nerf-sr")).unwrap();
     std::fs::rename(project.path(".nerf-sr"), moved.path(".nerf-sr")).unwrap();
     assert!(moved.ok(&["run"]).contains("nothing to run"));
     assert_eq!(listing.len(), moved.store_listing().len());
