@@ -195,7 +195,8 @@ impl RenderJob<'_> {
         let mut pixels = centres.pixels[first..first + rows.len() * width].to_vec();
         for (i, pixel) in self.cast(&detailed, n)?.into_iter().enumerate() {
             let [x, y] = detailed[i];
-            pixels[(y - rows.start) * width + x].add_mean(&pixel);
+            let index = (y - rows.start) * width + x;
+            pixels[index] = ViewPixel::blend(&pixels[index], &pixel);
         }
         Ok(pixels)
     }
@@ -246,15 +247,15 @@ struct ViewPixel {
 }
 
 impl ViewPixel {
-    /// Gives a pixel with the centre's ray the mean with all rays' colour and opacity, and their
-    /// depth. The centre alone is noisier, the other rays alone are blurred
-    /// (docs/design/003-degradation-like-pillow.md).
-    fn add_mean(&mut self, all: &Self) {
-        let halfway = |own: &mut f32, other: &f32| *own = 0.5 * (*own + other);
-        let (depth, blended) = self.channels.split_last_mut().expect("a view has channels");
-        blended.iter_mut().zip(&all.channels).for_each(|(own, other)| halfway(own, other));
-        self.colour.iter_mut().zip(&all.colour).for_each(|(own, other)| halfway(own, other));
-        *depth = all.channels[VIEW_CHANNELS.len() - 1];
+    /// Returns the mean of two pixels' colour and opacity, with the depth of `all`. The centre's ray
+    /// alone is noisier, all rays alone are blurred (docs/design/003-degradation-like-pillow.md).
+    fn blend(centre: &Self, all: &Self) -> Self {
+        let mean = |a: f32, b: f32| 0.5 * (a + b);
+        let [r, g, b, opacity] = [0, 1, 2, 3].map(|c| mean(centre.channels[c], all.channels[c]));
+        Self {
+            channels: [r, g, b, opacity, all.channels[4]],
+            colour: std::array::from_fn(|c| mean(centre.colour[c], all.colour[c])),
+        }
     }
 }
 
