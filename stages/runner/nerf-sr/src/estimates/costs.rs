@@ -13,8 +13,8 @@ use training::{field_factor, training_memory, training_need, training_seconds};
 const OBJECT_RENDERED_RAY_SECONDS: f64 = 4.4e-6;
 const OPAQUE_RENDERED_RAY_SECONDS: f64 = 8e-6;
 /// Fraction of the pixels that get all rays at the default tolerance, likewise.
-const OBJECT_DETAILED_PIXELS: f64 = 0.31;
-const OPAQUE_DETAILED_PIXELS: f64 = 0.39;
+const OBJECT_DETAILED_PIXELS: f64 = 0.23;
+const OPAQUE_DETAILED_PIXELS: f64 = 0.29;
 /// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
 const RENDERED_BYTES_PER_FLOAT: u64 = 7;
 /// Bytes of `render-depth` without its field and libtorch, but with the rays of a band of rows; as
@@ -126,7 +126,8 @@ fn rendering_seconds(parameters: &Value, work: &Work) -> Option<f64> {
     } else {
         1.0
     };
-    let further = number(parameters, "samples_per_axis")?.powi(2) - 1.0;
+    let samples = number(parameters, "samples_per_axis")?;
+    let further = if samples > 1.0 { samples.powi(2) } else { 0.0 };
     let rays = work.images.pixels as f64 * (1.0 + detailed * further);
     Some(number(field, "ensemble")? * rays * ray * field_factor(field, work.kind)?)
 }
