@@ -469,7 +469,7 @@ fn run_in_a_group(project: &Project, more: &[(&str, &str)]) -> Finished {
 #[test]
 fn a_group_can_share_a_store() {
     let project = Project::tiny();
-    // The fixture's files have no group's mode.
+    // The fixture's files aren't writable for the group.
     std::fs::remove_dir_all(project.path(".nerf-sr")).unwrap();
     // Once with checkpoints and parts lying there, once whole.
     let stopped = run_in_a_group(&project, &[("NERF_SR_STOP_AFTER", "30000")]);

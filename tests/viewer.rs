@@ -212,13 +212,15 @@ fn clear_scene(demo_scene: &str, field: &str) -> String {
     )
 }
 
-/// Trains a field of the demo scene in a space, and compares the page with rendered views.
+/// Trains a field of the demo scene in a space, and compares the page with rendered views. Returns
+/// the project.
 fn compare_space(demo_scene: &str, space: &str, compared: &Compared) -> Project {
     compare_page(&clear_scene(demo_scene, &compared.field), &[], space, compared)
 }
 
 /// Trains the field of the stages in `blocks`, and compares the page with rendered views of three
-/// test cameras and of three cameras between them. `inputs` are command-line arguments.
+/// test cameras and of three cameras between them. `inputs` are command-line arguments. Returns the
+/// project.
 fn compare_page(blocks: &str, inputs: &[&str], space: &str, compared: &Compared) -> Project {
     let (size, samples) = compared.views;
     let blocks = format!(
