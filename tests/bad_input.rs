@@ -1,5 +1,5 @@
-//! Bad input: one line that says what and where, the right exit code, nothing half-written in the
-//! store.
+//! Bad input causes a one-line error with cause and location, an exit code by kind, and no partial
+//! files in the store.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -8,22 +8,22 @@ use std::path::Path;
 
 use common::{Project, TINY, stage};
 
-/// A data set made once, copied and damaged by each test.
+/// Generates a small data set, which a test then damages.
 fn dataset(project: &Project) -> std::path::PathBuf {
     let folder = project.path("data");
-    let made = stage(
+    let finished = stage(
         "demo-scene",
         r#"{"size": 32, "train": 4, "test": 2, "samples_per_axis": 1}"#,
         &[],
         &folder,
         &[],
     );
-    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
     std::fs::remove_file(folder.join("artifact.json")).unwrap();
     folder
 }
 
-const FROM_FOLDER: &str = "
+const PREP_PIPELINE: &str = "
 default: [prep]
 stages:
   prep:
@@ -31,14 +31,19 @@ stages:
     parameters: {lr_width: 16, scale: 2}
 ";
 
-/// Damages a data set, runs prep through the runner, expects an error and an empty store.
+/// Damages a data set, runs `prep` and asserts an error and an empty store.
 #[track_caller]
-fn refused(damage: impl FnOnce(&Project, &Path), arguments: &[&str], code: i32, words: &[&str]) {
-    let project = Project::new(FROM_FOLDER);
+fn assert_refused(
+    damage: impl FnOnce(&Project, &Path),
+    arguments: &[&str],
+    code: i32,
+    texts: &[&str],
+) {
+    let project = Project::new(PREP_PIPELINE);
     let folder = dataset(&project);
     damage(&project, &folder);
-    project.run(&[&["run"], arguments].concat()).fails(code, words);
-    assert_eq!(project.store_listing(), Vec::<String>::new(), "nothing may be left in the store");
+    project.run(&[&["run"], arguments].concat()).fails(code, texts);
+    assert_eq!(project.store_listing(), Vec::<String>::new(), "the store isn't empty");
 }
 
 fn edit(file: &Path, from: &str, to: &str) {
@@ -47,10 +52,10 @@ fn edit(file: &Path, from: &str, to: &str) {
     std::fs::write(file, text.replacen(from, to, 1)).unwrap();
 }
 
-fn first_number(d: &Path) -> String {
-    let text = std::fs::read_to_string(d.join("transforms_train.json")).unwrap();
-    let at = text.find("\"transform_matrix\"").unwrap();
-    let rest = &text[at..];
+fn first_matrix_number(folder: &Path) -> String {
+    let text = std::fs::read_to_string(folder.join("transforms_train.json")).unwrap();
+    let start = text.find("\"transform_matrix\"").unwrap();
+    let rest = &text[start..];
     rest[rest.find(|c: char| c.is_ascii_digit() || c == '-').unwrap()..]
         .split(',')
         .next()
@@ -60,26 +65,26 @@ fn first_number(d: &Path) -> String {
 }
 
 #[test]
-fn datasets_that_cannot_be_used() {
-    refused(
+fn unusable_datasets_are_refused() {
+    assert_refused(
         |_, d| std::fs::remove_dir_all(d).unwrap(),
         &[],
         3,
         &["input dataset", "data", "no such folder; name an existing one"],
     );
-    refused(
+    assert_refused(
         |_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(),
         &["-p", "split=given"],
         2,
         &["parameter split", "choose holdout or paper"],
     );
-    refused(
+    assert_refused(
         |_, d| std::fs::remove_file(d.join("train/r_2.png")).unwrap(),
         &[],
         3,
         &["transforms_train.json: frame 2", "r_2.png not found"],
     );
-    refused(
+    assert_refused(
         |_, d| {
             let png = std::fs::read(d.join("train/r_1.png")).unwrap();
             std::fs::write(d.join("train/r_1.png"), &png[..png.len() / 2]).unwrap();
@@ -88,19 +93,19 @@ fn datasets_that_cannot_be_used() {
         3,
         &["frame r_1", "train/r_1.png", "incomplete or damaged image"],
     );
-    refused(
-        |_, d| edit(&d.join("transforms_train.json"), &first_number(d), "NaN"),
+    assert_refused(
+        |_, d| edit(&d.join("transforms_train.json"), &first_matrix_number(d), "NaN"),
         &[],
         3,
         &["transforms_train.json: frame 0", "is NaN"],
     );
-    refused(
+    assert_refused(
         |_, d| edit(&d.join("transforms_test.json"), "0.6911112", "3.2"),
         &[],
         3,
         &["camera_angle_x is 3.2", "focal length"],
     );
-    refused(
+    assert_refused(
         |_, d| {
             std::fs::write(
                 d.join("transforms_train.json"),
@@ -115,23 +120,28 @@ fn datasets_that_cannot_be_used() {
 }
 
 #[test]
-fn sizes_that_cannot_be() {
-    refused(
+fn invalid_parameters_are_refused() {
+    assert_refused(
         |_, _| {},
         &["-p", "lr_width=64", "-p", "scale=1"],
         2,
         &["lr_width = 64 and scale = 1 give HR images of 64 pixels", "32 pixels wide"],
     );
-    refused(|_, _| {}, &["-p", "lr_width=0"], 2, &["stage prep", "parameter lr_width", "minimum"]);
-    refused(|_, _| {}, &["-p", "kernel=gauss"], 2, &["parameter kernel", "lanczos"]);
-    refused(|_, _| {}, &["-p", "near=5", "-p", "far=3"], 2, &["near", "far = 3"]);
+    assert_refused(
+        |_, _| {},
+        &["-p", "lr_width=0"],
+        2,
+        &["stage prep", "parameter lr_width", "minimum"],
+    );
+    assert_refused(|_, _| {}, &["-p", "kernel=gauss"], 2, &["parameter kernel", "lanczos"]);
+    assert_refused(|_, _| {}, &["-p", "near=5", "-p", "far=3"], 2, &["near", "far = 3"]);
 }
 
 #[test]
-fn output_that_cannot_be_written() {
-    let project = Project::new(FROM_FOLDER);
+fn unwritable_outputs_are_reported() {
+    let project = Project::new(PREP_PIPELINE);
     let folder = dataset(&project);
-    // A file where the store should be: root may write anywhere else.
+    // A file in place of the store's parent folder: root may write to any existing folder.
     project.write("taken", "");
     project.run(&["run", "--store", "taken/store"]).fails(1, &["cannot open the store", "--store"]);
     let inputs = [("dataset", folder.as_path())];
@@ -146,9 +156,9 @@ fn output_that_cannot_be_written() {
     common::Finished::of(output).fails(1, &["--output taken/out", "cannot create the folder"]);
 }
 
-/// A small tmpfs as the store: needs root, as CI has; says so where it can't be mounted.
+/// The store is a small tmpfs, which only root can mount, as in CI; otherwise the test is skipped.
 #[test]
-fn a_full_disk() {
+fn a_full_disk_leaves_only_complete_artifacts() {
     let project = Project::new(TINY);
     let disk = project.path("disk");
     std::fs::create_dir(&disk).unwrap();
@@ -162,11 +172,11 @@ fn a_full_disk() {
     }
     let store = disk.join("store");
     let finished = project.run(&["run", "--store", store.to_str().unwrap()]);
-    // What was finished before the disk was full is whole; nothing else is there.
+    // Artifacts finished before the disk was full are complete; the store has no others.
     let verified = project.run(&["verify", "--store", store.to_str().unwrap()]);
     let count = |folder: &str| std::fs::read_dir(store.join(folder)).unwrap().count();
     let (objects, actions) = (count("objects"), count("actions"));
-    let staged = count("partial");
+    let partial = count("partial");
     std::process::Command::new("umount").arg(&disk).status().unwrap();
     finished.fails(1, &["No space left on device"]);
     assert!(
@@ -174,22 +184,22 @@ fn a_full_disk() {
         "{}",
         verified.stdout
     );
-    assert!(objects < 3 && actions <= 2 * objects && staged <= 1, "{objects} {actions} {staged}");
+    assert!(objects < 3 && actions <= 2 * objects && partial <= 1, "{objects} {actions} {partial}");
 }
 
 #[test]
-fn a_flipped_byte_in_an_artifact_is_noticed_and_named() {
+fn a_damaged_file_of_an_artifact_is_named() {
     let project = Project::tiny();
     project.ok(&["run"]);
     let scene = project.output_of("prep", &[]).remove(0);
-    let victim = project.object(&scene).join("train/images/r_3.png");
-    let mut bytes = std::fs::read(&victim).unwrap();
+    let image = project.object(&scene).join("train/images/r_3.png");
+    let mut bytes = std::fs::read(&image).unwrap();
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
-    std::fs::write(&victim, bytes).unwrap();
+    std::fs::write(&image, bytes).unwrap();
     let before = project.store_listing();
-    // Training reads it.
     project.run(&["run", "-p", "seed=1"]).fails(2, &["-p seed", "demo-scene.seed, train-ss.seed"]);
+    // Training reads the damaged image.
     project
         .run(&["run", "-p", "train-ss.seed=1"])
         .fails(3, &["train/images/r_3.png", "blake3 differs", "nerf-sr verify --remove"]);
@@ -197,21 +207,24 @@ fn a_flipped_byte_in_an_artifact_is_noticed_and_named() {
     project.run(&["verify"]).fails_on_stdout(3, &["train/images/r_3.png"]);
     project.run(&["verify", "--remove"]).fails_on_stdout(3, &["removed"]);
     let run = project.ok(&["run", "-p", "train-ss.seed=1"]);
-    assert!(run.contains("4 of 5 stages ran"), "prep, training, rendering and scoring run: {run}");
+    assert!(
+        run.contains("4 of 5 stages ran"),
+        "expected prep, training, rendering and scoring: {run}"
+    );
     assert_eq!(project.output_of("prep", &[]), [scene]);
 }
 
 impl common::Finished {
     #[track_caller]
-    fn fails_on_stdout(&self, code: i32, words: &[&str]) {
+    fn fails_on_stdout(&self, code: i32, texts: &[&str]) {
         assert_eq!(self.code, code, "{}", self.stdout);
-        assert!(words.iter().all(|w| self.stdout.contains(w)), "{}", self.stdout);
+        assert!(texts.iter().all(|text| self.stdout.contains(text)), "{}", self.stdout);
     }
 }
 
 #[test]
-fn pipelines_that_cannot_be_used() {
-    for (from, to, line, words) in [
+fn invalid_pipelines_are_refused() {
+    for (from, to, line, text) in [
         (
             "    inputs: {dataset: demo-scene}",
             "    inputs: {dataset: demo-scene}\n    imputs: {}",
@@ -249,9 +262,9 @@ fn pipelines_that_cannot_be_used() {
         ("default: [eval]", "default: [eval", 0, ""),
     ] {
         let project = Project::new(&TINY.replacen(from, to, 1));
-        let place =
+        let location =
             if line == 0 { "pipeline.yaml".to_owned() } else { format!("pipeline.yaml:{line}") };
-        project.run(&["run"]).fails(2, &[&place, words]);
+        project.run(&["run"]).fails(2, &[&location, text]);
         assert_eq!(project.store_listing(), Vec::<String>::new());
     }
 }
@@ -272,9 +285,9 @@ fn a_cycle_is_named() {
 }
 
 #[test]
-fn command_lines_that_cannot_be_used() {
+fn invalid_command_lines_are_refused() {
     let project = Project::tiny();
-    for (arguments, words) in [
+    for (arguments, text) in [
         (&["run", "nowhere"][..], "no stage \"nowhere\""),
         (&["run", "-p", "kernal=box"], "no stage has this parameter"),
         (&["run", "-p", "kernel"], "expected NAME=VALUE"),
@@ -282,7 +295,7 @@ fn command_lines_that_cannot_be_used() {
         (&["run", "-j", "0"], "at least 1"),
         (&["why", "nowhere"], "no stage \"nowhere\""),
     ] {
-        project.run(arguments).fails(2, &[words]);
+        project.run(arguments).fails(2, &[text]);
     }
     stage(
         "prep",
@@ -304,8 +317,8 @@ fn command_lines_that_cannot_be_used() {
 }
 
 #[test]
-fn a_folder_without_photographs() {
-    refused(
+fn a_folder_without_a_dataset_is_refused() {
+    assert_refused(
         |_, d| {
             std::fs::remove_file(d.join("transforms_test.json")).unwrap();
             std::fs::remove_file(d.join("transforms_train.json")).unwrap();
@@ -314,8 +327,8 @@ fn a_folder_without_photographs() {
         3,
         &["data: no data set", "transforms.json (instant-ngp", "LLFF", "COLMAP"],
     );
-    // Blender's form says its split; another doesn't.
-    refused(
+    // Blender's format defines a split, a single `transforms.json` doesn't.
+    assert_refused(
         |_, d| {
             std::fs::remove_file(d.join("transforms_test.json")).unwrap();
             std::fs::rename(d.join("transforms_train.json"), d.join("transforms.json")).unwrap();

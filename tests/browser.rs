@@ -1,10 +1,10 @@
-//! The browser that other tests look at pages with: it must notice what they rely on.
+//! The browser for tests of pages must report problems of a page and draw WebGL.
 
 mod common;
 
 use common::browser::run_in_browser;
 
-/// The problems that the browser finds on a page.
+/// Returns the problems that the browser reports for a page; `None` without a browser.
 fn problems(body: &str) -> Option<Vec<String>> {
     let folder = tempfile::tempdir().unwrap();
     let page = folder.path().join("page.html");
@@ -20,18 +20,18 @@ fn a_plain_page_has_no_problem() {
 }
 
 #[test]
-fn errors_requests_and_missing_labels_are_noticed() {
+fn errors_requests_and_missing_labels_are_reported() {
     let body = "<main><h1>A page</h1><img src=https://example.invalid/a.png><select></select></main>\
                 <script>console.error('said'); throw new Error('thrown')</script>";
     let Some(found) = problems(body) else { return };
-    for part in [
+    for text in [
         "console: said",
         "error: thrown",
         "request: https://example.invalid",
         "image-alt",
         "select-name",
     ] {
-        assert!(found.iter().any(|problem| problem.contains(part)), "{part}: {found:?}");
+        assert!(found.iter().any(|problem| problem.contains(text)), "{text}: {found:?}");
     }
 }
 

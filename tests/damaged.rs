@@ -1,6 +1,5 @@
-//! Damaged images and numbers in a data set: each is refused by a line that names the file, and
-//! nothing of it becomes grey, black or transparent. Files that are no part of a data set are
-//! passed over.
+//! Damaged images and numbers in a data set are refused by a line that names the file: no missing
+//! pixel becomes grey, black or transparent. Files that don't belong to a data set are ignored.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -12,7 +11,7 @@ use common::{Finished, Project, stage, stage_command};
 use exr::prelude::{Image, SpecificChannels, WritableImage as _, write_rgba_file};
 use serde_json::{Value, json};
 
-const FROM_FOLDER: &str = "
+const PIPELINE: &str = "
 default: [prep]
 stages:
   prep:
@@ -20,29 +19,29 @@ stages:
     parameters: {lr_width: 16, scale: 2}
 ";
 
-/// A demo scene as a user's folder, below a pipeline that prepares it.
+/// Creates a pipeline that prepares a demo scene, and the scene as a user's folder.
 fn project() -> (Project, PathBuf) {
-    let project = Project::new(FROM_FOLDER);
+    let project = Project::new(PIPELINE);
     let folder = project.path("data");
     let params = r#"{"size": 32, "train": 4, "test": 2, "samples_per_axis": 1}"#;
-    let made = stage("demo-scene", params, &[], &folder, &[]);
-    assert_eq!(made.code, 0, "{}", made.stderr);
+    let finished = stage("demo-scene", params, &[], &folder, &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
     std::fs::remove_file(folder.join("artifact.json")).unwrap();
     (project, folder)
 }
 
-/// Changes a list of views.
-fn edit(list: &Path, change: impl FnOnce(&mut Value)) {
-    let mut value: Value = serde_json::from_slice(&std::fs::read(list).unwrap()).unwrap();
+/// Edits a list of frames, `transforms_*.json`.
+fn edit_frames(path: &Path, change: impl FnOnce(&mut Value)) {
+    let mut value: Value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
     change(&mut value);
-    std::fs::write(list, value.to_string()).unwrap();
+    std::fs::write(path, value.to_string()).unwrap();
 }
 
 fn edit_training(folder: &Path, change: impl FnOnce(&mut Value)) {
-    edit(&folder.join("transforms_train.json"), change);
+    edit_frames(&folder.join("transforms_train.json"), change);
 }
 
-/// A JPEG of 32×32 pixels.
+/// Encodes a JPEG of 32×32 pixels.
 fn jpeg(is_progressive: bool) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, 90);
@@ -52,28 +51,28 @@ fn jpeg(is_progressive: bool) -> Vec<u8> {
     bytes
 }
 
-/// Puts the beginning of a JPEG in the place of an image.
-fn put_cut_jpeg(path: &Path, is_progressive: bool) {
+/// Replaces an image by a JPEG without its last 300 bytes.
+fn write_cut_jpeg(path: &Path, is_progressive: bool) {
     let bytes = jpeg(is_progressive);
     std::fs::write(path, &bytes[..bytes.len() - 300]).unwrap();
 }
 
-/// Writes an EXR that is grey but for the pixel in column 3 of row 5.
-fn put_exr(path: &Path, bad: (f32, f32, f32, f32)) {
+/// Writes an EXR whose pixels are grey except `bad` in column 3 of row 5.
+fn write_exr(path: &Path, bad: (f32, f32, f32, f32)) {
     let pixel = |x, y| if (x, y) == (3, 5) { bad } else { (0.5, 0.5, 0.5, 1.0) };
     write_rgba_file(path, 32, 32, pixel).unwrap();
 }
 
-/// Damage to a data set, and words of the refusal.
+/// Damage to a data set, and texts of the refusal.
 type Damage = (fn(&Path), &'static [&'static str]);
 
 const DAMAGES: &[Damage] = &[
     (
-        |data| put_cut_jpeg(&data.join("train/r_1.png"), false),
+        |data| write_cut_jpeg(&data.join("train/r_1.png"), false),
         &["frame r_1", "data/train/r_1.png: cut short or damaged: ", " of 32 rows are missing;"],
     ),
     (
-        |data| put_cut_jpeg(&data.join("test/r_1.png"), true),
+        |data| write_cut_jpeg(&data.join("test/r_1.png"), true),
         &[
             "frame r_1",
             "data/test/r_1.png: cut short or damaged in scan ",
@@ -82,22 +81,22 @@ const DAMAGES: &[Damage] = &[
     ),
     (
         |data| {
-            put_exr(&data.join("train/bad.exr"), (0.5, f32::NAN, 0.5, 1.0));
+            write_exr(&data.join("train/bad.exr"), (0.5, f32::NAN, 0.5, 1.0));
             edit_training(data, |list| list["frames"][2]["file_path"] = json!("./train/bad.exr"));
         },
         &["frame bad", "data/train/bad.exr: channel G is NaN at column 3, row 5;"],
     ),
     (
         |data| {
-            put_exr(&data.join("train/bad.exr"), (0.5, 0.5, 0.5, f32::NAN));
+            write_exr(&data.join("train/bad.exr"), (0.5, 0.5, 0.5, f32::NAN));
             edit_training(data, |list| list["frames"][2]["file_path"] = json!("./train/bad.exr"));
         },
         &["frame bad", "data/train/bad.exr: channel A is NaN at column 3, row 5;"],
     ),
     (
         |data| {
-            put_exr(&data.join("test/bad.exr"), (f32::INFINITY, 0.5, 0.5, 1.0));
-            edit(&data.join("transforms_test.json"), |list| {
+            write_exr(&data.join("test/bad.exr"), (f32::INFINITY, 0.5, 0.5, 1.0));
+            edit_frames(&data.join("transforms_test.json"), |list| {
                 list["frames"][0]["file_path"] = json!("./test/bad.exr");
             });
         },
@@ -105,7 +104,7 @@ const DAMAGES: &[Damage] = &[
     ),
     (
         |data| {
-            put_exr(&data.join("mask.exr"), (0.5, 0.5, f32::NEG_INFINITY, 1.0));
+            write_exr(&data.join("mask.exr"), (0.5, 0.5, f32::NEG_INFINITY, 1.0));
             edit_training(data, |list| list["frames"][0]["mask_path"] = json!("mask.exr"));
         },
         &["frame r_0", "data/mask.exr: channel B is -inf at column 3, row 5;"],
@@ -169,12 +168,12 @@ const DAMAGES: &[Damage] = &[
 ];
 
 #[test]
-fn damage_is_named_by_file_and_place() {
-    for (damage, words) in DAMAGES {
+fn damage_is_refused_with_its_file_and_position() {
+    for (damage, texts) in DAMAGES {
         let (project, folder) = project();
         damage(&folder);
         let run = project.run(&["run"]);
-        run.fails(3, words);
+        run.fails(3, texts);
         let longest = run.stderr.lines().map(str::len).max();
         assert!(longest < Some(1000), "{}", run.stderr);
         assert_eq!(project.store_listing(), Vec::<String>::new());
@@ -182,7 +181,7 @@ fn damage_is_named_by_file_and_place() {
 }
 
 #[test]
-fn memory_is_looked_at_before_images_are_decoded() {
+fn memory_is_checked_before_images_are_decoded() {
     let (project, folder) = project();
     let prepare = |memory: &str, output: &str| {
         let inputs = [("dataset", folder.as_path())];
@@ -194,29 +193,29 @@ fn memory_is_looked_at_before_images_are_decoded() {
         2,
         &["frame r_0: preparing its image of 32×32 pixels needs 20.5 kB of memory, and 20.0 kB are"],
     );
-    let one = prepare("30000", "one");
-    assert_eq!(one.code, 0, "{}", one.stderr);
-    let said = format!("{}{}", one.stdout, one.stderr);
+    let one_thread = prepare("30000", "one");
+    assert_eq!(one_thread.code, 0, "{}", one_thread.stderr);
+    let text = format!("{}{}", one_thread.stdout, one_thread.stderr);
     assert!(
-        said.contains("1 of 2 threads: preparing the largest image needs 20.5 kB of memory"),
-        "{said}"
+        text.contains("1 of 2 threads: preparing the largest image needs 20.5 kB of memory"),
+        "{text}"
     );
-    let both = prepare("4000000000", "both");
+    let two_threads = prepare("4000000000", "both");
     assert_eq!(
-        (both.code, common::manifest(&project.path("both"))),
+        (two_threads.code, common::manifest(&project.path("both"))),
         (0, common::manifest(&project.path("one")))
     );
 }
 
-/// Editors' and systems' own files and links to nothing come and go without a new run.
+/// Files of editors and systems, and broken links, may appear and disappear without a new run.
 #[test]
-fn files_that_are_no_part_of_the_data_are_passed_over() {
+fn files_that_do_not_belong_to_the_data_are_ignored() {
     let (project, folder) = project();
     symlink("me@host.123:4", folder.join(".#transforms_train.json")).unwrap();
     symlink("gone", folder.join("train/link.png")).unwrap();
     project.ok(&["run"]);
-    let said = project.ok(&["log", "prep"]);
-    assert!(said.contains("2 files ignored") && said.contains(".#transforms_train"), "{said}");
+    let log = project.ok(&["log", "prep"]);
+    assert!(log.contains("2 files ignored") && log.contains(".#transforms_train"), "{log}");
     std::fs::remove_file(folder.join(".#transforms_train.json")).unwrap();
     for name in [".DS_Store", "train/._r_0.png", ".~lock.transforms_train.json#", ".x.swp"] {
         std::fs::write(folder.join(name), "").unwrap();
@@ -226,7 +225,7 @@ fn files_that_are_no_part_of_the_data_are_passed_over() {
 }
 
 #[test]
-fn files_of_one_name_in_other_folders_are_told_apart() {
+fn equal_file_names_in_different_folders_are_distinguished() {
     let (project, folder) = project();
     let names = ["a/b", "c/b", "a_b"];
     for (frame, name) in names.into_iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Every difference that `why` and `diff` tell, as people read it.
+//! Every difference that `why` and `diff` report, in human-readable output.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -7,8 +7,8 @@ use artifact::hash_json;
 use common::Project;
 use serde_json::{Value, json};
 
-/// A stage in shell. It writes text files, the defaults by scene, and metrics; a part of
-/// the key is an environment variable.
+/// Shell stage that writes text files, by-scene defaults and metrics. The environment variable
+/// `MIX_MODE` is part of the key.
 const PROGRAM: &str = r#"#!/bin/sh
 if [ "$1" = describe ]; then
     text='{"kinds": ["text"], "summary": "a text", "optional": true}'
@@ -49,12 +49,12 @@ fn project() -> Project {
     project
 }
 
-/// Returns a command's output lines, with fixed text in place of hashes and times.
-fn said(project: &Project, arguments: &[&str]) -> Vec<String> {
-    project.ok(arguments).lines().map(plain).collect()
+/// Returns a command's output lines, with hashes and times replaced by fixed text.
+fn output_lines(project: &Project, arguments: &[&str]) -> Vec<String> {
+    project.ok(arguments).lines().map(mask_line).collect()
 }
 
-fn without_hash(word: &str) -> String {
+fn mask_hash(word: &str) -> String {
     let is_hash = |word: &str| word.len() == 10 && word.bytes().all(|b| b.is_ascii_hexdigit());
     if is_hash(word.trim_end_matches(';')) {
         word.replace(|c: char| c.is_ascii_hexdigit(), "#")
@@ -63,16 +63,16 @@ fn without_hash(word: &str) -> String {
     }
 }
 
-fn plain(line: &str) -> String {
-    let line = line.split(' ').map(without_hash).collect::<Vec<_>>().join(" ");
+fn mask_line(line: &str) -> String {
+    let line = line.split(' ').map(mask_hash).collect::<Vec<_>>().join(" ");
     match line.split_once("cached (") {
         Some((before, _)) => format!("{before}cached (…)"),
         None => line,
     }
 }
 
-/// Changes the parts of a stage's key to those of another version, so that the next run doesn't
-/// find the record.
+/// Changes one part of the key in a stage's records, so that the next run doesn't find these
+/// records.
 fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
     let actions = std::fs::read_dir(project.path(".nerf-sr/actions"))
         .unwrap()
@@ -89,35 +89,35 @@ fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
 }
 
 #[test]
-fn why_tells_each_difference() {
+fn why_reports_each_difference() {
     let project = project();
-    // Another block makes the program known.
+    // A run of another block caches the program's description.
     project.write("pipeline.yaml", &format!("{PIPELINE}  other: {{run: ./mix}}\n"));
     project.ok(&["run", "other", "--store", "empty"]);
     assert_eq!(
-        said(&project, &["why", "first", "--store", "empty"])[0],
+        output_lines(&project, &["why", "first", "--store", "empty"])[0],
         "first: will run: no earlier run of this stage"
     );
     project.write("pipeline.yaml", PIPELINE);
     project.ok(&["run", "first"]);
     assert_eq!(
-        said(&project, &["why", "second"]),
+        output_lines(&project, &["why", "second"]),
         ["second: will run: no earlier run of this stage", "    by scene: steps"]
     );
     project.ok(&["run"]);
-    let why = |arguments: &[&str]| said(&project, &[&["why", "first"], arguments].concat());
+    let why = |arguments: &[&str]| output_lines(&project, &[&["why", "first"], arguments].concat());
     assert_eq!(why(&[]), ["first: cached (…)", "    by scene: steps=256"]);
     let parameters = [
         ("count=2", "count: 1 → 2"),
         ("word=two words", "word: \"one\" → \"two words\""),
         ("flag=true", "flag: false → true"),
     ];
-    for (given, told) in parameters {
-        let lines = why(&["-p", &format!("first.{given}")]);
+    for (setting, change) in parameters {
+        let lines = why(&["-p", &format!("first.{setting}")]);
         assert_eq!(
             lines,
-            [&format!("first: will run: parameter {told}"), "    by scene: steps"],
-            "{given}"
+            [&format!("first: will run: parameter {change}"), "    by scene: steps"],
+            "{setting}"
         );
     }
     assert_eq!(why(&["-p", "first.steps=9"]), ["first: will run: parameter steps: null → 9"]);
@@ -130,10 +130,10 @@ fn why_tells_each_difference() {
         mode.lines().next().unwrap(),
         "first: will run: environment MIX_MODE: null → \"new\""
     );
-    // Inputs: another content, one more, one less.
+    // Inputs: changed content, an added input, a removed input.
     project.write("source/in.txt", "other\n");
     assert_eq!(why(&[])[0], "first: will run: input a: ########## → ##########");
-    let second = said(&project, &["why", "second"]);
+    let second = output_lines(&project, &["why", "second"]);
     let expected = [
         "second: waits for first; stays cached if results don't change",
         "    by scene: steps",
@@ -147,18 +147,18 @@ fn why_tells_each_difference() {
     project.write("pipeline.yaml", &PIPELINE.replace(", inputs: {a: ./source}", ""));
     assert_eq!(why(&[])[0], "first: will run: input a: ########## → absent");
     project.write("pipeline.yaml", PIPELINE);
-    // What is stored.
+    // A stored artifact with a missing file.
     std::fs::remove_file(project.artifact("first", &[]).join("1.txt")).unwrap();
     assert_eq!(why(&[])[0], "first: will run: its artifact ########## is missing or incomplete");
     project.ok(&["run"]);
-    // Records of another version, and of another program under the block's name.
+    // Records with another key version, or of another program under the block's name.
     change_key(&project, "first", "key version", &json!(1));
     assert_eq!(why(&[])[0], "first: will run: key version: 1 → 2");
     project.ok(&["run"]);
     change_key(&project, "first", "stage", &json!("blend"));
     assert_eq!(why(&[])[0], "first: will run: stage: \"blend\" → \"mix\"");
     project.ok(&["run"]);
-    // A run of another block with the new program makes it known.
+    // A run of another block caches the new program's description.
     project.program("mix", &format!("{PROGRAM}# changed\n"));
     project.write("pipeline.yaml", &format!("{PIPELINE}  third: {{run: ./mix}}\n"));
     project.ok(&["run", "third"]);
@@ -172,10 +172,10 @@ fn why_tells_each_difference() {
 }
 
 #[test]
-fn diff_tells_each_difference() {
+fn diff_reports_each_difference() {
     let project = project();
     project.ok(&["run", "-p", "first.count=1,2,6"]);
-    let diff = |before: &str, now: &str| said(&project, &["diff", before, now]);
+    let diff = |before: &str, now: &str| output_lines(&project, &["diff", before, now]);
     let two = [
         "first: metric mean.psnr: 31.25 → 32.25 (+1.0000)",
         "first: parameter count: 1 → 2",
@@ -184,19 +184,19 @@ fn diff_tells_each_difference() {
         "first: file 2.txt: absent → ##########",
     ];
     assert_eq!(diff("first", "first -p first.count=2"), two);
-    // More files than four are counted.
+    // More than four changed files are counted instead of listed.
     let six = diff("first", "first -p first.count=6");
     assert_eq!(six[3..], ["first: 6 files differ, such as 1.txt"]);
-    // An input's hash follows from what made it, and isn't told.
-    let of_both = [&two[..], &["second: file 1.txt: ########## → ##########"]].concat();
-    assert_eq!(diff("second", "second -p first.count=2"), of_both);
+    // `diff` omits an input's hash, which follows from the stage that created the input.
+    let both_stages = [&two[..], &["second: file 1.txt: ########## → ##########"]].concat();
+    assert_eq!(diff("second", "second -p first.count=2"), both_stages);
     assert_eq!(diff("first", "first"), ["no differences"]);
     assert_eq!(diff("first", "second"), ["second: stage: absent → \"mix\""]);
     assert_eq!(diff("second", "first"), ["second: stage: \"mix\" → absent"]);
-    let told: Value =
+    let report: Value =
         serde_json::from_str(&project.ok(&["diff", "--json", "first", "first -p first.count=6"]))
             .unwrap();
-    let names: Vec<&str> = told[0]["changes"]
+    let names: Vec<&str> = report[0]["changes"]
         .as_array()
         .unwrap()
         .iter()
@@ -209,39 +209,39 @@ fn diff_tells_each_difference() {
         [&files[..], &["metric mean.psnr", "parameter count", "resolved steps"]].concat()
     );
     assert_eq!(
-        told[0]["changes"][6],
+        report[0]["changes"][6],
         json!({"name": "metric mean.psnr", "before": 31.25, "now": 36.25})
     );
-    // Of an artifact that is gone, or a key of another version, what the records say is left.
+    // Without an artifact, `diff` still reports the differences between records.
     project.ok(&["pin", "one"]);
     project.ok(&["pin", "two", "-p", "first.count=2"]);
     std::fs::remove_dir_all(project.artifact("first", &["-p", "first.count=2"])).unwrap();
-    let gone = ["first: artifact: \"kept\" → \"gone\"", two[1], of_both[5]];
-    assert_eq!(diff("one", "two"), gone);
+    let records = ["first: artifact: \"kept\" → \"gone\"", two[1], both_stages[5]];
+    assert_eq!(diff("one", "two"), records);
 }
 
-fn pin(project: &Project, name: &str, mode: &str) {
+fn run_and_pin(project: &Project, name: &str, mode: &str) {
     for verb in [&["run", "first"][..], &["pin", name, "first"]] {
         assert!(project.command(verb).env("MIX_MODE", mode).output().unwrap().status.success());
     }
 }
 
-/// Differences that no parameter of the pipeline causes are reported, too.
+/// Differences outside the pipeline's parameters are reported as well.
 #[test]
-fn diff_tells_of_code_environment_and_sources() {
+fn diff_reports_code_environment_and_sources() {
     let project = project();
-    pin(&project, "one", "");
+    run_and_pin(&project, "one", "");
     project.write("source/unread.md", "more\n");
     project.program("mix", &format!("{PROGRAM}# changed\n"));
-    pin(&project, "two", " ");
-    let told = said(&project, &["diff", "one", "two"]);
-    let starts: Vec<&str> = told
+    run_and_pin(&project, "two", " ");
+    let lines = output_lines(&project, &["diff", "one", "two"]);
+    let starts: Vec<&str> = lines
         .iter()
         .map(|line| line.split_once(": \"").map_or(line.as_str(), |(start, _)| start))
         .collect();
-    assert_eq!(starts[..2], ["first: code", "first: environment MIX_MODE"], "{told:?}");
+    assert_eq!(starts[..2], ["first: code", "first: environment MIX_MODE"], "{lines:?}");
     assert_eq!(
-        told[2..],
+        lines[2..],
         ["first: input a: ########## → ##########", "first: file 1.txt: ########## → ##########"]
     );
 }

@@ -1,5 +1,5 @@
-//! The shipped experiments at small budgets, over a tiny pipeline: their tables, selections,
-//! failures, and a second run that does nothing.
+//! The shipped experiments with few rays on a tiny pipeline: tables, selections, failures, and a
+//! second run with nothing to do.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -7,8 +7,8 @@ mod common;
 use common::{Project, data};
 use serde_json::Value;
 
-/// The tiny pipeline with the shipped pipelines and experiments, and its scene once more as a data
-/// set, `data/other`.
+/// Creates a project with the shipped experiments, its demo scene as the data set `data/other`, and
+/// weights if available.
 fn project() -> Project {
     let project = Project::experiments();
     project.demo_data("other");
@@ -29,24 +29,24 @@ fn table(project: &Project, name: &str) -> String {
     std::fs::read_to_string(project.path(&format!("out/{name}/table.md"))).unwrap()
 }
 
-/// The values of a key, row by row.
+/// Returns the text values of a column, one per row.
 fn column(rows: &[Value], key: &str) -> Vec<String> {
     rows.iter().map(|row| row[key].as_str().unwrap_or_default().to_owned()).collect()
 }
 
-/// Two data sets in one run, a product of scenes and supervision, rows with all figures; a second
-/// run starts nothing.
+/// A run covers all combinations of scenes and supervision, with all metrics; a second run starts
+/// nothing.
 #[test]
-fn quality_runs_scenes_and_sweeps() {
+fn quality_runs_each_scene_with_each_supervision() {
     let project = project();
     let quality = [&["run", "quality", "--scene", "demo,other"][..], &SMALL].concat();
     project.ok(&quality);
     let text = table(&project, "quality");
     assert!(text.contains("| 24x2 | rendered | kernel | other |"), "{text}");
-    let made = rows(&project, "quality");
-    assert_eq!(column(&made, "scene"), ["demo", "demo", "other", "other"]);
-    assert_eq!(column(&made, "supervision"), ["average", "kernel", "average", "kernel"]);
-    for row in &made {
+    let results = rows(&project, "quality");
+    assert_eq!(column(&results, "scene"), ["demo", "demo", "other", "other"]);
+    assert_eq!(column(&results, "supervision"), ["average", "kernel", "average", "kernel"]);
+    for row in &results {
         for name in
             ["psnr", "ssim", "train_s", "render_s", "rays_per_s", "samples_per_ray", "views"]
         {
@@ -55,12 +55,15 @@ fn quality_runs_scenes_and_sweeps() {
         assert!(
             ["protocol", "machine"]
                 .iter()
-                .all(|name| row[name].as_str().is_some_and(|word| !word.is_empty())),
+                .all(|name| row[name].as_str().is_some_and(|value| !value.is_empty())),
             "{row}"
         );
     }
-    // Both are one scene under two names: the results are equal.
-    assert_eq!((&made[0]["psnr"], &made[1]["psnr"]), (&made[2]["psnr"], &made[3]["psnr"]));
+    // Both names refer to one scene, so results are equal.
+    assert_eq!(
+        (&results[0]["psnr"], &results[1]["psnr"]),
+        (&results[2]["psnr"], &results[3]["psnr"])
+    );
     let csv = std::fs::read_to_string(project.path("out/quality/rows.csv")).unwrap();
     assert_eq!(csv.lines().count(), 5);
     assert!(table(&project, "quality").starts_with(
@@ -68,15 +71,15 @@ fn quality_runs_scenes_and_sweeps() {
     ));
     let again = project.ok(&quality);
     assert!(again.contains("nothing to run") && again.contains("quality (up to date)"), "{again}");
-    assert_eq!(rows(&project, "quality"), made);
+    assert_eq!(rows(&project, "quality"), results);
     project
         .run(&["run", "quality", "--scene", "nowhere", "--data", "data"])
         .fails(2, &["no scene nowhere in data; set the folder"]);
 }
 
-/// Variants form no product, and each is compared with the first.
+/// Variants are not combined with each other; each is compared with the first.
 #[test]
-fn variants_stand_beside_the_first() {
+fn variants_are_compared_with_the_first() {
     let project = project();
     let first = ["--scene", "other", "--first-variants", "3"];
     project.ok(&[&["run", "ablation"][..], &first, &SMALL].concat());
@@ -101,10 +104,11 @@ fn variants_stand_beside_the_first() {
         "train-ss.rays=20000",
     ]);
     assert_eq!(column(&rows(&project, "tradeoff"), "variant"), ["draft", "fast", "balanced"]);
-    // Without a number on the command line, rays follow from each quality.
-    let plan = ["tradeoff", "--scene", "other", "--protocol", "100x2", "--first-variants", "4"];
-    let plan = project.nodes(&[&plan[..], &["--data", "data"]].concat());
-    let trainings = plan.iter().filter(|node| node["stage"] == "train-ss");
+    // Without `train-ss.rays`, each quality determines the number of rays.
+    let arguments =
+        ["tradeoff", "--scene", "other", "--protocol", "100x2", "--first-variants", "4"];
+    let nodes = project.nodes(&[&arguments[..], &["--data", "data"]].concat());
+    let trainings = nodes.iter().filter(|node| node["stage"] == "train-ss");
     let rays: Vec<f64> = trainings
         .map(|node| {
             assert!(node["parameters"]["rays"].is_null(), "{node}");
@@ -124,7 +128,7 @@ fn variants_stand_beside_the_first() {
     );
 }
 
-/// A point that fails is named; what else there is stands in the table.
+/// A failed point is named, and the table contains the other points.
 #[test]
 fn a_failed_point_is_named() {
     let project = project();
@@ -150,27 +154,27 @@ stages:
     assert_eq!(rows(&project, "trial").len(), 1);
 }
 
-/// Rendered and refined views, without references and with some, are scored on the same views, with
-/// figures that need both.
+/// Rendered and refined views, with and without references, are scored on the same views, with
+/// metrics that compare both.
 #[test]
-fn refinement_stands_beside_rendering() {
+fn refined_views_are_compared_with_rendered_ones() {
     let project = project();
-    let short = [
+    let budgets = [
         "downscaled-field.rays=30000",
         "finetuned-field.rays=30000",
         "train-refine.steps=20",
         "train-refine.features=8",
     ];
-    let short: Vec<&str> = short.into_iter().flat_map(|word| ["-p", word]).collect();
-    let numbers =
+    let budgets: Vec<&str> = budgets.into_iter().flat_map(|budget| ["-p", budget]).collect();
+    let selection =
         ["--scene", "other", "--variant", "1", "--variant", "2", "-p", "prep.hr_references=2"];
-    project.ok(&[&["run", "refine-table"][..], &numbers, &SMALL, &short].concat());
-    let made = rows(&project, "refine-table");
+    project.ok(&[&["run", "refine-table"][..], &selection, &SMALL, &budgets].concat());
+    let results = rows(&project, "refine-table");
     assert_eq!(
-        column(&made, "method"),
+        column(&results, "method"),
         ["ss", "refine", "refine, references: 1", "refine, references: 2"]
     );
-    for row in &made {
+    for row in &results {
         assert!(
             ["near_psnr", "seconds_per_view"]
                 .iter()
@@ -182,11 +186,11 @@ fn refinement_stands_beside_rendering() {
     project.ok(&[
         &["run", "quality-refined", "--scene", "other", "-p", "supervision=kernel"][..],
         &SMALL,
-        &short,
+        &budgets,
     ]
     .concat());
     assert_eq!(column(&rows(&project, "quality-refined"), "method"), ["rendered", "refined"]);
-    let parts = [
+    let arguments = [
         "--scene",
         "other",
         "--first-variants",
@@ -198,11 +202,10 @@ fn refinement_stands_beside_rendering() {
         "-p",
         "train-refine.steps=20",
     ];
-    project
-        .ok(&[&["run", "refine-ablation", "-p", "downscaled-field.rays=30000"][..], &parts]
-            .concat());
-    let made = rows(&project, "refine-ablation");
-    let gains: Vec<f64> = made.iter().map(|row| row["gain"].as_f64().unwrap()).collect();
+    project.ok(&[&["run", "refine-ablation", "-p", "downscaled-field.rays=30000"][..], &arguments]
+        .concat());
+    let results = rows(&project, "refine-ablation");
+    let gains: Vec<f64> = results.iter().map(|row| row["gain"].as_f64().unwrap()).collect();
     assert!(
         gains.len() == 4
             && gains[0] != gains[1]

@@ -1,5 +1,5 @@
-//! `nerf-sr run export`: files that other programs open, compared with the demo scene's own surface
-//! and images.
+//! Files of `nerf-sr run export`, also as other programs read them, compared with the demo scene's
+//! true surface and images.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -18,23 +18,22 @@ use pixels::{Filter, Image, Resampling, psnr_of, read_premultiplied};
 use scene::{Camera, View, Views};
 use serde_json::Value;
 
-/// Grid of points of the true surface.
-const CELL: f64 = 0.008;
-/// Factor by which splats are drawn wider than the images, as in a viewer's window, then shrunk.
-const ENLARGED: u32 = 4;
-/// Decibels of the splats after a short training, in the mean; 043 has figures.
-const LEAST_SPLATS: f64 = 24.0;
+/// Cell size of the grid that spaces points of the true surface, in scene units.
+const CELL_SIZE: f64 = 0.008;
+/// Factor by which splats are rendered larger than the test images, as in a viewer's window.
+const ENLARGEMENT: u32 = 4;
+/// Minimum mean PSNR of splats after a short training, in dB; design note 043 has measurements.
+const MIN_SPLAT_PSNR: f64 = 24.0;
 
-/// Inputs of a measurement: the exported files, the cameras they were made from, and the test
-/// images.
+/// Inputs of a comparison: the exported files, the training cameras and the test images.
 struct Exported {
     files: PathBuf,
     cameras: PathBuf,
     truth: PathBuf,
 }
 
-/// The demo scene after a short training.
-fn short_training() -> Project {
+/// Creates a project that trains briefly, on 40 views of the demo scene.
+fn short_training_project() -> Project {
     let project = Project::shipped(&["export"], "");
     project.replace("{size: 48, train: 12, test: 3, samples_per_axis: 2}", "{train: 40, test: 3}");
     project.replace("{lr_width: 24, scale: 2}", "{scale: 2}");
@@ -45,35 +44,35 @@ fn short_training() -> Project {
 }
 
 #[test]
-fn exported_files_show_the_demo_scene() {
-    let project = short_training();
-    let said = project.ok(&["run", "export"]);
-    for words in [
+fn exported_files_match_the_demo_scene() {
+    let project = short_training_project();
+    let output = project.ok(&["run", "export"]);
+    for text in [
         "export: ./out/export\n",
         "export: ./out/export/mesh.glb, ",
         "export: ./out/export/colmap/, 3 files, ",
     ] {
-        assert!(said.contains(words), "{said}");
+        assert!(output.contains(text), "{output}");
     }
-    let exported = exported_by(&project, &["export"]);
+    let exported = exported_artifacts(&project, &["export"]);
     assert_eq!(
         std::fs::read(project.path("out/export/mesh.ply")).unwrap(),
         std::fs::read(exported.files.join("mesh.ply")).unwrap()
     );
-    assert_near("mesh", exported.mesh());
-    assert_near("points", exported.points());
-    // By the reference renderer, over the field's background.
-    assert_shown(&exported.splats(1.0), LEAST_SPLATS);
-    if let Some(scores) = seen_in_viewer(&exported) {
-        assert_shown(&scores, LEAST_SPLATS);
+    assert_near("mesh", exported.mesh_errors());
+    assert_near("points", exported.point_errors());
+    // The reference renderer, over the field's white background.
+    assert_mean_psnr(&exported.splat_psnrs(1.0), MIN_SPLAT_PSNR);
+    if let Some(psnrs) = viewer_psnrs(&exported) {
+        assert_mean_psnr(&psnrs, MIN_SPLAT_PSNR);
     }
-    if let Some(read) = read_by_others(&exported) {
-        assert_same_files(&exported, &read);
-        assert_same_cameras(&exported, &read);
+    if let Some(read) = read_by_other_programs(&exported) {
+        assert_files_match(&exported, &read);
+        assert_cameras_match(&exported, &read);
     }
 }
 
-fn exported_by(project: &Project, arguments: &[&str]) -> Exported {
+fn exported_artifacts(project: &Project, arguments: &[&str]) -> Exported {
     let folder = |stage: &str| project.artifact(stage, arguments);
     Exported {
         files: folder("exported"),
@@ -87,13 +86,13 @@ fn cameras(folder: &Path) -> Vec<Camera> {
     views.views.into_iter().map(|view| view.camera).collect()
 }
 
-/// A camera turned by 180° around the x axis.
-fn turned_below(camera: &Camera) -> Camera {
+/// Returns a camera turned by 180° around the scene's x axis.
+fn camera_below(camera: &Camera) -> Camera {
     let [x, y, z] = camera.camera_to_world;
     Camera { camera_to_world: [x, y.map(|v| -v), z.map(|v| -v)], ..camera.clone() }
 }
 
-fn splats_score(splats: &[Splat], input: &GivenInput, background: f32, view: &View) -> f64 {
+fn splat_psnr(splats: &[Splat], input: &GivenInput, background: f32, view: &View) -> f64 {
     let image = read_premultiplied(&input.path(view.image.as_ref().unwrap())).unwrap();
     let drawn = render_splats(splats, &enlarged(&view.camera), f64::from(background));
     psnr(&image.over(background), &shrunk(&drawn))
@@ -102,46 +101,46 @@ fn splats_score(splats: &[Splat], input: &GivenInput, background: f32, view: &Vi
 impl Exported {
     /// Returns the part of the true surface that the training cameras observe.
     fn true_surface(&self) -> Vec<(DVec3, DVec3)> {
-        true_surface(&World::new(0), &cameras(&self.cameras), CELL)
+        true_surface(&World::new(0), &cameras(&self.cameras), CELL_SIZE)
     }
 
-    /// Returns that part and the one that mirrored cameras below the scene's middle observe.
-    fn whole_surface(&self) -> Vec<(DVec3, DVec3)> {
+    /// Returns the part of the true surface that the cameras observe from above or, turned, below.
+    fn surface_from_both_sides(&self) -> Vec<(DVec3, DVec3)> {
         let above = cameras(&self.cameras);
-        let below = above.iter().map(turned_below).collect::<Vec<_>>();
-        true_surface(&World::new(0), &[above, below].concat(), CELL)
+        let below = above.iter().map(camera_below).collect::<Vec<_>>();
+        true_surface(&World::new(0), &[above, below].concat(), CELL_SIZE)
     }
 
-    fn mesh(&self) -> Compared {
+    fn mesh_errors(&self) -> Compared {
         let mesh = Glb::read(&self.files.join("mesh.glb"));
         compare(&World::new(0), &self.true_surface(), &mesh.positions, &mesh.normals)
     }
 
-    fn points(&self) -> Compared {
+    fn point_errors(&self) -> Compared {
         let columns = read_ply(&self.files.join("points.ply"));
         let [positions, normals] =
             [["x", "y", "z"], ["nx", "ny", "nz"]].map(|names| vectors(&columns, names));
         compare(&World::new(0), &self.true_surface(), &positions, &normals)
     }
 
-    /// PSNR of each test view over a grey level, as the splats are rendered.
-    fn splats(&self, background: f32) -> Vec<f64> {
+    /// Returns the PSNR of each test view that is rendered from the splats over a grey level.
+    fn splat_psnrs(&self, background: f32) -> Vec<f64> {
         let splats = read_splats(&self.files.join("splats.ply"));
         let input = GivenInput::open("truth", &self.truth).unwrap();
         let views = Views::read(&input).unwrap().views;
-        views.iter().map(|view| splats_score(&splats, &input, background, view)).collect()
+        views.iter().map(|view| splat_psnr(&splats, &input, background, view)).collect()
     }
 }
 
 fn enlarged(camera: &Camera) -> Camera {
     let k = camera.intrinsics;
-    camera.resized(ENLARGED * k.width, ENLARGED * k.height)
+    camera.resized(ENLARGEMENT * k.width, ENLARGEMENT * k.height)
 }
 
-/// An image of an enlarged camera at the camera's size.
+/// Shrinks the image of an enlarged camera to the size of the original camera's image.
 fn shrunk(image: &Image) -> Image {
-    let to = [image.width, image.height].map(|side| side / ENLARGED as usize);
-    Resampling::new(Filter::Box, (image.width, image.height), (to[0], to[1])).apply(image)
+    let [width, height] = [image.width, image.height].map(|side| side / ENLARGEMENT as usize);
+    Resampling::new(Filter::Box, (image.width, image.height), (width, height)).apply(image)
 }
 
 fn psnr(a: &Image, b: &Image) -> f64 {
@@ -149,48 +148,49 @@ fn psnr(a: &Image, b: &Image) -> f64 {
     psnr_of(error.sum::<f64>() / a.data.len() as f64)
 }
 
-/// Not farther than a hundredth of the scene, with nearly all normals outwards; 043 has figures.
+/// Fails unless mean distances are below 1 % of the scene's size and at least 96 % of the normals
+/// point outwards.
 #[track_caller]
-fn assert_near(what: &str, compared: Compared) {
-    println!("{what}: {compared:?}");
-    assert!(compared.to_truth < 0.01 && compared.from_truth < 0.01, "{what}: {compared:?}");
-    assert!(compared.outward >= 0.96, "{what}: {compared:?}");
+fn assert_near(name: &str, compared: Compared) {
+    println!("{name}: {compared:?}");
+    assert!(compared.to_truth < 0.01 && compared.from_truth < 0.01, "{name}: {compared:?}");
+    assert!(compared.outward >= 0.96, "{name}: {compared:?}");
 }
 
-/// Fails below `least` dB in the mean. A mirrored or upside-down scene has about 12 dB.
+/// Fails if the mean PSNR is below `min` dB. A mirrored or upside-down scene has about 12 dB.
 #[track_caller]
-fn assert_shown(scores: &[f64], least: f64) {
-    println!("splats: {}", in_words(scores));
-    assert!(scores.iter().sum::<f64>() >= least * scores.len() as f64, "{}", in_words(scores));
+fn assert_mean_psnr(psnrs: &[f64], min: f64) {
+    println!("splats: {}", format_psnrs(psnrs));
+    assert!(psnrs.iter().sum::<f64>() >= min * psnrs.len() as f64, "{}", format_psnrs(psnrs));
 }
 
-fn viewer_score(input: &GivenInput, drawn: &Path, view: &View) -> f64 {
+fn viewer_psnr(input: &GivenInput, folder: &Path, view: &View) -> f64 {
     let image = read_premultiplied(&input.path(view.image.as_ref().unwrap())).unwrap();
-    let path = drawn.join(format!("{}.png", view.camera.name));
-    let shown = read_premultiplied(&path).unwrap().over(0.0);
-    // Nothing of the scene is in the corner.
-    let background = shown.data[0];
-    psnr(&image.over(background), &shrunk(&shown))
+    let path = folder.join(format!("{}.png", view.camera.name));
+    let drawn = read_premultiplied(&path).unwrap().over(0.0);
+    // The corner contains only the viewer's background.
+    let background = drawn.data[0];
+    psnr(&image.over(background), &shrunk(&drawn))
 }
 
-/// PSNR of each test view, as a viewer of others draws it, over the background that it draws. None
-/// without a browser.
-fn seen_in_viewer(exported: &Exported) -> Option<Vec<f64>> {
-    let drawn = tempfile::tempdir().unwrap();
+/// Returns the PSNR of each test view that another project's viewer draws, over the viewer's
+/// background; `None` without a browser.
+fn viewer_psnrs(exported: &Exported) -> Option<Vec<f64>> {
+    let folder = tempfile::tempdir().unwrap();
     let input = GivenInput::open("truth", &exported.truth).unwrap();
     let mut views = Views::read(&input).unwrap();
     views.views.iter_mut().for_each(|view| view.camera = enlarged(&view.camera));
-    let cameras = drawn.path().join("views.json");
+    let cameras = folder.path().join("views.json");
     artifact::write_json(&cameras, &views).unwrap();
     let files = [exported.files.join("splats.ply"), cameras];
-    let said =
-        run_in_browser("splats.mjs", files.iter().map(PathBuf::as_path).chain([drawn.path()]))?;
+    let report =
+        run_in_browser("splats.mjs", files.iter().map(PathBuf::as_path).chain([folder.path()]))?;
     let count = read_ply(&files[0])["x"].len();
-    assert_eq!(said, serde_json::json!({"count": count, "problems": []}));
-    Some(views.views.iter().map(|view| viewer_score(&input, drawn.path(), view)).collect())
+    assert_eq!(report, serde_json::json!({"count": count, "problems": []}));
+    Some(views.views.iter().map(|view| viewer_psnr(&input, folder.path(), view)).collect())
 }
 
-/// Points of the true surface with their normals, as PLY text.
+/// Writes points of the true surface with their normals as a text PLY file.
 fn write_truth(path: &Path, surface: &[(DVec3, DVec3)]) {
     let mut text = format!("ply\nformat ascii 1.0\nelement vertex {}\n", surface.len());
     ["x", "y", "z", "nx", "ny", "nz"]
@@ -203,28 +203,29 @@ fn write_truth(path: &Path, surface: &[(DVec3, DVec3)]) {
     std::fs::write(path, text).unwrap();
 }
 
-/// Returns the results of trimesh, plyfile and pycolmap; `None` if one isn't installed.
-fn read_by_others(exported: &Exported) -> Option<Value> {
+/// Reads the exported files by trimesh, plyfile and, where installed, pycolmap. Returns `None` if
+/// trimesh, plyfile or scipy isn't installed.
+fn read_by_other_programs(exported: &Exported) -> Option<Value> {
     let modules = "import trimesh, plyfile, scipy";
-    let has = Command::new("python3").args(["-c", modules]).output();
-    if !has.is_ok_and(|output| output.status.success()) {
+    let imported = Command::new("python3").args(["-c", modules]).output();
+    if !imported.is_ok_and(|output| output.status.success()) {
         eprintln!("skipped: no trimesh, plyfile or scipy (python3 -m pip install them)");
         return None;
     }
     let folder = tempfile::tempdir().unwrap();
-    let [all, seen] = ["all.ply", "seen.ply"].map(|name| folder.path().join(name));
-    write_truth(&all, &exported.whole_surface());
-    write_truth(&seen, &exported.true_surface());
+    let [complete, observed] = ["all.ply", "seen.ply"].map(|name| folder.path().join(name));
+    write_truth(&complete, &exported.surface_from_both_sides());
+    write_truth(&observed, &exported.true_surface());
     let mut command = Command::new("python3");
     command.arg(common::root().join("scripts/check-export.py"));
-    command.arg(&exported.files).args([&all, &seen]);
+    command.arg(&exported.files).args([&complete, &observed]);
     let read = Finished::of(command.output().unwrap());
     assert_eq!(read.code, 0, "{}", read.stderr);
     Some(serde_json::from_str(&read.stdout).unwrap())
 }
 
 /// Fails unless other programs read all points, splats and triangles, near the true surface.
-fn assert_same_files(exported: &Exported, read: &Value) {
+fn assert_files_match(exported: &Exported, read: &Value) {
     let summary: Value =
         serde_json::from_slice(&std::fs::read(exported.files.join("export.json")).unwrap())
             .unwrap();
@@ -247,8 +248,8 @@ fn assert_same_files(exported: &Exported, read: &Value) {
     assert_eq!(read["splats"]["count"], summary["splats"]);
 }
 
-/// Every camera's pose, as pycolmap reads it.
-fn assert_same_cameras(exported: &Exported, read: &Value) {
+/// Fails unless pycolmap reads the training cameras' poses.
+fn assert_cameras_match(exported: &Exported, read: &Value) {
     let cameras = cameras(&exported.cameras);
     assert_eq!(read["frames"], cameras.len());
     let Some(colmap) = read.get("colmap") else {
@@ -256,7 +257,7 @@ fn assert_same_cameras(exported: &Exported, read: &Value) {
         return;
     };
     for camera in &cameras {
-        // Right, down, forward.
+        // COLMAP's axes: right, down, forward.
         let axes = camera.rotation();
         let [right, down, forward] = [axes.x_axis, -axes.y_axis, -axes.z_axis];
         let pose = &colmap["camera_to_world"][format!("{}.png", camera.name)];
@@ -270,8 +271,8 @@ fn assert_same_cameras(exported: &Exported, read: &Value) {
     }
 }
 
-/// A tiny field, exported with some parameters by the stage alone.
-fn tiny(project: &Project, params: &str, output: &str, more: &[&str]) -> Finished {
+/// Exports a tiny field by running the stage without the runner.
+fn export_tiny(project: &Project, params: &str, output: &str, more: &[&str]) -> Finished {
     project.ok(&["run", "train-ss"]);
     let (field, prep) = (project.artifact("train-ss", &[]), project.artifact("prep", &[]));
     let inputs = [("field", &*field), ("cameras", &prep.join("train-cameras"))];
@@ -283,7 +284,7 @@ fn any_number_of_threads_gives_the_same_files() {
     let project = Project::tiny();
     let params = r#"{"resolution": 48}"#;
     for (output, threads) in [("a", "1"), ("b", "3")] {
-        let finished = tiny(&project, params, output, &["--threads", threads]);
+        let finished = export_tiny(&project, params, output, &["--threads", threads]);
         assert_eq!(finished.code, 0, "{}", finished.stderr);
     }
     let [a, b] = ["a", "b"].map(|output| common::manifest(&project.path(output)));
@@ -296,21 +297,21 @@ fn any_number_of_threads_gives_the_same_files() {
 }
 
 #[test]
-fn the_mesh_may_be_left_out() {
+fn the_mesh_can_be_omitted() {
     let project = Project::tiny();
-    let some = r#"{"mesh": false, "max_points": 500}"#;
-    assert_eq!(tiny(&project, some, "some", &[]).code, 0);
+    let params = r#"{"mesh": false, "max_points": 500}"#;
+    assert_eq!(export_tiny(&project, params, "some", &[]).code, 0);
     let manifest = common::manifest(&project.path("some"));
     assert!(manifest.contains("points.ply") && !manifest.contains("mesh.glb"), "{manifest}");
     let count = read_ply(&project.path("some/points.ply"))["x"].len();
     assert!((100..=500).contains(&count), "{count} points");
 }
 
-/// Measures an artifact of `export`, `EXPORT`, that was made by the training cameras of a scene of
-/// `prep`, `SCENE`: `docs/design/043-export.md` has the command.
+/// Prints errors of `EXPORT`, an artifact of `export` from the scene `SCENE` of `prep`.
+/// `docs/design/043-export.md` has the command.
 #[test]
 #[ignore = "measures folders given by EXPORT and SCENE"]
-fn figures_of_the_demo_scene() {
+fn errors_of_given_folders_are_printed() {
     let [Some(files), Some(prep)] = ["EXPORT", "SCENE"].map(std::env::var_os) else {
         eprintln!("skipped: EXPORT and SCENE don't name an artifact of export and of prep");
         return;
@@ -318,21 +319,21 @@ fn figures_of_the_demo_scene() {
     let [files, prep] = [files, prep].map(PathBuf::from);
     let exported =
         Exported { files, cameras: prep.join("train-cameras"), truth: prep.join("truth") };
-    println!("mesh: {:?}\npoints: {:?}", exported.mesh(), exported.points());
+    println!("mesh: {:?}\npoints: {:?}", exported.mesh_errors(), exported.point_errors());
     for background in [1.0, 0.0] {
-        println!("splats over {background}: {}", in_words(&exported.splats(background)));
+        println!("splats over {background}: {}", format_psnrs(&exported.splat_psnrs(background)));
     }
-    if let Some(read) = read_by_others(&exported) {
+    if let Some(read) = read_by_other_programs(&exported) {
         for kind in ["mesh", "points", "splats"] {
             println!("{kind}, read by others: {}", read[kind]);
         }
     }
-    if let Some(scores) = seen_in_viewer(&exported) {
-        println!("splats in the viewer: {}", in_words(&scores));
+    if let Some(psnrs) = viewer_psnrs(&exported) {
+        println!("splats in the viewer: {}", format_psnrs(&psnrs));
     }
 }
 
-fn in_words(scores: &[f64]) -> String {
-    let mean = scores.iter().sum::<f64>() / scores.len() as f64;
-    format!("{mean:.2} dB in the mean, {scores:.2?}")
+fn format_psnrs(psnrs: &[f64]) -> String {
+    let mean = psnrs.iter().sum::<f64>() / psnrs.len() as f64;
+    format!("{mean:.2} dB in the mean, {psnrs:.2?}")
 }

@@ -9,10 +9,11 @@ use common::{
     signal, stage, stage_command, wait_until,
 };
 
-/// Long enough for several checkpoints, the first after a second; with all that a checkpoint may
-/// hold.
+/// Parameters of a training with several checkpoints, the first after a second, that contain all
+/// optional state.
 const PARAMS: &str = r#"{"supervision": "kernel", "exposure": true, "pose_refinement": true, "ensemble": 2, "rays": 200000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 256, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
-/// In the second member's training. The first one's rays count twice, since poses are compared.
+/// Progress, in rays, at which the second member is being trained. The first member's rays count
+/// twice, since given and refined poses are compared.
 const SLOW_FROM: u64 = 240_000;
 
 #[test]
@@ -20,8 +21,8 @@ fn training_killed_at_any_moment_ends_in_the_same_bytes() {
     let project = Project::tiny();
     let train = demo_train(&project, 8);
     let inputs = [("scene", train.as_path())];
-    let whole = project.path("whole");
-    assert_eq!(stage("train-ss", PARAMS, &inputs, &whole, &[]).code, 0);
+    let expected = project.path("whole");
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &expected, &[]).code, 0);
 
     let (output, work) = (project.path("killed"), project.path("work"));
     let more = ["--work", work.to_str().unwrap()];
@@ -36,11 +37,11 @@ fn training_killed_at_any_moment_ends_in_the_same_bytes() {
     );
     let finished = stage("train-ss", PARAMS, &inputs, &output, &more);
     assert_eq!(finished.code, 0, "{}", finished.stderr);
-    assert_eq!(manifest(&output), manifest(&whole));
+    assert_eq!(manifest(&output), manifest(&expected));
 }
 
 #[test]
-fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
+fn an_interrupted_stage_leaves_a_checkpoint_and_exits_with_130() {
     let project = Project::tiny();
     let train = demo_train(&project, 8);
     let inputs = [("scene", train.as_path())];
@@ -53,45 +54,45 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     let finished = Finished::of(stopped);
     assert_eq!(finished.code, 130, "{}", finished.stderr);
     assert!(finished.stderr.contains("interrupted; run again to resume"), "{}", finished.stderr);
-    let checkpoint = checkpoints(&work).pop().expect("it left a checkpoint");
+    let checkpoint = checkpoints(&work).pop().expect("no checkpoint");
     assert!(!output.exists());
     // A truncated checkpoint is reported and skipped.
     let bytes = std::fs::read(&checkpoint).unwrap();
     std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
-    let again = stage("train-ss", PARAMS, &inputs, &output, &more);
-    assert_eq!(again.code, 0, "{}", again.stderr);
+    let restarted = stage("train-ss", PARAMS, &inputs, &output, &more);
+    assert_eq!(restarted.code, 0, "{}", restarted.stderr);
     assert!(
-        again.stderr.contains("checkpoint.safetensors: incomplete checkpoint; starting over"),
+        restarted.stderr.contains("checkpoint.safetensors: incomplete checkpoint; starting over"),
         "{}",
-        again.stderr
+        restarted.stderr
     );
-    let whole = project.path("whole");
-    assert_eq!(stage("train-ss", PARAMS, &inputs, &whole, &[]).code, 0);
-    assert_eq!(manifest(&output), manifest(&whole));
+    let expected = project.path("whole");
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &expected, &[]).code, 0);
+    assert_eq!(manifest(&output), manifest(&expected));
 }
 
-/// Starts a run, and signals it when something has happened.
-fn signal_once(project: &Project, name: &str, mut happened: impl FnMut() -> bool) -> Finished {
+/// Starts a run, and sends a signal after a condition has become true.
+fn run_and_signal(project: &Project, name: &str, mut condition: impl FnMut() -> bool) -> Finished {
     let mut child = project.spawn(&["run"]);
-    wait_until(|| happened() || child.try_wait().unwrap().is_some());
+    wait_until(|| condition() || child.try_wait().unwrap().is_some());
     signal(&child, name);
     Finished::of(child.wait_with_output().unwrap())
 }
 
 #[test]
-fn a_runner_killed_or_interrupted_goes_on() {
+fn a_killed_or_interrupted_runner_resumes() {
     let project = Project::tiny();
     project.replace("rays: 60000", "rays: 1500000");
-    // Killed as soon as a stage has begun, interrupted while a field is being trained.
+    // The first run is killed after a stage has begun, the second interrupted during training.
     let partial = project.path(".nerf-sr/partial");
     let has_begun = || partial.read_dir().is_ok_and(|mut entries| entries.next().is_some());
-    let killed = signal_once(&project, "-KILL", has_begun);
+    let killed = run_and_signal(&project, "-KILL", has_begun);
     assert_eq!(killed.code, -1, "the kill came too late: {}", killed.stderr);
-    let interrupted = signal_once(&project, "-INT", || last_checkpoint(&partial).is_some());
-    let said = interrupted.stderr;
-    assert!(interrupted.code == 130 && said.contains("interrupted"), "{said}");
+    let interrupted = run_and_signal(&project, "-INT", || last_checkpoint(&partial).is_some());
+    let log = interrupted.stderr;
+    assert!(interrupted.code == 130 && log.contains("interrupted"), "{log}");
     let status = project.ok(&["status"]);
-    assert!(status.contains("has a checkpoint to resume from"), "{status}{said}");
+    assert!(status.contains("has a checkpoint to resume from"), "{status}{log}");
     let last = project.run(&["run"]);
     assert_eq!(last.code, 0, "{}", last.stderr);
     assert!(last.stderr.contains("resuming from step"), "{}", last.stderr);
@@ -103,7 +104,7 @@ fn a_runner_killed_or_interrupted_goes_on() {
 }
 
 #[test]
-fn a_record_that_was_cut_short_is_made_again() {
+fn stages_with_truncated_records_run_again() {
     let project = Project::tiny();
     project.ok(&["run"]);
     let actions = project.path(".nerf-sr/actions");

@@ -1,4 +1,4 @@
-//! Messages to a new user: problems before anything runs, and progress of every stage.
+//! Messages for a new user: errors before anything runs, and progress.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -8,8 +8,8 @@ use std::path::Path;
 use common::{Project, demo_train, stage, stage_command};
 use serde_json::{Value, json};
 
-/// A project whose photographs are enlarged by a network.
-fn enlarging() -> Project {
+/// Creates a project with the stage `upsample`, and an empty folder for weights.
+fn upsampling_project() -> Project {
     let project = Project::tiny();
     let blocks = "
   upsample:
@@ -24,10 +24,11 @@ fn enlarging() -> Project {
     project
 }
 
-/// Weights, scales and folders that a later stage can't use are known before the first stage runs.
+/// Weights, scales and folders that a later stage can't use are reported before the first stage
+/// runs.
 #[test]
 fn every_input_is_checked_before_anything_runs() {
-    let project = enlarging();
+    let project = upsampling_project();
     let weights = ["-i", "upsample.weights=weights"];
     for (arguments, code, words) in [
         (
@@ -55,7 +56,7 @@ fn every_input_is_checked_before_anything_runs() {
     }
 }
 
-/// `12k` is 12000, on the command line and in a file, and has its key.
+/// `64k` means 64000 and gives an equal key.
 #[test]
 fn whole_numbers_may_have_a_suffix() {
     let project = Project::tiny();
@@ -69,7 +70,7 @@ fn whole_numbers_may_have_a_suffix() {
     project.run(&["plan", "-p", "train-ss.rays=30X"]).fails(2, &["\"30X\" is not a whole number"]);
 }
 
-/// A node of a run's record that a sink shows.
+/// Returns a node of a run's record that a sink displays.
 fn node(project: &Project, stage: &str, kind: &str) -> Value {
     let folder = project.artifact(stage, &[]);
     json!({"stage": stage, "point": "", "is_shown": true, "program": stage, "kind": kind,
@@ -78,9 +79,9 @@ fn node(project: &Project, stage: &str, kind: &str) -> Value {
         "threads": 2})
 }
 
-/// Runs a stage by itself, slowed, until it has reported a percentage.
+/// Runs a slowed stage alone and checks that progress is reported.
 #[track_caller]
-fn shows_a_percentage(project: &Project, name: &str, inputs: &[(&str, &Path)]) {
+fn check_progress(project: &Project, name: &str, inputs: &[(&str, &Path)]) {
     let output = project.path(&format!("{name}.out"));
     let mut command = stage_command(name, "{}", inputs, &output, &["--progress", "json"]);
     command.env("NERF_SR_SLOW_UNTIL", format!("0 {}", project.path("never").display()));
@@ -90,7 +91,7 @@ fn shows_a_percentage(project: &Project, name: &str, inputs: &[(&str, &Path)]) {
 }
 
 #[test]
-fn sinks_and_export_show_a_percentage() {
+fn sinks_and_export_report_progress() {
     let project = Project::fast();
     project.ok(&["run"]);
     for (sink, kind, stage) in [
@@ -104,16 +105,16 @@ fn sinks_and_export_show_a_percentage() {
         let record = json!({"home": project.path("out"), "command": ["nerf-sr", "run"],
             "data_sets": ["demo-scene"], "nodes": nodes});
         std::fs::write(run.join("run.json"), record.to_string()).unwrap();
-        shows_a_percentage(&project, sink, &[("run", &run)]);
+        check_progress(&project, sink, &[("run", &run)]);
     }
     let [field, scene] = ["train-ss", "prep"].map(|stage| project.artifact(stage, &[]));
     let cameras = scene.join("cameras");
-    shows_a_percentage(&project, "export", &[("field", &field), ("cameras", &cameras)]);
+    check_progress(&project, "export", &[("field", &field), ("cameras", &cameras)]);
 }
 
-/// A training's progress says what its PSNR is of: not of test views.
+/// Progress must describe its PSNR as one of training pixels, not of test views.
 #[test]
-fn progress_says_what_its_psnr_is_of() {
+fn progress_names_the_pixels_of_its_psnr() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
     let (inputs, field) = ([("scene", train.as_path())], project.path("field"));
@@ -123,19 +124,22 @@ fn progress_says_what_its_psnr_is_of() {
     assert!(training.stdout.contains("PSNR of training pixels "), "{}", training.stdout);
 }
 
-/// `-i init=train-ss` is the field of the same command, without the parameters of `train-ss`.
+/// `-i init=train-ss` is the field that the command trains without its parameters for `train-ss`.
 #[test]
-fn a_stages_name_continues_its_training() {
+fn init_by_a_stages_name_fine_tunes_its_field() {
     let project = Project::tiny();
-    let more =
+    let arguments =
         ["train-ss", "-i", "init=train-ss", "-p", "rays=2k", "-p", "combine=average_weights"];
-    let words = "train-ss has no artifact yet; run it first";
-    project.run(&[&["run"], &more[..]].concat()).fails(2, &[words]);
+    let message = "train-ss has no artifact yet; run it first";
+    project.run(&[&["run"], &arguments[..]].concat()).fails(2, &[message]);
     project.ok(&["run", "train-ss"]);
-    let first = project.artifact("train-ss", &["train-ss"]);
-    project.ok(&[&["run"], &more[..]].concat());
-    let second = project.artifact("train-ss", &more);
-    let log = std::fs::read(second.join("training.json")).unwrap();
+    let initial = project.artifact("train-ss", &["train-ss"]);
+    project.ok(&[&["run"], &arguments[..]].concat());
+    let finetuned = project.artifact("train-ss", &arguments);
+    let log = std::fs::read(finetuned.join("training.json")).unwrap();
     let log: Value = serde_json::from_slice(&log).unwrap();
-    assert!(log["rays"].as_u64().is_some_and(|rays| rays < 10_000) && first != second, "{log}");
+    assert!(
+        log["rays"].as_u64().is_some_and(|rays| rays < 10_000) && initial != finetuned,
+        "{log}"
+    );
 }

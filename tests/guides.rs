@@ -1,4 +1,4 @@
-//! Runs the commands of README and of the guides, as they stand there, with installed programs.
+//! Runs the commands of README and the guides with installed programs and small parameters.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -12,12 +12,12 @@ use std::path::Path;
 use common::{FAST, Finished, Project, commands, data, root, stage};
 
 /// Document whose commands `tests/slurm.rs` runs on a cluster.
-const ON_A_CLUSTER: &str = "slurm.md";
-/// Part of commands that need a GPU.
-const GPU: &str = "--device cuda";
-/// Parts of commands and what takes their place, so that each command takes a second. Commands end
-/// in a space.
-const SMALL: [(&str, &str); 23] = [
+const CLUSTER_GUIDE: &str = "slurm.md";
+/// Option of commands that need a GPU.
+const GPU_OPTION: &str = "--device cuda";
+/// Parts of commands and their replacements, so that each command takes a second. Commands end in a
+/// space.
+const REPLACEMENTS: [(&str, &str); 23] = [
     ("rays=30M", "rays=5000"),
     ("rays=2000000", "rays=500 -p layers=2 -p hidden_dim=16"),
     ("run seeds ", "run seeds -p train-ss.rays=4000 "),
@@ -43,7 +43,7 @@ const SMALL: [(&str, &str); 23] = [
         layers=2 -p hidden_dim=16",
     ),
     ("train-paper.steps=100", "train-paper.steps=1 -p features=4"),
-    // A folder takes the place of a team's and of a bucket: tests of `nerf-sr-remote` have a server.
+    // A folder replaces the team's folder and the bucket; tests of `nerf-sr-remote` use a server.
     ("/mnt/team/nerf-sr", "team"),
     ("s3://bucket/nerf-sr", "team"),
     ("3f9c27d1", "\"$(basename \"$(nerf-sr path train-ss)\")\""),
@@ -61,8 +61,8 @@ fn run(project: &Project, line: &str) -> Finished {
     Finished::of(shell.output().unwrap())
 }
 
-/// Makes an empty folder with photographs, writes its pipeline by `nerf-sr init`, and replaces the
-/// pipeline by one of seconds.
+/// Installs the programs, prepares a work folder by `nerf-sr init`, and replaces the pipeline by a
+/// pipeline that runs in seconds. Returns `false` if the programs can't be installed.
 fn prepare(project: &Project) -> bool {
     if !installed::install(&project.path("usr")) {
         return false;
@@ -77,23 +77,23 @@ fn prepare(project: &Project) -> bool {
     for name in ["lego", "chair"] {
         std::os::unix::fs::symlink(&scene, project.path("work/data").join(name)).unwrap();
     }
-    let written = run(project, "nerf-sr init my-photographs");
-    assert_eq!(written.code, 0, "{}", written.stderr);
-    // Photographs are LR images, as in the pipeline that `init` has written.
+    let init = run(project, "nerf-sr init my-photographs");
+    assert_eq!(init.code, 0, "{}", init.stderr);
+    // Photographs are used as LR images, as in the pipeline written by `init`.
     let pipeline = FAST.replace("size: 32", "size: 64").replace("lr_width: 16, ", "");
-    // Blocks that extend `train-ss` have no `rays`.
+    // Blocks that extend `train-ss` don't inherit `rays`; the bounds limit their rays.
     let pipeline = pipeline.replace("rays: 4000,", "rays: 4000, min_rays: 4000, max_rays: 4000,");
     let pipeline = pipeline.replace("\ndefault:", "\nquality: draft\ndefault:");
     project.write("work/pipeline.yaml", &pipeline);
     if let Some(data) = data() {
         std::os::unix::fs::symlink(data.join("weights"), project.path("work/weights")).unwrap();
     }
-    let film = run(
+    let video = run(
         project,
         "nerf-sr run video -p frames=2 && mkdir my-path && \
         cp \"$(nerf-sr path camera-path -p frames=2)\"/camera_path.json my-path",
     );
-    assert_eq!(film.code, 0, "{}", film.stderr);
+    assert_eq!(video.code, 0, "{}", video.stderr);
     true
 }
 
@@ -111,7 +111,7 @@ fn every_command_runs() {
     let mut count = 0;
     for document in documents {
         let name = document.file_name().unwrap().to_str().unwrap();
-        if name == ON_A_CLUSTER {
+        if name == CLUSTER_GUIDE {
             continue;
         }
         for command in commands(&document) {
@@ -119,20 +119,21 @@ fn every_command_runs() {
                 command.contains("=weights") && !project.path("work/weights").exists();
             let needs_remote = command.starts_with("nerf-sr-remote ")
                 && !project.path("usr/bin/nerf-sr-remote").exists();
-            // `prepare` has run it; a second one would overwrite the pipeline.
+            // `prepare` has run `init`; a second `init` would overwrite the pipeline.
             if command.starts_with("nerf-sr init ") {
                 continue;
             }
-            if needs_weights || needs_remote || command.contains(GPU) {
+            if needs_weights || needs_remote || command.contains(GPU_OPTION) {
                 println!("skipped: {command}");
                 continue;
             }
             let command = command + " ";
-            let small = SMALL.iter().fold(command, |text, (from, to)| text.replace(from, to));
+            let shortened =
+                REPLACEMENTS.iter().fold(command, |text, (from, to)| text.replace(from, to));
             let start = std::time::Instant::now();
-            let finished = run(&project, &small);
-            assert_eq!(finished.code, 0, "{name}: {small}\n{}", finished.stderr);
-            println!("{:5.1} s: {small}", start.elapsed().as_secs_f64());
+            let finished = run(&project, &shortened);
+            assert_eq!(finished.code, 0, "{name}: {shortened}\n{}", finished.stderr);
+            println!("{:5.1} s: {shortened}", start.elapsed().as_secs_f64());
             count += 1;
         }
     }

@@ -1,7 +1,7 @@
-//! Kills at random moments, with garbage collection at random moments beside: what was finished is
-//! whole, what a run needs stays, and the artifacts come out equal.
+//! Kills and garbage collection at random moments of a run: finished artifacts stay complete,
+//! required artifacts stay stored, and results equal those of undisturbed runs.
 //!
-//! NERF_SR_KILLS says how many kills (`make faults`: 200), NERF_SR_SEED which moments.
+//! `NERF_SR_KILLS` is the number of kills (`make faults`: 200); `NERF_SR_SEED` selects the moments.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -17,65 +17,69 @@ use serde_json::Value;
 
 const SIGNALS: [&str; 4] = ["-KILL", "-INT", "-TERM", "-HUP"];
 const STAGES: [&str; 5] = ["demo-scene", "prep", "train-ss", "render-depth", "eval"];
-/// Number of pipelines that are run in turn; each trains with another seed.
+/// Number of points; each trains with another seed.
 const POINTS: u64 = 3;
 
-fn point(number: u64) -> [String; 2] {
-    ["-p".to_owned(), format!("train-ss.seed={number}")]
+fn point(seed: u64) -> [String; 2] {
+    ["-p".to_owned(), format!("train-ss.seed={seed}")]
 }
 
 fn arguments<'a>(verb: &'a str, point: &'a [String; 2]) -> Vec<&'a str> {
     vec![verb, &point[0], &point[1]]
 }
 
-/// The finished stages of a point with their artifacts.
-fn finished(project: &Project, point: &[String; 2]) -> BTreeMap<String, String> {
-    let word = |node: &Value, key: &str| node[key].as_str().map(str::to_owned);
+/// Returns the identity of each finished stage's artifact at a point.
+fn finished_artifacts(project: &Project, point: &[String; 2]) -> BTreeMap<String, String> {
+    let text_of = |node: &Value, key: &str| node[key].as_str().map(str::to_owned);
     let nodes = project.nodes(&point.each_ref().map(String::as_str));
-    nodes.iter().filter_map(|node| Some((word(node, "stage")?, word(node, "output")?))).collect()
+    nodes
+        .iter()
+        .filter_map(|node| Some((text_of(node, "stage")?, text_of(node, "output")?)))
+        .collect()
 }
 
-/// The processes that a process has started.
+/// Returns the ids of a process's children.
 fn children(pid: u32) -> Vec<String> {
     let text =
         std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
-    // Threads start stages, too.
+    // A thread's `children` contains only the processes that this thread has started.
     let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
-    let of_threads =
+    let thread_children =
         tasks.filter_map(|task| std::fs::read_to_string(task.path().join("children")).ok());
-    let all = of_threads.collect::<String>() + " " + &text;
+    let all = thread_children.collect::<String>() + " " + &text;
     all.split_whitespace().map(str::to_owned).collect()
 }
 
-fn send(signal: &str, process: &str) {
-    // It may have ended by itself.
+fn send_signal(signal: &str, process: &str) {
+    // The process may have ended already, so that `kill` fails.
     Command::new("kill").args([signal, "--", process]).stderr(Stdio::null()).status().unwrap();
 }
 
-/// Sends a signal to the runner, its stages, both, or the process group; says to whom.
-fn strike(random: &mut Random, runner: &Child, stages: &[String]) -> String {
+/// Sends a random signal to the runner, its stages, both, or the process group. Returns the signal
+/// and its target as text.
+fn send_random_signal(random: &mut Random, runner: &Child, stages: &[String]) -> String {
     let signal = SIGNALS[random.below(4) as usize];
     let pid = runner.id();
-    let whom = ["runner", "stage", "both", "group"][random.below(4) as usize];
-    if whom == "stage" || whom == "both" {
-        stages.iter().for_each(|stage| send(signal, stage));
+    let target = ["runner", "stage", "both", "group"][random.below(4) as usize];
+    if target == "stage" || target == "both" {
+        stages.iter().for_each(|stage| send_signal(signal, stage));
     }
-    match whom {
-        "runner" | "both" => send(signal, &pid.to_string()),
-        "group" => send(signal, &format!("-{pid}")),
+    match target {
+        "runner" | "both" => send_signal(signal, &pid.to_string()),
+        "group" => send_signal(signal, &format!("-{pid}")),
         _ => {}
     }
-    format!("{signal} to {whom}")
+    format!("{signal} to {target}")
 }
 
-/// The command's result; one that hangs fails the test.
-fn ended(child: Child, what: &str) -> Finished {
+/// Waits for a command and returns its result; panics after two minutes.
+fn wait_for(child: Child, context: &str) -> Finished {
     let (sender, receiver) = std::sync::mpsc::channel();
     let pid = child.id();
     std::thread::spawn(move || sender.send(child.wait_with_output()));
     match receiver.recv_timeout(Duration::from_secs(120)) {
         Ok(output) => Finished::of(output.unwrap()),
-        Err(_) => panic!("{what}: process {pid} hangs"),
+        Err(_) => panic!("{context}: process {pid} hangs"),
     }
 }
 
@@ -86,13 +90,13 @@ fn kills_at_random_moments_lose_nothing() {
     println!("NERF_SR_KILLS={kills} NERF_SR_SEED={seed}");
     let mut random = Random::new(seed);
     let undisturbed = Project::fast();
-    let begun = Instant::now();
+    let start = Instant::now();
     undisturbed.ok(&["run", "-p", "train-ss.seed=0"]);
-    let whole_run = begun.elapsed().as_millis() as u64;
+    let run_milliseconds = start.elapsed().as_millis() as u64;
     let expected: Vec<BTreeMap<String, String>> = (0..POINTS)
         .map(|seed| {
             undisturbed.ok(&arguments("run", &point(seed)));
-            finished(&undisturbed, &point(seed))
+            finished_artifacts(&undisturbed, &point(seed))
         })
         .collect();
     assert!(expected.iter().all(|stages| stages.len() == STAGES.len()));
@@ -101,64 +105,64 @@ fn kills_at_random_moments_lose_nothing() {
     let mut cut_short = 0;
     for round in 0..kills {
         let seed = random.below(POINTS);
-        let before = finished(&project, &point(seed));
+        let before = finished_artifacts(&project, &point(seed));
         if before.len() == STAGES.len() {
-            // All is made: begin anew, so that kills find something to do.
+            // Every stage has finished: a new project gives kills a run to interrupt.
             project = Project::fast();
         }
         let mut command = project.command(&arguments("run", &point(seed)));
         let runner =
             command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        let moment = Duration::from_millis(random.below(whole_run + 1));
+        let moment = Duration::from_millis(random.below(run_milliseconds + 1));
         let collect_first = random.below(2) == 0;
         let collect = |project: &Project| project.spawn(&["gc", "--keep-days", "0"]);
         let mut collector = collect_first.then(|| collect(&project));
-        // This is fuzzing: no moment of a run is waited for, so that any may be met.
+        // Fuzzing: a random pause, not an event of the run, so that kills happen at any moment.
         std::thread::sleep(moment);
         collector = collector.or_else(|| Some(collect(&project)));
-        // Asked before, since a runner that is killed has no children any more.
+        // Children are listed before the kill, because a killed runner has none.
         let mut stages = children(runner.id());
-        let what = strike(&mut random, &runner, &stages);
-        // One may have been started in between.
+        let signal = send_random_signal(&mut random, &runner, &stages);
+        // The runner may have started another stage in between.
         stages.extend(children(runner.id()));
-        let place = format!("round {round}: seed {seed}, {what} after {moment:?}");
-        println!("{place}");
-        let run = ended(runner, &place);
+        let context = format!("round {round}: seed {seed}, {signal} after {moment:?}");
+        println!("{context}");
+        let run = wait_for(runner, &context);
         cut_short += u64::from(run.code != 0);
-        let gc = ended(collector.unwrap(), &place);
-        assert_eq!(gc.code, 0, "{place}: {}{}", gc.stdout, gc.stderr);
+        let gc = wait_for(collector.unwrap(), &context);
+        assert_eq!(gc.code, 0, "{context}: {}{}", gc.stdout, gc.stderr);
         assert!(
             !run.stderr.contains("panicked") && !run.stderr.contains("damaged"),
-            "{place}: {}",
+            "{context}: {}",
             run.stderr
         );
-        // Stages may live on for a moment, to write their checkpoints.
+        // Stages may still be writing checkpoints.
         wait_until(|| !stages.iter().any(|stage| is_running(stage)));
-        assert!(project.ok(&["verify"]).contains(", 0 damaged"), "{place}");
-        for (stage, hash) in finished(&project, &point(seed)) {
-            assert_eq!(hash, expected[seed as usize][&stage], "{place}: {stage}");
+        assert!(project.ok(&["verify"]).contains(", 0 damaged"), "{context}");
+        for (stage, hash) in finished_artifacts(&project, &point(seed)) {
+            assert_eq!(hash, expected[seed as usize][&stage], "{context}: {stage}");
         }
-        // What everything is made of is needed by the pipeline as it stands, whatever the point.
+        // `gc` must keep these artifacts, because every point of the pipeline needs them.
         for stage in ["demo-scene", "prep"] {
-            let now = finished(&project, &point(seed));
+            let now = finished_artifacts(&project, &point(seed));
             assert!(
                 !before.contains_key(stage)
                     || before.len() == STAGES.len()
                     || now.contains_key(stage),
-                "{place}: {stage} is gone"
+                "{context}: {stage} was removed"
             );
         }
     }
-    // Of a few kills each may have come too late.
+    // If there are few kills, all may have come after the ends of their runs.
     println!("{cut_short} of {kills} runs were cut short");
-    assert!(cut_short > 0 || kills < 20, "no kill met a run");
+    assert!(cut_short > 0 || kills < 20, "no kill interrupted a run");
     for seed in 0..POINTS {
-        // With garbage collection beside, and no kill, a run ends well.
+        // Without a kill, a run succeeds during garbage collection.
         let runner = project.spawn(&arguments("run", &point(seed)));
         let collector = project.spawn(&["gc", "--keep-days", "0"]);
-        let run = ended(runner, "the last run");
+        let run = wait_for(runner, "the last run");
         assert_eq!(run.code, 0, "{}", run.stderr);
-        assert_eq!(ended(collector, "the last collection").code, 0);
-        assert_eq!(finished(&project, &point(seed)), expected[seed as usize]);
+        assert_eq!(wait_for(collector, "the last collection").code, 0);
+        assert_eq!(finished_artifacts(&project, &point(seed)), expected[seed as usize]);
     }
 }

@@ -1,5 +1,5 @@
-//! Lens models: they agree with COLMAP's own library, and a field trained on fisheye photographs is
-//! as good as one trained on a pinhole camera's.
+//! Lens models agree with COLMAP's own library, and a field trained on fisheye photographs is as
+//! good as a field trained on a pinhole camera's.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -14,7 +14,7 @@ use glam::DVec3;
 use scene::{Camera, Views};
 use serde_json::{Value, json};
 
-/// Models and their parameters, all with distortion where the model has any.
+/// COLMAP's camera models and parameters, with distortion if the model has any.
 const MODELS: &[(&str, &[f64])] = &[
     ("SIMPLE_RADIAL", &[500.0, 322.0, 238.0, -0.11]),
     ("RADIAL", &[500.0, 322.0, 238.0, -0.13, 0.04]),
@@ -35,7 +35,8 @@ const MODELS: &[(&str, &[f64])] = &[
 ];
 const SIZE: [u32; 2] = [640, 480];
 
-/// The camera of a COLMAP model with one image at the origin, axes right, down, forward.
+/// Writes a COLMAP model with one image at the origin, axes right, down, forward, and reads its
+/// camera.
 fn read_camera(project: &Project, model: &str, parameters: &[f64]) -> Camera {
     let folder = project.path(model);
     let [width, height] = SIZE;
@@ -52,31 +53,31 @@ fn read_camera(project: &Project, model: &str, parameters: &[f64]) -> Camera {
     camera
 }
 
-/// Points that a camera sees at known positions, the image's corners among them, by its own rays;
-/// and points in directions up to 85° from its axis.
-fn points(camera: &Camera) -> (Vec<[f64; 2]>, Vec<DVec3>) {
+/// Returns image positions, corners included, and world points: first one on the camera's ray at
+/// each position, then some up to 85° (fisheye) or 35° from the axis.
+fn positions_and_points(camera: &Camera) -> (Vec<[f64; 2]>, Vec<DVec3>) {
     let [width, height] = SIZE.map(f64::from);
-    let places =
+    let fractions =
         (0..=8).flat_map(|x| (0..=6).map(move |y| [f64::from(x) / 8.0, f64::from(y) / 6.0]));
-    let positions: Vec<[f64; 2]> = places.map(|[x, y]| [x * width, y * height]).collect();
-    let seen = positions.iter().map(|[x, y]| camera.ray(*x, *y).at(3.7));
-    let most = if camera.intrinsics.distortion.is_fisheye() { 85.0 } else { 35.0 };
-    let around = (0..60).map(|i| {
-        let (angle, turn) = (f64::to_radians(most * f64::from(i) / 59.0), f64::from(i) * 2.4);
+    let positions: Vec<[f64; 2]> = fractions.map(|[x, y]| [x * width, y * height]).collect();
+    let on_rays = positions.iter().map(|[x, y]| camera.ray(*x, *y).at(3.7));
+    let max_angle = if camera.intrinsics.distortion.is_fisheye() { 85.0 } else { 35.0 };
+    let around_axis = (0..60).map(|i| {
+        let (angle, turn) = (f64::to_radians(max_angle * f64::from(i) / 59.0), f64::from(i) * 2.4);
         0.8 * DVec3::new(angle.sin() * turn.cos(), angle.sin() * turn.sin(), angle.cos())
     });
-    (positions.clone(), seen.chain(around).collect())
+    (positions.clone(), on_rays.chain(around_axis).collect())
 }
 
-/// Image positions of points by pycolmap; none where that isn't installed.
-fn by_pycolmap(entries: &[Value]) -> Option<Vec<Vec<[f64; 2]>>> {
+/// Returns pycolmap's image positions of points; `None` if pycolmap isn't installed.
+fn project_by_pycolmap(entries: &[Value]) -> Option<Vec<Vec<[f64; 2]>>> {
     let python = |arguments: &[&str]| {
         let mut command = Command::new("python3");
         command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped());
         command
     };
-    let has = python(&["-c", "import pycolmap"]).stderr(Stdio::null()).status();
-    if !has.is_ok_and(|status| status.success()) {
+    let import = python(&["-c", "import pycolmap"]).stderr(Stdio::null()).status();
+    if !import.is_ok_and(|status| status.success()) {
         eprintln!("skipped: no pycolmap (python3 -m pip install pycolmap)");
         return None;
     }
@@ -96,28 +97,29 @@ fn lenses_project_as_pycolmap_does() {
     let [width, height] = SIZE;
     let mut entries = Vec::new();
     for ((model, parameters), camera) in MODELS.iter().zip(&cameras) {
-        let points: Vec<[f64; 3]> = points(camera).1.iter().map(DVec3::to_array).collect();
+        let points: Vec<[f64; 3]> =
+            positions_and_points(camera).1.iter().map(DVec3::to_array).collect();
         entries.push(json!({"model": model, "width": width, "height": height,
             "parameters": parameters, "points": points}));
     }
-    let Some(theirs) = by_pycolmap(&entries) else { return };
-    for (((model, _), camera), theirs) in MODELS.iter().zip(&cameras).zip(&theirs) {
-        let (positions, points) = points(camera);
-        assert_eq!(theirs.len(), points.len());
-        let mut worst: f64 = 0.0;
-        for (i, (point, [x, y])) in points.iter().zip(theirs).enumerate() {
+    let Some(expected) = project_by_pycolmap(&entries) else { return };
+    for (((model, _), camera), expected) in MODELS.iter().zip(&cameras).zip(&expected) {
+        let (positions, points) = positions_and_points(camera);
+        assert_eq!(expected.len(), points.len());
+        let mut max_distance: f64 = 0.0;
+        for (i, (point, [x, y])) in points.iter().zip(expected).enumerate() {
             let (u, v, _) = camera.project(*point).unwrap();
-            worst = worst.max((u - x).hypot(v - y));
+            max_distance = max_distance.max((u - x).hypot(v - y));
             if let Some(position) = positions.get(i) {
-                worst = worst.max((position[0] - x).hypot(position[1] - y));
+                max_distance = max_distance.max((position[0] - x).hypot(position[1] - y));
             }
         }
-        println!("{model}: {worst:.1e} pixels apart");
-        assert!(worst < 1e-6, "{model}: {worst} pixels apart");
+        println!("{model}: {max_distance:.1e} pixels apart");
+        assert!(max_distance < 1e-6, "{model}: {max_distance} pixels apart");
     }
 }
 
-/// A demo scene whose training views are 100° wide, and a training of seconds on it.
+/// Pipeline of a demo scene whose training views are 100° wide, with a training of seconds.
 const WIDE: &str = "
 default: [eval]
 stages:
@@ -139,11 +141,11 @@ fn psnr(project: &Project, projection: &str) -> f64 {
     metrics["mean"]["psnr"].as_f64().unwrap()
 }
 
-/// Photographs of one scene from the same places, 100° wide, with as many pixels per degree in the
-/// middle, through a fisheye lens and by a pinhole camera: both fields are scored on the same
-/// pinhole views. The film and the page of the fisheye scene are a pinhole camera's.
+/// Fisheye and pinhole photographs are 100° wide, from equal positions, with equally many pixels
+/// per degree in the middle. Both fields are scored on the same pinhole views. The fisheye scene's
+/// test views and camera path are a pinhole camera's.
 #[test]
-fn a_fisheye_capture_is_as_good_as_a_pinholes() {
+fn fisheye_photographs_are_as_good_as_a_pinhole_cameras() {
     let project = Project::new(WIDE);
     let [fisheye, pinhole] = ["projection=fisheye", "projection=perspective"].map(|projection| {
         project.ok(&["run", "-p", projection]);
@@ -151,8 +153,8 @@ fn a_fisheye_capture_is_as_good_as_a_pinholes() {
     });
     println!("{fisheye:.2} dB from fisheye photographs, {pinhole:.2} dB from a pinhole's");
     assert!(pinhole > 20.0 && fisheye > pinhole - 0.3, "{fisheye} dB, a pinhole's {pinhole} dB");
-    let of_fisheye = ["-p", "projection=fisheye"];
-    let scene = project.artifact("prep", &of_fisheye);
+    let arguments = ["-p", "projection=fisheye"];
+    let scene = project.artifact("prep", &arguments);
     let is_fisheye = |subtree: &str| {
         let views = Views::read_folder(&scene.join(subtree)).unwrap();
         views.views.iter().all(|view| view.camera.intrinsics.distortion.is_fisheye())
@@ -161,16 +163,16 @@ fn a_fisheye_capture_is_as_good_as_a_pinholes() {
         ["train", "downscaled", "cameras", "truth"].map(is_fisheye),
         [true, true, false, false]
     );
-    let film = project.path("film");
+    let camera_path = project.path("film");
     let train = scene.join("train");
     assert_eq!(
-        stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &train)], &film, &[]).code,
+        stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &train)], &camera_path, &[]).code,
         0
     );
-    let intrinsics = Views::read_folder(&film).unwrap().views[0].camera.intrinsics;
+    let intrinsics = Views::read_folder(&camera_path).unwrap().views[0].camera.intrinsics;
     assert!(intrinsics.distortion.is_none());
-    let [across, _] = intrinsics.pinhole_angles();
-    assert!((99.0..=100.01).contains(&across), "{across}");
+    let [horizontal_angle, _] = intrinsics.pinhole_angles();
+    assert!((99.0..=100.01).contains(&horizontal_angle), "{horizontal_angle}");
 }
 
 fn demo_fisheye(project: &Project, angle: u32) -> std::path::PathBuf {
@@ -192,54 +194,62 @@ fn notes(scene: &Path) -> Vec<String> {
 /// Pixels more than 89° from the axis are masked and counted; with `lens: undo` nothing is masked,
 /// and the pinhole camera's angle of view is logged.
 #[test]
-fn what_a_fisheye_cannot_see_is_masked() {
+fn pixels_beyond_a_fisheye_lens_are_masked() {
     let project = Project::tiny();
     let data = demo_fisheye(&project, 160);
     let scene = project.path("scene");
-    let made = stage("prep", "{}", &[("dataset", &data)], &scene, &[]);
-    assert_eq!(made.code, 0, "{}", made.stderr);
+    let finished = stage("prep", "{}", &[("dataset", &data)], &scene, &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
     let views = Views::read_folder(&scene.join("train")).unwrap();
     let mut masked = 0;
     for view in &views.views {
-        let k = view.camera.intrinsics;
+        let intrinsics = view.camera.intrinsics;
         let mask = view.mask.as_ref().unwrap();
         let mask = pixels::Mask::read(
             &scene.join("train").join(mask),
-            (k.width as usize, k.height as usize),
+            (intrinsics.width as usize, intrinsics.height as usize),
         )
         .unwrap();
         for (i, counts) in mask.counts.iter().enumerate() {
-            let at = [i % mask.width, i / mask.width].map(|v| v as f64 + 0.5);
-            assert_eq!(*counts, !k.is_clamped(at), "pixel {i} of {}", view.camera.name);
+            let position = [i % mask.width, i / mask.width].map(|v| v as f64 + 0.5);
+            assert_eq!(
+                *counts,
+                !intrinsics.is_clamped(position),
+                "pixel {i} of {}",
+                view.camera.name
+            );
         }
         masked += mask.counts.iter().filter(|counts| !**counts).count();
     }
     assert!(masked > 8, "{masked}");
-    let said = format!(
+    let expected = format!(
         "{masked} pixels of 8 photographs are more than 89° from the axis of a fisheye lens and are \
         masked"
     );
-    assert!(notes(&scene).contains(&said), "{said}: {:?}", notes(&scene));
-    // Corners are black, the scene isn't; a box may not hold what lies behind.
-    let background: Value =
+    assert!(notes(&scene).contains(&expected), "{expected}: {:?}", notes(&scene));
+    // Black corners are not the scene's background, and a box may not contain the scene behind.
+    let scene_json: Value =
         serde_json::from_slice(&std::fs::read(scene.join("scene.json")).unwrap()).unwrap();
-    assert_eq!(background["background"], "opaque");
-    let undone = project.path("undone");
-    let made = stage("prep", r#"{"lens": "undo"}"#, &[("dataset", &data)], &undone, &[]);
-    assert_eq!(made.code, 0, "{}", made.stderr);
-    let said = "8 fisheye photographs are resampled to pinhole cameras with a field of view of \
+    assert_eq!(scene_json["background"], "opaque");
+    let undistorted = project.path("undone");
+    let finished = stage("prep", r#"{"lens": "undo"}"#, &[("dataset", &data)], &undistorted, &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
+    let beginning = "8 fisheye photographs are resampled to pinhole cameras with a field of view of \
         100.0°×100.0°";
-    assert!(notes(&undone).iter().any(|note| note.starts_with(said)), "{:?}", notes(&undone));
-    let views = Views::read_folder(&undone.join("train")).unwrap();
+    assert!(
+        notes(&undistorted).iter().any(|note| note.starts_with(beginning)),
+        "{:?}",
+        notes(&undistorted)
+    );
+    let views = Views::read_folder(&undistorted.join("train")).unwrap();
     assert!(
         views.views.iter().all(|v| v.mask.is_none() && v.camera.intrinsics.distortion.is_none())
     );
 }
 
-/// A frustum holds no fisheye view, and a lens whose polynomial folds has no rays: `prep` says so
-/// before anything is made.
+/// NDC's frustum can't contain a fisheye view, and a lens whose polynomial folds back has no rays.
 #[test]
-fn what_a_fisheye_cannot_have_is_refused() {
+fn ndc_and_folding_lenses_are_refused() {
     let project = Project::tiny();
     let data = demo_fisheye(&project, 120);
     let out = project.path("out");

@@ -1,4 +1,4 @@
-//! Output for programs: `--json` of the verbs that report, `path`, and `diff`, with real scenes of
+//! Machine-readable output: `--json` of the verbs that report, `path` and `diff`, with scenes of
 //! `prep`.
 
 #![allow(missing_docs, reason = "a test")]
@@ -16,7 +16,7 @@ stages:
     parameters: {scale: 2}
 ";
 
-fn read(project: &Project, arguments: &[&str]) -> Value {
+fn json_output(project: &Project, arguments: &[&str]) -> Value {
     serde_json::from_str(&project.ok(arguments)).unwrap()
 }
 
@@ -30,9 +30,9 @@ fn states(report: &Value) -> Vec<String> {
 }
 
 #[test]
-fn plan_status_and_why_say_the_same_to_programs() {
+fn plan_status_and_why_report_as_json() {
     let project = Project::new(PIPELINE);
-    let before = read(&project, &["plan", "--json", "-p", "kernel=lanczos,box"]);
+    let before = json_output(&project, &["plan", "--json", "-p", "kernel=lanczos,box"]);
     assert_eq!(states(&before), ["will run", "waits", "waits"]);
     assert_eq!(before["nodes"][2]["point"], "kernel=box");
     assert_eq!(
@@ -42,13 +42,13 @@ fn plan_status_and_why_say_the_same_to_programs() {
     assert_eq!(before["nodes"][1]["inputs"]["dataset"]["node"], 0);
     assert_eq!(before["nodes"][1]["parameters"]["scale"], 2.0);
     project.ok(&["run"]);
-    let after = read(&project, &["status", "--json"]);
+    let after = json_output(&project, &["status", "--json"]);
     assert_eq!(states(&after), ["cached", "cached"]);
     let prep = &after["nodes"][1];
     assert!(prep["bytes"].as_u64().unwrap() > 1000 && prep["seconds"].as_f64().unwrap() > 0.0);
     let folder = project.ok(&["path", "prep"]);
     assert_eq!(prep["folder"], folder.trim());
-    let why = read(&project, &["why", "prep", "--json", "-p", "kernel=box"]);
+    let why = json_output(&project, &["why", "prep", "--json", "-p", "kernel=box"]);
     assert_eq!(why["nodes"].as_array().unwrap().len(), 1);
     assert_eq!(
         why["nodes"][0]["changes"],
@@ -57,15 +57,15 @@ fn plan_status_and_why_say_the_same_to_programs() {
 }
 
 #[test]
-fn path_leads_into_an_artifact() {
+fn path_prints_folders_within_artifacts() {
     let project = Project::new(PIPELINE);
     project.run(&["path", "prep"]).fails(3, &["prep has no artifact yet; run it first"]);
     project.ok(&["run", "-p", "kernel=lanczos,box"]);
-    let two = project.ok(&["path", "prep/train", "-p", "kernel=lanczos,box"]);
-    assert_eq!(two.lines().count(), 2);
+    let paths = project.ok(&["path", "prep/train", "-p", "kernel=lanczos,box"]);
+    assert_eq!(paths.lines().count(), 2);
     assert!(
-        two.lines().all(|folder| std::path::Path::new(folder).join("views.json").is_file()),
-        "{two}"
+        paths.lines().all(|folder| std::path::Path::new(folder).join("views.json").is_file()),
+        "{paths}"
     );
     project
         .run(&["path", "prep/trian", "-p", "kernel=box"])
@@ -80,7 +80,7 @@ fn hash_of(project: &Project, arguments: &[&str]) -> String {
 
 /// Every kind of difference has its line, and no difference is reported twice.
 #[test]
-fn diff_tells_what_differs() {
+fn diff_lists_differences() {
     let project = Project::new(PIPELINE);
     project.ok(&["run", "-p", "kernel=lanczos,box"]);
     assert_eq!(
@@ -95,20 +95,20 @@ fn diff_tells_what_differs() {
         "{kernels}"
     );
     assert_eq!(lines.len(), 2, "{kernels}");
-    // By hashes, and as JSON.
+    // Artifacts may be named by hash, and the output may be JSON.
     let by_hash = project.ok(&[
         "diff",
         &hash_of(&project, &["-p", "kernel=lanczos"]),
         &hash_of(&project, &["-p", "kernel=box"]),
     ]);
     assert_eq!(by_hash, kernels);
-    let told: Value =
-        read(&project, &["diff", "--json", "prep -p kernel=lanczos", "prep -p kernel=box"]);
+    let report: Value =
+        json_output(&project, &["diff", "--json", "prep -p kernel=lanczos", "prep -p kernel=box"]);
     assert_eq!(
-        told[0]["changes"][0]["name"].as_str().map(|name| name.starts_with("file ")),
+        report[0]["changes"][0]["name"].as_str().map(|name| name.starts_with("file ")),
         Some(true)
     );
-    // Another data set leads to another scene: the input's hash follows from that and isn't told.
+    // Another data set changes the scene. The input's hash changes too and isn't reported.
     project.ok(&["run", "-p", "demo-scene.seed=1", "-p", "kernel=box"]);
     let scenes =
         project.ok(&["diff", "prep -p kernel=box", "prep -p kernel=box -p demo-scene.seed=1"]);
@@ -116,11 +116,11 @@ fn diff_tells_what_differs() {
         scenes.contains("demo-scene: parameter seed: 0 → 1") && !scenes.contains("input dataset"),
         "{scenes}"
     );
-    // Two recorded runs.
+    // Pinned runs are compared by name.
     project.ok(&["pin", "one", "-p", "kernel=box"]);
     project.ok(&["pin", "two", "-p", "kernel=box", "-p", "demo-scene.seed=1"]);
     assert_eq!(project.ok(&["diff", "one", "two"]), scenes);
-    for (arguments, code, words) in [
+    for (arguments, code, message) in [
         (["diff", "prep", "prep -p kernel=average"], 3, "has no artifact yet; run it first"),
         (
             ["diff", "prep -p kernel=box,lanczos", "prep -p kernel=box"],
@@ -131,21 +131,23 @@ fn diff_tells_what_differs() {
         (["diff", "", "prep"], 2, "expected a stage, an artifact's hash, a run or a pin"),
         (["diff", "nothing", "prep"], 2, "no stage \"nothing\""),
     ] {
-        project.run(&arguments).fails(code, &[words]);
+        project.run(&arguments).fails(code, &[message]);
     }
 }
 
 #[test]
-fn gc_says_the_same_to_programs() {
+fn gc_reports_as_json() {
     let project = Project::new(PIPELINE);
     project.ok(&["run", "-p", "kernel=lanczos,box"]);
-    let told =
-        read(&project, &["gc", "--json", "--dry-run", "--keep-days", "0", "-p", "kernel=lanczos"]);
-    let items = told["items"].as_array().unwrap();
-    let goes: Vec<&Value> = items.iter().filter(|item| item["stays"].is_null()).collect();
-    assert_eq!((items.len(), goes.len()), (3, 1));
-    assert_eq!(goes[0]["stage"], "prep [kernel=box]");
-    assert_eq!(goes[0]["bytes"], told["bytes_gone"]);
+    let report = json_output(
+        &project,
+        &["gc", "--json", "--dry-run", "--keep-days", "0", "-p", "kernel=lanczos"],
+    );
+    let items = report["items"].as_array().unwrap();
+    let deleted: Vec<&Value> = items.iter().filter(|item| item["stays"].is_null()).collect();
+    assert_eq!((items.len(), deleted.len()), (3, 1));
+    assert_eq!(deleted[0]["stage"], "prep [kernel=box]");
+    assert_eq!(deleted[0]["bytes"], report["bytes_gone"]);
     let plain = project.ok(&["gc", "--dry-run", "--keep-days", "0", "-p", "kernel=lanczos"]);
     assert!(plain.lines().last().unwrap().contains("MB would be deleted"), "{plain}");
 }

@@ -1,5 +1,5 @@
-//! Stages whose memory grows with a parameter say how much they need, and refuse where less is
-//! free.
+//! Stages whose memory grows with a parameter log the memory that they need, and refuse to begin if
+//! less is free.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -10,7 +10,7 @@ use common::large::Small;
 use common::{Finished, stage_command};
 use serde_json::json;
 
-/// Stage, parameters, inputs, and the message where 100 MB are free.
+/// Stage, parameters, inputs, and the message if 100 MB are free.
 type Case = (&'static str, &'static str, &'static [(&'static str, &'static str)], &'static str);
 
 const CASES: [Case; 3] = [
@@ -41,25 +41,25 @@ fn work_larger_than_memory_is_refused_before_it_begins() {
     let small = Small::new();
     let scene = json!({"scene": {"folder": small.path("scene/train")}});
     small.record("field-run", &[small.node("train-ss", "field", "field", &scene)]);
-    for (name, params, inputs, words) in CASES {
+    for (name, params, inputs, message) in CASES {
         let folders: Vec<(&str, PathBuf)> =
             inputs.iter().map(|(input, folder)| (*input, small.path(folder))).collect();
-        let given: Vec<(&str, &Path)> =
+        let inputs: Vec<(&str, &Path)> =
             folders.iter().map(|(input, folder)| (*input, folder.as_path())).collect();
         let output = small.path("out");
-        let mut command = stage_command(name, params, &given, &output, &["--threads", "2"]);
+        let mut command = stage_command(name, params, &inputs, &output, &["--threads", "2"]);
         let finished = Finished::of(command.env("NERF_SR_MEMORY", "100000000").output().unwrap());
-        finished.fails(2, &[name, words]);
+        finished.fails(2, &[name, message]);
         assert!(!output.exists());
     }
 }
 
 #[test]
-fn much_memory_is_logged() {
+fn large_memory_use_is_logged() {
     let folder = tempfile::tempdir().unwrap();
     let (params, output) = (r#"{"size": 2048, "aspect": 0.25}"#, folder.path().join("out"));
-    let more = ["--threads", "4", "--progress", "plain"];
-    let mut command = stage_command("demo-scene", params, &[], &output, &more);
+    let options = ["--threads", "4", "--progress", "plain"];
+    let mut command = stage_command("demo-scene", params, &[], &output, &options);
     let stopped = Finished::of(command.env("NERF_SR_STOP_AFTER", "1").output().unwrap());
     stopped.fails(130, &["demo-scene: interrupted"]);
     assert!(stopped.stderr.contains("memory: about 1.1 GB for rendering"), "{}", stopped.stderr);

@@ -1,4 +1,4 @@
-//! Messages of a run and their recipients: reasons of failures, logs, remedies, closed pipes.
+//! Messages of a run: reasons of failures, logs, recommended commands, closed pipes.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -11,9 +11,8 @@ use common::{
     stage_command, verbs, wait_until,
 };
 
-/// A pipeline of two stages that are one shell script; `run` is what it does, with `$out` its
-/// output.
-fn talking(run: &str) -> Project {
+/// Creates a project whose two stages run one shell script, `commands`; `$out` is the output.
+fn script_project(commands: &str) -> Project {
     let project = Project::new(
         "default: [talk]\nstages:\n  talk: {run: ./talk}\n  other: \
         {extends: talk, parameters: {word: other}}\n",
@@ -24,22 +23,22 @@ fn talking(run: &str) -> Project {
         "#!/bin/sh\nif [ \"$1\" = describe ]; then cat <<'END'\n{description}\nEND\nexit; fi\n\
          while [ $# -gt 0 ]; do case $1 in --output) out=$2;; --params) params=$2;; --threads) \
          threads=$2;; esac; shift; done\n\
-         {run}\n"
+         {commands}\n"
     );
     project.program("talk", &script);
     project
 }
 
-/// Ends a script well.
-const WELL: &str = "mkdir $out; echo text > $out/text";
+/// Shell commands that write a stage's output.
+const WRITE_OUTPUT: &str = "mkdir $out; echo text > $out/text";
 
-/// A pipe that nobody reads.
-fn closed() -> Stdio {
+/// Returns the write end of a pipe that has no reader.
+fn closed_pipe() -> Stdio {
     Stdio::from(std::io::pipe().unwrap().1)
 }
 
 #[test]
-fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
+fn a_failure_message_states_the_reason_not_just_the_last_line() {
     let note =
         "echo 'note: run with `RUST_BACKTRACE=1` environment variable to display a backtrace' >&2";
     let allocation =
@@ -47,7 +46,7 @@ fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
     let panic = format!(
         "echo \"thread 'main' panicked at x.rs:1:2:\" >&2; echo 'no entry' >&2; {note}; exit 101"
     );
-    for (run, code, said) in [
+    for (commands, code, expected) in [
         ("echo 'talk: r_0.png: cut short' >&2; exit 3", 3, "talk: failed: r_0.png: cut short"),
         (
             "echo '{\"event\": \"failed\", \"message\": \"disk full\"}'; echo 'a warning' >&2; \
@@ -76,17 +75,17 @@ fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
         (&panic, 101, "talk: failed: no entry"),
         ("exit 7", 7, "talk: failed: exit code 7 without a message"),
     ] {
-        let project = talking(run);
+        let project = script_project(commands);
         let finished = project.run(&["run"]);
-        assert_eq!(finished.code, code, "{run}: {}", finished.stderr);
+        assert_eq!(finished.code, code, "{commands}: {}", finished.stderr);
         assert!(
-            finished.stderr.lines().any(|line| line.starts_with(said)),
-            "{run}: {}",
+            finished.stderr.lines().any(|line| line.starts_with(expected)),
+            "{commands}: {}",
             finished.stderr
         );
         // The log ends with the same reason.
         let log = project.ok(&["log", "talk"]);
-        let reason = said.strip_prefix("talk: failed: ").unwrap();
+        let reason = expected.strip_prefix("talk: failed: ").unwrap();
         assert!(
             log.lines().last().unwrap().contains(&format!("with exit code {code}: {reason}")),
             "{log}"
@@ -95,11 +94,11 @@ fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
 }
 
 #[test]
-fn a_stage_of_ours_states_its_reason_once() {
+fn our_stages_state_the_reason_of_a_failure_once() {
     let project = Project::tiny();
     demo_train(&project, 4);
-    for lost in ["artifact.json", "train/r_2.png"] {
-        std::fs::remove_file(project.path("data").join(lost)).unwrap();
+    for file in ["artifact.json", "train/r_2.png"] {
+        std::fs::remove_file(project.path("data").join(file)).unwrap();
     }
     let finished = project.run(&["run", "-i", "dataset=data"]);
     assert_eq!(finished.code, 3, "{}", finished.stderr);
@@ -110,12 +109,12 @@ fn a_stage_of_ours_states_its_reason_once() {
 }
 
 #[test]
-fn a_log_holds_what_a_stage_was_given_said_and_made() {
-    let project = talking(&format!(
+fn a_log_contains_parameters_messages_and_result() {
+    let project = script_project(&format!(
         "echo 'on stderr' >&2; echo 'on stdout'\n\
          i=0; while [ $i -lt 40 ]; do i=$((i + 1)); \
          echo '{{\"event\": \"progress\", \"label\": \"talking\", \"done\": '$i', \"total\": 40, \"note\": \"PSNR '$i'\"}}'; done\n\
-         {WELL}; echo '40 words in all' > $out/summary.txt"
+         {WRITE_OUTPUT}; echo '40 words in all' > $out/summary.txt"
     ));
     project.ok(&["run", "-p", "word=bye"]);
     let log = project.ok(&["log", "talk", "-p", "word=bye"]);
@@ -143,7 +142,7 @@ fn a_log_holds_what_a_stage_was_given_said_and_made() {
 }
 
 #[test]
-fn logs_of_our_stages_have_parameters_inputs_and_result() {
+fn logs_of_our_stages_contain_parameters_inputs_and_result() {
     let project = Project::tiny();
     project.ok(&["run"]);
     let scene = project.output_of("prep", &[]).remove(0);
@@ -151,21 +150,21 @@ fn logs_of_our_stages_have_parameters_inputs_and_result() {
     let field = project.output_of("train-ss", &[]).remove(0);
     let summary = std::fs::read_to_string(project.object(&field).join("summary.txt")).unwrap();
     assert!(summary.contains(" rays in "), "{summary}");
-    for words in [
+    for text in [
         "train-ss: started 2",
         r#""rays":60000"#,
         &format!("input scene: {}", project.object(&scene).display()),
         &format!("result: {}", summary.trim()),
     ] {
-        assert!(log.contains(words), "{words}\n{log}");
+        assert!(log.contains(text), "{text}\n{log}");
     }
     let demo = project.ok(&["log", "demo-scene"]);
     assert!(demo.contains(r#""size":48"#) && demo.contains("done in"), "{demo}");
 }
 
 #[test]
-fn the_command_that_is_recommended_works_as_it_is_printed() {
-    let project = talking("echo 'it is the word' >&2; exit 1");
+fn the_recommended_command_works_as_printed() {
+    let project = script_project("echo 'it is the word' >&2; exit 1");
     std::fs::rename(project.path("pipeline.yaml"), project.path("my pipeline.yaml")).unwrap();
     let arguments = [
         "run",
@@ -182,29 +181,30 @@ fn the_command_that_is_recommended_works_as_it_is_printed() {
     ];
     let failed = project.run(&arguments);
     assert_eq!(failed.code, 1, "{}", failed.stderr);
-    let last = failed.stderr.lines().last().unwrap();
-    assert!(last.starts_with("nerf-sr: other failed; `"), "{last}");
-    let command = last.split('`').nth(1).unwrap();
+    let last_line = failed.stderr.lines().last().unwrap();
+    assert!(last_line.starts_with("nerf-sr: other failed; `"), "{last_line}");
+    let command = last_line.split('`').nth(1).unwrap();
     assert!(
         command.ends_with(
             r"nerf-sr log other other -p 'word=it'\''s $(all)' --pipeline 'my pipeline.yaml'"
         ),
         "{command}"
     );
-    let printed = Finished::of(
+    let finished = Finished::of(
         Command::new("sh").args(["-c", command]).current_dir(project.path(".")).output().unwrap(),
     );
     assert!(
-        printed.stdout.contains("it is the word") && !printed.stdout.contains("not run with these"),
+        finished.stdout.contains("it is the word")
+            && !finished.stdout.contains("not run with these"),
         "{}",
-        printed.stdout
+        finished.stdout
     );
 }
 
 #[test]
-fn a_log_is_found_whatever_the_stage_was_run_with() {
-    let project = talking(&format!(
-        "grep -q bad $params && {{ echo 'no good' >&2; exit 3; }}; cat $params >&2; {WELL}"
+fn log_finds_runs_with_other_parameters() {
+    let project = script_project(&format!(
+        "grep -q bad $params && {{ echo 'no good' >&2; exit 3; }}; cat $params >&2; {WRITE_OUTPUT}"
     ));
     // A stage that the default targets don't need, and one that ran with another parameter.
     project.ok(&["run", "other"]);
@@ -215,7 +215,7 @@ fn a_log_is_found_whatever_the_stage_was_run_with() {
         let log = project.ok(&["log", stage]);
         assert!(log.contains(word) && log.contains("no log for these arguments"), "{log}");
     }
-    // What failed has no record, but said something.
+    // A failed stage has no record, but has a log.
     project.run(&["run", "-p", "word=bad"]).fails(3, &["talk failed"]);
     assert!(project.ok(&["log", "talk", "-p", "word=bad"]).contains("no good"));
     project.ok(&["run", "other", "-p", "word=more"]);
@@ -231,15 +231,16 @@ fn a_closed_stdout_changes_nothing() {
     project.write("pipeline.yaml", &(text + "  report:\n    inputs: {run: eval}\n"));
     // `init` needs photographs, and writes a pipeline once.
     let verbs: Vec<String> = verbs().into_iter().filter(|verb| verb != "init").collect();
-    // While stages run; when all is cached; and with a closed stderr, too.
-    for errors_are_read in [true, true, false] {
+    // Stages run; all stages are cached; stderr is closed, too.
+    for is_stderr_read in [true, true, false] {
         for verb in &verbs {
-            let stderr = if errors_are_read { Stdio::piped() } else { closed() };
+            let stderr = if is_stderr_read { Stdio::piped() } else { closed_pipe() };
             let mut command = project.command(&call_of(verb));
-            let finished = Finished::of(command.stdout(closed()).stderr(stderr).output().unwrap());
+            let finished =
+                Finished::of(command.stdout(closed_pipe()).stderr(stderr).output().unwrap());
             assert_eq!(
                 finished.code, 0,
-                "{verb}: {}\n(call_of in tests/common/mod.rs has a verb's arguments)",
+                "{verb}: {}\n(call_of in tests/common/mod.rs lists a verb's arguments)",
                 finished.stderr
             );
             assert!(
@@ -251,18 +252,18 @@ fn a_closed_stdout_changes_nothing() {
         }
     }
     assert!(project.path("out/report/index.html").exists());
-    // A failure keeps its code.
+    // A failure keeps its exit code.
     let failed = project
         .command(&["run", "-p", "kernal=box"])
-        .stdout(closed())
-        .stderr(closed())
+        .stdout(closed_pipe())
+        .stderr(closed_pipe())
         .status()
         .unwrap();
     assert_eq!(failed.code(), Some(2));
 }
 
 #[test]
-fn a_stage_does_not_need_somebody_to_talk_to() {
+fn a_stage_runs_with_closed_stdout_and_stderr() {
     let project = Project::tiny();
     demo_train(&project, 4);
     for (progress, arguments, code) in [
@@ -274,7 +275,11 @@ fn a_stage_does_not_need_somebody_to_talk_to() {
         ("plain", &["--help"], 0),
     ] {
         let mut command = Command::new(bin("prep"));
-        command.args(arguments).current_dir(project.path(".")).stdout(closed()).stderr(closed());
+        command
+            .args(arguments)
+            .current_dir(project.path("."))
+            .stdout(closed_pipe())
+            .stderr(closed_pipe());
         if arguments.len() > 2 {
             project.write("params.json", r#"{"lr_width": 24}"#);
             command.args(["--params", "params.json", "--progress", progress]);
@@ -287,9 +292,9 @@ fn a_stage_does_not_need_somebody_to_talk_to() {
 }
 
 #[test]
-fn nothing_that_a_stage_says_reaches_the_terminal_raw() {
+fn control_characters_from_a_stage_are_escaped() {
     let escape = "\\033]0;PWN\\007\\033[31mred";
-    let project = talking(&format!(
+    let project = script_project(&format!(
         "printf '{escape} one\\n' >&2; printf '{escape} two\\n' >&2\n\
          printf '%s\\n' '{{\"event\": \"progress\", \"label\": \"\\u001b[1ma\", \"done\": 1, \"total\": 1, \"note\": \"\\u001b[2mb\"}}'\n\
          printf ' 10%%\\r 20%%\\r\\n' >&2\n\
@@ -306,7 +311,7 @@ fn nothing_that_a_stage_says_reaches_the_terminal_raw() {
         log.contains(r"\u{1b}[31mred two") && log.contains(r"\u{1b}[1ma: 100 % · \u{1b}[2mb"),
         "{log}"
     );
-    // Of a bar that was drawn over and over, what stood there last.
+    // The log contains the last state of a redrawn progress bar.
     assert!(log.lines().any(|line| line == " 20%"), "{log}");
     for text in [run.stderr, run.stdout, log] {
         assert!(!text.contains(['\u{1b}', '\u{7}', '\r']), "{text:?}");
@@ -328,16 +333,16 @@ fn describe_prints_a_stages_help() {
 
 #[test]
 fn more_threads_than_a_machine_can_use_are_not_started() {
-    let project = talking(&format!("echo \"threads=$threads\" >&2; {WELL}"));
+    let project = script_project(&format!("echo \"threads=$threads\" >&2; {WRITE_OUTPUT}"));
     let run = project.run(&["run", "--threads", "100000", "--jobs", "100000"]);
     assert_eq!(run.code, 0, "{}", run.stderr);
-    let most = 4 * stage::processors().count;
-    for words in [
+    let max_threads = 4 * stage::processors().count;
+    for text in [
         "nerf-sr: --threads 100000 is more than",
         "nerf-sr: --jobs 100000 is more than",
-        &format!("threads={most}"),
+        &format!("threads={max_threads}"),
     ] {
-        assert!(run.stderr.lines().any(|line| line.contains(words)), "{words}: {}", run.stderr);
+        assert!(run.stderr.lines().any(|line| line.contains(text)), "{text}: {}", run.stderr);
     }
     assert!(run.stdout.ends_with("1 of 1 stage ran, 0 were cached\n"), "{}", run.stdout);
     assert_eq!(project.ok(&["run"]), "nothing to run: the stage is cached\n");
@@ -357,7 +362,7 @@ fn has_signal(process: &std::process::Child, set: &str, signal: u32) -> bool {
 }
 
 #[test]
-fn a_terminal_that_goes_away_leaves_a_checkpoint() {
+fn a_closed_terminal_leaves_a_checkpoint() {
     let project = Project::tiny();
     let train = demo_train(&project, 8);
     let params = r#"{"rays": 900000000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12, "hidden_dim": 16, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
@@ -369,7 +374,7 @@ fn a_terminal_that_goes_away_leaves_a_checkpoint() {
         &output,
         &["--work", work.to_str().unwrap()],
     );
-    // With nohup, under which this test may run, it must continue.
+    // Under nohup, which may run this test too, the stage must ignore SIGHUP.
     for (disposition, code) in [("--default-signal=HUP", 130), ("--ignore-signal=HUP", 130)] {
         let mut command = Command::new("env");
         let child = command
@@ -384,7 +389,7 @@ fn a_terminal_that_goes_away_leaves_a_checkpoint() {
         assert_eq!(
             is_ignored,
             disposition.starts_with("--ignore"),
-            "it continues if the signal is ignored"
+            "the stage must ignore SIGHUP under nohup only"
         );
         signal(&child, "-HUP");
         if is_ignored {
@@ -401,7 +406,7 @@ fn a_terminal_that_goes_away_leaves_a_checkpoint() {
 }
 
 #[test]
-fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
+fn a_stage_stopped_at_a_given_count_resumes_to_the_same_result() {
     let project = Project::tiny();
     let mut command = project.command(&["run"]);
     let stopped = Finished::of(command.env("NERF_SR_STOP_AFTER", "30000").output().unwrap());
@@ -412,51 +417,53 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
         stopped.stderr
     );
     assert!(project.ok(&["status"]).contains("has a checkpoint to resume from"));
-    let again = project.run(&["run"]);
+    let resumed = project.run(&["run"]);
     assert!(
-        again.code == 0 && again.stderr.contains("train-ss: resuming from step"),
+        resumed.code == 0 && resumed.stderr.contains("train-ss: resuming from step"),
         "{}",
-        again.stderr
+        resumed.stderr
     );
-    let undisturbed = Project::tiny();
-    undisturbed.ok(&["run"]);
-    assert_eq!(project.output_of("train-ss", &[]), undisturbed.output_of("train-ss", &[]));
+    let uninterrupted = Project::tiny();
+    uninterrupted.ok(&["run"]);
+    assert_eq!(project.output_of("train-ss", &[]), uninterrupted.output_of("train-ss", &[]));
 }
 
-/// Leaves a process running that holds the stage's pipes open, and a mark if it ends by itself.
-const LEAVES_ONE: &str = "(sleep 1000; touch slept) & echo $! > left";
+/// Shell command that starts a background process, which keeps the stage's pipes open. The process
+/// creates `slept` unless another process ends the sleep.
+const START_BACKGROUND_PROCESS: &str = "(sleep 1000; touch slept) & echo $! > left";
 
-/// Fails unless the process that a stage left was ended and the runner didn't wait for it.
+/// Fails unless the runner ended a stage's background process without waiting for the sleep.
 #[track_caller]
-fn assert_left_is_ended(project: &Project) {
-    let left = std::fs::read_to_string(project.path("left")).unwrap();
-    wait_until(|| !is_running(left.trim()));
-    assert!(!project.path("slept").exists(), "it ended by itself");
+fn assert_background_process_is_ended(project: &Project) {
+    let process = std::fs::read_to_string(project.path("left")).unwrap();
+    wait_until(|| !is_running(process.trim()));
+    assert!(!project.path("slept").exists(), "the background process ended by itself");
 }
 
 #[test]
-fn what_a_stage_leaves_running_does_not_hold_up_the_runner() {
-    let project = talking(&format!("{LEAVES_ONE}; touch started; wait"));
+fn the_runner_ends_processes_that_a_stage_leaves_running() {
+    let project = script_project(&format!("{START_BACKGROUND_PROCESS}; touch started; wait"));
     let child = project.spawn(&["run"]);
     wait_until(|| project.path("started").exists());
     signal(&child, "-INT");
     let finished = Finished::of(child.wait_with_output().unwrap());
     assert_eq!(finished.code, 130, "{}", finished.stderr);
-    assert_left_is_ended(&project);
-    // Nor does what a stage starts beside itself and forgets.
-    let project = talking(&format!("{LEAVES_ONE}; {WELL}"));
+    assert_background_process_is_ended(&project);
+    // A successful stage may leave a process running, too.
+    let project = script_project(&format!("{START_BACKGROUND_PROCESS}; {WRITE_OUTPUT}"));
     project.ok(&["run"]);
-    assert_left_is_ended(&project);
+    assert_background_process_is_ended(&project);
 }
 
-fn run_in_a_group(project: &Project, more: &[(&str, &str)]) -> Finished {
+/// Runs the pipeline with a group's umask; fails unless the group can write all of the store.
+fn run_with_group_umask(project: &Project, variables: &[(&str, &str)]) -> Finished {
     let mut command = Command::new("sh");
     command
         .args(["-c", "umask 002; exec \"$0\" run"])
         .arg(bin("nerf-sr"))
         .current_dir(project.path("."));
     let finished = Finished::of(
-        command.env_remove("NERF_SR_STORE").envs(more.iter().copied()).output().unwrap(),
+        command.env_remove("NERF_SR_STORE").envs(variables.iter().copied()).output().unwrap(),
     );
     for entry in walkdir::WalkDir::new(project.path(".nerf-sr")) {
         let entry = entry.unwrap();
@@ -471,27 +478,27 @@ fn a_group_can_share_a_store() {
     let project = Project::tiny();
     // The fixture's files aren't writable for the group.
     std::fs::remove_dir_all(project.path(".nerf-sr")).unwrap();
-    // Once with checkpoints and parts lying there, once whole.
-    let stopped = run_in_a_group(&project, &[("NERF_SR_STOP_AFTER", "30000")]);
+    // A stopped run leaves checkpoints and parts; the next run finishes.
+    let stopped = run_with_group_umask(&project, &[("NERF_SR_STOP_AFTER", "30000")]);
     assert_eq!(stopped.code, 130, "{}", stopped.stderr);
-    let whole = run_in_a_group(&project, &[]);
-    assert_eq!(whole.code, 0, "{}", whole.stderr);
+    let finished = run_with_group_umask(&project, &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
 }
 
 #[test]
-fn verify_names_what_is_not_an_artifact() {
-    let project = talking(WELL);
+fn verify_names_files_and_folders_that_are_not_artifacts() {
+    let project = script_project(WRITE_OUTPUT);
     project.ok(&["run"]);
     project.write(".nerf-sr/objects/notes.txt", "mine");
     project.write(".nerf-sr/objects/folder/notes.txt", "mine");
-    let said = project.ok(&["verify", "--remove"]);
+    let output = project.ok(&["verify", "--remove"]);
     assert!(
-        said.contains("objects/notes.txt: not an artifact")
-            && said.contains("objects/folder: not an artifact"),
-        "{said}"
+        output.contains("objects/notes.txt: not an artifact")
+            && output.contains("objects/folder: not an artifact"),
+        "{output}"
     );
-    assert!(said.ends_with("1 artifact, 0 damaged\n"), "{said}");
-    // A plain file in an artifact's place is damage.
+    assert!(output.ends_with("1 artifact, 0 damaged\n"), "{output}");
+    // A file instead of an artifact's folder is damage.
     let object = project.object(&project.output_of("talk", &[])[0]);
     std::fs::remove_dir_all(&object).unwrap();
     std::fs::write(&object, "").unwrap();

@@ -1,4 +1,4 @@
-//! The paper's own field through the stages, small: bytes, checkpoints, collapse, errors.
+//! The paper's field in the stages, at a small size: equal bytes, checkpoints, collapse, errors.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -8,54 +8,54 @@ use std::path::Path;
 use common::{Finished, Project, demo_train, manifest, stage, stage_command};
 use pixels::Image;
 
-/// All of the published shape, in miniature; long enough to be stopped on the way.
+/// Parameters of a small version of the paper's field, trained long enough to be interrupted.
 const PARAMS: &str = r#"{"field": "mlp", "hidden_dim": 16, "layers": 5, "coarse_samples": 8,
     "fine_samples": 8, "max_rays_per_step": 128, "rays": 20000, "precrop_steps": 20}"#;
 
-/// The only view of a folder over white.
-fn only_picture(views: &Path) -> Image {
+/// Returns a folder's only view, over white.
+fn single_image(views: &Path) -> Image {
     let files: Vec<_> = views.join("images").read_dir().unwrap().map(Result::unwrap).collect();
     assert_eq!(files.len(), 1, "{files:?}");
-    let picture = pixels::read_premultiplied(&files[0].path()).unwrap().over(1.0);
-    assert_eq!((picture.width, picture.height), (48, 48));
-    picture
+    let image = pixels::read_premultiplied(&files[0].path()).unwrap().over(1.0);
+    assert_eq!((image.width, image.height), (48, 48));
+    image
 }
 
 fn weights(folder: &Path, member: u32) -> Option<Vec<u8>> {
     std::fs::read(folder.join(format!("field-{member}.safetensors"))).ok()
 }
 
-/// Equal bytes at one and two threads, and after an interruption.
+/// Training writes equal bytes at one and two threads, and after an interruption.
 #[test]
-fn trains_to_the_same_bytes_however_it_is_run() {
+fn threads_and_interruptions_leave_bytes_unchanged() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
     let inputs = [("scene", train.as_path())];
-    let [one, two, stopped, work] =
+    let [one_thread, two_threads, stopped, work] =
         ["one", "two", "stopped", "work"].map(|name| project.path(name));
-    assert_eq!(stage("train-ss", PARAMS, &inputs, &one, &["--threads", "1"]).code, 0);
-    assert_eq!(stage("train-ss", PARAMS, &inputs, &two, &["--threads", "2"]).code, 0);
-    assert_eq!(manifest(&one), manifest(&two));
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &one_thread, &["--threads", "1"]).code, 0);
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &two_threads, &["--threads", "2"]).code, 0);
+    assert_eq!(manifest(&one_thread), manifest(&two_threads));
 
-    let more = ["--work", work.to_str().unwrap()];
-    let half_way = stage_command("train-ss", PARAMS, &inputs, &stopped, &more)
+    let arguments = ["--work", work.to_str().unwrap()];
+    let interrupted = stage_command("train-ss", PARAMS, &inputs, &stopped, &arguments)
         .env("NERF_SR_STOP_AFTER", "10000")
         .output()
         .unwrap();
-    assert_eq!(half_way.status.code(), Some(130));
+    assert_eq!(interrupted.status.code(), Some(130));
     assert!(!stopped.exists() && work.join("member-0/checkpoint.safetensors").exists());
-    assert_eq!(stage("train-ss", PARAMS, &inputs, &stopped, &more).code, 0);
-    assert_eq!(manifest(&one), manifest(&stopped));
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &stopped, &arguments).code, 0);
+    assert_eq!(manifest(&one_thread), manifest(&stopped));
 
-    // A field initialised from it is written next to it, or their mean is.
-    let (beside, averaged) = (project.path("beside"), project.path("averaged"));
-    let inputs = [("scene", train.as_path()), ("init", one.as_path())];
-    let on = PARAMS.replace("20000", "2000");
-    assert_eq!(stage("train-ss", &on, &inputs, &beside, &[]).code, 0);
+    // A fine-tuned field is written next to the initial one, or as the mean of both.
+    let (ensemble, averaged) = (project.path("beside"), project.path("averaged"));
+    let inputs = [("scene", train.as_path()), ("init", one_thread.as_path())];
+    let fine_tuning_params = PARAMS.replace("20000", "2000");
+    assert_eq!(stage("train-ss", &fine_tuning_params, &inputs, &ensemble, &[]).code, 0);
     assert_eq!(
         stage(
             "train-ss",
-            &on.replace('{', r#"{"combine": "average_weights", "#),
+            &fine_tuning_params.replace('{', r#"{"combine": "average_weights", "#),
             &inputs,
             &averaged,
             &[]
@@ -63,21 +63,22 @@ fn trains_to_the_same_bytes_however_it_is_run() {
         .code,
         0
     );
-    let [initial, trained, mean] = [weights(&one, 0), weights(&beside, 1), weights(&averaged, 0)];
-    assert!(weights(&beside, 0) == initial && weights(&averaged, 1).is_none());
-    assert!(initial != trained && initial != mean && trained != mean);
+    let [initial, fine_tuned, mean] =
+        [weights(&one_thread, 0), weights(&ensemble, 1), weights(&averaged, 0)];
+    assert!(weights(&ensemble, 0) == initial && weights(&averaged, 1).is_none());
+    assert!(initial != fine_tuned && initial != mean && fine_tuned != mean);
 
-    // `render-depth` doesn't know which field it has.
+    // `render-depth` renders this field without a parameter for its kind.
     let (cameras, views) = (project.path("scene/cameras"), project.path("views"));
     let rendered =
-        stage("render-depth", "{}", &[("field", &one), ("cameras", &cameras)], &views, &[]);
+        stage("render-depth", "{}", &[("field", &one_thread), ("cameras", &cameras)], &views, &[]);
     assert_eq!(rendered.code, 0, "{}", rendered.stderr);
-    // The short training has 10.9 dB; an all-white image has 9.2.
-    let psnr = eval::psnr(&only_picture(&views), &only_picture(&project.path("scene/truth")));
+    // The short training reaches 10.9 dB; an all-white image has 9.2.
+    let psnr = eval::psnr(&single_image(&views), &single_image(&project.path("scene/truth")));
     assert!(psnr > 10.0, "{psnr} dB");
 }
 
-fn trained(project: &Project, train: &Path, seed: u64) -> Finished {
+fn train_at_high_rate(project: &Project, train: &Path, seed: u64) -> Finished {
     let params = PARAMS.replace(
         r#""max_rays_per_step": 128, "rays": 20000, "precrop_steps": 20"#,
         &format!(
@@ -88,19 +89,21 @@ fn trained(project: &Project, train: &Path, seed: u64) -> Finished {
     stage("train-ss", &params, &[("scene", train)], &project.path("trained"), &[])
 }
 
-/// A high rate kills a network under some seeds, and the stage says so.
+/// At a high learning rate the network collapses for some seeds, and the stage reports this.
 #[test]
-fn a_collapse_is_told() {
+fn a_collapse_is_reported() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
-    let collapsed = (0..20).map(|seed| trained(&project, &train, seed)).find(|one| one.code != 0);
+    let collapsed = (0..20)
+        .map(|seed| train_at_high_rate(&project, &train, seed))
+        .find(|finished| finished.code != 0);
     collapsed
         .expect("some seed collapses")
         .fails(4, &["network has collapsed", "try another seed"]);
 }
 
 #[test]
-fn mistakes_are_one_line() {
+fn wrong_arguments_give_one_line_errors() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
     let out = project.path("out");

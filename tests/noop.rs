@@ -11,8 +11,8 @@ use common::{FAST, Project, bin};
 
 const STAGES: [&str; 6] = ["demo-scene", "prep", "train-ss", "render-depth", "eval", "report"];
 
-/// The fast pipeline, its programs and git behind scripts that leave a mark when they are started.
-fn watched() -> Project {
+/// Creates a fast project whose stages and `git` are scripts that log each start.
+fn project_with_start_log() -> Project {
     let mut pipeline = FAST.to_owned();
     for stage in STAGES {
         pipeline = pipeline.replace(
@@ -21,16 +21,16 @@ fn watched() -> Project {
         );
     }
     let project = Project::new(&pipeline);
-    let here = project.path("started");
+    let log = project.path("started");
     for stage in STAGES {
         let script = format!(
             "#!/bin/sh\necho {stage} >> '{}'\nexec '{}' \"$@\"\n",
-            here.display(),
+            log.display(),
             bin(stage).display()
         );
         project.program(&format!("watched/{stage}"), &script);
     }
-    project.program("path/git", &format!("#!/bin/sh\necho git >> '{}'\n", here.display()));
+    project.program("path/git", &format!("#!/bin/sh\necho git >> '{}'\n", log.display()));
     project
 }
 
@@ -42,23 +42,23 @@ fn run(project: &Project) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-fn started(project: &Project) -> usize {
+fn count_starts(project: &Project) -> usize {
     std::fs::read_to_string(project.path("started")).unwrap_or_default().lines().count()
 }
 
-/// Sets when a file was last read to long ago, so that the next read changes it on any file system
-/// that keeps such times.
-fn set_unread(path: &Path) {
+/// Sets a file's access time to long ago, so that the next read changes the access time on any file
+/// system that records access times.
+fn reset_access_time(path: &Path) {
     let long_ago = SystemTime::now() - Duration::from_secs(1_000_000);
     File::open(path).unwrap().set_times(FileTimes::new().set_accessed(long_ago)).unwrap();
 }
 
-fn last_read(path: &Path) -> SystemTime {
+fn access_time(path: &Path) -> SystemTime {
     path.metadata().unwrap().accessed().unwrap()
 }
 
-/// Files of all artifacts but their manifests.
-fn contents(project: &Project) -> Vec<PathBuf> {
+/// Returns the files of all artifacts, except manifests.
+fn content_files(project: &Project) -> Vec<PathBuf> {
     let files = walkdir::WalkDir::new(project.path(".nerf-sr/objects"))
         .sort_by_file_name()
         .into_iter()
@@ -69,29 +69,29 @@ fn contents(project: &Project) -> Vec<PathBuf> {
 
 #[test]
 fn a_run_with_nothing_to_do_starts_nothing_and_reads_nothing() {
-    let project = watched();
+    let project = project_with_start_log();
     let first = run(&project);
-    let before = started(&project);
-    assert!(before > STAGES.len(), "all were started");
-    let files = contents(&project);
-    assert!(files.len() >= 5, "each artifact has a file: {files:?}");
-    files.iter().for_each(|file| set_unread(file));
+    let starts = count_starts(&project);
+    assert!(starts > STAGES.len(), "not all stages were started");
+    let files = content_files(&project);
+    assert!(files.len() >= 5, "expected a file of each artifact: {files:?}");
+    files.iter().for_each(|file| reset_access_time(file));
     let probe = project.path("pipeline.yaml");
-    set_unread(&probe);
-    let times: Vec<SystemTime> = files.iter().map(|file| last_read(file)).collect();
-    let untouched = last_read(&probe);
+    reset_access_time(&probe);
+    let times: Vec<SystemTime> = files.iter().map(|file| access_time(file)).collect();
+    let probe_time = access_time(&probe);
 
     let second = run(&project);
     assert!(second.contains("nothing to run: all 5 stages are cached"), "{second}");
     let summary =
-        |said: &str| said.lines().find(|line| line.starts_with("eval: ")).unwrap().to_owned();
+        |output: &str| output.lines().find(|line| line.starts_with("eval: ")).unwrap().to_owned();
     assert_eq!(summary(&first), summary(&second));
-    assert_eq!(started(&project), before, "nothing was started");
-    if last_read(&probe) == untouched {
+    assert_eq!(count_starts(&project), starts, "the second run started a process");
+    if access_time(&probe) == probe_time {
         eprintln!("skipped: this file system keeps no access times");
         return;
     }
     for (file, time) in files.iter().zip(times) {
-        assert_eq!(last_read(file), time, "{} was read", file.display());
+        assert_eq!(access_time(file), time, "{} was read", file.display());
     }
 }

@@ -1,5 +1,5 @@
-//! Odd data sets: names, text, poses and images as they happen to people. What can be used is used,
-//! what can't be is refused by a line that names it, and what is likely wrong is warned of.
+//! Unusual data sets: names, encodings, poses and images. Usable data is used, unusable data is
+//! refused with a message that names the file or frame, and suspicious data causes a warning.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use common::{Project, manifest, stage};
 use serde_json::{Value, json};
 
-const FROM_FOLDER: &str = "
+const PREP_PIPELINE: &str = "
 default: [prep]
 stages:
   prep:
@@ -20,14 +20,15 @@ stages:
     parameters: {scale: 2}
 ";
 
-/// A demo scene as a user's folder, below a pipeline that prepares it.
+/// Creates a demo scene as a user's folder, and a project that prepares the folder. Returns project
+/// and folder.
 fn project(size: u32, train: u32) -> (Project, PathBuf) {
-    let project = Project::new(FROM_FOLDER);
+    let project = Project::new(PREP_PIPELINE);
     let folder = project.path("data");
     let params =
         format!(r#"{{"size": {size}, "train": {train}, "test": 2, "samples_per_axis": 1}}"#);
-    let made = stage("demo-scene", &params, &[], &folder, &[]);
-    assert_eq!(made.code, 0, "{}", made.stderr);
+    let finished = stage("demo-scene", &params, &[], &folder, &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
     std::fs::remove_file(folder.join("artifact.json")).unwrap();
     (project, folder)
 }
@@ -56,29 +57,29 @@ fn names_from_files_are_printed_without_control_characters() {
         &[r"frame 1 (./train/\u{1b}]0;PWN\u{7}\u{1b}[31m\nred)", "not found; remove the frame"],
     );
     assert!(is_plain(&missing.stderr) && is_plain(&missing.stdout), "{}", missing.stderr);
-    // An image may have such a name; its view hasn't.
+    // The image may have this name; its view's name has no control characters.
     std::fs::rename(folder.join("train/r_1.png"), folder.join(format!("train/{name}.png")))
         .unwrap();
     let scene = project.path("scene");
-    let made = stage("prep", "{}", &[("dataset", &folder)], &scene, &["--threads", "1"]);
-    assert!(made.code == 0 && is_plain(&made.stderr), "{}", made.stderr);
+    let finished = stage("prep", "{}", &[("dataset", &folder)], &scene, &["--threads", "1"]);
+    assert!(finished.code == 0 && is_plain(&finished.stderr), "{}", finished.stderr);
     assert!(scene.join("train/images/_]0;PWN__[31m_red.png").is_file());
 }
 
-/// A file that no frame names is nobody's business, whatever it is called.
+/// A file name is ignored if no frame names the file.
 #[test]
-fn names_that_are_not_utf8_are_passed_over_or_named() {
+fn names_that_are_not_utf8_are_ignored_or_refused() {
     let (project, folder) = project(16, 4);
-    let odd = folder.join("train").join(OsStr::from_bytes(b"\xff\xfe.png"));
-    std::fs::copy(folder.join("train/r_2.png"), &odd).unwrap();
-    let made = stage("prep", "{}", &[("dataset", &folder)], &project.path("scene"), &[]);
-    assert_eq!(made.code, 0, "{}", made.stderr);
+    let path = folder.join("train").join(OsStr::from_bytes(b"\xff\xfe.png"));
+    std::fs::copy(folder.join("train/r_2.png"), &path).unwrap();
+    let finished = stage("prep", "{}", &[("dataset", &folder)], &project.path("scene"), &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
     let list = std::fs::read_to_string(folder.join("transforms_train.json")).unwrap();
     let bytes: Vec<u8> = list.replace("r_2", "\u{fffd}").into_bytes();
-    let place = bytes.windows(3).position(|w| w == "\u{fffd}".as_bytes()).unwrap();
+    let position = bytes.windows(3).position(|w| w == "\u{fffd}".as_bytes()).unwrap();
     std::fs::write(
         folder.join("transforms_train.json"),
-        [&bytes[..place], b"\xff\xfe", &bytes[place + 3..]].concat(),
+        [&bytes[..position], b"\xff\xfe", &bytes[position + 3..]].concat(),
     )
     .unwrap();
     let refused = stage("prep", "{}", &[("dataset", &folder)], &project.path("other"), &[]);
@@ -92,32 +93,33 @@ fn names_that_are_not_utf8_are_passed_over_or_named() {
     );
 }
 
-fn prepared(project: &Project, folder: &Path, name: &str) -> String {
+/// Prepares a data set and returns the scene's manifest.
+fn prepared_manifest(project: &Project, folder: &Path, name: &str) -> String {
     let scene = project.path(name);
-    let made = stage("prep", "{}", &[("dataset", folder)], &scene, &[]);
-    assert_eq!(made.code, 0, "{}", made.stderr);
+    let finished = stage("prep", "{}", &[("dataset", folder)], &scene, &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
     manifest(&scene)
 }
 
 #[test]
-fn text_as_other_editors_save_it() {
+fn a_byte_order_mark_and_crlf_are_accepted_and_utf16_is_refused() {
     let (project, folder) = project(16, 4);
-    let plain = prepared(&project, &folder, "plain");
+    let plain = prepared_manifest(&project, &folder, "plain");
     let path = folder.join("transforms_train.json");
     let text = std::fs::read_to_string(&path).unwrap();
     std::fs::write(&path, format!("\u{feff}{}", text.replace('\n', "\r\n"))).unwrap();
-    assert_eq!(prepared(&project, &folder, "marked"), plain);
-    let wide: Vec<u8> =
+    assert_eq!(prepared_manifest(&project, &folder, "marked"), plain);
+    let utf16: Vec<u8> =
         format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
-    std::fs::write(&path, wide).unwrap();
+    std::fs::write(&path, utf16).unwrap();
     project.run(&["run"]).fails(3, &["transforms_train.json: file is UTF-16; save it as UTF-8"]);
 }
 
-/// Damage to the list of training views, the exit code, and words of the refusal.
+/// Damage to the list of training views, exit code, and texts of the message.
 type Damage = (fn(&mut Value), i32, &'static [&'static str]);
 
 #[test]
-fn poses_that_cannot_be_are_refused() {
+fn impossible_poses_are_refused() {
     let refusals: [Damage; 4] = [
         (
             |list| pose(list, 2)[0][3] = json!(1e30),
@@ -138,8 +140,8 @@ fn poses_that_cannot_be_are_refused() {
         ),
         (
             |list| {
-                let same = pose(list, 0).clone();
-                (0..4).for_each(|i| *pose(list, i) = same.clone());
+                let first = pose(list, 0).clone();
+                (0..4).for_each(|i| *pose(list, i) = first.clone());
             },
             3,
             &["all 4 training views have the same pose"],
@@ -150,7 +152,7 @@ fn poses_that_cannot_be_are_refused() {
             &["frame 3 (./train/r_3)", "camera_to_world[1][3] is infinite; poses must be finite"],
         ),
     ];
-    for (damage, code, words) in refusals {
+    for (damage, code, texts) in refusals {
         let (project, folder) = project(16, 4);
         edit(&folder, damage);
         // Python writes infinities without quotes.
@@ -160,7 +162,7 @@ fn poses_that_cannot_be_are_refused() {
             std::fs::read_to_string(&path).unwrap().replace("\"Infinity\"", "Infinity"),
         )
         .unwrap();
-        project.run(&["run"]).fails(code, words);
+        project.run(&["run"]).fails(code, texts);
         assert_eq!(project.store_listing(), Vec::<String>::new());
     }
     let (project, folder) = project(1, 4);
@@ -170,10 +172,10 @@ fn poses_that_cannot_be_are_refused() {
     drop(folder);
 }
 
-/// Poses that are probably wrong are used, with a warning at once, in the log, in `scene.json` and
-/// at the end.
+/// Poses that are probably wrong are used, with a warning in the run's output, in the log and in
+/// `scene.json`.
 #[test]
-fn poses_that_look_wrong_are_warned_of() {
+fn suspicious_poses_cause_a_warning() {
     type Change = fn(&mut Value);
     let warnings: [(Change, &str); 4] = [
         (|_| {}, ""),
@@ -191,70 +193,72 @@ fn poses_that_look_wrong_are_warned_of() {
             view r_0 with (4.0, 4.0) in 16×16 pixels",
         ),
     ];
-    for (change, words) in warnings {
+    for (change, warning) in warnings {
         let (project, folder) = project(16, 4);
         edit(&folder, change);
-        let said = project.ok(&["run"]);
-        let logged = project.ok(&["log", "prep"]);
+        let stdout = project.ok(&["run"]);
+        let log = project.ok(&["log", "prep"]);
         let notes = project.json("prep", "scene.json", &[])["notes"].to_string();
-        for text in [said, logged, notes] {
-            // A log has it where it was said, and once more in the result.
-            assert_eq!(text.contains("warning: "), !words.is_empty(), "{text}");
-            assert!(text.contains(words), "{words} isn't in {text}");
+        for text in [stdout, log, notes] {
+            assert_eq!(text.contains("warning: "), !warning.is_empty(), "{text}");
+            assert!(text.contains(warning), "{warning:?} not found in {text}");
         }
     }
 }
 
-fn counts(project: &Project, settings: &[&str]) -> (u64, u64) {
-    project.ok(&[&["run"], settings].concat());
-    let scene = project.json("prep", "scene.json", settings);
+/// Runs the pipeline and returns the numbers of training and test views.
+fn view_counts(project: &Project, arguments: &[&str]) -> (u64, u64) {
+    project.ok(&[&["run"], arguments].concat());
+    let scene = project.json("prep", "scene.json", arguments);
     (scene["train"].as_u64().unwrap(), scene["test"].as_u64().unwrap())
 }
 
 #[test]
-fn training_views_alone_are_a_data_set() {
+fn test_views_are_held_out_if_none_are_given() {
     let (project, folder) = project(16, 10);
     let test = folder.join("transforms_test.json");
     std::fs::write(&test, r#"{"camera_angle_x": 0.69, "frames": []}"#).unwrap();
-    assert_eq!(counts(&project, &[]), (8, 2), "without frames, every eighth is held out");
+    assert_eq!(view_counts(&project, &[]), (8, 2), "every eighth view is held out");
     std::fs::remove_file(&test).unwrap();
-    assert_eq!(counts(&project, &[]), (8, 2));
-    assert_eq!(counts(&project, &["-p", "split=holdout"]), (8, 2));
-    assert_eq!(counts(&project, &["-p", "split=paper"]), (10, 9));
+    assert_eq!(view_counts(&project, &[]), (8, 2));
+    assert_eq!(view_counts(&project, &["-p", "split=holdout"]), (8, 2));
+    assert_eq!(view_counts(&project, &["-p", "split=paper"]), (10, 9));
     project
         .run(&["run", "-p", "split=given"])
         .fails(2, &["parameter split", "choose holdout or paper"]);
 }
 
 #[test]
-fn what_stands_where_an_image_should_be_is_named() {
-    type Put = fn(&Path);
-    let cases: [(Put, &str); 4] = [
-        (|at| std::fs::create_dir(at).unwrap(), "r_1.png is a folder, not an image"),
+fn the_type_of_a_file_that_is_not_an_image_is_reported() {
+    type Create = fn(&Path);
+    let cases: [(Create, &str); 4] = [
+        (|path| std::fs::create_dir(path).unwrap(), "r_1.png is a folder, not an image"),
         (
-            |at| assert!(std::process::Command::new("mkfifo").arg(at).status().unwrap().success()),
+            |path| {
+                assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success());
+            },
             "is a named pipe (FIFO), not an image",
         ),
-        (|at| symlink("/dev/zero", at).unwrap(), "r_1.png is a device, not an image"),
+        (|path| symlink("/dev/zero", path).unwrap(), "r_1.png is a device, not an image"),
         (
-            |at| symlink("r_1.png", at).unwrap(),
+            |path| symlink("r_1.png", path).unwrap(),
             "r_1.png is a symbolic link that cannot be followed",
         ),
     ];
-    for (put, words) in cases {
+    for (create, message) in cases {
         let (project, folder) = project(16, 4);
         let image = folder.join("train/r_1.png");
         std::fs::remove_file(&image).unwrap();
-        put(&image);
+        create(&image);
         let refused = stage("prep", "{}", &[("dataset", &folder)], &project.path("scene"), &[]);
-        refused.fails(3, &["transforms_train.json: frame 1 (./train/r_1)", words]);
+        refused.fails(3, &["transforms_train.json: frame 1 (./train/r_1)", message]);
     }
 }
 
 #[test]
-fn the_largest_size_is_said() {
+fn an_image_beyond_the_maximum_size_is_refused() {
     let (project, folder) = project(16, 4);
-    // An EXR's header isn't summed up: an image of one pixel that says it has 20000 × 20000.
+    // An EXR header has no checksum, so an image of one pixel can claim 20000 × 20000 pixels.
     let path = folder.join("train/huge.exr");
     let channels =
         ["R", "G", "B"].map(|name| pixels::Channel { name, sample_type: pixels::SampleType::Half });
@@ -265,8 +269,9 @@ fn the_largest_size_is_said() {
     .unwrap();
     let mut bytes = std::fs::read(&path).unwrap();
     for window in [&b"dataWindow\0box2i\0"[..], b"displayWindow\0box2i\0"] {
-        let at = bytes.windows(window.len()).position(|w| w == window).unwrap() + window.len() + 4;
-        bytes[at + 8..at + 16]
+        let start =
+            bytes.windows(window.len()).position(|w| w == window).unwrap() + window.len() + 4;
+        bytes[start + 8..start + 16]
             .copy_from_slice(&[19_999i32.to_le_bytes(), 19_999i32.to_le_bytes()].concat());
     }
     std::fs::write(&path, bytes).unwrap();
@@ -276,7 +281,7 @@ fn the_largest_size_is_said() {
         .fails(3, &["huge.exr", "20000×20000 pixels exceed the limit of 268435456"]);
 }
 
-const TRAINED: &str = "
+const TRAINING_PIPELINE: &str = "
 default: [report]
 stages:
   demo-scene:
@@ -295,59 +300,61 @@ stages:
     inputs: {run: eval}
 ";
 
-/// LR was made from that very image.
+/// The LR photograph was downscaled from the reference, so both have equal exposures.
 #[test]
 fn a_reference_has_the_exposure_of_its_own_lr_photograph() {
     for kernel in ["lanczos", "average"] {
-        let project = Project::new(TRAINED);
-        let settings = ["-p", "train-ss.rays=600", "-p", &format!("kernel={kernel}")];
-        project.ok(&[&["run", "train-ss"], &settings[..]].concat());
-        let said = project.ok(&[&["log", "train-ss"], &settings[..]].concat());
+        let project = Project::new(TRAINING_PIPELINE);
+        let arguments = ["-p", "train-ss.rays=600", "-p", &format!("kernel={kernel}")];
+        project.ok(&[&["run", "train-ss"], &arguments[..]].concat());
+        let log = project.ok(&[&["log", "train-ss"], &arguments[..]].concat());
         assert!(
-            !said.contains("another exposure") && !said.contains("is left out"),
-            "{kernel}: {said}"
+            !log.contains("another exposure") && !log.contains("is left out"),
+            "{kernel}: {log}"
         );
     }
 }
 
-fn trained_with(project: &Project, refined: &str) -> (Vec<u8>, String, Value, String) {
-    let settings = ["-p", refined];
-    let run = project.run(&[&["run"], &settings[..]].concat());
+/// Runs the pipeline with a parameter. Returns the field's weights, stderr, `training.json` and the
+/// page.
+fn run_with(project: &Project, parameter: &str) -> (Vec<u8>, String, Value, String) {
+    let arguments = ["-p", parameter];
+    let run = project.run(&[&["run"], &arguments[..]].concat());
     assert_eq!(run.code, 0, "{}", run.stderr);
     let weights = std::fs::read(
-        project.artifact("train-ss", &settings).join(fields::FieldFile::member_file(0)),
+        project.artifact("train-ss", &arguments).join(fields::FieldFile::member_file(0)),
     )
     .unwrap();
     let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
-    (weights, run.stderr, project.json("train-ss", "training.json", &settings), page)
+    (weights, run.stderr, project.json("train-ss", "training.json", &arguments), page)
 }
 
-/// Few rays can't refine poses: cameras wander off, photographs don't match their neighbours, and
-/// the field is the one with the given poses.
+/// With few rays, pose refinement moves cameras away and photographs don't match their neighbours.
+/// The result is the field with the given poses.
 #[test]
-fn poses_stay_where_refined_ones_are_no_better() {
-    let project = Project::new(TRAINED);
-    let (given, said, training, page) = trained_with(&project, "pose_refinement=false");
+fn given_poses_are_used_if_refined_poses_are_no_better() {
+    let project = Project::new(TRAINING_PIPELINE);
+    let (given_weights, stderr, training, page) = run_with(&project, "pose_refinement=false");
     assert!(
-        !said.contains("warning: ")
+        !stderr.contains("warning: ")
             && training.get("warnings").is_none()
             && !page.contains("id=\"warnings\""),
-        "{said}"
+        "{stderr}"
     );
-    let (kept, said, training, page) = trained_with(&project, "pose_refinement=true");
-    let words =
+    let (weights, stderr, training, page) = run_with(&project, "pose_refinement=true");
+    let warning =
         "given poses are used: photographs match their neighbours no better with refined poses";
-    assert!(said.contains(&format!("warning: {words}")), "{said}");
-    assert!(training["warnings"][0].as_str().unwrap().starts_with(words), "{training}");
-    assert!(page.contains("id=\"warnings\"") && page.contains(words));
-    assert!(project.ok(&["log", "train-ss", "-p", "pose_refinement=true"]).contains(words));
+    assert!(stderr.contains(&format!("warning: {warning}")), "{stderr}");
+    assert!(training["warnings"][0].as_str().unwrap().starts_with(warning), "{training}");
+    assert!(page.contains("id=\"warnings\"") && page.contains(warning));
+    assert!(project.ok(&["log", "train-ss", "-p", "pose_refinement=true"]).contains(warning));
     let cameras: Value = project.json("prep", "train/views.json", &[]);
     let poses: Vec<Value> = cameras["views"]
         .as_array()
         .unwrap()
         .iter()
-        .map(|v| v["camera"]["camera_to_world"].clone())
+        .map(|view| view["camera"]["camera_to_world"].clone())
         .collect();
     assert_eq!(training["poses"], Value::Array(poses));
-    assert!(kept == given, "the field is that with the given poses");
+    assert!(weights == given_weights, "the field is the one with the given poses");
 }

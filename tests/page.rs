@@ -1,5 +1,5 @@
-//! The report page in a real browser: of runs, of one result and of many, with and without
-//! pictures' originals, and of a run that failed.
+//! Report pages in a real browser: of one and of many results, with and without the images'
+//! originals, and of failed runs.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -11,87 +11,94 @@ use common::browser::run_in_browser;
 use common::{Project, stage};
 use serde_json::{Value, json};
 
-/// Maximum size of a page with 50 views of 800 pixels.
-const PAGE_BYTES: u64 = 15_000_000;
+/// Maximum bytes of a page with 50 views of 800 pixels.
+const MAX_PAGE_BYTES: u64 = 15_000_000;
 
-/// Returns the browser's reports on a dark phone, a light desktop, a light phone and a dark
-/// desktop, or on the first `count` of these; fails on any problem.
+/// Operates a page on a dark phone, a light desktop, a light phone and a dark desktop, or on the
+/// first `count` of these, and returns the page's content on each; `None` without a browser.
+/// Fails on any problem.
 #[track_caller]
-fn look(page: &Path, count: usize) -> Option<Vec<Value>> {
+fn operate_page(page: &Path, count: usize) -> Option<Vec<Value>> {
     let found = run_in_browser("page.mjs", [page.as_os_str(), count.to_string().as_ref()])?;
-    let looks = found.as_array().unwrap().clone();
-    assert_eq!(looks.len(), count);
-    for look in &looks {
-        assert_eq!(look["problems"], json!([]), "{}: {}", page.display(), look["size"]);
+    let contents = found.as_array().unwrap().clone();
+    assert_eq!(contents.len(), count);
+    for content in &contents {
+        assert_eq!(content["problems"], json!([]), "{}: {}", page.display(), content["size"]);
     }
-    Some(looks)
+    Some(contents)
 }
 
-fn scored_figure(view: &Value, figure: &Value) -> Option<(String, String)> {
-    let place = format!("/scores/{}", figure["path"].as_str().unwrap());
-    let value = view.pointer(&place)?.as_f64()?;
+/// Returns a figure's label and its rounded value in a view's scores.
+fn rounded_score(view: &Value, figure: &Value) -> Option<(String, String)> {
+    let pointer = format!("/scores/{}", figure["path"].as_str().unwrap());
+    let value = view.pointer(&pointer)?.as_f64()?;
     let digits = figure["digits"].as_u64().unwrap() as usize;
     Some((figure["label"].as_str().unwrap().to_owned(), format!("{value:.digits$}")))
 }
 
-fn scored_figures(view: &Value, figures: &[Value]) -> (String, BTreeMap<String, String>) {
+fn rounded_scores(view: &Value, figures: &[Value]) -> (String, BTreeMap<String, String>) {
     (
         view["name"].as_str().unwrap().to_owned(),
-        figures.iter().filter_map(|figure| scored_figure(view, figure)).collect(),
+        figures.iter().filter_map(|figure| rounded_score(view, figure)).collect(),
     )
 }
 
-/// `metrics.json` as the page should show it: by view and label of a figure, rounded.
-fn shown(metrics: &Value) -> BTreeMap<String, BTreeMap<String, String>> {
+/// Returns the numbers that a page should show for `metrics.json`, by view and figure label.
+fn expected_numbers(metrics: &Value) -> BTreeMap<String, BTreeMap<String, String>> {
     let figures = metrics["figures"].as_array().unwrap();
-    metrics["views"].as_array().unwrap().iter().map(|view| scored_figures(view, figures)).collect()
+    metrics["views"].as_array().unwrap().iter().map(|view| rounded_scores(view, figures)).collect()
 }
 
-/// Paths of a score's numbers.
-fn paths((name, score): (&String, &Value)) -> Vec<String> {
+/// Returns the paths of a score's numbers.
+fn number_paths((name, score): (&String, &Value)) -> Vec<String> {
     match score.as_object() {
         None => vec![name.clone()],
         Some(parts) => parts.keys().map(|part| format!("{name}/{part}")).collect(),
     }
 }
 
-/// Every number has a figure, without which no page would show it.
+/// Fails if a number of the scores has no figure, without which no page shows the number.
 #[track_caller]
-fn figures_name_all_numbers(metrics: &Value) {
+fn assert_all_numbers_have_figures(metrics: &Value) {
     let figures = metrics["figures"].as_array().unwrap();
-    for path in metrics["mean"].as_object().unwrap().iter().flat_map(paths) {
+    for path in metrics["mean"].as_object().unwrap().iter().flat_map(number_paths) {
         assert!(
             figures.iter().any(|figure| figure["path"] == path.as_str()),
-            "no figure of {path}"
+            "no figure for {path}"
         );
     }
 }
 
 #[track_caller]
-fn says(look: &Value, result: &str, metrics: &Value) {
-    for (view, figures) in shown(metrics) {
+fn assert_shows_scores(content: &Value, result: &str, metrics: &Value) {
+    for (view, figures) in expected_numbers(metrics) {
         assert!(!figures.is_empty(), "{view} has no figure");
-        let found = &look["numbers"][&view][result];
+        let found = &content["numbers"][&view][result];
         for (label, number) in figures {
-            assert_eq!(found[&label], json!(number), "{view}, {result}, {label}: {}", look["size"]);
+            assert_eq!(
+                found[&label],
+                json!(number),
+                "{view}, {result}, {label}: {}",
+                content["size"]
+            );
         }
     }
 }
 
-fn metrics_of(project: &Project, output: &str) -> Value {
+fn read_metrics(project: &Project, output: &str) -> Value {
     let file = project.object(output).join("metrics.json");
     serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap()
 }
 
 #[test]
-fn a_page_shows_a_sweep_as_eval_scored_it() {
+fn a_page_shows_the_scores_of_a_sweep() {
     let project = Project::fast();
     let sweep = ["-p", "supersample=1,2"];
-    let said = project.ok(&[&["run"], &sweep[..]].concat());
-    assert!(said.contains("out/report/index.html"), "{said}");
+    let stdout = project.ok(&[&["run"], &sweep[..]].concat());
+    assert!(stdout.contains("out/report/index.html"), "{stdout}");
     let page = project.path("out/report/index.html");
     let text = std::fs::read_to_string(&page).unwrap();
-    for words in [
+    for expected in [
         "run -p supersample=1,2",
         "weights not given",
         " UTC",
@@ -100,11 +107,11 @@ fn a_page_shows_a_sweep_as_eval_scored_it() {
         " per LR pixel",
         "href=\"#definition-psnr\" title=\"",
     ] {
-        assert!(text.contains(words), "the page lacks {words:?}");
+        assert!(text.contains(expected), "the page lacks {expected:?}");
     }
-    // Originals lie beside it, and what the page says of each stage is the run's.
+    // The images' originals are next to the page, which names the run's artifacts.
     let folders = std::fs::read_dir(project.path("out/report/views")).unwrap().count();
-    assert_eq!(folders, 2, "one a view");
+    assert_eq!(folders, 2, "one folder per view");
     for stage in ["prep", "train-ss", "eval"] {
         let output = project.output_of(stage, &sweep).remove(0);
         assert!(text.contains(&output[..10]), "{stage}: no {output}");
@@ -112,18 +119,18 @@ fn a_page_shows_a_sweep_as_eval_scored_it() {
     let metrics: Vec<Value> = project
         .output_of("eval", &sweep)
         .iter()
-        .map(|output| metrics_of(&project, output))
+        .map(|output| read_metrics(&project, output))
         .collect();
-    metrics.iter().for_each(figures_name_all_numbers);
-    let Some(looks) = look(&page, 4) else { return };
+    metrics.iter().for_each(assert_all_numbers_have_figures);
+    let Some(contents) = operate_page(&page, 4) else { return };
     for (metrics, result) in metrics.iter().zip(["supersample=1", "supersample=2"]) {
         assert!(metrics["mean"]["psnr"].is_number());
-        looks.iter().for_each(|look| says(look, result, metrics));
+        contents.iter().for_each(|content| assert_shows_scores(content, result, metrics));
     }
-    // Without the originals the page works.
-    let alone = project.path("alone.html");
-    std::fs::copy(&page, &alone).unwrap();
-    look(&alone, 1);
+    // The page works without the originals.
+    let copy = project.path("alone.html");
+    std::fs::copy(&page, &copy).unwrap();
+    operate_page(&copy, 1);
 }
 
 fn record_node(project: &Project, stage: &str, kind: &str, point: &str, inputs: &Value) -> Value {
@@ -136,30 +143,30 @@ fn record_node(project: &Project, stage: &str, kind: &str, point: &str, inputs: 
         "started_unix": 1_790_000_000, "seconds": 3.5, "threads": 2})
 }
 
-/// A run's record, as the runner writes it, with the same result many times. `constant` ends the
-/// points' names.
-fn record(project: &Project, results: usize, constant: &str) -> Value {
+/// Returns the record of a run with `results` results, which are equal except for their points'
+/// names. `suffix` ends the names.
+fn record(project: &Project, results: usize, suffix: &str) -> Value {
     let mut nodes = vec![
         record_node(project, "demo-scene", "dataset", "", &json!({})),
         record_node(project, "prep", "scene", "", &json!({"dataset": {"node": 0}})),
     ];
     for result in 0..results {
         let point =
-            if results == 1 { String::new() } else { format!("rays={}{constant}", 1000 + result) };
+            if results == 1 { String::new() } else { format!("rays={}{suffix}", 1000 + result) };
         let first = nodes.len();
-        let prep = |folder: &str| json!({"node": 1, "subtree": folder});
-        let inputs = json!({"scene": prep("train")});
+        let prep_subtree = |folder: &str| json!({"node": 1, "subtree": folder});
+        let inputs = json!({"scene": prep_subtree("train")});
         nodes.push(record_node(project, "train-ss", "field", &point, &inputs));
-        let inputs = json!({"field": {"node": first}, "cameras": prep("cameras")});
+        let inputs = json!({"field": {"node": first}, "cameras": prep_subtree("cameras")});
         nodes.push(record_node(project, "render-depth", "views", &point, &inputs));
-        let inputs = json!({"views": {"node": first + 1}, "truth": prep("truth")});
+        let inputs = json!({"views": {"node": first + 1}, "truth": prep_subtree("truth")});
         nodes.push(record_node(project, "eval", "metrics", &point, &inputs));
     }
     json!({"home": project.path("out"), "command": ["nerf-sr", "run"], "data_sets": ["demo-scene"],
         "nodes": nodes})
 }
 
-/// The page of a record.
+/// Runs `report` on a run's record and returns the page's path.
 #[track_caller]
 fn page_of(folder: &Path, record: &Value) -> PathBuf {
     let (run, page) = (folder.join("run"), folder.join("page"));
@@ -170,7 +177,7 @@ fn page_of(folder: &Path, record: &Value) -> PathBuf {
     page.join("index.html")
 }
 
-/// Labels of a page's layers of one kind.
+/// Returns the labels of a page's layers of one kind.
 fn layers(page: &str, kind: &str) -> Vec<String> {
     let data = page.split_once("id=\"data\">").unwrap().1.split_once("</script>").unwrap().0;
     let data: Value = serde_json::from_str(data).unwrap();
@@ -178,7 +185,7 @@ fn layers(page: &str, kind: &str) -> Vec<String> {
     layers.map(|layer| layer["label"].as_str().unwrap().to_owned()).collect()
 }
 
-/// Scores fail, but the views are rendered: the page shows them and their ground truth.
+/// If only `eval` fails, the page shows the rendered views and their ground truth.
 #[test]
 fn a_failed_run_shows_the_renders_that_it_finished() {
     let project = Project::fast();
@@ -195,16 +202,17 @@ fn a_failed_run_shows_the_renders_that_it_finished() {
     assert_eq!(layers(&text, "render"), ["rendered, not scored"]);
     assert_eq!(layers(&text, "ground-truth"), ["Ground truth"]);
     assert_eq!(std::fs::read_dir(folder.path().join("page/views")).unwrap().count(), 2);
-    look(&page, 1);
+    operate_page(&page, 1);
 }
 
-/// Names of photographs may be long: plots and tables have room for them, or shorten them.
+/// Plots and tables have room for long names of photographs, or shorten the names.
 #[test]
-fn long_view_names_have_room() {
+fn long_view_names_fit_the_page() {
     let dir = tempfile::tempdir().unwrap();
-    let metrics = photographs(dir.path(), 12, 64, "photograph_of_the_garden_behind_the_house_");
-    let page = page_of(dir.path(), &photographs_record(dir.path(), &metrics));
-    look(&page, 2);
+    let metrics =
+        write_scored_views(dir.path(), 12, 64, "photograph_of_the_garden_behind_the_house_");
+    let page = page_of(dir.path(), &scored_views_record(dir.path(), &metrics));
+    operate_page(&page, 2);
 }
 
 #[test]
@@ -212,23 +220,23 @@ fn one_result_and_a_hundred_have_readable_pages() {
     let project = Project::fast();
     project.ok(&["run"]);
     let metrics = project.json("eval", "metrics.json", &[]);
-    let long = ", experiment=photographs of the garden behind the house";
-    for (results, constant, last, sizes) in [
+    let long_suffix = ", experiment=photographs of the garden behind the house";
+    for (results, suffix, last, sizes) in [
         (1, "", "rendered".to_owned(), 1),
         (12, "", "rays=1011".to_owned(), 1),
-        (100, long, format!("rays=1099{long}"), 2),
+        (100, long_suffix, format!("rays=1099{long_suffix}"), 2),
     ] {
         let folder = tempfile::tempdir().unwrap();
-        let page = page_of(folder.path(), &record(&project, results, constant));
+        let page = page_of(folder.path(), &record(&project, results, suffix));
         let text = std::fs::read_to_string(&page).unwrap();
         assert_eq!(text.matches("★</span>").count() > 0, results > 1, "{results}");
-        assert!(text.len() as u64 <= PAGE_BYTES, "{} bytes", text.len());
-        // All results have equal pictures, which the page lists once.
+        assert!(text.len() as u64 <= MAX_PAGE_BYTES, "{} bytes", text.len());
+        // All results have equal images, which the page lists once.
         let renders: Vec<String> = layers(&text, "render");
         assert_eq!(renders.len(), 1, "{renders:?}");
         assert_eq!(renders[0].ends_with(&format!("and {} more", results - 1)), results > 1);
-        let Some(looks) = look(&page, sizes) else { return };
-        looks.iter().for_each(|look| says(look, &last, &metrics));
+        let Some(contents) = operate_page(&page, sizes) else { return };
+        contents.iter().for_each(|content| assert_shows_scores(content, &last, &metrics));
     }
 }
 
@@ -258,8 +266,9 @@ fn write_image(folder: &Path, file: &str, image: &pixels::Rgba8) {
     pixels::write_png(&path, image).unwrap();
 }
 
-/// Views of photographs, which no filter shrinks to nothing: detail at every size, and noise.
-fn photographs(folder: &Path, count: usize, side: usize, prefix: &str) -> Value {
+/// Writes `count` views, their ground truth and error maps, and returns their metrics. Like
+/// photographs, the images have detail at every size and noise, which limits PNG's compression.
+fn write_scored_views(folder: &Path, count: usize, side: usize, prefix: &str) -> Value {
     let (mut truths, mut renders, mut scores) = (vec![], vec![], vec![]);
     for number in 0..count {
         let name = format!("{prefix}{number}");
@@ -288,10 +297,10 @@ fn photographs(folder: &Path, count: usize, side: usize, prefix: &str) -> Value 
     let conventions = serde_json::to_value(scene::Conventions::default()).unwrap();
     let bounds =
         json!({"min": [-1.0, -1.0, -1.0], "max": [1.0, 1.0, 1.0], "near": 1.0, "far": 9.0});
-    for (place, views) in [("truth", truths), ("views", renders)] {
+    for (subfolder, views) in [("truth", truths), ("views", renders)] {
         let file = json!({"conventions": conventions, "background": "white", "bounds": bounds,
             "views": views});
-        std::fs::write(folder.join(place).join("views.json"), file.to_string()).unwrap();
+        std::fs::write(folder.join(subfolder).join("views.json"), file.to_string()).unwrap();
     }
     let figure =
         json!({"path": "psnr", "label": "PSNR ↑ dB", "digits": 2, "higher_is_better": true});
@@ -326,7 +335,7 @@ fn texture_pixel(number: u64, detail: f64, x: usize, y: usize) -> [u8; 4] {
     [r, g, b, 255]
 }
 
-/// Waves of every length with phases that depend on the number, and noise.
+/// Returns an image of noise and of waves of every length, whose phases depend on `number`.
 fn texture(side: usize, number: u64, detail: f64) -> pixels::Rgba8 {
     let pixel = |i: usize| texture_pixel(number, detail, i % side, i / side);
     pixels::Rgba8::new(side, side, (0..side * side).flat_map(pixel).collect())
@@ -338,8 +347,8 @@ fn folder_node(dir: &Path, stage: &str, kind: &str, folder: &str, inputs: &Value
         "started_unix": 1, "seconds": 1.0, "threads": 1})
 }
 
-/// The record of scored [`photographs`].
-fn photographs_record(dir: &Path, metrics: &Value) -> Value {
+/// Writes `metrics.json`, and returns the record of a run with [`write_scored_views`]'s views.
+fn scored_views_record(dir: &Path, metrics: &Value) -> Value {
     std::fs::write(dir.join("metrics/metrics.json"), metrics.to_string()).unwrap();
     let inputs = json!({"views": {"node": 1}, "truth": {"node": 0}});
     let nodes = [
@@ -351,70 +360,79 @@ fn photographs_record(dir: &Path, metrics: &Value) -> Value {
 }
 
 #[test]
-fn fifty_views_of_800_pixels_have_room() {
+fn fifty_views_of_800_pixels_fit_the_size_limit() {
     let dir = tempfile::tempdir().unwrap();
-    let metrics = photographs(dir.path(), 50, 800, "r_");
-    let page = page_of(dir.path(), &photographs_record(dir.path(), &metrics));
+    let metrics = write_scored_views(dir.path(), 50, 800, "r_");
+    let page = page_of(dir.path(), &scored_views_record(dir.path(), &metrics));
     let bytes = page.metadata().unwrap().len();
     println!("{bytes} bytes");
-    assert!(bytes <= PAGE_BYTES, "{bytes} bytes");
-    // All views are there, with their originals.
+    assert!(bytes <= MAX_PAGE_BYTES, "{bytes} bytes");
+    // The page has all views, with their originals.
     let views = std::fs::read_dir(dir.path().join("page/views")).unwrap();
     assert_eq!(views.count(), 50);
     let original = pixels::read_png(&dir.path().join("page/views/r_7/ground-truth.png")).unwrap();
     let truth = pixels::read_png(&dir.path().join("truth/images/r_7.png")).unwrap();
-    assert!(original == truth, "an original isn't what it was");
+    assert!(original == truth, "the original differs from the ground truth");
     let text = std::fs::read_to_string(&page).unwrap();
     assert_eq!(text.matches("\"uri\":\"data:image/").count(), 50 * 4);
 }
 
-/// The second stage fails: the page shows the first, and says what happened.
+/// If training fails, the page shows the failure, and the earlier page is moved away.
 #[test]
 fn a_run_that_failed_has_a_page() {
     let project = Project::fast();
     project.ok(&["run"]);
-    let whole = std::fs::read(project.path("out/report/index.html")).unwrap();
+    let earlier_page = std::fs::read(project.path("out/report/index.html")).unwrap();
     let failed = project.run(&["run", "-p", "train-ss.rays=1"]);
     assert_ne!(failed.code, 0);
     assert!(failed.stdout.contains("moved the earlier page to"), "{}", failed.stdout);
-    assert_eq!(std::fs::read(project.path("out/report-demo-scene/index.html")).unwrap(), whole);
+    assert_eq!(
+        std::fs::read(project.path("out/report-demo-scene/index.html")).unwrap(),
+        earlier_page
+    );
     let page = project.path("out/report/index.html");
     let text = std::fs::read_to_string(&page).unwrap();
-    for words in
+    for expected in
         ["This run failed", "<b>train-ss</b>: ", "✕ failed", "– not run", "There are no scores"]
     {
-        assert!(text.contains(words), "the page lacks {words:?}");
+        assert!(text.contains(expected), "the page lacks {expected:?}");
     }
-    look(&page, 2);
-    // Results that are there are shown beside those that aren't.
+    operate_page(&page, 2);
+    // The finished result of a sweep is shown next to the failed one.
     let sweep = ["run", "--keep-going", "-p", "train-ss.rays=1,4000"];
     assert_ne!(project.run(&sweep).code, 0);
     let text = std::fs::read_to_string(&page).unwrap();
     assert!(text.contains("This run failed") && text.contains("<b>train-ss [rays=1]</b>"));
-    let Some(looks) = look(&page, 1) else { return };
+    let Some(contents) = operate_page(&page, 1) else { return };
     let metrics = project.json("eval", "metrics.json", &[]);
-    looks.iter().for_each(|look| says(look, "rays=4000", &metrics));
+    contents.iter().for_each(|content| assert_shows_scores(content, "rays=4000", &metrics));
 }
 
 #[test]
-fn a_page_without_scores_to_read_says_so() {
+fn a_page_reports_unreadable_scores() {
     let project = Project::fast();
     project.ok(&["run"]);
     let mut record = record(&project, 2, "");
     let empty = tempfile::tempdir().unwrap();
     record["nodes"][4]["folder"] = json!(empty.path());
-    // Metrics of somebody's own, without views or figures.
-    let own = tempfile::tempdir().unwrap();
-    std::fs::write(own.path().join("metrics.json"), r#"{"mean": {"mse": 0.25}, "views": {}}"#)
+    // Metrics of a user's own program, without views or figures.
+    let custom = tempfile::tempdir().unwrap();
+    std::fs::write(custom.path().join("metrics.json"), r#"{"mean": {"mse": 0.25}, "views": {}}"#)
         .unwrap();
-    record["nodes"][7]["folder"] = json!(own.path());
+    record["nodes"][7]["folder"] = json!(custom.path());
     let folder = tempfile::tempdir().unwrap();
     let page = page_of(folder.path(), &record);
     let text = std::fs::read_to_string(&page).unwrap();
-    assert!(text.contains("Scores that can't be read") && text.contains("0.2500"), "no such page");
-    let looks = look(&page, 1);
+    assert!(
+        text.contains("Scores that can't be read") && text.contains("0.2500"),
+        "the page lacks the notice or the score"
+    );
+    let contents = operate_page(&page, 1);
     let summary = json!(["0.2500"]);
-    looks.into_iter().flatten().for_each(|look| assert_eq!(look["summary"][0], summary[0]));
+    contents
+        .into_iter()
+        .flatten()
+        .for_each(|content| assert_eq!(content["summary"][0], summary[0]));
 }
 
 fn heading(project: &Project, folder: &str) -> String {
@@ -431,13 +449,15 @@ fn another_data_set_has_its_own_page() {
         let path = project.path("data").join(data_set).canonicalize().unwrap();
         let copy = project.path("sets").join(data_set);
         std::fs::create_dir_all(&copy).unwrap();
-        let all = [path.join("."), copy.clone()];
-        assert!(std::process::Command::new("cp").arg("-r").args(all).status().unwrap().success());
+        let arguments = [path.join("."), copy.clone()];
+        assert!(
+            std::process::Command::new("cp").arg("-r").args(arguments).status().unwrap().success()
+        );
     }
     let run = |data_set: &str| project.ok(&["run", "-i", &format!("dataset=./sets/{data_set}")]);
     assert!(!run("first").contains("before"));
-    let said = run("second");
-    assert!(said.contains("out/report-first/index.html"), "{said}");
+    let stdout = run("second");
+    assert!(stdout.contains("out/report-first/index.html"), "{stdout}");
     assert_eq!(heading(&project, "out/report"), "second");
     assert_eq!(heading(&project, "out/report-first"), "first");
     assert!(run("second").contains("up to date"));

@@ -1,5 +1,5 @@
-//! Photographs of one's own: whatever form their folder has, the cameras are the same, and one
-//! command makes HR views of LR images.
+//! A user's own photographs: every data set format gives equal cameras, and one command renders HR
+//! views of LR photographs.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -14,20 +14,20 @@ use glam::{DMat3, DQuat, DVec3};
 use scene::{Distortion, Intrinsics};
 use serde_json::{Value, json};
 
-fn numbers(v: &Value) -> Vec<f64> {
-    let pose = v["camera"]["camera_to_world"]
+fn camera_numbers(view: &Value) -> Vec<f64> {
+    let pose = view["camera"]["camera_to_world"]
         .as_array()
         .unwrap()
         .iter()
         .flat_map(|r| r.as_array().unwrap().clone());
-    let inside =
-        v["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
-    pose.chain(inside).map(|n| n.as_f64().unwrap()).collect()
+    let intrinsics =
+        view["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
+    pose.chain(intrinsics).map(|n| n.as_f64().unwrap()).collect()
 }
 
-/// The largest difference between the numbers of two views' cameras.
+/// Returns the largest difference between the numbers of two views' cameras.
 fn difference(a: &Value, b: &Value) -> f64 {
-    let (a, b) = (numbers(a), numbers(b));
+    let (a, b) = (camera_numbers(a), camera_numbers(b));
     assert_eq!(a.len(), b.len());
     a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
@@ -37,7 +37,7 @@ fn views(folder: &Path) -> Vec<Value> {
     serde_json::from_str::<Value>(&text).unwrap()["views"].as_array().unwrap().clone()
 }
 
-/// Mean PSNR at LR of what a stage scored.
+/// Returns the mean PSNR at LR that a stage reports.
 #[track_caller]
 fn lr_psnr(project: &Project, stage: &str, settings: &[&str]) -> f64 {
     let metrics = project.json(stage, "metrics.json", settings);
@@ -45,27 +45,27 @@ fn lr_psnr(project: &Project, stage: &str, settings: &[&str]) -> f64 {
 }
 
 #[test]
-fn every_form_gives_the_same_cameras_and_images() {
+fn every_format_gives_equal_cameras_and_images() {
     let project = Project::tiny();
     let mut scenes = Vec::new();
     for form in FORMS {
         let folder = (form.write)(&project);
         let scene = project.path(&format!("scene-{}", form.name));
-        let made = stage(
+        let finished = stage(
             "prep",
             r#"{"lr_source": "photographs", "scale": 1.5}"#,
             &[("dataset", &folder)],
             &scene,
             &[],
         );
-        assert_eq!(made.code, 0, "{}: {}", form.name, made.stderr);
+        assert_eq!(finished.code, 0, "{}: {}", form.name, finished.stderr);
         let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
-        for words in [
+        for text in [
             "17 training views, 3 test views",
             "with assumed kernel box; HR is 48×48",
             "20 photographs",
         ] {
-            assert!(summary.contains(words), "{words} isn't in {summary}");
+            assert!(summary.contains(text), "{text} isn't in {summary}");
         }
         scenes.push(scene);
     }
@@ -85,13 +85,13 @@ fn every_form_gives_the_same_cameras_and_images() {
     assert!(scenes.iter().all(|s| image(s) == image(&scenes[0])));
 }
 
-/// A model written by COLMAP's own library is read, too.
+/// A model written by COLMAP's own library must be readable, too.
 #[test]
 fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
     let project = Project::tiny();
     let folder = as_transforms(&project);
-    let has = std::process::Command::new("python3").args(["-c", "import pycolmap"]).output();
-    if !has.is_ok_and(|o| o.status.success()) {
+    let import = std::process::Command::new("python3").args(["-c", "import pycolmap"]).output();
+    if !import.is_ok_and(|o| o.status.success()) {
         eprintln!("skipped: no pycolmap (python3 -m pip install pycolmap)");
         return;
     }
@@ -108,8 +108,8 @@ fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
     assert!(written.status.success(), "{}", String::from_utf8_lossy(&written.stderr));
     let scenes = [folder, colmap].map(|folder| {
         let scene = folder.with_extension("scene");
-        let made = stage("prep", "{}", &[("dataset", &folder)], &scene, &[]);
-        assert_eq!(made.code, 0, "{}", made.stderr);
+        let finished = stage("prep", "{}", &[("dataset", &folder)], &scene, &[]);
+        assert_eq!(finished.code, 0, "{}", finished.stderr);
         scene
     });
     let [ours, theirs] = scenes.map(|scene| views(&scene.join("train")));
@@ -120,17 +120,17 @@ fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
     }
 }
 
-/// COLMAP's folder and no option: views at twice the size of photographs that nobody has larger,
-/// scored by what can be known.
+/// A COLMAP folder without options must give views at twice the photographs' size, scored at LR
+/// because no HR photographs exist.
 #[test]
-fn one_command_makes_hr_views_of_lr_photographs() {
+fn one_command_renders_hr_views_of_lr_photographs() {
     let project = Project::tiny();
     as_colmap(&project);
-    // One of them is a smaller copy.
-    let copy = project.path("colmap/images/r_3.png");
+    // One photograph is smaller than the others.
+    let path = project.path("colmap/images/r_3.png");
     let small =
-        pixels::resize_pillow(&pixels::read_png(&copy).unwrap(), 20, 20, pixels::Filter::Box);
-    pixels::write_png(&copy, &small).unwrap();
+        pixels::resize_pillow(&pixels::read_png(&path).unwrap(), 20, 20, pixels::Filter::Box);
+    pixels::write_png(&path, &small).unwrap();
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("default: [eval]", "default: [report]");
     project.replace("  eval:", "  report:\n    inputs: {run: eval}\n  eval:");
@@ -139,7 +139,7 @@ fn one_command_makes_hr_views_of_lr_photographs() {
     let metrics = project.json("eval", "metrics.json", &["-i", "dataset=./colmap"]);
     let mean = &metrics["mean"];
     assert!(mean.get("psnr").is_none() && mean.get("ssim").is_none(), "{mean}");
-    // What is far above a page of the mean colour's; wrong poses end there.
+    // Far above an image of the mean colour, which wrong poses lead to.
     assert!(mean["low_resolution"]["psnr"].as_f64().unwrap() > 19.0, "{mean}");
     let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
     assert!(
@@ -147,27 +147,27 @@ fn one_command_makes_hr_views_of_lr_photographs() {
             && page.contains("PSNR at LR")
             && page.contains("\"kind\":\"low-resolution\"")
             && !page.contains("\"kind\":\"ground-truth\""),
-        "no such page"
+        "unexpected width, score or images on the page"
     );
 }
 
-fn scored_with(project: &Project, exposure: &str) -> (f64, Value) {
-    // Each exposure has its own grey behind the objects, which looks like a scene that continues.
+fn score_with(project: &Project, exposure: &str) -> (f64, Value) {
+    // Exposures tint the white background, which then looks like a scene that continues.
     let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", exposure];
     project.ok(&[&["run"], &settings[..]].concat());
     (lr_psnr(project, "eval", &settings), project.json("train-ss", "training.json", &settings))
 }
 
-/// Returns the factors of a photograph's channels.
+/// Returns the exposure factors of a photograph's channels.
 fn exposure_factors(photograph: usize) -> [f32; 3] {
     [0.7f32, 1.0 / 0.7].map(|f| [f, f.sqrt(), 1.0 / f.sqrt()])[photograph % 2]
 }
 
 const WHITE: &str = "background=white";
 
-/// Trains a field on a data set with a setting, and stops it after each given number of rays.
-/// Returns the log and the weights.
-fn field(project: &Project, dataset: &str, setting: &str, stops: &[&str]) -> (Value, Vec<u8>) {
+/// Trains a field on a data set with a setting, interrupted after each number of rays in `stops`.
+/// Returns `training.json` and the weights.
+fn train(project: &Project, dataset: &str, setting: &str, stops: &[&str]) -> (Value, Vec<u8>) {
     let dataset = format!("dataset={dataset}");
     let settings = ["-i", &dataset, "-p", WHITE, "-p", setting];
     let run = [&["run", "train-ss"], &settings[..]].concat();
@@ -182,8 +182,9 @@ fn field(project: &Project, dataset: &str, setting: &str, stops: &[&str]) -> (Va
     (project.json("train-ss", "training.json", &settings), weights)
 }
 
-fn off_by(found: &[[f32; 3]]) -> f32 {
-    found
+/// Returns the sum of the absolute logarithmic errors of estimated exposures.
+fn exposure_error(exposures: &[[f32; 3]]) -> f32 {
+    exposures
         .iter()
         .enumerate()
         .flat_map(|(i, e)| (0..3).map(move |c| (e[c] / exposure_factors(i)[c]).ln().abs()))
@@ -195,75 +196,80 @@ fn copy_folder(from: &Path, to: &Path) {
     assert!(status.success());
 }
 
-/// Photographs of one scene with exposures and white balances of their own: the field has one, and
-/// it is that of the untouched ones.
+/// Photographs have different exposures and white balances; the field must have the mean exposure,
+/// which the unmodified test photographs have.
 #[test]
-fn exposures_are_found() {
+fn exposures_are_estimated() {
     let project = Project::tiny();
     let folder = as_transforms(&project);
     let file = folder.join("transforms.json");
     let transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     copy_folder(&folder, &project.path("equal"));
-    // Every eighth photograph is held out and unchanged; the others' factors have mean 1.
+    // Every eighth photograph is held out and unchanged; the others' factors have geometric mean 1.
     let frames =
         transforms["frames"].as_array().unwrap().iter().enumerate().filter(|(i, _)| i % 8 != 0);
-    for (taken, (_, frame)) in frames.enumerate() {
+    for (index, (_, frame)) in frames.enumerate() {
         let path = folder.join(frame["file_path"].as_str().unwrap());
         let mut image = pixels::read_png(&path).unwrap();
         for pixel in image.data.chunks_exact_mut(4) {
             (0..3).for_each(|c| {
                 pixel[c] =
-                    (f32::from(pixel[c]) * exposure_factors(taken)[c]).round().min(255.0) as u8;
+                    (f32::from(pixel[c]) * exposure_factors(index)[c]).round().min(255.0) as u8;
             });
         }
         pixels::write_png(&path, &image).unwrap();
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 500000");
-    let ((found, training), (ignored, _)) =
-        (scored_with(&project, "exposure=true"), scored_with(&project, "exposure=false"));
+    let ((estimated, training), (ignored, _)) =
+        (score_with(&project, "exposure=true"), score_with(&project, "exposure=false"));
     let exposures: Vec<[f32; 3]> = serde_json::from_value(training["exposures"].clone()).unwrap();
-    println!("{found:.2} dB with exposures, {ignored:.2} dB without; {exposures:?}");
-    // By default the training measures differences, in its first quarter, and then ends in the field
-    // of a training that was told. It needs some hundred steps for this. Stops lie before, while it
-    // measures, and after the training has started over.
+    println!("{estimated:.2} dB with exposures, {ignored:.2} dB without; {exposures:?}");
+    // By default, the first quarter of the training measures exposures, which takes some hundred
+    // steps. The field then equals that of a training with an explicit `exposure`. Stops are before
+    // and during the measurement, and after the training has started over.
     project.replace("samples_per_step: 16384", "samples_per_step: 2048");
-    for (dataset, told, expected, stops) in [
+    for (dataset, explicit, expected, stops) in [
         ("./transforms", "exposure=true", true, &["3000", "60000", "200000"][..]),
         ("./equal", "exposure=false", false, &[]),
     ] {
-        let (training, by_scene) = field(&project, dataset, "train-ss.seed=0", stops);
+        let (training, weights) = train(&project, dataset, "train-ss.seed=0", stops);
         assert_eq!(training["resolved"]["exposure"], json!(expected), "{dataset}");
-        assert!(by_scene == field(&project, dataset, told, &[]).1, "{dataset}");
+        assert!(weights == train(&project, dataset, explicit, &[]).1, "{dataset}");
     }
-    // Against having found nothing: all factors 1.
-    let (off, was) = (off_by(&exposures), off_by(&vec![[1.0; 3]; exposures.len()]));
-    assert!(!exposures.is_empty() && off < 0.5 * was, "off by {off} of {was}: {exposures:?}");
-    assert!(found > ignored + 2.0, "{found} dB with exposures, {ignored} dB without");
-    let open =
+    let (error, initial_error) =
+        (exposure_error(&exposures), exposure_error(&vec![[1.0; 3]; exposures.len()]));
+    assert!(
+        !exposures.is_empty() && error < 0.5 * initial_error,
+        "error {error}, with factors 1 {initial_error}: {exposures:?}"
+    );
+    assert!(estimated > ignored + 2.0, "{estimated} dB with exposures, {ignored} dB without");
+    let with_alpha =
         ["run", "-i", "dataset=./transforms", "-p", "exposure=true", "-p", "background=alpha"];
-    project.run(&open).fails(2, &["parameter exposure", "with prep.background alpha"]);
+    project.run(&with_alpha).fails(2, &["parameter exposure", "with prep.background alpha"]);
 }
 
-fn levels(image: &pixels::Rgba8, column: usize, row: usize) -> [f64; 4] {
+fn pixel_levels(image: &pixels::Rgba8, column: usize, row: usize) -> [f64; 4] {
     [0, 1, 2, 3].map(|c| f64::from(image.data[4 * (row * image.width + column) + c]))
 }
 
-fn through(lens: &Intrinsics, pinhole: &pixels::Rgba8, i: usize) -> [u8; 4] {
+/// Returns the `i`-th pixel of a pinhole camera's image as seen through a lens.
+fn distorted_pixel(lens: &Intrinsics, pinhole: &pixels::Rgba8, i: usize) -> [u8; 4] {
     let (width, height) = (pinhole.width, pinhole.height);
-    let at = lens.undistort([(i % width) as f64 + 0.5, (i / width) as f64 + 0.5]);
-    pixels::sample_cubic((width, height), at, |x, y| levels(pinhole, x, y)).map(|v| (v + 0.5) as u8)
+    let position = lens.undistort([(i % width) as f64 + 0.5, (i / width) as f64 + 0.5]);
+    pixels::sample_cubic((width, height), position, |x, y| pixel_levels(pinhole, x, y))
+        .map(|level| (level + 0.5) as u8)
 }
 
 fn lens_psnr(project: &Project, lens: &str) -> f64 {
-    // Through this lens the objects touch the border, which looks like a scene that continues.
+    // Through this lens, objects touch the image border, which looks like a scene that continues.
     let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", lens];
     project.ok(&[&["run"], &settings[..]].concat());
     lr_psnr(project, "eval", &settings)
 }
 
-/// Photographs taken through a lens that bends lines: rays follow it, or it is undone; without its
-/// coefficients there are floaters.
+/// Photographs have lens distortion: rays that follow the lens, and undistorted images, must both
+/// score better than a training without the distortion coefficients.
 #[test]
 fn lenses_are_followed_or_undone() {
     let project = Project::tiny();
@@ -284,7 +290,7 @@ fn lenses_are_followed_or_undone() {
             &pixels::Rgba8::new(
                 size,
                 size,
-                (0..size * size).flat_map(|i| through(&lens, &pinhole, i)).collect(),
+                (0..size * size).flat_map(|i| distorted_pixel(&lens, &pinhole, i)).collect(),
             ),
         )
         .unwrap();
@@ -292,9 +298,9 @@ fn lenses_are_followed_or_undone() {
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 400000");
     let [followed, undone] = ["lens=follow", "lens=undo"].map(|lens| lens_psnr(&project, lens));
-    let mut without = transforms.clone();
-    (without["k1"], without["p2"]) = (json!(0.0), json!(0.0));
-    std::fs::write(&file, without.to_string()).unwrap();
+    let mut without_lens = transforms.clone();
+    (without_lens["k1"], without_lens["p2"]) = (json!(0.0), json!(0.0));
+    std::fs::write(&file, without_lens.to_string()).unwrap();
     let ignored = lens_psnr(&project, "lens=follow");
     std::fs::write(&file, transforms.to_string()).unwrap();
     println!("{followed:.2} dB followed, {undone:.2} dB undone, {ignored:.2} dB ignored");
@@ -302,19 +308,19 @@ fn lenses_are_followed_or_undone() {
         followed > ignored + 1.0 && undone > ignored + 1.0,
         "{followed} dB followed, {undone} dB undone, {ignored} dB ignored"
     );
-    // Cameras say so, and films don't.
-    let scene = project
+    // The scene's cameras have distortion, those of a camera path don't.
+    let cameras = project
         .artifact("prep", &["-i", "dataset=./transforms", "-p", "background=white"])
         .join("cameras");
     let film = project.path("film");
     assert_eq!(
-        stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &scene)], &film, &[]).code,
+        stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &cameras)], &film, &[]).code,
         0
     );
-    let is_bent =
+    let has_distortion =
         |folder: &Path| views(folder)[0]["camera"]["intrinsics"].get("distortion").is_some();
-    assert!(is_bent(&scene) && !is_bent(&film));
-    // Beyond 0.55 of the focal length nothing is seen by such a lens: the corners have no ray.
+    assert!(has_distortion(&cameras) && !has_distortion(&film));
+    // This lens images nothing beyond 0.55 focal lengths from the axis: the corners have no ray.
     transforms["k1"] = json!(-1.1);
     std::fs::write(&file, transforms.to_string()).unwrap();
     project
@@ -323,14 +329,15 @@ fn lenses_are_followed_or_undone() {
     project.ok(&["run", "prep", "-i", "dataset=./transforms", "-p", "lens=undo"]);
 }
 
-fn scored_registered(project: &Project, refined: &str) -> [f64; 2] {
-    let settings = ["eval", "eval-registered", "-i", "dataset=./transforms", "-p", refined];
+/// Returns the PSNR at LR with given and with registered test poses.
+fn psnr_given_and_registered(project: &Project, refinement: &str) -> [f64; 2] {
+    let settings = ["eval", "eval-registered", "-i", "dataset=./transforms", "-p", refinement];
     project.ok(&[&["run"], &settings[..]].concat());
     ["eval", "eval-registered"].map(|stage| lr_psnr(project, stage, &settings))
 }
 
-/// Photographs whose poses are off by about a pixel: cameras move while the field learns, and those
-/// that it is tested by are found by it.
+/// Poses are off by about a pixel: only refined training poses together with registered test poses
+/// may give the best score.
 #[test]
 fn poses_are_refined_and_test_views_registered() {
     let project = Project::shipped(&["registered"], "");
@@ -338,15 +345,15 @@ fn poses_are_refined_and_test_views_registered() {
     let file = folder.join("transforms.json");
     let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let mut rng = numerics::CounterRng::new(7, 1, 1);
-    let mut off =
+    let mut random_vector =
         |size: f64| DVec3::from([0, 1, 2].map(|_| size * f64::from(2.0 * rng.uniform() - 1.0)));
     for frame in transforms["frames"].as_array_mut().unwrap() {
         let matrix: [[f64; 4]; 4] =
             serde_json::from_value(frame["transform_matrix"].clone()).unwrap();
-        let turn = DMat3::from_quat(DQuat::from_scaled_axis(off(0.02)));
+        let turn = DMat3::from_quat(DQuat::from_scaled_axis(random_vector(0.02)));
         let axes =
             DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| [0, 1, 2].map(|r| matrix[r][c]))) * turn;
-        let shift = off(0.08);
+        let shift = random_vector(0.08);
         let row =
             |r: usize| [axes.x_axis[r], axes.y_axis[r], axes.z_axis[r], matrix[r][3] + shift[r]];
         frame["transform_matrix"] = json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]);
@@ -355,8 +362,8 @@ fn poses_are_refined_and_test_views_registered() {
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 900000");
     let ([as_given, only_registered], [only_refined, both]) = (
-        scored_registered(&project, "pose_refinement=false"),
-        scored_registered(&project, "pose_refinement=true"),
+        psnr_given_and_registered(&project, "pose_refinement=false"),
+        psnr_given_and_registered(&project, "pose_refinement=true"),
     );
     println!(
         "{as_given:.2} dB as given, {only_registered:.2} registered, {only_refined:.2} refined, \
@@ -366,7 +373,7 @@ fn poses_are_refined_and_test_views_registered() {
     let settings = ["-i", "dataset=./transforms", "-p", "pose_refinement=true"];
     let training = project.json("train-ss", "training.json", &settings);
     assert_eq!(training["poses"].as_array().unwrap().len(), 17);
-    let open = [
+    let with_alpha = [
         "run",
         "-i",
         "dataset=./transforms",
@@ -375,11 +382,11 @@ fn poses_are_refined_and_test_views_registered() {
         "-p",
         "background=alpha",
     ];
-    project.run(&open).fails(2, &["parameter pose_refinement", "with prep.background alpha"]);
+    project.run(&with_alpha).fails(2, &["parameter pose_refinement", "with prep.background alpha"]);
 }
 
-fn psnr_with_masks(project: &Project, file: &Path, transforms: &mut Value, keep: bool) -> f64 {
-    for frame in transforms["frames"].as_array_mut().unwrap().iter_mut().filter(|_| !keep) {
+fn psnr_with_masks(project: &Project, file: &Path, transforms: &mut Value, has_masks: bool) -> f64 {
+    for frame in transforms["frames"].as_array_mut().unwrap().iter_mut().filter(|_| !has_masks) {
         frame.as_object_mut().unwrap().remove("mask_path");
     }
     std::fs::write(file, transforms.to_string()).unwrap();
@@ -387,17 +394,17 @@ fn psnr_with_masks(project: &Project, file: &Path, transforms: &mut Value, keep:
     lr_psnr(project, "eval", &["-i", "dataset=./transforms"])
 }
 
-/// Somebody walked through most of the photographs: what the masks leave out is neither learnt nor
-/// scored.
+/// A magenta rectangle covers part of most photographs: its masked pixels must be neither trained
+/// on nor scored.
 #[test]
-fn what_masks_leave_out_is_not_learnt() {
+fn masked_pixels_are_neither_trained_on_nor_scored() {
     let project = Project::tiny();
     let folder = as_transforms(&project);
     let file = folder.join("transforms.json");
     let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     std::fs::create_dir(folder.join("masks")).unwrap();
     for (i, frame) in transforms["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
-        // The held-out ones are free of it but for a corner.
+        // In held-out photographs, the rectangle covers only a corner.
         let (columns, rows) =
             if i % 8 == 0 { (0..4, 0..4) } else { (8 + i % 5..20 + i % 5, 6..26) };
         let name = Path::new(frame["file_path"].as_str().unwrap())
@@ -419,37 +426,37 @@ fn what_masks_leave_out_is_not_learnt() {
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 600000");
     let masked = psnr_with_masks(&project, &file, &mut transforms, true);
-    // With HR truth: PSNR is that of the pixels that count.
-    let small = ["-i", "dataset=./transforms", "-p", "lr_width=16", "-p", "train-ss.rays=20000"];
-    project.ok(&[&["run", "eval"], &small[..]].concat());
-    let object = |stage: &str| project.artifact(stage, &small);
-    let (rendered, truth) = (object("render-depth"), object("prep").join("truth"));
-    let metrics = project.json("eval", "metrics.json", &small);
+    // With HR ground truth, `eval` reports the PSNR of the unmasked pixels.
+    let settings = ["-i", "dataset=./transforms", "-p", "lr_width=16", "-p", "train-ss.rays=20000"];
+    project.ok(&[&["run", "eval"], &settings[..]].concat());
+    let artifact = |stage: &str| project.artifact(stage, &settings);
+    let (rendered, truth) = (artifact("render-depth"), artifact("prep").join("truth"));
+    let metrics = project.json("eval", "metrics.json", &settings);
     let list: scene::Views =
         serde_json::from_slice(&std::fs::read(truth.join("views.json")).unwrap()).unwrap();
-    let shown = list.background.grey_level();
+    let grey = list.background.grey_level();
     for (view, scores) in list.views.iter().zip(metrics["views"].as_array().unwrap()) {
         let file = |path: &Option<String>| truth.join(path.as_ref().unwrap());
         let name = &view.camera.name;
         let found = pixels::read_premultiplied(&rendered.join(format!("images/{name}.exr")))
             .unwrap()
-            .over(shown);
-        let expected = pixels::read_premultiplied(&file(&view.image)).unwrap().over(shown);
+            .over(grey);
+        let expected = pixels::read_premultiplied(&file(&view.image)).unwrap().over(grey);
         let mask = pixels::Mask::read(&file(&view.mask), (32, 32)).unwrap();
         let pixels =
             found.data.chunks_exact(3).zip(expected.data.chunks_exact(3)).zip(&mask.counts);
-        let counted: Vec<f64> = pixels
+        let errors: Vec<f64> = pixels
             .filter(|(_, counts)| **counts)
             .flat_map(|((f, e), _)| {
                 f.iter().zip(e).map(|(f, e)| f64::from(f.clamp(0.0, 1.0) - e).powi(2))
             })
             .collect();
         assert!(
-            counted.len() < 3 * 32 * 32 && counted.len() > 3 * 16 * 32,
+            errors.len() < 3 * 32 * 32 && errors.len() > 3 * 16 * 32,
             "{name}: {} samples",
-            counted.len()
+            errors.len()
         );
-        let by_hand = pixels::psnr_of(counted.iter().sum::<f64>() / counted.len() as f64);
+        let by_hand = pixels::psnr_of(errors.iter().sum::<f64>() / errors.len() as f64);
         let psnr = scores["scores"]["psnr"].as_f64().unwrap();
         assert!((psnr - by_hand).abs() < 1e-3, "{name}: {psnr}, by hand {by_hand}");
     }
@@ -462,16 +469,16 @@ fn what_masks_leave_out_is_not_learnt() {
 }
 
 #[track_caller]
-fn refused(folder: &Path, out: &Path, params: &str, words: &[&str]) {
+fn assert_prep_fails(folder: &Path, out: &Path, params: &str, words: &[&str]) {
     stage("prep", params, &[("dataset", folder)], out, &[]).fails(2, words);
 }
 
 #[test]
-fn contradictions_are_refused() {
+fn contradictory_parameters_are_refused() {
     let project = Project::tiny();
     let folder = as_transforms(&project);
     let out = project.path("out");
-    refused(
+    assert_prep_fails(
         &folder,
         &out,
         r#"{"lr_source": "photographs", "kernel": "average"}"#,
@@ -479,56 +486,55 @@ fn contradictions_are_refused() {
     );
 }
 
-fn names(scene: &Path, subtree: &str) -> Vec<Value> {
+fn view_names(scene: &Path, subtree: &str) -> Vec<Value> {
     views(&scene.join(subtree)).iter().map(|v| v["camera"]["name"].clone()).collect()
 }
 
-/// The paper's split: all views for training and all but the references for testing.
+/// The paper's split must train on all views and test on all but the references.
 #[test]
 fn the_papers_split_leaves_references_out() {
     let project = Project::tiny();
     let folder = as_llff(&project);
     let scene = project.path("scene");
-    let made = stage(
+    let finished = stage(
         "prep",
         r#"{"split": "paper", "hr_references": 3}"#,
         &[("dataset", &folder)],
         &scene,
         &[],
     );
-    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
     assert_eq!((views(&scene.join("train")).len(), views(&scene.join("truth")).len()), (20, 17));
-    let (references, tested) = (names(&scene, "references"), names(&scene, "truth"));
-    // The first view, and others far from it, of which none is tested.
+    let (references, tested) = (view_names(&scene, "references"), view_names(&scene, "truth"));
+    // References are the first view and others far from the first, none of which is tested.
     assert_eq!((references.len(), &references[0]), (3, &json!("r_0")));
     assert!(references.iter().all(|name| !tested.contains(name)), "{references:?} of {tested:?}");
     assert_ne!(references[1], json!("r_1"));
 }
 
 fn psnr_and_depth_error(project: &Project, settings: [&str; 2]) -> (f64, f64) {
-    let all = settings.into_iter().chain(["backdrop=true", "near=2", "far=80"]);
-    let all: Vec<&str> = all.flat_map(|setting| ["-p", setting]).collect();
-    project.ok(&[&["run"], &all[..]].concat());
-    let mean = project.json("eval", "metrics.json", &all)["mean"].take();
+    let settings = settings.into_iter().chain(["backdrop=true", "near=2", "far=80"]);
+    let arguments: Vec<&str> = settings.flat_map(|setting| ["-p", setting]).collect();
+    project.ok(&[&["run"], &arguments[..]].concat());
+    let mean = project.json("eval", "metrics.json", &arguments)["mean"].take();
     (mean["psnr"].as_f64().unwrap(), mean["depth"]["median_absolute"].as_f64().unwrap())
 }
 
-/// A world without end, seen from the front and from all around: trained in NDC and in a
-/// contraction. Depth is the camera's z, whatever the field's own space, and the views are better
-/// than a box's, whose world ends.
+/// Unbounded scenes, observed from the front and from all around, are trained in NDC and in a
+/// contraction. Depth must be the camera's z in both spaces, and PSNR higher than in a bounded box.
 #[test]
-fn worlds_without_end_have_a_space_of_their_own() {
+fn ndc_and_contraction_suit_unbounded_scenes() {
     let project = Project::tiny();
     project.replace("train: 12", "train: 30");
     project.replace("rays: 60000", "rays: 400000");
-    for (layout, space, least, depth_error) in [
+    for (layout, space, min_psnr, max_error) in [
         ("layout=forward", "space=ndc", 22.0, 0.7),
         ("layout=around", "space=contraction", 18.0, 0.7),
     ] {
-        let (psnr, depth) = psnr_and_depth_error(&project, [layout, space]);
-        let (psnr_of_box, _) = psnr_and_depth_error(&project, [layout, "space=box"]);
-        println!("{space}: {psnr:.2} dB, depth off by {depth:.3}; box {psnr_of_box:.2} dB");
-        assert!(psnr > least && depth < depth_error, "{space}: {psnr} dB, depth off by {depth}");
-        assert!(psnr > psnr_of_box, "{space}: {psnr} dB, box {psnr_of_box}");
+        let (psnr, error) = psnr_and_depth_error(&project, [layout, space]);
+        let (box_psnr, _) = psnr_and_depth_error(&project, [layout, "space=box"]);
+        println!("{space}: {psnr:.2} dB, depth error {error:.3}; box {box_psnr:.2} dB");
+        assert!(psnr > min_psnr && error < max_error, "{space}: {psnr} dB, depth error {error}");
+        assert!(psnr > box_psnr, "{space}: {psnr} dB, box {box_psnr}");
     }
 }

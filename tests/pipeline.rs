@@ -12,14 +12,14 @@ use safetensors::tensor::TensorView;
 use scene::Views;
 
 #[test]
-fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
+fn second_runs_and_cosmetic_changes_run_nothing() {
     let project = Project::tiny();
     let first = project.ok(&["run"]);
     assert!(first.contains("eval: PSNR"), "{first}");
     assert!(first.contains("5 of 5 stages ran"), "{first}");
     let listing = project.store_listing();
     assert!(project.ok(&["run"]).contains("nothing to run"));
-    // A comment, another order of keys, another number of threads, another place.
+    // A comment, another order of keys, another number of threads, another folder.
     project.replace("default: [eval]", "# a comment\ndefault: [eval]");
     project.replace("{lr_width: 24, scale: 2}", "{scale: 2, lr_width: 24}");
     assert!(project.ok(&["run", "--threads", "1"]).contains("nothing to run"));
@@ -31,38 +31,38 @@ fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
 }
 
 #[test]
-fn why_names_the_changed_parameter_and_equal_output_cuts_off() {
+fn why_names_changed_parameters_and_equal_outputs_stop_reruns() {
     let project = Project::tiny();
     assert!(project.ok(&["why", "prep"]).contains("waits for demo-scene"));
     project.ok(&["run"]);
     assert!(project.ok(&["why", "prep"]).contains("cached"));
-    // Another kernel: prep reruns, what depends on it waits for it.
+    // With another kernel, prep reruns, and its dependents wait for prep.
     let why = project.ok(&["why", "train-ss", "-p", "kernel=box"]);
     assert!(why.contains("train-ss: waits for prep"), "{why}");
     assert!(why.contains(r#"prep: will run: parameter kernel: null → "box""#), "{why}");
     let plan = project.ok(&["plan", "-p", "kernel=box"]);
     assert!(plan.lines().any(|l| l.starts_with("demo-scene") && l.contains("cached")), "{plan}");
     assert!(plan.lines().any(|l| l.starts_with("eval") && l.contains("waits for")), "{plan}");
-    // The default said: prep runs, its output is equal, all else stays cached.
+    // With an explicit default, prep runs, its output is equal, and other stages stay cached.
     let run = project.ok(&["run", "-p", "lr_source=downscaled"]);
     assert!(run.contains("1 of 5 stages ran, 4 were cached"), "{run}");
-    // And with the other kernel everything after demo-scene runs.
+    // With the other kernel, every stage after demo-scene runs.
     let run = project.ok(&["run", "-p", "kernel=box"]);
     assert!(run.contains("4 of 5 stages ran, 1 was cached"), "{run}");
 }
 
 #[test]
-fn equal_bytes_with_one_and_two_threads() {
-    let (one, two) = (Project::tiny(), Project::tiny());
-    one.ok(&["run", "--threads", "1"]);
-    two.ok(&["run", "--threads", "2"]);
+fn one_and_two_threads_give_equal_bytes() {
+    let (one_thread, two_threads) = (Project::tiny(), Project::tiny());
+    one_thread.ok(&["run", "--threads", "1"]);
+    two_threads.ok(&["run", "--threads", "2"]);
     for stage in ["demo-scene", "prep", "train-ss", "render-depth", "eval"] {
-        assert_eq!(one.output_of(stage, &[]), two.output_of(stage, &[]), "{stage}");
+        assert_eq!(one_thread.output_of(stage, &[]), two_threads.output_of(stage, &[]), "{stage}");
     }
 }
 
 #[test]
-fn a_sweep_shares_what_it_can() {
+fn a_sweep_shares_common_artifacts() {
     let project = Project::tiny();
     let sweep = ["-p", "supersample=1,2", "-p", "render-depth.samples_per_axis=1,2"];
     let run = project.ok(&[&["run"][..], &sweep].concat());
@@ -70,27 +70,26 @@ fn a_sweep_shares_what_it_can() {
     assert!(run.contains("12 of 12 stages ran"), "{run}");
     assert!(run.contains("eval [supersample=2, samples_per_axis=2]: PSNR"), "{run}");
     assert_eq!(project.output_of("train-ss", &sweep).len(), 2);
-    // A single point of it is cached.
+    // A single point of the sweep is cached.
     assert!(project.ok(&["run", "-p", "supersample=1"]).contains("nothing to run"));
 }
 
-fn tensor_of<'a>(zeros: &'a [u8], shape: &[usize]) -> TensorView<'a> {
+fn zero_tensor<'a>(zeros: &'a [u8], shape: &[usize]) -> TensorView<'a> {
     let length = 4 * shape.iter().product::<usize>();
     TensorView::new(Dtype::F32, shape.to_vec(), &zeros[..length]).unwrap()
 }
 
-/// Tensors of zeros.
+/// Writes a safetensors file with tensors of zeros.
 fn write_zeros(file: &Path, shapes: &[(String, Vec<usize>)]) {
-    let longest = shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).max();
-    let zeros = vec![0u8; 4 * longest.unwrap()];
-    let tensors = shapes.iter().map(|(name, shape)| (name.as_str(), tensor_of(&zeros, shape)));
+    let max_length = shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).max();
+    let zeros = vec![0u8; 4 * max_length.unwrap()];
+    let tensors = shapes.iter().map(|(name, shape)| (name.as_str(), zero_tensor(&zeros, shape)));
     std::fs::write(file, safetensors::serialize(tensors, None).unwrap()).unwrap();
 }
 
-/// LPIPS stands for each network that is there with its heads, and what lacks for the others is
-/// said.
+/// Each network with its heads must give an LPIPS score; missing files of others must be reported.
 #[test]
-fn every_network_given_scores() {
+fn every_complete_lpips_network_scores() {
     let project = Project::tiny();
     let folder = project.path("weights");
     std::fs::create_dir(&folder).unwrap();
@@ -107,7 +106,7 @@ fn every_network_given_scores() {
         ]
     });
     write_zeros(&folder.join("alexnet.safetensors"), &network.collect::<Vec<_>>());
-    // Without its heads it isn't whole.
+    // Without its heads, AlexNet is incomplete.
     project.run(&arguments).fails(3, &["no LPIPS network found"]);
     let heads = layers
         .iter()
@@ -121,20 +120,20 @@ fn every_network_given_scores() {
         "{}",
         metrics["mean"]
     );
-    // A network without weights sees no difference.
+    // With weights of zero, a network finds no difference.
     assert_eq!(metrics["mean"]["lpips_alex"], 0.0);
-    let said = metrics["conventions"]["lpips"].as_str().unwrap();
+    let convention = metrics["conventions"]["lpips"].as_str().unwrap();
     assert!(
-        said.contains("by AlexNet (lpips_alex); weights not given for others")
-            && said.contains("vgg16"),
-        "{said}"
+        convention.contains("by AlexNet (lpips_alex); weights not given for others")
+            && convention.contains("vgg16"),
+        "{convention}"
     );
     let ssim = |name: &str| metrics["mean"][name].as_f64().unwrap();
     assert!(ssim("ssim") != ssim("ssim_valid") && (ssim("ssim") - ssim("ssim_valid")).abs() < 0.2);
 }
 
 #[test]
-fn graph_status_log_gc_and_verify() {
+fn graph_status_log_gc_and_verify_report_the_store() {
     let project = Project::tiny();
     project.ok(&["run"]);
     assert!(project.ok(&["graph"]).contains("train-ss (cached)  ← scene = prep/train"));
@@ -149,10 +148,10 @@ fn graph_status_log_gc_and_verify() {
     // Artifacts of another kernel are garbage, those of the pipeline are not.
     project.ok(&["run", "-p", "kernel=box"]);
     let before = project.store_listing();
-    assert!(project.ok(&["gc"]).contains("0.0 MB deleted"), "young things stay");
+    assert!(project.ok(&["gc"]).contains("0.0 MB deleted"), "recent artifacts stay");
     assert_eq!(project.store_listing(), before);
-    let dry = project.ok(&["gc", "--dry-run", "--keep-days", "0"]);
-    assert!(dry.contains("train-ss") && dry.contains("would be deleted"), "{dry}");
+    let report = project.ok(&["gc", "--dry-run", "--keep-days", "0"]);
+    assert!(report.contains("train-ss") && report.contains("would be deleted"), "{report}");
     assert_eq!(project.store_listing(), before);
     project.ok(&["gc", "--keep-days", "0"]);
     assert_eq!(project.store_listing().len(), before.len() - 4 * 3);
@@ -168,7 +167,7 @@ fn the_page_is_written_and_then_up_to_date() {
     let run = project.ok(&["run", "-p", "supersample=1,2"]);
     assert!(run.contains("out/report/index.html"), "{run}");
     let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
-    for words in [
+    for text in [
         "supersample=1",
         "supersample=2",
         "data:image/png;base64,",
@@ -176,9 +175,9 @@ fn the_page_is_written_and_then_up_to_date() {
         "Depth maps",
         "\"label\":\"Ground truth\",\"group\":\"Observations\"",
     ] {
-        assert!(page.contains(words), "the page lacks {words:?}");
+        assert!(page.contains(text), "the page lacks {text:?}");
     }
-    // Nothing is fetched from anywhere: the one address is SVG's name.
+    // The page fetches nothing: its only address is the namespace of SVG.
     assert!(page.contains("default-src 'none'") && !page.contains("https://"));
     assert_eq!(page.matches("http://").count(), page.matches("http://www.w3.org/2000/svg").count());
     let again = project.ok(&["run", "-p", "supersample=1,2"]);
@@ -186,7 +185,7 @@ fn the_page_is_written_and_then_up_to_date() {
 }
 
 #[test]
-fn a_stage_in_python_takes_evals_place() {
+fn a_python_program_replaces_eval() {
     let project = Project::tiny();
     let script = common::root().join("scripts/example-eval.py");
     std::fs::copy(script, project.path("my-eval.py")).unwrap();
@@ -197,7 +196,7 @@ fn a_stage_in_python_takes_evals_place() {
     assert!(project.ok(&["log", "eval"]).contains("scoring with Python"));
     let why = project.ok(&["why", "eval", "-p", "peak=1"]);
     assert!(why.contains("parameter peak: 255 → 1"), "{why}");
-    // Changed code is noticed, and the rest isn't run again.
+    // A changed program is noticed, and the other stages stay cached.
     let text = std::fs::read_to_string(project.path("my-eval.py")).unwrap();
     project.write("my-eval.py", &text.replace("scoring with Python", "scoring anew"));
     std::process::Command::new("chmod").arg("+x").arg(project.path("my-eval.py")).status().unwrap();
@@ -210,7 +209,7 @@ fn spawn(project: &Project) -> Child {
 }
 
 #[test]
-fn two_runners_at_once_make_everything_once() {
+fn two_runners_at_once_run_each_stage_once() {
     let project = Project::tiny();
     let runners = [spawn(&project), spawn(&project)]
         .map(|child| Finished::of(child.wait_with_output().unwrap()));
@@ -227,7 +226,7 @@ fn two_runners_at_once_make_everything_once() {
     assert_eq!(ran, 5);
 }
 
-/// Options that change the data between stages, and the measured PSNR of each.
+/// Measured PSNR of settings that change the data between stages.
 const OPTIONS: [(f64, &str); 11] = [
     (22.28, "background=alpha"),
     (22.41, "background=black kernel=bicubic"),
@@ -246,7 +245,7 @@ const OPTIONS: [(f64, &str); 11] = [
     ),
 ];
 
-/// Mean PSNR of the rendered views, from the images themselves.
+/// Computes the mean PSNR of the rendered views from the images.
 fn psnr_by_hand(project: &Project, options: &[&str]) -> f64 {
     let rendered = project.artifact("render-depth", options);
     let truth = project.artifact("prep", options).join("truth");
@@ -268,9 +267,9 @@ fn psnr_of_files(list: &Views, found: &Path, expected: &Path) -> f64 {
     pixels::psnr_of(errors.sum::<f64>() / found.data.len() as f64)
 }
 
-/// Each option through the whole pipeline to the score that its images have.
+/// With each setting, `eval` must report the PSNR of the images, close to the measured one.
 #[test]
-fn every_option_goes_through() {
+fn every_setting_has_its_measured_psnr() {
     let project = Project::tiny();
     project.replace("rays: 60000", "rays: 150000");
     for (measured, settings) in OPTIONS {
@@ -281,23 +280,25 @@ fn every_option_goes_through() {
         assert!(run.contains(&format!("eval: PSNR {psnr:.2} dB")), "{settings}: {run}");
         let by_hand = psnr_by_hand(&project, &options);
         assert!((psnr - by_hand).abs() < 1e-3, "{settings}: {psnr} dB, by hand {by_hand}");
-        // A change of the engine may move it by a little.
+        // Changes of training or rendering may change the PSNR a little.
         assert!((psnr - measured).abs() < 1.0, "{settings}: {psnr} dB, measured {measured}");
         assert!(run.contains("depth error"), "{run}");
     }
 }
 
-fn weights(stage: &Path, m: usize) -> Vec<u8> {
-    std::fs::read(stage.join(format!("field-{m}.safetensors"))).unwrap()
+fn member_weights(field: &Path, member: usize) -> Vec<u8> {
+    std::fs::read(field.join(format!("field-{member}.safetensors"))).unwrap()
 }
 
-/// Member m of several is what seed + m gives alone, and what is rendered is their mean.
+/// Member m of an ensemble must equal a field trained alone with seed + m, and rendered views must
+/// be the mean of the members' views.
 #[test]
-fn members_are_fields_of_their_own_and_average() {
+fn ensemble_members_are_trained_independently_and_averaged() {
     let project = Project::tiny();
-    let of = |stage: &str, more: &[&str]| project.artifact(stage, more);
-    // With all rays everywhere: by which rays a mean is shown depends on the mean.
-    let both = [
+    let artifact = |stage: &str, settings: &[&str]| project.artifact(stage, settings);
+    // Tolerance 0 renders all sub-pixel rays. Adaptive sampling would choose them by the mean's
+    // error for the ensemble, and by one field's error for the single fields.
+    let ensemble = [
         "-p",
         "render-depth.tolerance=0",
         "-p",
@@ -309,16 +310,16 @@ fn members_are_fields_of_their_own_and_average() {
     ];
     let singles = ["train-ss.seed=4", "train-ss.seed=5"]
         .map(|seed| ["-p", "render-depth.tolerance=0", "-p", seed, "-p", "rays=30000"]);
-    project.ok(&[&["run"], &both[..]].concat());
-    let views = of("render-depth", &both);
+    project.ok(&[&["run"], &ensemble[..]].concat());
+    let (views, field) = (artifact("render-depth", &ensemble), artifact("train-ss", &ensemble));
     let mut images = Vec::new();
     for (m, single) in singles.iter().enumerate() {
         project.ok(&[&["run"], &single[..]].concat());
         assert!(
-            weights(&of("train-ss", &both), m) == weights(&of("train-ss", single), 0),
+            member_weights(&field, m) == member_weights(&artifact("train-ss", single), 0),
             "member {m}"
         );
-        images.push(of("render-depth", single).join("images"));
+        images.push(artifact("render-depth", single).join("images"));
     }
     for entry in std::fs::read_dir(views.join("images")).unwrap() {
         let name = entry.unwrap().file_name();
@@ -326,20 +327,20 @@ fn members_are_fields_of_their_own_and_average() {
         let (mean, a, b) = (read(&views.join("images")), read(&images[0]), read(&images[1]));
         for channel in ["R", "G", "B", "A"] {
             let samples = |image: &pixels::ExrImage| image.channel(channel).unwrap().to_vec();
-            for (m, (a, b)) in samples(&mean).iter().zip(samples(&a).iter().zip(samples(&b))) {
-                assert!((m - (a + b) / 2.0).abs() < 1e-3, "{channel}: {m} of {a} and {b}");
+            for (mean, (a, b)) in samples(&mean).iter().zip(samples(&a).iter().zip(samples(&b))) {
+                assert!((mean - (a + b) / 2.0).abs() < 1e-3, "{channel}: {mean} of {a} and {b}");
             }
         }
     }
 }
 
-/// A field renders at any size, and images need not be square.
+/// A field must render at any size, and images need not be square.
 #[test]
-fn any_size_and_shape() {
+fn renders_have_any_size_and_shape() {
     let project = Project::tiny();
     project.ok(&["run", "render-depth", "-p", "render-depth.size=1"]);
     project.ok(&["run", "render-depth", "-p", "render-depth.size=100"]);
-    // Cut the data set's images to 48×30: the same focal length, the same centre.
+    // Crops the data set's images to 48×30, with an equal focal length and centre.
     let dataset = project.artifact("demo-scene", &[]);
     for split in ["train", "test"] {
         let text =

@@ -1,11 +1,11 @@
-//! The shipped `pipelines/`: found by their names, and sharing one store. Nothing slow is run.
+//! Shipped `pipelines/`: targets are found by name and share one store. No slow stage runs.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
 use common::Project;
 
-/// The fast pipeline with the shipped targets beside it.
+/// Creates a project with the fast pipeline and the shipped targets.
 fn project() -> Project {
     let project = Project::fast();
     project.copy_folder("pipelines", ".");
@@ -13,9 +13,9 @@ fn project() -> Project {
 }
 
 #[test]
-fn every_verb_finds_a_target_of_its_own_file() {
+fn every_verb_finds_shipped_targets() {
     let project = project();
-    for (arguments, words) in [
+    for (arguments, texts) in [
         (&["plan", "refined"][..], &["downscaled-field", "eval-refined", "refined"][..]),
         (&["plan", "eval-refined"], &["downscaled-field", "eval-refined"]),
         (
@@ -39,35 +39,35 @@ fn every_verb_finds_a_target_of_its_own_file() {
         (&["gc", "refined", "--dry-run"], &["would be kept"]),
         (&["describe", "train-refine"], &["Usage: train-refine ", "\nParameters, "]),
     ] {
-        let said = project.ok(arguments);
-        assert!(words.iter().all(|word| said.contains(word)), "{arguments:?}: {said}");
+        let output = project.ok(arguments);
+        assert!(texts.iter().all(|text| output.contains(text)), "{arguments:?}: {output}");
     }
     project.run(&["pin", "kept", "video"]).fails(2, &["has no artifact to pin yet"]);
 }
 
-/// A file of `pipelines/`, by any path, uses the artifacts and pages that pipeline.yaml made.
+/// A file of `pipelines/`, given by name or path, uses the store of pipeline.yaml.
 #[test]
 fn targets_share_one_store() {
     let project = project();
     project.ok(&["run", "prep"]);
     project.ok(&["run", "camera-path"]);
-    let said = project.ok(&["plan", "camera-path", "--pipeline", "pipelines/video.yaml"]);
-    assert!(said.contains("cached") && !said.contains("will run"), "{said}");
+    let plan = project.ok(&["plan", "camera-path", "--pipeline", "pipelines/video.yaml"]);
+    assert!(plan.contains("cached") && !plan.contains("will run"), "{plan}");
     assert!(!project.path("pipelines/.nerf-sr").exists());
-    let made = project.output_of("camera-path", &["camera-path"]);
+    let artifacts = project.output_of("camera-path", &["camera-path"]);
     assert_eq!(
-        made,
+        artifacts,
         project.output_of("camera-path", &["video", "--pipeline", "pipelines/video.yaml"])
     );
-    // A folder is named from the file in which it stands.
+    // A folder is relative to the pipeline file that names the folder.
     let dataset = project.artifact("demo-scene", &[]);
     std::os::unix::fs::symlink(dataset, project.path("scene")).unwrap();
     project.write(
         "pipelines/mine.yaml",
         "extends: ../pipeline.yaml\nstages:\n  prep: {inputs: {dataset: ../scene}}\n",
     );
-    let said = project.ok(&["plan", "mine"]);
-    assert!(!said.contains("demo-scene") && said.contains("report"), "{said}");
+    let plan = project.ok(&["plan", "mine"]);
+    assert!(!plan.contains("demo-scene") && plan.contains("report"), "{plan}");
     project.write(
         "pipelines/mine.yaml",
         "extends: ../pipeline.yaml\nstages:\n  prep: {inputs: {dataset: ./scene}}\n",
@@ -76,9 +76,9 @@ fn targets_share_one_store() {
 }
 
 #[test]
-fn wrong_names_are_told_the_nearest() {
+fn unknown_names_get_a_suggestion() {
     let project = project();
-    for (arguments, words) in [
+    for (arguments, texts) in [
         (&["run", "regsitered"][..], &["no stage \"regsitered\"", "did you mean registered?"][..]),
         (&["why", "downscaled-fields", "refined"], &["did you mean downscaled-field?"]),
         (&["describe", "registers"], &["did you mean register?"]),
@@ -87,7 +87,7 @@ fn wrong_names_are_told_the_nearest() {
             &["did you mean downscaled-field?"],
         ),
     ] {
-        project.run(arguments).fails(2, words);
+        project.run(arguments).fails(2, texts);
     }
     project.replace("scene: prep/train", "scene: prep/trian");
     project

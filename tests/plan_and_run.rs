@@ -1,5 +1,5 @@
-//! Property: `plan` and `run` agree, over random pipelines, edits and overrides. NERF_SR_SEED says
-//! which.
+//! Property test: `plan` and `run` agree, for pipelines, edits and overrides drawn from
+//! NERF_SR_SEED.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -12,8 +12,9 @@ use common::Project;
 use numerics::CounterRng;
 use serde_json::Value;
 
-/// A stage in shell. Its output follows from its inputs and from half of its value, that in `sub`
-/// from the value alone: so a change may come out as before. It notes the key under which it ran.
+/// Stage as a shell script. The output depends on the inputs and on half of `value`, rounded down;
+/// the subtree `sub` depends on this half alone. So a new value may leave the output unchanged. The
+/// stage appends its key to `ran`.
 const PROGRAM: &str = r#"#!/bin/sh
 if [ "$1" = describe ]; then
     input='{"kinds": ["text"], "summary": "a text", "optional": true}'
@@ -40,7 +41,7 @@ const SOURCES: u64 = 2;
 const PROGRAMS: u64 = 2;
 const STAGES: u64 = 5;
 
-/// A stage of the pipeline.
+/// Stage of a pipeline.
 struct Block {
     program: u64,
     value: u64,
@@ -48,49 +49,50 @@ struct Block {
     inputs: BTreeMap<&'static str, String>,
 }
 
-/// A project and all that is drawn for it.
-struct World {
+/// Test case: a project with a randomly drawn pipeline.
+struct Case {
     project: Project,
     draws: CounterRng,
     blocks: Vec<Block>,
-    /// `-p` and `-i` of the next commands.
+    /// Arguments `-p` and `-i` of the next commands.
     overrides: Vec<String>,
-    edits: u64,
+    /// Number of programs written so far, which makes each program unique.
+    written_programs: u64,
 }
 
-impl World {
+impl Case {
     fn new(seed: u64, number: u64) -> Self {
-        let mut world = Self {
+        let mut case = Self {
             project: Project::new(""),
             draws: CounterRng::new(seed, 0, number),
             blocks: Vec::new(),
             overrides: Vec::new(),
-            edits: 0,
+            written_programs: 0,
         };
         for program in 0..PROGRAMS {
-            world.write_program(program);
+            case.write_program(program);
         }
         for source in 0..SOURCES {
-            world.write_source(source);
+            case.write_source(source);
         }
-        for index in 0..1 + world.draws.below(STAGES) {
-            let block = world.block(index);
-            world.blocks.push(block);
+        for index in 0..1 + case.draws.below(STAGES) {
+            let block = case.draw_block(index);
+            case.blocks.push(block);
         }
-        world.write_pipeline();
-        world
+        case.write_pipeline();
+        case
     }
 
-    fn block(&mut self, index: u64) -> Block {
-        let mut inputs = BTreeMap::from([("a", self.origin(index))]);
+    fn draw_block(&mut self, index: u64) -> Block {
+        let mut inputs = BTreeMap::from([("a", self.draw_input(index))]);
         if self.draws.below(2) == 0 {
-            inputs.insert("b", self.origin(index));
+            inputs.insert("b", self.draw_input(index));
         }
         Block { program: self.draws.below(PROGRAMS), value: self.draws.below(6), inputs }
     }
 
-    /// A source, or an earlier stage or a folder of it.
-    fn origin(&mut self, index: u64) -> String {
+    /// Draws an input: a source, an earlier stage or an earlier stage's subtree.
+    fn draw_input(&mut self, index: u64) -> String {
         match self.draws.below(index + 1) {
             0 => format!("./source{}", self.draws.below(SOURCES)),
             stage => format!("s{}{}", stage - 1, ["", "/sub"][self.draws.below(2) as usize]),
@@ -98,9 +100,11 @@ impl World {
     }
 
     fn write_program(&mut self, program: u64) {
-        self.edits += 1;
-        self.project
-            .program(&format!("p{program}"), &format!("{PROGRAM}# p{program}, {}\n", self.edits));
+        self.written_programs += 1;
+        self.project.program(
+            &format!("p{program}"),
+            &format!("{PROGRAM}# p{program}, {}\n", self.written_programs),
+        );
     }
 
     fn write_source(&mut self, source: u64) {
@@ -124,12 +128,12 @@ impl World {
         self.project.write("pipeline.yaml", &text);
     }
 
-    /// Changes something.
+    /// Makes a random change of the pipeline, a program, a source, the overrides or the store.
     fn edit(&mut self) {
         let index = self.draws.below(self.blocks.len() as u64) as usize;
         match self.draws.below(9) {
             0 => self.blocks[index].value = self.draws.below(6),
-            1 => self.blocks[index] = self.block(index as u64),
+            1 => self.blocks[index] = self.draw_block(index as u64),
             2 => {
                 let source = self.draws.below(SOURCES);
                 self.write_source(source);
@@ -139,7 +143,8 @@ impl World {
                 self.write_program(program);
             }
             4 => {
-                self.overrides = vec!["-p".to_owned(), format!("s{index}.value={}", self.values())];
+                self.overrides =
+                    vec!["-p".to_owned(), format!("s{index}.value={}", self.draw_values())];
             }
             5 => {
                 self.overrides = vec![
@@ -147,44 +152,44 @@ impl World {
                     format!("s{index}.a=./source{}", self.draws.below(SOURCES)),
                 ];
             }
-            6 => self.harm("objects", "/all.txt"),
-            7 => self.harm("actions", ""),
-            _ => self.add_or_remove(),
+            6 => self.damage_file("objects", "/all.txt"),
+            7 => self.damage_file("actions", ""),
+            _ => self.add_or_remove_stage(),
         }
         self.write_pipeline();
     }
 
-    /// Adds a stage at the end, or takes the last away.
-    fn add_or_remove(&mut self) {
+    /// Adds a stage at the end or removes the last stage.
+    fn add_or_remove_stage(&mut self) {
         self.overrides.clear();
         if self.blocks.len() > 1 && self.draws.below(2) == 0 {
             self.blocks.pop();
         } else {
-            let block = self.block(self.blocks.len() as u64);
+            let block = self.draw_block(self.blocks.len() as u64);
             self.blocks.push(block);
         }
     }
 
-    /// Keys that have a record, each with whether its artifact is whole: what a run needn't make.
+    /// Returns the recorded keys; the value is true if the key's artifact is complete.
     fn records(&self) -> BTreeMap<String, bool> {
         let store = store::Store::open(&self.project.path(".nerf-sr")).unwrap();
         let keys = store.records().unwrap().into_iter().map(|record| record.key());
         keys.map(|key| (key.clone(), store.hit(&key).unwrap().is_some())).collect()
     }
 
-    /// One value or a sweep's.
-    fn values(&mut self) -> String {
+    /// Draws the values of a parameter: one or, for a sweep, several.
+    fn draw_values(&mut self) -> String {
         let values: BTreeSet<u64> =
             (0..1 + self.draws.below(3)).map(|_| self.draws.below(6)).collect();
         values.iter().map(u64::to_string).collect::<Vec<_>>().join(",")
     }
 
-    /// Cuts a file of the store short, or takes it away: one of a folder, or one below an entry of
-    /// it.
-    fn harm(&mut self, folder: &str, below: &str) {
+    /// Empties or deletes a random file of the store. The file's path is an entry of `folder`,
+    /// followed by `suffix`.
+    fn damage_file(&mut self, folder: &str, suffix: &str) {
         let entries = std::fs::read_dir(self.project.path(".nerf-sr").join(folder)).unwrap();
         let paths = entries
-            .map(|entry| entry.unwrap().path().into_os_string().into_string().unwrap() + below);
+            .map(|entry| entry.unwrap().path().into_os_string().into_string().unwrap() + suffix);
         let mut paths: Vec<String> = paths.filter(|path| Path::new(path).is_file()).collect();
         paths.sort();
         let chosen = &paths[self.draws.below(paths.len() as u64) as usize];
@@ -195,14 +200,14 @@ impl World {
         }
     }
 
-    fn words<'a>(&'a self, verb: &[&'a str]) -> Vec<&'a str> {
-        verb.iter().copied().chain(self.overrides.iter().map(String::as_str)).collect()
+    fn with_overrides<'a>(&'a self, arguments: &[&'a str]) -> Vec<&'a str> {
+        arguments.iter().copied().chain(self.overrides.iter().map(String::as_str)).collect()
     }
 
-    /// The nodes as a looking verb has them; none where it doesn't start a new program before a run
-    /// has.
-    fn nodes(&self, verb: &[&str]) -> Vec<Value> {
-        let finished = self.project.run(&self.words(verb));
+    /// Returns the nodes that `plan` or `status` reports, or none if the verb refuses to start a
+    /// program that no run has started yet.
+    fn nodes(&self, arguments: &[&str]) -> Vec<Value> {
+        let finished = self.project.run(&self.with_overrides(arguments));
         if finished.stderr.contains("check what the program does, then start it") {
             return Vec::new();
         }
@@ -211,11 +216,11 @@ impl World {
         report["nodes"].as_array().unwrap().clone()
     }
 
-    /// Runs all; the keys that ran, sorted.
-    fn run(&self, more: &[&str]) -> Vec<String> {
+    /// Runs all stages and returns the sorted keys of those that ran.
+    fn run(&self, arguments: &[&str]) -> Vec<String> {
         let ran = self.project.path("ran");
         std::fs::remove_file(&ran).ok();
-        self.project.ok(&[&self.words(&["run"])[..], more].concat());
+        self.project.ok(&[&self.with_overrides(&["run"])[..], arguments].concat());
         let mut keys: Vec<String> =
             std::fs::read_to_string(ran).unwrap_or_default().lines().map(str::to_owned).collect();
         keys.sort();
@@ -227,7 +232,7 @@ fn text(node: &Value, name: &str) -> String {
     node[name].as_str().unwrap_or_default().to_owned()
 }
 
-/// Keys of the nodes in a state, each once: two stages that do the same have one.
+/// Returns the distinct keys of the nodes in a state. Equal stages have one key.
 fn keys(nodes: &[Value], state: &str) -> BTreeSet<String> {
     nodes.iter().filter(|node| node["state"] == state).map(|node| text(node, "key")).collect()
 }
@@ -236,64 +241,64 @@ fn keys(nodes: &[Value], state: &str) -> BTreeSet<String> {
 fn plan_and_run_agree() {
     let seed = std::env::var("NERF_SR_SEED")
         .map_or_else(|_| std::process::id().into(), |text| text.parse().unwrap());
-    let mut planned = 0;
+    let mut planned_count = 0;
     for number in 0..12 {
-        let mut world = World::new(seed, number);
-        world.run(&[]);
+        let mut case = Case::new(seed, number);
+        case.run(&[]);
         for edit in 0..8 {
-            let place = format!("seed {seed}, pipeline {number}, edit {edit}");
-            world.edit();
-            let pipeline = std::fs::read_to_string(world.project.path("pipeline.yaml")).unwrap();
-            let place = format!("{place}: {:?}\n{pipeline}", world.overrides);
-            let records = world.records();
-            let before = world.nodes(&["plan", "--json"]);
-            planned += before.len();
-            let ran = world.run(&[]);
+            let context = format!("seed {seed}, pipeline {number}, edit {edit}");
+            case.edit();
+            let pipeline = std::fs::read_to_string(case.project.path("pipeline.yaml")).unwrap();
+            let context = format!("{context}: {:?}\n{pipeline}", case.overrides);
+            let records = case.records();
+            let before = case.nodes(&["plan", "--json"]);
+            planned_count += before.len();
+            let ran = case.run(&[]);
             let distinct: BTreeSet<String> = ran.iter().cloned().collect();
-            assert_eq!(distinct.len(), ran.len(), "each key once; {place}");
-            let after = world.nodes(&["status", "--json"]);
-            assert!(after.iter().all(|node| node["state"] == "cached"), "{place}");
-            // What the plan said of each node: whether it runs, and under which key; or that its
-            // key isn't known.
-            assert!(keys(&before, "cached").is_disjoint(&distinct), "cached, and ran; {place}");
+            assert_eq!(distinct.len(), ran.len(), "each key runs once; {context}");
+            let after = case.nodes(&["status", "--json"]);
+            assert!(after.iter().all(|node| node["state"] == "cached"), "{context}");
+            // The plan predicts each node's key and whether the node runs, unless the key isn't
+            // known yet.
+            assert!(keys(&before, "cached").is_disjoint(&distinct), "a cached key ran; {context}");
             for (planned, node) in before.iter().zip(&after) {
                 assert_eq!(
                     [&planned["stage"], &planned["point"]],
                     [&node["stage"], &node["point"]],
-                    "{place}"
+                    "{context}"
                 );
-                assert!(planned["state"] == "waits" || planned["key"] == node["key"], "{place}");
+                assert!(planned["state"] == "waits" || planned["key"] == node["key"], "{context}");
             }
-            // What was there didn't run. What wasn't did, but where another key made the artifact
-            // again.
-            let ran_now = |node: &Value| distinct.contains(&text(node, "key"));
-            let made: BTreeSet<String> = after
+            // A node with a complete artifact doesn't run. Any other node runs, unless another key
+            // recreates the artifact.
+            let has_run = |node: &Value| distinct.contains(&text(node, "key"));
+            let created: BTreeSet<String> = after
                 .iter()
-                .filter(|node| ran_now(node))
+                .filter(|node| has_run(node))
                 .map(|node| text(node, "output"))
                 .collect();
             for node in &after {
-                let known = records.get(&text(node, "key"));
-                let made_by_another = known.is_some() && made.contains(&text(node, "output"));
-                let was_there = known == Some(&true);
+                let record = records.get(&text(node, "key"));
+                let is_recreated = record.is_some() && created.contains(&text(node, "output"));
+                let was_complete = record == Some(&true);
                 assert!(
-                    if was_there { !ran_now(node) } else { ran_now(node) || made_by_another },
-                    "{node}; {place}"
+                    if was_complete { !has_run(node) } else { has_run(node) || is_recreated },
+                    "{node}; {context}"
                 );
             }
-            assert!(distinct.is_subset(&keys(&after, "cached")), "nothing else ran; {place}");
-            assert_eq!(world.run(&[]), Vec::<String>::new(), "{place}");
+            assert!(distinct.is_subset(&keys(&after, "cached")), "no other key runs; {context}");
+            assert_eq!(case.run(&[]), Vec::<String>::new(), "{context}");
         }
-        // Whatever came of it is what a store that knows nothing gets.
+        // An empty store gives equal outputs.
         let outputs =
             |nodes: &[Value]| nodes.iter().map(|node| text(node, "output")).collect::<Vec<_>>();
-        let kept = outputs(&world.nodes(&["status", "--json"]));
-        world.run(&["--store", "fresh"]);
+        let edited = outputs(&case.nodes(&["status", "--json"]));
+        case.run(&["--store", "fresh"]);
         assert_eq!(
-            kept,
-            outputs(&world.nodes(&["status", "--json", "--store", "fresh"])),
+            edited,
+            outputs(&case.nodes(&["status", "--json", "--store", "fresh"])),
             "seed {seed}, pipeline {number}"
         );
     }
-    assert!(planned > 50, "{planned} nodes were planned");
+    assert!(planned_count > 50, "{planned_count} nodes were planned");
 }

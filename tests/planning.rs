@@ -9,8 +9,8 @@ use std::process::{Command, Stdio};
 
 use common::{Finished, Project, TINY, bin, signal, wait_until};
 
-/// A copy of a program, made by another process: one that this process has open for writing can't
-/// be started.
+/// Copies a program by another process: a file that this process has open for writing can't be
+/// executed.
 fn install(from: &Path, to: &Path) {
     std::fs::create_dir_all(to.parent().unwrap()).unwrap();
     assert!(
@@ -18,8 +18,8 @@ fn install(from: &Path, to: &Path) {
     );
 }
 
-/// A stage as a script: it leaves a mark when it is started, describes itself as soon as no file
-/// `wait` is there, or makes its output.
+/// Shell script of a stage, which appends its first argument to `started`. `describe` waits while
+/// the file `wait` exists.
 const SCRIPT: &str = r#"#!/bin/sh
 cd "$(dirname "$0")"
 echo "$1" >> started
@@ -32,7 +32,7 @@ while [ "$1" != --output ]; do shift; done
 mkdir "$2" && echo 1 > "$2/x"
 "#;
 
-fn with_script() -> Project {
+fn project_with_script() -> Project {
     let project = Project::new(
         "default: [mine]\nstages:\n  mine: {run: ./mine.sh}\n  other: {run: ./other.sh}\n",
     );
@@ -41,13 +41,13 @@ fn with_script() -> Project {
     project
 }
 
-/// Looking at somebody's pipeline starts nothing of theirs: only `run` does, and then the others
-/// know what it said, until it changes.
+/// Commands that inspect a foreign pipeline start none of its programs; only `run` does. Later
+/// commands use the cached description until the program changes.
 #[test]
 fn only_run_starts_a_foreign_program() {
-    let project = with_script();
+    let project = project_with_script();
     let started = || std::fs::read_to_string(project.path("started")).unwrap_or_default();
-    let looks: [&[&str]; 6] = [
+    let inspections: [&[&str]; 6] = [
         &["plan"],
         &["why", "mine"],
         &["status"],
@@ -55,9 +55,9 @@ fn only_run_starts_a_foreign_program() {
         &["log", "mine"],
         &["gc", "--dry-run"],
     ];
-    for look in looks {
-        let finished = project.run(look);
-        if !["log", "gc"].contains(&look[0]) {
+    for arguments in inspections {
+        let finished = project.run(arguments);
+        if !["log", "gc"].contains(&arguments[0]) {
             finished.fails(
                 2,
                 &[
@@ -67,30 +67,31 @@ fn only_run_starts_a_foreign_program() {
                 ],
             );
         }
-        assert_eq!(started(), "", "{look:?}");
+        assert_eq!(started(), "", "{arguments:?}");
     }
     project.ok(&["run"]);
-    // Afterwards it is asked again: it may call another program, which was built anew meanwhile.
-    let by_run = "describe\n--params\ndescribe\n";
-    assert_eq!(started(), by_run, "and other.sh, which isn't there, isn't needed");
-    for look in looks {
-        project.ok(look);
+    // `run` reads the description again after the stage: the script may call another program, which
+    // may have been rebuilt meanwhile.
+    let started_by_run = "describe\n--params\ndescribe\n";
+    assert_eq!(started(), started_by_run, "other.sh is missing, but isn't needed");
+    for arguments in inspections {
+        project.ok(arguments);
     }
     assert!(project.ok(&["plan"]).contains("cached"));
-    assert_eq!(started(), by_run);
-    // Other bytes are another program, whatever its size and time say.
+    assert_eq!(started(), started_by_run);
+    // A program with changed content counts as changed, even with equal size and time.
     let metadata = std::fs::metadata(project.path("mine.sh")).unwrap();
     project.write("script", &SCRIPT.replace("echo 1", "echo 2"));
     install(&project.path("script"), &project.path("mine.sh"));
-    let changed = std::fs::File::options().write(true).open(project.path("mine.sh")).unwrap();
-    changed.set_modified(metadata.modified().unwrap()).unwrap();
-    drop(changed);
+    let file = std::fs::File::options().write(true).open(project.path("mine.sh")).unwrap();
+    file.set_modified(metadata.modified().unwrap()).unwrap();
+    drop(file);
     assert_eq!(std::fs::metadata(project.path("mine.sh")).unwrap().len(), metadata.len());
     project.run(&["plan"]).fails(2, &["check what the program does"]);
-    assert_eq!(started(), by_run);
+    assert_eq!(started(), started_by_run);
     project.ok(&["run"]);
     project.ok(&["plan"]);
-    // One that isn't needed isn't started by a run either.
+    // `run` starts only programs that its targets need.
     project.write(
         "pipeline.yaml",
         "default: [demo-scene]\nstages:\n  demo-scene: {}\n  mine: {run: ./new.sh}\n",
@@ -111,10 +112,9 @@ fn only_run_starts_a_foreign_program() {
     assert_eq!(started(), before);
 }
 
-/// A slow `describe` is reported, and ends at once after a signal.
 #[test]
-fn asking_can_be_watched_and_interrupted() {
-    let project = with_script();
+fn a_slow_describe_is_reported_and_can_be_interrupted() {
+    let project = project_with_script();
     project.write("wait", "");
     let mut child =
         project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -131,7 +131,7 @@ fn asking_can_be_watched_and_interrupted() {
         line.contains("interrupted") && !line.contains("failed") && !line.contains("stage mine"),
         "{line}"
     );
-    // The started run continues after its stage is released.
+    // The next run continues after the file `wait` is deleted.
     let child =
         project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     std::fs::remove_file(project.path("wait")).unwrap();
@@ -149,13 +149,15 @@ fn run_installed(project: &Project, arguments: &[&str]) -> Finished {
     )
 }
 
-/// A missing program affects only targets that use it; their message has the command that builds
-/// it.
+/// A missing program affects only targets that use it; the error message names the command that
+/// builds the program.
 #[test]
-fn a_missing_program_is_missed_where_it_is_needed() {
+fn a_missing_program_fails_only_targets_that_need_it() {
     let project = Project::tiny();
-    let own = |name: &str| -> PathBuf { project.path("bin").join(name) };
-    ["nerf-sr", "demo-scene", "prep"].into_iter().for_each(|name| install(&bin(name), &own(name)));
+    let installed = |name: &str| -> PathBuf { project.path("bin").join(name) };
+    ["nerf-sr", "demo-scene", "prep"]
+        .into_iter()
+        .for_each(|name| install(&bin(name), &installed(name)));
     for arguments in
         [&["plan", "prep"][..], &["run", "demo-scene"], &["plan", "prep", "-p", "kernel=box"]]
     {
@@ -172,7 +174,7 @@ fn a_missing_program_is_missed_where_it_is_needed() {
     project.replace("{dataset: demo-scene}", "{dataset: demo-secne}");
     run_installed(&project, &["plan"])
         .fails(2, &["pipeline.yaml:4: stage demo-secne", "did you mean demo-scene?"]);
-    // The rest of the file is checked, needed or not.
+    // Blocks that the target doesn't need are checked too.
     project.replace("lr_width: 24", "ir_width: 24");
     run_installed(&project, &["plan", "demo-secne"]).fails(
         2,
@@ -180,13 +182,13 @@ fn a_missing_program_is_missed_where_it_is_needed() {
     );
 }
 
-/// Calls that stages would refuse are refused before anything runs, by `plan` and by `run`.
+/// Bad calls are refused before any stage runs.
 #[test]
-fn what_stages_would_refuse_is_refused_in_the_plan() {
+fn plan_and_run_refuse_calls_that_a_stage_would_refuse() {
     let upsample = "  upsample:\n    inputs: \
         {views: prep/train, cameras: prep/train-cameras}\n    parameters: {method: imdn}\n";
     let project = Project::new(&format!("{TINY}{upsample}"));
-    for (arguments, words) in [
+    for (arguments, message) in [
         (
             &["upsample"][..],
             "stage upsample: input weights is missing: methods imdn, liif and swinir",
@@ -215,30 +217,29 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         (&["--device", "cuda:"], "--device cuda:: no such device"),
     ] {
         for verb in ["plan", "run"] {
-            project.run(&[&[verb], arguments].concat()).fails(2, &[words]);
+            project.run(&[&[verb], arguments].concat()).fails(2, &[message]);
         }
     }
     assert_eq!(project.store_listing(), Vec::<String>::new());
     std::fs::create_dir(project.path("weights")).unwrap();
     project.ok(&["plan", "upsample", "-i", "weights=weights"]);
-    // A stage by itself checks the same.
-    let (views, none) = (project.path("views"), project.path("none"));
+    // A stage that is started directly refuses the same calls.
+    let (views, output) = (project.path("views"), project.path("none"));
     let inputs = [("views", views.as_path()), ("cameras", &views)];
-    common::stage("upsample", r#"{"method": "imdn"}"#, &inputs, &none, &[])
+    common::stage("upsample", r#"{"method": "imdn"}"#, &inputs, &output, &[])
         .fails(2, &["input weights is missing", "convert-weights.py"]);
     let inputs = [("dataset", views.as_path())];
-    common::stage("prep", r#"{"kernel": "average", "scale": 1.5}"#, &inputs, &none, &[])
+    common::stage("prep", r#"{"kernel": "average", "scale": 1.5}"#, &inputs, &output, &[])
         .fails(2, &["average requires an integer scale"]);
 }
 
-/// Sinks are drawn and explained.
 #[test]
-fn sinks_are_part_of_the_picture() {
+fn why_plan_and_graph_include_sinks() {
     let project = Project::new(&format!(
         "{}  report:\n    inputs: {{run: eval}}\n",
         TINY.replace("[eval]", "[report]")
     ));
-    for (arguments, words) in [
+    for (arguments, texts) in [
         (
             &["why", "report"][..],
             &[
@@ -250,8 +251,8 @@ fn sinks_are_part_of_the_picture() {
         (&["graph"], &["report (displays the run)  ← eval\n"]),
         (&["graph", "--format", "dot"], &["[label=\"report\", shape=note]", "n4 -> n5"]),
     ] {
-        let said = project.ok(arguments);
-        assert!(words.iter().all(|w| said.contains(w)), "{arguments:?}: {said}");
+        let stdout = project.ok(arguments);
+        assert!(texts.iter().all(|text| stdout.contains(text)), "{arguments:?}: {stdout}");
     }
     project.run(&["why", "reprot"]).fails(2, &["no stage \"reprot\" in this plan"]);
     project
@@ -259,21 +260,21 @@ fn sinks_are_part_of_the_picture() {
         .fails(2, &["no stage \"evla\" in this plan; did you mean eval? known: demo-scene, eval"]);
 }
 
-/// Times follow from the sizes of images that don't exist yet.
+/// Estimates use the sizes of images that no stage has written yet.
 #[test]
 fn times_are_estimated_before_a_run() {
     let project = Project::tiny();
     let plan = project.ok(&["plan"]);
-    // The demo scene, preparation, training, rendering, scoring, and all of them.
+    // Five stages (demo scene, preparation, training, rendering, scoring), and the total.
     let times = plan.lines().filter(|line| line.contains("of processor time")).count();
     assert_eq!(times, 6, "{plan}");
     let total = plan.lines().last().unwrap();
-    for words in ["about ", " on ", "at most ", "MB of memory for a stage"] {
-        assert!(total.contains(words) && !total.contains("without"), "{words}: {total}");
+    for text in ["about ", " on ", "at most ", "MB of memory for a stage"] {
+        assert!(total.contains(text) && !total.contains("without"), "{text}: {total}");
     }
     let advice = project.ok(&["advise", "-p", "test_views=1", "--minutes", "100"]);
-    for words in ["12 training views", "1 views", "training ", "rendering ", "scoring "] {
-        assert!(advice.contains(words), "{words}: {advice}");
+    for text in ["12 training views", "1 views", "training ", "rendering ", "scoring "] {
+        assert!(advice.contains(text), "{text}: {advice}");
     }
     for quality in ["draft ", "fast ", "balanced ", "best "] {
         let line = advice.lines().find(|line| line.starts_with(quality)).unwrap();
@@ -291,26 +292,26 @@ fn times_are_estimated_before_a_run() {
     assert!(project.ok(&["advise"]).trim_end().ends_with("-p quality=balanced"));
 }
 
-/// Frames along a path are as many and as large as the path's parameters, or its file, say.
+/// Estimates for a camera path use the number and size of frames in its parameters or its file.
 #[test]
 fn views_along_a_path_are_estimated() {
     let project = Project::shipped(&["video"], "");
-    let line = |arguments: &[&str]| {
+    let estimate = |arguments: &[&str]| {
         let plan = project.ok(&[&["plan", "video"], arguments].concat());
         let line = plan.lines().find(|line| line.starts_with("path-views ")).unwrap();
         line.rsplit_once("; about ").unwrap_or_else(|| panic!("{plan}")).1.to_owned()
     };
-    let computed = line(&[]);
-    assert!(computed.contains(" of processor time, "), "{computed}");
-    assert_ne!(line(&["-p", "frames=1200"]), computed);
+    let default_estimate = estimate(&[]);
+    assert!(default_estimate.contains(" of processor time, "), "{default_estimate}");
+    assert_ne!(estimate(&["-p", "frames=1200"]), default_estimate);
     project.write(
         "path/camera_path.json",
         r#"{"render_width": 4000, "render_height": 3000, "camera_path": [{}]}"#,
     );
-    assert_ne!(line(&["-i", "camera-path.path=path"]), computed);
+    assert_ne!(estimate(&["-i", "camera-path.path=path"]), default_estimate);
 }
 
-/// A run states its estimate before and after; its records correct the next estimate's memory.
+/// A run prints its estimate before the first stage, after each stage and at the end.
 #[test]
 fn a_run_is_compared_with_its_estimate() {
     let project = Project::tiny();
@@ -330,9 +331,8 @@ fn a_run_is_compared_with_its_estimate() {
     assert!(!again.stderr.contains("about "), "{}", again.stderr);
 }
 
-/// Without memory for one of its stages, nothing runs.
 #[test]
-fn a_run_beyond_the_memory_is_refused_before_its_start() {
+fn a_run_with_a_stage_beyond_the_free_memory_is_refused_before_its_start() {
     let project = Project::tiny();
     let refused = project.run(&["run", "--memory", "50M"]);
     refused.fails(2, &["train-ss needs about ", "and 52.4 MB are free, so nothing was run"]);
@@ -344,12 +344,12 @@ fn a_run_beyond_the_memory_is_refused_before_its_start() {
 
 /// A stage that ran with a quality is cached for the quality's parameters.
 #[test]
-fn a_quality_is_known_by_its_parameters() {
+fn a_quality_has_the_key_of_its_parameters() {
     let project = Project::tiny();
-    let known = "no quality \"good\"; choose draft, fast, balanced or best";
-    project.run(&["plan", "-p", "quality=good"]).fails(2, &["-p quality=good: ", known]);
+    let message = "no quality \"good\"; choose draft, fast, balanced or best";
+    project.run(&["plan", "-p", "quality=good"]).fails(2, &["-p quality=good: ", message]);
     project.ok(&["run", "-p", "quality=fast"]);
-    let others = [
+    let parameters = [
         "rays_per_pixel=4",
         "pixel_importance=20",
         "cells_per_pixel=1.6",
@@ -358,23 +358,24 @@ fn a_quality_is_known_by_its_parameters() {
         "max_rays=8000000",
         "render-depth.samples_per_axis=1",
     ];
-    let written: Vec<&str> = others.iter().flat_map(|parameter| ["-p", parameter]).collect();
-    let written = project.ok(&[&["status", "eval"], &written[..]].concat());
-    assert!(written.lines().all(|line| line.contains(" cached ")), "{written}");
+    let arguments: Vec<&str> = parameters.iter().flat_map(|parameter| ["-p", parameter]).collect();
+    let status = project.ok(&[&["status", "eval"], &arguments[..]].concat());
+    assert!(status.lines().all(|line| line.contains(" cached ")), "{status}");
     assert!(!project.ok(&["status", "eval"]).lines().all(|line| line.contains(" cached ")));
 }
 
-/// The plan says what a run then does: what will run runs, what is cached doesn't, and what waits
-/// may do either. Equal values are one key.
+/// A run executes the actions that its plan lists as `will run`, no cached actions, and possibly
+/// waiting ones. Equal parameter values have equal keys.
 #[test]
-fn a_run_does_what_the_plan_says() {
+fn a_run_follows_its_plan() {
     let project = Project::tiny();
     project.replace("{lr_width: 24, scale: 2}", "{lr_width: 24, scale: 2, kernel: box}");
-    let actions = || project.store_listing().iter().filter(|name| name.ends_with(".json")).count();
-    for (arguments, runs) in [
+    let action_count =
+        || project.store_listing().iter().filter(|name| name.ends_with(".json")).count();
+    for (arguments, expected_runs) in [
         (&[][..], 2),
         (&[], 0),
-        // Said otherwise, or said where it is so by default.
+        // Equal values in other notations, and explicit defaults.
         (
             &[
                 "-p",
@@ -389,7 +390,7 @@ fn a_run_does_what_the_plan_says() {
             0,
         ),
         (&["-p", "prep.scale=3", "-p", "prep.scale=2", "-p", "near=", "-p", "lens=follow"], 0),
-        // Equal output ends what waits.
+        // An explicit value differs from a default that `prep` chooses by data set.
         (&["-p", "lr_source=downscaled"], 1),
         (&["-p", "demo-scene.train=11", "-p", "demo-scene.train=12"], 0),
         (&["-p", "kernel=box,bicubic"], 1),
@@ -398,30 +399,31 @@ fn a_run_does_what_the_plan_says() {
     ] {
         let arguments = [&["prep"], arguments].concat();
         let plan = project.ok(&[&["plan"], &arguments[..]].concat());
-        let count = |words: &str| plan.lines().filter(|line| line.contains(words)).count();
-        let (will_run, waits, before) = (count("will run"), count("waits for"), actions());
+        let count = |text: &str| plan.lines().filter(|line| line.contains(text)).count();
+        let (will_run, waits, before) = (count("will run"), count("waits for"), action_count());
         project.ok(&[&["run"], &arguments[..]].concat());
-        let ran = actions() - before;
+        let ran = action_count() - before;
         assert!(
-            (will_run..=will_run + waits).contains(&ran) && ran == runs,
+            (will_run..=will_run + waits).contains(&ran) && ran == expected_runs,
             "{arguments:?}: {ran} ran of\n{plan}"
         );
         let after = project.ok(&[&["plan"], &arguments[..]].concat());
         assert!(after.lines().all(|line| line.contains("cached")), "{after}");
     }
     for verb in ["plan", "run"] {
-        let said = project.run(&[verb, "prep", "-p", "kernel=lanczos", "-p", "prep.kernel=box"]);
+        let finished =
+            project.run(&[verb, "prep", "-p", "kernel=lanczos", "-p", "prep.kernel=box"]);
         assert!(
-            said.code == 0
-                && said.stderr.contains("-p kernel=lanczos: overridden by -p prep.kernel=box"),
+            finished.code == 0
+                && finished.stderr.contains("-p kernel=lanczos: overridden by -p prep.kernel=box"),
             "{}",
-            said.stderr
+            finished.stderr
         );
     }
 }
 
 #[test]
-fn a_file_in_another_encoding_is_refused_with_the_cure() {
+fn utf16_is_refused_with_advice_and_a_byte_order_mark_is_accepted() {
     let project = Project::new("");
     let utf16: Vec<u8> =
         std::iter::once(0xfeff).chain(TINY.encode_utf16()).flat_map(u16::to_le_bytes).collect();

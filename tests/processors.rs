@@ -10,17 +10,21 @@ use std::process::Command;
 use common::{Finished, Project, bin, stage_command};
 use stage::{ProcessorLimit, processors};
 
-/// Variables that would change the number of processors.
+/// Slurm's environment variables that limit the number of processors.
 const VARIABLES: [&str; 2] = ["SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"];
 
-/// Returns the line in which a stage reports its threads, called through a program such as
-/// `taskset`, with and without a variable of Slurm.
-fn reported(project: &Project, through: &[&str], variable: Option<(&str, &str)>) -> String {
+/// Runs a stage with a launcher such as `taskset` and an optional Slurm variable, and returns the
+/// line that reports the number of threads.
+fn reported_threads(
+    project: &Project,
+    launcher: &[&str],
+    variable: Option<(&str, &str)>,
+) -> String {
     let output = project.path("data");
     fs::remove_dir_all(&output).ok();
     let params = r#"{"size": 16, "train": 1, "test": 1, "samples_per_axis": 1}"#;
     let call = stage_command("demo-scene", params, &[], &output, &["--progress", "plain"]);
-    let mut command = match through {
+    let mut command = match launcher {
         [] => Command::new(call.get_program()),
         [first, others @ ..] => {
             let mut command = Command::new(first);
@@ -37,14 +41,13 @@ fn reported(project: &Project, through: &[&str], variable: Option<(&str, &str)>)
     finished.stderr.lines().next().unwrap_or_default().to_owned()
 }
 
-/// True if a program can be started.
-fn exists(program: &str) -> bool {
+fn can_start(program: &str) -> bool {
     Command::new(program).arg("--help").output().is_ok()
 }
 
 #[test]
 fn affinity_limits_threads_of_stages_and_runs() {
-    if !exists("taskset") {
+    if !can_start("taskset") {
         eprintln!("skipped: no taskset");
         return;
     }
@@ -53,19 +56,20 @@ fn affinity_limits_threads_of_stages_and_runs() {
         eprintln!("skipped: no list of processors in /proc/self/status");
         return;
     };
-    let through = ["taskset", "-c", processor.as_str()];
-    let said = reported(&project, &through, None);
+    let launcher = ["taskset", "-c", processor.as_str()];
+    let line = reported_threads(&project, &launcher, None);
     if processors().limit == ProcessorLimit::Machine && processors().count == 1 {
-        assert_eq!(said, "1 thread: all processors of this machine");
+        assert_eq!(line, "1 thread: all processors of this machine");
         return;
     }
-    assert_eq!(said, "1 thread: the CPU affinity of this process");
-    let help = Command::new(through[0]).args(&through[1..]).arg(bin("eval")).arg("--help").output();
+    assert_eq!(line, "1 thread: the CPU affinity of this process");
+    let help =
+        Command::new(launcher[0]).args(&launcher[1..]).arg(bin("eval")).arg("--help").output();
     let help = Finished::of(help.unwrap()).stdout;
     assert!(help.contains("[default: the CPU affinity of this process, here 1]"), "{help}");
     let nerf_sr = project.command(&["run", "prep"]);
-    let mut run = Command::new(through[0]);
-    run.args(&through[1..]).arg(nerf_sr.get_program()).args(nerf_sr.get_args());
+    let mut run = Command::new(launcher[0]);
+    run.args(&launcher[1..]).arg(nerf_sr.get_program()).args(nerf_sr.get_args());
     for name in VARIABLES {
         run.env_remove(name);
     }
@@ -84,24 +88,28 @@ fn any_processor() -> Option<String> {
 }
 
 #[test]
-fn slurms_variables_limit_threads() {
+fn slurm_variables_limit_threads() {
     let project = Project::new("");
     for name in VARIABLES {
-        let said = reported(&project, &[], Some((name, "1")));
+        let line = reported_threads(&project, &[], Some((name, "1")));
         let expected = if processors().count == 1 { "1 thread: " } else { "1 thread: SLURM_CPUS_" };
-        assert!(said.starts_with(expected), "{said}");
+        assert!(line.starts_with(expected), "{line}");
     }
-    let all = reported(&project, &[], None);
+    let without_variable = reported_threads(&project, &[], None);
     for value in ["0", "x", "", "1000000"] {
-        assert_eq!(reported(&project, &[], Some(("SLURM_CPUS_ON_NODE", value))), all, "{value}");
+        assert_eq!(
+            reported_threads(&project, &[], Some(("SLURM_CPUS_ON_NODE", value))),
+            without_variable,
+            "{value}"
+        );
     }
 }
 
-/// A cgroup with a quota of one processor, removed when dropped.
+/// Cgroup with a quota of one processor, removed when dropped.
 struct Quota(PathBuf);
 
 impl Quota {
-    /// Creates a cgroup of version 1 or 2; `None` if that isn't permitted.
+    /// Creates a cgroup of version 1 or 2; `None` if this process may not create one.
     fn create() -> Option<Self> {
         let name = format!("nerf-sr-test-{}", std::process::id());
         let versions: [(&str, &[(&str, &str)]); 3] = [
@@ -116,7 +124,7 @@ impl Quota {
             ),
         ];
         versions.iter().find_map(|(root, settings)| {
-            // Without this file the folder isn't a hierarchy with cgroups.
+            // A folder without this file isn't a cgroup hierarchy.
             Path::new(root).join("cgroup.procs").is_file().then_some(())?;
             let group = Self(Path::new(root).join(&name));
             fs::create_dir(&group.0).ok()?;
@@ -143,47 +151,52 @@ fn a_quota_limits_threads() {
     };
     let project = Project::new("");
     let enter = format!("echo $$ > {}/cgroup.procs && exec \"$0\" \"$@\"", group.0.display());
-    let said = reported(&project, &["sh", "-c", &enter], None);
+    let line = reported_threads(&project, &["sh", "-c", &enter], None);
     let expected = if processors().count == 1 { "1 thread: " } else { "1 thread: the CPU quota" };
-    assert!(said.starts_with(expected), "{said}");
+    assert!(line.starts_with(expected), "{line}");
 }
 
-/// Returns the largest number of threads of a training with an input, which is checked in parallel,
-/// and the bytes of the trained field.
+/// Trains a field from an input that is checked in parallel. Returns the largest number of threads
+/// and the field's bytes.
 fn train_with_threads(project: &Project, threads: &str) -> (usize, Vec<u8>) {
     let data = project.path("data");
     if !data.exists() {
         let params = r#"{"size": 32, "train": 2, "test": 1, "samples_per_axis": 1}"#;
-        let made = stage_command("demo-scene", params, &[], &data, &[]).output().unwrap();
-        assert!(made.status.success());
+        let demo = stage_command("demo-scene", params, &[], &data, &[]).output().unwrap();
+        assert!(demo.status.success());
     }
     let params = r#"{"lr_width": 16, "scale": 2}"#;
     let scene = project.path(&format!("scene-{threads}"));
-    let made = stage_command("prep", params, &[("dataset", &data)], &scene, &[]).output().unwrap();
-    assert!(made.status.success());
+    let prepared =
+        stage_command("prep", params, &[("dataset", &data)], &scene, &[]).output().unwrap();
+    assert!(prepared.status.success());
     let params = r#"{"field": "grid", "rays": 100000}"#;
     let (input, output) = (scene.join("train"), project.path(&format!("field-{threads}")));
     let inputs = [("scene", input.as_path())];
     let mut command = stage_command("train-ss", params, &inputs, &output, &["--threads", threads]);
     let mut training = command.spawn().unwrap();
     let tasks = PathBuf::from(format!("/proc/{}/task", training.id()));
-    let mut most = 0;
+    let mut max_threads = 0;
     while training.try_wait().unwrap().is_none() {
-        most = most.max(fs::read_dir(&tasks).map_or(0, Iterator::count));
+        max_threads = max_threads.max(fs::read_dir(&tasks).map_or(0, Iterator::count));
         std::thread::sleep(std::time::Duration::from_millis(5));
     }
     assert!(training.wait().unwrap().success());
-    (most, fs::read(output.join("field-0.safetensors")).unwrap())
+    (max_threads, fs::read(output.join("field-0.safetensors")).unwrap())
 }
 
-/// A stage has as many threads as given, and fields have equal bytes.
+/// A stage has the given number of threads, which doesn't change the field's bytes.
 #[test]
 fn fields_are_equal_at_any_number_of_threads() {
     let project = Project::fast();
-    let (one, field) = train_with_threads(&project, "1");
+    let (base_threads, field) = train_with_threads(&project, "1");
     for threads in [2, 3, 8, 16] {
-        let (most, other) = train_with_threads(&project, &threads.to_string());
-        assert_eq!(most - one, threads - 1, "{one} and {most} threads");
-        assert!(other == field, "{threads} threads");
+        let (max_threads, other_field) = train_with_threads(&project, &threads.to_string());
+        assert_eq!(
+            max_threads - base_threads,
+            threads - 1,
+            "{base_threads} and {max_threads} threads"
+        );
+        assert!(other_field == field, "{threads} threads");
     }
 }

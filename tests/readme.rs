@@ -1,5 +1,5 @@
-//! The documents tell the truth: commands parse and plan, pipeline blocks are valid, the files they
-//! name are there.
+//! Checks of the documents: commands plan, pipeline blocks are valid, linked files exist, and
+//! figures are in the results.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -11,18 +11,19 @@ use std::process::Command;
 use common::{Finished, Project, bin};
 use serde_json::Value;
 
-/// Documents whose commands and blocks are checked, and folders that hold more of them.
+/// Documents whose commands and blocks are checked, and folders of more such documents.
 const DOCUMENTS: [&str; 2] = ["README.md", "ARCHITECTURE.md"];
 const FOLDERS: [&str; 2] = ["docs/guide", "docs/results"];
-/// Documents of which only links are checked.
+/// Documents in which only links are checked.
 const LINKED: [&str; 4] =
     ["CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md", "docs/comparison.md"];
 const LINKED_FOLDERS: [&str; 1] = ["docs/design"];
 
-/// Documents that measure nothing themselves.
+/// Folder of documents whose figures must be in [`RESULTS`].
 const GUIDES: &str = "docs/guide";
+/// Folder of documents with measured figures.
 const RESULTS: &str = "docs/results";
-/// Units of measured figures, and how results may spell each.
+/// Units of measured figures, each with its spellings.
 const UNITS: [&[&str]; 9] = [
     &["dB"],
     &["ms", "milliseconds", "millisecond"],
@@ -39,8 +40,8 @@ fn read(path: impl AsRef<Path>) -> String {
     std::fs::read_to_string(common::root().join(path)).unwrap()
 }
 
-/// Paths of documents, from the root: those named, and every Markdown file of the folders.
-fn paths(files: &[&str], folders: &[&str]) -> Vec<String> {
+/// Returns `files` and the paths of all Markdown files of the folders, relative to the root.
+fn document_paths(files: &[&str], folders: &[&str]) -> Vec<String> {
     let mut paths: Vec<String> = files.iter().map(|file| (*file).to_owned()).collect();
     for folder in folders {
         let entries = std::fs::read_dir(common::root().join(folder)).unwrap();
@@ -54,18 +55,18 @@ fn paths(files: &[&str], folders: &[&str]) -> Vec<String> {
     paths
 }
 
-fn documents() -> String {
-    paths(&DOCUMENTS, &FOLDERS).iter().map(|path| read(path) + "\n").collect()
+fn documents_text() -> String {
+    document_paths(&DOCUMENTS, &FOLDERS).iter().map(|path| read(path) + "\n").collect()
 }
 
-/// Contents of the fenced blocks of a language.
-fn blocks(text: &str, language: &str) -> Vec<String> {
+/// Returns the contents of a text's fenced blocks of a language.
+fn fenced_blocks(text: &str, language: &str) -> Vec<String> {
     let fence = format!("```{language}\n");
     text.split(&fence).skip(1).map(|rest| rest.split("```").next().unwrap().to_owned()).collect()
 }
 
-/// The words of a command line, without quotes.
-fn words_of(line: &str) -> Vec<&str> {
+/// Splits a command line into arguments, without quotes.
+fn split_arguments(line: &str) -> Vec<&str> {
     let pieces = line.split('"').enumerate();
     pieces
         .flat_map(
@@ -77,7 +78,7 @@ fn words_of(line: &str) -> Vec<&str> {
 #[test]
 fn every_command_plans() {
     let project = Project::new(&read("pipeline.yaml"));
-    // Folders that the examples name.
+    // Folders that the documents' commands name.
     for folder in [
         "my-scene",
         "my-photographs",
@@ -95,7 +96,7 @@ fn every_command_plans() {
         project.copy_folder(folder, "project");
     }
     let mut planned = 0;
-    for block in blocks(&documents(), "sh") {
+    for block in fenced_blocks(&documents_text(), "sh") {
         let joined = block.replace("\\\n", " ");
         for line in joined.lines().map(|l| l.split('#').next().unwrap().trim()) {
             let Some(rest) = line
@@ -114,46 +115,46 @@ fn every_command_plans() {
                 );
                 continue;
             };
-            let mut words = words_of(rest);
-            // It overwrites nothing, and here there is a pipeline.
-            if words[0] == "init" {
+            let mut args = split_arguments(rest);
+            // `init` refuses to overwrite a pipeline, and this folder has one.
+            if args[0] == "init" {
                 continue;
             }
-            // What isn't made yet can't be pinned, found or compared.
-            match words[0] {
-                "pin" => _ = words.splice(..2, ["plan"]),
-                "path" => words = vec!["plan", words[1].split('/').next().unwrap()],
-                "diff" => words = ["plan"].into_iter().chain(words[1].split_whitespace()).collect(),
+            // Artifacts that don't exist yet can't be pinned, located or compared.
+            match args[0] {
+                "pin" => _ = args.splice(..2, ["plan"]),
+                "path" => args = vec!["plan", args[1].split('/').next().unwrap()],
+                "diff" => args = ["plan"].into_iter().chain(args[1].split_whitespace()).collect(),
                 _ => {}
             }
-            // Nor can it be an input.
-            if let Some(at) = words.iter().position(|word| *word == "init=train-ss") {
-                words.drain(at - 1..=at);
+            // Nor can such an artifact be an input.
+            if let Some(index) = args.iter().position(|arg| *arg == "init=train-ss") {
+                args.drain(index - 1..=index);
             }
-            // `run` would train for minutes; the plan is the same code up to running. It has no use
-            // for run's own options.
-            if words[0] == "run" {
-                words[0] = "plan";
-                words.retain(|word| !word.starts_with("--watch"));
-                while let Some(at) =
-                    words.iter().position(|w| ["-j", "--threads", "--memory", "--out"].contains(w))
+            // `run` would train for minutes. `plan` runs the same code up to the first stage, but
+            // lacks the other options of `run`.
+            if args[0] == "run" {
+                args[0] = "plan";
+                args.retain(|arg| !arg.starts_with("--watch"));
+                while let Some(index) =
+                    args.iter().position(|a| ["-j", "--threads", "--memory", "--out"].contains(a))
                 {
-                    words.drain(at..at + 2);
+                    args.drain(index..index + 2);
                 }
             }
             let output =
-                project.command(&words).current_dir(project.path("project")).output().unwrap();
+                project.command(&args).current_dir(project.path("project")).output().unwrap();
             assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
             planned += 1;
         }
     }
-    assert!(planned >= 8, "the README shows the runner's verbs");
+    assert!(planned >= 8, "only {planned} commands in the documents");
 }
 
 #[test]
 fn every_make_target_exists() {
     let makefile = read("Makefile");
-    for block in blocks(&documents(), "sh") {
+    for block in fenced_blocks(&documents_text(), "sh") {
         for line in block.lines().filter_map(|l| l.trim().strip_prefix("make ")) {
             let target = line.split_whitespace().next().unwrap();
             assert!(makefile.contains(&format!("\n{target}:")), "no make target {target}");
@@ -163,14 +164,14 @@ fn every_make_target_exists() {
 
 #[test]
 fn pipeline_blocks_are_valid() {
-    let blocks = blocks(&documents(), "yaml");
+    let blocks = fenced_blocks(&documents_text(), "yaml");
     assert!(!blocks.is_empty());
     for block in blocks {
         let project = Project::tiny();
         std::fs::create_dir(project.path("scripts")).unwrap();
         let script = common::root().join("scripts/example-eval.py");
         std::fs::copy(script, project.path("scripts/example-eval.py")).unwrap();
-        // Each block replaces the stage of its name.
+        // Each block replaces the stage with its name.
         let name = block.lines().next().unwrap().trim().trim_end_matches(':').to_owned();
         let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
         let start = text.find(&format!("  {name}:")).unwrap();
@@ -182,7 +183,7 @@ fn pipeline_blocks_are_valid() {
             .unwrap_or(after.len());
         project.write("pipeline.yaml", &format!("{}{block}{}", &text[..start], &after[end..]));
         if block.contains("run: ./") {
-            // Somebody's program: it is for `run` to start.
+            // Only `run` may start a user's program for the first time.
             project.run(&["plan"]).fails(2, &["check what the program does"]);
             project.ok(&["run"]);
         }
@@ -190,7 +191,7 @@ fn pipeline_blocks_are_valid() {
     }
 }
 
-/// The code cells of a notebook.
+/// Reads the code cells of a notebook.
 fn code_cells(notebook: &str) -> Vec<String> {
     let notebook: Value = serde_json::from_str(&read(notebook)).unwrap();
     let cells = notebook["cells"].as_array().unwrap().iter();
@@ -199,12 +200,12 @@ fn code_cells(notebook: &str) -> Vec<String> {
     lines.map(|lines| lines.map(|line| line.as_str().unwrap()).collect()).collect()
 }
 
-/// The notebook's programs, which are the guide's, run one after the other, next to a finished run.
+/// The notebook's programs, which the guide contains too, must succeed after a finished run.
 #[test]
 fn programs_of_the_notebook_run() {
     let modules = ["-c", "import numpy, pandas, OpenEXR"];
-    let has = Command::new("python3").args(modules).output();
-    if !has.is_ok_and(|output| output.status.success()) {
+    let import = Command::new("python3").args(modules).output();
+    if !import.is_ok_and(|output| output.status.success()) {
         eprintln!("skipped: no numpy, pandas or OpenEXR (python3 -m pip install them)");
         return;
     }
@@ -214,28 +215,28 @@ fn programs_of_the_notebook_run() {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let path = std::env::join_paths([programs].into_iter().chain(std::env::split_paths(&path)));
     let path = path.unwrap();
-    let blocks = code_cells("docs/guide/python.ipynb");
-    let words = [&["eval", "psnr", "seconds"][..], &["view_0 (48, 48, 4)", "view_2 (48, 48, 4)"]];
-    assert_eq!(blocks.len(), words.len());
-    for (block, words) in blocks.iter().zip(words) {
-        assert!(block.lines().count() <= 30);
-        let mut python = project.command_of(Path::new("python3"), &["-c", block]);
+    let cells = code_cells("docs/guide/python.ipynb");
+    let texts = [&["eval", "psnr", "seconds"][..], &["view_0 (48, 48, 4)", "view_2 (48, 48, 4)"]];
+    assert_eq!(cells.len(), texts.len());
+    for (cell, texts) in cells.iter().zip(texts) {
+        assert!(cell.lines().count() <= 30);
+        let mut python = project.command_of(Path::new("python3"), &["-c", cell]);
         let finished = Finished::of(python.env("PATH", &path).output().unwrap());
         assert_eq!(finished.code, 0, "{}", finished.stderr);
-        assert!(words.iter().all(|word| finished.stdout.contains(word)), "{}", finished.stdout);
+        assert!(texts.iter().all(|text| finished.stdout.contains(text)), "{}", finished.stdout);
     }
 }
 
 #[test]
-fn links_lead_somewhere() {
+fn linked_files_exist() {
     let files = [&DOCUMENTS[..], &LINKED[..]].concat();
     let folders = [&FOLDERS[..], &LINKED_FOLDERS[..]].concat();
-    for document in paths(&files, &folders) {
+    for document in document_paths(&files, &folders) {
         let folder = common::root().join(&document).parent().unwrap().to_owned();
         for target in
             read(&document).split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap())
         {
-            assert!(folder.join(target).exists(), "{document}: {target} is not there");
+            assert!(folder.join(target).exists(), "{document}: {target} not found");
         }
     }
 }
@@ -252,7 +253,7 @@ fn is_number(word: &str) -> bool {
         && word.chars().all(|c| c.is_ascii_digit() || c == '.')
 }
 
-/// Splits a text at everything that belongs to no number and no unit.
+/// Splits a text at all characters that are part of neither numbers nor units.
 fn tokens(text: &str) -> Vec<&str> {
     text.split(|c: char| !c.is_alphanumeric() && c != '.' && c != '%')
         .map(|token| token.trim_end_matches('.'))
@@ -260,16 +261,16 @@ fn tokens(text: &str) -> Vec<&str> {
         .collect()
 }
 
-/// Numbers with a unit outside code, such as `4.5 GB`, with the unit's first spelling.
-fn with_unit(text: &str) -> BTreeSet<String> {
+/// Finds numbers with a unit outside code, such as `4.5 GB`, with the unit's first spelling.
+fn quantities(text: &str) -> BTreeSet<String> {
     let prose: String = text.split("```").step_by(2).collect();
     let words = tokens(&prose);
     let mut found = BTreeSet::new();
     for (i, word) in words.iter().enumerate() {
         // Number and unit may be one word: 90s.
         let split = word.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(word.len());
-        let (number, glued) = word.split_at(split);
-        let unit = if glued.is_empty() { words.get(i + 1).unwrap_or(&"") } else { glued };
+        let (number, suffix) = word.split_at(split);
+        let unit = if suffix.is_empty() { words.get(i + 1).unwrap_or(&"") } else { suffix };
         if is_number(number)
             && let Some(unit) = UNITS.iter().find(|spellings| spellings.contains(&unit))
         {
@@ -279,7 +280,7 @@ fn with_unit(text: &str) -> BTreeSet<String> {
     found
 }
 
-/// Numbers with two or more decimals in a text's tables: scores.
+/// Finds scores in a text's tables: numbers with two or more decimals.
 fn scores(text: &str) -> BTreeSet<String> {
     let rows = text.lines().filter(|line| line.starts_with('|'));
     rows.flat_map(tokens)
@@ -289,28 +290,29 @@ fn scores(text: &str) -> BTreeSet<String> {
         .collect()
 }
 
-/// Figures of `text` that are not in `results`. A number with decimals may be anywhere in them, a
-/// whole number must have its unit.
+/// Returns the figures of `text` that are not in `results`. A number with decimals may have another
+/// unit in the results, a whole number may not.
 fn unmeasured(text: &str, results: &str) -> Vec<String> {
-    let (numbers, measured) = (BTreeSet::from_iter(tokens(results)), with_unit(results));
+    let (numbers, measured) = (BTreeSet::from_iter(tokens(results)), quantities(results));
     let is_measured = |figure: &String| {
         let number = figure.split(' ').next().unwrap();
         measured.contains(figure) || number.contains('.') && numbers.contains(number)
     };
-    with_unit(text).into_iter().chain(scores(text)).filter(|figure| !is_measured(figure)).collect()
+    quantities(text).into_iter().chain(scores(text)).filter(|figure| !is_measured(figure)).collect()
 }
 
 #[test]
-fn figures_are_those_of_the_results() {
-    let results: String = paths(&[], &[RESULTS]).iter().map(|path| read(path) + "\n").collect();
-    for document in paths(&DOCUMENTS, &[GUIDES]) {
+fn figures_are_in_the_results() {
+    let results: String =
+        document_paths(&[], &[RESULTS]).iter().map(|path| read(path) + "\n").collect();
+    for document in document_paths(&DOCUMENTS, &[GUIDES]) {
         let unknown = unmeasured(&read(&document), &results);
         assert!(unknown.is_empty(), "{document}: not in {RESULTS}: {unknown:?}");
     }
 }
 
 #[test]
-fn a_figure_without_a_result_is_found() {
+fn figures_without_a_result_are_found() {
     let results = "| lego | 31.20 |\nIt takes 12 minutes and 4.5 GB.\n";
     let text = "It takes 12 minutes, 12 s, 4.5 GB (1.5 GB for `s: 3`), 90s.\n```\n7 s\n```\n\
                 | 31.20 | **31.34** | 200×4 | 0.5 |\n";

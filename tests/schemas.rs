@@ -1,5 +1,5 @@
-//! `schemas/` and `docs/reference/` are made from the types and from what the built stages say, the
-//! notebook from the guide; this test keeps them current. `make reference` writes them anew.
+//! `schemas/` and `docs/reference/` match the types and the built stages' descriptions, and the
+//! notebook matches the guide. `make reference` generates these files.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -13,7 +13,7 @@ use schemars::{JsonSchema, schema_for};
 use serde_json::{Value, json};
 use stage::Description;
 
-fn of<T: JsonSchema>() -> Value {
+fn schema_of<T: JsonSchema>() -> Value {
     schema_for!(T).to_value()
 }
 
@@ -30,22 +30,22 @@ fn description(name: &str) -> Description {
     assert_up_to_date(&program);
     let output = Command::new(program).arg("describe").output().unwrap();
     assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
-    let said: Description = serde_json::from_slice(&output.stdout).unwrap();
-    assert_eq!(said.name, name, "folder, crate and program have one name");
-    Description { version: String::new(), code: String::new(), ..said }
+    let description: Description = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(description.name, name, "folder, crate and program have one name");
+    Description { version: String::new(), code: String::new(), ..description }
 }
 
-/// Returns whether files are to be rewritten.
+/// Returns whether files are rewritten instead of compared.
 fn is_update() -> bool {
     std::env::var_os("UPDATE").is_some()
 }
 
-/// Refuses to write what a program says that is older than its sources.
+/// Fails if files are rewritten from a program that is older than its sources.
 fn assert_up_to_date(program: &Path) {
     if !is_update() {
         return;
     }
-    // Beside a program cargo lists what it was built from.
+    // Cargo lists a program's sources in a file next to the program.
     let list = std::fs::read_to_string(program.with_extension("d")).unwrap();
     let sources = list.split_whitespace().skip(1).map(Path::new).filter(|path| path.is_file());
     for source in sources {
@@ -62,24 +62,24 @@ fn modified(file: &Path) -> SystemTime {
     file.metadata().unwrap().modified().unwrap()
 }
 
-/// The schemas of all files, by their place in `schemas/`.
+/// Returns the schemas of all files, by their paths in `schemas/`.
 fn schemas() -> BTreeMap<String, Value> {
     let files = [
-        ("pipeline", of::<planning::PipelineFile>()),
-        ("describe", of::<stage::Description>()),
-        ("artifact", of::<artifact::Manifest>()),
-        ("action", of::<store::Record>()),
-        ("run", of::<artifact::RunRecord>()),
-        ("views", of::<scene::Views>()),
-        ("scene", of::<prep::SceneSummary>()),
-        ("field", of::<fields::FieldFile>()),
-        ("training", of::<radiance::TrainingLog>()),
-        ("refiner", of::<refinement::RefinerFile>()),
-        ("metrics", of::<metrics::Metrics>()),
-        ("results", of::<Vec<report::ResultRow>>()),
-        ("export", of::<export::ExportSummary>()),
-        ("offset", of::<export::ExportOffset>()),
-        ("degradation", of::<pixels::Degradation>()),
+        ("pipeline", schema_of::<planning::PipelineFile>()),
+        ("describe", schema_of::<stage::Description>()),
+        ("artifact", schema_of::<artifact::Manifest>()),
+        ("action", schema_of::<store::Record>()),
+        ("run", schema_of::<artifact::RunRecord>()),
+        ("views", schema_of::<scene::Views>()),
+        ("scene", schema_of::<prep::SceneSummary>()),
+        ("field", schema_of::<fields::FieldFile>()),
+        ("training", schema_of::<radiance::TrainingLog>()),
+        ("refiner", schema_of::<refinement::RefinerFile>()),
+        ("metrics", schema_of::<metrics::Metrics>()),
+        ("results", schema_of::<Vec<report::ResultRow>>()),
+        ("export", schema_of::<export::ExportSummary>()),
+        ("offset", schema_of::<export::ExportOffset>()),
+        ("degradation", schema_of::<pixels::Degradation>()),
     ];
     let parameters = descriptions()
         .iter()
@@ -91,7 +91,7 @@ fn schemas() -> BTreeMap<String, Value> {
         .collect()
 }
 
-/// Compares a file with what it should hold, or writes it anew.
+/// Compares a file with its expected content, or rewrites the file.
 fn check_file(file: &str, expected: &str) {
     let path = common::root().join(file);
     if is_update() {
@@ -99,11 +99,11 @@ fn check_file(file: &str, expected: &str) {
         std::fs::write(&path, expected).unwrap();
     } else {
         let found = std::fs::read_to_string(&path).unwrap_or_default();
-        assert!(found == expected, "{file} is out of date; CONTRIBUTING.md says how it is made");
+        assert!(found == expected, "{file} is out of date; run `make reference` (CONTRIBUTING.md)");
     }
 }
 
-/// Compares a folder with what it should hold, or writes it anew.
+/// Compares a folder with its expected files, or rewrites the files.
 fn check_folder(folder: &str, expected: &BTreeMap<String, String>) {
     let root = common::root().join(folder);
     for (name, text) in expected {
@@ -113,7 +113,7 @@ fn check_folder(folder: &str, expected: &BTreeMap<String, String>) {
         .into_iter()
         .filter(|e| e.as_ref().unwrap().file_type().is_file())
         .count();
-    assert_eq!(files, expected.len(), "{folder} has a file that nothing makes");
+    assert_eq!(files, expected.len(), "{folder} has a file that isn't generated");
 }
 
 #[test]
@@ -147,7 +147,7 @@ fn reference_pages_are_current() {
     check_folder("docs/reference", &pages);
 }
 
-/// The notebook has the Python guide's text and programs, in their order.
+/// The notebook has the Python guide's text and programs, in the guide's order.
 #[test]
 fn the_notebook_is_current() {
     let guide = std::fs::read_to_string(common::root().join("docs/guide/python.md")).unwrap();
@@ -176,7 +176,7 @@ fn the_notebook_is_current() {
     check_file("docs/guide/python.ipynb", &text);
 }
 
-/// A stage's help names its page, and a parameter's group is one of those that there are.
+/// A stage's help names its reference page, and every parameter has a known group or none.
 #[test]
 fn help_leads_to_the_reference() {
     for description in descriptions()
@@ -191,9 +191,12 @@ fn help_leads_to_the_reference() {
         for parameter in
             description.parameter_sections().iter().flat_map(|section| &section.parameters)
         {
-            let known = parameter.group.is_empty()
+            let is_known_group = parameter.group.is_empty()
                 || stage::PARAMETER_GROUPS.contains(&parameter.group.as_str());
-            assert!(known && help.contains(&format!("  {}", parameter.name)), "{parameter:?}");
+            assert!(
+                is_known_group && help.contains(&format!("  {}", parameter.name)),
+                "{parameter:?}"
+            );
             let is_choice = parameter.choices.iter().any(|(word, _)| *word == parameter.default);
             assert!(
                 parameter.text.ends_with('.') && (parameter.default != "none" || is_choice),
@@ -203,16 +206,17 @@ fn help_leads_to_the_reference() {
     }
 }
 
-/// A name means one parameter in each variant of a stage.
+/// Parameters of each variant of a stage have different names.
 #[test]
-fn parameters_have_one_meaning() {
+fn parameter_names_are_unique() {
     for description in descriptions() {
         let sections = description.parameter_sections();
         let (common, variants): (Vec<_>, Vec<_>) =
             sections.iter().partition(|section| section.variant.is_none());
         for variant in &variants {
-            let all = common.iter().chain([variant]).flat_map(|section| &section.parameters);
-            let mut names: Vec<&str> = all.map(|parameter| parameter.name.as_str()).collect();
+            let parameters = common.iter().chain([variant]).flat_map(|section| &section.parameters);
+            let mut names: Vec<&str> =
+                parameters.map(|parameter| parameter.name.as_str()).collect();
             let count = names.len();
             names.sort_unstable();
             names.dedup();
@@ -225,7 +229,7 @@ fn read_json(path: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
 }
 
-fn assert_fits(schema: &str, file: &Path) {
+fn assert_matches_schema(schema: &str, file: &Path) {
     let folder = common::root().join("schemas");
     let validator = jsonschema::validator_for(&read_json(&folder.join(schema))).unwrap();
     let errors: Vec<String> =
@@ -235,16 +239,16 @@ fn assert_fits(schema: &str, file: &Path) {
 
 /// The stages' files match the schemas.
 #[test]
-fn artifacts_fit_their_schemas() {
+fn artifacts_match_their_schemas() {
     let project = common::Project::tiny();
     project.ok(&["run"]);
     let object = |stage: &str| project.artifact(stage, &[]);
     let (scene, field, views, metrics) =
         (object("prep"), object("train-ss"), object("render-depth"), object("eval"));
     for folder in [&scene, &field, &views, &metrics] {
-        assert_fits("artifact.json", &folder.join("artifact.json"));
+        assert_matches_schema("artifact.json", &folder.join("artifact.json"));
     }
-    assert_fits("scene.json", &scene.join("scene.json"));
+    assert_matches_schema("scene.json", &scene.join("scene.json"));
     for views in [
         scene.join("train"),
         scene.join("truth"),
@@ -252,15 +256,15 @@ fn artifacts_fit_their_schemas() {
         scene.join("references"),
         views,
     ] {
-        assert_fits("views.json", &views.join("views.json"));
+        assert_matches_schema("views.json", &views.join("views.json"));
     }
-    assert_fits("field.json", &field.join("field.json"));
-    assert_fits("training.json", &field.join("training.json"));
-    assert_fits("metrics.json", &metrics.join("metrics.json"));
+    assert_matches_schema("field.json", &field.join("field.json"));
+    assert_matches_schema("training.json", &field.join("training.json"));
+    assert_matches_schema("metrics.json", &metrics.join("metrics.json"));
     for action in std::fs::read_dir(project.path(".nerf-sr/actions")).unwrap() {
         let path = action.unwrap().path();
         if path.extension().is_some_and(|e| e == "json") {
-            assert_fits("action.json", &path);
+            assert_matches_schema("action.json", &path);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The Slurm executor: on a real cluster of one node, and against programs that play Slurm's.
+//! Slurm executor, on a real cluster of one node and with fake Slurm programs.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -13,10 +13,10 @@ use std::time::{Duration, Instant};
 use common::{Finished, Project, commands, happens, root, wait_until};
 use numerics::CounterRng;
 
-/// A stage in plain Python. It takes a number of steps, each from the previous one, and leaves a
-/// checkpoint when it is interrupted or, with `keeps`, at every step. While the file that `hold`
-/// names exists, the stage waits at the step in this file, after a line in `held`. `pause` prolongs
-/// each step, so that kills at random moments interrupt it at work.
+/// Stage in plain Python that computes `steps` hashes, each from the previous one. The stage writes
+/// a checkpoint when it is interrupted and, with `keeps`, after every step. While the file named by
+/// `hold` exists, the stage waits at the step in this file, and appends the step to `held`. `pause`
+/// prolongs each step, so that kills at random moments interrupt a working stage.
 const STEP: &str = r#"#!/usr/bin/env python3
 import hashlib, json, os, pathlib, signal, sys, time
 here = pathlib.Path(__file__).parent
@@ -66,7 +66,7 @@ os.makedirs(given["--output"])
 pathlib.Path(given["--output"], "text").write_text(state)
 "#;
 
-/// A sink in plain Python.
+/// Sink in plain Python, whose page lists the outputs of a run's nodes.
 const PAGE: &str = r#"#!/usr/bin/env python3
 import json, os, pathlib, sys
 if sys.argv[1] == "describe":
@@ -95,7 +95,7 @@ fn project(pipeline: &str) -> Project {
     project
 }
 
-/// The first of two ports that nobody listens on, below those that the kernel hands out to clients.
+/// Returns the first of two consecutive free ports, below the kernel's range of client ports.
 fn free_ports() -> u16 {
     static NEXT: AtomicU16 = AtomicU16::new(0);
     let first = (std::process::id() % 600) as u16 * 20;
@@ -105,24 +105,24 @@ fn free_ports() -> u16 {
     ports.take(6_000).find(|&port| is_free(port) && is_free(port + 1)).expect("two free ports")
 }
 
-/// A cluster of one node; it ends with this.
+/// Slurm cluster of one node, stopped when dropped.
 struct Cluster {
     dir: tempfile::TempDir,
 }
 
-fn word_after(text: &str, key: &str) -> String {
+fn field_value(text: &str, key: &str) -> String {
     text.split_whitespace().find_map(|word| word.strip_prefix(key)).unwrap_or_default().to_owned()
 }
 
 impl Cluster {
-    /// One try: somebody else may take a port between the look and the start.
+    /// Tries to start a cluster; fails if another process takes one of the free ports meanwhile.
     fn try_start() -> Option<Self> {
-        // Socket paths are short: not in a test's own deep folder.
+        // Paths of sockets have to be short, so the cluster isn't in a test's own folder.
         let cluster =
             Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
         let mut script = cluster.script("start");
         script.env("MINI_SLURM_PORT", free_ports().to_string()).env("MINI_SLURM_FAKE_GPUS", "2");
-        // The daemons would hold a pipe open, and write into the lines of tests.
+        // The daemons would keep a pipe open, and mix their lines with those of tests.
         script
             .stdout(Stdio::null())
             .stderr(Stdio::null())
@@ -132,7 +132,8 @@ impl Cluster {
             .then_some(cluster)
     }
 
-    /// A new one; without Slurm's programs it says so and is none.
+    /// Starts a cluster. Without Slurm's programs, prints that the test is skipped and returns
+    /// `None`.
     fn start() -> Option<Self> {
         let path = std::env::var("PATH").unwrap_or_default() + ":/usr/sbin";
         let has = |name: &str| path.split(':').any(|folder| Path::new(folder).join(name).exists());
@@ -142,7 +143,7 @@ impl Cluster {
             return None;
         }
         let cluster = (0..3).find_map(|_| Self::try_start());
-        assert!(cluster.is_some(), "the cluster doesn't start");
+        assert!(cluster.is_some(), "cannot start the cluster");
         cluster
     }
 
@@ -152,7 +153,7 @@ impl Cluster {
         command
     }
 
-    /// A command that works with this cluster.
+    /// Returns the command with this cluster's configuration in the environment.
     fn with(&self, command: Command) -> Command {
         with_environment(command, "SLURM_CONF", &self.dir.path().join("slurm.conf"))
     }
@@ -177,7 +178,7 @@ impl Cluster {
         finished.stdout
     }
 
-    /// The jobs of a submission by the names of their tasks.
+    /// Submits a run and returns its jobs' ids by their labels.
     #[track_caller]
     fn submit(&self, project: &Project, arguments: &[&str]) -> BTreeMap<String, String> {
         jobs(&self.ok(project, &[&["run"], arguments].concat()))
@@ -190,10 +191,10 @@ impl Cluster {
         assert!(is_empty, "{}", self.slurm("scontrol", &["show", "job"]));
     }
 
-    /// Slurm's word on a job: `COMPLETED 0:0`.
+    /// Returns a job's state and exit code as reported by Slurm: `COMPLETED 0:0`.
     fn state(&self, job: &str) -> String {
-        let shown = self.slurm("scontrol", &["-o", "show", "job", job]);
-        format!("{} {}", word_after(&shown, "JobState="), word_after(&shown, "ExitCode="))
+        let details = self.slurm("scontrol", &["-o", "show", "job", job]);
+        format!("{} {}", field_value(&details, "JobState="), field_value(&details, "ExitCode="))
     }
 }
 
@@ -218,8 +219,9 @@ fn command(project: &Project, arguments: &[&str]) -> Command {
     command
 }
 
-fn jobs(said: &str) -> BTreeMap<String, String> {
-    said.lines()
+fn jobs(stdout: &str) -> BTreeMap<String, String> {
+    stdout
+        .lines()
         .filter_map(|line| line.rsplit_once(": job "))
         .map(|(label, id)| (label.to_owned(), id.to_owned()))
         .collect()
@@ -230,62 +232,62 @@ fn lines(project: &Project, file: &str) -> Vec<String> {
     text.lines().map(str::to_owned).collect()
 }
 
-/// Returns the names of the stages that ran, one for each time.
-fn ran(project: &Project) -> Vec<String> {
+/// Returns a line for each time that a stage ran: the key, device and number of threads.
+fn stage_runs(project: &Project) -> Vec<String> {
     lines(project, "ran")
 }
 
-/// The steps at which stages began to wait.
-fn held(project: &Project) -> Vec<String> {
+/// Returns the steps at which stages began to wait.
+fn held_steps(project: &Project) -> Vec<String> {
     lines(project, "held")
 }
 
-/// The objects that a stage's nodes have now.
+/// Returns the identities of a stage's current artifacts.
 fn outputs(project: &Project, stage: &str, arguments: &[&str]) -> Vec<String> {
     project.output_of(stage, arguments)
 }
 
-const SIX: [&str; 2] = ["-p", "train.seed=1,2,3,4,5,6"];
+const SEEDS: [&str; 2] = ["-p", "train.seed=1,2,3,4,5,6"];
 
 #[test]
-fn a_sweep_submitted_twice_at_once_runs_once_and_ends_as_locally() {
+fn a_sweep_submitted_twice_at_once_runs_once_and_equals_a_local_run() {
     let Some(cluster) = Cluster::start() else { return };
     let (shared, local) = (project(SWEEP), project(SWEEP));
-    let both = [0, 1].map(|_| {
-        let mut command = cluster.with(command(&shared, &[&["run"][..], &SIX].concat()));
+    let runners = [0, 1].map(|_| {
+        let mut command = cluster.with(command(&shared, &[&["run"][..], &SEEDS].concat()));
         command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
     });
     let started = Instant::now();
-    let said: Vec<Finished> =
-        both.into_iter().map(|child| Finished::of(child.wait_with_output().unwrap())).collect();
-    for one in &said {
-        assert_eq!(one.code, 0, "{}{}", one.stdout, one.stderr);
+    let finished: Vec<Finished> =
+        runners.into_iter().map(|child| Finished::of(child.wait_with_output().unwrap())).collect();
+    for runner in &finished {
+        assert_eq!(runner.code, 0, "{}{}", runner.stdout, runner.stderr);
     }
-    let submitted: usize = said.iter().map(|one| jobs(&one.stdout).len()).sum();
-    assert_eq!(submitted, 14, "{}{}", said[0].stdout, said[1].stdout);
-    let status = cluster.ok(&shared, &[&["status"][..], &SIX].concat());
+    let submitted: usize = finished.iter().map(|runner| jobs(&runner.stdout).len()).sum();
+    assert_eq!(submitted, 14, "{}{}", finished[0].stdout, finished[1].stdout);
+    let status = cluster.ok(&shared, &[&["status"][..], &SEEDS].concat());
     assert!(status.contains(" pending: Dependency"), "{status}");
     cluster.drain();
     eprintln!("14 jobs, 4 hops, on four places: {:.1} s", started.elapsed().as_secs_f64());
-    assert_eq!(ran(&shared).len(), 13, "each stage ran once");
-    local.ok(&[&["run"][..], &SIX].concat());
+    assert_eq!(stage_runs(&shared).len(), 13, "each stage runs once");
+    local.ok(&[&["run"][..], &SEEDS].concat());
     for stage in ["prep", "train", "eval"] {
-        assert_eq!(outputs(&shared, stage, &SIX), outputs(&local, stage, &SIX), "{stage}");
+        assert_eq!(outputs(&shared, stage, &SEEDS), outputs(&local, stage, &SEEDS), "{stage}");
     }
     let page =
         |project: &Project| std::fs::read_to_string(project.path("out/page/index.html")).unwrap();
     assert_eq!(page(&shared), page(&local));
     assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
     assert!(
-        cluster.ok(&shared, &[&["run"][..], &SIX].concat()).contains("nothing to run"),
-        "and a page that is there"
+        cluster.ok(&shared, &[&["run"][..], &SEEDS].concat()).contains("nothing to run"),
+        "the page exists already"
     );
-    // `cpus` leads to as many threads.
-    assert!(ran(&shared)[0].ends_with(" cpu 2"), "{:?}", ran(&shared));
+    // `cpus` sets the number of threads.
+    assert!(stage_runs(&shared)[0].ends_with(" cpu 2"), "{:?}", stage_runs(&shared));
 }
 
 #[test]
-fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
+fn a_failing_stage_cancels_only_its_dependents() {
     let Some(cluster) = Cluster::start() else { return };
     let project = project(SWEEP);
     let arguments = ["eval", "-p", "train.fails=0,7", "-p", "eval.seed=3"];
@@ -307,21 +309,21 @@ fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
             && log.contains("exit code 7 without a message"),
         "{log}"
     );
-    // Once more: what failed, and what needs it.
+    // A second submission contains only the failed stage and its dependent.
     let again = cluster.submit(&project, &arguments);
     assert_eq!(again.keys().collect::<Vec<_>>(), ["eval [fails=7]", "train [fails=7]"]);
     cluster.drain();
-    // A stage that comes out as before leaves the rest cached: the job ends as a hit.
+    // `prep` has another key but an equal output, so its dependents' jobs end as cache hits.
     let hit = ["eval", "-p", "prep.pause=0.01", "-p", "train.fails=0", "-p", "eval.seed=3"];
     let jobs = cluster.submit(&project, &hit);
     assert_eq!(jobs.len(), 3);
     cluster.drain();
     assert_eq!(cluster.state(&jobs["eval"]), "COMPLETED 0:0");
     assert!(cluster.ok(&project, &[&["log", "eval"][..], &hit].concat()).contains("eval: cached"));
-    assert_eq!(ran(&project).len(), 6, "{:?}", ran(&project));
+    assert_eq!(stage_runs(&project).len(), 6, "{:?}", stage_runs(&project));
 }
 
-/// The guide's commands, one after the other, on a pipeline of seconds.
+/// The guide's commands succeed one after another, with a pipeline that takes seconds.
 #[test]
 fn commands_of_the_guide_run() {
     let Some(cluster) = Cluster::start() else { return };
@@ -329,29 +331,33 @@ fn commands_of_the_guide_run() {
     let guide = commands(&root().join("docs/guide/slurm.md"));
     assert_eq!(guide.len(), 4, "{guide:?}");
     for command in &guide {
-        let words: Vec<&str> = command.split_whitespace().skip(1).collect();
-        let said = cluster.ok(&project, &words);
-        assert!(!said.is_empty(), "{command}");
-        if words[0] == "run" {
-            // Two supersamplings, three seeds, and what each training needs and feeds.
-            assert_eq!(jobs(&said).keys().filter(|label| label.starts_with("train-ss")).count(), 6);
+        let arguments: Vec<&str> = command.split_whitespace().skip(1).collect();
+        let stdout = cluster.ok(&project, &arguments);
+        assert!(!stdout.is_empty(), "{command}");
+        if arguments[0] == "run" {
+            // Two values of `supersample` and three seeds give six trainings.
+            assert_eq!(
+                jobs(&stdout).keys().filter(|label| label.starts_with("train-ss")).count(),
+                6
+            );
         }
     }
     cluster.drain();
 }
 
-const ONE: &str =
+const TWO_STAGES: &str =
     "default: [last]\nstages:\n  first: {run: ./step}\n  last: {run: ./step, inputs: {a: first}}\n";
 
-fn shows_running(cluster: &Cluster, project: &Project, arguments: &[&str], job: &str) -> bool {
+fn is_job_running(cluster: &Cluster, project: &Project, arguments: &[&str], job: &str) -> bool {
     let status = cluster.ok(project, &[&["status"], arguments].concat());
     status.contains(&format!("job {job} running"))
 }
 
 #[test]
-fn an_outstanding_submission_is_seen_kept_and_cancelled() {
+fn queued_jobs_are_found_kept_and_cancelled() {
     let Some(cluster) = Cluster::start() else { return };
-    let project = project(&format!("{ONE}  other: {{run: ./step, parameters: {{seed: 9}}}}\n"));
+    let project =
+        project(&format!("{TWO_STAGES}  other: {{run: ./step, parameters: {{seed: 9}}}}\n"));
     cluster.ok(&project, &["run", "other", "--executor", "local"]);
     project.write("hold", "");
     let first = ["first", "-p", "first.seed=5"];
@@ -359,37 +365,37 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     cluster.drain();
     let held = ["-p", "first.seed=5", "-p", "last.hold=hold"];
     let jobs = cluster.submit(&project, &held);
-    assert_eq!(jobs.keys().collect::<Vec<_>>(), ["last"], "what is cached is not submitted");
-    wait_until(|| shows_running(&cluster, &project, &held, &jobs["last"]));
+    assert_eq!(jobs.keys().collect::<Vec<_>>(), ["last"], "a cached stage isn't submitted");
+    wait_until(|| is_job_running(&cluster, &project, &held, &jobs["last"]));
     let second = cluster.ok(&project, &[&["run"][..], &held].concat());
     assert!(second.contains("0 jobs submitted, 1 already queued"), "{second}");
-    // What the job needs stays, though the plan without arguments doesn't name it.
-    let said = cluster.ok(&project, &["gc", "other", "--keep-days", "0", "--drop-unfinished"]);
+    // gc keeps the inputs of a queued job, even if the given target doesn't need them.
+    let stdout = cluster.ok(&project, &["gc", "other", "--keep-days", "0", "--drop-unfinished"]);
     assert!(
-        said.lines()
+        stdout
+            .lines()
             .any(|line| line.contains("first") && line.contains("a submitted job needs it")),
-        "{said}"
+        "{stdout}"
     );
-    // Edits meanwhile change nothing of what was submitted; a job that waits for the held one is
-    // queued with it.
-    let more = cluster.submit(
+    // Edits of the pipeline don't change the two submitted jobs, which both wait.
+    let other_jobs = cluster.submit(
         &project,
         &[&["other"][..], &["-p", "other.hold=hold", "-p", "other.seed=1"]].concat(),
     );
     std::fs::write(
         project.path("pipeline.yaml"),
-        ONE.replace("run: ./step, inputs", "parameters: {steps: 3}, run: ./step, inputs"),
+        TWO_STAGES.replace("run: ./step, inputs", "parameters: {steps: 3}, run: ./step, inputs"),
     )
     .unwrap();
     std::fs::remove_file(project.path("hold")).unwrap();
     cluster.drain();
     assert_eq!(
-        [&jobs["last"], &more["other"]].map(|job| cluster.state(job)),
+        [&jobs["last"], &other_jobs["other"]].map(|job| cluster.state(job)),
         ["COMPLETED 0:0", "COMPLETED 0:0"]
     );
-    std::fs::write(project.path("pipeline.yaml"), ONE).unwrap();
+    std::fs::write(project.path("pipeline.yaml"), TWO_STAGES).unwrap();
     assert!(cluster.ok(&project, &[&["plan"][..], &held].concat()).matches("cached").count() >= 2);
-    // Without jobs the submissions are runs like others.
+    // gc removes submissions whose jobs have all ended.
     cluster.ok(&project, &["gc", "first", "--keep-days", "0"]);
     assert!(
         std::fs::read_dir(project.path(".nerf-sr/slurm"))
@@ -399,8 +405,8 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     project.write("hold", "");
     let jobs = cluster.submit(&project, &["-p", "first.hold=hold"]);
     assert_eq!(jobs.len(), 2);
-    let said = cluster.ok(&project, &["cancel", "first"]);
-    assert!(said.contains("cancelled 1 job of first"), "{said}");
+    let stdout = cluster.ok(&project, &["cancel", "first"]);
+    assert!(stdout.contains("cancelled 1 job of first"), "{stdout}");
     cluster.drain();
     assert!(
         cluster.state(&jobs["last"]).starts_with("CANCELLED")
@@ -409,10 +415,10 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     assert!(cluster.ok(&project, &["cancel"]).contains("cancelled 0 jobs"));
 }
 
-/// Five ends of its time, the first by Slurm's own clock; the bytes are those of an undisturbed
-/// run.
+/// A job reaches its time limit five times: first by Slurm's clock, then by the test's signals.
+/// The output equals that of an uninterrupted run.
 #[test]
-fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
+fn a_job_at_its_time_limit_resumes_from_its_checkpoint() {
     let Some(cluster) = Cluster::start() else { return };
     let pipeline = "default: [first]\nstages:\n  first: \
         {run: ./step, parameters: {steps: 60, hold: hold}, resources: {time: 1m}}\n";
@@ -423,9 +429,10 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
     let log = || cluster.ok(&shared, &["log", "first"]);
     let state = || cluster.state(&job);
     for round in 1..=5 {
-        // Asked to end any earlier, it would stop at another step, or before it knows how to.
-        let is_held = happens(|| held(&shared).len() == round);
-        assert!(is_held, "{:?} {} {}", held(&shared), state(), log());
+        // A signal before the stage waits would stop the stage at another step, or before its
+        // signal handler is installed.
+        let is_held = happens(|| held_steps(&shared).len() == round);
+        assert!(is_held, "{:?} {} {}", held_steps(&shared), state(), log());
         if round > 1 {
             cluster.slurm("scancel", &["--batch", "--signal=USR1", &job]);
         }
@@ -435,13 +442,13 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
         });
         assert!(is_queued, "{} {}", state(), log());
         shared.write("hold", &(10 * (round + 1)).to_string());
-        // Slurm waits two minutes with what is queued again. At once it would take the old
-        // credential for the new one's.
+        // Slurm starts a requeued job after two minutes. Without any delay, Slurm would mistake
+        // the job's old credential for the new one.
         cluster.slurm("scontrol", &["update", &format!("JobId={job}"), "StartTime=now+2"]);
     }
     std::fs::remove_file(shared.path("hold")).unwrap();
     cluster.drain();
-    assert_eq!((ran(&shared).len(), state().as_str()), (6, "COMPLETED 0:0"), "{}", log());
+    assert_eq!((stage_runs(&shared).len(), state().as_str()), (6, "COMPLETED 0:0"), "{}", log());
     assert!(
         log().contains("set-up is done")
             && [10, 20, 30, 40, 50].iter().all(|n| log().contains(&format!("stopped at {n}"))),
@@ -453,25 +460,26 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
     assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
 }
 
-fn names_folder(entry: &std::fs::DirEntry, folder: &[u8]) -> bool {
-    let words = std::fs::read(entry.path().join("cmdline")).unwrap_or_default();
-    words.windows(folder.len()).any(|window| window == folder)
+fn command_line_contains(entry: &std::fs::DirEntry, path: &[u8]) -> bool {
+    let command_line = std::fs::read(entry.path().join("cmdline")).unwrap_or_default();
+    command_line.windows(path.len()).any(|window| window == path)
 }
 
-/// Processes whose command line names a project: its jobs' runners and stages.
+/// Returns the ids of processes whose command line contains a project's path: runners and stages of
+/// the project's jobs.
 fn processes(project: &Project) -> Vec<String> {
     let folder = project.path("").into_os_string().into_encoded_bytes();
     let entries = std::fs::read_dir("/proc").unwrap().map(|entry| entry.unwrap());
     let mut found: Vec<String> = entries
-        .filter(|entry| names_folder(entry, &folder))
+        .filter(|entry| command_line_contains(entry, &folder))
         .map(|entry| entry.file_name().into_string().unwrap())
         .collect();
     found.sort();
     found
 }
 
-/// Ten times one of the jobs' processes ends at once, whichever it is, and the sweep is submitted
-/// again.
+/// Ten times, a random process of the jobs is killed and the sweep is submitted again. Artifacts
+/// equal those of a local run.
 #[test]
 fn kills_at_random_moments_lose_nothing() {
     let Some(cluster) = Cluster::start() else { return };
@@ -485,17 +493,17 @@ fn kills_at_random_moments_lose_nothing() {
     let seed = std::env::var("NERF_SR_SEED").map_or(1, |text| text.parse().unwrap());
     let mut draws = CounterRng::new(seed, 0, 0);
     for kill in 0..10 {
-        // No node is done before the last kill; each has a few steps to go before every kill.
+        // No node finishes before the last kill. Each node may take a few steps before every kill.
         shared.write("hold", &(5 * (kill + 1)).to_string());
-        // A job that Slurm hasn't yet seen end counts as outstanding: the last kill's may have to
-        // be submitted once more.
+        // Until Slurm notices that a killed job has ended, the job counts as queued. So the job may
+        // have to be submitted in a later attempt.
         let killed = happens(|| {
             cluster.submit(&shared, &sweep);
-            // This is fuzzing: no moment is waited for, so that any may be met.
+            // The kill comes at a random moment, so that every moment may be tested.
             std::thread::sleep(Duration::from_millis(draws.below(500)));
             let running = processes(&shared);
             let chosen = running.get(draws.below(running.len().max(1) as u64) as usize);
-            // It may end by itself before the signal comes.
+            // The process may end by itself before the signal arrives.
             chosen.is_some_and(|process| {
                 Command::new("kill").args(["-KILL", process]).status().unwrap().success()
             })
@@ -520,10 +528,10 @@ fn kills_at_random_moments_lose_nothing() {
 #[test]
 fn a_dependency_that_slurm_has_forgotten_is_caught() {
     let Some(cluster) = Cluster::start() else { return };
-    let project = project(ONE);
+    let project = project(TWO_STAGES);
     cluster.submit(&project, &[]);
     cluster.drain();
-    // Both have gone: a hit of the last wouldn't need the first.
+    // Both artifacts are removed, because a cached `last` wouldn't need `first`.
     let objects = ["first", "last"].map(|stage| project.artifact(stage, &[]));
     objects.iter().for_each(|object| std::fs::remove_dir_all(object).unwrap());
     let submissions =
@@ -532,7 +540,7 @@ fn a_dependency_that_slurm_has_forgotten_is_caught() {
         submissions.filter(|path| path.is_dir()).map(|path| path.join("job.sh")).next().unwrap();
     let log = project.path("log");
     let output = format!("--output={}", log.display());
-    // Slurm takes a job that it doesn't know for one that went well.
+    // Slurm treats an unknown job as one that succeeded.
     let arguments = [
         "--parsable",
         "--dependency=afterok:99999",
@@ -544,33 +552,35 @@ fn a_dependency_that_slurm_has_forgotten_is_caught() {
     let job = cluster.slurm("sbatch", &arguments);
     cluster.drain();
     assert_eq!(cluster.state(&job), "FAILED 3:0");
-    let said = std::fs::read_to_string(log).unwrap();
-    assert!(said.contains("last needs first, which has no artifact"), "{said}");
+    let log_text = std::fs::read_to_string(log).unwrap();
+    assert!(log_text.contains("last needs first, which has no artifact"), "{log_text}");
 }
 
-/// A stage that asks for a GPU computes on the first of its own; here that is another kind of
-/// device, and so another key.
+/// A stage that requests a GPU computes on the job's first GPU. The key differs from the key of a
+/// run on the CPU.
 #[test]
 fn a_stage_with_a_gpu_computes_on_it() {
     let Some(cluster) = Cluster::start() else { return };
-    let project = project(&ONE.replace("last: {", "last: {resources: {gpus: 1}, "));
+    let project = project(&TWO_STAGES.replace("last: {", "last: {resources: {gpus: 1}, "));
     let jobs = cluster.submit(&project, &[]);
     cluster.drain();
     assert_eq!(cluster.state(&jobs["last"]), "COMPLETED 0:0");
-    let devices: Vec<String> =
-        ran(&project).iter().map(|line| line.split(' ').nth(1).unwrap().to_owned()).collect();
+    let devices: Vec<String> = stage_runs(&project)
+        .iter()
+        .map(|line| line.split(' ').nth(1).unwrap().to_owned())
+        .collect();
     assert_eq!(devices, ["cpu", "cuda:0"]);
     assert!(cluster.ok(&project, &["run"]).contains("nothing to run"));
     let why = project.ok(&["why", "last"]);
     assert!(why.contains("device: \"cuda\" → \"cpu\""), "{why}");
 }
 
-/// A program of Slurm's that writes down how it was called.
-fn fake(project: &Project, name: &str, more: &str) {
-    let here = project.path(".").display().to_string();
+/// Writes a fake Slurm program, which appends its arguments to `NAME.called` and then runs `body`.
+fn write_fake(project: &Project, name: &str, body: &str) {
+    let folder = project.path(".").display().to_string();
     project.program(
         &format!("bin/{name}"),
-        &format!("#!/bin/sh\ncd '{here}'\necho \"$@\" >> {name}.called\n{more}\n"),
+        &format!("#!/bin/sh\ncd '{folder}'\necho \"$@\" >> {name}.called\n{body}\n"),
     );
 }
 
@@ -581,34 +591,35 @@ fn run_on_path(project: &Project, path: &str, arguments: &[&str]) -> Finished {
 }
 
 #[test]
-fn what_slurm_is_told() {
+fn resources_and_dependencies_are_passed_to_slurm() {
     let project = project(
         "default: [page]\nstages:\n  first: \
         {run: ./step, resources: {cpus: 4, mem: 8G, gpus: 1, time: 2h}}\n  \
          last: {extends: first, inputs: {a: first}, resources: {gpus: 0}}\n  page: \
          {run: ./page, inputs: {run: last}}\n",
     );
-    fake(&project, "sbatch", "echo $((40 + $(wc -l < sbatch.called)))");
-    fake(&project, "squeue", "cat queue 2>/dev/null || true");
-    fake(&project, "scancel", "");
+    write_fake(&project, "sbatch", "echo $((40 + $(wc -l < sbatch.called)))");
+    write_fake(&project, "squeue", "cat queue 2>/dev/null || true");
+    write_fake(&project, "scancel", "");
     let path = format!("{}:{}", project.path("bin").display(), std::env::var("PATH").unwrap());
     project.write("site.yaml", "partition: gpu\nmax_submit: 2\nsetup: [module load cuda]\n");
-    let said = run_on_path(&project, &path, &["run"]);
+    let finished = run_on_path(&project, &path, &["run"]);
     assert_eq!(
-        (said.code, said.stdout.as_str()),
+        (finished.code, finished.stdout.as_str()),
         (0, "first: job 41\nlast: job 42\n2 jobs submitted, 0 already queued\n"),
         "{}",
-        said.stderr
+        finished.stderr
     );
     assert!(
-        said.stderr
+        finished
+            .stderr
             .contains("1 job not submitted: at most 2 jobs may be queued at once (max_submit)"),
         "{}",
-        said.stderr
+        finished.stderr
     );
-    let called = std::fs::read_to_string(project.path("sbatch.called")).unwrap();
-    let lines: Vec<&str> = called.lines().collect();
-    for (line, words) in [
+    let calls = std::fs::read_to_string(project.path("sbatch.called")).unwrap();
+    let lines: Vec<&str> = calls.lines().collect();
+    for (line, options) in [
         (lines[0], " --cpus-per-task=4 --mem=8192M --gres=gpu:1 --time=120 --partition=gpu /"),
         (
             lines[1],
@@ -617,13 +628,13 @@ fn what_slurm_is_told() {
         ),
     ] {
         assert!(
-            line.contains(words)
+            line.contains(options)
                 && line.contains("--requeue")
                 && line.contains("--signal=B:USR1@90"),
             "{line}"
         );
     }
-    // The same again, while both are queued, and when there is room.
+    // Queued jobs aren't submitted again, and `page` is submitted after `max_submit` is raised.
     let script = lines[0].split_whitespace().find(|word| word.ends_with("job.sh")).unwrap();
     project
         .write("queue", &format!("41|RUNNING|None|{script} 0\n42|PENDING|Dependency|{script} 1\n"));
@@ -633,8 +644,8 @@ fn what_slurm_is_told() {
             .contains("0 jobs submitted, 2 already queued")
     );
     project.write("site.yaml", "max_submit: 3\n");
-    let said = run_on_path(&project, &path, &["run"]);
-    assert_eq!(said.stdout, "page: job 43\n1 job submitted, 2 already queued\n");
+    let finished = run_on_path(&project, &path, &["run"]);
+    assert_eq!(finished.stdout, "page: job 43\n1 job submitted, 2 already queued\n");
     assert!(
         std::fs::read_to_string(project.path("sbatch.called"))
             .unwrap()
@@ -654,8 +665,8 @@ fn what_slurm_is_told() {
             .contains("cancelled 1 job of last")
     );
     assert_eq!(std::fs::read_to_string(project.path("scancel.called")).unwrap(), "42\n");
-    // Refusals are one line, and nothing is lost.
-    fake(&project, "sbatch", "echo 'sbatch: error: invalid partition' >&2; exit 1");
+    // A refusal is one line, and the jobs can be submitted later.
+    write_fake(&project, "sbatch", "echo 'sbatch: error: invalid partition' >&2; exit 1");
     project.write("queue", "");
     run_on_path(&project, &path, &["run"])
         .fails(1, &["3 jobs not submitted: sbatch: error: invalid partition; run this again"]);
@@ -664,22 +675,22 @@ fn what_slurm_is_told() {
     project.write("site.yaml", "partitions: gpu\n");
     run_on_path(&project, &path, &["run"]).fails(2, &["site.yaml", "unknown field `partitions`"]);
     std::fs::remove_file(project.path("bin/squeue")).unwrap();
-    let mut alone = with_environment(
+    let mut without_slurm = with_environment(
         command(&project, &["gc", "--keep-days", "0"]),
         "PATH",
         Path::new("/nowhere"),
     );
-    let said = Finished::of(alone.output().unwrap());
-    assert_eq!(said.code, 0, "{}", said.stderr);
+    let finished = Finished::of(without_slurm.output().unwrap());
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
     assert!(
         project.path(".nerf-sr/slurm").read_dir().unwrap().count() > 1,
-        "where Slurm can't be asked, submissions stay"
+        "gc keeps submissions if Slurm can't be queried"
     );
 }
 
 #[test]
-fn resources_are_checked_with_the_file() {
-    for (block, words) in [
+fn resources_are_validated_and_not_part_of_keys() {
+    for (block, message) in [
         (
             "{mem: 8}",
             "pipeline.yaml:3: stages.first.resources.mem: invalid amount of memory \"8\"; write a \
@@ -694,7 +705,7 @@ fn resources_are_checked_with_the_file() {
         let project = project(&format!(
             "default: [first]\nstages:\n  first: {{run: ./step, resources: {block}}}\n"
         ));
-        project.run(&["plan"]).fails(2, &[words]);
+        project.run(&["plan"]).fails(2, &[message]);
     }
     // No resource is part of a key.
     let project = project("default: [first]\nstages:\n  first: {run: ./step}\n");

@@ -1,5 +1,5 @@
-//! Promises of the store: a file that can't be read isn't taken for absent, and users of one store
-//! don't get in each other's way.
+//! Guarantees of the store: an unreadable file isn't treated as absent, and users of one store
+//! don't disturb each other.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -13,9 +13,9 @@ use std::process::{Child, Command, Stdio};
 
 use common::{Finished, Project, bin, signal};
 
-/// A pipeline of one shell script; `run` is what it does, with `$out` its output and `$params` its
-/// parameters. The default is another point of the same stage.
-fn scripted(run: &str) -> Project {
+/// Creates a project with a stage `text`, a shell script that executes `command`: `$out` is the
+/// output folder, `$params` the parameter file. The default target extends `text`.
+fn scripted(command: &str) -> Project {
     let project = Project::new(
         "default: [other]\nstages:\n  text: {run: ./text}\n  other: {extends: text, parameters: \
         {word: other}}\n",
@@ -25,27 +25,28 @@ fn scripted(run: &str) -> Project {
     let script = format!(
         "#!/bin/sh\nif [ \"$1\" = describe ]; then cat <<'END'\n{description}\nEND\nexit; fi\n\
          while [ $# -gt 0 ]; do case $1 in --output) out=$2;; --params) params=$2;; esac; shift; \
-         done\nmkdir $out; {run}\n"
+         done\nmkdir $out; {command}\n"
     );
     project.program("text", &script);
     project
 }
 
-/// An artifact for each word.
-const WORD: &str = "cp $params $out/word";
+/// Command that creates an artifact for each value of `word`.
+const COPY_PARAMETERS: &str = "cp $params $out/word";
 
-/// A store with a pinned artifact: of another user's, where root runs the tests.
+/// Creates a project with a pinned artifact, whose files all users may read and write.
 fn pinned() -> Project {
-    let project = scripted(WORD);
+    let project = scripted(COPY_PARAMETERS);
     project.ok(&["run", "text"]);
     project.ok(&["pin", "mine", "text"]);
-    let opened = Command::new("chmod").args(["-R", "a+rwX"]).arg(project.path(".")).status();
-    assert!(opened.unwrap().success());
+    let status = Command::new("chmod").args(["-R", "a+rwX"]).arg(project.path(".")).status();
+    assert!(status.unwrap().success());
     project
 }
 
-/// Runs the runner with no more rights than any user has; `None` if that user can't start it.
-fn unprivileged(project: &Project, arguments: &[&str]) -> Option<Finished> {
+/// Runs the runner, as user 65534 if root runs the tests; returns `None` if that user can't start
+/// the runner.
+fn run_unprivileged(project: &Project, arguments: &[&str]) -> Option<Finished> {
     let mut command = project.command(arguments);
     if fs::metadata("/proc/self").unwrap().uid() == 0 {
         command.uid(65534).gid(65534);
@@ -59,8 +60,8 @@ fn unprivileged(project: &Project, arguments: &[&str]) -> Option<Finished> {
     }
 }
 
-/// The first file of a folder of the store.
-fn first(project: &Project, folder: &str, ending: &str) -> PathBuf {
+/// Returns a store folder's first entry, by name, with the given ending.
+fn first_entry(project: &Project, folder: &str, ending: &str) -> PathBuf {
     let entries = fs::read_dir(project.path(".nerf-sr").join(folder)).unwrap();
     let mut paths: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
     paths.retain(|path| path.to_str().unwrap().ends_with(ending));
@@ -68,8 +69,8 @@ fn first(project: &Project, folder: &str, ending: &str) -> PathBuf {
     paths.remove(0)
 }
 
-/// Files by which an artifact stays, and whether its stage's state follows from them.
-const NEEDED: [(&str, &str, bool); 5] = [
+/// Files that `gc` reads: folder, ending, and whether a stage's state depends on the file.
+const READ_BY_GC: [(&str, &str, bool); 5] = [
     ("actions", ".json", true),
     ("objects", "", true),
     ("pins", ".jsonl", false),
@@ -78,37 +79,37 @@ const NEEDED: [(&str, &str, bool); 5] = [
 ];
 
 #[test]
-fn gc_deletes_nothing_where_a_file_may_not_be_read() {
+fn gc_deletes_nothing_if_a_file_is_unreadable() {
     let project = pinned();
     let before = project.store_listing();
-    for (folder, ending, decides) in NEEDED {
-        let path = first(&project, folder, ending);
+    for (folder, ending, decides_state) in READ_BY_GC {
+        let path = first_entry(&project, folder, ending);
         let permissions = fs::metadata(&path).unwrap().permissions();
         fs::set_permissions(&path, PermissionsExt::from_mode(0o0)).unwrap();
         let name = format!("{folder}/{}", path.file_name().unwrap().to_str().unwrap());
         let refused = [&name, "Permission denied", "owned by user", "umask 002", "--store"];
         for arguments in [&["gc", "--keep-days", "0"][..], &["gc", "--dry-run"]] {
-            let Some(finished) = unprivileged(&project, arguments) else { return };
+            let Some(finished) = run_unprivileged(&project, arguments) else { return };
             finished.fails(1, &[&["nothing was deleted"][..], &refused].concat());
         }
-        for verb in ["status", "plan", "run"].into_iter().filter(|_| decides) {
-            unprivileged(&project, &[verb, "text"]).unwrap().fails(1, &refused);
+        for verb in ["status", "plan", "run"].into_iter().filter(|_| decides_state) {
+            run_unprivileged(&project, &[verb, "text"]).unwrap().fails(1, &refused);
         }
         fs::set_permissions(&path, permissions).unwrap();
         assert_eq!(project.store_listing(), before, "{name}");
     }
     project.ok(&["gc", "--keep-days", "0"]);
-    assert_eq!(project.store_listing(), before, "it is pinned");
+    assert_eq!(project.store_listing(), before, "the artifact is pinned");
 }
 
-/// A loop of links, which not even root can read.
+/// A symbolic link to itself, which not even root can read, must be reported.
 #[test]
-fn what_can_not_be_read_is_not_absent() {
-    for (folder, ending, decides) in NEEDED {
+fn unreadable_files_are_not_treated_as_absent() {
+    for (folder, ending, decides_state) in READ_BY_GC {
         let project = pinned();
         let path = match folder {
-            "objects" => first(&project, folder, ending).join("artifact.json"),
-            _ => first(&project, folder, ending),
+            "objects" => first_entry(&project, folder, ending).join("artifact.json"),
+            _ => first_entry(&project, folder, ending),
         };
         fs::remove_file(&path).unwrap();
         symlink(path.file_name().unwrap(), &path).unwrap();
@@ -118,7 +119,7 @@ fn what_can_not_be_read_is_not_absent() {
         project
             .run(&["gc", "--keep-days", "0"])
             .fails(1, &[&["nothing was deleted"][..], &words].concat());
-        for verb in ["status", "plan", "run"].into_iter().filter(|_| decides) {
+        for verb in ["status", "plan", "run"].into_iter().filter(|_| decides_state) {
             project.run(&[verb, "text"]).fails(1, &words);
         }
         assert_eq!(project.store_listing(), before, "{name}");
@@ -143,11 +144,11 @@ fn a_damaged_pin_stops_gc_until_it_is_removed() {
     assert!(project.store_listing().is_empty());
 }
 
-/// A damaged record may be the one by which an artifact is pinned.
+/// A damaged record may be the record of a pinned artifact.
 #[test]
-fn a_damaged_record_stops_gc_until_it_is_removed_or_made_again() {
+fn a_damaged_record_stops_gc_until_it_is_removed_or_rewritten() {
     let project = pinned();
-    let record = first(&project, "actions", ".json");
+    let record = first_entry(&project, "actions", ".json");
     let damage = || fs::write(&record, "{\"stage\":").unwrap();
     let name = record.file_name().unwrap().to_str().unwrap();
     damage();
@@ -167,33 +168,36 @@ fn a_damaged_record_stops_gc_until_it_is_removed_or_made_again() {
     project.ok(&gc);
 }
 
-/// Two users and one store without a common group: messages say what is wrong.
+/// If two users without a common group share a store, messages must report missing permissions.
 #[test]
 fn a_colleagues_files_are_not_called_damaged() {
     let project = pinned();
-    let object = first(&project, "objects", "");
+    let object = first_entry(&project, "objects", "");
     fs::set_permissions(&object, PermissionsExt::from_mode(0o0)).unwrap();
-    let Some(verified) = unprivileged(&project, &["verify", "--remove"]) else { return };
+    let Some(verified) = run_unprivileged(&project, &["verify", "--remove"]) else { return };
     fs::set_permissions(&object, PermissionsExt::from_mode(0o777)).unwrap();
-    let said = &verified.stdout;
-    assert!(verified.code == 3 && said.contains("cannot read ") && object.exists(), "{said}");
-    assert!(said.contains("owned by user") && !said.contains("the artifact is damaged"), "{said}");
-    assert!(said.ends_with("1 artifact, 0 damaged, 1 unreadable\n"), "{said}");
-    // The lock of an action that isn't done, as a colleague with umask 022 leaves it.
+    let report = &verified.stdout;
+    assert!(verified.code == 3 && report.contains("cannot read ") && object.exists(), "{report}");
+    assert!(
+        report.contains("owned by user") && !report.contains("the artifact is damaged"),
+        "{report}"
+    );
+    assert!(report.ends_with("1 artifact, 0 damaged, 1 unreadable\n"), "{report}");
+    // A lock of an unfinished action, as a colleague with umask 022 leaves the file.
     fs::remove_dir_all(&object).unwrap();
-    let lock = first(&project, "locks", "");
+    let lock = first_entry(&project, "locks", "");
     fs::set_permissions(&lock, PermissionsExt::from_mode(0o444)).unwrap();
     let name = format!("locks/{}: Permission denied", lock.file_name().unwrap().to_str().unwrap());
-    let refused = unprivileged(&project, &["run", "text"]).unwrap();
+    let refused = run_unprivileged(&project, &["run", "text"]).unwrap();
     refused.fails(1, &[&name, "owned by user", "umask 002", "--store"]);
 }
 
-/// Some file systems of clusters have no locks.
+/// Some clusters' file systems have no file locks.
 #[test]
-fn a_file_system_without_locks_is_named() {
+fn a_file_system_without_locks_is_reported() {
     let project = pinned();
-    let refuse = "#include <errno.h>\nint flock(int f, int o) { errno = ENOSYS; return -1; }\n";
-    project.write("shim.c", refuse);
+    let source = "#include <errno.h>\nint flock(int f, int o) { errno = ENOSYS; return -1; }\n";
+    project.write("shim.c", source);
     let shim = project.path("shim.so");
     let compiled = Command::new("cc")
         .args(["-shared", "-fPIC", "-o"])
@@ -210,8 +214,8 @@ fn a_file_system_without_locks_is_named() {
     }
 }
 
-/// Starts the runner as process 1 of its own, as a container does.
-fn contained(project: &Project, arguments: &[&str]) -> Child {
+/// Starts the runner as process 1 of a new PID namespace, as a container does.
+fn spawn_contained(project: &Project, arguments: &[&str]) -> Child {
     let mut command = Command::new("unshare");
     command.args(["--pid", "--fork"]).arg(bin("nerf-sr")).args(arguments);
     command.current_dir(project.path(".")).env_remove("NERF_SR_STORE");
@@ -228,10 +232,10 @@ fn containers_share_a_store() {
         eprintln!("skipped: processes can't be counted anew here (it needs root)");
         return;
     }
-    let project = scripted(WORD);
+    let project = scripted(COPY_PARAMETERS);
     for word in ["a", "b", "c"] {
         let value = format!("text.word={word}");
-        let runs = [(); 3].map(|()| contained(&project, &["run", "text", "-p", &value]));
+        let runs = [(); 3].map(|()| spawn_contained(&project, &["run", "text", "-p", &value]));
         for run in runs {
             let finished = Finished::of(run.wait_with_output().unwrap());
             assert_eq!(finished.code, 0, "{}", finished.stderr);
@@ -240,15 +244,15 @@ fn containers_share_a_store() {
     assert_eq!(fs::read_dir(project.path(".nerf-sr/runs")).unwrap().count(), 9);
 }
 
-/// Returns whether a process has a file open whose path contains these words.
-fn has_open(process: u32, words: &str) -> bool {
+/// Returns whether a process has an open file whose path contains `part`.
+fn has_open(process: u32, part: &str) -> bool {
     let files = fs::read_dir(format!("/proc/{process}/fd")).into_iter().flatten().flatten();
     let mut targets = files.filter_map(|file| fs::read_link(file.path()).ok());
-    targets.any(|target: PathBuf| target.to_string_lossy().contains(words))
+    targets.any(|target: PathBuf| target.to_string_lossy().contains(part))
 }
 
-/// Starts `verify` and stops it while it reads its first artifact.
-fn stopped_verify(project: &Project, arguments: &[&str]) -> Child {
+/// Starts `verify`, and suspends the process while an artifact is being read.
+fn suspended_verify(project: &Project, arguments: &[&str]) -> Child {
     loop {
         let mut child = project.spawn(arguments);
         while child.try_wait().unwrap().is_none() {
@@ -260,14 +264,14 @@ fn stopped_verify(project: &Project, arguments: &[&str]) -> Child {
     }
 }
 
-/// Artifacts that garbage collection takes while `verify` reads aren't damaged.
+/// Artifacts that `gc` deletes while `verify` reads aren't damaged.
 #[test]
-fn verify_beside_gc_cries_no_damage() {
-    // Large enough to be met while it is read; there are holes on the disk.
+fn verify_reports_no_damage_during_gc() {
+    // Large enough that `verify` is suspended while reading, and sparse on the disk.
     let project = scripted("cp $params $out/word; truncate -s 200M $out/word");
     for arguments in [&["verify"][..], &["verify", "--remove"]] {
         project.ok(&["run", "text", "-p", "text.word=a,b,c"]);
-        let verify = stopped_verify(&project, arguments);
+        let verify = suspended_verify(&project, arguments);
         project.ok(&["gc", "--keep-days", "0"]);
         assert!(project.store_listing().is_empty());
         signal(&verify, "-CONT");
@@ -277,7 +281,8 @@ fn verify_beside_gc_cries_no_damage() {
     }
 }
 
-/// Scripts' changes to their output, and the reason of the refusal; `${0%/*}` is the project.
+/// Commands that write links or pipes, and the reason why the output is refused. `${0%/*}` is the
+/// project's folder.
 const LINKS: [(&str, &str); 4] = [
     ("rmdir $out; ln -s ${0%/*}/own $out", "/output is a symbolic link"),
     ("cp ${0%/*}/own/x $out; ln -s x $out/link", "/output/link is a symbolic link"),
@@ -290,14 +295,14 @@ fn assert_untouched(project: &Project) {
     assert_eq!(fs::read_to_string(project.path("own/x")).unwrap(), "mine");
 }
 
-/// An artifact that is a link would change with the user's file, and the runner would write into
-/// the user's folder.
+/// A linked artifact would change with the user's file, and the runner would write into the user's
+/// folder.
 #[test]
 fn links_in_a_stages_output_are_refused() {
-    for (run, words) in LINKS {
-        let project = scripted(run);
+    for (command, reason) in LINKS {
+        let project = scripted(command);
         project.write("own/x", "mine");
-        project.run(&["run", "text"]).fails(1, &["text", "without a valid artifact", words]);
+        project.run(&["run", "text"]).fails(1, &["text", "without a valid artifact", reason]);
         assert!(project.store_listing().is_empty());
         assert_untouched(&project);
     }
@@ -307,29 +312,29 @@ fn links_in_a_stages_output_are_refused() {
 fn links_in_a_sinks_output_are_refused() {
     let description = r#"{"name": "page", "version": "1", "code": "1", "summary": "Shows.", "sink": true, "parameters": {"type": "object"},
       "inputs": {"run": {"kinds": ["run"], "summary": "a run"}}, "output": {"kind": "page"}}"#;
-    for (run, words) in LINKS {
-        let project = scripted(WORD);
+    for (command, reason) in LINKS {
+        let project = scripted(COPY_PARAMETERS);
         project.write("own/x", "mine");
         project.write(
             "pipeline.yaml",
             "default: [page]\nstages:\n  text: {run: ./text}\n  page: {run: ./page, inputs: {run: text}}\n",
         );
         let script = fs::read_to_string(project.path("text")).unwrap();
-        let (_, arguments) = script.split_once("exit; fi\n").unwrap();
-        let arguments = arguments.replace(WORD, run);
+        let (_, body) = script.split_once("exit; fi\n").unwrap();
+        let body = body.replace(COPY_PARAMETERS, command);
         project.program(
             "page",
             &format!(
-                "#!/bin/sh\nif [ $1 = describe ]; then echo '{description}'; exit; fi\n{arguments}"
+                "#!/bin/sh\nif [ $1 = describe ]; then echo '{description}'; exit; fi\n{body}"
             ),
         );
-        project.run(&["run", "page"]).fails(1, &["page", words]);
+        project.run(&["run", "page"]).fails(1, &["page", reason]);
         assert!(!project.path("out/page").exists());
         assert_untouched(&project);
     }
 }
 
-/// A hard link is a second name of the user's file: the artifact has a copy.
+/// A hard link is a second name of the user's file, so the artifact contains a copy.
 #[test]
 fn a_hard_link_in_an_output_becomes_a_copy() {
     let project = scripted("ln ${0%/*}/own/x $out/x");

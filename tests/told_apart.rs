@@ -1,5 +1,5 @@
-//! Detection of scenes on a background, forward-facing scenes and unbounded ones, also without
-//! known depths.
+//! Detection of scenes on a flat background, forward-facing scenes and unbounded scenes, also
+//! without known depths.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -11,8 +11,8 @@ use dataset::Dataset;
 use pixels::{Filter, Rgba8, read_png, resize_pillow, write_png};
 use serde_json::{Value, json};
 
-/// Returns background, kind of space and notes that `prep` writes for a data set.
-fn prepared(project: &Project, dataset: &Path, params: &Value) -> (String, String, String) {
+/// Prepares a data set; returns the scene's background, kind of space and notes.
+fn prepare(project: &Project, dataset: &Path, params: &Value) -> (String, String, String) {
     let scene = project.path("scene");
     std::fs::remove_dir_all(&scene).ok();
     let finished = stage("prep", &params.to_string(), &[("dataset", dataset)], &scene, &[]);
@@ -27,7 +27,8 @@ fn prepared(project: &Project, dataset: &Path, params: &Value) -> (String, Strin
     (summary["background"].as_str().unwrap().to_owned(), space, summary["notes"].to_string())
 }
 
-fn chosen(folder: &Path, file: &str) -> Vec<String> {
+/// Returns the image names in a list of frames.
+fn image_names(folder: &Path, file: &str) -> Vec<String> {
     let transforms: Value =
         serde_json::from_str(&std::fs::read_to_string(folder.join(file)).unwrap()).unwrap();
     let frames = transforms["frames"].as_array().unwrap();
@@ -44,14 +45,14 @@ fn chosen(folder: &Path, file: &str) -> Vec<String> {
         .collect()
 }
 
-fn over_white(p: &[u8]) -> [u8; 4] {
-    let alpha = u32::from(p[3]);
-    let level = |c: usize| ((u32::from(p[c]) * alpha + 255 * (255 - alpha)) / 255) as u8;
+fn over_white(pixel: &[u8]) -> [u8; 4] {
+    let alpha = u32::from(pixel[3]);
+    let level = |c: usize| ((u32::from(pixel[c]) * alpha + 255 * (255 - alpha)) / 255) as u8;
     [level(0), level(1), level(2), 255]
 }
 
-/// Some views of a Blender scene, as RGB on white.
-fn on_white(source: &Path, folder: &Path) {
+/// Writes ten views per split of a Blender scene, composited over white.
+fn write_on_white(source: &Path, folder: &Path) {
     for split in ["train", "test"] {
         std::fs::create_dir_all(folder.join(split)).unwrap();
         let text =
@@ -63,14 +64,16 @@ fn on_white(source: &Path, folder: &Path) {
             .unwrap();
     }
     let (train, test) =
-        (chosen(folder, "transforms_train.json"), chosen(folder, "transforms_test.json"));
-    let set = Dataset::read(source).unwrap();
-    let given = set.split.clone().unwrap();
-    for (split, numbers, names) in [("train", given.train, train), ("test", given.test, test)] {
-        for number in numbers {
-            let frame = &set.frames[number];
+        (image_names(folder, "transforms_train.json"), image_names(folder, "transforms_test.json"));
+    let dataset = Dataset::read(source).unwrap();
+    let given_split = dataset.split.clone().unwrap();
+    for (split, indices, names) in
+        [("train", given_split.train, train), ("test", given_split.test, test)]
+    {
+        for index in indices {
+            let frame = &dataset.frames[index];
             let name = frame.image.file_stem().unwrap().to_str().unwrap();
-            if !names.iter().any(|chosen| chosen == name) {
+            if !names.iter().any(|selected| selected == name) {
                 continue;
             }
             let image = frame.photograph().unwrap();
@@ -85,14 +88,14 @@ fn on_white(source: &Path, folder: &Path) {
 }
 
 #[test]
-fn objects_on_white_stay_in_a_box_on_white() {
+fn objects_on_white_have_a_white_background_and_a_box() {
     let Some(data) = data() else { return };
     let project = Project::tiny();
     for scene in ["lego", "chair"] {
         let folder = project.path(scene);
-        on_white(&data.join("nerf_synthetic").join(scene), &folder);
+        write_on_white(&data.join("nerf_synthetic").join(scene), &folder);
         let (background, space, notes) =
-            prepared(&project, &folder, &json!({"lr_width": 50, "scale": 2}));
+            prepare(&project, &folder, &json!({"lr_width": 50, "scale": 2}));
         assert_eq!((background.as_str(), space.as_str()), ("white", "box"), "{scene}: {notes}");
         assert!(
             notes.contains("borders are one flat colour (255 255 255) in 10 of 10 sampled views"),
@@ -101,7 +104,8 @@ fn objects_on_white_stay_in_a_box_on_white() {
     }
 }
 
-fn demo(
+/// Creates and prepares a demo scene; returns the values of [`prepare`].
+fn prepare_demo(
     project: &Project,
     folder: &Path,
     layout: &str,
@@ -112,35 +116,35 @@ fn demo(
         "size": 64, "aspect": 1.5, "train": 12, "test": 3,
         "samples_per_axis": 1});
     assert_eq!(stage("demo-scene", &params.to_string(), &[], folder, &[]).code, 0);
-    prepared(project, folder, &json!({}))
+    prepare(project, folder, &json!({}))
 }
 
 #[test]
-fn photographs_of_a_scene_that_goes_on_are_opaque_and_unbounded() {
+fn photographs_with_a_backdrop_are_opaque_and_unbounded() {
     let project = Project::tiny();
     let folder = project.path("photographs");
-    let (background, space, notes) = demo(&project, &folder, "around", true);
+    let (background, space, notes) = prepare_demo(&project, &folder, "around", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"), "{notes}");
     assert!(notes.contains("of 12 sampled views: the photographs show the scene up to"), "{notes}");
-    let (background, space, notes) = demo(&project, &folder, "forward", true);
+    let (background, space, notes) = prepare_demo(&project, &folder, "forward", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
-    let (background, space, notes) = demo(&project, &folder, "around", false);
+    let (background, space, notes) = prepare_demo(&project, &folder, "around", false);
     assert_eq!((background.as_str(), space.as_str()), ("white", "box"), "{notes}");
-    // Given parameters are used.
-    let (background, space, _) = prepared(&project, &folder, &json!({"background": "opaque"}));
+    // A given background overrides the detected one.
+    let (background, space, _) = prepare(&project, &folder, &json!({"background": "opaque"}));
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"));
 }
 
-/// Enlarged photographs hold no detail for a larger scale, unless they are downscaled again.
+/// Enlarged photographs lack detail at their own size, but not after they are downscaled again.
 #[test]
-fn missing_detail_is_told() {
+fn missing_detail_is_reported() {
     let project = Project::tiny();
     let folder = project.path("enlarged");
     let params = json!({"backdrop": true, "size": 96, "train": 8, "test": 2});
     assert_eq!(stage("demo-scene", &params.to_string(), &[], &folder, &[]).code, 0);
-    let (_, _, notes) = prepared(&project, &folder, &json!({"lr_source": "photographs"}));
+    let (_, _, notes) = prepare(&project, &folder, &json!({"lr_source": "photographs"}));
     assert!(!notes.contains("detail"), "{notes}");
-    // A folder without a manifest is somebody's own.
+    // A folder without a manifest counts as a user's own data.
     std::fs::remove_file(folder.join("artifact.json")).unwrap();
     for entry in std::fs::read_dir(folder.join("train")).unwrap() {
         let path = entry.unwrap().path();
@@ -148,18 +152,18 @@ fn missing_detail_is_told() {
         write_png(&path, &resize_pillow(&image, 192, 192, Filter::Lanczos)).unwrap();
     }
     let (_, _, notes) =
-        prepared(&project, &folder, &json!({"lr_source": "photographs", "split": "holdout"}));
-    let words = "of the LR images' resolution: the photographs are enlarged, blurred";
-    assert!(notes.contains(words), "{notes}");
+        prepare(&project, &folder, &json!({"lr_source": "photographs", "split": "holdout"}));
+    let note = "of the LR images' resolution: the photographs are enlarged, blurred";
+    assert!(notes.contains(note), "{notes}");
     let summary = std::fs::read_to_string(project.path("scene/scene.json")).unwrap();
     let detail = serde_json::from_str::<Value>(&summary).unwrap()["detail"].as_f64().unwrap();
     assert!((0.3..0.7).contains(&detail), "{detail}");
-    let (_, _, notes) = prepared(&project, &folder, &json!({"lr_width": 48, "scale": 2}));
+    let (_, _, notes) = prepare(&project, &folder, &json!({"lr_width": 48, "scale": 2}));
     assert!(!notes.contains("detail"), "{notes}");
 }
 
 #[test]
-fn fern_without_points_is_forward() {
+fn fern_without_points_is_forward_facing() {
     let Some(data) = data() else { return };
     let project = Project::tiny();
     let (source, folder) = (data.join("nerf_llff_data/fern"), project.path("fern"));
@@ -170,6 +174,6 @@ fn fern_without_points_is_forward() {
         }
     }
     let (background, space, notes) =
-        prepared(&project, &folder, &json!({"lr_width": 63, "scale": 2}));
+        prepare(&project, &folder, &json!({"lr_width": 63, "scale": 2}));
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
 }

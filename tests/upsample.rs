@@ -1,5 +1,4 @@
-//! `upsample` in a pipeline, what it says to what it can't do, and `make table`, which puts every
-//! method side by side.
+//! `upsample` in a pipeline, its error messages, and the table that compares all methods.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -9,8 +8,8 @@ use std::path::Path;
 use common::{Project, manifest, stage};
 use pixels::{Filter, Image, read_exr, read_premultiplied, resize_pillow};
 
-/// A project whose LR views are enlarged.
-fn project() -> Project {
+/// Creates a project that enlarges rendered LR views.
+fn upsampling_project() -> Project {
     let project = Project::tiny();
     let blocks = "
   views-lr:
@@ -50,20 +49,20 @@ fn fails_to_upsample(
 
 #[test]
 fn views_are_enlarged_and_scored() {
-    let project = project();
+    let project = upsampling_project();
     project.ok(&["run", "eval-upsampled"]);
     let folder = |stage: &str| project.artifact(stage, &["eval-upsampled"]);
     let (lr, hr) = (folder("views-lr"), folder("upsample"));
     for file in std::fs::read_dir(lr.join("images")).unwrap() {
         let name = file.unwrap().file_name();
-        let before = read_premultiplied(&lr.join("images").join(&name)).unwrap().over(1.0);
-        let after = read_exr(&hr.join("images").join(&name)).unwrap();
-        assert_eq!((after.width, after.height, after.channel("Z")), (48, 48, None));
-        // Pillow's own bicubic filter on 8 bits, but for half precision.
+        let lr_image = read_premultiplied(&lr.join("images").join(&name)).unwrap().over(1.0);
+        let hr_image = read_exr(&hr.join("images").join(&name)).unwrap();
+        assert_eq!((hr_image.width, hr_image.height, hr_image.channel("Z")), (48, 48, None));
+        // Equal to Pillow's bicubic filter on 8 bits, except for rounding to half precision.
         let expected =
-            Image::premultiplied(&resize_pillow(&before.to_rgba8(), 48, 48, Filter::Bicubic));
-        let worst = (0..4).flat_map(|c| {
-            let found = after.channel(["R", "G", "B", "A"][c]).unwrap();
+            Image::premultiplied(&resize_pillow(&lr_image.to_rgba8(), 48, 48, Filter::Bicubic));
+        let errors = (0..4).flat_map(|c| {
+            let found = hr_image.channel(["R", "G", "B", "A"][c]).unwrap();
             expected
                 .channel(c)
                 .into_iter()
@@ -71,9 +70,9 @@ fn views_are_enlarged_and_scored() {
                 .map(|(a, b)| (a - b).abs())
                 .collect::<Vec<_>>()
         });
-        assert!(worst.fold(0.0, f32::max) < 3e-4);
+        assert!(errors.fold(0.0, f32::max) < 3e-4);
     }
-    // A network of the same scale, and one of any: small ones with random weights.
+    // Small networks with random weights: SwinIR of this scale, LIIF for any scale.
     let weights = project.path("weights");
     std::fs::create_dir(&weights).unwrap();
     std::fs::copy(
@@ -91,7 +90,7 @@ fn views_are_enlarged_and_scored() {
         "method=swinir,liif",
     ]);
     assert!(run.contains("method=swinir") && run.contains("method=liif"), "{run}");
-    // At any thread count the same bytes.
+    // Bytes are equal at any thread count.
     let outputs = project.output_of(
         "upsample",
         &["eval-upsampled", "-i", "upsample.weights=weights", "-p", "method=swinir"],
@@ -100,9 +99,9 @@ fn views_are_enlarged_and_scored() {
     for threads in ["1", "3"] {
         let output = project.path(&format!("threads-{threads}"));
         let inputs = [("views", views.as_path()), ("cameras", &cameras), ("weights", &weights)];
-        let done =
+        let finished =
             stage("upsample", r#"{"method": "swinir"}"#, &inputs, &output, &["--threads", threads]);
-        assert_eq!(done.code, 0, "{}", done.stderr);
+        assert_eq!(finished.code, 0, "{}", finished.stderr);
         assert_eq!(manifest(&output), manifest(&project.object(&outputs[0])), "{threads} threads");
     }
 
@@ -151,30 +150,31 @@ fn views_are_enlarged_and_scored() {
 }
 
 #[test]
-fn the_table_has_every_method_side_by_side() {
+fn the_table_compares_every_method() {
     let project = Project::experiments();
     let methods = ["nerf", "nerf-epochs", "bicubic", "swinir", "ss", "kernel", "hr"];
-    let shown = methods.join(",");
+    let names = methods.join(",");
     let rays = ["-p", "train-ss.rays=160000", "-p", "field-nerf-epochs.rays=40000"];
-    let of = ["--scene", "demo", "--protocol", "24x2", "--data", "data", "--show", &shown];
-    let arguments = [&["run", "paper-table", "paper-times", "paper-page"], &of[..], &rays].concat();
+    let options = ["--scene", "demo", "--protocol", "24x2", "--data", "data", "--show", &names];
+    let arguments =
+        [&["run", "paper-table", "paper-times", "paper-page"], &options[..], &rays].concat();
     project.ok(&arguments);
     let read = |file: &str| std::fs::read_to_string(project.path(file)).unwrap();
     let table = read("out/paper-table/table.md");
-    for words in [
+    for text in [
         "| method | has seen | 24x2 (PSNR / SSIM) | commit | machine |",
         "\n| ours, SS | LR |",
         "| NeRF-Swin | other images | no weights/swinir_x2.safetensors |",
         "ours, SS over NeRF at equal epochs |",
     ] {
-        assert!(table.contains(words), "no {words:?} in:\n{table}");
+        assert!(table.contains(text), "no {text:?} in:\n{table}");
     }
     let rows: Vec<serde_json::Value> =
         serde_json::from_str(&read("out/paper-table/rows.json")).unwrap();
     assert_eq!(rows.len(), methods.len());
     let psnr = |method: &str| rows.iter().find(|r| r["method"] == method).unwrap()["psnr"].as_f64();
     assert!(psnr("NeRF-Swin").is_none());
-    // Measured: 21.4 and 20.2 dB, 20.8 and 20.6 dB.
+    // Measured PSNR: 21.4 and 20.2 dB, 20.8 and 20.6 dB.
     for (better, worse, margin) in
         [("trained at HR", "NeRF-Bi", 0.5), ("ours, SS", "NeRF, equal rays", 0.1)]
     {
@@ -186,9 +186,9 @@ fn the_table_has_every_method_side_by_side() {
     let page = read("out/paper-page/index.html");
     assert!(
         page.contains("Side by side") && page.contains("eval-bicubic"),
-        "the page compares nothing"
+        "the page has no comparison"
     );
-    // Again: all is there.
+    // A second run finds everything cached.
     let again = project.ok(&arguments);
     assert!(
         again.contains("paper-table (up to date)") && again.contains("nothing to run"),

@@ -1,5 +1,5 @@
-//! Runs pages that stages write in a real browser: node runs the scripts of `tests/browser`, which
-//! control Debian's Chromium.
+//! Helper for tests in a real browser: node runs the scripts of `tests/browser`, which control
+//! Debian's Chromium.
 
 use std::ffi::OsStr;
 use std::path::PathBuf;
@@ -16,10 +16,10 @@ pub fn run_in_browser<A: AsRef<OsStr>>(
     let packages = root.join("target/browser");
     let chromium = chromium();
     // `complete` is a copy of the lock file with which the packages were installed.
-    let [installed, wanted] =
+    let [installed, required] =
         [packages.join("complete"), root.join("tests/browser/package-lock.json")]
             .map(|file| std::fs::read(file).ok());
-    if chromium.is_none() || installed != wanted {
+    if chromium.is_none() || installed != required {
         eprintln!("skipped: no browser (apt-get install chromium; scripts/setup-browser.sh)");
         return None;
     }
@@ -30,7 +30,7 @@ pub fn run_in_browser<A: AsRef<OsStr>>(
         .env("NERF_SR_CHROMIUM", chromium.unwrap())
         .stdin(Stdio::null())
         .output()
-        .expect("node starts");
+        .expect("cannot start node");
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{script}: {errors}");
     Some(serde_json::from_slice(&output.stdout).unwrap_or_else(|error| {

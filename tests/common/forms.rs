@@ -10,7 +10,9 @@ use serde_json::{Value, json};
 
 use super::common::{Project, stage};
 
+/// Width and height of the photographs, in pixels.
 pub const WIDTH: u32 = 32;
+/// Field of view of the photographs, in radians.
 pub const ANGLE: f64 = 0.691_111_2;
 
 /// Data set format.
@@ -142,9 +144,10 @@ pub fn as_llff(project: &Project) -> PathBuf {
     let views = photographs(project, "llff");
     let mut numbers: Vec<f64> = Vec::new();
     for (_, axes, centre) in &views {
-        let inside = [f64::from(WIDTH), f64::from(WIDTH), focal()];
+        // The fifth column of LLFF's matrices: height, width, focal length.
+        let hwf = [f64::from(WIDTH), f64::from(WIDTH), focal()];
         for k in 0..3 {
-            numbers.extend([-axes.y_axis[k], axes.x_axis[k], axes.z_axis[k], centre[k], inside[k]]);
+            numbers.extend([-axes.y_axis[k], axes.x_axis[k], axes.z_axis[k], centre[k], hwf[k]]);
         }
         numbers.extend([2.0, 6.0]);
     }

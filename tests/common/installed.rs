@@ -1,4 +1,4 @@
-//! Programs as `make install` installs them.
+//! Programs installed by the script of `make install`.
 
 #![allow(unreachable_pub, reason = "shared by several test binaries")]
 
@@ -7,7 +7,7 @@ use std::process::Command;
 
 use super::common::{Finished, bin, root};
 
-/// Installs the built programs into a folder. Returns false without libtorch.
+/// Installs the built programs into a folder. Returns false if libtorch is missing.
 pub fn install(prefix: &Path) -> bool {
     let given = std::env::var_os("LIBTORCH").map(PathBuf::from);
     let libtorch = given.unwrap_or_else(|| root().join(".libtorch"));

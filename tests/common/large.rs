@@ -1,4 +1,4 @@
-//! Stage inputs that are generated in seconds, and parameters with which the stages run for long.
+//! Stage inputs that are generated in seconds, including large ones on which stages run for long.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ pub struct Small {
     pub project: Project,
 }
 
-const FIELD: &str = r#"{"rays": 60000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
+const FIELD_PARAMETERS: &str = r#"{"rays": 60000, "n_levels": 4, "cells_per_pixel": 1.28, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
 
 impl Small {
     /// Runs the stages up to a field, its LR views and a refiner.
@@ -22,7 +22,7 @@ impl Small {
         let demo = r#"{"size": 48, "train": 4, "test": 1, "samples_per_axis": 1}"#;
         small.make("demo-scene", demo, &[], "data");
         small.make("prep", r#"{"lr_width": 24}"#, &[("dataset", "data")], "scene");
-        small.make("train-ss", FIELD, &[("scene", "scene/train")], "field");
+        small.make("train-ss", FIELD_PARAMETERS, &[("scene", "scene/train")], "field");
         let cameras = [("field", "field"), ("cameras", "scene/train")];
         small.make("render-depth", r#"{"samples_per_axis": 1}"#, &cameras, "views");
         let refiner =
@@ -42,8 +42,8 @@ impl Small {
         for ((name, _), folder) in inputs.iter().zip(&folders) {
             given.push((name, folder));
         }
-        let done = stage(name, params, &given, &self.path(output), &[]);
-        assert_eq!(done.code, 0, "{name}: {}", done.stderr);
+        let finished = stage(name, params, &given, &self.path(output), &[]);
+        assert_eq!(finished.code, 0, "{name}: {}", finished.stderr);
     }
 
     /// Writes cameras of the training views, resized to the given widths.
@@ -78,13 +78,13 @@ impl Small {
         }
     }
 
-    /// Writes a run's record with these nodes, as the input of a sink.
+    /// Writes a run's record with the given nodes, as the input of a sink.
     pub fn record(&self, output: &str, nodes: &[Value]) {
         let record = json!({"home": self.path("out"), "nodes": nodes}).to_string();
         self.project.write(&format!("{output}/run.json"), &record);
     }
 
-    /// Returns a node of a run's record; its artifact is a folder of the project.
+    /// Returns a node of a run's record; the node's artifact is a folder of the project.
     pub fn node(&self, stage: &str, kind: &str, folder: &str, inputs: &Value) -> Value {
         json!({"stage": stage, "point": "", "is_shown": true, "kind": kind, "key": "k",
             "output": "o", "folder": self.path(folder), "parameters": {}, "inputs": inputs,

@@ -1,4 +1,4 @@
-//! Files of a project: lasting ones, and leftovers of unfinished commands.
+//! Files of a project: lasting files, and leftovers of unfinished commands.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -21,11 +21,12 @@ pub fn files_below(folder: &Path) -> Files {
     files
 }
 
+/// Folders of a project that are stores.
 const STORES: [&str; 2] = [".nerf-sr", "other"];
 /// Folders of a store that are empty after garbage collection if no run is in progress.
 const EMPTY_FOLDERS: [&str; 3] = ["trash", "sinks", "partial"];
 
-/// Returns whether a file exists only during a command or after an interrupted one.
+/// Returns whether a file exists only during a command or after an interrupted command.
 pub fn is_leftover(path: &str) -> bool {
     let parts: Vec<&str> = path.split('/').collect();
     let is_temporary = |name: &&str| {
@@ -33,16 +34,16 @@ pub fn is_leftover(path: &str) -> bool {
         name.contains('#')
             || is_hidden && (name.ends_with(".partial") || name.contains(".nerf-sr-"))
     };
-    let (folder, place) = (parts[0], parts.get(1).copied().unwrap_or_default());
-    let in_place = folder == "shared" && place == "uploads"
-        || STORES.contains(&folder) && EMPTY_FOLDERS.contains(&place);
-    in_place
+    let (root, folder) = (parts[0], parts.get(1).copied().unwrap_or_default());
+    let is_in_temporary_folder = root == "shared" && folder == "uploads"
+        || STORES.contains(&root) && EMPTY_FOLDERS.contains(&folder);
+    is_in_temporary_folder
         || parts.iter().any(is_temporary)
         || parts.iter().any(|name| name.starts_with(".nerf-sr-"))
 }
 
-/// Returns the part of a file's content that is equal in equal runs, without times and process
-/// numbers; `None` if the file has no such part.
+/// Returns the part of a file's content that is equal in equal runs, without times and process IDs;
+/// `None` if the file has no such part.
 pub fn lasting(path: &str, content: &[u8]) -> Option<Vec<u8>> {
     let parts: Vec<&str> = path.split('/').collect();
     let (name, folder) = (parts[parts.len() - 1], parts.iter().rev().nth(1).copied());
@@ -62,7 +63,7 @@ pub fn lasting(path: &str, content: &[u8]) -> Option<Vec<u8>> {
     }
 }
 
-/// Reads the lasting files of a project.
+/// Reads the lasting contents of a project's files.
 pub fn lasting_files(folder: &Path) -> Files {
     let mut files = Files::new();
     for (path, content) in files_below(folder) {

@@ -21,7 +21,7 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_path_buf()
 }
 
-/// Returns the path of a program that `make build` built.
+/// Returns the path of a program built by `make build`.
 pub fn bin(name: &str) -> PathBuf {
     // Test binaries are one folder deeper than programs.
     let test = std::env::current_exe().unwrap();
@@ -30,8 +30,8 @@ pub fn bin(name: &str) -> PathBuf {
     path
 }
 
-/// Returns the names of all stages, sorted: a stage has the name of its crate's folder or, as a
-/// crate's second program, of its file in `src/bin/`.
+/// Returns all stage names, sorted: names of crate folders, and names of files in `src/bin/` for
+/// crates with a second program.
 pub fn stage_names() -> Vec<String> {
     let mut names = Vec::new();
     for entry in std::fs::read_dir(root().join("stages")).unwrap() {
@@ -58,7 +58,7 @@ pub fn verbs() -> Vec<String> {
     verbs_of(&help).into_iter().map(str::to_owned).collect()
 }
 
-/// Returns the verbs that a help text of the runner lists.
+/// Returns the verbs listed in a help text of the runner.
 pub fn verbs_of(help: &str) -> Vec<&str> {
     let lines = help.lines().skip_while(|line| *line != "Commands:").skip(1);
     lines
@@ -68,8 +68,8 @@ pub fn verbs_of(help: &str) -> Vec<&str> {
         .collect()
 }
 
-/// Returns a verb with its required arguments, for a project that has `prep`'s artifact. A new verb
-/// with required arguments is added here.
+/// Returns a verb with its required arguments, for a project that has `prep`'s artifact. Add a new
+/// verb with required arguments here.
 pub fn call_of(verb: &str) -> Vec<&str> {
     let arguments: &[&str] = match verb {
         "init" => &["data"],
@@ -83,7 +83,7 @@ pub fn call_of(verb: &str) -> Vec<&str> {
     [&[verb][..], arguments].concat()
 }
 
-/// Pipeline that runs in seconds: 12 views of 24 pixels, a small field.
+/// Pipeline that runs in seconds: 12 training views 24 pixels wide, a small field.
 pub const TINY: &str = "
 default: [eval]
 stages:
@@ -101,7 +101,7 @@ stages:
     inputs: {views: render-depth, truth: prep/truth}
 ";
 
-/// Pipeline with a page, whose stages take a tenth of a second each.
+/// Pipeline with a report page; each stage takes a tenth of a second.
 pub const FAST: &str = "
 default: [report]
 stages:
@@ -122,29 +122,29 @@ stages:
     inputs: {run: eval}
 ";
 
-/// Path of a store's cache of descriptions, within a project.
-const DESCRIPTIONS: &str = ".nerf-sr/cache/describe.json";
+/// Path of the cache of stage descriptions, relative to the project.
+const DESCRIPTION_CACHE: &str = ".nerf-sr/cache/describe.json";
 
-/// Cached descriptions of all stages. Without these, each project's runner starts every stage's
-/// program once, and programs with libtorch take half a second to start.
+/// Cached descriptions of all stages. Without a cache, each project's runner starts every stage's
+/// program, and programs with libtorch take half a second to start.
 static STAGE_DESCRIPTIONS: LazyLock<String> = LazyLock::new(|| {
     let file = Path::new(env!("CARGO_TARGET_TMPDIR")).join("describe.json");
-    let changed = |path: &Path| path.metadata().and_then(|found| found.modified());
-    let built = stage_names().iter().map(|stage| changed(&bin(stage)).unwrap()).max().unwrap();
-    if changed(&file).is_ok_and(|written| written > built) {
+    let modified = |path: &Path| path.metadata().and_then(|metadata| metadata.modified());
+    let built = stage_names().iter().map(|stage| modified(&bin(stage)).unwrap()).max().unwrap();
+    if modified(&file).is_ok_and(|written| written > built) {
         return std::fs::read_to_string(file).unwrap();
     }
     let project = Project { dir: tempfile::tempdir().unwrap() };
     let blocks = stage_names().iter().map(|stage| format!("  {stage}: {{}}\n")).collect::<String>();
     project.write("pipeline.yaml", &format!("default: [prep]\nstages:\n{blocks}"));
-    // The blocks lack their inputs, which the runner finds after it has read the descriptions.
+    // The blocks lack inputs, which `plan` reports only after the runner has cached descriptions.
     assert_ne!(project.run(&["plan"]).code, 0);
-    let cached = project.path(DESCRIPTIONS);
+    let cached = project.path(DESCRIPTION_CACHE);
     artifact::write_atomically(&file, &std::fs::read(&cached).unwrap()).unwrap();
     std::fs::read_to_string(cached).unwrap()
 });
 
-/// Temporary folder with a pipeline.
+/// Temporary project folder with a pipeline.
 pub struct Project {
     dir: tempfile::TempDir,
 }
@@ -153,7 +153,7 @@ impl Project {
     pub fn new(pipeline: &str) -> Self {
         let project = Self { dir: tempfile::tempdir().unwrap() };
         project.write("pipeline.yaml", pipeline);
-        project.write(DESCRIPTIONS, &STAGE_DESCRIPTIONS);
+        project.write(DESCRIPTION_CACHE, &STAGE_DESCRIPTIONS);
         project
     }
 
@@ -165,8 +165,8 @@ impl Project {
         Self::new(FAST)
     }
 
-    /// Creates a project with the tiny pipeline and shipped targets; `blocks` are stage blocks that
-    /// change theirs or are added.
+    /// Creates a project with the tiny pipeline and shipped targets; `blocks` are additional or
+    /// overriding stage blocks.
     pub fn shipped(targets: &[&str], blocks: &str) -> Self {
         let project = Self::tiny();
         project.write("base/pipeline.yaml", TINY);
@@ -212,24 +212,24 @@ impl Project {
         std::fs::write(path, text).unwrap();
     }
 
-    /// Writes an executable file, by another process: a child that another test forks meanwhile
-    /// would inherit this process's open file, and a file open for writing can't be executed.
+    /// Writes an executable file with `install`: a child forked by a concurrent test would inherit
+    /// this process's open file, and a file open for writing can't be executed.
     pub fn program(&self, file: &str, text: &str) {
         self.write(".source", text);
-        let to = self.path(file);
-        std::fs::create_dir_all(to.parent().unwrap()).unwrap();
+        let path = self.path(file);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         assert!(
             Command::new("install")
                 .args(["-m", "755"])
                 .arg(self.path(".source"))
-                .arg(to)
+                .arg(path)
                 .status()
                 .unwrap()
                 .success()
         );
     }
 
-    /// Replaces text in the pipeline and in the tiny pipeline that it extends.
+    /// Replaces text in the pipeline and the base pipeline; at least one must contain the text.
     #[track_caller]
     pub fn replace(&self, from: &str, to: &str) {
         let files = ["pipeline.yaml", "base/pipeline.yaml"];
@@ -245,7 +245,7 @@ impl Project {
         self.command_of(&bin("nerf-sr"), arguments)
     }
 
-    /// Returns the command of a program, in the project's folder.
+    /// Returns a command that runs a program in the project's folder.
     pub fn command_of(&self, program: &Path, arguments: &[&str]) -> Command {
         let mut command = Command::new(program);
         command.args(arguments).current_dir(self.dir.path());
@@ -265,7 +265,7 @@ impl Project {
         Finished::of(self.command(arguments).output().unwrap())
     }
 
-    /// Runs the runner, which must succeed, and returns its stdout.
+    /// Runs the runner, asserts success and returns stdout.
     #[track_caller]
     pub fn ok(&self, arguments: &[&str]) -> String {
         let finished = self.run(arguments);
@@ -281,7 +281,7 @@ impl Project {
         report["nodes"].as_array().unwrap().clone()
     }
 
-    /// Returns identities of a stage's current artifacts, in the order of the sweep's points.
+    /// Returns the identities of a stage's current artifacts, in the order of the sweep's points.
     #[track_caller]
     pub fn output_of(&self, stage: &str, arguments: &[&str]) -> Vec<String> {
         let nodes = self.nodes(arguments);
@@ -291,7 +291,7 @@ impl Project {
         outputs.collect()
     }
 
-    /// Returns the folder of a stage's current artifact, the first one of a sweep.
+    /// Returns the folder of a stage's current artifact; in a sweep, of the first point's artifact.
     #[track_caller]
     pub fn artifact(&self, stage: &str, arguments: &[&str]) -> PathBuf {
         self.object(&self.output_of(stage, arguments)[0])
@@ -305,17 +305,17 @@ impl Project {
             .unwrap_or_else(|e| panic!("{}: {e}", path.display()))
     }
 
-    /// Returns the folder of an artifact, given the beginning of its identity.
+    /// Returns the folder of the artifact whose identity begins with `prefix`.
     #[track_caller]
-    pub fn object(&self, start: &str) -> PathBuf {
+    pub fn object(&self, prefix: &str) -> PathBuf {
         let objects = std::fs::read_dir(self.path(".nerf-sr/objects")).unwrap();
         let found = objects
             .map(|e| e.unwrap().path())
-            .find(|p| p.file_name().unwrap().to_str().unwrap().starts_with(start));
-        found.unwrap_or_else(|| panic!("no object {start}"))
+            .find(|p| p.file_name().unwrap().to_str().unwrap().starts_with(prefix));
+        found.unwrap_or_else(|| panic!("no object {prefix}"))
     }
 
-    /// Links the pipeline's demo scene as `data/NAME`, so that `data` can be given as a data
+    /// Links the pipeline's demo scene as `data/NAME`, so that `data` can be used as a data
     /// folder.
     pub fn demo_data(&self, name: &str) {
         self.ok(&["run", "demo-scene"]);
@@ -338,7 +338,7 @@ impl Project {
     }
 }
 
-/// Returns a document's commands of the runner and of `nerf-sr-remote`.
+/// Returns the commands of `nerf-sr` and `nerf-sr-remote` in a document's shell blocks.
 pub fn commands(document: &Path) -> Vec<String> {
     let text = std::fs::read_to_string(document).unwrap();
     let blocks = text.split("```sh\n").skip(1).map(|rest| rest.split("```").next().unwrap());
@@ -370,50 +370,52 @@ impl Finished {
         }
     }
 
-    /// Asserts an exit code and that one line of stderr contains all texts of `words`.
+    /// Asserts the exit code, that one line of stderr contains all `texts`, and that no panic is
+    /// printed.
     #[track_caller]
-    pub fn fails(&self, code: i32, words: &[&str]) {
+    pub fn fails(&self, code: i32, texts: &[&str]) {
         assert_eq!(self.code, code, "{}\n{}", self.stdout, self.stderr);
-        let line = self.stderr.lines().rfind(|l| words.iter().all(|w| l.contains(w)));
-        assert!(line.is_some(), "no line with {words:?} in:\n{}", self.stderr);
+        let line = self.stderr.lines().rfind(|l| texts.iter().all(|text| l.contains(text)));
+        assert!(line.is_some(), "no line with {texts:?} in:\n{}", self.stderr);
         assert!(!self.stderr.contains("panicked"), "{}", self.stderr);
     }
 }
 
-/// Runs a stage by the stage contract.
+/// Runs a stage's program with the arguments of the stage contract.
 pub fn stage(
     name: &str,
     params: &str,
     inputs: &[(&str, &Path)],
     output: &Path,
-    more: &[&str],
+    options: &[&str],
 ) -> Finished {
-    Finished::of(stage_command(name, params, inputs, output, more).output().unwrap())
+    Finished::of(stage_command(name, params, inputs, output, options).output().unwrap())
 }
 
-/// Returns the command of a stage by the stage contract, after writing its parameters next to the
-/// output. The stage prints no progress unless `more` has `--progress`.
+/// Writes a stage's parameters next to the output and returns the stage's command. The stage prints
+/// no progress unless `options` has `--progress`.
 pub fn stage_command(
     name: &str,
     params: &str,
     inputs: &[(&str, &Path)],
     output: &Path,
-    more: &[&str],
+    options: &[&str],
 ) -> Command {
     let file = output.with_extension("params.json");
     if let Some(folder) = file.parent().filter(|f| f.is_dir()) {
         std::fs::write(folder.join(file.file_name().unwrap()), params).ok();
     }
-    let silent: &[&str] = if more.contains(&"--progress") { &[] } else { &["--progress", "none"] };
+    let silent: &[&str] =
+        if options.contains(&"--progress") { &[] } else { &["--progress", "none"] };
     let mut command = Command::new(bin(name));
-    command.arg("--params").arg(&file).arg("--output").arg(output).args(silent).args(more);
+    command.arg("--params").arg(&file).arg("--output").arg(output).args(silent).args(options);
     for (name, folder) in inputs {
         command.arg("--input").arg(format!("{name}={}", folder.display()));
     }
     command
 }
 
-/// Prepares a small demo scene at half its size and returns the folder of the LR images.
+/// Renders a small demo scene, prepares it at half the width and returns the folder of LR images.
 pub fn demo_train(project: &Project, views: u32) -> PathBuf {
     let (data, scene) = (project.path("data"), project.path("scene"));
     let params = format!(r#"{{"size": 48, "train": {views}, "test": 1, "samples_per_axis": 1}}"#);
@@ -422,17 +424,17 @@ pub fn demo_train(project: &Project, views: u32) -> PathBuf {
     scene.join("train")
 }
 
-/// Returns the text of an artifact's manifest, which identifies its content.
+/// Returns the text of an artifact's manifest, which identifies the artifact's content.
 pub fn manifest(folder: &Path) -> String {
     std::fs::read_to_string(folder.join("artifact.json")).unwrap()
 }
 
-/// Sends a signal to a running stage: "-TERM", "-KILL".
+/// Sends a signal, such as "-TERM" or "-KILL", to a child process.
 pub fn signal(child: &Child, name: &str) {
     Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
 }
 
-/// Returns the time of a work folder's latest checkpoint.
+/// Returns the modification time of a work folder's latest checkpoint.
 pub fn last_checkpoint(work: &Path) -> Option<SystemTime> {
     checkpoints(work).iter().filter_map(|file| file.metadata().ok()?.modified().ok()).max()
 }
@@ -448,20 +450,20 @@ pub fn checkpoints(work: &Path) -> Vec<PathBuf> {
 
 /// Timeout of [`wait_until`], long enough for a busy machine. Slurm takes a minute to end a job
 /// whose time limit has passed.
-const PATIENCE: Duration = Duration::from_secs(300);
+const TIMEOUT: Duration = Duration::from_secs(300);
 
-/// Waits until a condition is true; panics after [`PATIENCE`].
+/// Waits until a condition is true; panics after [`TIMEOUT`].
 #[track_caller]
-pub fn wait_until(happened: impl FnMut() -> bool) {
-    assert!(happens(happened), "what the test waits for hasn't happened in {PATIENCE:?}");
+pub fn wait_until(condition: impl FnMut() -> bool) {
+    assert!(happens(condition), "condition not met within {TIMEOUT:?}");
 }
 
-/// Waits until a condition is true; returns `false` after [`PATIENCE`], for callers that report the
+/// Waits until a condition is true; returns `false` after [`TIMEOUT`], for callers that report the
 /// failure in more detail.
-pub fn happens(mut happened: impl FnMut() -> bool) -> bool {
-    let begun = Instant::now();
-    while !happened() {
-        if begun.elapsed() > PATIENCE {
+pub fn happens(mut condition: impl FnMut() -> bool) -> bool {
+    let start = Instant::now();
+    while !condition() {
+        if start.elapsed() > TIMEOUT {
             return false;
         }
         std::thread::sleep(Duration::from_millis(25));
@@ -469,18 +471,19 @@ pub fn happens(mut happened: impl FnMut() -> bool) -> bool {
     true
 }
 
-/// Returns whether a process is running. A zombie, which `/proc` still lists, is not.
-pub fn is_running(process: &str) -> bool {
-    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
-    // The state follows the process name in brackets, which may contain any characters.
+/// Returns whether a process is running; a zombie, which `/proc` still lists, isn't running.
+pub fn is_running(pid: &str) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    // The state follows the parenthesised process name, which may contain any characters.
     stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with(['Z', 'X']))
 }
 
-/// Runs and kills a stage once per entry of `milliseconds`: the given time after its start, and in
-/// later rounds the given time after the next checkpoint. A checkpoint remains at the end.
+/// Runs and kills a stage once per entry of `milliseconds`, a delay after the start in the first
+/// round and after the next checkpoint in later rounds. Asserts that a checkpoint remains and no
+/// output exists.
 ///
-/// Kills happen at arbitrary moments. From the progress count `slow_from` on, the stage slows down,
-/// so that no machine finishes the stage before the last kill. Tests that need a certain step set
+/// Kills happen at arbitrary moments. From the progress count `slow_from`, the stage is slowed, so
+/// that no machine finishes the stage before the last kill. Tests that need a certain step set
 /// `NERF_SR_STOP_AFTER`.
 pub fn kill_again_and_again(
     name: &str,
@@ -491,17 +494,17 @@ pub fn kill_again_and_again(
     slow_from: u64,
     milliseconds: &[u64],
 ) {
-    let never = work.with_extension("never");
+    let missing_file = work.with_extension("never");
     for (round, pause) in milliseconds.iter().enumerate() {
-        let before = last_checkpoint(work);
-        let more = ["--work", work.to_str().unwrap()];
-        let mut child = stage_command(name, params, inputs, output, &more)
-            .env("NERF_SR_SLOW_UNTIL", format!("{slow_from} {}", never.display()))
+        let previous = last_checkpoint(work);
+        let options = ["--work", work.to_str().unwrap()];
+        let mut child = stage_command(name, params, inputs, output, &options)
+            .env("NERF_SR_SLOW_UNTIL", format!("{slow_from} {}", missing_file.display()))
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
         if round > 0 {
-            wait_until(|| last_checkpoint(work) != before || child.try_wait().unwrap().is_some());
+            wait_until(|| last_checkpoint(work) != previous || child.try_wait().unwrap().is_some());
         }
         std::thread::sleep(Duration::from_millis(*pause));
         child.kill().unwrap();

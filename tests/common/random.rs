@@ -1,4 +1,4 @@
-//! Seeded random choices.
+//! Seeded random numbers, and numbers from environment variables.
 
 /// Seeded random number generator (xorshift).
 pub struct Random(u64);
@@ -16,12 +16,12 @@ impl Random {
     }
 
     /// Returns a random element.
-    pub fn choose<'a, T>(&mut self, things: &'a [T]) -> &'a T {
-        &things[self.below(things.len() as u64) as usize]
+    pub fn choose<'a, T>(&mut self, items: &'a [T]) -> &'a T {
+        &items[self.below(items.len() as u64) as usize]
     }
 }
 
-/// Returns the number in an environment variable, if set.
+/// Returns the number in an environment variable; `None` if the variable is unset.
 pub fn number(variable: &str) -> Option<u64> {
     std::env::var(variable)
         .ok()

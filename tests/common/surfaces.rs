@@ -22,35 +22,36 @@ pub struct Glb {
     pub triangles: Vec<[usize; 3]>,
 }
 
-fn words(description: &Value, binary: &[u8], accessor: &Value) -> Vec<[u8; 4]> {
+/// Returns the 32-bit words of an accessor.
+fn accessor_words(description: &Value, binary: &[u8], accessor: &Value) -> Vec<[u8; 4]> {
     let accessor = &description["accessors"][accessor.as_u64().unwrap() as usize];
     let view = &description["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
     let [offset, length] =
         ["byteOffset", "byteLength"].map(|name| view[name].as_u64().unwrap() as usize);
-    let part = &binary[offset..offset + length];
-    part.as_chunks::<4>().0.to_vec()
+    let bytes = &binary[offset..offset + length];
+    bytes.as_chunks::<4>().0.to_vec()
 }
 
 fn vectors(description: &Value, binary: &[u8], accessor: &Value) -> Vec<DVec3> {
-    let words = words(description, binary, accessor);
-    let number = |word: [u8; 4]| f64::from(f32::from_le_bytes(word));
-    words.as_chunks::<3>().0.iter().map(|v| DVec3::from(v.map(number))).collect()
+    let words = accessor_words(description, binary, accessor);
+    let float = |word: [u8; 4]| f64::from(f32::from_le_bytes(word));
+    words.as_chunks::<3>().0.iter().map(|v| DVec3::from(v.map(float))).collect()
 }
 
 impl Glb {
     /// Reads a binary glTF file.
     pub fn read(path: &Path) -> Self {
         let bytes = std::fs::read(path).unwrap();
-        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+        let word = |i: usize| u32::from_le_bytes(bytes[i..i + 4].try_into().unwrap()) as usize;
         assert!(&bytes[..4] == b"glTF" && word(4) == 2 && word(8) == bytes.len());
-        let text = word(12);
-        assert!(&bytes[16..20] == b"JSON" && text % 4 == 0);
-        let description: Value = serde_json::from_slice(&bytes[20..20 + text]).unwrap();
-        let first = 28 + text;
-        assert!(&bytes[first - 4..first] == b"BIN\0" && word(first - 8) == bytes.len() - first);
+        let json_length = word(12);
+        assert!(&bytes[16..20] == b"JSON" && json_length % 4 == 0);
+        let description: Value = serde_json::from_slice(&bytes[20..20 + json_length]).unwrap();
+        let start = 28 + json_length;
+        assert!(&bytes[start - 4..start] == b"BIN\0" && word(start - 8) == bytes.len() - start);
         let primitive = &description["meshes"][0]["primitives"][0];
-        let (attributes, binary) = (&primitive["attributes"], &bytes[first..]);
-        let indices = words(&description, binary, &primitive["indices"]);
+        let (attributes, binary) = (&primitive["attributes"], &bytes[start..]);
+        let indices = accessor_words(&description, binary, &primitive["indices"]);
         let index = |word: [u8; 4]| u32::from_le_bytes(word) as usize;
         Self {
             positions: vectors(&description, binary, &attributes["POSITION"]),
@@ -62,8 +63,8 @@ impl Glb {
     }
 }
 
-/// Returns points of the true surface that are visible from the cameras, with normals; one point
-/// per cell of a grid.
+/// Returns points of the true surface that are visible from the cameras, with normals: one point
+/// per grid cell of side `cell`.
 pub fn true_surface(world: &World, cameras: &[Camera], cell: f64) -> Vec<(DVec3, DVec3)> {
     let mut points = BTreeMap::new();
     for camera in cameras {
@@ -71,14 +72,14 @@ pub fn true_surface(world: &World, cameras: &[Camera], cell: f64) -> Vec<(DVec3,
         for i in 0..k.width * k.height {
             let ray = camera.ray(f64::from(i % k.width) + 0.5, f64::from(i / k.width) + 0.5);
             if let Some((point, normal)) = world.surface(ray.origin, ray.direction) {
-                points.entry(key(point, cell)).or_insert((point, normal));
+                points.entry(cell_index(point, cell)).or_insert((point, normal));
             }
         }
     }
     points.into_values().collect()
 }
 
-fn key(point: DVec3, cell: f64) -> [i32; 3] {
+fn cell_index(point: DVec3, cell: f64) -> [i32; 3] {
     (point / cell).to_array().map(|x| x.floor() as i32)
 }
 
@@ -89,18 +90,18 @@ pub fn size(points: &[(DVec3, DVec3)]) -> f64 {
     (max - min).max_element()
 }
 
-/// Errors of an exported surface.
+/// Errors of an exported surface; distances are divided by the scene's size.
 #[derive(Clone, Copy, Debug)]
 pub struct Compared {
-    /// Mean distance from exported vertices or points to the true surface, over the scene's size.
+    /// Mean distance from exported vertices or points to the true surface.
     pub to_truth: f64,
-    /// Mean distance from the true surface to the nearest exported vertex, over the scene's size.
+    /// Mean distance from the true surface to the nearest exported vertex.
     pub from_truth: f64,
-    /// Share of the normals along which the distance from the true surface grows.
+    /// Share of the normals along which the signed distance from the true surface grows.
     pub outward: f64,
 }
 
-/// Compares vertices and normals with the true surface, of which `truth` are sample points.
+/// Compares vertices and normals with the true surface and its sample points `truth`.
 pub fn compare(
     world: &World,
     truth: &[(DVec3, DVec3)],
@@ -109,16 +110,16 @@ pub fn compare(
 ) -> Compared {
     let size = size(truth);
     let mean = |sum: f64, count: usize| sum / count as f64 / size;
-    let off: f64 = positions.iter().map(|p| world.distance(*p).abs()).sum();
+    let error_sum: f64 = positions.iter().map(|p| world.distance(*p).abs()).sum();
     let step = 1e-4;
     let is_outward =
         |p: DVec3, n: DVec3| world.distance(p + step * n) > world.distance(p - step * n);
     let outward = positions.iter().zip(normals).filter(|(p, n)| is_outward(**p, **n)).count();
-    let near = Nearest::new(positions, 0.02 * size);
-    let missing: f64 = truth.iter().map(|(point, _)| near.distance(*point)).sum();
+    let nearest = Nearest::new(positions, 0.02 * size);
+    let gap_sum: f64 = truth.iter().map(|(point, _)| nearest.distance(*point)).sum();
     Compared {
-        to_truth: mean(off, positions.len()),
-        from_truth: mean(missing, truth.len()),
+        to_truth: mean(error_sum, positions.len()),
+        from_truth: mean(gap_sum, truth.len()),
         outward: outward as f64 / positions.len() as f64,
     }
 }
@@ -132,19 +133,20 @@ struct Nearest {
 impl Nearest {
     fn new(points: &[DVec3], cell: f64) -> Self {
         let mut cells: BTreeMap<[i32; 3], Vec<DVec3>> = BTreeMap::new();
-        points.iter().for_each(|p| cells.entry(key(*p, cell)).or_default().push(*p));
+        points.iter().for_each(|p| cells.entry(cell_index(*p, cell)).or_default().push(*p));
         Self { cell, points: cells }
     }
 
+    /// Returns the distance from a point to the nearest indexed point.
     fn distance(&self, from: DVec3) -> f64 {
-        let middle = key(from, self.cell);
+        let centre = cell_index(from, self.cell);
         let mut best = f64::INFINITY;
         for ring in 0..64 {
             // Points in this ring and farther ones can't be nearer than `ring - 1` cells.
             if best <= f64::from(ring - 1) * self.cell {
                 break;
             }
-            for cell in cells_of_ring(middle, ring) {
+            for cell in cells_of_ring(centre, ring) {
                 for point in self.points.get(&cell).into_iter().flatten() {
                     best = best.min((*point - from).length());
                 }
@@ -155,11 +157,11 @@ impl Nearest {
 }
 
 /// Returns the cells at Chebyshev distance `ring` from a cell.
-fn cells_of_ring(middle: [i32; 3], ring: i32) -> impl Iterator<Item = [i32; 3]> {
+fn cells_of_ring(centre: [i32; 3], ring: i32) -> impl Iterator<Item = [i32; 3]> {
     let side = 2 * ring + 1;
     (0..side.pow(3)).filter_map(move |i| {
-        let off = [i % side - ring, i / side % side - ring, i / (side * side) - ring];
-        let is_there = off.iter().any(|o| o.abs() == ring);
-        is_there.then(|| [0, 1, 2].map(|axis| middle[axis] + off[axis]))
+        let offset = [i % side - ring, i / side % side - ring, i / (side * side) - ring];
+        let is_on_ring = offset.iter().any(|o| o.abs() == ring);
+        is_on_ring.then(|| [0, 1, 2].map(|axis| centre[axis] + offset[axis]))
     })
 }

@@ -17,7 +17,7 @@ pub(crate) const SIZE: u32 = 48;
 pub(crate) const DISTANCE: f64 = 4.0;
 /// Angle of view of the photographs in degrees.
 const ANGLE: f64 = 39.6;
-/// Rays along each side of a pixel.
+/// Rays per pixel along each axis.
 const SAMPLES: u32 = 2;
 
 /// Content of the photographs.
@@ -48,28 +48,28 @@ pub(crate) struct Capture {
     pub(crate) unit: f64,
     /// Origin of the demo scene in the data set's coordinates.
     pub(crate) origin: DVec3,
-    /// Training view whose pose is another's in the data set.
+    /// Index of the training view that has another view's pose in the data set.
     pub(crate) outlier: Option<usize>,
 }
 
-/// Returns a camera's intrinsics: a pinhole's, `angle` degrees wide.
+/// Returns the intrinsics of a pinhole camera with an angle of view of `angle` degrees.
 pub(crate) fn pinhole(size: u32, angle: f64) -> Intrinsics {
     Intrinsics::from_angle_x(size, size, angle.to_radians())
 }
 
-/// Returns a direction from the scene's centre to a camera.
+/// Returns the direction from the scene's centre to camera `i` of `count`.
 fn direction(split: &str, i: usize, count: usize) -> DVec3 {
-    let share = (i as f64 + 0.5) / count as f64;
-    let (turn, height) = match split {
-        "train" => (2.4 * i as f64, 0.95 * share),
-        _ => (std::f64::consts::TAU * share, 0.4 + 0.2 * (7.0 * share).sin()),
+    let fraction = (i as f64 + 0.5) / count as f64;
+    let (azimuth, height) = match split {
+        "train" => (2.4 * i as f64, 0.95 * fraction),
+        _ => (std::f64::consts::TAU * fraction, 0.4 + 0.2 * (7.0 * fraction).sin()),
     };
-    let level = (1.0 - height * height).sqrt();
-    DVec3::new(level * turn.cos(), level * turn.sin(), height)
+    let horizontal = (1.0 - height * height).sqrt();
+    DVec3::new(horizontal * azimuth.cos(), horizontal * azimuth.sin(), height)
 }
 
-/// Creates cameras around the scene's centre that look at it.
-pub(crate) fn around(
+/// Creates cameras around the scene's centre, directed at the centre.
+pub(crate) fn cameras_around(
     split: &str,
     count: usize,
     distance: f64,
@@ -86,9 +86,9 @@ pub(crate) fn around(
     (0..count).map(camera).collect()
 }
 
-/// Creates cameras in a square in front of the scene that look in one direction.
+/// Creates cameras with one viewing direction, in a square in front of the scene.
 pub(crate) fn forward(split: &str, count: usize) -> Vec<Camera> {
-    let mut cameras = around(split, count, DISTANCE, pinhole(SIZE, ANGLE));
+    let mut cameras = cameras_around(split, count, DISTANCE, pinhole(SIZE, ANGLE));
     let axes = DMat3::from_cols(DVec3::X, DVec3::Z, -DVec3::Y);
     for (i, camera) in cameras.iter_mut().enumerate() {
         let (u, v) = ((0.618 * i as f64) % 1.0 - 0.5, (i as f64 + 0.5) / count as f64 - 0.5);
@@ -121,10 +121,10 @@ impl Default for Capture {
 }
 
 impl Capture {
-    /// Puts cameras around the scene.
+    /// Replaces all cameras: `train` training and four test cameras around the scene.
     pub(crate) fn surround(&mut self, train: usize, distance: f64, intrinsics: Intrinsics) {
-        self.train = around("train", train, distance, intrinsics);
-        self.test = around("test", 4, distance, intrinsics);
+        self.train = cameras_around("train", train, distance, intrinsics);
+        self.test = cameras_around("test", 4, distance, intrinsics);
     }
 
     /// Returns all cameras.
@@ -179,7 +179,7 @@ impl Capture {
         frame
     }
 
-    /// Returns a camera's photograph; a lens without rays sees as a pinhole does.
+    /// Renders a camera's photograph; an invalid lens is replaced by a pinhole.
     fn photograph(&self, world: &World, camera: &Camera, seed: u64) -> Rgba8 {
         let Intrinsics { width, height, .. } = camera.intrinsics;
         let mut camera = camera.clone();
@@ -205,7 +205,7 @@ impl Capture {
         Rgba8::new(width as usize, height as usize, data)
     }
 
-    /// Returns a pixel of a camera's photograph, with straight alpha.
+    /// Renders a pixel of a camera's photograph, with straight alpha.
     fn pixel(&self, world: &World, camera: &Camera, [x, y]: [u32; 2], gain: f64) -> [u8; 4] {
         let (mut sum, mut hits) = (DVec3::ZERO, 0.0);
         for k in 0..SAMPLES * SAMPLES {

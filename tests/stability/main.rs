@@ -1,6 +1,6 @@
-//! The programs at the extremes of their inputs and parameters, each run on a tiny scene: figures
-//! within a stated loss of the baseline's, or one line of refusal; no artifact has a number that
-//! isn't finite. `make stability` writes the table of all rows.
+//! Programs at extremes of their inputs and parameters, on a tiny scene: PSNR must be within stated
+//! bounds, or a program must refuse with one line. Numbers in artifacts must be finite. The command
+//! `make stability` writes the table of all rows.
 
 #![allow(missing_docs, reason = "a test")]
 #[path = "../common/mod.rs"]
@@ -15,15 +15,15 @@ use std::fmt::Write as _;
 use rows::{Expected, Row, rows};
 use trial::{Figures, Outcome};
 
-/// Returns what is wrong with a row's outcome.
+/// Returns the unexpected outcome of a row as text; `None` if the outcome is expected.
 fn fault(row: &Row, outcome: &Outcome, baseline: f64) -> Option<String> {
     let psnr = |figures: &Figures| figures.psnr.unwrap_or(f64::NAN);
     let is_expected = match (outcome, row.expected) {
         (Outcome::Done(figures), Expected::Like(loss)) => (psnr(figures) - baseline).abs() <= loss,
-        (Outcome::Done(figures), Expected::Psnr(least)) => psnr(figures) >= least,
+        (Outcome::Done(figures), Expected::Psnr(min)) => psnr(figures) >= min,
         (Outcome::Done(_), Expected::Finite) => true,
-        (Outcome::Refused { code, message, .. }, Expected::Refused(expected, words)) => {
-            *code == expected && message.contains(words)
+        (Outcome::Refused { code, message, .. }, Expected::Refused(expected, text)) => {
+            *code == expected && message.contains(text)
         }
         _ => false,
     };
@@ -31,7 +31,7 @@ fn fault(row: &Row, outcome: &Outcome, baseline: f64) -> Option<String> {
         .then(|| format!("{}, {}: {outcome:?}, not {:?}", row.part, row.case, row.expected))
 }
 
-/// Runs rows, and returns the table's lines and all faults.
+/// Runs rows; returns the table's lines and all faults.
 fn run_all(rows: &[Row]) -> (String, Vec<String>) {
     let (mut table, mut faults, mut baseline) = (String::new(), Vec::new(), f64::NAN);
     for row in rows {
@@ -49,14 +49,14 @@ fn run_all(rows: &[Row]) -> (String, Vec<String>) {
     (table, faults)
 }
 
-/// Returns a row of the table.
+/// Returns a row's line of the table.
 fn table_line(row: &Row, outcome: &Outcome) -> String {
     let (figure, mut notes) = match outcome {
         Outcome::Done(figures) => {
             (figures.psnr.map_or("–".to_owned(), |psnr| format!("{psnr:.2}")), figures.notes(row))
         }
         Outcome::Refused { message, .. } => ("refused".to_owned(), vec![message.clone()]),
-        Outcome::Broken(found) => ("broken".to_owned(), vec![found.clone()]),
+        Outcome::Broken(problem) => ("broken".to_owned(), vec![problem.clone()]),
     };
     notes.extend((!row.why.is_empty()).then(|| row.why.to_owned()));
     let star = if row.fast { "\\*" } else { "" };
@@ -80,7 +80,7 @@ impl Figures {
     }
 }
 
-/// Returns the rows of the parts that `NERF_SR_ROWS` names; all by default.
+/// Returns the baseline and the rows of the parts in `NERF_SR_ROWS`, by default all rows.
 fn chosen_rows() -> Vec<Row> {
     let parts = std::env::var("NERF_SR_ROWS").ok();
     let is_chosen = |row: &Row| {
@@ -92,12 +92,12 @@ fn chosen_rows() -> Vec<Row> {
     rows().into_iter().filter(is_chosen).collect()
 }
 
-/// Rows that may differ from the baseline say why.
+/// Rows whose outcome may differ from the baseline's must give the reason.
 #[test]
 fn every_difference_is_explained() {
     for row in rows().iter().skip(1) {
-        let needs_none = matches!(row.expected, Expected::Like(_) | Expected::Refused(..));
-        assert!(needs_none || !row.why.is_empty(), "{}, {}", row.part, row.case);
+        let needs_no_reason = matches!(row.expected, Expected::Like(_) | Expected::Refused(..));
+        assert!(needs_no_reason || !row.why.is_empty(), "{}, {}", row.part, row.case);
     }
 }
 

@@ -1,4 +1,4 @@
-//! Rows of the table: extremes, the expected outcome, and its explanation.
+//! Rows of the table: an extreme setup, the expected outcome and its explanation.
 
 use glam::DVec3;
 use scene::{Distortion, looking_at};
@@ -10,37 +10,38 @@ use crate::trial::{Setup, merge};
 /// Outcome that a row must have.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Expected {
-    /// A PSNR that differs from the baseline's by at most this.
+    /// PSNR that differs from the baseline's by at most this many dB.
     Like(f64),
-    /// At least this PSNR.
+    /// Minimum PSNR in dB.
     Psnr(f64),
-    /// Success, where no PSNR says anything.
+    /// Success with finite artifacts and any PSNR or none.
     Finite,
-    /// A refusal with this exit code, whose message contains this text.
+    /// Refusal with this exit code and a message that contains this text.
     Refused(i32, &'static str),
 }
 
-/// A row of the table.
+/// Row of the table.
 pub(crate) struct Row {
     pub(crate) part: &'static str,
     pub(crate) case: &'static str,
     pub(crate) expected: Expected,
-    /// Explanation of an outcome that isn't as the baseline's.
+    /// Explanation of an outcome that differs from the baseline's.
     pub(crate) why: &'static str,
     /// True if CI runs the row.
     pub(crate) fast: bool,
-    /// True if the table shows the largest parameter and density.
+    /// True if the row's note contains the largest parameter and density.
     pub(crate) shows_numbers: bool,
     pub(crate) setup: Setup,
 }
 
-/// Changes of the baseline.
-struct Change {
+/// Builder of a row that changes the baseline.
+struct RowBuilder {
     row: Row,
 }
 
-fn row(part: &'static str, case: &'static str) -> Change {
-    Change {
+/// Creates the builder of a row, with the baseline's setup.
+fn row(part: &'static str, case: &'static str) -> RowBuilder {
+    RowBuilder {
         row: Row {
             part,
             case,
@@ -53,7 +54,7 @@ fn row(part: &'static str, case: &'static str) -> Change {
     }
 }
 
-impl Change {
+impl RowBuilder {
     fn capture(mut self, change: impl Fn(&mut Capture)) -> Self {
         change(&mut self.row.setup.capture);
         self
@@ -72,8 +73,8 @@ impl Change {
         self.setup(|setup| merge(&mut setup.train, params))
     }
 
-    /// Prepares the photographs as LR images, without ground truth.
-    fn photographs(self, params: &Value) -> Self {
+    /// Replaces all parameters of `prep`.
+    fn replace_prep(self, params: &Value) -> Self {
         self.setup(|setup| setup.prep = params.clone())
     }
 
@@ -92,13 +93,14 @@ impl Change {
         self.row
     }
 
-    fn like(self, loss: f64) -> Row {
-        self.expect(Expected::Like(loss), "")
+    fn like(self, difference: f64) -> Row {
+        self.expect(Expected::Like(difference), "")
     }
 }
 
-/// A town in UTM coordinates, and one in ECEF coordinates.
+/// Origin in UTM coordinates, in metres.
 const UTM: DVec3 = DVec3::new(500_000.1, 4_649_776.2, 120.3);
+/// Origin in ECEF coordinates, in metres.
 const ECEF: DVec3 = DVec3::new(4_027_893.85, 307_045.825, 4_919_475.175);
 
 /// Returns all rows; the first is the baseline.
@@ -111,7 +113,7 @@ fn unit(case: &'static str, unit: f64) -> Row {
     row("unit", case).capture(|capture| capture.unit = unit).fast().like(0.15)
 }
 
-fn origin(case: &'static str, origin: DVec3) -> Change {
+fn origin(case: &'static str, origin: DVec3) -> RowBuilder {
     row("origin", case).capture(|capture| capture.origin = origin)
 }
 
@@ -137,11 +139,11 @@ fn coordinates() -> Vec<Row> {
     ]
 }
 
-fn rays(case: &'static str, rays: u32) -> Change {
+fn rays(case: &'static str, rays: u32) -> RowBuilder {
     row("rays", case).train(&json!({"rays": rays})).numbers()
 }
 
-fn rates(case: &'static str, grid: f64, mlps: f64) -> Change {
+fn rates(case: &'static str, grid: f64, mlps: f64) -> RowBuilder {
     row("learning rates", case)
         .train(&json!({"learning_rate": grid, "mlp_learning_rate": mlps}))
         .numbers()
@@ -163,21 +165,21 @@ fn training() -> Vec<Row> {
     ]
 }
 
-fn scale(case: &'static str, scale: f64, lr_width: u32) -> Change {
+fn scale(case: &'static str, scale: f64, lr_width: u32) -> RowBuilder {
     row("scale", case).setup(|setup| {
         setup.prep = json!({"lr_width": lr_width, "scale": scale});
         merge(&mut setup.train, &json!({"supersample": scale}));
     })
 }
 
-fn views(case: &'static str, views: usize) -> Change {
+fn views(case: &'static str, views: usize) -> RowBuilder {
     row("views", case).capture(|capture| capture.surround(views, DISTANCE, pinhole(SIZE, 39.6)))
 }
 
-fn enlarged(case: &'static str, size: [u32; 2]) -> Change {
+fn enlarged(case: &'static str, size: [u32; 2]) -> RowBuilder {
     row("image", case)
         .capture(|capture| capture.enlarged = Some(size))
-        .photographs(&json!({"lr_source": "photographs", "scale": 1}))
+        .replace_prep(&json!({"lr_source": "photographs", "scale": 1}))
         .train(&json!({"supersample": 1}))
 }
 
@@ -194,7 +196,7 @@ fn sizes() -> Vec<Row> {
         views("500", 500).expect(Psnr(15.0), "fewer rays a pixel, more views"),
         enlarged("1×1", [1, 1]).expect(Finite, "no ground truth"),
         enlarged("2×2, from 1×1", [2, 2])
-            .photographs(&json!({"lr_width": 1}))
+            .replace_prep(&json!({"lr_width": 1}))
             .expect(Finite, "one pixel a view"),
         enlarged("64×1", [64, 1]).expect(Finite, "no ground truth"),
         enlarged("4096×4096", [4096, 4096])
@@ -206,13 +208,13 @@ fn sizes() -> Vec<Row> {
     ]
 }
 
-fn angle(case: &'static str, angle: f64, distance: f64) -> Change {
+fn angle(case: &'static str, angle: f64, distance: f64) -> RowBuilder {
     row("angle of view", case)
         .capture(|capture| capture.surround(16, distance, pinhole(SIZE, angle)))
 }
 
-/// Training photographs through a lens; test views are a pinhole's.
-fn lens(case: &'static str, angle: f64, distance: f64, lens: Distortion) -> Change {
+/// Takes training photographs through a lens, and test views through a pinhole.
+fn lens(case: &'static str, angle: f64, distance: f64, lens: Distortion) -> RowBuilder {
     row("lens", case).capture(|capture| {
         let mut intrinsics = pinhole(SIZE, angle);
         intrinsics.distortion = lens;
@@ -222,7 +224,7 @@ fn lens(case: &'static str, angle: f64, distance: f64, lens: Distortion) -> Chan
     })
 }
 
-/// Returns a perspective lens that folds at a multiple of the corners' radius in the image.
+/// Returns a distortion that folds at `multiple` times the radius of the image's corners.
 fn folding(multiple: f64) -> Distortion {
     // x + k1·x³ has its maximum, 2/3·x, at x = 1/√(-3·k1).
     let corner = 2.0f64.sqrt() * (0.5 * 39.6f64.to_radians()).tan();
@@ -312,7 +314,7 @@ fn cameras() -> Vec<Row> {
     ]
 }
 
-fn content(case: &'static str, content: Content) -> Change {
+fn content(case: &'static str, content: Content) -> RowBuilder {
     row("images", case)
         .capture(|capture| capture.content = content)
         .setup(|setup| setup.export = true)
@@ -330,11 +332,11 @@ fn images() -> Vec<Row> {
     ]
 }
 
-fn range(case: &'static str, near: f64, far: f64) -> Change {
+fn range(case: &'static str, near: f64, far: f64) -> RowBuilder {
     row("near and far", case).prep(&json!({"near": near, "far": far}))
 }
 
-fn space(case: &'static str, space: &str) -> Change {
+fn space(case: &'static str, space: &str) -> RowBuilder {
     let mut prep = json!({"space": space, "background": "white"});
     if space == "ndc" {
         merge(&mut prep, &json!({"near": 2, "far": 6}));
@@ -346,9 +348,9 @@ fn space(case: &'static str, space: &str) -> Change {
     })
 }
 
-/// Trains a small field of the paper's kind.
-fn mlp(change: Change) -> Change {
-    change.setup(|setup| {
+/// Trains the paper's field, with small networks.
+fn mlp(builder: RowBuilder) -> RowBuilder {
+    builder.setup(|setup| {
         setup.train = json!({"field": "mlp", "rays": 40_000, "layers": 2, "hidden_dim": 32,
             "max_rays_per_step": 512, "precrop_steps": 0});
     })

@@ -1,4 +1,4 @@
-//! One run of the pipeline's programs on a data set, and what became of it.
+//! Run of the pipeline's programs on a data set, and the run's outcome.
 
 use std::path::{Path, PathBuf};
 
@@ -15,9 +15,9 @@ pub(crate) struct Setup {
     pub(crate) prep: Value,
     pub(crate) train: Value,
     pub(crate) render: Value,
-    /// Stores the field with half precision before it is rendered.
+    /// True if the field is rounded to half precision before it is rendered.
     pub(crate) half: bool,
-    /// Also exports the field.
+    /// True if the field is also exported.
     pub(crate) export: bool,
 }
 
@@ -36,31 +36,31 @@ impl Default for Setup {
     }
 }
 
-/// End of a run.
+/// Outcome of a run.
 #[derive(Clone, Debug)]
 pub(crate) enum Outcome {
-    /// All programs succeeded, with finite artifacts.
+    /// Success of all programs, with finite artifacts.
     Done(Figures),
-    /// A program refused with one line.
+    /// Refusal by a program, in one line.
     Refused { code: i32, message: String },
-    /// A program crashed, printed several lines, or wrote a number that isn't finite.
+    /// Crash of a program, an error of several lines, or a number that isn't finite.
     Broken(String),
 }
 
-/// Figures of a run.
+/// Measured values of a run.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Figures {
     /// Mean PSNR of the test views; `None` without ground truth.
     pub(crate) psnr: Option<f64>,
     /// Largest absolute parameter of the field.
     pub(crate) parameter: f32,
-    /// Largest natural logarithm of a density, per side of the unit cube.
+    /// Natural logarithm of the largest density, per side of the unit cube.
     pub(crate) density: f32,
     /// Warnings of `prep` and `train-ss`.
     pub(crate) warnings: Vec<String>,
 }
 
-/// Merges an object's entries into another.
+/// Copies the entries of one JSON object into another.
 pub(crate) fn merge(into: &mut Value, from: &Value) {
     for (key, value) in from.as_object().unwrap() {
         into[key] = value.clone();
@@ -81,7 +81,6 @@ fn run_stages(project: &Project, setup: &Setup) -> Result<Figures, Outcome> {
     let run = |name: &str, params: &Value, inputs: &[(&str, &str)], output: &str| {
         run_stage(project, name, params, inputs, output)
     };
-    let none = json!({});
     run("prep", &setup.prep, &[("dataset", "data")], "scene")?;
     run("train-ss", &setup.train, &[("scene", "scene/train")], "field")?;
     if setup.half {
@@ -97,10 +96,10 @@ fn run_stages(project: &Project, setup: &Setup) -> Result<Figures, Outcome> {
             Err(broken) => return Err(broken),
         }
     }
-    let mut figures = Figures { warnings: warnings(project), ..figures_of_field(project) };
-    if read(&project.path("scene/scene.json"))["has_truth"] == true {
-        run("eval", &none, &[("views", "views"), ("truth", "scene/truth")], "scores")?;
-        figures.psnr = read(&project.path("scores/metrics.json"))["mean"]["psnr"].as_f64();
+    let mut figures = Figures { warnings: warnings(project), ..measure_field(project) };
+    if read_json(&project.path("scene/scene.json"))["has_truth"] == true {
+        run("eval", &json!({}), &[("views", "views"), ("truth", "scene/truth")], "scores")?;
+        figures.psnr = read_json(&project.path("scores/metrics.json"))["mean"]["psnr"].as_f64();
     }
     Ok(figures)
 }
@@ -113,17 +112,17 @@ fn run_stage(
     output: &str,
 ) -> Result<(), Outcome> {
     let folders: Vec<PathBuf> = inputs.iter().map(|(_, folder)| project.path(folder)).collect();
-    let mut given: Vec<(&str, &Path)> = Vec::new();
+    let mut named_folders: Vec<(&str, &Path)> = Vec::new();
     for ((name, _), folder) in inputs.iter().zip(&folders) {
-        given.push((name, folder));
+        named_folders.push((name, folder));
     }
     let output = project.path(output);
-    let finished = stage(name, &params.to_string(), &given, &output, &[]);
-    let home = format!("{}/", project.path("").display());
-    let text = finished.stderr.replace(&home, "").replace(home.trim_end_matches('/'), "");
+    let finished = stage(name, &params.to_string(), &named_folders, &output, &[]);
+    let root = format!("{}/", project.path("").display());
+    let text = finished.stderr.replace(&root, "").replace(root.trim_end_matches('/'), "");
     let text = text.trim();
     if finished.code == 0 {
-        return match not_finite(&output) {
+        return match find_non_finite(&output) {
             None => Ok(()),
             Some(found) => Err(Outcome::Broken(format!("{name}: {found}"))),
         };
@@ -136,38 +135,39 @@ fn run_stage(
     })
 }
 
-fn read(path: &Path) -> Value {
+fn read_json(path: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
 }
 
-/// Returns the warnings among the notes of `prep`, and those of `train-ss`.
+/// Returns the warnings of `prep`, from its notes, and of `train-ss`.
 fn warnings(project: &Project) -> Vec<String> {
-    let notes = read(&project.path("scene/scene.json"))["notes"].clone();
-    let log = read(&project.path("field/training.json"))["warnings"].clone();
+    let notes = read_json(&project.path("scene/scene.json"))["notes"].clone();
+    let log = read_json(&project.path("field/training.json"))["warnings"].clone();
     let texts = |list: &Value| -> Vec<String> {
         let entries = list.as_array().into_iter().flatten();
         entries.map(|entry| entry.as_str().unwrap().to_owned()).collect()
     };
     let notes = texts(&notes);
-    let of_prep = notes.iter().filter_map(|note| note.strip_prefix("warning: "));
-    of_prep.map(str::to_owned).chain(texts(&log)).collect()
+    let prep_warnings = notes.iter().filter_map(|note| note.strip_prefix("warning: "));
+    prep_warnings.map(str::to_owned).chain(texts(&log)).collect()
 }
 
-/// Returns the largest parameter of a grid field, and its largest density at 64³ points.
-fn figures_of_field(project: &Project) -> Figures {
+/// Returns a field's largest parameter and, for a grid, the largest density at 64³ points.
+fn measure_field(project: &Project) -> Figures {
     let file: FieldFile =
-        serde_json::from_value(read(&project.path("field").join(fields::FIELD_FILE))).unwrap();
+        serde_json::from_value(read_json(&project.path("field").join(fields::FIELD_FILE))).unwrap();
     let path = project.path("field").join(FieldFile::member_file(0));
-    let parameter = floats(&path).into_iter().fold(0.0, |most: f32, x| most.max(x.abs()));
+    let parameter = floats(&path).into_iter().fold(0.0, |largest: f32, x| largest.max(x.abs()));
     let fields::FieldModel::Grid(architecture) = file.field else {
         return Figures { parameter, ..Figures::default() };
     };
     let field = radiance::Field::read(&path, architecture, file.bounds).unwrap();
-    let side = |k: usize| (k as f32 + 0.5) / 64.0;
-    let points: Vec<[f32; 3]> =
-        (0..64usize.pow(3)).map(|i| [side(i % 64), side(i / 64 % 64), side(i / 4096)]).collect();
+    let centre = |k: usize| (k as f32 + 0.5) / 64.0;
+    let points: Vec<[f32; 3]> = (0..64usize.pow(3))
+        .map(|i| [centre(i % 64), centre(i / 64 % 64), centre(i / 4096)])
+        .collect();
     let densities = field.sample_points(&points);
-    let density = densities.iter().fold(0.0, |most: f32, point| most.max(point.density));
+    let density = densities.iter().fold(0.0, |largest: f32, point| largest.max(point.density));
     Figures { parameter, density: density.ln(), ..Figures::default() }
 }
 
@@ -175,8 +175,8 @@ fn figures_of_field(project: &Project) -> Figures {
 fn floats(path: &Path) -> Vec<f32> {
     let bytes = std::fs::read(path).unwrap();
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
-    let of_floats = tensors.iter().filter(|(_, tensor)| tensor.dtype() == Dtype::F32);
-    let bytes = of_floats.flat_map(|(_, tensor)| tensor.data().as_chunks::<4>().0.to_vec());
+    let float_tensors = tensors.iter().filter(|(_, tensor)| tensor.dtype() == Dtype::F32);
+    let bytes = float_tensors.flat_map(|(_, tensor)| tensor.data().as_chunks::<4>().0.to_vec());
     bytes.map(f32::from_le_bytes).collect()
 }
 
@@ -201,13 +201,13 @@ fn round_to_half(field: &Path) {
     artifact::write_json(&field.join(artifact::MANIFEST_FILE), &manifest).unwrap();
 }
 
-/// Returns the first number of an artifact that isn't finite, as text: in JSON, EXR, PLY and
-/// safetensors files. Rust writes such numbers to JSON as `null`.
-fn not_finite(folder: &Path) -> Option<String> {
+/// Returns a message about the artifact's first JSON, EXR, PLY or safetensors file with a number
+/// that isn't finite. Rust writes such numbers to JSON as `null`.
+fn find_non_finite(folder: &Path) -> Option<String> {
     for entry in walkdir::WalkDir::new(folder).sort_by_file_name() {
         let path = entry.unwrap().into_path();
         let is_finite = match path.extension().and_then(|end| end.to_str()) {
-            Some("json") => !has_null(&read(&path)),
+            Some("json") => !has_null(&read_json(&path)),
             Some("exr") => {
                 let image = pixels::read_exr(&path).unwrap();
                 image.channels.iter().all(|(_, samples)| samples.iter().all(|x| x.is_finite()))
