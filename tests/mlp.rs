@@ -37,14 +37,16 @@ fn threads_and_interruptions_leave_bytes_unchanged() {
     assert_eq!(stage("train-ss", PARAMS, &inputs, &two_threads, &["--threads", "2"]).code, 0);
     assert_eq!(manifest(&one_thread), manifest(&two_threads));
 
-    let arguments = ["--work", work.to_str().unwrap()];
+    let arguments = ["--work", work.to_str().unwrap(), "--progress", "plain"];
     let interrupted = stage_command("train-ss", PARAMS, &inputs, &stopped, &arguments)
         .env("NERF_SR_STOP_AFTER", "10000")
         .output()
         .unwrap();
     assert_eq!(interrupted.status.code(), Some(130));
     assert!(!stopped.exists() && work.join("member-0/checkpoint.safetensors").exists());
-    assert_eq!(stage("train-ss", PARAMS, &inputs, &stopped, &arguments).code, 0);
+    let resumed = stage("train-ss", PARAMS, &inputs, &stopped, &arguments);
+    assert_eq!(resumed.code, 0, "{}", resumed.stderr);
+    assert!(resumed.stderr.contains("resuming from step "), "{}", resumed.stderr);
     assert_eq!(manifest(&one_thread), manifest(&stopped));
 
     // A fine-tuned field is written next to the initial one, or as the mean of both.

@@ -273,7 +273,7 @@ fn times_are_estimated_before_a_run() {
         assert!(total.contains(text) && !total.contains("without"), "{text}: {total}");
     }
     let advice = project.ok(&["advise", "-p", "test_views=1", "--minutes", "100"]);
-    for text in ["12 training views", "1 views", "training ", "rendering ", "scoring "] {
+    for text in ["12 training views", "1 view of", "training ", "rendering ", "scoring "] {
         assert!(advice.contains(text), "{text}: {advice}");
     }
     for quality in ["draft ", "fast ", "balanced ", "best "] {

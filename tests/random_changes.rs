@@ -202,7 +202,7 @@ fn fails_in_round(
         Change::apply(random, project, file, &other)
     });
     let Some(change) = change.flatten() else {
-        return child.wait_with_output().unwrap().status.success();
+        return !child.wait_with_output().unwrap().status.success();
     };
     let is_undone_at_once = random.below(3) == 0;
     let (edit, file) = (change.edit, change.file.display());

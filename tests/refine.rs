@@ -391,7 +391,8 @@ fn with_colours(
 
 fn first_psnr(prep: &Path, views: &Path) -> f64 {
     let read = |path: &Path| pixels::read_premultiplied(path).unwrap().over(1.0);
-    let truth = prep.join("truth/images").read_dir().unwrap().next().unwrap().unwrap().path();
+    let images = prep.join("truth/images").read_dir().unwrap().map(|entry| entry.unwrap().path());
+    let truth = images.min().unwrap();
     let name = truth.with_extension("exr");
     eval::psnr(&read(&views.join("images").join(name.file_name().unwrap())), &read(&truth))
 }

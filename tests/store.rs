@@ -229,7 +229,7 @@ fn containers_share_a_store() {
         .status()
         .is_ok_and(|s| s.success())
     {
-        eprintln!("skipped: processes can't be counted anew here (it needs root)");
+        eprintln!("skipped: a new PID namespace needs root");
         return;
     }
     let project = scripted(COPY_PARAMETERS);

@@ -12,7 +12,7 @@ pub fn install(prefix: &Path) -> bool {
     let given = std::env::var_os("LIBTORCH").map(PathBuf::from);
     let libtorch = given.unwrap_or_else(|| root().join(".libtorch"));
     if !libtorch.join("lib").is_dir() {
-        eprintln!("skipped: {} is no libtorch of `make setup`", libtorch.display());
+        eprintln!("skipped: {}/lib not found; run `make setup`", libtorch.display());
         return false;
     }
     let mut install = Command::new(root().join("scripts/install.sh"));

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use artifact::format_count;
 use dataset::{Dataset, Format, Frame, Split};
 use serde_json::Value;
 use workload::preparation_bytes;
@@ -195,9 +196,12 @@ impl SceneImages {
             SceneKind::Unbounded => "opaque scene around the cameras",
         };
         format!(
-            "{kind}: {} training views of {:.2} million LR pixels in all, {} views of {:.2} \
-            million pixels in all to render",
-            train.0, train.1, test.0, test.1
+            "{kind}: {} of {:.2} million LR pixels in all, {} of {:.2} million pixels in all to \
+            render",
+            format_count(train.0, "training view"),
+            train.1,
+            format_count(test.0, "view"),
+            test.1
         )
     }
 
