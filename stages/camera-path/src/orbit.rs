@@ -129,7 +129,7 @@ mod tests {
     }
 
     /// Frames stay between the first and the last camera of an arc, also across 180°, and reach
-    /// both; there is no jump, not from the last frame to the first either.
+    /// both. No step between frames is a jump, including the step from the last to the first.
     #[test]
     fn an_orbit_of_an_arc_stays_on_it() {
         for (start, step) in [(10.0, 8.0), (130.0, 6.0), (0.0, 18.0)] {
@@ -149,7 +149,7 @@ mod tests {
         }
     }
 
-    /// Few cameras all around, a small gap, and one camera give a circle.
+    /// A few cameras all around, cameras with a small gap, and a single camera give a circle.
     #[test]
     fn cameras_all_around_give_a_circle() {
         let few = (0..4).map(|i| 90.0 * f64::from(i)).collect::<Vec<_>>();
@@ -157,16 +157,17 @@ mod tests {
         for angles in [few, gap, vec![30.0]] {
             let frames = frames(&cameras(angles.clone(), 1.0));
             assert!(frames.iter().any(|a| *a < -170.0) && frames.iter().any(|a| *a > 170.0));
-            // As many frames in each quarter.
+            // A quarter of the frames is in the first quadrant.
             let quarter =
                 |from: f64| frames.iter().filter(move |a| (from..from + 90.0).contains(*a));
             assert!((14..=18).contains(&quarter(0.0).count()), "{angles:?}");
         }
     }
 
-    /// Cameras on one side look down, and their own up directions lean to the middle.
+    /// The result is vertical although the cameras look down from one side, so that their own up
+    /// directions lean to the middle.
     #[test]
-    fn an_arc_is_level() {
+    fn up_direction_of_an_arc_is_vertical() {
         for (count, height) in [(4, 2.0), (16, 5.0)] {
             let arc = cameras((0..=count).map(|i| 10.0 * f64::from(i)), height);
             let up = up_direction(&arc);
@@ -176,9 +177,9 @@ mod tests {
         assert!(up_direction(&rolled).dot(rolled[0].rotation().y_axis) > 0.9999);
     }
 
-    /// A camera that looks down from above is at no angle.
+    /// A camera above the centre has no meaningful angle around the axis.
     #[test]
-    fn cameras_above_the_middle_do_not_count() {
+    fn cameras_above_the_centre_are_ignored() {
         let mut arc = cameras((0..13).map(|i| 10.0 * f64::from(i)), 1.0);
         let above = DVec3::new(-0.3, -0.3, 4.0);
         let pose = looking_at(above, DVec3::ZERO, DVec3::Z);

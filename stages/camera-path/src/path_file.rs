@@ -241,7 +241,7 @@ fn pose_of(m: &[f64; 16]) -> Pose {
 mod tests {
     use super::*;
 
-    /// Returns the path in a file's text, or the failure's message.
+    /// Reads the path in a file with this text, or returns the error's message.
     fn read(text: &str) -> Result<PathFile, String> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join(PATH_FILE), text).unwrap();
@@ -249,7 +249,7 @@ mod tests {
         PathFile::read(&input).map_err(|failure| failure.to_string())
     }
 
-    /// A file with a frame, as nerfstudio writes it.
+    /// Path file with one frame, as written by nerfstudio.
     const FILE: &str = r#"{"default_fov": 60, "default_transition_sec": 4.0, "keyframes": [
         {"matrix": [0,0,1,5, 1,0,0,6, 0,1,0,7, 0,0,0,1], "fov": 60, "aspect": 1.3333,
         "override_transition_enabled": false, "override_transition_sec": null}],
@@ -265,23 +265,23 @@ mod tests {
         assert_eq!(camera.camera_to_world, [[0., 0., 1., 5.], [1., 0., 0., 6.], [0., 1., 0., 7.]]);
         let k = camera.intrinsics;
         assert_eq!((k.width, k.height, k.cx, k.cy), (40, 30, 20.0, 15.0));
-        // The angle is that of the height.
+        // `fov` is the vertical angle of view.
         let focal = 15.0 / 30f64.to_radians().tan();
         assert!((k.fx - focal).abs() < 1e-9 && (k.fy - focal).abs() < 1e-9, "{k:?}");
     }
 
-    /// Checks that a path in a file is equal after reading.
+    /// Checks that a path is equal after writing and reading; returns the file's JSON.
     fn round_trip(path: &PathFile) -> Value {
         let text = serde_json::to_string(path).unwrap();
-        let again = read(&text).unwrap();
-        assert_eq!(&again, path);
-        assert_eq!(again.cameras(), path.cameras());
+        let reread = read(&text).unwrap();
+        assert_eq!(&reread, path);
+        assert_eq!(reread.cameras(), path.cameras());
         serde_json::from_str(&text).unwrap()
     }
 
-    /// The fields are those that nerfstudio's viewer writes and its `get_path_from_json` reads.
+    /// Files have the fields that nerfstudio's viewer writes and its `get_path_from_json` reads.
     #[test]
-    fn files_are_nerfstudios_and_give_the_same_cameras() {
+    fn files_have_nerfstudios_fields_and_round_trip() {
         let camera = Intrinsics { fy: 61.0, cx: 18.0, ..Intrinsics::from_angle_x(40, 30, 0.7) };
         let poses = [0.1, 0.2, 0.3].map(|x| {
             scene::looking_at(glam::DVec3::new(x, x * x, 3.0), glam::DVec3::ZERO, glam::DVec3::Y)
@@ -305,9 +305,9 @@ mod tests {
         assert!((k.fx - 61.0).abs() < 1e-9 && (k.fy - 61.0).abs() < 1e-9 && k.cx == 20.0, "{k:?}");
     }
 
-    /// A recorded path keeps its keys, rate and angles of view, also at another size.
+    /// A recorded path keeps its keys, frame rate and angles of view, also at another size.
     #[test]
-    fn recorded_paths_are_written_again() {
+    fn recorded_paths_round_trip() {
         let path = read(FILE).unwrap();
         round_trip(&path);
         let file = round_trip(&path.resized(80));
@@ -315,13 +315,13 @@ mod tests {
         assert_eq!(file["seconds"].as_f64(), Some(1.0 / 30.0));
         assert_eq!(file["camera_path"][0]["fov"], 60.0);
         assert_eq!(file["keyframes"].as_array().unwrap().len(), 1);
-        // nerfstudio's add-on for Blender.
+        // nerfstudio's add-on for Blender writes `is_cycle` as a string.
         read(&FILE.replace("\"is_cycle\": false", "\"is_cycle\": \"false\"")).unwrap();
     }
 
     #[test]
-    fn faults_are_named_with_their_place() {
-        for (from, to, said) in [
+    fn errors_name_the_file_and_the_field() {
+        for (from, to, expected) in [
             ("perspective", "equirectangular", "camera_type equirectangular isn't supported"),
             (
                 "\"render_width\": 40",
@@ -346,9 +346,9 @@ mod tests {
             let changed = FILE.replace(from, to);
             assert_ne!(changed, FILE, "{from}");
             let message = read(&changed).unwrap_err();
-            assert!(message.contains(said) && message.contains(PATH_FILE), "{message}");
+            assert!(message.contains(expected) && message.contains(PATH_FILE), "{message}");
         }
-        let none = r#"{"render_height": 3, "render_width": 4, "camera_path": []}"#;
-        assert!(read(none).unwrap_err().contains("no frame; add a key"));
+        let no_frames = r#"{"render_height": 3, "render_width": 4, "camera_path": []}"#;
+        assert!(read(no_frames).unwrap_err().contains("no frame; add a key"));
     }
 }

@@ -162,13 +162,13 @@ mod tests {
         Camera { name: name.to_owned(), intrinsics, camera_to_world }
     }
 
-    fn cameras(places: &[DVec3], at: impl Fn(DVec3) -> DVec3) -> Vec<Camera> {
-        let poses = places.iter().map(|&place| looking_at(place, at(place), DVec3::Z));
+    fn cameras(positions: &[DVec3], target: impl Fn(DVec3) -> DVec3) -> Vec<Camera> {
+        let poses = positions.iter().map(|&p| looking_at(p, target(p), DVec3::Z));
         poses.enumerate().map(|(i, pose)| camera(&i.to_string(), pose)).collect()
     }
 
     fn ring() -> Vec<Camera> {
-        let places: Vec<DVec3> = (0..7)
+        let positions: Vec<DVec3> = (0..7)
             .map(|i| {
                 DVec3::new(
                     4.0 * f64::from(i).cos(),
@@ -177,77 +177,80 @@ mod tests {
                 )
             })
             .collect();
-        cameras(&places, |_| DVec3::ZERO)
+        cameras(&positions, |_| DVec3::ZERO)
     }
 
-    fn row() -> Vec<Camera> {
-        let places: Vec<DVec3> = (0..9)
+    fn parallel_grid() -> Vec<Camera> {
+        let positions: Vec<DVec3> = (0..9)
             .map(|i| DVec3::new(f64::from(i % 3) - 1.0, 0.0, 0.5 * f64::from(i / 3)))
             .collect();
-        cameras(&places, |p| p + DVec3::Y)
+        cameras(&positions, |p| p + DVec3::Y)
     }
 
     const BOX: Bounds = Bounds::cube(1.0, 2.0, 6.0);
 
-    fn whole(poses: &[Pose]) -> Vec<Camera> {
+    /// Returns cameras at the poses; fails if one is invalid.
+    fn valid_cameras(poses: &[Pose]) -> Vec<Camera> {
         let cameras: Vec<Camera> = poses.iter().map(|&pose| camera("c", pose)).collect();
         cameras.iter().for_each(|c| c.check().unwrap());
         cameras
     }
 
     #[test]
-    fn an_orbit_goes_around_the_middle() {
+    fn an_orbit_circles_the_origin() {
         let cameras = ring();
         assert_eq!(default_kind(&cameras), Kind::Orbit);
-        let path = whole(&poses(Kind::Orbit, 24, &cameras[0], &cameras, &BOX));
+        let path = valid_cameras(&poses(Kind::Orbit, 24, &cameras[0], &cameras, &BOX));
         assert_eq!(path.len(), 24);
         for camera in &path {
             assert!((camera.centre().length() - 4.2).abs() < 0.3, "{}", camera.centre());
             assert!(camera.forward().dot(-camera.centre().normalize()) > 0.999);
         }
-        // No jump, not from the last to the first either.
+        // No jump between frames, nor from the last to the first.
         for (a, b) in path.iter().zip(path.iter().cycle().skip(1)) {
             assert!((a.centre() - b.centre()).length() < 1.2);
         }
     }
 
     #[test]
-    fn a_spiral_stays_among_the_cameras_and_looks_their_way() {
-        let cameras = row();
+    fn a_spiral_stays_among_the_cameras_and_faces_their_direction() {
+        let cameras = parallel_grid();
         assert_eq!(default_kind(&cameras), Kind::Spiral);
-        for camera in whole(&poses(Kind::Spiral, 30, &cameras[0], &cameras, &BOX)) {
-            let off = camera.centre() - DVec3::new(0.0, 0.0, 0.5);
+        for camera in valid_cameras(&poses(Kind::Spiral, 30, &cameras[0], &cameras, &BOX)) {
+            let offset = camera.centre() - DVec3::new(0.0, 0.0, 0.5);
             assert!(
-                off.x.abs() <= 1.0 + 1e-9 && off.z.abs() <= 0.5 + 1e-9 && camera.forward().y > 0.8,
-                "{off}"
+                offset.x.abs() <= 1.0 + 1e-9
+                    && offset.z.abs() <= 0.5 + 1e-9
+                    && camera.forward().y > 0.8,
+                "{offset}"
             );
         }
     }
 
-    /// A spiral of a grid of parallel cameras stays where they looked, at every depth; one around a
-    /// near point doesn't.
+    /// A spiral fitted to a grid of parallel cameras shows few points that no camera observes. An
+    /// unfitted spiral around a near point shows many.
     #[test]
-    fn frames_of_a_spiral_show_what_cameras_saw() {
-        let cameras = row();
+    fn a_fitted_spiral_shows_observed_points() {
+        let cameras = parallel_grid();
         let bounds = Bounds::cube(20.0, 4.0, 40.0);
         let range = depth_range(&bounds);
         let coverage = Coverage::new(&cameras, &cameras[0], range.0, range.1);
-        let unseen = |poses: &[Pose]| {
+        let max_unseen = |poses: &[Pose]| {
             let counts = poses.iter().map(|&pose| coverage.count_unseen(pose));
             counts.max().unwrap_or(0)
         };
         let around = Spiral::around(&cameras, range);
         let poses_around: Vec<Pose> = (0..8).map(|i| around.pose(f64::from(i))).collect();
-        assert!(unseen(&poses_around) > 15, "{}", unseen(&poses_around));
+        assert!(max_unseen(&poses_around) > 15, "{}", max_unseen(&poses_around));
         let path = poses(Kind::Spiral, 50, &cameras[0], &cameras, &bounds);
-        let widest = whole(&path).iter().map(|c| c.centre().x).fold(0.0, f64::max);
-        assert!(unseen(&path) <= 4 && widest > 0.9, "{} {widest}", unseen(&path));
+        let max_x = valid_cameras(&path).iter().map(|c| c.centre().x).fold(0.0, f64::max);
+        assert!(max_unseen(&path) <= 4 && max_x > 0.9, "{} {max_x}", max_unseen(&path));
     }
 
     #[test]
     fn between_passes_every_camera() {
         let cameras = ring();
-        let path = whole(&poses(Kind::Between, 70, &cameras[0], &cameras, &BOX));
+        let path = valid_cameras(&poses(Kind::Between, 70, &cameras[0], &cameras, &BOX));
         for (i, camera) in cameras.iter().enumerate() {
             let frame = &path[10 * i];
             assert!(
@@ -258,10 +261,10 @@ mod tests {
     }
 
     #[test]
-    fn one_camera_and_straight_down_are_paths_too() {
-        let one = cameras(&[DVec3::new(0.0, 0.0, 4.0)], |_| DVec3::ZERO);
+    fn one_camera_that_looks_down_has_paths() {
+        let single = cameras(&[DVec3::new(0.0, 0.0, 4.0)], |_| DVec3::ZERO);
         for kind in [Kind::Spiral, Kind::Orbit, Kind::Between] {
-            whole(&poses(kind, 5, &one[0], &one, &BOX));
+            valid_cameras(&poses(kind, 5, &single[0], &single, &BOX));
         }
     }
 }

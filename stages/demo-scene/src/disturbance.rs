@@ -51,29 +51,29 @@ mod tests {
         let exact = Params::default();
         let image = || Rgba8::new(2, 1, vec![100, 50, 200, 128, 250, 0, 10, 255]);
         let pose = crate::camera_pose(exact.layout, "train", 3, 10);
-        let mut same = image();
-        expose(&mut same, &exact, 0);
-        assert_eq!((same, with_error(&pose, &exact, 3)), (image(), pose));
+        let mut unchanged = image();
+        expose(&mut unchanged, &exact, 0);
+        assert_eq!((unchanged, with_error(&pose, &exact, 3)), (image(), pose));
 
         let flawed = Params { exposure_difference: 0.1, pose_error: 0.5, ..exact };
         let mut levels = [0; 100];
         for (i, level) in levels.iter_mut().enumerate() {
-            let mut other = image();
-            expose(&mut other, &flawed, i as u32);
-            *level = other.data[0];
-            assert_eq!([other.data[3], other.data[7]], [128, 255]);
+            let mut exposed = image();
+            expose(&mut exposed, &flawed, i as u32);
+            *level = exposed.data[0];
+            assert_eq!([exposed.data[3], exposed.data[7]], [128, 255]);
         }
         assert!(levels.iter().all(|level| [90, 111].contains(level)), "{levels:?}");
         assert!((30..70).contains(&levels.iter().filter(|&&level| level == 90).count()));
 
-        let mut squares = 0.0;
+        let mut mean_square = 0.0;
         for i in 0..400 {
             let moved = with_error(&pose, &flawed, i);
             assert_eq!(moved.map(|row| row[3]), pose.map(|row| row[3]));
             let back = [moved, pose].map(|pose| DVec3::new(pose[0][2], pose[1][2], pose[2][2]));
-            squares += back[0].angle_between(back[1]).to_degrees().powi(2) / 400.0;
+            mean_square += back[0].angle_between(back[1]).to_degrees().powi(2) / 400.0;
         }
         // Two of the three rotations turn the optical axis.
-        assert!((squares / (2.0 * 0.25) - 1.0).abs() < 0.2, "{squares}");
+        assert!((mean_square / (2.0 * 0.25) - 1.0).abs() < 0.2, "{mean_square}");
     }
 }

@@ -158,15 +158,15 @@ mod tests {
     }
 
     #[test]
-    fn depth_is_that_of_the_surface() {
+    fn depth_agrees_with_the_surfaces() {
         let world = World::new(0);
         let pose = camera_pose(Layout::Around, "test", 3, 10);
         let frame = render::render(&world, &pose, &test_camera(64, 1.0), 2, &Progress::silent());
-        let seen: Vec<f32> = frame.depth.iter().flatten().copied().collect();
-        assert!(seen.len() > 64 * 64 / 8, "{} pixels see something", seen.len());
-        assert!(seen.iter().all(|z| (2.0..6.0).contains(z)));
-        // Where all four rays of a pixel meet something, so does nearly every centre ray; where
-        // none does, hardly any.
+        let depths: Vec<f32> = frame.depth.iter().flatten().copied().collect();
+        assert!(depths.len() > 64 * 64 / 8, "{} pixels hit a surface", depths.len());
+        assert!(depths.iter().all(|z| (2.0..6.0).contains(z)));
+        // Centre rays hit a surface in nearly all pixels where all four rays do, and in hardly any
+        // where none does.
         let agree = frame
             .depth
             .iter()
@@ -175,36 +175,37 @@ mod tests {
         assert!(agree.count() > 64 * 64 * 95 / 100);
     }
 
-    /// A ray's first surface is at distance 0, its normal is where the distance grows, and all the
-    /// way there is no nearer one.
+    /// The distance is 0 at a ray's first surface and grows along its normal. Before the surface,
+    /// the distance is positive and at most the ray's remaining length.
     #[test]
-    fn distances_are_those_of_the_surfaces() {
+    fn distances_agree_with_the_surfaces() {
         let world = World::new(2);
-        let mut met = 0;
+        let mut hits = 0;
         for i in 0..200 {
             let pose = camera_pose(Layout::Around, "train", i, 200);
             let origin = DVec3::new(pose[0][3], pose[1][3], pose[2][3]);
-            let at = 0.2 * DVec3::new(f64::from(i % 7) - 3.0, f64::from(i % 11) - 5.0, -1.0);
-            let direction = (at - origin).normalize();
+            let target = 0.2 * DVec3::new(f64::from(i % 7) - 3.0, f64::from(i % 11) - 5.0, -1.0);
+            let direction = (target - origin).normalize();
             let Some((point, normal)) = world.surface(origin, direction) else { continue };
-            met += 1;
+            hits += 1;
             assert!(world.distance(point).abs() < 1e-9, "ray {i}");
             let step = 1e-4;
-            let [out, inside] = [step, -step].map(|by| world.distance(point + by * normal));
-            assert!(out > 0.5 * step && inside < 0.0, "ray {i}: {out} and {inside}");
+            let [outside, inside] =
+                [step, -step].map(|offset| world.distance(point + offset * normal));
+            assert!(outside > 0.5 * step && inside < 0.0, "ray {i}: {outside} and {inside}");
             for k in 1..10 {
-                let share = f64::from(k) / 10.0;
-                let left = (1.0 - share) * (point - origin).length();
-                let distance = world.distance(origin.lerp(point, share));
-                assert!(distance > 0.0 && distance <= left + 1e-9, "ray {i}");
+                let fraction = f64::from(k) / 10.0;
+                let remaining = (1.0 - fraction) * (point - origin).length();
+                let distance = world.distance(origin.lerp(point, fraction));
+                assert!(distance > 0.0 && distance <= remaining + 1e-9, "ray {i}");
             }
         }
-        assert!(met > 100, "{met} rays meet something");
+        assert!(hits > 100, "{hits} rays hit a surface");
     }
 
     #[test]
     fn the_scene_stays_in_every_view() {
-        // What a test view sees must be inside the training views' frusta, or near/far and hull
+        // Surfaces in test views must be inside the training views' frusta, or near/far and hull
         // would be guesses.
         let world = World::new(0);
         for aspect in [1.0, 1.5, 0.75] {
@@ -234,8 +235,8 @@ mod tests {
         assert_ne!(view(0), view(1));
     }
 
-    /// A fisheye's middle has as many pixels per degree as a test view, its border is seen at the
-    /// angle asked for, and corners beyond 89° are black.
+    /// A fisheye's middle has as many pixels per degree as a test view, its border is at the
+    /// requested angle, and corners beyond 89° are black.
     #[test]
     fn a_fisheye_view_is_taken_through_its_lens() {
         let params = Params {

@@ -92,10 +92,10 @@ mod tests {
         Camera { name: degrees.to_string(), intrinsics, camera_to_world: pose }
     }
 
-    /// Views along z, each turned about y by an angle in degrees.
-    fn views(turns: &[f64]) -> Views {
+    /// Returns views along z, each turned about y by an angle in degrees.
+    fn views(angles: &[f64]) -> Views {
         let view = |degrees: &f64| View::camera_only(camera(*degrees));
-        Views::new(Background::White, Bounds::default(), turns.iter().map(view).collect())
+        Views::new(Background::White, Bounds::default(), angles.iter().map(view).collect())
     }
 
     #[test]
@@ -113,9 +113,9 @@ mod tests {
         assert_eq!(near_references(&[scores("0", None)], &views(&[0.0]), &views(&[0.0])), None);
     }
 
-    fn baseline_of(folder: &Path, names: &[(&str, f64)]) -> GivenInput {
+    fn write_baseline(folder: &Path, psnrs: &[(&str, f64)]) -> GivenInput {
         let views: Vec<ViewScores> =
-            names.iter().map(|(name, psnr)| scores(name, Some(*psnr))).collect();
+            psnrs.iter().map(|(name, psnr)| scores(name, Some(*psnr))).collect();
         let metrics = Metrics {
             conventions: BTreeMap::new(),
             figures: Vec::new(),
@@ -130,13 +130,14 @@ mod tests {
     }
 
     #[test]
-    fn the_least_gain_is_the_worst_views() {
+    fn the_least_gain_is_that_of_the_worst_view() {
         let folder = tempfile::tempdir().unwrap();
-        let now = [scores("a", Some(31.0)), scores("b", Some(29.5)), scores("c", None)];
-        let baseline = baseline_of(folder.path(), &[("a", 30.0), ("b", 30.0), ("c", 1.0)]);
-        assert_eq!(least_gain(&now, &baseline).unwrap(), Some(-0.5));
-        let problem =
-            least_gain(&now, &baseline_of(folder.path(), &[("a", 30.0)])).unwrap_err().to_string();
+        let scored = [scores("a", Some(31.0)), scores("b", Some(29.5)), scores("c", None)];
+        let baseline = write_baseline(folder.path(), &[("a", 30.0), ("b", 30.0), ("c", 1.0)]);
+        assert_eq!(least_gain(&scored, &baseline).unwrap(), Some(-0.5));
+        let problem = least_gain(&scored, &write_baseline(folder.path(), &[("a", 30.0)]))
+            .unwrap_err()
+            .to_string();
         assert!(problem.contains("input baseline: no view b"), "{problem}");
     }
 }

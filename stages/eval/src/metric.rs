@@ -97,11 +97,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn means_are_those_of_the_views_that_have_a_value() {
-        let one = |value| Scores::from([("psnr".to_owned(), Score::One(value))]);
-        let mut with_depth = one(32.0);
+    fn means_are_over_the_views_that_have_a_value() {
+        let psnr = |value| Scores::from([("psnr".to_owned(), Score::One(value))]);
+        let mut with_depth = psnr(32.0);
         with_depth.insert("depth".to_owned(), Score::several([("missed", 0.5)]));
-        let mean = mean_of([one(30.0), with_depth, Scores::new()].iter());
+        let mean = mean_of([psnr(30.0), with_depth, Scores::new()].iter());
         assert_eq!((value(&mean, "psnr"), value(&mean, "depth/missed")), (Some(31.0), Some(0.5)));
         for path in ["ssim", "depth", "psnr/missed", "depth/none"] {
             assert_eq!(value(&mean, path), None, "{path}");

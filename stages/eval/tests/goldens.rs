@@ -12,7 +12,8 @@ fn levels(width: usize, height: usize, seed: u32) -> Vec<f64> {
     pattern::pattern(width, height, 3, seed).iter().map(|&v| f64::from(v) / 255.0).collect()
 }
 
-/// f64 in the goldens, f32 in an image: the blend is rounded here, which costs about 1e-8.
+/// Returns an image and a blend with another image. The goldens are in f64; rounding the blend to
+/// f32 costs about 1e-8.
 fn images(width: usize, height: usize, seed: u32) -> (Image, Image) {
     let (a, other) = (levels(width, height, seed), levels(width, height, seed + 100));
     let b = a.iter().zip(&other).map(|(a, o)| (0.7 * a + 0.3 * o) as f32).collect();
@@ -28,8 +29,8 @@ fn ssim_equals_scikit_image_and_pytorch() {
     for case in list["cases"].as_array().unwrap() {
         let number = |key: &str| case[key].as_u64().unwrap() as usize;
         let (a, b) = images(number("width"), number("height"), number("seed") as u32);
-        let both = ssim(&a, &b);
-        for (ours, key) in [(both.valid, "valid"), (both.reflected, "reflect")] {
+        let scores = ssim(&a, &b);
+        for (ours, key) in [(scores.valid, "valid"), (scores.reflected, "reflect")] {
             let theirs = case[key].as_f64().unwrap();
             assert!((ours - theirs).abs() < 1e-6, "{key}: {ours} {theirs} {case}");
         }
@@ -41,8 +42,8 @@ fn ssim_equals_scikit_image_and_pytorch() {
 fn one_pixel_and_narrow_images_have_an_ssim() {
     for (width, height) in [(1, 1), (2, 7), (4, 30)] {
         let (a, b) = images(width, height, 5);
-        let both = ssim(&a, &b);
-        assert!(both.valid.is_finite() && both.reflected.is_finite());
+        let scores = ssim(&a, &b);
+        assert!(scores.valid.is_finite() && scores.reflected.is_finite());
     }
 }
 
@@ -68,10 +69,11 @@ fn lpips_gives_the_published_distances() {
     assert!(lpips.distance(&reference, &reference).unwrap().abs() < 1e-6);
 }
 
-/// Every network with fixed random weights, against PyTorch's layers (`scripts/goldens/images.py`).
+/// Distances of every network with fixed random weights equal those of PyTorch's layers
+/// (`scripts/goldens/images.py`).
 #[cfg(feature = "torch")]
 #[test]
-fn lpips_is_that_of_pytorch_with_every_network() {
+fn lpips_equals_pytorch_with_every_network() {
     use eval::LpipsNetwork::{Alex, Squeeze, Vgg};
     let list: serde_json::Value = serde_json::from_str(include_str!("goldens/lpips.json")).unwrap();
     let folder = tempfile::tempdir().unwrap();

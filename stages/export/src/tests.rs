@@ -1,4 +1,4 @@
-//! Everything on a ball that is known exactly.
+//! Tests of all outputs on a ball, whose surface is known exactly.
 
 use dataset::Dataset;
 use glam::{DMat3, DVec3};
@@ -14,7 +14,7 @@ use crate::surface_view::SurfaceView;
 use crate::surfel::Surfel;
 use crate::{cameras, fusion, glb, ply, surface_nets, surfel};
 
-/// A ball around the origin: red on the side of +x, blue on the other.
+/// Ball around the origin: red where x > 0, otherwise blue.
 struct Ball;
 
 const RADIUS: f64 = 0.7;
@@ -28,11 +28,11 @@ impl RayField for Ball {
 fn ball_pixel(ray: &Ray) -> Pixel {
     let [origin, direction] = [ray.origin, ray.direction].map(DVec3::from);
     let along = -origin.dot(direction);
-    let under = RADIUS * RADIUS - (origin + along * direction).length_squared();
-    if under < 0.0 {
+    let discriminant = RADIUS * RADIUS - (origin + along * direction).length_squared();
+    if discriminant < 0.0 {
         return Pixel { colour: ray.background, depth: 9.0, median_depth: 9.0, ..Pixel::default() };
     }
-    let distance = along - under.sqrt();
+    let distance = along - discriminant.sqrt();
     let is_red = origin.x + distance * direction.x > 0.0;
     let colour = if is_red { [1.0, 0.0, 0.0] } else { [0.0, 0.0, 1.0] };
     let depth = distance as f32;
@@ -42,10 +42,10 @@ fn ball_pixel(ray: &Ray) -> Pixel {
 const BOX: Bounds = Bounds::cube(1.0, 1.0, 9.0);
 
 fn camera_around(i: u32, count: u32, lowest: f64) -> Camera {
-    let share = (f64::from(i) + 0.5) / f64::from(count);
-    let (height, angle) = (lowest + (0.98 - lowest) * share, 2.4 * f64::from(i));
-    let level = (1.0 - height * height).sqrt();
-    let back = DVec3::new(level * angle.cos(), level * angle.sin(), height);
+    let fraction = (f64::from(i) + 0.5) / f64::from(count);
+    let (height, angle) = (lowest + (0.98 - lowest) * fraction, 2.4 * f64::from(i));
+    let horizontal = (1.0 - height * height).sqrt();
+    let back = DVec3::new(horizontal * angle.cos(), horizontal * angle.sin(), height);
     let right = DVec3::Z.cross(back).normalize();
     let up = back.cross(right);
     Camera {
@@ -55,8 +55,8 @@ fn camera_around(i: u32, count: u32, lowest: f64) -> Camera {
     }
 }
 
-/// Cameras around the origin at distance 3; `up` is the lowest height that they have.
-fn around(count: u32, lowest: f64) -> Vec<Camera> {
+/// Returns cameras around the origin at distance 3; `lowest` is the minimum z of their directions.
+fn cameras_around(count: u32, lowest: f64) -> Vec<Camera> {
     (0..count).map(|i| camera_around(i, count, lowest)).collect()
 }
 
@@ -76,23 +76,23 @@ fn fused(views: &[SurfaceView], cells: u32) -> Mesh {
     mesh
 }
 
-/// Signed volume between a triangle and the origin.
-fn tetrahedron(mesh: &Mesh, t: &[u32; 3]) -> f64 {
+/// Returns the signed volume between a triangle and the origin.
+fn tetrahedron_volume(mesh: &Mesh, t: &[u32; 3]) -> f64 {
     let [a, b, c] = t.map(|v| mesh.positions[v as usize].as_dvec3());
     a.dot(b.cross(c)) / 6.0
 }
 
-/// The volume inside, above 0 where triangles are counter-clockwise seen from outside.
+/// Returns the enclosed volume, positive if triangles are counter-clockwise seen from outside.
 fn volume(mesh: &Mesh) -> f64 {
-    mesh.triangles.iter().map(|t| tetrahedron(mesh, t)).sum()
+    mesh.triangles.iter().map(|t| tetrahedron_volume(mesh, t)).sum()
 }
 
 const BALL_VOLUME: f64 = 4.0 / 3.0 * std::f64::consts::PI * RADIUS * RADIUS * RADIUS;
 
-fn beyond_the_ball(lattice: &Lattice, i: usize) -> f32 {
+fn ball_distance(lattice: &Lattice, i: usize) -> f32 {
     let [nx, ny, _] = lattice.counts;
-    let place = [i % nx, i / nx % ny, i / (nx * ny)].map(|n| n as f64);
-    (lattice.to_world(place).length() - RADIUS) as f32
+    let point = [i % nx, i / nx % ny, i / (nx * ny)].map(|n| n as f64);
+    (lattice.to_world(point).length() - RADIUS) as f32
 }
 
 #[test]
@@ -102,7 +102,7 @@ fn surface_nets_close_a_ball_in_a_box_and_in_a_frustum() {
     let frustum = Frustum { camera_to_world: pose, min: [-0.4; 2], max: [0.4; 2], near, far };
     for space in [Space::Box, Space::Ndc(frustum)] {
         let lattice = Lattice::new(&Bounds { space, ..BOX }, 48);
-        let values: Vec<f32> = (0..lattice.len()).map(|i| beyond_the_ball(&lattice, i)).collect();
+        let values: Vec<f32> = (0..lattice.len()).map(|i| ball_distance(&lattice, i)).collect();
         let mut mesh = surface_nets::extract(&lattice, &values, &Progress::silent());
         mesh.compute_normals();
         assert_eq!(mesh.boundary_edges().len(), 0, "{space:?}");
@@ -115,67 +115,67 @@ fn surface_nets_close_a_ball_in_a_box_and_in_a_frustum() {
 }
 
 #[test]
-fn places_of_a_lattice_come_back() {
+fn lattice_points_round_trip() {
     let pose = [[0.0, 0.0, 1.0, 0.5], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 4.0]];
     let (near, far) = (0.5, 90.0);
     let frustum = Frustum { camera_to_world: pose, min: [-0.9, -0.6], max: [0.8, 0.7], near, far };
     for space in [Space::Box, Space::Ndc(frustum), Space::Contraction] {
         let lattice = Lattice::new(&Bounds { space, ..BOX }, 20);
-        let place = [3.0, 1.5, 2.25];
-        let back = lattice.to_lattice(lattice.to_world(place));
-        assert!((DVec3::from(back) - DVec3::from(place)).length() < 1e-9, "{space:?}: {back:?}");
+        let point = [3.0, 1.5, 2.25];
+        let back = lattice.to_lattice(lattice.to_world(point));
+        assert!((DVec3::from(back) - DVec3::from(point)).length() < 1e-9, "{space:?}: {back:?}");
     }
 }
 
 #[test]
-fn fused_depth_is_the_ball() {
-    let mesh = fused(&views(&around(24, -0.95)), 64);
+fn fused_depth_reproduces_the_ball() {
+    let mesh = fused(&views(&cameras_around(24, -0.95)), 64);
     assert_eq!(mesh.boundary_edges().len(), 0);
     assert!((volume(&mesh) / BALL_VOLUME - 1.0).abs() < 0.02, "{}", volume(&mesh));
-    let off = mesh.positions.iter().map(|p| (f64::from(p.length()) - RADIUS).abs());
-    let mean = off.sum::<f64>() / mesh.positions.len() as f64;
-    // Pixels are 0.015 wide there.
+    let errors = mesh.positions.iter().map(|p| (f64::from(p.length()) - RADIUS).abs());
+    let mean = errors.sum::<f64>() / mesh.positions.len() as f64;
+    // Pixels are 0.015 wide at the ball.
     assert!(mean < 6e-3, "{mean}");
 }
 
-/// Cameras above alone: there is no surface where none looks.
+/// All cameras are above the ball: no surface is created below, where no camera looks.
 #[test]
 fn the_unseen_side_stays_open() {
-    let mesh = fused(&views(&around(24, 0.05)), 64);
+    let mesh = fused(&views(&cameras_around(24, 0.05)), 64);
     assert!(mesh.boundary_edges().len() > 50, "{}", mesh.boundary_edges().len());
     for p in &mesh.positions {
         assert!((f64::from(p.length()) - RADIUS).abs() < 0.08, "{p}");
     }
 }
 
-/// A camera at distance 3 sees the points whose direction has a cosine above RADIUS / 3 with its
-/// own.
+/// Returns whether a camera observes a point of the ball. At distance 3, the cosine between the
+/// directions of such a point and the camera is above RADIUS / 3.
 fn is_seen(cameras: &[Camera], p: &glam::Vec3) -> bool {
     let outwards = p.as_dvec3().normalize();
     cameras.iter().any(|c| outwards.dot(c.centre().normalize()) > RADIUS / 3.0)
 }
 
-/// Fused surfaces extend a little beyond what is seen. That part is dropped, with only a few rows
-/// before it.
+/// Fused surfaces extend a little beyond the observed points. The unobserved part is removed, with
+/// only a few rows of triangles before that part.
 #[test]
-fn what_no_view_shows_is_dropped() {
-    let (cameras, lattice) = (around(24, 0.3), Lattice::new(&BOX, 64));
+fn unobserved_surface_is_removed() {
+    let (cameras, lattice) = (cameras_around(24, 0.3), Lattice::new(&BOX, 64));
     let views = views(&cameras);
-    let whole = fused(&views, 64);
-    let mut mesh = whole.clone();
+    let original = fused(&views, 64);
+    let mut mesh = original.clone();
     fusion::remove_unseen(&views, &lattice, &mut mesh);
     mesh.remove_small_components();
     assert!(
-        !whole.positions.iter().all(|p| is_seen(&cameras, p))
+        !original.positions.iter().all(|p| is_seen(&cameras, p))
             && mesh.positions.iter().all(|p| is_seen(&cameras, p))
     );
-    let share = mesh.triangles.len() as f64 / whole.triangles.len() as f64;
-    assert!((0.7..1.0).contains(&share), "{share}");
+    let ratio = mesh.triangles.len() as f64 / original.triangles.len() as f64;
+    assert!((0.7..1.0).contains(&ratio), "{ratio}");
 }
 
 #[test]
 fn surfels_lie_on_the_ball_and_face_outwards() {
-    let views = views(&around(24, -0.95));
+    let views = views(&cameras_around(24, -0.95));
     let all = surfel::merge(&views, &BOX, 1_000_000);
     let few = surfel::merge(&views, &BOX, 2_000);
     assert!(all.len() > 10_000 && (1_500..=2_000).contains(&few.len()), "{}", few.len());
@@ -189,28 +189,28 @@ fn surfels_lie_on_the_ball_and_face_outwards() {
     }
 }
 
-fn made_with(threads: usize) -> (Mesh, Vec<Surfel>) {
+fn mesh_and_surfels(threads: usize) -> (Mesh, Vec<Surfel>) {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     pool.install(|| {
-        let views = views(&around(9, -0.5));
+        let views = views(&cameras_around(9, -0.5));
         (fused(&views, 40), surfel::merge(&views, &BOX, 5_000))
     })
 }
 
 #[test]
-fn any_number_of_threads_gives_the_same() {
-    assert!(made_with(1) == made_with(3));
+fn any_number_of_threads_gives_equal_results() {
+    assert!(mesh_and_surfels(1) == mesh_and_surfels(3));
 }
 
 #[test]
-fn pieces_of_a_few_triangles_go() {
-    let mut mesh = fused(&views(&around(24, -0.95)), 64);
-    let whole = mesh.clone();
+fn components_of_a_few_triangles_are_removed() {
+    let mut mesh = fused(&views(&cameras_around(24, -0.95)), 64);
+    let original = mesh.clone();
     let first = mesh.positions.len() as u32;
     mesh.positions.extend([glam::Vec3::X, glam::Vec3::Y, glam::Vec3::Z]);
     mesh.triangles.insert(0, [first, first + 1, first + 2]);
     mesh.remove_small_components();
-    assert!(mesh.positions == whole.positions && mesh.triangles == whole.triangles);
+    assert!(mesh.positions == original.positions && mesh.triangles == original.triangles);
 }
 
 fn one_surfel() -> Surfel {
@@ -224,11 +224,12 @@ fn one_surfel() -> Surfel {
     }
 }
 
-/// Header and numbers of a PLY file.
+/// Splits a PLY file into its header and its binary data.
 fn split_ply(bytes: &[u8]) -> (String, Vec<u8>) {
-    let end = b"end_header\n";
-    let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
-    (String::from_utf8(bytes[..at].to_vec()).unwrap(), bytes[at..].to_vec())
+    let last_line = b"end_header\n";
+    let length =
+        bytes.windows(last_line.len()).position(|w| w == last_line).unwrap() + last_line.len();
+    (String::from_utf8(bytes[..length].to_vec()).unwrap(), bytes[length..].to_vec())
 }
 
 #[test]
@@ -248,7 +249,7 @@ fn points_have_normals_and_colours() {
 }
 
 #[test]
-fn points_keep_away_from_silhouettes_where_there_are_others() {
+fn points_at_silhouettes_are_left_out_if_others_exist() {
     let with = |margin| Surfel { margin, ..one_surfel() };
     let all = [with(1), with(2), with(3), with(4)];
     assert_eq!(ply::select_points(&all), all[2..]);
@@ -265,47 +266,48 @@ fn splats_are_discs_across_their_normal() {
     let numbers: Vec<f64> =
         data.as_chunks::<4>().0.iter().map(|b| f64::from(f32::from_le_bytes(*b))).collect();
     assert_eq!(names.len(), numbers.len());
-    let of = |name: &str| numbers[names.iter().position(|n| *n == name).unwrap()];
-    // 0.75 of an opaque surface's 0.6.
-    assert!((1.0 / (1.0 + (-of("opacity")).exp()) - 0.45).abs() < 1e-6);
-    let colour = |c: i32| 0.5 + 0.282_094_79 * of(&format!("f_dc_{c}"));
+    let get = |name: &str| numbers[names.iter().position(|n| *n == name).unwrap()];
+    // 0.75 times 0.6, the opacity of a splat on an opaque surface.
+    assert!((1.0 / (1.0 + (-get("opacity")).exp()) - 0.45).abs() < 1e-6);
+    let colour = |c: i32| 0.5 + 0.282_094_79 * get(&format!("f_dc_{c}"));
     assert!((colour(0) - 1.0).abs() < 1e-6 && (colour(2)).abs() < 1e-6);
-    let turn = glam::DQuat::from_xyzw(of("rot_1"), of("rot_2"), of("rot_3"), of("rot_0"));
-    assert!((turn * DVec3::Z).dot(DVec3::NEG_Y) > 1.0 - 1e-6);
-    assert!(of("scale_0") == of("scale_1") && of("scale_2") < of("scale_0") - 1.0);
+    let rotation = glam::DQuat::from_xyzw(get("rot_1"), get("rot_2"), get("rot_3"), get("rot_0"));
+    assert!((rotation * DVec3::Z).dot(DVec3::NEG_Y) > 1.0 - 1e-6);
+    assert!(get("scale_0") == get("scale_1") && get("scale_2") < get("scale_0") - 1.0);
 }
 
 #[test]
-fn glb_chunks_hold_what_the_json_says() {
-    let mesh = fused(&views(&around(9, -0.5)), 24);
+fn glb_chunks_match_the_json() {
+    let mesh = fused(&views(&cameras_around(9, -0.5)), 24);
     let colours = vec![[1.0, 0.5, 0.0]; mesh.positions.len()];
     let mut bytes = Vec::new();
     glb::write(&mut bytes, &mesh, &colours, &Coordinates::default()).unwrap();
-    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
-    assert_eq!((&bytes[..4], word(4), word(8)), (&b"glTF"[..], 2, bytes.len()));
-    let text = word(12);
-    let json: serde_json::Value = serde_json::from_slice(&bytes[20..20 + text]).unwrap();
-    assert_eq!(word(20 + text), bytes.len() - 28 - text);
+    let u32_at =
+        |offset: usize| u32::from_le_bytes(bytes[offset..offset + 4].try_into().unwrap()) as usize;
+    assert_eq!((&bytes[..4], u32_at(4), u32_at(8)), (&b"glTF"[..], 2, bytes.len()));
+    let json_length = u32_at(12);
+    let json: serde_json::Value = serde_json::from_slice(&bytes[20..20 + json_length]).unwrap();
+    assert_eq!(u32_at(20 + json_length), bytes.len() - 28 - json_length);
     assert_eq!(json["buffers"][0]["byteLength"], glb::buffer_length(&mesh));
     let views = json["bufferViews"].as_array().unwrap();
-    let end =
+    let ends =
         views.iter().map(|v| v["byteOffset"].as_u64().unwrap() + v["byteLength"].as_u64().unwrap());
-    assert_eq!(end.max().unwrap() as usize, glb::buffer_length(&mesh));
-    // 50 % display-encoded are 21.4 % of the light.
-    let first = 28 + text + views[2]["byteOffset"].as_u64().unwrap() as usize;
-    assert!((f32::from_bits(word(first + 4) as u32) - 0.2140).abs() < 1e-3);
+    assert_eq!(ends.max().unwrap() as usize, glb::buffer_length(&mesh));
+    // Display-encoded 0.5 is 0.214 in linear light.
+    let first = 28 + json_length + views[2]["byteOffset"].as_u64().unwrap() as usize;
+    assert!((f32::from_bits(u32_at(first + 4) as u32) - 0.2140).abs() < 1e-3);
 }
 
-/// A ball far away from the origin, of another size.
+/// Ball at another position, of another size.
 struct MovedBall {
-    at: DVec3,
+    centre: DVec3,
     scale: f64,
 }
 
 impl RayField for MovedBall {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         let pixel = |ray: &Ray| {
-            let origin = (DVec3::from(ray.origin) - self.at) / self.scale;
+            let origin = (DVec3::from(ray.origin) - self.centre) / self.scale;
             let pixel = ball_pixel(&Ray { origin: origin.to_array(), ..*ray });
             let scaled = |depth: f32| depth * self.scale as f32;
             Pixel { depth: scaled(pixel.depth), median_depth: scaled(pixel.median_depth), ..pixel }
@@ -314,13 +316,13 @@ impl RayField for MovedBall {
     }
 }
 
-/// Surfaces far from the origin, with tiny and huge units, are counted from an offset; with it they
-/// lie where they do around the origin.
+/// Positions of surfaces far from the origin, in tiny and huge units, are relative to an offset.
+/// Moved back and scaled, these surfaces are the same as around the origin.
 #[test]
 fn surfaces_far_away_have_an_offset() {
-    let here = surfel::merge(&views(&around(9, -0.5)), &BOX, 100_000);
+    let expected = surfel::merge(&views(&cameras_around(9, -0.5)), &BOX, 100_000);
     for scale in [1e-12f64, 1e-5, 1.0, 1e5, 1e12] {
-        let at = scale.max(1.0) * DVec3::new(500_000.3, 4_649_776.0, 120.0);
+        let centre = scale.max(1.0) * DVec3::new(500_000.3, 4_649_776.0, 120.0);
         let bounds = Bounds {
             min: [-scale; 3],
             max: [scale; 3],
@@ -328,27 +330,27 @@ fn surfaces_far_away_have_an_offset() {
             far: 9.0 * scale,
             space: Space::Box,
         };
-        // A tiny scene so far away has no digits left.
-        let at = if scale < 1e-6 { DVec3::ZERO } else { at };
-        let field = MovedBall { at, scale };
-        let coordinates = Coordinates::new(&bounds.moved(at));
+        // So far away, the rounding of f64 exceeds the size of a tiny scene.
+        let centre = if scale < 1e-6 { DVec3::ZERO } else { centre };
+        let field = MovedBall { centre, scale };
+        let coordinates = Coordinates::new(&bounds.moved(centre));
         let offset = coordinates.offset;
-        assert_eq!(coordinates.is_moved(), at != DVec3::ZERO);
-        assert!((offset - at).length() < 8.0 * scale, "{offset}");
-        let cameras = around(9, -0.5).into_iter().map(|camera| {
-            let centre = camera.centre();
-            camera.moved(at + scale * centre - centre)
+        assert_eq!(coordinates.is_moved(), centre != DVec3::ZERO);
+        assert!((offset - centre).length() < 8.0 * scale, "{offset}");
+        let cameras = cameras_around(9, -0.5).into_iter().map(|camera| {
+            let position = camera.centre();
+            camera.moved(centre + scale * position - position)
         });
         let (background, silent) = (Background::White, Progress::silent());
         let views: Vec<SurfaceView> = cameras
             .map(|c| SurfaceView::render(&field, &c, background, offset, &silent).unwrap())
             .collect();
-        let there = surfel::merge(&views, &bounds.moved(at - offset), 100_000);
-        // Cells at which roundings differ apart.
-        let share = there.len() as f64 / here.len() as f64;
-        assert!((share - 1.0).abs() < 0.05, "{share} at {scale}");
-        for surfel in &there {
-            let position = (offset - at + surfel.position) / scale;
+        let found = surfel::merge(&views, &bounds.moved(centre - offset), 100_000);
+        // Rounding moves some surfels to other cells.
+        let ratio = found.len() as f64 / expected.len() as f64;
+        assert!((ratio - 1.0).abs() < 0.05, "{ratio} at {scale}");
+        for surfel in &found {
+            let position = (offset - centre + surfel.position) / scale;
             assert!((position.length() - RADIUS).abs() < 4e-3, "{position} at {scale}");
             assert!(position.normalize().dot(surfel.normal) > 0.9, "{position} at {scale}");
         }
@@ -356,15 +358,15 @@ fn surfaces_far_away_have_an_offset() {
 }
 
 #[test]
-fn offsets_are_short_and_only_where_they_are_needed() {
-    let boxed = |middle: [f64; 3], half: f64| {
+fn offsets_are_short_and_zero_near_the_origin() {
+    let offset = |middle: [f64; 3], half: f64| {
         let bounds = Bounds { min: [-half; 3], max: [half; 3], ..BOX };
         Coordinates::new(&bounds.moved(middle.into())).offset.to_array()
     };
-    assert_eq!(boxed([15.9, -3.0, 0.0], 1.0), [0.0; 3]);
-    assert_eq!(boxed([16.3, -3.2, -0.1], 1.0), [16.0, -3.0, 0.0]);
-    assert_eq!(boxed([499_999.97, 4_649_776.21, 120.4], 0.02), [499_999.97, 4_649_776.21, 120.4]);
-    assert_eq!(boxed([1e9, 0.0, 0.0], 3e7), [1e9, 0.0, 0.0]);
+    assert_eq!(offset([15.9, -3.0, 0.0], 1.0), [0.0; 3]);
+    assert_eq!(offset([16.3, -3.2, -0.1], 1.0), [16.0, -3.0, 0.0]);
+    assert_eq!(offset([499_999.97, 4_649_776.21, 120.4], 0.02), [499_999.97, 4_649_776.21, 120.4]);
+    assert_eq!(offset([1e9, 0.0, 0.0], 3e7), [1e9, 0.0, 0.0]);
     let file = Coordinates { offset: DVec3::X }.offset_file(false);
     assert_eq!(
         (file.offset, file.files),
@@ -372,8 +374,9 @@ fn offsets_are_short_and_only_where_they_are_needed() {
     );
 }
 
-/// A folder with images of the cameras' size, where `transforms.json` and COLMAP look for them.
-fn folder(cameras: &[Camera]) -> tempfile::TempDir {
+/// Creates a folder with images of the cameras' sizes, where `transforms.json` and COLMAP expect
+/// images.
+fn image_folder(cameras: &[Camera]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("images")).unwrap();
     for camera in cameras {
@@ -386,38 +389,38 @@ fn folder(cameras: &[Camera]) -> tempfile::TempDir {
     folder
 }
 
-fn assert_same(set: &Dataset, cameras: &[Camera]) {
+fn assert_equal_cameras(set: &Dataset, cameras: &[Camera]) {
     assert_eq!(set.frames.len(), cameras.len());
     for camera in cameras {
         let frame = set.frames.iter().find(|f| f.name == camera.name).unwrap();
         assert_eq!(frame.stored_intrinsics, camera.intrinsics);
-        let off =
+        let error =
             |r: usize, c: usize| (frame.camera_to_world[r][c] - camera.camera_to_world[r][c]).abs();
-        assert!((0..12).all(|i| off(i / 4, i % 4) < 1e-12), "{}", camera.name);
+        assert!((0..12).all(|i| error(i / 4, i % 4) < 1e-12), "{}", camera.name);
     }
 }
 
 #[test]
-fn cameras_come_back_from_both_files() {
-    let plain = around(7, -0.9);
+fn cameras_round_trip_through_both_formats() {
+    let plain = cameras_around(7, -0.9);
     let mut mixed = plain.clone();
     let distortion = Distortion::brown([0.1, -0.01, 0.0], [0.001, 0.002]);
     mixed[2].intrinsics.distortion = distortion;
     let fisheye = Distortion::fisheye([-0.02, 0.006, -0.003, 0.0005]);
     mixed[6].intrinsics.distortion = fisheye;
     mixed[4].intrinsics.cx += 3.5;
-    // As published poses are: rounded.
+    // Rounded, like published poses.
     mixed[5].camera_to_world = plain[5].camera_to_world.map(|row| row.map(|v| f64::from(v as f32)));
     for cameras in [plain, mixed] {
-        assert!(comes_back_from_transforms(&cameras) && comes_back_from_colmap(&cameras));
+        assert!(transforms_preserve(&cameras) && colmap_preserves(&cameras));
     }
 }
 
-/// A format that can't hold a lens says so, and the other holds it.
+/// A format that can't represent a lens reports this; the other format represents the lens.
 #[test]
-fn lenses_are_in_the_formats_that_have_them() {
+fn formats_refuse_lenses_that_they_cannot_represent() {
     let with = |lens: Distortion| {
-        let mut cameras = around(3, -0.9);
+        let mut cameras = cameras_around(3, -0.9);
         cameras[1].intrinsics.distortion = lens;
         cameras
     };
@@ -431,32 +434,32 @@ fn lenses_are_in_the_formats_that_have_them() {
         (tangential, [true, true]),
     ] {
         let cameras = with(lens);
-        let found = [comes_back_from_transforms(&cameras), comes_back_from_colmap(&cameras)];
+        let found = [transforms_preserve(&cameras), colmap_preserves(&cameras)];
         assert_eq!(found, formats, "{lens}");
     }
     let cameras = with(Distortion { radial: [0.0, 0.0, 0.0, 0.01], ..Distortion::default() });
-    let words = crate::lens_notes(&cameras);
-    assert!(words.len() == 1 && words[0].contains("fourth radial term"), "{words:?}");
+    let notes = crate::lens_notes(&cameras);
+    assert!(notes.len() == 1 && notes[0].contains("fourth radial term"), "{notes:?}");
 }
 
-/// False where the format says that it can't hold the cameras.
-fn comes_back_from_transforms(cameras: &[Camera]) -> bool {
+/// Returns false if the format can't represent a lens, otherwise checks the cameras read back.
+fn transforms_preserve(cameras: &[Camera]) -> bool {
     if CameraFormat::Transforms.lens_problem(cameras).is_some() {
         return false;
     }
-    let folder = folder(cameras);
+    let folder = image_folder(cameras);
     let text = cameras::transforms_json(cameras, Some("points.ply")).to_string();
     std::fs::write(folder.path().join("transforms.json"), text).unwrap();
-    assert_same(&Dataset::read(folder.path()).unwrap(), cameras);
+    assert_equal_cameras(&Dataset::read(folder.path()).unwrap(), cameras);
     true
 }
 
-/// False where the format says that it can't hold the cameras.
-fn comes_back_from_colmap(cameras: &[Camera]) -> bool {
+/// Returns false if the format can't represent a lens, otherwise checks the cameras read back.
+fn colmap_preserves(cameras: &[Camera]) -> bool {
     if CameraFormat::Colmap.lens_problem(cameras).is_some() {
         return false;
     }
-    let folder = folder(cameras);
+    let folder = image_folder(cameras);
     let sparse = folder.path().join("sparse/0");
     std::fs::create_dir_all(&sparse).unwrap();
     for (name, text) in cameras::colmap_files(cameras, &[one_surfel()], DVec3::ZERO) {
@@ -465,15 +468,15 @@ fn comes_back_from_colmap(cameras: &[Camera]) -> bool {
     let set = Dataset::read(folder.path()).unwrap();
     assert!(set.notes[0].starts_with("COLMAP"), "{:?}", set.notes);
     let rounded: Vec<Camera> = cameras.iter().map(orthonormal).collect();
-    assert_same(&set, &rounded);
+    assert_equal_cameras(&set, &rounded);
     true
 }
 
-/// A camera's nearest rotation that a quaternion can say: what COLMAP's files hold.
+/// Rounds a camera's rotation to that of a unit quaternion, which COLMAP's files contain.
 fn orthonormal(camera: &Camera) -> Camera {
-    let turn = glam::DQuat::from_mat3(&camera.rotation()).normalize();
-    let r = DMat3::from_quat(turn);
-    let at = camera.centre();
-    let camera_to_world = [0, 1, 2].map(|k| [r.x_axis[k], r.y_axis[k], r.z_axis[k], at[k]]);
+    let rotation = glam::DQuat::from_mat3(&camera.rotation()).normalize();
+    let r = DMat3::from_quat(rotation);
+    let centre = camera.centre();
+    let camera_to_world = [0, 1, 2].map(|k| [r.x_axis[k], r.y_axis[k], r.z_axis[k], centre[k]]);
     Camera { camera_to_world, ..camera.clone() }
 }

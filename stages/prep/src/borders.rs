@@ -186,66 +186,69 @@ fn median_colour(colours: &[[u8; 3]]) -> [u8; 3] {
 mod tests {
     use super::*;
 
-    fn picture_pixel(border: [u8; 3], noise: u8, touching: usize, at: usize) -> [u8; 4] {
-        let (x, y) = (at % 20, at / 20);
+    fn image_pixel(border: [u8; 3], noise: u8, touching: usize, index: usize) -> [u8; 4] {
+        let (x, y) = (index % 20, index / 20);
         let inside = (5..15).contains(&x) && (3..7).contains(&y) || y == 0 && x < touching;
         let [r, g, b] = if inside {
             [90, 40, 200]
         } else {
-            border.map(|v| v.saturating_sub(at as u8 % (noise + 1)))
+            border.map(|v| v.saturating_sub(index as u8 % (noise + 1)))
         };
         [r, g, b, u8::MAX]
     }
 
-    /// A picture of 20×10 pixels: a border of a colour with some noise, and something in the
-    /// middle, which may touch the border.
-    fn picture(border: [u8; 3], noise: u8, touching: usize) -> Rgba8 {
+    /// Creates an image of 20×10 pixels: a noisy flat background with an object in the middle, and
+    /// `touching` pixels of the object on the border.
+    fn test_image(border: [u8; 3], noise: u8, touching: usize) -> Rgba8 {
         Rgba8::new(
             20,
             10,
-            (0..200).flat_map(|at| picture_pixel(border, noise, touching, at)).collect(),
+            (0..200).flat_map(|index| image_pixel(border, noise, touching, index)).collect(),
         )
     }
 
-    fn of(images: &[Rgba8]) -> Borders {
+    fn borders_of(images: &[Rgba8]) -> Borders {
         Borders::new(&images.iter().map(Border::of).collect::<Vec<_>>())
     }
 
     #[test]
-    fn a_flat_border_is_told_from_a_scene() {
+    fn flat_borders_are_distinguished_from_scenes() {
         let views = |image: &Rgba8, count| vec![image.clone(); count];
-        let white = of(&views(&picture([255; 3], 6, 4), 3));
+        let white = borders_of(&views(&test_image([255; 3], 6, 4), 3));
         assert_eq!(white.background(), Background::White);
         assert_eq!(
             white.to_string(),
             "images have no alpha; borders are one flat colour (251 251 251) in 3 of 3 \
             sampled views"
         );
-        assert_eq!(of(&views(&picture([3; 3], 3, 0), 1)).background(), Background::Black);
-        // A tenth of a border may be something else, and a tenth of the views.
-        let cut = views(&picture([255; 3], 0, 12), 3);
-        assert_eq!(of(&cut).evidence, BorderEvidence::Scene);
-        let mut most = views(&picture([255; 3], 0, 0), 9);
-        most.push(picture([120; 3], 60, 0));
-        assert_eq!(of(&most).background(), Background::White);
-        most.push(picture([120; 3], 60, 0));
-        assert_eq!(of(&most).background(), Background::Opaque);
-        // Walls: each view has another flat colour, or all the same grey.
-        let walls: Vec<Rgba8> = (0..5).map(|i| picture([50 * i; 3], 0, 0)).collect();
-        assert_eq!(of(&walls).evidence, BorderEvidence::Scene);
-        let grey = of(&views(&picture([128; 3], 0, 0), 5));
+        assert_eq!(
+            borders_of(&views(&test_image([3; 3], 3, 0), 1)).background(),
+            Background::Black
+        );
+        // At most a tenth of a border, and of the views, may differ.
+        let covered = views(&test_image([255; 3], 0, 12), 3);
+        assert_eq!(borders_of(&covered).evidence, BorderEvidence::Scene);
+        let mut mostly_white = views(&test_image([255; 3], 0, 0), 9);
+        mostly_white.push(test_image([120; 3], 60, 0));
+        assert_eq!(borders_of(&mostly_white).background(), Background::White);
+        mostly_white.push(test_image([120; 3], 60, 0));
+        assert_eq!(borders_of(&mostly_white).background(), Background::Opaque);
+        // Walls: each view has its own flat colour, or all have the same grey.
+        let walls: Vec<Rgba8> = (0..5).map(|i| test_image([50 * i; 3], 0, 0)).collect();
+        assert_eq!(borders_of(&walls).evidence, BorderEvidence::Scene);
+        let grey = borders_of(&views(&test_image([128; 3], 0, 0), 5));
         assert_eq!(
             (grey.evidence, grey.background()),
             (BorderEvidence::Flat([128; 3]), Background::Opaque)
         );
-        assert_eq!(of(&[]).background(), Background::Opaque);
+        assert_eq!(borders_of(&[]).background(), Background::Opaque);
     }
 
     #[test]
-    fn one_image_with_alpha_is_enough() {
-        let mut image = picture([10, 200, 30], 90, 0);
+    fn one_image_with_alpha_is_evidence_of_alpha() {
+        let mut image = test_image([10, 200, 30], 90, 0);
         image.data[7] = 254;
-        let borders = of(&[picture([0; 3], 0, 0), image]);
+        let borders = borders_of(&[test_image([0; 3], 0, 0), image]);
         assert_eq!(
             (borders.evidence, borders.background()),
             (BorderEvidence::Alpha, Background::White)

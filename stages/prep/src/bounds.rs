@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn the_box_is_around_what_all_cameras_see_at_any_scale() {
+    fn the_box_surrounds_the_common_view_at_any_scale() {
         for scale in [1e-6, 1.0, 1e6] {
             let target = scale * DVec3::new(0.5, -0.3, 0.2);
             let bounds = box_bounds(&sights(&circle(target, 4.0 * scale), None));
@@ -417,10 +417,9 @@ mod tests {
         assert!(joined.far > 400.0, "{joined:?}");
     }
 
-    /// Whatever a camera of a row sees between its depths lies in the box, and between near and
-    /// far.
+    /// Points that a camera observes between its depths are in the box, and between near and far.
     #[test]
-    fn a_row_of_cameras_has_what_it_sees() {
+    fn the_box_contains_the_view_of_a_row_of_cameras() {
         let row: Vec<Camera> = (0..5)
             .map(|i| {
                 let from = DVec3::new(0.2 * f64::from(i), 0.0, 0.0);
@@ -451,10 +450,9 @@ mod tests {
         cameras.iter().map(|c| (c.clone(), depths)).collect()
     }
 
-    /// Each camera's view between its depths lies in the frustum's cube, at any scale of the
-    /// world.
+    /// Points that a camera observes between its depths are in the frustum's cube, at any scale.
     #[test]
-    fn cameras_that_look_one_way_get_ndc() {
+    fn cameras_that_face_one_direction_get_ndc() {
         for scale in [1e-3, 1.0, 1e3] {
             let row: Vec<Camera> = (0..5)
                 .map(|i| {
@@ -485,7 +483,8 @@ mod tests {
         }
     }
 
-    /// Cameras around, forward without and with depths, and outwards: a scene of each space.
+    /// Returns scenes of every space, and whether they are unbounded: cameras that face inwards,
+    /// outwards, and forwards without and with depths.
     fn scenes() -> [(Vec<CameraDepths>, bool); 4] {
         let ring = circle(DVec3::new(0.5, -0.3, 0.2), 4.0);
         let outwards = ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre()));
@@ -500,13 +499,14 @@ mod tests {
         ]
     }
 
-    /// A camera whose centre is a multiple of 2⁻²⁰, so that large shifts are exact.
+    /// Moves a camera's centre to a multiple of 2⁻²⁰, so that large shifts are exact.
     fn on_grid(camera: &Camera) -> Camera {
         let grid = 1_048_576.0;
         camera.moved((grid * camera.centre()).round() / grid - camera.centre())
     }
 
-    fn placed(sights: &[CameraDepths], is_unbounded: bool, shift: DVec3, scale: f64) -> Bounds {
+    /// Returns the rounded bounds of a scene that is shifted and then scaled.
+    fn bounds_at(sights: &[CameraDepths], is_unbounded: bool, shift: DVec3, scale: f64) -> Bounds {
         let moved = |(camera, depths): &CameraDepths| {
             let centre = on_grid(camera).centre();
             let moved = on_grid(camera).moved(scale * (centre + shift) - centre);
@@ -516,48 +516,52 @@ mod tests {
         scene_bounds(&all, &all[..1], is_unbounded, None).unwrap().rounded(all[0].0.centre())
     }
 
-    fn scaled(bounds: Bounds, by: f64) -> Bounds {
-        let corner = |corner: [f64; 3]| corner.map(|x| by * x);
+    fn scaled(bounds: Bounds, factor: f64) -> Bounds {
+        let corner = |corner: [f64; 3]| corner.map(|x| factor * x);
         let space = match bounds.space {
             Space::Ndc(f) => Space::Ndc(Frustum {
                 camera_to_world: pose_of(
                     DMat3::from_cols_array_2d(
                         &[0, 1, 2].map(|c| f.camera_to_world.map(|row| row[c])),
                     ),
-                    by * f.centre(),
+                    factor * f.centre(),
                 ),
-                near: by * f.near,
-                far: by * f.far,
+                near: factor * f.near,
+                far: factor * f.far,
                 ..f
             }),
             other => other,
         };
-        let (near, far) = (by * bounds.near, by * bounds.far);
+        let (near, far) = (factor * bounds.near, factor * bounds.far);
         Bounds { min: corner(bounds.min), max: corner(bounds.max), near, far, space }
     }
 
-    /// Rounded bounds move with a scene, and grow with it, to the last bit: rays in the unit cube
-    /// don't know where the scene lies.
+    /// Rounded bounds move and scale with a scene, to the last bit: rays in the unit cube don't
+    /// depend on the scene's position.
     #[test]
-    fn bounds_move_with_the_scene() {
+    fn bounds_move_and_scale_with_the_scene() {
         for (sights, is_unbounded) in scenes() {
-            let here = placed(&sights, is_unbounded, DVec3::ZERO, 1.0);
+            let here = bounds_at(&sights, is_unbounded, DVec3::ZERO, 1.0);
             for shift in [
                 DVec3::new(500_000.0, 4_649_776.0, 120.0),
                 DVec3::new(4_027_893.75, 307_045.625, 4_919_474.875),
                 DVec3::new(-7.25, 300.0, 1024.0),
             ] {
-                assert_eq!(placed(&sights, is_unbounded, shift, 1.0), here.moved(shift), "{shift}");
+                assert_eq!(
+                    bounds_at(&sights, is_unbounded, shift, 1.0),
+                    here.moved(shift),
+                    "{shift}"
+                );
             }
             for scale in [1.0 / 131_072.0, 0.5, 65_536.0] {
-                let there = placed(&sights, is_unbounded, DVec3::ZERO, scale);
+                let there = bounds_at(&sights, is_unbounded, DVec3::ZERO, scale);
                 assert_eq!(there, scaled(here, scale), "{scale}");
             }
         }
     }
 
     #[test]
-    fn scenes_around_the_origin_are_computed_from_there() {
+    fn scenes_around_the_origin_are_relative_to_the_origin() {
         for (sights, _) in scenes() {
             assert_eq!(near_point(&sights), DVec3::ZERO);
         }
@@ -566,7 +570,7 @@ mod tests {
     }
 
     #[test]
-    fn the_space_is_what_the_cameras_see() {
+    fn the_space_follows_from_the_depths_or_the_given_kind() {
         let ring = circle(DVec3::ZERO, 4.0);
         let chosen =
             |depths, kind| scene_bounds(&sights(&ring, depths), &[], false, kind).map(|b| b.space);
@@ -576,13 +580,13 @@ mod tests {
         assert_eq!(chosen(Some([3.0, 40.0]), Some(SpaceKind::Box)), Ok(Space::Box));
         assert_eq!(chosen(None, Some(SpaceKind::Contraction)), Ok(Space::Contraction));
         assert_eq!(chosen(Some([3.0, 5.0]), Some(SpaceKind::Ndc)), Err(SpaceError::NotForward));
-        let one = [looking_at(DVec3::Y, DVec3::ZERO)];
+        let single = [looking_at(DVec3::Y, DVec3::ZERO)];
         assert_eq!(
-            scene_bounds(&sights(&one, None), &[], false, Some(SpaceKind::Ndc)),
+            scene_bounds(&sights(&single, None), &[], false, Some(SpaceKind::Ndc)),
             Err(SpaceError::NoDepths)
         );
         assert_eq!(
-            scene_bounds(&sights(&one, None), &[], false, None).map(|b| b.space),
+            scene_bounds(&sights(&single, None), &[], false, None).map(|b| b.space),
             Ok(Space::Box)
         );
     }
@@ -616,13 +620,13 @@ mod tests {
         assert_eq!(known.space, Space::Box);
         let unknown = scene_bounds(&sights(&row, None), &[], true, None).unwrap();
         assert_eq!(unknown.space, Space::Contraction);
-        // Test views count, too.
+        // Test views are checked, too.
         let pinholes: Vec<Camera> = (0..5).map(|i| parallel(1.0, i)).collect();
-        let others = sights(&row[..1], Some([2.0, 10.0]));
+        let test_views = sights(&row[..1], Some([2.0, 10.0]));
         assert_eq!(
             scene_bounds(
                 &sights(&pinholes, Some([2.0, 10.0])),
-                &others,
+                &test_views,
                 false,
                 Some(SpaceKind::Ndc)
             ),
@@ -631,8 +635,8 @@ mod tests {
         // A box around the region that the cameras face doesn't contain the cameras, however wide
         // their angle of view is.
         for (degrees, half) in [(60.0, 1.05 * 4.0 * f64::to_radians(30.0).tan()), (180.0, 4.2)] {
-            let around = circle(DVec3::ZERO, 4.0);
-            let ring: Vec<Camera> = around.iter().map(|c| fisheye(c, degrees)).collect();
+            let pinholes = circle(DVec3::ZERO, 4.0);
+            let ring: Vec<Camera> = pinholes.iter().map(|c| fisheye(c, degrees)).collect();
             let found = 0.5 * box_bounds(&sights(&ring, None)).longest_side();
             assert!((found - half).abs() < 1e-9, "{degrees}: {found}");
         }
@@ -666,38 +670,38 @@ mod tests {
                     && around.near < 0.1 * scale,
                 "{around:?}"
             );
-            // Where depths are known they decide.
+            // Known depths determine the space.
             let known =
                 scene_bounds(&sights(&ring, Some([3.0 * scale, 5.0 * scale])), &[], true, None)
                     .unwrap();
             assert_eq!(known.space, Space::Box);
-            // From within: a room.
+            // Cameras that face outwards: a room.
             let outwards: Vec<Camera> =
                 ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre())).collect();
             let room = scene_bounds(&sights(&outwards, None), &[], true, None).unwrap();
             assert_eq!(room.space, Space::Contraction);
             assert!((7.9..8.5).contains(&(0.5 * room.longest_side() / scale)), "{room:?}");
-            // Forward: parallel axes, and axes that meet at a distance of 6.
+            // Cameras that face forwards: parallel axes, and axes that meet at a distance of 6.
             let forward: [(Vec<Camera>, f64); 2] = [
                 ((0..5).map(|i| parallel(scale, i)).collect(), 3.2),
                 ((0..5).map(|i| meeting(scale, i)).collect(), 6.0),
             ];
             for (cameras, distance) in forward {
-                let seen = scene_bounds(
+                let bounds = scene_bounds(
                     &sights(&cameras, None),
                     &sights(&cameras[1..2], None),
                     true,
                     None,
                 )
                 .unwrap();
-                let Space::Ndc(frustum) = seen.space else { panic!("{seen:?}") };
+                let Space::Ndc(frustum) = bounds.space else { panic!("{bounds:?}") };
                 assert!(
                     frustum.near < 0.3 * distance * scale && frustum.near > 0.1 * distance * scale,
                     "{frustum:?}"
                 );
-                assert!(frustum.far > 40.0 * distance * scale && seen.is_valid(), "{frustum:?}");
+                assert!(frustum.far > 40.0 * distance * scale && bounds.is_valid(), "{frustum:?}");
             }
-            // One camera says nothing of how far anything is.
+            // One camera alone determines no distance.
             assert_eq!(
                 scene_bounds(&sights(&ring[..1], None), &[], true, None).unwrap().space,
                 Space::Contraction

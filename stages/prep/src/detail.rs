@@ -168,8 +168,8 @@ mod tests {
             for row in y.saturating_sub(radius)..(y + radius).min(side) {
                 for column in x.saturating_sub(radius)..(x + radius).min(side) {
                     if (row.abs_diff(y)).pow(2) + (column.abs_diff(x)).pow(2) < radius * radius {
-                        let at = 4 * (row * side + column);
-                        data[at..at + 3].copy_from_slice(&colour);
+                        let start = 4 * (row * side + column);
+                        data[start..start + 3].copy_from_slice(&colour);
                     }
                 }
             }
@@ -188,7 +188,7 @@ mod tests {
         for (side, low, high) in [(512, 0.4, 0.55), (768, 0.25, 0.4)] {
             let reach = Spectrum::of(&resized(&sharp, side)).reach().unwrap();
             assert!((low..high).contains(&reach), "{side}: {reach}");
-            // Downscaled again, it is sharp.
+            // The enlarged image is sharp if downscaled again.
             assert_eq!(Spectrum::of(&resized(&resized(&sharp, side), 200)).reach(), Some(1.0));
         }
     }
@@ -205,7 +205,7 @@ mod tests {
         assert_eq!(Spectrum::default().reach(), None);
     }
 
-    /// Several images together reach as far as most of their power.
+    /// Two equal images have twice the power of one, and the same reach.
     #[test]
     fn spectra_are_summed() {
         let sharp = resized(&discs(512), 256);
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_detail_has_a_remedy() {
+    fn missing_detail_is_reported_with_a_remedy() {
         assert_eq!(lr_reach(0.5, 1.0), 0.5);
         assert_eq!(lr_reach(0.5, 8.0), 1.0);
         assert_eq!(missing_detail_warning(0.7, 100), None);

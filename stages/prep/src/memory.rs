@@ -83,7 +83,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn as_many_as_fit_are_prepared_at_a_time() {
+    fn free_memory_bounds_the_number_of_concurrent_images() {
         let need =
             MemoryNeed { bytes: 1_000_000_000, frame: "frame r_1".to_owned(), size: (9000, 8000) };
         assert_eq!(need.max_concurrent(1_000_000_000).unwrap(), 1);

@@ -151,10 +151,10 @@ mod tests {
 
     use super::*;
 
-    fn camera(name: &str, turn: f64, centre: [f64; 3]) -> Camera {
-        let r = DMat3::from_rotation_z(turn);
+    fn camera(name: &str, angle: f64, centre: [f64; 3]) -> Camera {
+        let rotation = DMat3::from_rotation_z(angle);
         let intrinsics = Intrinsics::from_angle_x(32, 24, 0.69);
-        Camera { name: name.into(), intrinsics, camera_to_world: pose_of(r, centre.into()) }
+        Camera { name: name.into(), intrinsics, camera_to_world: pose_of(rotation, centre.into()) }
     }
 
     fn on_ring(i: u32, scale: f64, middle: f64) -> Camera {
@@ -166,16 +166,16 @@ mod tests {
         )
     }
 
-    /// Around something, at any scale and anywhere.
+    /// Returns cameras on a circle of radius 4 · `scale` around x = `middle`.
     fn ring(count: u32, scale: f64, middle: f64) -> Vec<Camera> {
         (0..count).map(|i| on_ring(i, scale, middle)).collect()
     }
 
     #[test]
-    fn ordinary_cameras_are_nothing_to_warn_of() {
+    fn ordinary_cameras_cause_no_warning() {
         for (scale, middle) in [(1.0, 0.0), (1e-3, 0.0), (100.0, 4e5)] {
             let mut training = ring(30, scale, middle);
-            // One that looks from farther away, and a lens that isn't quite centred.
+            // A camera farther away, and a principal point slightly off the image centre.
             training.push(camera("overview", 0.0, [middle, 0.0, 30.0 * scale]));
             training[0].intrinsics.cx += 3.0;
             assert_eq!(warnings(&training, &ring(7, 1.1 * scale, middle)), Vec::<String>::new());
@@ -184,30 +184,30 @@ mod tests {
         assert_eq!(warnings(&ring(2, 1.0, 0.0), &ring(1, 1.0, 0.0)), Vec::<String>::new());
     }
 
-    /// Captures of a table and of a town in UTM and ECEF coordinates: nothing is wrong with them,
-    /// unless they were written in single precision.
+    /// Captures of a table and of a town in UTM and ECEF coordinates are unusable only if they were
+    /// written in single precision.
     #[test]
-    fn georeferenced_cameras_are_known_as_well_as_their_numbers_say() {
+    fn georeferenced_cameras_cause_warnings_only_in_single_precision() {
         let (utm, ecef) = ([500_000.0, 4_649_776.0, 120.0], [4_027_893.75, 307_045.6, 4_919_474.9]);
         for offset in [utm, ecef] {
-            for (scale, words) in [
+            for (scale, expected) in [
                 (0.025, "all 8 training cameras are at the same position"),
                 (10.0, "units apart, but their centres are rounded to 0.5"),
             ] {
-                let mut there: Vec<Camera> =
+                let mut moved: Vec<Camera> =
                     ring(8, scale, 0.0).iter().map(|c| c.moved(offset.into())).collect();
-                assert_eq!(warnings(&there, &[]), Vec::<String>::new(), "{scale}");
-                for number in there.iter_mut().flat_map(|c| c.camera_to_world.as_flattened_mut()) {
+                assert_eq!(warnings(&moved, &[]), Vec::<String>::new(), "{scale}");
+                for number in moved.iter_mut().flat_map(|c| c.camera_to_world.as_flattened_mut()) {
                     *number = f64::from(*number as f32);
                 }
-                let found = warnings(&there, &[]).join("; ");
-                assert!(found.contains(words), "{scale}: {found}");
+                let found = warnings(&moved, &[]).join("; ");
+                assert!(found.contains(expected), "{scale}: {found}");
             }
         }
     }
 
     #[test]
-    fn published_scenes_are_nothing_to_warn_of() {
+    fn published_scenes_cause_no_warning() {
         let data = std::env::var("NERF_SR_DATA").map_or_else(
             |_| std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data"),
             std::path::PathBuf::from,
@@ -222,7 +222,7 @@ mod tests {
             let split =
                 set.split.clone().unwrap_or_else(|| dataset::Split::hold_out(set.frames.len(), 8));
             let cameras =
-                |of: &[usize]| of.iter().map(|&i| set.frames[i].camera()).collect::<Vec<_>>();
+                |views: &[usize]| views.iter().map(|&i| set.frames[i].camera()).collect::<Vec<_>>();
             let (training, test) = (cameras(&split.train), cameras(&split.test));
             assert_eq!(
                 (have_equal_poses(&training), warnings(&training, &test)),
@@ -240,13 +240,13 @@ mod tests {
     }
 
     #[track_caller]
-    fn assert_one_warning(training: &[Camera], test: &[Camera], words: &str) {
+    fn assert_one_warning(training: &[Camera], test: &[Camera], expected: &str) {
         let found = warnings(training, test);
-        assert!(found.len() == 1 && found[0].contains(words), "{words}: {found:?}");
+        assert!(found.len() == 1 && found[0].contains(expected), "{expected}: {found:?}");
     }
 
     #[test]
-    fn what_looks_wrong_is_said_once() {
+    fn each_problem_causes_one_warning() {
         assert_one_warning(
             &ring(1, 1.0, 0.0),
             &ring(3, 1.0, 0.0),
@@ -256,8 +256,8 @@ mod tests {
             (0..5).map(|i| camera("t", f64::from(i), [3.0, 1.0, 4.0])).collect();
         assert_one_warning(&turning, &[], "all 5 training cameras are at the same position");
         let utm = DVec3::new(500_000.0, 4_649_776.0, 120.0);
-        let there: Vec<Camera> = turning.iter().map(|camera| camera.moved(utm)).collect();
-        assert_one_warning(&there, &[], "all 5 training cameras are at the same position");
+        let moved: Vec<Camera> = turning.iter().map(|camera| camera.moved(utm)).collect();
+        assert_one_warning(&moved, &[], "all 5 training cameras are at the same position");
         let mut far = ring(8, 1.0, 0.0);
         far[5].camera_to_world[0][3] = 1e6;
         assert_one_warning(&far, &ring(3, 1.0, 0.0), "training view r_5 is 3");
@@ -266,7 +266,7 @@ mod tests {
         let mut far = ring(3, 1.0, 0.0);
         far[0].camera_to_world[1][3] = 500.0;
         assert_one_warning(&ring(8, 1.0, 0.0), &far, "test view r_0 is ");
-        // Numbers for 32×24 pixels, taken for ones for 64×48.
+        // Intrinsics for 32×24 pixels, scaled as if they were for 64×48.
         let mut shrunk = ring(6, 1.0, 0.0);
         shrunk[2..].iter_mut().for_each(|c| (c.intrinsics.cx, c.intrinsics.cy) = (8.0, 6.0));
         assert_one_warning(

@@ -179,7 +179,7 @@ mod tests {
         }
     }
 
-    /// Frames on a ring around what they look at, photographs or a benchmark's.
+    /// Returns a dataset of `count` cameras on a ring, which face its centre.
     fn ring(format: Format, count: usize) -> Dataset {
         Dataset {
             format,
@@ -200,23 +200,26 @@ mod tests {
         Ok((plan.images, plan.bounds, plan.references))
     }
 
-    /// A benchmark's images are HR truth, photographs are unmodified LR images; sizes, kernel and
-    /// references follow.
+    /// A benchmark's images are HR ground truth, photographs are unmodified LR images. The sizes,
+    /// the kernel and the number of references depend on this.
     #[test]
-    fn images_follow_from_the_form() {
+    fn images_follow_from_the_format() {
         let params =
             Params { hr_references: 2, split: Some(SplitKind::Holdout), ..Params::default() };
-        let (made, _, references) =
+        let (benchmark, _, references) =
             planned(&ring(Format::Blender, 16), &params, Background::White).unwrap();
-        assert_eq!((made.has_truth, made.sizes.lr, made.sizes.hr), (true, (40, 30), (80, 60)));
+        assert_eq!(
+            (benchmark.has_truth, benchmark.sizes.lr, benchmark.sizes.hr),
+            (true, (40, 30), (80, 60))
+        );
         assert_eq!(references.len(), 2);
-        let (given, _, references) =
+        let (photographs, _, references) =
             planned(&ring(Format::Transforms, 16), &params, Background::White).unwrap();
         assert_eq!(
-            (given.has_truth, given.sizes.lr, given.sizes.hr),
+            (photographs.has_truth, photographs.sizes.lr, photographs.sizes.hr),
             (false, (80, 60), (160, 120))
         );
-        assert_eq!((given.kernel, references.len()), (pixels::Kernel::Box, 0));
+        assert_eq!((photographs.kernel, references.len()), (pixels::Kernel::Box, 0));
     }
 
     fn near_and_far(
@@ -228,9 +231,9 @@ mod tests {
         planned(set, &params, Background::White).map(|(_, bounds, _)| (bounds.near, bounds.far))
     }
 
-    /// Given near and far values are used, unless they are impossible.
+    /// Impossible near and far values are refused.
     #[test]
-    fn near_and_far_are_as_given() {
+    fn given_near_and_far_are_used() {
         let set = ring(Format::Blender, 8);
         assert_eq!(near_and_far(&set, Some(1.5), Some(7.0)).unwrap(), (1.5, 7.0));
         assert_eq!(
@@ -245,7 +248,7 @@ mod tests {
 
     /// Lengths are printed with significant digits, however large the scene's unit is.
     #[test]
-    fn spaces_are_printed_with_their_digits() {
+    fn spaces_are_printed_with_significant_digits() {
         let (near, far) = (2e-5, 9e-5);
         for (space, note) in [
             (
@@ -264,23 +267,23 @@ mod tests {
         }
     }
 
-    /// A box that is a point for f64 is refused, without a word of parameters that nobody has
-    /// given.
+    /// A bounding box that f64 rounds to a point is refused. The message names no parameter, since
+    /// none was given.
     #[test]
-    fn boxes_without_an_inside_are_refused() {
+    fn boxes_without_volume_are_refused() {
         let mut set = ring(Format::Blender, 8);
         for frame in &mut set.frames {
             (frame.stored_intrinsics.fx, frame.stored_intrinsics.fy) = (1e300, 1e300);
         }
-        let refused = planned(&set, &Params::default(), Background::White).unwrap_err();
-        assert!(matches!(refused, Failure::BadInput(_)));
+        let failure = planned(&set, &Params::default(), Background::White).unwrap_err();
+        assert!(matches!(failure, Failure::BadInput(_)));
         assert_eq!(
-            refused.to_string(),
+            failure.to_string(),
             "dataset: the scene's bounding box has no volume; check the poses and their unit"
         );
     }
 
-    fn refused(format: Format, params: &Params) -> String {
+    fn error_message(format: Format, params: &Params) -> String {
         planned(&ring(format, 8), params, Background::White).unwrap_err().to_string()
     }
 
@@ -301,13 +304,13 @@ mod tests {
 
     /// A message about an impossible value names the parameter.
     #[test]
-    fn what_cannot_be_is_refused() {
-        let kernel =
+    fn impossible_values_are_refused() {
+        let params =
             Params { kernel: Some(pixels::Kernel::Average), scale: 2.7, ..Params::default() };
-        let kernel = refused(Format::Blender, &kernel);
+        let message = error_message(Format::Blender, &params);
         assert!(
-            kernel.starts_with("parameter kernel: average requires an integer scale"),
-            "{kernel}"
+            message.starts_with("parameter kernel: average requires an integer scale"),
+            "{message}"
         );
     }
 }

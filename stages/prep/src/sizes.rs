@@ -84,7 +84,7 @@ mod tests {
 
     #[test]
     fn enlarging_and_empty_sizes_are_refused() {
-        for (native, lr, scale, words) in [
+        for (native, lr, scale, expected) in [
             (800, Some(900), 1.0, "lr_width = 900 and scale = 1 give HR images of 900 pixels"),
             (
                 800,
@@ -97,7 +97,7 @@ mod tests {
             (10, Some(10), 1.01, "scale = 1.01 gives LR and HR images the same width of 10 pixels"),
         ] {
             let message = downscaled_sizes((native, native), lr, scale).unwrap_err().to_string();
-            assert!(message.contains(words), "{message}");
+            assert!(message.contains(expected), "{message}");
         }
         assert_eq!(downscaled_sizes((1, 1), None, 1.0).unwrap(), Sizes { lr: (1, 1), hr: (1, 1) });
     }

@@ -66,18 +66,18 @@ pub(crate) fn choose_references(centres: impl Iterator<Item = DVec3>, count: usi
 mod tests {
     use super::*;
 
-    fn along(places: &[f64]) -> std::vec::IntoIter<DVec3> {
-        places.iter().map(|&x| DVec3::new(x, 0.0, 0.0)).collect::<Vec<_>>().into_iter()
+    fn along_x(xs: &[f64]) -> std::vec::IntoIter<DVec3> {
+        xs.iter().map(|&x| DVec3::new(x, 0.0, 0.0)).collect::<Vec<_>>().into_iter()
     }
 
     #[test]
     fn references_are_spread() {
-        let cameras = || along(&[0.0, 1.0, 2.0, 3.0, 9.0, 10.0]);
+        let cameras = || along_x(&[0.0, 1.0, 2.0, 3.0, 9.0, 10.0]);
         assert_eq!(choose_references(cameras(), 4), [0, 5, 3, 1]);
         assert_eq!(choose_references(cameras(), 2), [0, 5]);
         assert_eq!(choose_references(cameras(), 99).len(), 6);
         assert!(choose_references(cameras(), 0).is_empty());
-        // All in one place, or nowhere.
-        assert_eq!(choose_references(along(&[1.0, 1.0, f64::NAN]), 3).len(), 3);
+        // Equal and undefined positions.
+        assert_eq!(choose_references(along_x(&[1.0, 1.0, f64::NAN]), 3).len(), 3);
     }
 }

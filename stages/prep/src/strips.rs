@@ -184,7 +184,7 @@ fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
 mod tests {
     use super::*;
 
-    /// A photograph of 40×30 pixels with strips of some widths.
+    /// Returns a photograph of 40×30 pixels with strips of the given widths.
     fn photograph(widths: [usize; 4], strip: [u8; 3], seed: usize) -> Rgba8 {
         let [top, right, bottom, left] = widths;
         let pixel = |i: usize| {
@@ -197,7 +197,7 @@ mod tests {
         Rgba8::new(40, 30, (0..40 * 30).flat_map(pixel).collect())
     }
 
-    fn views(widths: [usize; 4], strip: [u8; 3], count: usize) -> Vec<Option<Strips>> {
+    fn strips_of_views(widths: [usize; 4], strip: [u8; 3], count: usize) -> Vec<Option<Strips>> {
         (0..count).map(|seed| Strips::of(&photograph(widths, strip, seed))).collect()
     }
 
@@ -205,29 +205,30 @@ mod tests {
     fn widths_are_measured_on_each_side() {
         for widths in [[3, 3, 3, 3], [1, 2, 3, 4], [6, 0, 6, 0], [0, 13, 0, 13], [0, 0, 2, 0]] {
             for colour in [[0; 3], [255; 3], [4, 0, 9]] {
-                let found = Strips::common(&views(widths, colour, 10));
+                let found = Strips::common(&strips_of_views(widths, colour, 10));
                 assert_eq!(found, Some((Strips { widths, colour }, 10)), "{widths:?} {colour:?}");
             }
         }
-        assert_eq!(Strips::common(&views([0; 4], [0; 3], 10)), None);
-        let shown = Strips { widths: [6, 0, 6, 0], colour: [0; 3] }.to_string();
-        assert_eq!(shown, "uniform strips at the border (colour 0 0 0; top 6, bottom 6 pixels)");
+        assert_eq!(Strips::common(&strips_of_views([0; 4], [0; 3], 10)), None);
+        let text = Strips { widths: [6, 0, 6, 0], colour: [0; 3] }.to_string();
+        assert_eq!(text, "uniform strips at the border (colour 0 0 0; top 6, bottom 6 pixels)");
     }
 
-    /// Nine in ten views have to have the same strips; a wide frame is rather an object's margin.
+    /// Nine in ten views must have the same strips. A wide frame is an object's margin.
     #[test]
     fn margins_of_objects_are_no_strips() {
-        let mut all = views([3; 4], [0; 3], 9);
-        all.push(None);
-        assert!(Strips::common(&all).is_some());
-        all.push(None);
-        assert_eq!(Strips::common(&all), None);
-        let varied: Vec<_> = (1..6).flat_map(|w| views([w, 3, 3, 3], [0; 3], 2)).collect();
+        let mut found = strips_of_views([3; 4], [0; 3], 9);
+        found.push(None);
+        assert!(Strips::common(&found).is_some());
+        found.push(None);
+        assert_eq!(Strips::common(&found), None);
+        let varied: Vec<_> =
+            (1..6).flat_map(|w| strips_of_views([w, 3, 3, 3], [0; 3], 2)).collect();
         assert_eq!(
             Strips::common(&varied).map(|(strips, count)| (strips.widths[0], count)),
             Some((3, 10))
         );
-        let sides: Vec<_> = (0..4).flat_map(|w| views([w, 3, 3, 3], [0; 3], 2)).collect();
+        let sides: Vec<_> = (0..4).flat_map(|w| strips_of_views([w, 3, 3, 3], [0; 3], 2)).collect();
         assert_eq!(Strips::common(&sides), None);
         assert_eq!(Strips::of(&photograph([9; 4], [0; 3], 0)), None);
         // Ellipses on black that nearly fill the image: the corners around them are empty.
@@ -248,15 +249,15 @@ mod tests {
     }
 
     #[test]
-    fn masks_leave_strips_out() {
+    fn masks_that_cover_the_strips_are_recognised() {
         let strips = Strips { widths: [1, 2, 0, 0], colour: [0; 3] };
-        let counts = |from: &[&str]| Mask {
+        let mask = |rows: &[&str]| Mask {
             width: 4,
             height: 3,
-            counts: from.iter().flat_map(|row| row.bytes().map(|b| b == b'#')).collect(),
+            counts: rows.iter().flat_map(|row| row.bytes().map(|b| b == b'#')).collect(),
         };
-        assert!(strips.are_masked(&counts(&["....", "##..", "##.."])));
-        assert!(!strips.are_masked(&counts(&["#...", "##..", "##.."])));
-        assert!(!strips.are_masked(&counts(&["....", "###.", "##.."])));
+        assert!(strips.are_masked(&mask(&["....", "##..", "##.."])));
+        assert!(!strips.are_masked(&mask(&["#...", "##..", "##.."])));
+        assert!(!strips.are_masked(&mask(&["....", "###.", "##.."])));
     }
 }

@@ -63,34 +63,35 @@ mod tests {
         }
     }
 
-    /// Three views. `whole` has a pixel of level 0.2 and a transparent one on white. `masked` has
-    /// the same image, but its second pixel doesn't count. `empty` has no image.
-    fn folder() -> tempfile::TempDir {
+    /// Writes three views. `whole` has a pixel of level 0.2 and a transparent pixel on white.
+    /// `masked` has the same image, but its second pixel doesn't count. `empty` has no image.
+    fn views_folder() -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         let image = Rgba8::new(2, 1, vec![51, 51, 51, 255, 0, 0, 0, 0]);
         write_png(&folder.path().join("image.png"), &image).unwrap();
         let mask = Mask { width: 2, height: 1, counts: vec![true, false] };
         write_png(&folder.path().join("mask.png"), &mask.to_rgba8()).unwrap();
-        let without = |name: &str| View::camera_only(camera(name, 0.0));
-        let whole = View { image: Some("image.png".to_owned()), ..without("whole") };
+        let camera_only = |name: &str| View::camera_only(camera(name, 0.0));
+        let whole = View { image: Some("image.png".to_owned()), ..camera_only("whole") };
         let masked = View {
             image: Some("image.png".to_owned()),
             mask: Some("mask.png".to_owned()),
-            ..without("masked")
+            ..camera_only("masked")
         };
         let bounds = Bounds::cube(1.0, 2.0, 6.0);
-        let views = Views::new(Background::White, bounds, vec![whole, masked, without("empty")]);
+        let views =
+            Views::new(Background::White, bounds, vec![whole, masked, camera_only("empty")]);
         write_json(&folder.path().join(VIEWS_FILE), &views).unwrap();
         folder
     }
 
     #[test]
     fn pixels_that_count_are_averaged() {
-        let folder = folder();
+        let folder = views_folder();
         let input = GivenInput::open("enlarged", folder.path()).unwrap();
         let enlarged = EnlargedPhotographs::read(&input).unwrap();
         let image = Image::new(2, 1, 3, vec![0.4, 0.4, 0.4, 0.5, 0.5, 0.5]);
-        // The last two have another pose and another name.
+        // The last two cases have another pose and another name.
         let cases: [(&str, f64, [f32; 2]); 5] = [
             ("whole", 0.0, [0.3, 0.75]),
             ("masked", 0.0, [0.3, 0.5]),
@@ -110,7 +111,7 @@ mod tests {
 
     #[test]
     fn another_size_is_refused() {
-        let folder = folder();
+        let folder = views_folder();
         let input = GivenInput::open("enlarged", folder.path()).unwrap();
         let enlarged = EnlargedPhotographs::read(&input).unwrap();
         let image = Image::new(3, 1, 3, vec![0.5; 9]);

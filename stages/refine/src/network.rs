@@ -118,13 +118,13 @@ mod tests {
             (1.0, [0.4, 0.4, 0.7]),
             (2.0, [0.6, 0.4, 0.5]),
         ] {
-            let mut drawn = Image::new(1, 1, 3, vec![0.4, 0.4, 0.7]);
-            blend(&view, &mut drawn, weight);
+            let mut redrawn = Image::new(1, 1, 3, vec![0.4, 0.4, 0.7]);
+            blend(&view, &mut redrawn, weight);
             let is_near = |(a, b): (&f32, f32)| (a - b).abs() < 1e-6;
-            assert!(drawn.data.iter().zip(expected).all(is_near), "{weight}: {:?}", drawn.data);
+            assert!(redrawn.data.iter().zip(expected).all(is_near), "{weight}: {:?}", redrawn.data);
         }
-        let mut drawn = Image::new(1, 1, 3, vec![1.0, 0.0, 0.9]);
-        blend(&view, &mut drawn, 2.0);
-        assert_eq!(drawn.data, [1.0, 0.0, 0.9], "colours stay in 0..1");
+        let mut redrawn = Image::new(1, 1, 3, vec![1.0, 0.0, 0.9]);
+        blend(&view, &mut redrawn, 2.0);
+        assert_eq!(redrawn.data, [1.0, 0.0, 0.9], "colours stay in 0..1");
     }
 }

@@ -201,8 +201,8 @@ mod tests {
         [0.1 + rise, 0.9 - rise, 0.1 + rise]
     }
 
-    /// Returns the wall rendered by that camera, with a true image.
-    fn known(name: &str, right: f64, truth: &[[f32; 3]]) -> KnownView {
+    /// Returns the view of a camera `right` pixels to the right, with a true image.
+    fn known_view(name: &str, right: f64, truth: &[[f32; 3]]) -> KnownView {
         let camera = Camera {
             name: name.to_owned(),
             intrinsics: Intrinsics {
@@ -228,16 +228,16 @@ mod tests {
         KnownView { rendered, truth }
     }
 
-    /// Returns the names of the references, of four, that are kept.
-    fn sorted(judge: &ReferenceJudge<'_>, confidence: f64) -> anyhow::Result<Vec<String>> {
+    /// Returns the names of the reliable references among four.
+    fn reliable_names(judge: &ReferenceJudge<'_>, confidence: f64) -> anyhow::Result<Vec<String>> {
         let right = 100.0;
         let tinted: Vec<[f32; 3]> =
             colours(right).into_iter().map(|[r, g, b]| [r + 0.04, g + 0.04, b]).collect();
         let references = vec![
-            known("same", right, &colours(right)),
-            known("tinted", right, &tinted),
-            known("farther", right, &colours(right / 1.1)),
-            known("other", right, &[[0.9; 3]; WIDTH * HEIGHT]),
+            known_view("same", right, &colours(right)),
+            known_view("tinted", right, &tinted),
+            known_view("farther", right, &colours(right / 1.1)),
+            known_view("other", right, &[[0.9; 3]; WIDTH * HEIGHT]),
         ];
         let kept = judge.retain_reliable(references, confidence)?;
         Ok(kept.into_iter().map(|reference| reference.rendered.camera.name).collect())
@@ -247,72 +247,74 @@ mod tests {
     /// The reference is removed if shifted depths fit equally well or better.
     #[test]
     fn misleading_references_are_left_out() {
-        let rendered = known("view", 0.0, &colours(0.0)).rendered;
+        let rendered = known_view("view", 0.0, &colours(0.0)).rendered;
         let views = vec![View::camera_only(rendered.camera.clone()); 9];
-        let asked = Cell::new(0);
+        let read_count = Cell::new(0);
         let read = |_: &View| {
-            asked.set(asked.get() + 1);
+            read_count.set(read_count.get() + 1);
             Ok::<_, Failure>(rendered.clone())
         };
-        let said = RefCell::new(Vec::new());
-        let log = |note: String| said.borrow_mut().push(note);
+        let logged = RefCell::new(Vec::new());
+        let log = |note: String| logged.borrow_mut().push(note);
         let warp_options = WarpOptions::default();
         let judge = ReferenceJudge { views: &views, warp_options, read: &read, log: &log };
-        assert_eq!(sorted(&judge, 1.0).unwrap(), ["same", "tinted"]);
+        assert_eq!(reliable_names(&judge, 1.0).unwrap(), ["same", "tinted"]);
         // Per channel the farther wall differs by 0.0318, and (1 + 100 · 3 · 0.0318²)⁻² is 0.59.
         let starts = [
             "reference farther differs from the renders (confidence 59 %)",
             "reference other differs from the renders",
         ];
-        let notes = said.take();
+        let notes = logged.take();
         assert_eq!(notes.len(), 2, "{notes:?}");
         assert!(notes[0].starts_with(starts[0]), "{}", notes[0]);
         assert!(notes[1].starts_with(starts[1]), "{}", notes[1]);
         // Every second of nine views is read: once for all references, then three times for each of
         // three references with low confidence.
-        assert_eq!(asked.get(), 5 * (1 + 3 * 3));
+        assert_eq!(read_count.get(), 5 * (1 + 3 * 3));
         // With lower confidence during training, lower confidence suffices.
-        assert_eq!(sorted(&judge, 0.7).unwrap(), ["same", "tinted", "farther"]);
+        assert_eq!(reliable_names(&judge, 0.7).unwrap(), ["same", "tinted", "farther"]);
         // The note on one reference is logged even if views can't be read for the next one.
-        asked.set(0);
-        said.borrow_mut().clear();
+        read_count.set(0);
+        logged.borrow_mut().clear();
         let failing = |view: &View| {
-            if asked.get() < 5 * (1 + 2 * 3) {
+            if read_count.get() < 5 * (1 + 2 * 3) {
                 read(view)
             } else {
                 Err(Failure::BadInput("no view".to_owned()))
             }
         };
-        assert!(sorted(&ReferenceJudge { read: &failing, ..judge }, 1.0).is_err());
-        let notes = said.take();
+        assert!(reliable_names(&ReferenceJudge { read: &failing, ..judge }, 1.0).is_err());
+        let notes = logged.take();
         assert!(notes.len() == 1 && notes[0].starts_with(starts[0]), "{notes:?}");
     }
 
     /// Returns a reference whose channels are multiplied by `gain`.
-    fn seen(gain: [f32; 3]) -> KnownView {
+    fn with_gain(gain: [f32; 3]) -> KnownView {
         let truth: Vec<[f32; 3]> =
-            colours(0.0).iter().map(|right| std::array::from_fn(|c| gain[c] * right[c])).collect();
-        known("a", 0.0, &truth)
+            colours(0.0).iter().map(|wall| std::array::from_fn(|c| gain[c] * wall[c])).collect();
+        known_view("a", 0.0, &truth)
     }
 
     #[test]
-    fn another_exposure_is_corrected() {
-        let (reference, note) = correct_exposure(seen([0.6, 0.7, 1.0]));
+    fn a_differing_exposure_is_corrected() {
+        let (reference, note) = correct_exposure(with_gain([0.6, 0.7, 1.0]));
         let expected =
             "reference a has another exposure (0.60, 0.70, 1.00 times as bright); corrected";
         assert_eq!(note.as_deref(), Some(expected));
-        let off = reference
+        let error = reference
             .truth
             .data
             .iter()
             .zip(colours(0.0).as_flattened())
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, f32::max);
-        assert!(off < 1e-4, "{off}");
+        assert!(error < 1e-4, "{error}");
         // Differences that a field's errors explain aren't corrected, nor is a uniform image.
-        for same in [seen([1.05, 0.95, 1.0]), known("a", 0.0, &[[1.0; 3]; WIDTH * HEIGHT])] {
-            let truth = same.truth.clone();
-            let (reference, note) = correct_exposure(same);
+        for unchanged in
+            [with_gain([1.05, 0.95, 1.0]), known_view("a", 0.0, &[[1.0; 3]; WIDTH * HEIGHT])]
+        {
+            let truth = unchanged.truth.clone();
+            let (reference, note) = correct_exposure(unchanged);
             assert!(reference.truth == truth && note.is_none(), "{note:?}");
         }
     }

@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_summary_says_what_was_used() {
+    fn a_summary_describes_the_refinement() {
         let plain = Summary {
             views: 1,
             consistent: 0,
@@ -70,13 +70,13 @@ mod tests {
             statistics: Vec::new(),
         };
         assert_eq!(plain.text(), "1 view, residual weight 0.80");
-        let seen = ReferenceStatistics { visible_pixels: 10, visibility: 8.0, confidence: 4.0 };
+        let visible = ReferenceStatistics { visible_pixels: 10, visibility: 8.0, confidence: 4.0 };
         let by_references = Summary {
             views: 3,
             consistent: 2,
             averaged: 1,
             is_reference_based: true,
-            statistics: vec![seen, ReferenceStatistics::default()],
+            statistics: vec![visible, ReferenceStatistics::default()],
             ..plain
         };
         assert_eq!(
@@ -84,7 +84,7 @@ mod tests {
             "3 views by 2 references (confidence 50 %), residual weight 0.80; 1 averaged with \
              their enlarged photographs; 2 consistent with their own photographs"
         );
-        let unseen = Summary { statistics: vec![ReferenceStatistics::default()], ..by_references };
-        assert!(unseen.text().starts_with("3 views by 1 reference that show no part of them, "));
+        let hidden = Summary { statistics: vec![ReferenceStatistics::default()], ..by_references };
+        assert!(hidden.text().starts_with("3 views by 1 reference that show no part of them, "));
     }
 }

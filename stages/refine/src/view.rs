@@ -137,7 +137,7 @@ mod tests {
 
     use super::*;
 
-    /// Writes and reads two pixels, the second half transparent.
+    /// Writes and reads an image of two pixels, of which the second is half transparent.
     fn rendered(folder: &Path) -> ExrImage {
         let path = folder.join("rendered.exr");
         let pixels = [[0.5, 0.25, 0.125, 1.0, 2.0], [0.25, 0.25, 0.25, 0.5, 3.0]];

@@ -342,8 +342,8 @@ mod tests {
         Camera { name: "a".to_owned(), intrinsics, camera_to_world }
     }
 
-    /// Renders a picture in bands of some rows; returns red of each pixel and the number of rays.
-    fn red(colour: fn(f64, f64) -> f64, tolerance: f64, band: usize) -> (Vec<f32>, usize) {
+    /// Renders a picture in bands of `band` rows. Returns each pixel's red and the number of rays.
+    fn render_red(colour: fn(f64, f64) -> f64, tolerance: f64, band: usize) -> (Vec<f32>, usize) {
         let (camera, params) = (&camera(), &Params { tolerance, ..Params::default() });
         let count = Arc::new(AtomicUsize::new(0));
         let members: &[Box<dyn RayField>] =
@@ -351,43 +351,43 @@ mod tests {
         let job = RenderJob { params, members, background: Background::White, camera };
         let mut centres = CentreRows::default();
         let bands = (0..SIZE).step_by(band).map(|first| first..(first + band).min(SIZE));
-        let shown: Vec<ViewPixel> =
+        let pixels: Vec<ViewPixel> =
             bands.flat_map(|rows| job.render_rows(&mut centres, rows).unwrap()).collect();
-        (shown.iter().map(|pixel| pixel.channels[0]).collect(), count.load(Ordering::Relaxed))
+        (pixels.iter().map(|pixel| pixel.channels[0]).collect(), count.load(Ordering::Relaxed))
     }
 
-    /// Colour whose curvature grows to the right.
-    fn bent(x: f64, y: f64) -> f64 {
+    /// Returns a colour whose curvature grows to the right.
+    fn curved_colour(x: f64, y: f64) -> f64 {
         0.2 + 0.004 * x + 2e-5 * x.powi(3) - 0.001 * y * y + 0.002 * x * y
     }
 
     #[test]
     fn smooth_pixels_have_one_ray_within_the_tolerance() {
-        let (all, most) = red(bent, 0.0, SIZE);
-        assert_eq!(most, 5 * SIZE * SIZE);
+        let (reference, max_rays) = render_red(curved_colour, 0.0, SIZE);
+        assert_eq!(max_rays, 5 * SIZE * SIZE);
         for tolerance in [1e-5, 5e-5, 7.5e-5, 1e-4, 1e-3] {
-            let (adaptive, rays) = red(bent, tolerance, SIZE);
-            let error = all
+            let (adaptive, rays) = render_red(curved_colour, tolerance, SIZE);
+            let error = reference
                 .iter()
                 .zip(&adaptive)
                 .map(|(a, b)| f64::from((a - b).abs()))
                 .fold(0.0, f64::max);
             println!("tolerance {tolerance}: error {error}, {rays} rays");
             assert!(error <= tolerance + 1e-6, "an error of {error} is above {tolerance}");
-            assert!(rays <= most);
+            assert!(rays <= max_rays);
         }
         let [few, several, many] =
-            [1e-3, 7.5e-5, 1e-5].map(|tolerance| red(bent, tolerance, SIZE).1);
+            [1e-3, 7.5e-5, 1e-5].map(|tolerance| render_red(curved_colour, tolerance, SIZE).1);
         assert!(few < several && several < many, "{few}, {several}, {many} rays");
-        // The border's pixels have all rays.
+        // All rays are cast through the border's pixels.
         assert_eq!(few, SIZE * SIZE + 4 * (4 * SIZE - 4));
     }
 
     #[test]
-    fn bands_change_nothing() {
-        let expected = red(bent, 7.5e-5, SIZE);
+    fn bands_do_not_change_the_image() {
+        let expected = render_red(curved_colour, 7.5e-5, SIZE);
         for band in [1, 2, 5, 16] {
-            assert!(red(bent, 7.5e-5, band) == expected, "bands of {band} rows");
+            assert!(render_red(curved_colour, 7.5e-5, band) == expected, "bands of {band} rows");
         }
     }
 
@@ -408,24 +408,24 @@ mod tests {
         }
     }
 
-    /// The depth is that of one ray of one member, the middle one of all by distance. Opacity is
-    /// the mean.
+    /// A pixel's depth is that of one ray of one member: their lower median by distance. Its
+    /// opacity is the mean.
     #[test]
     fn a_pixel_has_the_depth_of_one_ray_of_one_member() {
         let camera = &camera();
-        // Walls of the members, then the middle one, then opacity.
+        // Walls of the members, then the pixel's depth and opacity.
         let cases: [(&[f32], f32, f32); 3] =
             [(&[1.0], 1.0, 0.25), (&[1.0, 3.0], 1.0, 0.5), (&[3.0, 1.0, 3.0], 3.0, 7.0 / 12.0)];
-        for (walls, wall, opacity) in cases {
+        for (walls, depth, opacity) in cases {
             let members: Vec<Box<dyn RayField>> =
                 walls.iter().map(|wall| Box::new(Wall(*wall)) as Box<dyn RayField>).collect();
             let (params, members) = (&Params::default(), &members[..]);
             let job = RenderJob { params, members, background: Background::White, camera };
-            let shown = job.cast(&[[14, 12]], 2).unwrap()[0].channels;
+            let channels = job.cast(&[[14, 12]], 2).unwrap()[0].channels;
             let is_near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-4;
             assert!(
-                shown[3..].iter().zip(&[opacity, wall]).all(is_near),
-                "walls {walls:?}: {shown:?} where {opacity} and {wall} are right"
+                channels[3..].iter().zip(&[opacity, depth]).all(is_near),
+                "walls {walls:?}: {channels:?}, expected {opacity} and {depth}"
             );
         }
     }

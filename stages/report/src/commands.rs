@@ -72,8 +72,9 @@ mod tests {
 
     #[test]
     fn commands_can_be_pasted() {
-        let words = ["/opt/bin/nerf-sr", "run", "-i", "dataset=my data/it's", "-p", "rays=1,2", ""];
-        let command = words.map(str::to_owned).to_vec();
+        let arguments =
+            ["/opt/bin/nerf-sr", "run", "-i", "dataset=my data/it's", "-p", "rays=1,2", ""];
+        let command = arguments.map(str::to_owned).to_vec();
         let run = RunRecord { command, ..RunRecord::default() };
         let expected = r"nerf-sr run -i 'dataset=my data/it'\''s' -p rays=1,2 ''";
         assert_eq!(run_command(&run).unwrap(), expected);

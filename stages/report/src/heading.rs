@@ -74,11 +74,11 @@ mod tests {
     fn sizes_rays_and_machine_are_in_the_heading() {
         let folder = tempfile::tempdir().unwrap();
         let node = |stage: &str, kind: &str, file: &str, content: serde_json::Value| {
-            let place = folder.path().join(stage);
-            std::fs::create_dir(&place).unwrap();
-            std::fs::write(place.join(file), content.to_string()).unwrap();
+            let output = folder.path().join(stage);
+            std::fs::create_dir(&output).unwrap();
+            std::fs::write(output.join(file), content.to_string()).unwrap();
             json!({"stage": stage, "point": "", "kind": kind, "key": "", "output": "",
-                "folder": place, "parameters": {}, "inputs": {}, "started_unix": 0,
+                "folder": output, "parameters": {}, "inputs": {}, "started_unix": 0,
                 "seconds": 0.0, "threads": 2, "host": "box"})
         };
         let scene = json!({"lr": [10, 20], "hr": [20, 40], "train": 5, "test": 1});

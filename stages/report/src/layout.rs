@@ -206,9 +206,9 @@ fn path(items: &[Item], route: &[usize]) -> String {
 mod tests {
     use super::*;
 
-    /// The shipped pipeline: `prep` is joined to all that follow.
+    /// In the shipped pipeline, `prep` (node 1) has edges to all later stages.
     #[test]
-    fn edges_pass_beside_boxes() {
+    fn edges_pass_between_boxes() {
         let drawing = draw(5, &[(0, 1), (1, 2), (2, 3), (1, 3), (3, 4), (1, 4)]);
         assert_eq!(drawing.boxes.iter().map(|b| b[1]).collect::<Vec<_>>(), {
             let step = HEIGHT + LAYER_GAP;
@@ -216,22 +216,22 @@ mod tests {
         });
         assert_eq!(drawing.height, 5.0 * HEIGHT + 4.0 * LAYER_GAP);
         // prep → eval goes straight down through two layers, outside of their boxes.
-        let long = &drawing.edges[5];
-        let lanes: Vec<f64> = long
+        let long_edge = &drawing.edges[5];
+        let lanes: Vec<f64> = long_edge
             .split('L')
             .skip(1)
             .map(|part| part.split(' ').next().unwrap().parse().unwrap())
             .collect();
-        assert_eq!(lanes.len(), 2, "{long}");
+        assert_eq!(lanes.len(), 2, "{long_edge}");
         for (x, [left, _]) in lanes.iter().zip(&drawing.boxes[2..4]) {
-            assert!(*x < *left || *x > left + WIDTH, "{long} crosses {:?}", drawing.boxes);
+            assert!(*x < *left || *x > left + WIDTH, "{long_edge} crosses {:?}", drawing.boxes);
         }
         assert!(drawing.width < 2.0 * WIDTH, "{}", drawing.width);
     }
 
     #[test]
     fn boxes_do_not_overlap() {
-        // Many parents of one, and one of many.
+        // One parent of many children, and one child of many parents.
         let edges: Vec<(usize, usize)> =
             (1..8).map(|i| (0, i)).chain((1..8).map(|i| (i, 8))).chain([(0, 8)]).collect();
         let drawing = draw(9, &edges);

@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn warnings_stand_in_summaries() {
+    fn warnings_are_read_from_summaries() {
         let folder = tempfile::tempdir().unwrap();
         let nodes = vec![
             node(

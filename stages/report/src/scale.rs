@@ -91,12 +91,12 @@ mod tests {
         let depth = Scale::depth((2.13, 6.4));
         assert_eq!(texts(&depth), ["3", "4", "5", "6"]);
         assert!(depth.ticks.windows(2).all(|pair| pair[0].0 < pair[1].0));
-        // One depth alone, and what can't be.
+        // A range with one depth, and an invalid range.
         assert_eq!(texts(&Scale::depth((2.13, 2.13))), ["2.13"]);
         assert_eq!(Scale::depth((3.0, f32::NAN)).ticks.len(), 1);
     }
 
-    /// The colours are those of the pictures: near is warm.
+    /// Scales have the colours of the maps: near is warm.
     #[test]
     fn colours_are_those_of_the_maps() {
         let (error, depth) = (Scale::error(0.25, false), Scale::depth((1.0, 9.0)));

@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn times_and_what_tables_add_have_their_own_form() {
+    fn undeclared_figures_have_fixed_formats() {
         let figures = Figures::default();
         for (name, value, text) in [
             ("train_s", 119.94, "119.9 s"),

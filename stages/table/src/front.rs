@@ -228,12 +228,12 @@ mod tests {
         let points = ["one", "two", "three", "four"].map(|name| point(name, 10.0, 25.0));
         let far = point("far", 300.0, 30.0);
         let svg = AXES.picture(&[&points[..], &[far]].concat(), &Figures::default()).unwrap();
-        let lines = ["one", "two", "three", "four"].map(|name| {
+        let base_lines = ["one", "two", "three", "four"].map(|name| {
             let before = svg.split(&format!(">{name}</text>")).next().unwrap();
             before.rsplit("y=\"").next().unwrap().split('"').next().unwrap().to_owned()
         });
-        for (i, line) in lines.iter().enumerate() {
-            assert!(!lines[..i].contains(line), "{lines:?}");
+        for (i, base_line) in base_lines.iter().enumerate() {
+            assert!(!base_lines[..i].contains(base_line), "{base_lines:?}");
         }
     }
 
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn impossible_costs_have_no_picture() {
+    fn points_that_cannot_be_drawn_have_no_picture() {
         for points in [
             vec![],
             vec![point("a", 1.0, 1.0)],

@@ -1,4 +1,4 @@
-//! Rows to Markdown.
+//! Tests of the conversion of rows to Markdown.
 
 use super::*;
 use crate::params::{Gain, Group};
@@ -75,7 +75,7 @@ fn results_of_one_row_are_averaged_and_the_best_is_marked() {
 }
 
 #[test]
-fn columns_hold_all_values_of_a_key() {
+fn columns_are_the_values_of_a_key() {
     let params = Params {
         rows: vec!["variant".to_owned()],
         columns: vec!["scene".to_owned()],
@@ -104,7 +104,7 @@ Failed, or waiting for a failed stage:
 
 #[test]
 fn keys_that_no_result_has_are_refused() {
-    for (rows_by, relative_to, words) in [
+    for (rows_by, relative_to, expected) in [
         (
             vec!["varant"],
             vec![],
@@ -126,39 +126,39 @@ fn keys_that_no_result_has_are_refused() {
             ..Params::default()
         };
         let problem = markdown(&params, &rows(), &figures(), &[]).unwrap_err();
-        assert!(matches!(&problem, Failure::Usage(said) if said == words), "{problem}");
+        assert!(matches!(&problem, Failure::Usage(message) if message == expected), "{problem}");
     }
     let seeds = [30.0, 32.0].map(|psnr| row("lego", &psnr.to_string(), "100x2", psnr, None, 1.0));
-    let by_seed = seeds.map(|mut row| {
+    let seed_rows = seeds.map(|mut row| {
         let seed = row.remove("variant").unwrap();
         row.insert("seed".to_owned(), seed);
         row
     });
-    let text = markdown(&Params::default(), &by_seed, &figures(), &[]).unwrap();
+    let text = markdown(&Params::default(), &seed_rows, &figures(), &[]).unwrap();
     assert!(text.ends_with("\nPSNR over 2 results: 31.00 ± 1.41, from 30.00 to 32.00\n"), "{text}");
-    let nothing = markdown(
+    let without_results = markdown(
         &Params::default(),
         &[],
         &figures(),
         &[FailedPoint { stage: "eval".to_owned(), ..FailedPoint::default() }],
     )
     .unwrap();
-    assert!(nothing.contains("* eval\n"), "{nothing}");
+    assert!(without_results.contains("* eval\n"), "{without_results}");
 }
 
-fn params(text: serde_json::Value) -> Params {
-    serde_json::from_value(text).unwrap()
+fn params(value: serde_json::Value) -> Params {
+    serde_json::from_value(value).unwrap()
 }
 
-fn method_row(method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64) -> Value {
-    let places = json!({"commit": "abc1234", "machine": "vm"});
-    let mut row = json!({"method": method, "has seen": seen, "scene": scene,
+fn method_row(method: &str, group: &str, scene: &str, protocol: &str, psnr: f64) -> Value {
+    let origin = json!({"commit": "abc1234", "machine": "vm"});
+    let mut row = json!({"method": method, "has seen": group, "scene": scene,
         "protocol": protocol, "psnr": psnr});
-    row.as_object_mut().unwrap().extend(places.as_object().cloned().unwrap());
+    row.as_object_mut().unwrap().extend(origin.as_object().cloned().unwrap());
     row
 }
 
-/// Rows of two methods in two groups at two protocols, as `rows` makes them.
+/// Returns rows of four methods in two groups at two protocols, as `rows` creates them.
 fn methods() -> Vec<Row> {
     let missing = json!({"method": "liif", "has seen": "HR", "scene": "lego", "protocol": "100x2",
         "missing": "no liif"});
@@ -175,8 +175,6 @@ fn methods() -> Vec<Row> {
     rows.map(|row| row.as_object().cloned().unwrap()).into()
 }
 
-/// The best is marked among those that have seen the same; what is known from elsewhere competes
-/// with none.
 /// An extra row belongs to results whose keys it shares, also without a given list of keys.
 #[test]
 fn extra_rows_match_default_keys() {
@@ -186,8 +184,9 @@ fn extra_rows_match_default_keys() {
     assert!(text.contains("| 27.50 |"), "{text}");
 }
 
+/// The best row of each group is marked. Extra rows are in no group.
 #[test]
-fn groups_further_rows_and_gains() {
+fn groups_extra_rows_and_gains_are_rendered() {
     let params = Params {
         groups: vec![Group {
             name: "LR".to_owned(),
@@ -261,7 +260,7 @@ fn node(stage: &str) -> Value {
         "seconds": 1.0, "threads": 1, "host": "vm"})
 }
 
-/// Methods stand in the order of their groups, and what was left out in its place.
+/// Methods are in the order of their groups, also methods that were left out.
 #[test]
 fn rows_follow_the_groups() {
     let left_out = json!({"stage": "eval-liif", "point": "", "values": {"protocol": "100x2"},
@@ -275,7 +274,7 @@ fn rows_follow_the_groups() {
     let run = serde_json::from_value(run).unwrap();
     let silent = stage::Progress::silent();
     let rows = crate::rows::rows(&run, &params, &mut Figures::default(), &silent).unwrap();
-    let told: Vec<[&str; 3]> = rows
+    let cells: Vec<[&str; 3]> = rows
         .iter()
         .map(|row| {
             ["method", "has seen", "missing"]
@@ -283,7 +282,7 @@ fn rows_follow_the_groups() {
         })
         .collect();
     assert_eq!(
-        told,
+        cells,
         [
             ["ours, 100x2", "LR", ""],
             ["eval-liif", "LR", "no liif"],
@@ -302,7 +301,7 @@ fn the_front_is_marked_and_drawn() {
         front: Some("train_s".to_owned()),
         ..Params::default()
     };
-    let made = document(&params, &rows(), &figures(), &[]).unwrap();
+    let rendered = document(&params, &rows(), &figures(), &[]).unwrap();
     let expected = "\
 | variant | PSNR | front | commit | machine |
 | --- | --- | --- | --- | --- |
@@ -311,7 +310,7 @@ fn the_front_is_marked_and_drawn() {
 
 ![The results by cost and score](front.svg)
 ";
-    assert!(made.text.contains(expected), "{}", made.text);
+    assert!(rendered.text.contains(expected), "{}", rendered.text);
     let lego = "## lego
 
 | variant | PSNR | front | commit | machine |
@@ -319,8 +318,8 @@ fn the_front_is_marked_and_drawn() {
 | as it is | **30.00** | ● | abc1234 | 2 cores |
 | no warm-up | 29.50 | ● | abc1234 | 2 cores |
 ";
-    assert!(made.text.contains(lego), "{}", made.text);
-    assert!(made.picture.unwrap().contains(">no warm-up</text>"));
+    assert!(rendered.text.contains(lego), "{}", rendered.text);
+    assert!(rendered.picture.unwrap().contains(">no warm-up</text>"));
 
     let unknown = Params { front: Some("train_seconds".to_owned()), ..params };
     let problem = document(&unknown, &rows(), &figures(), &[]).err().unwrap().to_string();

@@ -122,9 +122,10 @@ mod tests {
 
     use super::*;
 
+    /// Side of all images in pixels.
     const SIDE: usize = 4;
 
-    /// View at a distance to the right; its image, if any, is the file of its name.
+    /// Returns a view at x = `right`. The view's image, if any, has the view's name.
     fn view(name: &str, right: f64, extension: Option<&str>) -> View {
         let camera = Camera {
             name: name.to_owned(),
@@ -135,8 +136,8 @@ mod tests {
         View { image, ..View::camera_only(camera) }
     }
 
-    /// Writes an input: rendered views are half transparent, photographs are grey.
-    fn input(dir: &Path, name: &str, views: Vec<View>) -> GivenInput {
+    /// Writes and opens an input: rendered views are half transparent, photographs are grey.
+    fn write_input(dir: &Path, name: &str, views: Vec<View>) -> GivenInput {
         let folder = dir.join(name);
         std::fs::create_dir(&folder).unwrap();
         for file in views.iter().filter_map(|view| view.image.as_ref()) {
@@ -180,13 +181,13 @@ mod tests {
             view("unrendered", 0.0, Some("png")),
             view("whole", 0.0, Some("png")),
         ];
-        let [views, truth] =
-            [("views", views), ("truth", truth)].map(|(name, of)| input(dir.path(), name, of));
+        let [views, truth] = [("views", views), ("truth", truth)]
+            .map(|(name, views)| write_input(dir.path(), name, views));
         let Examples { training, left_out } = Examples::read(&views, &truth, None).unwrap();
         assert_eq!((training.len(), left_out.len()), (1, 1));
         let KnownView { rendered, truth } = &training[0];
         assert_eq!(rendered.camera.name, "whole");
-        // Over white.
+        // Composited over white.
         assert_eq!(rendered.colours().data, [0.75; 3 * SIDE * SIDE]);
         assert_eq!(rendered.depth, [2.0; SIDE * SIDE]);
         assert_eq!(truth.data, [0.2; 3 * SIDE * SIDE]);
@@ -195,12 +196,13 @@ mod tests {
     #[test]
     fn views_without_truth_are_refused() {
         let dir = tempfile::tempdir().unwrap();
-        let [views, truth] = [("views", "one"), ("truth", "other")]
-            .map(|(input_name, name)| input(dir.path(), input_name, vec![view(name, 0.0, None)]));
-        let Err(Failure::BadInput(said)) = Examples::read(&views, &truth, None) else {
-            panic!("they have none");
+        let [views, truth] = [("views", "one"), ("truth", "other")].map(|(input_name, name)| {
+            write_input(dir.path(), input_name, vec![view(name, 0.0, None)])
+        });
+        let Err(Failure::BadInput(message)) = Examples::read(&views, &truth, None) else {
+            panic!("views without ground truth are accepted");
         };
-        assert!(said.starts_with("input views: no view has an image"), "{said}");
+        assert!(message.starts_with("input views: no view has an image"), "{message}");
     }
 
     #[test]
@@ -217,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_single_one_is_both() {
+    fn a_single_example_is_trained_on_and_left_out() {
         let Examples { training, left_out } = Examples::split(vec![7]);
         assert_eq!((training, left_out), (vec![7], vec![7]));
     }

@@ -43,11 +43,11 @@ mod tests {
 
     #[test]
     fn numbers_that_are_not_finite_are_a_numerical_failure() {
-        let channels = RefinementError::Unusable("view r_0: too small".to_owned());
-        for (error, code) in [(RefinementError::NotFinite { step: 7 }, 4), (channels, 1)] {
-            let words = error.to_string();
+        let unusable = RefinementError::Unusable("view r_0: too small".to_owned());
+        for (error, code) in [(RefinementError::NotFinite { step: 7 }, 4), (unusable, 1)] {
+            let message = error.to_string();
             let failure = step_error(error);
-            assert_eq!((failure.to_string(), exit_code(&failure)), (words, code));
+            assert_eq!((failure.to_string(), exit_code(&failure)), (message, code));
         }
     }
 }

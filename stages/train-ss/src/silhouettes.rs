@@ -125,11 +125,11 @@ mod tests {
 
     const SIZE: u32 = 48;
 
-    fn camera(from: DVec3) -> Camera {
+    fn camera(position: DVec3) -> Camera {
         Camera {
             name: "orbit".to_owned(),
             intrinsics: Intrinsics::from_angle_x(SIZE, SIZE, 0.8),
-            camera_to_world: looking_at(from, DVec3::ZERO, DVec3::Y),
+            camera_to_world: looking_at(position, DVec3::ZERO, DVec3::Y),
         }
     }
 
@@ -144,12 +144,13 @@ mod tests {
         Image::new(size, size, 4, pixels.collect()).into()
     }
 
-    fn carved(cameras: &[Camera], mut change: impl FnMut(&mut Photograph)) -> Vec<bool> {
+    /// Returns the cells that remain after carving by photographs, each edited first.
+    fn carved(cameras: &[Camera], mut edit: impl FnMut(&mut Photograph)) -> Vec<bool> {
         let bounds = Bounds::cube(1.0, 1.0, 5.0);
         let mut cells = vec![true; OCCUPANCY_CELLS.pow(3)];
         for camera in cameras {
             let mut photograph = photograph_of_sphere(camera);
-            change(&mut photograph);
+            edit(&mut photograph);
             if let Some(silhouette) = Silhouette::new(&photograph) {
                 silhouette.carve(camera, &bounds, &mut cells);
             }
@@ -157,17 +158,17 @@ mod tests {
         cells
     }
 
-    fn distance_of(cell: usize) -> f64 {
+    fn distance_to_origin(cell: usize) -> f64 {
         let n = OCCUPANCY_CELLS;
         let p = [cell % n, cell / n % n, cell / (n * n)];
         DVec3::from(p.map(|c| (c as f64 + 0.5) / (n as f64 / 2.0) - 1.0)).length()
     }
 
     #[test]
-    fn the_object_stays_and_most_of_the_rest_goes() {
+    fn carving_retains_the_object_and_few_other_cells() {
         let cameras = [3.0 * DVec3::X, 3.0 * DVec3::Z, DVec3::new(2.0, 2.0, 1.0)].map(camera);
         let cells = carved(&cameras, |_| ());
-        let near = (0..cells.len()).filter(|&cell| distance_of(cell) < 0.32);
+        let near = (0..cells.len()).filter(|&cell| distance_to_origin(cell) < 0.32);
         assert!(near.into_iter().all(|cell| cells[cell]));
         let kept = cells.iter().filter(|kept| **kept).count();
         assert!(kept < cells.len() / 4, "{kept} of {} cells", cells.len());
@@ -175,17 +176,19 @@ mod tests {
 
     /// Neither masked pixels nor the region outside the image are known to be empty.
     #[test]
-    fn unknown_regions_stay() {
-        let far = camera(3.0 * DVec3::X);
+    fn unknown_regions_are_retained() {
+        let facing = camera(3.0 * DVec3::X);
         let masked = |photograph: &mut Photograph| {
             let size = SIZE as usize;
             let mask = Mask { width: size, height: size, counts: vec![false; size * size] };
             photograph.mask = Some(mask);
         };
-        assert!(carved(std::slice::from_ref(&far), masked).into_iter().all(|kept| kept));
-        let aside =
-            Camera { camera_to_world: looking_at(3.0 * DVec3::X, 9.0 * DVec3::Z, DVec3::Y), ..far };
-        assert!(carved(&[aside], |_| ()).into_iter().all(|kept| kept));
+        assert!(carved(std::slice::from_ref(&facing), masked).into_iter().all(|kept| kept));
+        let averted = Camera {
+            camera_to_world: looking_at(3.0 * DVec3::X, 9.0 * DVec3::Z, DVec3::Y),
+            ..facing
+        };
+        assert!(carved(&[averted], |_| ()).into_iter().all(|kept| kept));
     }
 
     #[test]
@@ -205,7 +208,7 @@ mod tests {
         assert!(cells.into_iter().all(|kept| kept));
     }
 
-    /// Sums of any rectangle equal a count of its pixels.
+    /// Every rectangle of whole pixels is compared with a test of its pixels one by one.
     #[test]
     fn rectangles_are_transparent_if_all_their_pixels_are() {
         let (width, height) = (7, 5);

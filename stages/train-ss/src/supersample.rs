@@ -52,13 +52,13 @@ mod tests {
     use super::*;
 
     fn rays_at(supersample: usize, progress: f64) -> usize {
-        let mut rays = SupersampleSchedule::new([supersample; 2], 0.3);
-        rays.set_progress(progress);
-        assert_eq!(rays.is_warmed_up(), rays.rays_per_pixel() == supersample * supersample);
-        rays.rays_per_pixel()
+        let mut schedule = SupersampleSchedule::new([supersample; 2], 0.3);
+        schedule.set_progress(progress);
+        assert_eq!(schedule.is_warmed_up(), schedule.rays_per_pixel() == supersample * supersample);
+        schedule.rays_per_pixel()
     }
 
-    /// 1, 2, 4 … sub-pixel rays a side, each for an equal part of the warm-up, and then all.
+    /// Equal parts of the warm-up cast 1, 2, 4 … sub-pixel rays per side; later, all are cast.
     #[test]
     fn sub_pixel_rays_double_until_all_are_cast() {
         for (supersample, expected) in

@@ -35,13 +35,13 @@ fn read(name: &str, weights: &Weights) -> Result<Box<dyn Network>, nets::Weights
     })
 }
 
-fn case(weights: &Weights, number: usize, what: &str) -> Tensor {
-    let name = format!("golden.{what}.{number}");
+fn case_tensor(weights: &Weights, number: usize, role: &str) -> Tensor {
+    let name = format!("golden.{role}.{number}");
     weights.tensor(&name, &weights.shape::<4>(&name).unwrap()).unwrap()
 }
 
 #[test]
-fn networks_are_those_of_pytorch() {
+fn networks_agree_with_pytorch() {
     nets::deterministic();
     for name in FILES {
         let weights = Weights::read(&golden(name)).unwrap();
@@ -49,13 +49,13 @@ fn networks_are_those_of_pytorch() {
         let mut cases = 0;
         while weights.has(&format!("golden.input.{cases}")) {
             let (input, expected) =
-                (case(&weights, cases, "input"), case(&weights, cases, "output"));
+                (case_tensor(&weights, cases, "input"), case_tensor(&weights, cases, "output"));
             let [.., rows, columns] = expected.size()[..] else { unreachable!() };
             let found = no_grad(|| network.enlarge(&input, [rows, columns])).unwrap();
             assert_eq!(found.size(), expected.size(), "{name}, case {cases}");
             let norm = |t: &Tensor| t.square().sum(Kind::Double).sqrt().double_value(&[]);
-            let apart = norm(&(&found - &expected)) / norm(&expected);
-            assert!(apart < 1e-5, "{name}, case {cases}: {apart:e} apart");
+            let difference = norm(&(&found - &expected)) / norm(&expected);
+            assert!(difference < 1e-5, "{name}, case {cases}: {difference:e}");
             cases += 1;
         }
         assert!(cases > 0, "{name} has no cases");
@@ -75,12 +75,12 @@ fn broken_weights_are_refused() {
             serde_json::from_slice(&bytes[8..8 + length]).unwrap();
         let names: Vec<&String> =
             header.keys().filter(|n| !n.starts_with("golden") && !n.starts_with("__")).collect();
-        let whole = Weights::read(&golden(name)).unwrap();
+        let complete = Weights::read(&golden(name)).unwrap();
         let all: Vec<(String, Tensor)> = names
             .iter()
             .map(|n| {
                 let shape: Vec<i64> = serde_json::from_value(header[*n]["shape"].clone()).unwrap();
-                ((*n).clone(), whole.tensor(n, &shape).unwrap())
+                ((*n).clone(), complete.tensor(n, &shape).unwrap())
             })
             .collect();
         let mut refused = 0;
@@ -111,7 +111,7 @@ fn broken_weights_are_refused() {
 }
 
 #[test]
-fn sizes_that_a_network_cannot_make_are_said() {
+fn sizes_that_a_network_cannot_produce_are_refused() {
     assert!(
         check_scale(Some(4), [5, 7], [20, 28]).is_ok()
             && check_scale(None, [5, 7], [13, 20]).is_ok()
@@ -119,9 +119,9 @@ fn sizes_that_a_network_cannot_make_are_said() {
     assert!(check_scale(Some(4), [5, 7], [20, 27]).unwrap_err().to_string().contains("4 times"));
 }
 
-/// IMDN as released, on ten real views, against PyTorch's scores.
+/// IMDN with the released weights scores on ten real views as in PyTorch.
 #[test]
-fn imdn_as_released_scores_as_in_pytorch() {
+fn released_imdn_scores_as_in_pytorch() {
     let data = std::env::var("NERF_SR_DATA").map_or_else(
         |_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data"),
         PathBuf::from,
@@ -143,8 +143,8 @@ fn imdn_as_released_scores_as_in_pytorch() {
         assert_eq!(rows.len(), 10);
         for row in rows {
             let view = row["view"].as_str().unwrap();
-            let whole = read_png(&data.join(format!("nerf_synthetic/lego/{view}.png"))).unwrap();
-            let white = Image::premultiplied(&whole).over(1.0).to_rgba8();
+            let image = read_png(&data.join(format!("nerf_synthetic/lego/{view}.png"))).unwrap();
+            let white = Image::premultiplied(&image).over(1.0).to_rgba8();
             let hr = resize_pillow(&white, 200, 200, Filter::Lanczos);
             let lr = resize_pillow(&hr, 200 / scale, 200 / scale, Filter::Bicubic);
             let input = nets::tensor_of(&Image::premultiplied(&lr).over(0.0)).unwrap();
@@ -157,7 +157,7 @@ fn imdn_as_released_scores_as_in_pytorch() {
                 (psnr_of(error / truth.data.len() as f64), row["psnr"].as_f64().unwrap());
             assert!(
                 (found - expected).abs() < 0.02,
-                "{view} ×{scale}: {found} dB where PyTorch has {expected}"
+                "{view} ×{scale}: {found} dB, PyTorch {expected} dB"
             );
             assert!(
                 expected > row["bicubic_psnr"].as_f64().unwrap() + 1.0,

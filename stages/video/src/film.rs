@@ -154,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ffmpeg_reports_frames() {
+    fn frame_counts_of_ffmpeg_are_read() {
         assert_eq!(encoded_frames("frame=12"), Some(12));
         assert_eq!(encoded_frames("frame=  7"), Some(7));
         assert!(

@@ -201,8 +201,8 @@ mod tests {
 
     #[test]
     fn frames_have_even_sizes_and_both_images() {
-        let one = |width: usize, level: u8| Rgba8::new(width, 3, vec![level; 4 * width * 3]);
-        let frame = with_even_size(&side_by_side(&one(3, 10), &one(2, 20)));
+        let image = |width: usize, level: u8| Rgba8::new(width, 3, vec![level; 4 * width * 3]);
+        let frame = with_even_size(&side_by_side(&image(3, 10), &image(2, 20)));
         assert_eq!((frame.width, frame.height), (6, 4));
         let row: Vec<u8> = frame.data[3 * 6 * 4..].chunks_exact(4).map(|p| p[0]).collect();
         assert_eq!(row, [10, 10, 10, 20, 20, 20]);

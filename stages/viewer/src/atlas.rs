@@ -104,9 +104,9 @@ mod tests {
         (volume, atlas)
     }
 
-    /// Every voxel is found again in the bytes, as near as a byte comes.
+    /// Every voxel is decoded from the bytes, within the rounding of a byte.
     #[test]
-    fn bytes_say_what_voxels_are() {
+    fn bytes_encode_the_voxels() {
         let (volume, atlas) = packed();
         let mut bytes = Vec::new();
         flate2::read::ZlibDecoder::new(&atlas.bytes[..]).read_to_end(&mut bytes).unwrap();
@@ -117,8 +117,8 @@ mod tests {
         let count = atlas.bricks * VOXELS;
         let mut opaque = 0;
         for voxel in &volume.voxels {
-            let at = bricks.voxel_index(voxel.position.map(usize::from)).unwrap();
-            let byte = |plane: usize| f32::from(planes[plane * count + at]);
+            let index = bricks.voxel_index(voxel.position.map(usize::from)).unwrap();
+            let byte = |plane: usize| f32::from(planes[plane * count + index]);
             opaque += usize::from(byte(0) > 0.0);
             assert!((byte(0) / 255.0 - voxel.opacity.sqrt()).abs() < 0.51 / 255.0);
             let root = byte(0) / 255.0;
@@ -138,7 +138,7 @@ mod tests {
 
     /// A ball's surface needs less than 8 bytes per voxel, and packing is deterministic.
     #[test]
-    fn packing_is_small_and_repeats() {
+    fn atlases_are_small_and_deterministic() {
         let (volume, atlas) = packed();
         assert!(atlas.bytes.len() < 8 * volume.voxels.len(), "{}", atlas.bytes.len());
         assert!(packed().1 == atlas);

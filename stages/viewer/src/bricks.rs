@@ -127,11 +127,16 @@ mod tests {
     #[test]
     fn distances_are_those_to_the_nearest_brick() {
         let kept = [[1, 2, 3], [7, 0, 5]];
-        let bricks = Bricks::new(64, |place| kept.contains(&place));
+        let bricks = Bricks::new(64, |position| kept.contains(&position));
         for (i, &distance) in bricks.distances().iter().enumerate() {
-            let place = [i % 8, i / 8 % 8, i / 64];
-            let to = |brick: &[usize; 3]| (0..3).map(|c| place[c].abs_diff(brick[c])).max();
-            assert_eq!(Some(usize::from(distance)), kept.iter().filter_map(to).min(), "{place:?}");
+            let position = [i % 8, i / 8 % 8, i / 64];
+            let distance_to =
+                |brick: &[usize; 3]| (0..3).map(|c| position[c].abs_diff(brick[c])).max();
+            assert_eq!(
+                Some(usize::from(distance)),
+                kept.iter().filter_map(distance_to).min(),
+                "{position:?}"
+            );
         }
         assert!(Bricks::new(16, |_| false).distances().iter().all(|&d| d == 255));
     }

@@ -91,7 +91,7 @@ mod tests {
     use crate::view::COEFFICIENTS;
     use scene::Intrinsics;
 
-    /// A level camera at a place, looking at the origin.
+    /// Returns a level camera at `centre` that looks at the origin.
     fn camera(centre: DVec3, up: DVec3) -> Camera {
         let back = centre.normalize();
         let right = up.cross(back).normalize();
@@ -105,30 +105,30 @@ mod tests {
     }
 
     #[test]
-    fn level_cameras_say_what_is_up() {
-        let up_is = DVec3::new(0.1, -0.5, 0.8).normalize();
-        let side = up_is.any_orthonormal_vector();
-        // All on one side, so that the mean of their up directions leans away.
-        let places = (0..12).map(|i| {
-            let turn = glam::DQuat::from_axis_angle(up_is, 0.25 * f64::from(i));
-            turn * side * 3.0 + up_is * (0.5 + 0.2 * f64::from(i))
+    fn level_cameras_determine_the_up_direction() {
+        let up = DVec3::new(0.1, -0.5, 0.8).normalize();
+        let side = up.any_orthonormal_vector();
+        // All cameras are on one side, so that the mean of their up directions is tilted.
+        let centres = (0..12).map(|i| {
+            let rotation = glam::DQuat::from_axis_angle(up, 0.25 * f64::from(i));
+            rotation * side * 3.0 + up * (0.5 + 0.2 * f64::from(i))
         });
-        let cameras: Vec<Camera> = places.map(|p| camera(p, up_is)).collect();
+        let cameras: Vec<Camera> = centres.map(|centre| camera(centre, up)).collect();
         let cameras: Vec<&Camera> = cameras.iter().collect();
         let found = up_direction(&cameras);
-        assert!(found.dot(up_is) > 0.9999, "{found}");
-        let start = cameras[start_camera(&cameras, up_is)];
-        assert!((-start.forward().dot(up_is) - ELEVATION_SINE).abs() < 0.1);
+        assert!(found.dot(up) > 0.9999, "{found}");
+        let start = cameras[start_camera(&cameras, up)];
+        assert!((-start.forward().dot(up) - ELEVATION_SINE).abs() < 0.1);
         // A single camera has its own up direction.
         assert!(up_direction(&cameras[..1]).dot(cameras[0].rotation().y_axis) > 0.9999);
     }
 
-    /// Frusta of near cameras are small, those of distant or single ones no larger than the scene
-    /// allows.
+    /// Frusta of close cameras are small; the scene's size limits frusta of distant or single
+    /// cameras.
     #[test]
     fn frusta_stay_apart() {
-        let at = |x: f64| camera(DVec3::new(x, 1.0, 1.0), DVec3::Z);
-        let cameras = [0.0, 0.1, 0.2, 0.2, 9.0].map(at);
+        let camera_at = |x: f64| camera(DVec3::new(x, 1.0, 1.0), DVec3::Z);
+        let cameras = [0.0, 0.1, 0.2, 0.2, 9.0].map(camera_at);
         let cameras: Vec<&Camera> = cameras.iter().collect();
         assert!((frustum_depth(&cameras, 10.0) - 0.04).abs() < 1e-9);
         assert!((frustum_depth(&cameras, 0.1) - 0.006).abs() < 1e-9);
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_middle_is_that_of_most_voxels() {
+    fn the_centre_ignores_outlying_voxels() {
         let bounds = Bounds::cube(1.0, 0.0, 9.0);
         let voxel = |position| Voxel {
             position,
@@ -147,8 +147,11 @@ mod tests {
         let mut voxels: Vec<Voxel> = (0..100).map(|i| voxel([40 + i % 5, 20, 32])).collect();
         voxels.push(voxel([0, 63, 63]));
         let (centre, size) = centre_and_size(&bounds, &Volume { resolution: 64, voxels });
-        let at = |c: f64| (c + 0.5) / 32.0 - 1.0;
-        assert!(centre.distance(DVec3::new(at(42.0), at(20.0), at(32.0))) < 1e-9, "{centre}");
+        let world = |c: f64| (c + 0.5) / 32.0 - 1.0;
+        assert!(
+            centre.distance(DVec3::new(world(42.0), world(20.0), world(32.0))) < 1e-9,
+            "{centre}"
+        );
         assert!(size < 0.2, "{size}");
     }
 }

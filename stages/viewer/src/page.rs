@@ -196,7 +196,7 @@ mod tests {
     use crate::view::Components;
 
     #[test]
-    fn names_cannot_leave_their_place() {
+    fn markup_in_names_is_escaped() {
         let name = "</script><b onclick=\"x\">";
         let scene = PageScene {
             name: name.to_owned(),
@@ -227,8 +227,8 @@ mod tests {
         };
         let text = page(&scene, &atlas).unwrap().into_string();
         assert!(!text.contains("<b onclick") && text.contains("&lt;b onclick"));
-        let from = text.find("id=\"scene\"").unwrap();
-        let json = &text[from..from + text[from..].find("</script>").unwrap()];
+        let scene_start = text.find("id=\"scene\"").unwrap();
+        let json = &text[scene_start..scene_start + text[scene_start..].find("</script>").unwrap()];
         let json: serde_json::Value =
             serde_json::from_str(&json[json.find('>').unwrap() + 1..]).unwrap();
         assert_eq!(json["cameras"][0]["name"], name);

@@ -94,11 +94,12 @@ mod tests {
     }
 
     #[test]
-    fn positions_and_points_are_inverse() {
+    fn cube_positions_convert_to_world_points_and_back() {
         for bounds in spaces() {
             for k in 0..64 {
-                let place = DVec3::new(f64::from(k % 4), f64::from(k / 4 % 4), f64::from(k / 16));
-                let position = 0.5 + 0.3 * (place / 3.0 - 0.5);
+                let grid_point =
+                    DVec3::new(f64::from(k % 4), f64::from(k / 4 % 4), f64::from(k / 16));
+                let position = 0.5 + 0.3 * (grid_point / 3.0 - 0.5);
                 let found = bounds.to_cube(to_world(&bounds, position));
                 assert!((found - position).length() < 1e-9, "{bounds:?} {position} {found}");
             }

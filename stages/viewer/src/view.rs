@@ -118,19 +118,20 @@ mod tests {
             .collect()
     }
 
-    fn at(numbers: &[f32; COEFFICIENTS], direction: [f32; 3]) -> [f32; 3] {
+    /// Evaluates spherical harmonics in a direction.
+    fn evaluate(coefficients: &[f32; COEFFICIENTS], direction: [f32; 3]) -> [f32; 3] {
         let basis = spherical_harmonics(direction);
-        std::array::from_fn(|c| (0..BASIS).map(|i| numbers[c * BASIS + i] * basis[i]).sum())
+        std::array::from_fn(|c| (0..BASIS).map(|i| coefficients[c * BASIS + i] * basis[i]).sum())
     }
 
     #[test]
-    fn a_smooth_function_is_found_again() {
+    fn a_smooth_function_is_reconstructed() {
         let directions = directions();
         let colours: Vec<[f32; 3]> =
             directions.iter().map(|[x, y, z]| [0.3 + 0.5 * x, x * y - 0.2 * z, -1.0]).collect();
-        let (mean, numbers) = fit(&directions, &colours);
+        let (mean, coefficients) = fit(&directions, &colours);
         for (direction, colour) in directions.iter().zip(&colours) {
-            let found = at(&numbers, *direction);
+            let found = evaluate(&coefficients, *direction);
             for c in 0..3 {
                 assert!((mean[c] + found[c] - colour[c]).abs() < 0.08, "{colour:?} {found:?}");
             }
@@ -138,25 +139,25 @@ mod tests {
         assert_eq!(fit(&[], &[]), ([0.0; 3], [0.0; COEFFICIENTS]));
     }
 
+    /// Returns the coefficients at a position in a plane.
     fn on_plane(a: f32, b: f32) -> [f32; COEFFICIENTS] {
         std::array::from_fn(|i| a * (i as f32 * 0.7).sin() + b * (i as f32 * 1.3).cos())
     }
 
-    /// Numbers on a plane are two components.
     #[test]
-    fn few_combinations_say_all() {
+    fn two_components_represent_a_plane() {
         let all: Vec<[f32; COEFFICIENTS]> =
             (0..50).map(|i| on_plane((i as f32).sin(), 0.3 * (2.0 * i as f32).cos())).collect();
-        let components = Components::of(all.iter().map(|numbers| (numbers, 1.0)), 2);
-        for numbers in &all {
+        let components = Components::of(all.iter().map(|coefficients| (coefficients, 1.0)), 2);
+        for coefficients in &all {
             let mut rebuilt = [0.0; COEFFICIENTS];
-            let found = components.project(numbers);
+            let found = components.project(coefficients);
             for (value, Component { axis, scale }) in found.zip(&components.0) {
                 for i in 0..COEFFICIENTS {
                     rebuilt[i] += value * scale * axis[i];
                 }
             }
-            for (a, b) in rebuilt.iter().zip(numbers) {
+            for (a, b) in rebuilt.iter().zip(coefficients) {
                 assert!((a - b).abs() < 1e-4, "{a} {b}");
             }
         }

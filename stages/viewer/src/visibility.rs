@@ -139,7 +139,7 @@ mod tests {
         }
     }
 
-    /// A wall hides the one behind it; a camera on the other side sees that one.
+    /// A wall hides a second wall from one camera; a camera on the other side sees the second wall.
     #[test]
     fn walls_hide_each_other() {
         let bricks = Bricks::new(32, |_| true);
@@ -153,12 +153,12 @@ mod tests {
         for space in [Space::Box, Space::Contraction] {
             let bounds = Bounds { space, ..Bounds::cube(1.0, 0.0, 9.0) };
             let cameras = [camera_at(4.0), camera_at(-4.0)];
-            let look = || visible_from(&bricks, &opacity, (&cameras, &bounds), &Progress::silent());
-            let seen = look();
-            let at = |z: usize| seen[bricks.voxel_index([16, 16, z]).unwrap()];
-            assert_eq!([at(21), at(9), at(15)], [0b01, 0b10, 0], "{space:?}");
-            let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-            assert!(alone.install(look) == seen);
+            let find = || visible_from(&bricks, &opacity, (&cameras, &bounds), &Progress::silent());
+            let visible = find();
+            let mask_at = |z: usize| visible[bricks.voxel_index([16, 16, z]).unwrap()];
+            assert_eq!([mask_at(21), mask_at(9), mask_at(15)], [0b01, 0b10, 0], "{space:?}");
+            let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+            assert!(one_thread.install(find) == visible);
         }
     }
 
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_are_spread_over_the_list() {
+    fn observers_are_spread_over_the_list() {
         let all: Vec<Camera> = (0..128).map(camera).collect();
         let chosen = observers(&all.iter().collect::<Vec<_>>(), 256);
         assert_eq!((chosen.len(), chosen[1].name.as_str()), (64, "2"));

@@ -258,9 +258,8 @@ fn read_depth(path: &Path, view: &str) -> Result<ExrImage, artifact::Failure> {
 mod tests {
     use super::*;
 
-    /// No two figures share a path or a label.
     #[test]
-    fn figures_are_told_apart() {
+    fn figures_have_distinct_paths_and_labels() {
         let all = metrics(Perceptual::new(None).unwrap());
         let figures: Vec<ScoreFormat> = all.iter().flat_map(|metric| metric.figures()).collect();
         for (i, figure) in figures.iter().enumerate() {

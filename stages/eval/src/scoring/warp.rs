@@ -171,7 +171,7 @@ mod tests {
         }
     }
 
-    fn image(depth: f32) -> ExrImage {
+    fn depth_image(depth: f32) -> ExrImage {
         let channels = vec![("A".into(), vec![1.0; 160]), ("Z".into(), vec![depth; 160])];
         ExrImage { width: 40, height: 4, channels }
     }
@@ -181,26 +181,26 @@ mod tests {
         Image::new(40, 4, 3, (0..160).flat_map(|i| [level(i); 3]).collect())
     }
 
-    fn walls_warped(depth: f32) -> (WarpScore, Rgba8) {
-        warp_masked(depth, [None, None])
+    fn warp_walls(depth: f32) -> (WarpScore, Rgba8) {
+        warp_masked_walls(depth, [None, None])
     }
 
-    fn warp_masked(depth: f32, [mask, other_mask]: [Option<Mask>; 2]) -> (WarpScore, Rgba8) {
-        let (a, b, depth) = (camera("a", 0.0), camera("b", 0.1), image(depth));
+    fn warp_masked_walls(depth: f32, [mask, other_mask]: [Option<Mask>; 2]) -> (WarpScore, Rgba8) {
+        let (a, b, depth) = (camera("a", 0.0), camera("b", 0.1), depth_image(depth));
         let view = TrueView { camera: &a, depth: &depth, truth: &wall(0), mask };
         let neighbour = TrueView { camera: &b, depth: &depth, truth: &wall(2), mask: other_mask };
         warp(&view, &neighbour).unwrap()
     }
 
-    /// A step of a tenth to the side in front of a wall at distance 2 moves its image by two
+    /// The neighbour's camera is 0.1 to the right, so that a wall at distance 2 is shifted by two
     /// pixels.
     #[test]
     fn right_depth_agrees_and_wrong_depth_does_not() {
-        let (right, picture) = walls_warped(2.0);
-        assert!(right.psnr > 60.0 && (right.seen - 0.95).abs() < 0.03, "{right:?}");
-        // The view's left border lies outside the neighbour's image.
+        let (correct, picture) = warp_walls(2.0);
+        assert!(correct.psnr > 60.0 && (correct.seen - 0.95).abs() < 0.03, "{correct:?}");
+        // The view's left border is outside the neighbour's image.
         assert_eq!(picture.data[..3], [120, 20, 30]);
-        let (wrong, _) = walls_warped(3.0);
+        let (wrong, _) = warp_walls(3.0);
         assert!(wrong.psnr < 25.0, "{wrong:?}");
     }
 
@@ -213,10 +213,10 @@ mod tests {
             height: 4,
             counts: (0..160).map(|i| (i % 40 < 20) == is_left).collect(),
         };
-        let (own, picture) = warp_masked(2.0, [Some(half(true)), None]);
+        let (own, picture) = warp_masked_walls(2.0, [Some(half(true)), None]);
         assert!((own.seen - 0.45).abs() < 0.03, "{own:?}");
         assert_eq!(picture.data[4 * 30..][..3], [120, 20, 30]);
-        let (others, _) = warp_masked(2.0, [None, Some(half(false))]);
+        let (others, _) = warp_masked_walls(2.0, [None, Some(half(false))]);
         assert!((others.seen - 0.45).abs() < 0.06, "{others:?}");
     }
 
@@ -226,7 +226,7 @@ mod tests {
         for (angle, is_compared) in [(10.0_f64, true), (30.0, false)] {
             let baseline = 2.0 * 2.0 * (angle / 2.0).to_radians().tan();
             let (a, b) = (camera("a", 0.0), camera("b", baseline));
-            assert_eq!(are_near(&a, &b, &image(2.0)), is_compared, "{angle}");
+            assert_eq!(are_near(&a, &b, &depth_image(2.0)), is_compared, "{angle}");
         }
     }
 

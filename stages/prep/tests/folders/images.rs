@@ -10,21 +10,22 @@ use super::kit::{
     write_colmap, write_image, write_llff, write_mask, write_photographs, write_transforms,
 };
 
-const THREE: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
+/// Log line about the data set of most cases.
+const TRANSFORMS: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
 const COLMAP: &str = "COLMAP: 10 photographs from sparse/0";
 
-/// EXR photographs; the second has 16 pixels of 40.
-fn exr(folder: &Path) {
+/// Writes EXR photographs; 16 pixels of the second have the value 40.
+fn write_exrs(folder: &Path) {
     std::fs::create_dir_all(folder.join("images")).unwrap();
     for number in 0..3 {
         let channels = ["R", "G", "B"].map(|name| Channel { name, sample_type: SampleType::Half });
         let size = (SIDE as usize, SIDE as usize);
-        let bright = if number == 1 { 3 * SIDE as usize } else { 0 };
+        let bright_samples = if number == 1 { 3 * SIDE as usize } else { 0 };
         let path = folder.join(format!("images/a{number}.exr"));
         write_exr(&path, size, &channels, "", |first, _, samples| {
             for (i, sample) in samples.iter_mut().enumerate() {
-                let at = 3 * first * size.0 + i;
-                *sample = if at < bright { 40.0 } else { (at % 97) as f32 / 97.0 };
+                let index = 3 * first * size.0 + i;
+                *sample = if index < bright_samples { 40.0 } else { (index % 97) as f32 / 97.0 };
             }
             Ok::<(), PixelError>(())
         })
@@ -33,8 +34,8 @@ fn exr(folder: &Path) {
     write_transforms(folder, &transforms("images/a#.exr", 3));
 }
 
-/// JPEGs with an EXIF orientation, and cameras of a size.
-fn oriented(folder: &Path, stored: (u32, u32), orientation: u8, camera: (u32, u32)) {
+/// Writes JPEGs with an EXIF orientation, and cameras of the given size.
+fn write_oriented(folder: &Path, stored: (u32, u32), orientation: u8, camera: (u32, u32)) {
     for number in 0..3 {
         let image = jpeg(&photograph(stored.0, stored.1, number), Some(orientation));
         write(folder.join(format!("images/a{number}.jpg")), image);
@@ -44,6 +45,7 @@ fn oriented(folder: &Path, stored: (u32, u32), orientation: u8, camera: (u32, u3
     write_transforms(folder, &list);
 }
 
+/// Returns the expected scene with views of the given size.
 fn of_size(mut scene: Scene, width: f64, height: f64) -> Expected {
     for view in scene.train.iter_mut().chain(&mut scene.test) {
         (view.inside[0], view.inside[1]) = (width, height);
@@ -51,15 +53,15 @@ fn of_size(mut scene: Scene, width: f64, height: f64) -> Expected {
     Expected::Scene(scene)
 }
 
-/// Ten photographs with black strips of some widths: top, right, bottom, left.
-fn strips(folder: &Path, [top, right, bottom, left]: [u32; 4]) {
+/// Writes ten photographs with dark strips of the given widths: top, right, bottom, left.
+fn write_strips(folder: &Path, [top, right, bottom, left]: [u32; 4]) {
     write_colmap(&folder.join("sparse/0"), CAMERA, "a#.png", 10);
     for number in 0..10 {
         let mut image = photograph(SIDE, SIDE, number);
-        for at in 0..SIDE * SIDE {
-            let (x, y) = (at % SIDE, at / SIDE);
+        for pixel in 0..SIDE * SIDE {
+            let (x, y) = (pixel % SIDE, pixel / SIDE);
             if x < left || x >= SIDE - right || y < top || y >= SIDE - bottom {
-                image.data[4 * at as usize..][..3].fill(2);
+                image.data[4 * pixel as usize..][..3].fill(2);
             }
         }
         write_image(&folder.join(format!("images/a{number}.png")), &image);
@@ -70,35 +72,36 @@ fn is_inside(x: u32, y: u32) -> bool {
     (3..SIDE - 3).contains(&x) && (3..SIDE - 3).contains(&y)
 }
 
-fn masked_strips(folder: &Path) {
-    strips(folder, [3; 4]);
+fn write_masked_strips(folder: &Path) {
+    write_strips(folder, [3; 4]);
     for number in 0..10 {
         write_mask(&folder.join(format!("masks/a{number}.png")), (SIDE, SIDE), is_inside);
     }
 }
 
-fn with_lines(mut scene: Scene, further: &[&'static str]) -> Scene {
-    scene.further = further.to_vec();
+fn with_lines(mut scene: Scene, lines: &[&'static str]) -> Scene {
+    scene.further = lines.to_vec();
     scene
 }
 
-/// Objects on black: views of a disc of several sizes.
-fn discs(folder: &Path) {
+/// Writes views of an object on black: a disc of several sizes.
+fn write_discs(folder: &Path) {
     write_colmap(&folder.join("sparse/0"), CAMERA, "a#.png", 10);
     for number in 0..10 {
-        let radius = 24 + 3 * number as i64;
+        let radius_squared = 24 + 3 * number as i64;
         let mut image = photograph(SIDE, SIDE, number);
-        for at in 0..(SIDE * SIDE) as usize {
-            let (x, y) = (at as i64 % 16 - 8, at as i64 / 16 - 8);
-            if x * x + y * y > radius {
-                image.data[4 * at..][..3].fill(0);
+        for pixel in 0..(SIDE * SIDE) as usize {
+            let (x, y) = (pixel as i64 % 16 - 8, pixel as i64 / 16 - 8);
+            if x * x + y * y > radius_squared {
+                image.data[4 * pixel..][..3].fill(0);
             }
         }
         write_image(&folder.join(format!("images/a{number}.png")), &image);
     }
 }
 
-fn unread(folder: &Path, name: &str, content: &[u8]) {
+/// Writes a data set whose second photograph has the given name and content.
+fn write_format(folder: &Path, name: &str, content: &[u8]) {
     let mut list = transforms("images/a#.png", 3);
     list["frames"][1]["file_path"] = json!(name);
     write_photographs(folder, "images/a#.png", 3);
@@ -111,27 +114,27 @@ fn exif_cases() -> Vec<Case> {
     vec![
         case(
             "colmap#1456: a square, turned by 90°",
-            |folder| oriented(folder, (SIDE, SIDE), 6, (SIDE, SIDE)),
-            Expected::Scene(held_out("a#", 3, &[THREE, ASSUMED])),
+            |folder| write_oriented(folder, (SIDE, SIDE), 6, (SIDE, SIDE)),
+            Expected::Scene(held_out("a#", 3, &[TRANSFORMS, ASSUMED])),
         ),
         case(
             "colmap#2104: turned by 180°",
-            |folder| oriented(folder, (SIDE, 12), 3, (SIDE, 12)),
-            of_size(held_out("a#", 3, &[THREE, ASSUMED]), 16.0, 12.0),
+            |folder| write_oriented(folder, (SIDE, 12), 3, (SIDE, 12)),
+            of_size(held_out("a#", 3, &[TRANSFORMS, ASSUMED]), 16.0, 12.0),
         ),
         case(
             "the camera has the stored shape",
-            |folder| oriented(folder, (SIDE, 12), 6, (SIDE, 12)),
-            of_size(held_out("a#", 3, &[THREE]), 16.0, 12.0),
+            |folder| write_oriented(folder, (SIDE, 12), 6, (SIDE, 12)),
+            of_size(held_out("a#", 3, &[TRANSFORMS]), 16.0, 12.0),
         ),
         case(
             "the camera has the turned shape",
-            |folder| oriented(folder, (SIDE, 12), 6, (12, SIDE)),
+            |folder| write_oriented(folder, (SIDE, 12), 6, (12, SIDE)),
             of_size(
                 held_out(
                     "a#",
                     3,
-                    &[THREE, "3 photographs are turned upright, as EXIF data require"],
+                    &[TRANSFORMS, "3 photographs are turned upright, as EXIF data require"],
                 ),
                 12.0,
                 16.0,
@@ -144,7 +147,7 @@ fn border_cases() -> Vec<Case> {
     vec![
         case(
             "f2-nerf#33: strips around every photograph",
-            |folder| strips(folder, [3; 4]),
+            |folder| write_strips(folder, [3; 4]),
             Expected::Scene(with_lines(
                 held_out("a#", 10, &[COLMAP]),
                 &[
@@ -154,7 +157,7 @@ fn border_cases() -> Vec<Case> {
         ),
         case(
             "letterboxing",
-            |folder| strips(folder, [2, 0, 3, 0]),
+            |folder| write_strips(folder, [2, 0, 3, 0]),
             Expected::Scene(with_lines(
                 held_out("a#", 10, &[COLMAP]),
                 &[
@@ -162,7 +165,7 @@ fn border_cases() -> Vec<Case> {
                 ],
             )),
         ),
-        case("strips that are masked out", masked_strips, {
+        case("strips that are masked out", write_masked_strips, {
             let mut scene = held_out(
                 "a#",
                 10,
@@ -183,7 +186,7 @@ fn border_cases() -> Vec<Case> {
         }),
         case(
             "objects on black are on black",
-            discs,
+            write_discs,
             Expected::Scene(with_lines(
                 held_out("a#", 10, &[COLMAP]),
                 &[
@@ -198,28 +201,28 @@ fn format_cases() -> Vec<Case> {
     vec![
         case(
             "HEIC",
-            |folder| unread(folder, "images/b.HEIC", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"),
+            |folder| write_format(folder, "images/b.HEIC", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"),
             Expected::Refused(
                 "dataset: DIR/transforms.json: frame 1 (images/b.HEIC): DIR/images/b.HEIC is a HEIC image, which is not supported; convert: magick mogrify -format jpg -quality 98 'DIR/images'/*.HEIC",
             ),
         ),
         case(
             "WebP that is named PNG",
-            |folder| unread(folder, "images/b.png", b"RIFF\x10\0\0\0WEBPVP8 \0\0\0\0"),
+            |folder| write_format(folder, "images/b.png", b"RIFF\x10\0\0\0WEBPVP8 \0\0\0\0"),
             Expected::Refused(
                 "dataset: DIR/transforms.json: frame 1 (images/b.png): DIR/images/b.png is a WebP image, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.png",
             ),
         ),
         case(
             "TIFF",
-            |folder| unread(folder, "images/b.tif", b"II*\0\x08\0\0\0\0\0\0\0"),
+            |folder| write_format(folder, "images/b.tif", b"II*\0\x08\0\0\0\0\0\0\0"),
             Expected::Refused(
                 "dataset: DIR/transforms.json: frame 1 (images/b.tif): DIR/images/b.tif is a TIFF image, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.tif",
             ),
         ),
         case(
             "BMP",
-            |folder| unread(folder, "images/b.bmp", b"BM\x46\0\0\0\0\0\0\0\x36\0\0\0"),
+            |folder| write_format(folder, "images/b.bmp", b"BM\x46\0\0\0\0\0\0\0\x36\0\0\0"),
             Expected::Refused(
                 "dataset: DIR/transforms.json: frame 1 (images/b.bmp): DIR/images/b.bmp is a BMP image, which is not supported; convert: magick mogrify -format png 'DIR/images'/*.bmp",
             ),
@@ -227,7 +230,7 @@ fn format_cases() -> Vec<Case> {
         case(
             "HEIC that was converted",
             |folder| {
-                unread(folder, "images/b.HEIC", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic");
+                write_format(folder, "images/b.HEIC", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic");
                 write_image(&folder.join("images/b.jpg"), &photograph(SIDE, SIDE, 1));
             },
             {
@@ -235,7 +238,7 @@ fn format_cases() -> Vec<Case> {
                     "a#",
                     3,
                     &[
-                        THREE,
+                        TRANSFORMS,
                         "1 file name found with a different extension (first: images/b.HEIC is images/b.jpg)",
                     ],
                 );
@@ -260,9 +263,9 @@ fn format_cases() -> Vec<Case> {
 
 pub(crate) fn cases() -> Vec<Case> {
     let mut cases = vec![
-        case("ns#1097, LFS#1011: EXR above 1", exr, {
+        case("ns#1097, LFS#1011: EXR above 1", write_exrs, {
             Expected::Scene(with_lines(
-                held_out("a#", 3, &[THREE]),
+                held_out("a#", 3, &[TRANSFORMS]),
                 &[
                     "warning: 16 of 768 pixels (2.08 %) are brighter than 1 and clipped to 1, in 1 of 3 EXR photographs (first: frame a1); to keep them, scale the files to at most 1",
                 ],
@@ -279,8 +282,11 @@ pub(crate) fn cases() -> Vec<Case> {
                 write_transforms(folder, &list);
             },
             {
-                let mut scene =
-                    held_out("a#", 3, &[THREE, "photographs have 2 sizes, from 12×16 to 16×16"]);
+                let mut scene = held_out(
+                    "a#",
+                    3,
+                    &[TRANSFORMS, "photographs have 2 sizes, from 12×16 to 16×16"],
+                );
                 scene.train[0].inside = [12.0, 16.0, 20.0, 20.0, 6.0, 8.0];
                 Expected::Scene(scene)
             },

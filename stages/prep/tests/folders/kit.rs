@@ -1,4 +1,4 @@
-//! Folders of tiny photographs, and what `prep` is expected to make of them.
+//! Folders of tiny photographs, and the expected results of `prep`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,9 +14,9 @@ pub(crate) const FOCAL: f64 = 20.0;
 /// Intrinsics of a camera of the kit: width, height, fx, fy, cx, cy.
 pub(crate) const INSIDE: [f64; 6] = [16.0, 16.0, FOCAL, FOCAL, 8.0, 8.0];
 
-/// Folder, and what `prep` is expected to make of it.
+/// Folder of photographs, and the expected result of `prep`.
 pub(crate) struct Case {
-    /// Report that the case is after, or its condition.
+    /// Issue that the case reproduces, or condition that it tests.
     pub(crate) name: &'static str,
     /// Writes the folder.
     pub(crate) make: fn(&Path),
@@ -28,7 +28,7 @@ pub(crate) struct Case {
 /// Result of `prep`.
 pub(crate) enum Expected {
     Scene(Scene),
-    /// The whole message, in which `DIR` is the folder.
+    /// Whole message; `DIR` stands for the folder.
     Refused(&'static str),
 }
 
@@ -37,9 +37,9 @@ pub(crate) enum Expected {
 pub(crate) struct Scene {
     pub(crate) train: Vec<View>,
     pub(crate) test: Vec<View>,
-    /// Lines on the data set, all of them in order.
+    /// All notes on the data set, in order.
     pub(crate) notes: Vec<&'static str>,
-    /// Further lines, such as those on the background, in any place.
+    /// Further notes, such as those on the background, in any order.
     pub(crate) further: Vec<&'static str>,
 }
 
@@ -48,26 +48,27 @@ pub(crate) struct View {
     pub(crate) name: String,
     /// Number of the pose.
     pub(crate) pose: usize,
+    /// Intrinsics: width, height, fx, fy, cx, cy.
     pub(crate) inside: [f64; 6],
     /// Lens as in `views.json`; null for a pinhole.
     pub(crate) lens: Value,
-    /// True for each pixel that counts; no mask where `None`.
+    /// True for the pixels that the mask keeps; `None` if the view has no mask.
     pub(crate) mask: Option<fn(u32, u32) -> bool>,
 }
 
-/// Views of the kit with poses and names of the same numbers.
+/// Returns views whose poses have the given numbers. `#` in `names` stands for the number.
 pub(crate) fn views(names: &str, numbers: impl IntoIterator<Item = usize>) -> Vec<View> {
-    let of = |pose: usize| View {
+    let view = |pose: usize| View {
         name: names.replace('#', &pose.to_string()),
         pose,
         inside: INSIDE,
         lens: Value::Null,
         mask: None,
     };
-    numbers.into_iter().map(of).collect()
+    numbers.into_iter().map(view).collect()
 }
 
-/// Scene of views of which every eighth is held out.
+/// Returns a scene in which every eighth view is held out.
 pub(crate) fn held_out(names: &str, count: usize, notes: &[&'static str]) -> Scene {
     let is_test = |number: &usize| number.is_multiple_of(8);
     Scene {
@@ -78,13 +79,13 @@ pub(crate) fn held_out(names: &str, count: usize, notes: &[&'static str]) -> Sce
     }
 }
 
-/// Case with the default parameters.
+/// Returns a case with the default parameters.
 pub(crate) fn case(name: &'static str, make: fn(&Path), expected: Expected) -> Case {
     Case { name, make, params: json!({}), expected }
 }
 
 impl Case {
-    /// Runs `prep`; returns how the result differs from the expected one.
+    /// Runs `prep`. Describes the result's first difference from the expected one, if any.
     pub(crate) fn failure(&self) -> Option<String> {
         let dir = tempfile::tempdir().unwrap();
         let folder = dir.path().join("data");
@@ -106,15 +107,16 @@ impl Case {
             .args(["--progress", "none", "--threads", "1"])
             .output()
             .unwrap();
-        let (code, said) = (finished.status.code(), String::from_utf8_lossy(&finished.stderr));
+        let (code, stderr) = (finished.status.code(), String::from_utf8_lossy(&finished.stderr));
         match &self.expected {
-            Expected::Scene(_) if code != Some(0) => Some(format!("exit code {code:?}: {said}")),
+            Expected::Scene(_) if code != Some(0) => Some(format!("exit code {code:?}: {stderr}")),
             Expected::Scene(scene) => scene.failure(&output),
             Expected::Refused(message) => {
                 let message = message.replace("DIR", &folder.display().to_string());
-                let is_refused = code == Some(3) && said.trim_end() == format!("prep: {message}");
-                (!is_refused)
-                    .then(|| format!("exit code {code:?}:\n  {said}  expected:\n  prep: {message}"))
+                let is_refused = code == Some(3) && stderr.trim_end() == format!("prep: {message}");
+                (!is_refused).then(|| {
+                    format!("exit code {code:?}:\n  {stderr}  expected:\n  prep: {message}")
+                })
             }
         }
     }
@@ -129,13 +131,13 @@ impl Scene {
         let notes = read_json(&output.join("scene.json"))["notes"].clone();
         let notes: Vec<String> = serde_json::from_value(notes).unwrap();
         let is_choice = |note: &String| note.contains("the photographs are the LR images");
-        let own = notes.iter().position(is_choice).unwrap();
-        if notes[..own] != self.notes[..] {
-            return Some(format!("notes {:#?}, expected {:#?}", &notes[..own], self.notes));
+        let split = notes.iter().position(is_choice).unwrap();
+        if notes[..split] != self.notes[..] {
+            return Some(format!("notes {:#?}, expected {:#?}", &notes[..split], self.notes));
         }
-        for line in &self.further {
-            if !notes[own..].iter().any(|note| note == line) {
-                return Some(format!("no line {line:?} in {:#?}", &notes[own..]));
+        for expected in &self.further {
+            if !notes[split..].iter().any(|note| note == expected) {
+                return Some(format!("no note {expected:?} in {:#?}", &notes[split..]));
             }
         }
         let train = failure_of_views(&output.join("train"), &self.train);
@@ -178,17 +180,17 @@ fn failure_of_view(subtree: &Path, view: &Value, expected: &View) -> Option<Stri
     };
     let Some(mask) = mask else { return Some(format!("{}: no mask", expected.name)) };
     let mask = pixels::read_png(&subtree.join(mask)).unwrap();
-    let wrong = (0..mask.width * mask.height).find(|&at| {
-        let is_white = mask.data[4 * at] == 255;
-        is_white != counts((at % mask.width) as u32, (at / mask.width) as u32)
+    let wrong = (0..mask.width * mask.height).find(|&i| {
+        let is_white = mask.data[4 * i] == 255;
+        is_white != counts((i % mask.width) as u32, (i / mask.width) as u32)
     });
-    wrong.map(|at| {
-        let (x, y) = (at % mask.width, at / mask.width);
+    wrong.map(|i| {
+        let (x, y) = (i % mask.width, i / mask.width);
         format!("{}: mask differs at ({x}, {y})", expected.name)
     })
 }
 
-/// Camera `i` on a ring around the origin, which it faces: 4×4, row by row.
+/// Returns the pose of camera `i` on a ring; the camera faces the origin. 4×4, row by row.
 pub(crate) fn pose_of(i: usize) -> [[f64; 4]; 4] {
     let angle = 0.5 * i as f64;
     let (sin, cos) = angle.sin_cos();
@@ -200,7 +202,7 @@ pub(crate) fn pose_of(i: usize) -> [[f64; 4]; 4] {
     ]
 }
 
-/// Opaque photograph without a flat border, another for each seed.
+/// Creates an opaque photograph without a flat border, a different one for each seed.
 pub(crate) fn photograph(width: u32, height: u32, seed: usize) -> Rgba8 {
     let level = |i: u32, c: u32| {
         let hash = (i + 1).wrapping_mul(2_654_435_761) ^ (c + 7 * seed as u32).wrapping_mul(40_503);
@@ -210,13 +212,13 @@ pub(crate) fn photograph(width: u32, height: u32, seed: usize) -> Rgba8 {
     Rgba8::new(width as usize, height as usize, (0..width * height).flat_map(pixel).collect())
 }
 
-fn above(path: &Path) {
+fn create_parent(path: &Path) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
 }
 
 /// Writes a file and the folders above it.
 pub(crate) fn write(path: PathBuf, bytes: impl AsRef<[u8]>) {
-    above(&path);
+    create_parent(&path);
     fs::write(path, bytes).unwrap();
 }
 
@@ -233,7 +235,7 @@ pub(crate) fn write_image(path: &Path, image: &Rgba8) {
     write(path.to_path_buf(), bytes);
 }
 
-/// JPEG with an EXIF orientation, if any.
+/// Encodes an image as JPEG, with an EXIF orientation if given.
 pub(crate) fn jpeg(image: &Rgba8, orientation: Option<u8>) -> Vec<u8> {
     let rgb: Vec<u8> = image.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
     let mut bytes = Vec::new();
@@ -250,26 +252,26 @@ pub(crate) fn jpeg(image: &Rgba8, orientation: Option<u8>) -> Vec<u8> {
     bytes
 }
 
-/// Mask of the kit's size: white where `counts` says so, black elsewhere.
+/// Writes a mask: white where `counts` is true, black elsewhere.
 pub(crate) fn write_mask(path: &Path, size: (u32, u32), counts: fn(u32, u32) -> bool) {
     let pixel = |i: u32| if counts(i % size.0, i / size.0) { [255; 4] } else { [0, 0, 0, 255] };
     let data = (0..size.0 * size.1).flat_map(pixel).collect();
     write_image(path, &Rgba8::new(size.0 as usize, size.1 as usize, data));
 }
 
-/// Mask whose left half counts.
+/// Returns true in the left half of a photograph.
 pub(crate) fn left_half(x: u32, _: u32) -> bool {
     x < SIDE / 2
 }
 
-/// Writes photographs of a pattern of names, in which `#` is the number.
+/// Writes photographs named by the pattern `names`, in which `#` stands for the number.
 pub(crate) fn write_photographs(folder: &Path, names: &str, count: usize) {
     for number in 0..count {
         write_photograph(&folder.join(names.replace('#', &number.to_string())), number);
     }
 }
 
-/// `transforms.json` of frames with a pattern of names, as JSON to change.
+/// Returns `transforms.json` with frames named by a pattern, as JSON to modify.
 pub(crate) fn transforms(names: &str, count: usize) -> Value {
     let frames: Vec<Value> = (0..count)
         .map(|number| {
@@ -288,7 +290,7 @@ pub(crate) fn write_transforms(folder: &Path, transforms: &Value) {
 /// Camera of a COLMAP model as text.
 pub(crate) const CAMERA: &str = "1 PINHOLE 16 16 20 20 8 8\n";
 
-/// Line of an image in COLMAP's text, without its points.
+/// Returns an image's line in COLMAP's text format, without the line of its points.
 pub(crate) fn colmap_line(number: usize, name: &str) -> String {
     let pose = pose_of(number);
     let column = |c: usize| glam::DVec3::new(pose[0][c], pose[1][c], pose[2][c]);
@@ -298,7 +300,7 @@ pub(crate) fn colmap_line(number: usize, name: &str) -> String {
     format!("{id} {} {} {} {} {} {} {} 1 {name}\n", q.w, q.x, q.y, q.z, t.x, t.y, t.z)
 }
 
-/// Writes a COLMAP model as text: a camera and images of a pattern of names.
+/// Writes a COLMAP model as text: a camera, and images named by a pattern.
 pub(crate) fn write_colmap(model: &Path, camera: &str, names: &str, count: usize) {
     let mut images = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n".to_owned();
     for number in 0..count {
@@ -309,7 +311,7 @@ pub(crate) fn write_colmap(model: &Path, camera: &str, names: &str, count: usize
     write(model.join("images.txt"), images);
 }
 
-/// Writes `poses_bounds.npy` of poses by number.
+/// Writes `poses_bounds.npy` with the poses of the given numbers.
 pub(crate) fn write_llff(folder: &Path, poses: &[usize], bounds: [f64; 2]) {
     let mut numbers: Vec<f64> = Vec::new();
     for &pose in poses {

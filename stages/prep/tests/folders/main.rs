@@ -1,5 +1,5 @@
-//! Folders as people have them, after public reports on other programs: what `prep` reads, assumes
-//! and refuses. A subject is a module with a table of its cases.
+//! Folders like those in public reports on other programs: `prep` reads each folder, with notes on
+//! its assumptions, or refuses the folder. Each subject is a module with a table of cases.
 
 mod images;
 mod kit;
@@ -12,7 +12,7 @@ mod splits;
 
 use kit::Case;
 
-/// Tables of cases, one a subject.
+/// Tables of cases, one per subject.
 const SUBJECTS: &[fn() -> Vec<Case>] = &[
     names::cases,
     reduced::cases,
@@ -24,7 +24,7 @@ const SUBJECTS: &[fn() -> Vec<Case>] = &[
 ];
 
 #[test]
-fn folders_as_people_have_them() {
+fn folders_of_users_are_read_or_refused() {
     let mut failures = Vec::new();
     for case in SUBJECTS.iter().flat_map(|cases| cases()) {
         failures.extend(case.failure().map(|failure| format!("{}: {failure}", case.name)));

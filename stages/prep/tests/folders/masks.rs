@@ -1,4 +1,4 @@
-//! Masks of every convention.
+//! Cases of masks in all supported conventions.
 
 use std::path::Path;
 
@@ -13,29 +13,30 @@ fn right_half(x: u32, y: u32) -> bool {
     !left_half(x, y)
 }
 
-fn colmap(folder: &Path, names: &str, count: usize) {
+fn write_colmap_photographs(folder: &Path, names: &str, count: usize) {
     write_colmap(&folder.join("sparse/0"), CAMERA, names, count);
     write_photographs(&folder.join("images"), names, count);
 }
 
-fn masks(folder: &Path, names: &str, numbers: impl IntoIterator<Item = usize>) {
+fn write_masks(folder: &Path, names: &str, numbers: impl IntoIterator<Item = usize>) {
     for number in numbers {
         let path = folder.join(names.replace('#', &number.to_string()));
         write_mask(&path, (SIDE, SIDE), left_half);
     }
 }
 
-/// Transforms with a mask for some frames.
-fn listed(folder: &Path, size: (u32, u32), counts: fn(u32, u32) -> bool) {
+/// Writes `transforms.json` with three frames, and masks for the first and the last.
+fn write_masked_frames(folder: &Path, size: (u32, u32), counts: fn(u32, u32) -> bool) {
     write_photographs(folder, "images/a#.png", 3);
-    let mut list: Value = transforms("images/a#.png", 3);
+    let mut content: Value = transforms("images/a#.png", 3);
     for number in [0, 2] {
         write_mask(&folder.join(format!("masks/m{number}.png")), size, counts);
-        list["frames"][number]["mask_path"] = json!(format!("masks/m{number}.png"));
+        content["frames"][number]["mask_path"] = json!(format!("masks/m{number}.png"));
     }
-    write_transforms(folder, &list);
+    write_transforms(folder, &content);
 }
 
+/// Returns the scene with masks for the views with the given pose numbers.
 fn masked(mut scene: Scene, numbers: &[usize], counts: fn(u32, u32) -> bool) -> Expected {
     for view in scene.train.iter_mut().chain(&mut scene.test) {
         if numbers.contains(&view.pose) {
@@ -45,23 +46,23 @@ fn masked(mut scene: Scene, numbers: &[usize], counts: fn(u32, u32) -> bool) -> 
     Expected::Scene(scene)
 }
 
-const TEN: &str = "COLMAP: 10 photographs from sparse/0";
-const THREE: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
+const COLMAP_NOTE: &str = "COLMAP: 10 photographs from sparse/0";
+const TRANSFORMS_NOTE: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
 
 fn colmap_cases() -> Vec<Case> {
     vec![
         case(
             "LFS#1612: masks/NAME.png",
             |folder| {
-                colmap(folder, "a#.jpg", 10);
-                masks(folder, "masks/a#.png", 3..6);
+                write_colmap_photographs(folder, "a#.jpg", 10);
+                write_masks(folder, "masks/a#.png", 3..6);
             },
             masked(
                 held_out(
                     "a#",
                     10,
                     &[
-                        TEN,
+                        COLMAP_NOTE,
                         "3 of 10 views have masks (3 by masks/NAME.png, where black is excluded)",
                     ],
                 ),
@@ -72,15 +73,15 @@ fn colmap_cases() -> Vec<Case> {
         case(
             "ns PR#2115: masks/NAME.EXT.png, in folders",
             |folder| {
-                colmap(folder, "x/a#.JPG", 10);
-                masks(folder, "masks/x/a#.JPG.png", 0..10);
+                write_colmap_photographs(folder, "x/a#.JPG", 10);
+                write_masks(folder, "masks/x/a#.JPG.png", 0..10);
             },
             masked(
                 held_out(
                     "a#",
                     10,
                     &[
-                        TEN,
+                        COLMAP_NOTE,
                         "10 of 10 views have masks (10 by masks/NAME.EXT.png, where black is excluded)",
                     ],
                 ),
@@ -91,9 +92,9 @@ fn colmap_cases() -> Vec<Case> {
         case(
             "both conventions for one photograph",
             |folder| {
-                colmap(folder, "a#.jpg", 2);
-                masks(folder, "masks/a#.png", [1]);
-                masks(folder, "masks/a#.jpg.png", [1]);
+                write_colmap_photographs(folder, "a#.jpg", 2);
+                write_masks(folder, "masks/a#.png", [1]);
+                write_masks(folder, "masks/a#.jpg.png", [1]);
             },
             Expected::Refused(
                 "dataset: DIR/images/a1.jpg: masks/a1.jpg.png and masks/a1.png both match \"masks/a1.png\"; remove one of the two, or name it exactly",
@@ -102,15 +103,15 @@ fn colmap_cases() -> Vec<Case> {
         case(
             "masks of other names",
             |folder| {
-                colmap(folder, "a#.jpg", 10);
-                masks(folder, "masks/b#.png", 0..2);
-                masks(folder, "segmentation/a#.png", 0..1);
+                write_colmap_photographs(folder, "a#.jpg", 10);
+                write_masks(folder, "masks/b#.png", 0..2);
+                write_masks(folder, "segmentation/a#.png", 0..1);
             },
             Expected::Scene(held_out(
                 "a#",
                 10,
                 &[
-                    TEN,
+                    COLMAP_NOTE,
                     "warning: 2 unused files in masks look like masks (first: masks/b0.png); name the mask of NAME.EXT masks/NAME.png or masks/NAME.EXT.png",
                     "warning: 1 unused file in segmentation looks like a mask (first: segmentation/a0.png); name the mask of NAME.EXT masks/NAME.png or masks/NAME.EXT.png",
                 ],
@@ -126,7 +127,7 @@ fn llff_cases() -> Vec<Case> {
             |folder| {
                 write_photographs(folder, "images/a#.png", 9);
                 write_llff(folder, &Vec::from_iter(0..9), [2.0, 6.0]);
-                masks(folder, "masks/A#.png", [1]);
+                write_masks(folder, "masks/A#.png", [1]);
             },
             masked(
                 held_out(
@@ -146,7 +147,7 @@ fn llff_cases() -> Vec<Case> {
             |folder| {
                 write_photographs(folder, "images/a#.png", 9);
                 write_llff(folder, &Vec::from_iter(0..9), [2.0, 6.0]);
-                masks(folder, "images/dynamic_mask_a#.png", 0..9);
+                write_masks(folder, "images/dynamic_mask_a#.png", 0..9);
             },
             masked(
                 held_out(
@@ -168,12 +169,15 @@ fn transforms_cases() -> Vec<Case> {
     vec![
         case(
             "mask_path",
-            |folder| listed(folder, (SIDE, SIDE), left_half),
+            |folder| write_masked_frames(folder, (SIDE, SIDE), left_half),
             masked(
                 held_out(
                     "a#",
                     3,
-                    &[THREE, "2 of 3 views have masks (2 by mask_path, where black is excluded)"],
+                    &[
+                        TRANSFORMS_NOTE,
+                        "2 of 3 views have masks (2 by mask_path, where black is excluded)",
+                    ],
                 ),
                 &[0, 2],
                 left_half,
@@ -181,13 +185,13 @@ fn transforms_cases() -> Vec<Case> {
         ),
         case(
             "ns#2020, ns#3659: masks of another size",
-            |folder| listed(folder, (SIDE / 2, SIDE / 2), |x, _| x < SIDE / 4),
+            |folder| write_masked_frames(folder, (SIDE / 2, SIDE / 2), |x, _| x < SIDE / 4),
             masked(
                 held_out(
                     "a#",
                     3,
                     &[
-                        THREE,
+                        TRANSFORMS_NOTE,
                         "2 of 3 views have masks (2 by mask_path, where black is excluded)",
                         "2 masks differ from the photograph in size; resampled by nearest neighbour (first: masks/m0.png: 8×8 for 16×16)",
                     ],
@@ -198,13 +202,13 @@ fn transforms_cases() -> Vec<Case> {
         ),
         case(
             "masks of another shape",
-            |folder| listed(folder, (2, SIDE), |x, _| x < 1),
+            |folder| write_masked_frames(folder, (2, SIDE), |x, _| x < 1),
             masked(
                 held_out(
                     "a#",
                     3,
                     &[
-                        THREE,
+                        TRANSFORMS_NOTE,
                         "2 of 3 views have masks (2 by mask_path, where black is excluded)",
                         "warning: 2 masks differ from the photograph in aspect ratio; resampled by nearest neighbour (first: masks/m0.png: 2×16 for 16×16)",
                     ],
@@ -218,7 +222,7 @@ fn transforms_cases() -> Vec<Case> {
             |folder| {
                 write_photographs(folder, "images/a#.png", 3);
                 write_transforms(folder, &transforms("images/a#.png", 3));
-                masks(folder, "images/dynamic_mask_a#.png", 0..2);
+                write_masks(folder, "images/dynamic_mask_a#.png", 0..2);
                 write_photograph(&folder.join("images/b_mask.png"), 9);
             },
             masked(
@@ -226,7 +230,7 @@ fn transforms_cases() -> Vec<Case> {
                     "a#",
                     3,
                     &[
-                        THREE,
+                        TRANSFORMS_NOTE,
                         "2 of 3 views have masks (2 by dynamic_mask_NAME.png, where white is excluded)",
                         "warning: 1 unused file in images looks like a mask (first: images/b_mask.png); name masks in their frames' mask_path",
                     ],
@@ -240,13 +244,13 @@ fn transforms_cases() -> Vec<Case> {
             |folder| {
                 write_photographs(folder, "images/a#.png", 3);
                 write_transforms(folder, &transforms("images/a#.png", 3));
-                masks(folder, "masks/a#.png", 0..3);
+                write_masks(folder, "masks/a#.png", 0..3);
             },
             Expected::Scene(held_out(
                 "a#",
                 3,
                 &[
-                    THREE,
+                    TRANSFORMS_NOTE,
                     "warning: 3 unused files in masks look like masks (first: masks/a0.png); name masks in their frames' mask_path",
                 ],
             )),
@@ -255,9 +259,9 @@ fn transforms_cases() -> Vec<Case> {
             "a mask that is missing",
             |folder| {
                 write_photographs(folder, "images/a#.png", 3);
-                let mut list = transforms("images/a#.png", 3);
-                list["frames"][1]["mask_path"] = json!("masks/a1.png");
-                write_transforms(folder, &list);
+                let mut content = transforms("images/a#.png", 3);
+                content["frames"][1]["mask_path"] = json!("masks/a1.png");
+                write_transforms(folder, &content);
             },
             Expected::Refused(
                 "dataset: DIR/transforms.json: frame 1 (images/a1.png): DIR/masks/a1.png not found; remove the entry or restore the file",

@@ -1,4 +1,4 @@
-//! File names from other machines and programs.
+//! Cases of file names from other machines and programs.
 
 use std::path::Path;
 
@@ -10,14 +10,15 @@ use super::kit::{
     write_transforms,
 };
 
-fn named(folder: &Path, names: &str, files: &str) {
+/// Writes ten photographs named `files`, and `transforms.json` with `names`.
+fn write_frames(folder: &Path, names: &str, files: &str) {
     write_photographs(folder, files, 10);
     write_transforms(folder, &transforms(names, 10));
 }
 
-const TEN: &str = "transforms.json (instant-ngp, nerfstudio): 10 photographs";
+const TEN_PHOTOGRAPHS: &str = "transforms.json (instant-ngp, nerfstudio): 10 photographs";
 
-/// A set made on Windows: backslashes in all names.
+/// Writes a data set from Windows: backslashes in all names.
 fn windows(folder: &Path) {
     write_photographs(folder, "images/a_#.png", 3);
     let mut list = transforms(r"images\a_#.png", 3);
@@ -47,25 +48,25 @@ fn windows_scene() -> Scene {
     scene
 }
 
-/// A file whose name has a backslash, next to one in a folder.
-fn with_backslash(folder: &Path) {
+/// Writes a file whose name contains a backslash, next to a folder with two other files.
+fn backslash_in_a_name(folder: &Path) {
     write_photograph(&folder.join(r"images\a_0.png"), 0);
     write_photographs(folder, "images/a_#.png", 2);
     write_transforms(folder, &transforms(r"images\a_#.png", 2));
 }
 
 fn ambiguous_extension(folder: &Path) {
-    named(folder, "images/r_#", "images/r_#.jpg");
+    write_frames(folder, "images/r_#", "images/r_#.jpg");
     write_photograph(&folder.join("images/r_1.png"), 1);
 }
 
 fn ambiguous_case(folder: &Path) {
-    named(folder, "images/FRAME_#.png", "images/frame_#.png");
+    write_frames(folder, "images/FRAME_#.png", "images/frame_#.png");
     write_photograph(&folder.join("images/Frame_0.png"), 1);
 }
 
-/// Hidden files that macOS and other systems leave in folders.
-fn hidden(folder: &Path) {
+/// Writes photographs and the hidden files that macOS leaves next to them.
+fn hidden_files(folder: &Path) {
     write_photographs(folder, "images/IMG_#.png", 10);
     for number in 0..10 {
         write(folder.join(format!("images/._IMG_{number}.png")), "Mac OS X");
@@ -74,13 +75,14 @@ fn hidden(folder: &Path) {
     write_llff(folder, &Vec::from_iter(0..10), [2.0, 6.0]);
 }
 
-fn colmap(folder: &Path, names: &str, files: &str, count: usize) {
+/// Writes photographs named `files`, and COLMAP's model with `names`.
+fn write_model(folder: &Path, names: &str, files: &str, count: usize) {
     write_colmap(&folder.join("sparse/0"), CAMERA, names, count);
     write_photographs(&folder.join("images"), files, count);
 }
 
-/// Two cameras with the same file names, and a name with two spaces.
-fn rig(folder: &Path) {
+/// Writes photographs of two cameras with equal file names, and one with two spaces in its name.
+fn camera_rig(folder: &Path) {
     let mut images = String::new();
     for (number, name) in ["back/1.jpg", "front/1.jpg", "front/A DJI  (2).png"].iter().enumerate() {
         images += &colmap_line(number, name);
@@ -99,8 +101,8 @@ fn rig_scene() -> Scene {
     scene
 }
 
-/// Blender's files name images without an extension.
-fn blender(folder: &Path, names: &str, files: &str) {
+/// Writes photographs named `files`, and Blender's two lists with `names`.
+fn write_blender(folder: &Path, names: &str, files: &str) {
     let mut list: Value = transforms(names, 2);
     write_photographs(folder, files, 3);
     write(folder.join("transforms_train.json"), list.to_string());
@@ -114,8 +116,9 @@ fn blender_scene(notes: &[&'static str]) -> Scene {
     Scene { train: views("r_#", 0..2), test: views("r_#", 2..3), notes: all, ..Scene::default() }
 }
 
-fn read(names: &str, notes: &[&'static str]) -> Expected {
-    let mut all = vec![TEN];
+/// Returns the scene of ten views with the given names and notes.
+fn ten_views(names: &str, notes: &[&'static str]) -> Expected {
+    let mut all = vec![TEN_PHOTOGRAPHS];
     all.extend(notes);
     Expected::Scene(held_out(names, 10, &all))
 }
@@ -123,7 +126,7 @@ fn read(names: &str, notes: &[&'static str]) -> Expected {
 pub(crate) fn cases() -> Vec<Case> {
     vec![
         case("ns#874: backslashes", windows, Expected::Scene(windows_scene())),
-        case("a backslash in a name wins", with_backslash, {
+        case("a backslash in a name wins", backslash_in_a_name, {
             let mut scene = held_out(
                 "a_#",
                 2,
@@ -137,8 +140,8 @@ pub(crate) fn cases() -> Vec<Case> {
         }),
         case(
             "brush#269: Windows",
-            |folder| named(folder, r"C:\Users\x\scene\images\a_#.png", "images/a_#.png"),
-            read(
+            |folder| write_frames(folder, r"C:\Users\x\scene\images\a_#.png", "images/a_#.png"),
+            ten_views(
                 "a_#",
                 &[
                     r"10 file names found without the first 4 parts of absolute paths (first: C:\Users\x\scene\images\a_0.png is images/a_0.png)",
@@ -147,8 +150,8 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "brush#269: Unix",
-            |folder| named(folder, "/home/x/scene/images/a_#.png", "images/a_#.png"),
-            read(
+            |folder| write_frames(folder, "/home/x/scene/images/a_#.png", "images/a_#.png"),
+            ten_views(
                 "a_#",
                 &[
                     "10 file names found without the first 3 parts of absolute paths (first: /home/x/scene/images/a_0.png is images/a_0.png)",
@@ -157,22 +160,22 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "an absolute path of nothing here",
-            |folder| named(folder, "/home/x/b_#.png", "images/a_#.png"),
+            |folder| write_frames(folder, "/home/x/b_#.png", "images/a_#.png"),
             Expected::Refused(
                 "dataset: DIR/transforms.json: none of the 10 images exists (first missing: /home/x/b_0.png)",
             ),
         ),
         case(
             "a path out of the folder",
-            |folder| named(folder, "../data/images/a_#.png", "images/a_#.png"),
+            |folder| write_frames(folder, "../data/images/a_#.png", "images/a_#.png"),
             Expected::Refused(
                 "dataset: DIR/transforms.json: frame 0 (../data/images/a_0.png): \"../data/images/a_0.png\" is not a path inside the folder",
             ),
         ),
         case(
             "brush PR#539: no extension",
-            |folder| named(folder, "images/r_#", "images/r_#.jpg"),
-            read(
+            |folder| write_frames(folder, "images/r_#", "images/r_#.jpg"),
+            ten_views(
                 "r_#",
                 &[
                     "10 file names found with a different extension (first: images/r_0 is images/r_0.jpg)",
@@ -188,8 +191,8 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "text2room#7: upper case",
-            |folder| named(folder, "images/r_#", "images/r_#.JPEG"),
-            read(
+            |folder| write_frames(folder, "images/r_#", "images/r_#.JPEG"),
+            ten_views(
                 "r_#",
                 &[
                     "10 file names found with a different extension (first: images/r_0 is images/r_0.JPEG)",
@@ -198,8 +201,8 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "BlenderNeRF#48: doubled on disk",
-            |folder| named(folder, "images/000#.png", "images/000#.png.png"),
-            read(
+            |folder| write_frames(folder, "images/000#.png", "images/000#.png.png"),
+            ten_views(
                 "000#",
                 &[
                     "10 file names found with a different extension (first: images/0000.png is images/0000.png.png)",
@@ -208,8 +211,8 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "doubled in the file",
-            |folder| named(folder, "images/000#.jpg.jpg", "images/000#.jpg"),
-            read(
+            |folder| write_frames(folder, "images/000#.jpg.jpg", "images/000#.jpg"),
+            ten_views(
                 "000#",
                 &[
                     "10 file names found with a different extension (first: images/0000.jpg.jpg is images/0000.jpg)",
@@ -218,8 +221,8 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "brush#172: case",
-            |folder| named(folder, "images/FRAME_#.png", "images/frame_#.png"),
-            read(
+            |folder| write_frames(folder, "images/FRAME_#.png", "images/frame_#.png"),
+            ten_views(
                 "frame_#",
                 &[
                     "10 file names found in a different case (first: images/FRAME_0.png is images/frame_0.png)",
@@ -235,7 +238,7 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "brush#172: COLMAP",
-            |folder| colmap(folder, "A#.JPG", "A#.jpg", 3),
+            |folder| write_model(folder, "A#.JPG", "A#.jpg", 3),
             Expected::Scene(held_out(
                 "A#",
                 3,
@@ -247,8 +250,8 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "everything at once",
-            |folder| named(folder, r"D:\set\Images\R_#", "images/r_#.Jpg"),
-            read(
+            |folder| write_frames(folder, r"D:\set\Images\R_#", "images/r_#.Jpg"),
+            ten_views(
                 "r_#",
                 &[
                     r"10 file names found without the first 2 parts of absolute paths (first: D:\set\Images\R_0 is images/r_0.Jpg)",
@@ -257,27 +260,27 @@ pub(crate) fn cases() -> Vec<Case> {
                 ],
             ),
         ),
-        case("LLFF#36: hidden files", hidden, {
+        case("LLFF#36: hidden files", hidden_files, {
             Expected::Scene(held_out(
                 "IMG_#",
                 10,
                 &["LLFF (poses_bounds.npy): 10 photographs from images"],
             ))
         }),
-        case("LFS#810, LFS#1422: spaces and folders", rig, Expected::Scene(rig_scene())),
+        case("LFS#810, LFS#1422: spaces and folders", camera_rig, Expected::Scene(rig_scene())),
         case(
             "COLMAP's names from the folder above",
-            |folder| colmap(folder, "images/a#.png", "a#.png", 2),
+            |folder| write_model(folder, "images/a#.png", "a#.png", 2),
             Expected::Scene(held_out("a#", 2, &["COLMAP: 2 photographs from sparse/0"])),
         ),
         case(
             "Blender as usual",
-            |folder| blender(folder, "./train/r_#", "train/r_#.png"),
+            |folder| write_blender(folder, "./train/r_#", "train/r_#.png"),
             Expected::Scene(blender_scene(&[])),
         ),
         case(
             "Blender moved",
-            |folder| blender(folder, "/data/lego/train/r_#", "train/r_#.jpg"),
+            |folder| write_blender(folder, "/data/lego/train/r_#", "train/r_#.jpg"),
             Expected::Scene(blender_scene(&[
                 "3 file names found without the first 2 parts of absolute paths (first: /data/lego/train/r_0 is train/r_0.jpg)",
                 "3 file names found with a different extension (first: /data/lego/train/r_0 is train/r_0.jpg)",
@@ -285,7 +288,7 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "Blender without an image",
-            |folder| blender(folder, "./train/r_#", "train/x_#.png"),
+            |folder| write_blender(folder, "./train/r_#", "train/x_#.png"),
             Expected::Refused(
                 "dataset: DIR/transforms_train.json: frame 0 (./train/r_0): DIR/train/r_0.png not found; remove the frame or restore the file",
             ),

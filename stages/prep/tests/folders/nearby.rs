@@ -1,4 +1,4 @@
-//! Folders that are almost data sets, and data sets that are almost whole.
+//! Folders that are almost data sets, and data sets that are almost complete.
 
 use std::path::Path;
 
@@ -9,39 +9,40 @@ use super::kit::{
     write_llff, write_photographs, write_transforms,
 };
 
-fn colmap(folder: &Path, model: &str, images: &str) {
+fn write_colmap_set(folder: &Path, model: &str, images: &str) {
     write_colmap(&folder.join(model), CAMERA, "a#.png", 3);
     write_photographs(&folder.join(images), "a#.png", 3);
 }
 
-fn whole(folder: &Path) {
+fn write_nerfstudio_set(folder: &Path) {
     write_photographs(folder, "images/a#.png", 3);
     write_transforms(folder, &transforms("images/a#.png", 3));
 }
 
-/// Ten photographs, eight poses, and what names the photographs of the poses.
-fn llff(folder: &Path) {
+/// Writes ten photographs and eight poses.
+fn write_llff_set(folder: &Path) {
     write_photographs(folder, "images/a#.png", 10);
     write_llff(folder, &[0, 1, 2, 4, 5, 6, 7, 9], [2.0, 6.0]);
 }
 
-/// Names of the eight in COLMAP's order, which isn't that of names.
-const EIGHT: [usize; 8] = [9, 1, 0, 2, 7, 4, 5, 6];
+/// Numbers of the photographs with poses, in COLMAP's order, which isn't sorted.
+const COLMAP_ORDER: [usize; 8] = [9, 1, 0, 2, 7, 4, 5, 6];
 
+/// Expects the eight photographs with poses; `source` is the note on the source of their names.
 fn paired(source: &'static str) -> Expected {
-    let of = |numbers: &[usize]| super::kit::views("a#", numbers.iter().copied());
+    let views = |numbers: &[usize]| super::kit::views("a#", numbers.iter().copied());
     let note = "LLFF (poses_bounds.npy): 8 photographs from images";
     Expected::Scene(Scene {
-        train: of(&[1, 2, 4, 5, 6, 7, 9]),
-        test: of(&[0]),
+        train: views(&[1, 2, 4, 5, 6, 7, 9]),
+        test: views(&[0]),
         notes: vec![note, source],
         further: Vec::new(),
     })
 }
 
-fn binary_images(folder: &Path) {
-    let mut bytes = (EIGHT.len() as u64).to_le_bytes().to_vec();
-    for number in EIGHT {
+fn write_binary_images(folder: &Path) {
+    let mut bytes = (COLMAP_ORDER.len() as u64).to_le_bytes().to_vec();
+    for number in COLMAP_ORDER {
         bytes.extend((number as u32 + 1).to_le_bytes());
         bytes.extend([1.0f64, 0.0, 0.0, 0.0, 0.0, 0.0, 3.0].iter().flat_map(|v| v.to_le_bytes()));
         bytes.extend(1u32.to_le_bytes());
@@ -55,12 +56,12 @@ fn model_cases() -> Vec<Case> {
     vec![
         case(
             "nerfstudio's colmap/sparse/0",
-            |folder| colmap(folder, "colmap/sparse/0", "images"),
+            |folder| write_colmap_set(folder, "colmap/sparse/0", "images"),
             Expected::Scene(held_out("a#", 3, &["COLMAP: 3 photographs from colmap/sparse/0"])),
         ),
         case(
             "3DGS#272: dense/0/sparse",
-            |folder| colmap(folder, "dense/0/sparse", "dense/0/images"),
+            |folder| write_colmap_set(folder, "dense/0/sparse", "dense/0/images"),
             Expected::Refused(
                 "dataset: DIR: no data set; found COLMAP (sparse) in DIR/dense/0; give that folder",
             ),
@@ -95,7 +96,7 @@ fn model_cases() -> Vec<Case> {
                 bytes.extend([1u32.to_le_bytes(), 99u32.to_le_bytes()].concat());
                 bytes.extend([16u64.to_le_bytes(); 6].concat());
                 write(folder.join("sparse/0/cameras.bin"), bytes);
-                binary_images(folder);
+                write_binary_images(folder);
             },
             Expected::Refused(
                 "dataset: DIR/sparse/0/cameras.bin: byte 32: camera 1 has unknown model 99 (from a newer COLMAP?); undistort with colmap image_undistorter",
@@ -108,7 +109,7 @@ fn llff_cases() -> Vec<Case> {
     vec![
         case(
             "LLFF#69: fewer poses than photographs",
-            llff,
+            write_llff_set,
             Expected::Refused(
                 "dataset: DIR/poses_bounds.npy: 8 poses for 10 images in images/; counts must match, or view_imgs.txt must list the images that have poses",
             ),
@@ -116,8 +117,8 @@ fn llff_cases() -> Vec<Case> {
         case(
             "colmap#1487: paired by view_imgs.txt",
             |folder| {
-                llff(folder);
-                let names: String = EIGHT.iter().map(|i| format!("a{i}.png\r\n")).collect();
+                write_llff_set(folder);
+                let names: String = COLMAP_ORDER.iter().map(|i| format!("a{i}.png\r\n")).collect();
                 write(folder.join("view_imgs.txt"), names);
             },
             paired("photographs with poses are listed by view_imgs.txt"),
@@ -125,8 +126,8 @@ fn llff_cases() -> Vec<Case> {
         case(
             "nerf_pl#33: paired by COLMAP's model",
             |folder| {
-                llff(folder);
-                binary_images(folder);
+                write_llff_set(folder);
+                write_binary_images(folder);
             },
             paired("photographs with poses are listed by COLMAP's model in sparse"),
         ),
@@ -162,7 +163,7 @@ fn name_cases() -> Vec<Case> {
         case(
             "transform_test.json next to the training views",
             |folder| {
-                whole(folder);
+                write_nerfstudio_set(folder);
                 std::fs::rename(
                     folder.join("transforms.json"),
                     folder.join("transforms_train.json"),
@@ -181,7 +182,7 @@ fn name_cases() -> Vec<Case> {
         ),
         case(
             "a single sub-folder",
-            |folder| whole(&folder.join("scene")),
+            |folder| write_nerfstudio_set(&folder.join("scene")),
             Expected::Refused(
                 "dataset: DIR: no data set; found transforms.json (instant-ngp, nerfstudio) in DIR/scene; give that folder",
             ),
@@ -190,7 +191,7 @@ fn name_cases() -> Vec<Case> {
             "several data sets",
             |folder| {
                 for name in ["a", "b", "c", "d"] {
-                    whole(&folder.join(name));
+                    write_nerfstudio_set(&folder.join(name));
                 }
             },
             Expected::Refused(

@@ -9,24 +9,25 @@ use super::kit::{
     write_image, write_photographs, write_transforms,
 };
 
-const LARGE: &str = "1 PINHOLE 193 129 200 210 96.5 64.5\n";
+/// COLMAP's camera of the photographs themselves.
+const PHOTOGRAPH_CAMERA: &str = "1 PINHOLE 193 129 200 210 96.5 64.5\n";
 
-fn copies(folder: &Path, names: &str, (width, height): (u32, u32), count: usize) {
+fn write_copies(folder: &Path, names: &str, (width, height): (u32, u32), count: usize) {
     for number in 0..count {
         let path = folder.join(names.replace('#', &number.to_string()));
         write_image(&path, &photograph(width, height, number));
     }
 }
 
-/// COLMAP's model, and copies by 4 and 8 as PNG. Of the copies by 2 all but one are missing.
-fn colmap(folder: &Path) {
-    write_colmap(&folder.join("sparse/0"), LARGE, "a#.jpg", 3);
-    copies(folder, "images_2/a#.png", (97, 65), 1);
-    copies(folder, "images_4/a#.png", (48, 32), 3);
-    copies(folder, "images_8/a#.png", (24, 16), 3);
+/// Writes COLMAP's model, and copies by 4 and 8 as PNG. Only one of the copies by 2 exists.
+fn write_colmap_copies(folder: &Path) {
+    write_colmap(&folder.join("sparse/0"), PHOTOGRAPH_CAMERA, "a#.jpg", 3);
+    write_copies(folder, "images_2/a#.png", (97, 65), 1);
+    write_copies(folder, "images_4/a#.png", (48, 32), 3);
+    write_copies(folder, "images_8/a#.png", (24, 16), 3);
 }
 
-/// The copies' sizes are rounded, each axis for itself.
+/// Scales the cameras to the copies, whose width and height are each rounded.
 fn scaled(mut scene: Scene) -> Scene {
     let (x, y) = (48.0 / 193.0, 32.0 / 129.0);
     for view in scene.train.iter_mut().chain(&mut scene.test) {
@@ -35,7 +36,7 @@ fn scaled(mut scene: Scene) -> Scene {
     scene
 }
 
-fn from_transforms(folder: &Path) {
+fn write_transforms_copies(folder: &Path) {
     let mut list = transforms("images/a#.jpg", 3);
     (list["w"], list["h"]) = (json!(2 * SIDE), json!(2 * SIDE));
     (list["fl_x"], list["fl_y"]) = (json!(2.0 * FOCAL), json!(2.0 * FOCAL));
@@ -46,7 +47,7 @@ fn from_transforms(folder: &Path) {
 
 pub(crate) fn cases() -> Vec<Case> {
     vec![
-        case("ns PR#2860, gsplat#212: COLMAP", colmap, {
+        case("ns PR#2860, gsplat#212: COLMAP", write_colmap_copies, {
             Expected::Scene(scaled(held_out(
                 "a#",
                 3,
@@ -56,7 +57,7 @@ pub(crate) fn cases() -> Vec<Case> {
                 ],
             )))
         }),
-        case("transforms.json", from_transforms, {
+        case("transforms.json", write_transforms_copies, {
             Expected::Scene(held_out(
                 "a#",
                 3,
@@ -69,8 +70,8 @@ pub(crate) fn cases() -> Vec<Case> {
         case(
             "copies of other photographs",
             |folder| {
-                write_colmap(&folder.join("sparse/0"), LARGE, "a#.jpg", 3);
-                copies(folder, "images_4/b#.png", (48, 32), 3);
+                write_colmap(&folder.join("sparse/0"), PHOTOGRAPH_CAMERA, "a#.jpg", 3);
+                write_copies(folder, "images_4/b#.png", (48, 32), 3);
             },
             Expected::Refused(
                 "dataset: DIR/sparse/0/images.txt: none of the 3 images exists in DIR (first missing: a0.jpg)",

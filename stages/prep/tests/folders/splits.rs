@@ -14,8 +14,8 @@ fn names(numbers: impl IntoIterator<Item = usize>) -> Value {
     numbers.into_iter().map(|number| format!("images/a_{number}.png")).collect()
 }
 
-/// Ten photographs, and lists for training, validation and testing; none where `null`.
-fn listed(folder: &Path, train: Value, val: Value, test: Value) {
+/// Writes ten photographs, and lists for training, validation and testing. `null` omits a list.
+fn write_lists(folder: &Path, train: Value, val: Value, test: Value) {
     write_photographs(folder, "images/a_#.png", 10);
     let mut list = transforms("images/a_#.png", 10);
     for (key, names) in
@@ -33,29 +33,29 @@ fn split(
     test: impl IntoIterator<Item = usize>,
     notes: &[&'static str],
 ) -> Expected {
-    let mut all = vec![NOTE];
-    all.extend(notes);
+    let mut all_notes = vec![NOTE];
+    all_notes.extend(notes);
     let (train, test) = (views("a_#", train), views("a_#", test));
-    Expected::Scene(Scene { train, test, notes: all, ..Scene::default() })
+    Expected::Scene(Scene { train, test, notes: all_notes, ..Scene::default() })
 }
 
 pub(crate) fn cases() -> Vec<Case> {
     vec![
         case(
             "ns#2933, ns PR#3054: an empty test list",
-            |folder| listed(folder, names(2..10), names(0..2), json!([])),
+            |folder| write_lists(folder, names(2..10), names(0..2), json!([])),
             split(2..10, 0..2, &[]),
         ),
         case(
             "views for validation next to test views",
-            |folder| listed(folder, names(3..10), names(1..3), names([0])),
+            |folder| write_lists(folder, names(3..10), names(1..3), names([0])),
             split(3..10, [0], &[]),
         ),
         case(
             "names of frames as other steps of the lookup find them",
             |folder| {
                 let train = json!([r"images\a_4.png", "/x/images/a_5.png", "images/A_6"]);
-                listed(folder, train, Value::Null, json!(["./images/a_0.png"]));
+                write_lists(folder, train, Value::Null, json!(["./images/a_0.png"]));
             },
             split(
                 4..7,
@@ -72,7 +72,7 @@ pub(crate) fn cases() -> Vec<Case> {
             "names without a frame",
             |folder| {
                 let train = json!(["images/a_3.png", "images/b.png", "images/c.png"]);
-                listed(folder, train, Value::Null, names([0]));
+                write_lists(folder, train, Value::Null, names([0]));
             },
             split(
                 [3],
@@ -82,36 +82,36 @@ pub(crate) fn cases() -> Vec<Case> {
         ),
         case(
             "ns PR#3054: a list without frames",
-            |folder| listed(folder, json!(["x/1.png", "x/2.png"]), names([0]), json!([])),
+            |folder| write_lists(folder, json!(["x/1.png", "x/2.png"]), names([0]), json!([])),
             Expected::Refused(
                 "dataset: DIR/transforms.json: no name in train_filenames is that of a frame (first of 2: x/1.png); correct the names, or remove train_filenames",
             ),
         ),
         case(
             "a validation list without frames",
-            |folder| listed(folder, names([1]), json!(["x/1.png"]), names([0])),
+            |folder| write_lists(folder, names([1]), json!(["x/1.png"]), names([0])),
             Expected::Refused(
                 "dataset: DIR/transforms.json: no name in val_filenames is that of a frame (first of 1: x/1.png); correct the names, or remove val_filenames",
             ),
         ),
         case(
             "empty lists",
-            |folder| listed(folder, json!([]), json!([]), json!([])),
+            |folder| write_lists(folder, json!([]), json!([]), json!([])),
             Expected::Scene(held_out("a_#", 10, &[NOTE])),
         ),
         case(
             "test views alone",
-            |folder| listed(folder, Value::Null, json!([]), names([3, 5])),
+            |folder| write_lists(folder, Value::Null, json!([]), names([3, 5])),
             split([0, 1, 2, 4, 6, 7, 8, 9], [3, 5], &["8 training views: all unlisted frames"]),
         ),
         case(
             "training views alone",
-            |folder| listed(folder, names(0..9), json!([]), Value::Null),
+            |folder| write_lists(folder, names(0..9), json!([]), Value::Null),
             split(0..9, [9], &["1 test view: all unlisted frames"]),
         ),
         case(
             "all views for training",
-            |folder| listed(folder, names(0..10), Value::Null, Value::Null),
+            |folder| write_lists(folder, names(0..10), Value::Null, Value::Null),
             Expected::Scene(held_out("a_#", 10, &[NOTE])),
         ),
     ]

@@ -1,4 +1,4 @@
-//! Publishing next to pages, leftovers of kills and somebody's files.
+//! Publishing where earlier pages, leftovers of kills or a user's files exist.
 
 use super::*;
 use crate::page::MARK_FILE;
@@ -6,8 +6,8 @@ use artifact::{MANIFEST_FILE, write_json};
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 
-/// A folder as a sink leaves it.
-fn made(dir: &Path, text: &str) -> PathBuf {
+/// Creates a folder like a sink's output.
+fn sink_output(dir: &Path, text: &str) -> PathBuf {
     let folder = dir.join("made");
     remove_folder(&folder).unwrap();
     fs::create_dir_all(folder.join("views")).unwrap();
@@ -21,36 +21,37 @@ fn made(dir: &Path, text: &str) -> PathBuf {
     folder
 }
 
-fn published(dir: &Path, text: &str) -> Result<PathBuf, StageFailure> {
+/// Publishes a sink's output as `out/report`.
+fn publish_output(dir: &Path, text: &str) -> Result<PathBuf, StageFailure> {
     let target = dir.join("out/report");
-    publish(&made(dir, text), &target, "page", &AtomicBool::new(false)).map(|_| target)
+    publish(&sink_output(dir, text), &target, "page", &AtomicBool::new(false)).map(|_| target)
 }
 
 #[test]
 fn a_page_replaces_a_page() {
     let dir = tempfile::tempdir().unwrap();
-    let target = published(dir.path(), "one").unwrap();
+    let target = publish_output(dir.path(), "one").unwrap();
     assert!(has_current_page(&target, "one") && !has_current_page(&target, "two"));
-    published(dir.path(), "two").unwrap();
+    publish_output(dir.path(), "two").unwrap();
     assert_eq!(fs::read_to_string(target.join("index.html")).unwrap(), "two");
-    // One that lost a file is no longer whole, but ours.
+    // A page that lost a file is incomplete, but still nerf-sr's.
     fs::remove_file(target.join("views/a.png")).unwrap();
-    published(dir.path(), "two").unwrap();
+    publish_output(dir.path(), "two").unwrap();
     assert!(target.join("views/a.png").exists());
-    assert_eq!(fs::read_dir(dir.path().join("out")).unwrap().count(), 1, "nothing is left beside");
+    assert_eq!(fs::read_dir(dir.path().join("out")).unwrap().count(), 1, "nothing else is left");
     let empty = dir.path().join("out/report");
     remove_folder(&empty).unwrap();
     fs::create_dir(&empty).unwrap();
-    published(dir.path(), "three").unwrap();
+    publish_output(dir.path(), "three").unwrap();
 }
 
-/// A page of a data set as a sink leaves it, with one result if it is complete.
+/// Creates a data set's page like a sink's output, with one result if the page is complete.
 fn page(dir: &Path, text: &str, data_set: &str, is_complete: bool) -> PathBuf {
     page_of(dir, text, data_set, if is_complete { &["eval"] } else { &[] })
 }
 
 fn page_of(dir: &Path, text: &str, data_set: &str, results: &[&str]) -> PathBuf {
-    let folder = made(dir, text);
+    let folder = sink_output(dir, text);
     let data_sets = vec![data_set.to_owned()];
     let results = Some(results.iter().map(|result| format!("{data_set}: {result}")).collect());
     let mark = PageMark { identity: text.to_owned(), results, data_sets };
@@ -69,7 +70,7 @@ fn page_text(dir: &Path, folder: &str) -> String {
     fs::read_to_string(dir.join("out").join(folder).join("index.html")).unwrap()
 }
 
-/// Pages of data sets, one after the other: what was whole before is found again.
+/// Publishing the pages of several data sets in turn keeps their complete pages.
 #[test]
 fn pages_of_other_data_sets_are_archived() {
     let dir = tempfile::tempdir().unwrap();
@@ -77,7 +78,7 @@ fn pages_of_other_data_sets_are_archived() {
     assert_eq!(
         publish_page(dir.path(), "lego 2", "data/lego", true),
         None,
-        "a newer one of the same"
+        "a newer page of the same data set"
     );
     assert_eq!(publish_page(dir.path(), "chair 1", "data/chair", true).unwrap(), "report-lego");
     assert_eq!(publish_page(dir.path(), "lego 3", "data/lego", true).unwrap(), "report-chair");
@@ -89,7 +90,7 @@ fn pages_of_other_data_sets_are_archived() {
     assert_eq!(page_text(dir.path(), "report-lego"), "lego 3");
     // A page without a result has nothing that another page lacks.
     assert_eq!(publish_page(dir.path(), "other 1", "more/lego", true), None);
-    // Another folder of that name has its own place, and so has what isn't ours.
+    // A data set of the same name has its own archive. An archive with a user's file is kept.
     assert_eq!(publish_page(dir.path(), "chair 2", "data/chair", true).unwrap(), "report-lego-2");
     fs::write(dir.path().join("out/report-lego-2/notes.txt"), "precious").unwrap();
     publish_page(dir.path(), "other 2", "more/lego", true);
@@ -104,7 +105,7 @@ fn pages_of_other_data_sets_are_archived() {
     );
 }
 
-/// A sweep's page is kept when a page of one of its points comes, but not the other way round.
+/// A page is archived if it has a result that the new page lacks.
 #[test]
 fn a_page_with_more_results_is_archived() {
     let dir = tempfile::tempdir().unwrap();
@@ -122,7 +123,7 @@ fn a_page_with_more_results_is_archived() {
     }
 }
 
-/// Folders of `out` with the text of each one's page, sorted.
+/// Returns the folders of `out` with their pages' texts, sorted.
 fn pages(dir: &Path) -> Vec<String> {
     let names = fs::read_dir(dir.join("out")).unwrap();
     let mut pages: Vec<String> = names
@@ -133,31 +134,31 @@ fn pages(dir: &Path) -> Vec<String> {
     pages
 }
 
-/// The next publishing completes one that was killed: no complete page is lost.
+/// The next publishing completes a killed one: no complete page is lost.
 #[test]
 fn pages_left_by_a_kill_are_archived() {
     const NEW: &str = ".report.nerf-sr-new";
     const OLD: &str = ".report.nerf-sr-old";
-    type Lying<'a> = &'a [(&'a str, &'a str, &'a str, bool)];
+    type Leftovers<'a> = &'a [(&'a str, &'a str, &'a str, bool)];
     let lego = ("lego 1", "lego", true);
-    let cases: [(&str, Lying<'_>, &[&str]); 8] = [
+    let cases: [(&str, Leftovers<'_>, &[&str]); 8] = [
         (
             "exchanged, and killed before the old page was archived",
             &[("report", "chair 1", "chair", true), (NEW, lego.0, lego.1, lego.2)],
             &["report-lego: lego 1", "report: chair 2"],
         ),
         (
-            "a whole page before a part of one",
+            "a complete page before an incomplete one",
             &[("report", "chair 1", "chair", false), (NEW, "chair 0", "chair", true)],
             &["report-chair: chair 0", "report: chair 2"],
         ),
         (
-            "one that was to be deleted",
+            "a page that was to be deleted",
             &[("report", "chair 1", "chair", true), (NEW, "chair 0", "chair", true)],
             &["report: chair 2"],
         ),
         (
-            "copied, and killed before it was put in its place",
+            "copied, and killed before the copy replaced the old page",
             &[("report", lego.0, lego.1, lego.2), (NEW, "chair 2", "chair", true)],
             &["report-lego: lego 1", "report: chair 2"],
         ),
@@ -168,7 +169,7 @@ fn pages_left_by_a_kill_are_archived() {
             &["report-lego: lego 1", "report: chair 2"],
         ),
         (
-            "without exchange, killed before the third",
+            "without exchange, killed before the third rename",
             &[("report", "chair 1", "chair", true), (OLD, lego.0, lego.1, lego.2)],
             &["report-lego: lego 1", "report: chair 2"],
         ),
@@ -182,33 +183,33 @@ fn pages_left_by_a_kill_are_archived() {
             &["report-lego: lego 1", "report: chair 2"],
         ),
     ];
-    for (what, lying, expected) in cases {
+    for (case, leftovers, expected) in cases {
         let dir = tempfile::tempdir().unwrap();
         fs::create_dir(dir.path().join("out")).unwrap();
-        for (name, text, data_set, is_complete) in lying {
-            let made = page(dir.path(), text, data_set, *is_complete);
-            fs::rename(made, dir.path().join("out").join(name)).unwrap();
+        for (name, text, data_set, is_complete) in leftovers {
+            let folder = page(dir.path(), text, data_set, *is_complete);
+            fs::rename(folder, dir.path().join("out").join(name)).unwrap();
         }
         publish_page(dir.path(), "chair 2", "chair", true);
-        assert_eq!(pages(dir.path()), expected, "{what}");
+        assert_eq!(pages(dir.path()), expected, "{case}");
     }
 }
 
-/// A leftover means that there is something to do, even where the page itself is right.
+/// A leftover must be finished or removed, even if the page itself is current.
 #[test]
-fn a_page_with_a_leftover_beside_it_is_not_up_to_date() {
+fn a_page_next_to_a_leftover_is_not_up_to_date() {
     let dir = tempfile::tempdir().unwrap();
-    let target = published(dir.path(), "one").unwrap();
+    let target = publish_output(dir.path(), "one").unwrap();
     for name in [".report.nerf-sr-new", ".report.nerf-sr-old"] {
         let leftover = target.with_file_name(name);
         fs::create_dir(&leftover).unwrap();
         assert!(!has_current_page(&target, "one"), "{name}");
-        published(dir.path(), "one").unwrap();
+        publish_output(dir.path(), "one").unwrap();
         assert!(has_current_page(&target, "one") && !leftover.exists(), "{name}");
     }
 }
 
-/// Half a copy is no page; somebody's files are nobody else's to delete.
+/// An incomplete copy isn't a page, and a user's files are never deleted.
 #[test]
 fn leftovers_that_are_no_pages_are_not_archived() {
     let dir = tempfile::tempdir().unwrap();
@@ -218,15 +219,15 @@ fn leftovers_that_are_no_pages_are_not_archived() {
     fs::remove_file(leftover.join("index.html")).unwrap();
     publish_page(dir.path(), "chair 2", "chair", true);
     assert_eq!(pages(dir.path()), ["report: chair 2"]);
-    for (file, words) in [
+    for (file, expected) in [
         ("notes.txt", "notes.txt was not written by nerf-sr"),
         ("index.html", "index.html was changed"),
     ] {
         fs::rename(page(dir.path(), "lego 1", "lego", true), &leftover).unwrap();
         fs::write(leftover.join(file), "precious").unwrap();
-        let message = published(dir.path(), "chair 3").unwrap_err().message;
+        let message = publish_output(dir.path(), "chair 3").unwrap_err().message;
         assert!(
-            message.contains(words) && message.contains("move that file or folder away"),
+            message.contains(expected) && message.contains("move that file or folder away"),
             "{message}"
         );
         assert_eq!(fs::read_to_string(leftover.join(file)).unwrap(), "precious");
@@ -240,9 +241,9 @@ fn all_files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     files.map(|(relative, file)| (relative, fs::read(file).unwrap())).collect()
 }
 
-/// Whatever isn't ours stays to the byte, and is named.
+/// Files that nerf-sr didn't write stay unchanged, and the message names them.
 #[test]
-fn what_is_not_ours_is_not_replaced() {
+fn foreign_files_are_not_replaced() {
     type Damage = fn(&Path);
     let cases: [(&str, Damage); 9] = [
         ("cannot read ", |t| {
@@ -277,13 +278,13 @@ fn what_is_not_ours_is_not_replaced() {
             fs::write(t, "precious").unwrap();
         }),
     ];
-    for (words, damage) in cases {
+    for (expected, damage) in cases {
         let dir = tempfile::tempdir().unwrap();
-        let target = published(dir.path(), "one").unwrap();
+        let target = publish_output(dir.path(), "one").unwrap();
         damage(&target);
         let before = all_files(&dir.path().join("out"));
-        let message = published(dir.path(), "two").unwrap_err().message;
-        assert!(message.contains(words) && message.contains("--out"), "{words}: {message}");
-        assert_eq!(all_files(&dir.path().join("out")), before, "{words}");
+        let message = publish_output(dir.path(), "two").unwrap_err().message;
+        assert!(message.contains(expected) && message.contains("--out"), "{expected}: {message}");
+        assert_eq!(all_files(&dir.path().join("out")), before, "{expected}");
     }
 }

@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_is_not_many() {
+    fn singular_and_plural_are_correct() {
         assert_eq!(end_message(4, 5, true), "4 of 5 stages ran, 1 was cached");
         assert_eq!(end_message(1, 1, false), "1 of 1 stage ran, 0 were cached");
         assert_eq!(end_message(0, 5, true), "0 of 5 stages ran, 5 were cached");
@@ -86,8 +86,8 @@ mod tests {
     }
 
     #[test]
-    fn words_are_quoted_where_a_shell_would_read_more_into_them() {
-        for (word, quoted) in [
+    fn arguments_are_quoted_for_a_shell() {
+        for (argument, quoted) in [
             ("train-ss", "train-ss"),
             ("dataset=/data/lego,./x", "dataset=/data/lego,./x"),
             ("dataset=my scenes/Bäume", "'dataset=my scenes/Bäume'"),
@@ -95,12 +95,12 @@ mod tests {
             ("~/x", "'~/x'"),
             ("", "''"),
         ] {
-            assert_eq!(shell_quoted(word), quoted);
+            assert_eq!(shell_quoted(argument), quoted);
         }
     }
 
     #[test]
-    fn the_command_is_complete() {
+    fn failures_name_the_command_of_the_log() {
         let hint = FailureHint {
             program: "nerf-sr".to_owned(),
             arguments: vec!["-p".to_owned(), "x=a b".to_owned()],

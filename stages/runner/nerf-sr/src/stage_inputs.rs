@@ -88,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parameters_of_the_stage_are_those_of_the_continued_training() {
+    fn arguments_are_matched_to_their_stage() {
         let names = ["rays".to_owned(), "seed".to_owned()];
         for (text, expected) in [
             ("rays=30M", true),

@@ -98,14 +98,14 @@ mod tests {
         let store = Store::open(dir.path()).unwrap();
         let Locked::Acquired(_lock) = store.try_lock("k").unwrap() else { panic!("held") };
         let stop = AtomicBool::new(false);
-        let said = RefCell::new(Vec::new());
-        let say = |holder: Option<&Holder>, _: Duration| {
-            said.borrow_mut().push(holder_text(holder));
+        let reports = RefCell::new(Vec::new());
+        let report = |holder: Option<&Holder>, _: Duration| {
+            reports.borrow_mut().push(holder_text(holder));
             stop.store(true, Ordering::Relaxed);
         };
-        let failure = wait_for_lock(&stop, &say, || store.try_lock("k")).unwrap_err();
+        let failure = wait_for_lock(&stop, &report, || store.try_lock("k")).unwrap_err();
         assert_eq!(failure.code, 130);
-        assert_eq!(said.into_inner(), [format!(" by process {}", std::process::id())]);
+        assert_eq!(reports.into_inner(), [format!(" by process {}", std::process::id())]);
     }
 
     #[test]

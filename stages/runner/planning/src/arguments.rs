@@ -82,7 +82,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn numbers_are_json_numbers_and_all_else_is_a_word() {
+    fn values_are_json_or_else_strings() {
         for (text, expected) in [
             ("", json!([null])),
             ("null", json!([null])),
@@ -111,8 +111,8 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_meant_is_refused() {
-        for (text, words) in [
+    fn empty_values_and_invalid_json_are_refused() {
+        for (text, expected) in [
             (",", "empty value in the list"),
             ("1,,2", "empty value in the list"),
             ("1,", "write null"),
@@ -120,7 +120,7 @@ mod tests {
             ("\"a", "is invalid JSON"),
         ] {
             let problem = values(text).unwrap_err();
-            assert!(problem.contains(words), "{text}: {problem}");
+            assert!(problem.contains(expected), "{text}: {problem}");
         }
         assert_eq!(folders("a,./b").unwrap(), ["a", "./b"]);
         assert!(folders("").unwrap_err().contains("expected a folder"));

@@ -67,7 +67,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn differences_as_text() {
+    fn changes_are_formatted_as_text() {
         let map = |value: Value| value.as_object().cloned().unwrap();
         let before = map(json!({
             "code": "a".repeat(64), "parameter kernel": "box", "parameter near": null,

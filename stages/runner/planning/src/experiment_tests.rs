@@ -1,4 +1,4 @@
-//! Expansion of experiments to nodes, with given descriptions.
+//! Expansion of experiments to nodes, with given descriptions of stages.
 
 use std::path::{Path, PathBuf};
 
@@ -31,7 +31,9 @@ experiment:
     - {name: 'one ray, shown', parameters: {score.samples: 1}}
 ";
 
-fn whole((name, kind, inputs, parameters): (&str, &str, Value, Value)) -> (String, Description) {
+fn description(
+    (name, kind, inputs, parameters): (&str, &str, Value, Value),
+) -> (String, Description) {
     let text = json!({"name": name, "version": "", "code": "", "summary": "", "inputs": inputs,
         "output": {"kind": kind},
         "parameters": {"properties": parameters}, "sink": name == "table",
@@ -41,7 +43,7 @@ fn whole((name, kind, inputs, parameters): (&str, &str, Value, Value)) -> (Strin
 
 fn descriptions() -> BTreeMap<String, Description> {
     let integer = |default: u64| json!({"type": "integer", "default": default});
-    let described = [
+    let stages = [
         (
             "prep",
             "scene",
@@ -63,10 +65,10 @@ fn descriptions() -> BTreeMap<String, Description> {
         ),
         ("table", "table", json!({"run": {"kinds": ["run"], "summary": ""}}), json!({})),
     ];
-    described.map(whole).into()
+    stages.map(description).into()
 }
 
-/// Plans an experiment with a folder of data sets.
+/// Plans an experiment with a folder of data sets, with `change` applied to the request.
 fn plan_of(text: &str, data: &Path, change: impl Fn(&mut Request)) -> Result<Plan, PlanError> {
     let mut request = Request {
         selection: Selection { data: Some(data.to_path_buf()), ..Selection::default() },
@@ -90,14 +92,14 @@ fn labels(plan: &Plan) -> Vec<String> {
 }
 
 fn folder_of(plan: &Plan, node: usize, input: &str) -> PathBuf {
-    let input = plan.nodes[node].inputs.iter().find(|one| one.name == input).unwrap();
+    let input = plan.nodes[node].inputs.iter().find(|candidate| candidate.name == input).unwrap();
     match &input.from {
         Origin::Folder(folder) => folder.clone(),
         Origin::Node { .. } => panic!("{input:?}"),
     }
 }
 
-/// Variants form no product, and share nodes with equal settings.
+/// Variants aren't combined with each other, and share nodes with equal settings.
 #[test]
 fn scenes_protocols_and_variants_are_axes() {
     let data = data();
@@ -142,24 +144,24 @@ fn scores(data: &Path, change: &dyn Fn(&mut Request)) -> Vec<String> {
 }
 
 #[test]
-fn the_command_line_chooses_and_wins() {
+fn the_command_line_selects_and_overrides() {
     let data = data();
-    let named = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+    let owned = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
     assert_eq!(
         scores(data.path(), &|r| (r.selection.scenes, r.selection.max_variants) =
-            (named(&["chair"]), Some(1))),
+            (owned(&["chair"]), Some(1))),
         ["score"]
     );
     assert_eq!(
         scores(data.path(), &|r| (r.selection.scenes, r.selection.variants) =
-            (named(&["demo"]), named(&["no warm-up", "as it is"]))),
+            (owned(&["demo"]), owned(&["no warm-up", "as it is"]))),
         ["score [variant=as it is]", "score [variant=no warm-up]"]
     );
     let plan = plan_of(EXPERIMENT, data.path(), |r| {
-        r.selection.scenes = named(&["chair"]);
-        r.selection.protocols = named(&["50x3"]);
+        r.selection.scenes = owned(&["chair"]);
+        r.selection.protocols = owned(&["50x3"]);
         r.selection.max_variants = Some(2);
-        r.parameters = named(&["warmup=7", "lr_width=20,30"]);
+        r.parameters = owned(&["warmup=7", "lr_width=20,30"]);
     });
     let plan = plan.unwrap();
     // The command line overrides the settings of both variants, so they share a node.
@@ -177,9 +179,9 @@ fn the_command_line_chooses_and_wins() {
     );
 }
 
-/// The pipeline's own scene has no settings, but tables name it.
+/// The pipeline's own scene changes no setting, but tables show its name.
 #[test]
-fn an_only_value_is_every_nodes() {
+fn the_only_value_of_an_axis_is_in_all_nodes_but_no_labels() {
     let data = data();
     let text = EXPERIMENT.replace("  inputs: {score.weights: weights}\n", "");
     let plan =
@@ -192,24 +194,23 @@ fn an_only_value_is_every_nodes() {
 }
 
 #[test]
-fn a_sweep_of_the_file_gives_way() {
+fn the_command_line_overrides_a_sweep_of_the_file() {
     let data = data();
     let text = EXPERIMENT.replace("  variants:\n", "  sweeps: {train.rays: [5, 6]}\n  variants:\n");
-    let choose = |r: &mut Request| {
+    let select = |r: &mut Request| {
         (r.selection.scenes, r.selection.max_variants) = (vec!["demo".to_owned()], Some(1));
     };
-    let plan = plan_of(&text, data.path(), choose).unwrap();
+    let plan = plan_of(&text, data.path(), select).unwrap();
     assert_eq!(labels(&plan)[1..3], ["train [rays=5]", "train [rays=6]"]);
     let plan = plan_of(&text, data.path(), |r| {
-        choose(r);
+        select(r);
         r.parameters = vec!["rays=9".to_owned()];
     });
     assert_eq!(labels(&plan.unwrap())[1..2], ["train"]);
 }
 
-/// Experiment whose sink shows the scores of two fields. One of them has its own scene and requires
-/// a file.
-const SHOWN: &str = "
+/// Blocks of a second field, which has its own scene, and of a table of both fields' scores.
+const TWO_FIELDS: &str = "
   prep-large:
     extends: prep
     inputs: {dataset: ./own}
@@ -223,8 +224,9 @@ const SHOWN: &str = "
     inputs: {small: score, large: score-large}
 ";
 
-fn shown() -> String {
-    let text = EXPERIMENT.replace("\n  table:\n    inputs: {run: score}\n", SHOWN);
+/// Returns an experiment with both fields; the second one requires a file of weights.
+fn two_field_experiment() -> String {
+    let text = EXPERIMENT.replace("\n  table:\n    inputs: {run: score}\n", TWO_FIELDS);
     let text = text.replace(
         "  variants:\n",
         "    every: {prep-large.lr_width: '{hr_width}', score-large.samples: '{scale}'}\n  \
@@ -234,7 +236,7 @@ fn shown() -> String {
 }
 
 fn plan_showing(data: &Path, show: &[&str]) -> Result<Plan, PlanError> {
-    plan_of(&shown(), data, |r| {
+    plan_of(&two_field_experiment(), data, |r| {
         (r.selection.scenes, r.selection.protocols, r.selection.max_variants) =
             (vec!["lego".to_owned()], vec!["50x3".to_owned()], Some(1));
         r.selection.show = show.iter().map(|name| (*name).to_owned()).collect();
@@ -242,7 +244,7 @@ fn plan_showing(data: &Path, show: &[&str]) -> Result<Plan, PlanError> {
 }
 
 #[test]
-fn only_what_is_to_be_shown_is_made() {
+fn only_shown_inputs_are_planned() {
     let data = data();
     std::fs::write(data.path().join("weights/x500"), "").unwrap();
     for (show, expected) in [
@@ -254,13 +256,13 @@ fn only_what_is_to_be_shown_is_made() {
         (&["small"], &["prep", "train", "score"]),
         (&["score-large"], &["prep-large", "train-large", "score-large"]),
     ] {
-        let mut made = labels(&plan_showing(data.path(), show).unwrap());
+        let mut planned = labels(&plan_showing(data.path(), show).unwrap());
         let mut expected: Vec<&str> = expected.to_vec();
-        made.sort_unstable();
+        planned.sort_unstable();
         expected.sort_unstable();
-        assert_eq!(made, expected, "{show:?}");
+        assert_eq!(planned, expected, "{show:?}");
     }
-    // The scene replaces the pipeline's own in every block; sizes follow from the protocol.
+    // The selected scene replaces the pipeline's in every block; sizes follow from the protocol.
     let large = &plan_showing(data.path(), &["large"]).unwrap().nodes;
     let folder = NodeInput {
         name: "dataset".to_owned(),
@@ -280,10 +282,10 @@ fn only_what_is_to_be_shown_is_made() {
 }
 
 #[test]
-fn what_lacks_a_file_is_left_out() {
+fn stages_without_a_required_file_are_left_out() {
     let data = data();
     std::fs::write(data.path().join("weights/x500"), "").unwrap();
-    let plan = plan_of(&shown(), data.path(), |r| {
+    let plan = plan_of(&two_field_experiment(), data.path(), |r| {
         r.selection.protocols = vec!["50x3".to_owned(), "100x2".to_owned()];
         (r.selection.scenes, r.selection.max_variants) = (vec!["chair".to_owned()], Some(1));
     });
@@ -309,9 +311,9 @@ fn what_lacks_a_file_is_left_out() {
 }
 
 #[test]
-fn what_there_is_not_is_refused() {
+fn invalid_selections_are_refused() {
     let data = data();
-    for (text, change, words) in [
+    for (text, change, expected) in [
         (
             EXPERIMENT.to_owned(),
             &(|c: &mut Selection| c.scenes = vec!["ship".to_owned()]) as &dyn Fn(&mut Selection),
@@ -355,7 +357,7 @@ fn what_there_is_not_is_refused() {
         ),
     ] {
         let plan = plan_of(&text, data.path(), |request| change(&mut request.selection));
-        let problem = plan.map(|plan| labels(&plan)).unwrap_err().to_string();
-        assert!(problem.contains(words), "{problem}");
+        let message = plan.map(|plan| labels(&plan)).unwrap_err().to_string();
+        assert!(message.contains(expected), "{message}");
     }
 }

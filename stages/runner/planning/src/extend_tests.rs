@@ -1,4 +1,4 @@
-//! Files that extend others, targets of `pipelines/`, and the pipelines that are shipped.
+//! Tests of files that extend others, targets in `pipelines/`, and the shipped pipelines.
 
 use tempfile::TempDir;
 
@@ -26,7 +26,7 @@ stages:
     inputs: {x: a}
 ";
 
-const UPPER: &str = "extends: ../pipeline.yaml
+const EXTENDING: &str = "extends: ../pipeline.yaml
 stages:
   a:
     inputs:
@@ -42,10 +42,10 @@ fn base_and(more: &[(&str, &str)]) -> TempDir {
 }
 
 #[test]
-fn a_file_changes_part_by_part_what_it_extends() {
-    let folder = base_and(&[("pipelines/c.yaml", UPPER)]);
-    let home = folder.path().canonicalize().unwrap();
-    let pipeline = Pipeline::read(&home.join("pipelines/c.yaml")).unwrap();
+fn a_file_overrides_parts_of_the_file_that_it_extends() {
+    let folder = base_and(&[("pipelines/c.yaml", EXTENDING)]);
+    let project = folder.path().canonicalize().unwrap();
+    let pipeline = Pipeline::read(&project.join("pipelines/c.yaml")).unwrap();
     assert_eq!(pipeline.default, ["b"]);
     assert_eq!(pipeline.stages.keys().collect::<Vec<_>>(), ["a", "b", "c"]);
     let (a, b) = (&pipeline.stages["a"], &pipeline.stages["b"]);
@@ -58,16 +58,16 @@ fn a_file_changes_part_by_part_what_it_extends() {
     assert_eq!((b.run.as_deref(), b.extends.as_deref()), (None, Some("a")));
     assert_eq!(b.inputs["x"], "a");
     // Paths are relative to the file that contains them; errors name its lines.
-    let (lower, upper) = (home.join("pipeline.yaml"), home.join("pipelines/c.yaml"));
+    let (base, extending) = (project.join("pipeline.yaml"), project.join("pipelines/c.yaml"));
     for (stage, part, file, line) in [
-        ("a", Part::Input("x"), &lower, 3),
-        ("a", Part::Input("y"), &upper, 5),
-        ("a", Part::Parameter("one"), &lower, 3),
-        ("a", Part::Parameter("two"), &upper, 7),
-        ("a", Part::Block, &upper, 3),
-        ("b", Part::Field("extends"), &upper, 8),
-        ("b", Part::Input("x"), &lower, 6),
-        ("c", Part::Field("run"), &upper, 9),
+        ("a", Part::Input("x"), &base, 3),
+        ("a", Part::Input("y"), &extending, 5),
+        ("a", Part::Parameter("one"), &base, 3),
+        ("a", Part::Parameter("two"), &extending, 7),
+        ("a", Part::Block, &extending, 3),
+        ("b", Part::Field("extends"), &extending, 8),
+        ("b", Part::Input("x"), &base, 6),
+        ("c", Part::Field("run"), &extending, 9),
     ] {
         let error = pipeline.error(stage, part, "wrong").to_string();
         assert_eq!(error, format!("{}:{line}: stage {stage}: wrong", file.display()));
@@ -78,18 +78,18 @@ fn a_file_changes_part_by_part_what_it_extends() {
         );
     }
     let error = pipeline.error_in_default("wrong".to_owned()).to_string();
-    assert_eq!(error, format!("{}:1: wrong", lower.display()));
+    assert_eq!(error, format!("{}:1: wrong", base.display()));
 }
 
 /// Each error is one line and names the line of `extends`.
 #[test]
-fn files_that_cannot_be_extended() {
+fn files_that_cannot_be_extended_are_refused() {
     let deep: Vec<(String, String)> = (0..10)
         .map(|i| (format!("{i}.yaml"), format!("\nextends: {}.yaml", (i + 1).min(9))))
         .collect();
     let deep: Vec<(&str, &str)> =
         deep.iter().map(|(name, text)| (name.as_str(), text.as_str())).collect();
-    for (files, place, words) in [
+    for (files, location, reason) in [
         (
             &[("x.yaml", "\nextends: ../none.yaml\n")][..],
             "x.yaml:2: ",
@@ -130,15 +130,16 @@ fn files_that_cannot_be_extended() {
         ),
     ] {
         let folder = base_and(&[files, &deep].concat());
-        let home = folder.path().canonicalize().unwrap();
-        let error = Pipeline::read(&home.join("x.yaml")).unwrap_err().to_string();
+        let project = folder.path().canonicalize().unwrap();
+        let error = Pipeline::read(&project.join("x.yaml")).unwrap_err().to_string();
         assert!(
-            error.starts_with(&home.join(place).display().to_string()) && error.contains(words),
+            error.starts_with(&project.join(location).display().to_string())
+                && error.contains(reason),
             "{error}"
         );
         assert!(!error.contains('\n'), "{error}");
     }
-    // Eight files in a chain are allowed, and so is one file reached by two ways.
+    // Eight files in a chain are allowed, and so is one file reached in two ways.
     for text in ["extends: 3.yaml", "extends: [y.yaml, pipeline.yaml, z.yaml]"] {
         let shared = "extends: pipeline.yaml\nstages: {d: {}}";
         let folder = base_and(
@@ -153,16 +154,16 @@ fn files_that_cannot_be_extended() {
     }
 }
 
-fn find(home: &Path, names: &[&str]) -> Result<(Pipeline, Vec<String>), PlanError> {
+fn find(project: &Path, names: &[&str]) -> Result<(Pipeline, Vec<String>), PlanError> {
     let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
-    targets::find_targets(&Pipeline::read(&home.join("pipeline.yaml")).unwrap(), &names)
+    targets::find_targets(&Pipeline::read(&project.join("pipeline.yaml")).unwrap(), &names)
 }
 
 /// Targets are searched in pipeline.yaml, then among the files of `pipelines/`, then among the
 /// blocks of these files.
 #[test]
-fn targets_are_found_beside_the_pipeline() {
-    let shelf = [
+fn targets_are_found_next_to_the_pipeline() {
+    let files = [
         (
             "pipelines/c.yaml",
             "extends: ../pipeline.yaml\nstages: {c: {inputs: {x: b}}, inner: {}, b: {}}",
@@ -175,8 +176,8 @@ fn targets_are_found_beside_the_pipeline() {
         ("pipelines/broken.yaml", "stages: ["),
         ("pipelines/notes.txt", "c"),
     ];
-    let folder = base_and(&shelf);
-    let home = folder.path().canonicalize().unwrap();
+    let folder = base_and(&files);
+    let project = folder.path().canonicalize().unwrap();
     for (names, blocks, stages) in [
         (&[][..], &[][..], &["a", "b"][..]),
         (&["a"], &["a"], &["a", "b"]),
@@ -186,11 +187,11 @@ fn targets_are_found_beside_the_pipeline() {
         (&["b", "c", "other"], &["b", "c", "other"], &["a", "b", "c", "inner", "other"]),
         (&["e"], &["e"], &["a", "b", "e"]),
     ] {
-        let (pipeline, found) = find(&home, names).unwrap();
+        let (pipeline, found) = find(&project, names).unwrap();
         assert_eq!(found, blocks, "{names:?}");
         assert_eq!(pipeline.stages.keys().collect::<Vec<_>>(), stages, "{names:?}");
     }
-    for (names, words) in [
+    for (names, reasons) in [
         (
             &["othre"][..],
             &["no stage \"othre\"; did you mean other? known: a, b, broken, c, d, e, inner, other"]
@@ -199,14 +200,13 @@ fn targets_are_found_beside_the_pipeline() {
         (&["../pipeline"], &["no stage \"../pipeline\""]),
         (&["broken"], &["pipelines/broken.yaml"]),
         (&["c", "e"], &["e can't be combined with c: block a differs in", "run e alone"]),
-        (&["othre"], &["no stage \"othre\"; did you mean other?"]),
     ] {
-        let error = find(&home, names).unwrap_err().to_string();
-        assert!(words.iter().all(|words| error.contains(words)), "{error}");
+        let error = find(&project, names).unwrap_err().to_string();
+        assert!(reasons.iter().all(|reason| error.contains(reason)), "{error}");
     }
 }
 
-fn home_of(folder: &Path, file: &str) -> PathBuf {
+fn relative_project_folder(folder: &Path, file: &str) -> PathBuf {
     let pipeline = Pipeline::read(&folder.join(file)).unwrap();
     pipeline
         .project_folder()
@@ -218,11 +218,11 @@ fn home_of(folder: &Path, file: &str) -> PathBuf {
 }
 
 /// A file of `pipelines/` shares store and pages with pipeline.yaml. An independent pipeline has
-/// its own, wherever it is.
+/// its own store and pages next to it.
 #[test]
-fn the_store_lies_beside_the_pipeline() {
+fn the_store_is_next_to_the_pipeline() {
     let more = [
-        ("pipelines/c.yaml", UPPER),
+        ("pipelines/c.yaml", EXTENDING),
         ("pipelines/alone.yaml", BASE),
         ("other/x.yaml", "extends: ../pipelines/c.yaml"),
     ];
@@ -234,7 +234,7 @@ fn the_store_lies_beside_the_pipeline() {
         ("pipelines/alone.yaml", "pipelines"),
         ("other/x.yaml", "other"),
     ] {
-        assert_eq!(home_of(folder.path(), file), Path::new(expected), "{file}");
+        assert_eq!(relative_project_folder(folder.path(), file), Path::new(expected), "{file}");
     }
 }
 
@@ -250,25 +250,26 @@ fn shipped() -> (Pipeline, Vec<String>) {
 }
 
 /// Checks the names and the order of a pipeline's stages.
-fn holds_together(pipeline: &Pipeline) -> Result<(), crate::PipelineError> {
+fn check_pipeline(pipeline: &Pipeline) -> Result<(), crate::PipelineError> {
     crate::check::check_names(pipeline)?;
     crate::check::topological_order(pipeline).map(drop)
 }
 
 #[test]
-fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
+fn every_shipped_file_is_a_target_and_all_combine() {
     let (pipeline, names) = shipped();
     assert_eq!(pipeline.stages.len(), 6);
     let (all, blocks) = targets::find_targets(&pipeline, &names).unwrap();
     assert_eq!(blocks, names);
-    holds_together(&all).unwrap();
+    check_pipeline(&all).unwrap();
     for name in &names {
-        let (of_file, _) = targets::find_targets(&pipeline, std::slice::from_ref(name)).unwrap();
-        assert_eq!(&of_file.default, std::slice::from_ref(name));
-        holds_together(&of_file).unwrap();
+        let (file_pipeline, _) =
+            targets::find_targets(&pipeline, std::slice::from_ref(name)).unwrap();
+        assert_eq!(&file_pipeline.default, std::slice::from_ref(name));
+        check_pipeline(&file_pipeline).unwrap();
         // The file is complete, and its blocks are those of pipeline.yaml unless it overrides them.
         assert!(
-            pipeline.stages.keys().all(|stage| pipeline.has_equal_block(&of_file, stage)),
+            pipeline.stages.keys().all(|stage| pipeline.has_equal_block(&file_pipeline, stage)),
             "{name}"
         );
     }

@@ -72,16 +72,16 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_earlier_run_explains() {
+    fn changes_are_from_the_nearest_earlier_run_of_the_stage() {
         let records = [
             record("prep", 1, &json!({"code": "a", "parameter kernel": "box"})),
             record("prep", 9, &json!({"code": "z", "parameter kernel": "avg"})),
             record("eval", 9, &json!({"code": "a", "parameter kernel": "lanczos"})),
         ];
-        let now = json!({"code": "a", "parameter kernel": "lanczos"});
-        let changes = explain(now.as_object().unwrap(), "prep", &records).unwrap();
+        let key_parts = json!({"code": "a", "parameter kernel": "lanczos"});
+        let changes = explain(key_parts.as_object().unwrap(), "prep", &records).unwrap();
         assert_eq!(changes, [r#"parameter kernel: "box" → "lanczos""#]);
-        assert_eq!(explain(now.as_object().unwrap(), "other", &records), None);
-        assert!(explain(now.as_object().unwrap(), "eval", &records).unwrap().is_empty());
+        assert_eq!(explain(key_parts.as_object().unwrap(), "other", &records), None);
+        assert!(explain(key_parts.as_object().unwrap(), "eval", &records).unwrap().is_empty());
     }
 }

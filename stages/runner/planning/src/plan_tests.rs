@@ -1,4 +1,4 @@
-//! Expansion of files and command lines to nodes, with given descriptions.
+//! Expansion of pipeline files and command lines to nodes, with given descriptions of stages.
 
 use std::path::Path;
 
@@ -27,7 +27,8 @@ stages:
     inputs: {run: score}
 ";
 
-fn whole(mut one: Value) -> (String, Description) {
+/// Adds missing fields to a description. Returns the stage's name and the description.
+fn complete_description(mut description: Value) -> (String, Description) {
     for (name, value) in [
         ("version", json!("1")),
         ("code", json!("1")),
@@ -35,15 +36,15 @@ fn whole(mut one: Value) -> (String, Description) {
         ("inputs", json!({})),
         ("parameters", json!({})),
     ] {
-        one.as_object_mut().unwrap().entry(name).or_insert(value);
+        description.as_object_mut().unwrap().entry(name).or_insert(value);
     }
-    (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
+    (description["name"].as_str().unwrap().to_owned(), serde_json::from_value(description).unwrap())
 }
 
-/// Descriptions of the stages of [`PIPELINE`].
+/// Returns the descriptions of the stages of [`PIPELINE`].
 fn descriptions() -> BTreeMap<String, Description> {
     let seed = json!({"type": "integer", "format": "uint64", "default": 0});
-    let described = json!([
+    let stages = json!([
         {"name": "make", "output": {"kind": "data"}, "parameters": {"properties": {
             "size": {"type": "integer", "format": "uint32", "minimum": 1, "default": 4},
             "seed": seed}}},
@@ -81,17 +82,17 @@ fn descriptions() -> BTreeMap<String, Description> {
          "rules": [{"when": {"run.quick": {"const": true}}, "must": {"views": {"maximum": 8}},
             "message": "quick scores have few views"}]}
     ]);
-    described.as_array().unwrap().iter().cloned().map(whole).collect()
+    stages.as_array().unwrap().iter().cloned().map(complete_description).collect()
 }
 
 fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
     let mut request = Request::default();
-    let mut words = arguments.iter().map(|word| (*word).to_owned());
-    while let Some(word) = words.next() {
-        match word.as_str() {
-            "-p" => request.parameters.extend(words.next()),
-            "-i" => request.inputs.extend(words.next()),
-            _ => request.targets.push(word),
+    let mut remaining = arguments.iter().map(|argument| (*argument).to_owned());
+    while let Some(argument) = remaining.next() {
+        match argument.as_str() {
+            "-p" => request.parameters.extend(remaining.next()),
+            "-i" => request.inputs.extend(remaining.next()),
+            _ => request.targets.push(argument),
         }
     }
     let pipeline = Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?;
@@ -99,7 +100,7 @@ fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
 }
 
 #[track_caller]
-fn refused(text: &str, arguments: &[&str]) -> PlanError {
+fn plan_error(text: &str, arguments: &[&str]) -> PlanError {
     plan_of(text, arguments).map(|plan| plan.nodes.len()).unwrap_err()
 }
 
@@ -146,12 +147,19 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
 }
 
 #[test]
-fn a_block_follows_the_one_it_extends_save_in_what_it_says() {
+fn a_block_inherits_the_parameters_that_it_does_not_set() {
     let plan = plan_of(PIPELINE, &["again", "train", "-p", "train.rays=9", "-p", "supersample=3"])
         .unwrap();
-    let of = |stage: &str| &plan.nodes.iter().find(|n| n.stage == stage).unwrap().parameters;
-    assert_eq!((&of("train")["rays"], &of("train")["supersample"]), (&json!(9), &json!(3.0)));
-    assert_eq!((&of("again")["rays"], &of("again")["supersample"]), (&json!(7), &json!(3.0)));
+    let parameters =
+        |stage: &str| &plan.nodes.iter().find(|n| n.stage == stage).unwrap().parameters;
+    assert_eq!(
+        (&parameters("train")["rays"], &parameters("train")["supersample"]),
+        (&json!(9), &json!(3.0))
+    );
+    assert_eq!(
+        (&parameters("again")["rays"], &parameters("again")["supersample"]),
+        (&json!(7), &json!(3.0))
+    );
 }
 
 fn keys(text: &str, arguments: &[&str]) -> Vec<String> {
@@ -159,11 +167,11 @@ fn keys(text: &str, arguments: &[&str]) -> Vec<String> {
     plan.nodes.iter().map(|node| artifact::hash_json(&key_parts(node, &[], "cpu"))).collect()
 }
 
-/// Equal values have equal keys, in every notation and place. An explicit default and an omitted
-/// parameter have equal keys, too.
+/// Equal values have equal keys, in every notation, in files and on command lines. An explicit
+/// default and an omitted parameter also have equal keys.
 #[test]
-fn equal_values_are_one_key() {
-    let same: [(&[&str], &[&str]); 9] = [
+fn equal_values_have_equal_keys() {
+    let equal: [(&[&str], &[&str]); 8] = [
         (&[], &["-p", "supersample=2"]),
         (&[], &["-p", "supersample=2e0", "-p", "size=4.0", "-p", "train.seed=0"]),
         (&[], &["-p", "prep.scale=2.0"]),
@@ -171,11 +179,10 @@ fn equal_values_are_one_key() {
         (&["-p", "rays=6e4"], &["-p", "rays=60000"]),
         (&["-p", "prep.scale=3"], &["-p", "prep.scale=3.0"]),
         (&["-p", "place=[1,2.5]"], &["-p", "place=[1.0,25e-1]"]),
-        (&["-p", "make.seed=18446744073709551615"], &["-p", "make.seed=18446744073709551615"]),
         (&["-p", "supersample=3"], &["-p", "supersample=4", "-p", "train.supersample=3.0"]),
     ];
-    for (one, other) in same {
-        assert_eq!(keys(PIPELINE, one), keys(PIPELINE, other), "{one:?} {other:?}");
+    for (left, right) in equal {
+        assert_eq!(keys(PIPELINE, left), keys(PIPELINE, right), "{left:?} {right:?}");
     }
     for (from, to) in [
         ("{scale: 2}", "{scale: 2.0}"),
@@ -190,7 +197,7 @@ fn equal_values_are_one_key() {
 
 /// The last of several values for one parameter wins, and the plan notes the others.
 #[test]
-fn the_last_one_wins() {
+fn the_last_value_wins() {
     for (arguments, notes, name, value) in [
         (
             &["-p", "kernel=box", "-p", "prep.kernel=average"][..],
@@ -238,8 +245,8 @@ fn the_last_one_wins() {
 }
 
 #[test]
-fn command_lines_that_cannot_be_meant() {
-    for (arguments, words) in [
+fn invalid_command_lines_are_refused() {
+    for (arguments, expected) in [
         (&["evla"][..], "no stage \"evla\"; known: again, make, prep, report, score, train"),
         (&["socre"], "no stage \"socre\"; did you mean score? known:"),
         (&["-p", "kernal=box"], "-p kernal: no stage has this parameter; did you mean kernel? see"),
@@ -286,11 +293,11 @@ fn command_lines_that_cannot_be_meant() {
         (&["-p", "quick=true", "-p", "views=9"], "stage report: quick scores have few views"),
         (&["-p", "method=plain,net"], "stage train [method=net]: input weights is missing"),
     ] {
-        let problem = refused(PIPELINE, arguments);
+        let problem = plan_error(PIPELINE, arguments);
         assert!(matches!(problem, PlanError::Usage(_)), "{problem:?}");
-        assert!(problem.to_string().contains(words), "{arguments:?}: {problem}");
+        assert!(problem.to_string().contains(expected), "{arguments:?}: {problem}");
     }
-    for fine in [
+    for valid in [
         &["-p", "kernel=average"][..],
         &["-p", "method=net", "-i", "weights=w"],
         &["-p", "background=alpha", "-p", "open=true"],
@@ -298,11 +305,11 @@ fn command_lines_that_cannot_be_meant() {
         &["prep", "-p", "background=alpha"],
         &["-p", "quick=true"],
     ] {
-        assert!(plan_of(PIPELINE, fine).is_ok(), "{fine:?}");
+        assert!(plan_of(PIPELINE, valid).is_ok(), "{valid:?}");
     }
     let values = (0..120).map(|i| i.to_string()).collect::<Vec<_>>().join(",");
     let arguments = [format!("make.seed={values}"), format!("train.seed={values}")];
-    let problem = refused(PIPELINE, &["train", "-p", &arguments[0], "-p", &arguments[1]]);
+    let problem = plan_error(PIPELINE, &["train", "-p", &arguments[0], "-p", &arguments[1]]);
     assert!(
         problem
             .to_string()
@@ -313,8 +320,8 @@ fn command_lines_that_cannot_be_meant() {
 
 /// Each error names its line.
 #[test]
-fn files_that_cannot_be_used() {
-    for (from, to, line, words) in [
+fn invalid_files_are_refused() {
+    for (from, to, line, expected) in [
         (
             "default: [report]",
             "\n\ndefault: [reprot]",
@@ -392,16 +399,18 @@ fn files_that_cannot_be_used() {
         ("  train:\n", "  train:\n    run: other\n", 8, "stage train: no description of other"),
     ] {
         let text = PIPELINE.replace(from, to);
-        let problem = refused(&text, &[]).to_string();
+        let problem = plan_error(&text, &[]).to_string();
         assert!(
-            problem.starts_with(&format!("dir/pipeline.yaml:{line}: ")) && problem.contains(words),
+            problem.starts_with(&format!("dir/pipeline.yaml:{line}: "))
+                && problem.contains(expected),
             "{to}: {problem}"
         );
     }
     // The program of an unneeded stage may be unknown.
     let unneeded = plan_of(&format!("{PIPELINE}  other: {{}}\n"), &[]).unwrap();
     assert_eq!(unneeded.nodes.len(), 4);
-    let problem = refused(&format!("{PIPELINE}  other: {{}}\n"), &["-p", "nothing=1"]).to_string();
+    let problem =
+        plan_error(&format!("{PIPELINE}  other: {{}}\n"), &["-p", "nothing=1"]).to_string();
     assert!(
         problem.contains("has this parameter") && problem.contains("were not searched: other"),
         "{problem}"
@@ -409,21 +418,17 @@ fn files_that_cannot_be_used() {
 }
 
 #[test]
-fn files_as_editors_write_them() {
+fn byte_order_marks_crlf_and_merge_keys_are_accepted() {
     let expected =
         plan_of(PIPELINE, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>();
-    let windows = format!("\u{feff}{}", PIPELINE.replace('\n', "\r\n"));
+    let with_crlf = format!("\u{feff}{}", PIPELINE.replace('\n', "\r\n"));
     let merged = PIPELINE
         .replace("{scale: 2}", "&prep {scale: 2}")
         .replace("rays: 7", "<<: *prep\n      rays: 7");
-    for text in [windows.as_str(), PIPELINE] {
-        assert_eq!(
-            plan_of(text, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>(),
-            expected
-        );
-    }
+    let found = plan_of(&with_crlf, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>();
+    assert_eq!(found, expected);
     // A merged key is checked like any other key.
-    let problem = refused(&merged, &[]).to_string();
+    let problem = plan_error(&merged, &[]).to_string();
     assert!(
         problem.starts_with("dir/pipeline.yaml:13: ")
             && problem.contains("parameter scale: unknown"),
@@ -435,24 +440,24 @@ fn files_as_editors_write_them() {
     assert_eq!(plan_of(&merged, &["again"]).unwrap().nodes.len(), 3);
     let merged =
         merged.replace("rays: 7", "rays: {x: 7}").replace("extends: train", "extends: [train]");
-    let problem = refused(&merged, &["again"]).to_string();
+    let problem = plan_error(&merged, &["again"]).to_string();
     assert!(problem.starts_with("dir/pipeline.yaml:11: stages.again.extends"), "{problem}");
-    // A merge key with a tag is a key like any other.
+    // A tagged merge key is an ordinary key.
     let tagged = format!("!tag <<: {{a: 1}}\n{PIPELINE}");
-    assert!(refused(&tagged, &[]).to_string().contains("dir/pipeline.yaml"));
+    assert!(plan_error(&tagged, &[]).to_string().contains("dir/pipeline.yaml"));
 }
 
 #[test]
-fn resources_follow_extends_and_gpus_are_the_clusters_affair() {
+fn resources_are_inherited_and_gpus_choose_the_device() {
     let text = PIPELINE
         .replace("  make: {}", "  make: {resources: {cpus: 2}}")
         .replace("  train:\n", "  train:\n    resources: {gpus: 1, mem: 8G}\n")
         .replace("    extends: train\n", "    extends: train\n    resources: {mem: 4G}\n");
     let plan = plan_of(&text, &["again", "report"]).unwrap();
-    let of = |stage: &str| serde_json::to_value(plan.resources.get(stage)).unwrap();
-    assert_eq!([of("make"), of("prep")], [json!({"cpus": 2}), json!(null)]);
+    let resources = |stage: &str| serde_json::to_value(plan.resources.get(stage)).unwrap();
+    assert_eq!([resources("make"), resources("prep")], [json!({"cpus": 2}), json!(null)]);
     assert_eq!(
-        [of("train"), of("again")],
+        [resources("train"), resources("again")],
         [json!({"gpus": 1, "mem": "8G"}), json!({"gpus": 1, "mem": "4G"})]
     );
     for (by_resources, device) in [(false, "cpu"), (true, "cuda:0")] {
@@ -462,11 +467,14 @@ fn resources_follow_extends_and_gpus_are_the_clusters_affair() {
     }
 }
 
-fn ancestors(plan: &Plan, of: usize) -> usize {
-    let mut wanted = BTreeSet::from([of]);
-    (0..=of)
+/// Returns the number of a node and its ancestors.
+fn count_with_ancestors(plan: &Plan, node: usize) -> usize {
+    let mut included = BTreeSet::from([node]);
+    (0..=node)
         .rev()
-        .filter(|&i| wanted.contains(&i).then(|| wanted.extend(plan.nodes[i].parents())).is_some())
+        .filter(|&i| {
+            included.contains(&i).then(|| included.extend(plan.nodes[i].parents())).is_some()
+        })
         .count()
 }
 
@@ -474,9 +482,9 @@ fn parent_labels(plan: &Plan, node: &Node) -> Vec<String> {
     node.parents().map(|p| plan.nodes[p].label()).collect()
 }
 
-/// The plan of a task survives writing and reading.
+/// A written plan that is read back gives each task its node and the node's ancestors.
 #[test]
-fn a_frozen_plan_has_all_that_a_task_needs() {
+fn a_frozen_plan_contains_the_nodes_of_each_task() {
     use crate::frozen::FrozenPlan;
     let plan = plan_of(PIPELINE, &["-p", "supersample=1,2", "report"]).unwrap();
     let text = serde_json::to_vec(&FrozenPlan::new(&plan, Path::new("/out"))).unwrap();
@@ -484,15 +492,15 @@ fn a_frozen_plan_has_all_that_a_task_needs() {
     std::fs::write(folder.path().join("plan.json"), &text).unwrap();
     let frozen = FrozenPlan::read(&folder.path().join("plan.json")).unwrap();
     for (index, node) in plan.nodes.iter().enumerate() {
-        let part = frozen.task_plan(index).unwrap();
-        let last = part.nodes.last().unwrap();
+        let task_plan = frozen.task_plan(index).unwrap();
+        let last = task_plan.nodes.last().unwrap();
         assert_eq!((last.label(), &last.parameters), (node.label(), &node.parameters));
         assert_eq!(
-            (parent_labels(&part, last), part.nodes.len()),
-            (parent_labels(&plan, node), ancestors(&plan, index))
+            (parent_labels(&task_plan, last), task_plan.nodes.len()),
+            (parent_labels(&plan, node), count_with_ancestors(&plan, index))
         );
     }
-    let page = frozen.task_plan(plan.nodes.len()).unwrap();
-    assert_eq!((page.nodes.len(), page.sinks[0].nodes.len()), (plan.nodes.len(), 2));
+    let sink_plan = frozen.task_plan(plan.nodes.len()).unwrap();
+    assert_eq!((sink_plan.nodes.len(), sink_plan.sinks[0].nodes.len()), (plan.nodes.len(), 2));
     assert!(frozen.task_plan(plan.nodes.len() + 1).is_err());
 }

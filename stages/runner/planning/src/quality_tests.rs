@@ -1,4 +1,4 @@
-//! Qualities: their table, and their expansion to parameters.
+//! Tests of the table of qualities, and of the expansion of qualities to parameters.
 
 use std::path::Path;
 
@@ -27,30 +27,30 @@ const SCHEMAS: [(&str, &str); 4] = [
 ];
 
 fn descriptions() -> BTreeMap<String, Description> {
-    let mut described = BTreeMap::new();
+    let mut descriptions = BTreeMap::new();
     let prep = [("prep", r#"{"properties": {"lr_width": {"type": "integer", "default": 100}}}"#)];
     for (name, parameters) in SCHEMAS.into_iter().chain(prep) {
         let parameters: Value = serde_json::from_str(parameters).unwrap();
-        let text = json!({"name": name, "version": "", "code": "", "summary": "",
+        let description = json!({"name": name, "version": "", "code": "", "summary": "",
         "parameters": parameters, "output": {"kind": name},
         "inputs": {
             "scene": {"kinds": ["prep"], "summary": "", "optional": true},
             "field": {"kinds": ["train-ss"], "summary": "", "optional": true},
         }});
-        described.insert(name.to_owned(), serde_json::from_value(text).unwrap());
+        descriptions.insert(name.to_owned(), serde_json::from_value(description).unwrap());
     }
-    described
+    descriptions
 }
 
 fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
-    let parameters = arguments.iter().map(|word| (*word).to_owned()).collect();
+    let parameters = arguments.iter().map(|argument| (*argument).to_owned()).collect();
     let pipeline = Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?;
     let request = Request { parameters, ..Request::default() };
     Plan::from_descriptions(&pipeline, &descriptions(), &request)
 }
 
 fn problem(text: &str, arguments: &[&str]) -> String {
-    plan_of(text, arguments).err().expect("refused").to_string()
+    plan_of(text, arguments).err().expect("a refused plan").to_string()
 }
 
 /// Returns the only node of a stage.
@@ -63,7 +63,7 @@ fn node(text: &str, arguments: &[&str], stage: &str) -> Node {
 }
 
 /// Returns a parameter of a quality's row.
-fn of(quality: Quality, program: &str, name: &str) -> Value {
+fn parameter_of(quality: Quality, program: &str, name: &str) -> Value {
     ROWS[&quality][program][name].clone()
 }
 
@@ -95,30 +95,31 @@ fn best_has_the_defaults_of_the_stages() {
 #[test]
 fn a_better_quality_casts_more_rays() {
     for name in ["rays_per_pixel", "min_rays", "max_rays"] {
-        let values = Quality::ALL.map(|quality| of(quality, "train-ss", name).as_f64().unwrap());
+        let values =
+            Quality::ALL.map(|quality| parameter_of(quality, "train-ss", name).as_f64().unwrap());
         assert!(values.is_sorted_by(|a, b| a < b), "{name}: {values:?}");
     }
 }
 
-/// Keys contain the parameters, and never the word.
+/// Keys contain a quality's parameters, but never its name.
 #[test]
 fn a_quality_equals_its_parameters() {
     for (stage, program) in [("train-ss", "train-ss"), ("render-depth", "render-depth")] {
-        let written: Vec<String> = ROWS[&Quality::Fast][program]
+        let explicit: Vec<String> = ROWS[&Quality::Fast][program]
             .iter()
             .map(|(name, value)| format!("{stage}.{name}={value}"))
             .collect();
-        let written: Vec<&str> = written.iter().map(String::as_str).collect();
+        let explicit: Vec<&str> = explicit.iter().map(String::as_str).collect();
         let parts = |arguments: &[&str]| {
             let parts = key_parts(&node(PIPELINE, arguments, stage), &[], "cpu");
             assert!(!parts.contains_key("parameter quality"));
             parts
         };
-        assert_eq!(parts(&["quality=fast"]), parts(&written));
+        assert_eq!(parts(&["quality=fast"]), parts(&explicit));
         assert_eq!(parts(&["quality=balanced"]), parts(&[]));
         assert_ne!(parts(&["quality=fast"]), parts(&[]));
         let in_file = PIPELINE.replace("default:", "quality: fast\ndefault:");
-        assert_eq!(key_parts(&node(&in_file, &[], stage), &[], "cpu"), parts(&written));
+        assert_eq!(key_parts(&node(&in_file, &[], stage), &[], "cpu"), parts(&explicit));
     }
 }
 
@@ -133,12 +134,12 @@ fn given_parameters_override_a_quality() {
         (
             &[][..],
             "train-ss",
-            [json!(7), json!(5), of(Quality::Fast, "train-ss", "rays_per_pixel")],
+            [json!(7), json!(5), parameter_of(Quality::Fast, "train-ss", "rays_per_pixel")],
         ),
         (
             &["quality=best", "min_rays=6"],
             "train-ss",
-            [json!(7), json!(6), of(Quality::Best, "train-ss", "rays_per_pixel")],
+            [json!(7), json!(6), parameter_of(Quality::Best, "train-ss", "rays_per_pixel")],
         ),
         (
             &["rays_per_pixel=0.5", "quality=draft", "rays="],
@@ -161,7 +162,7 @@ fn a_block_that_extends_another_has_the_quality() {
     );
     let text = text.replace("[render-depth]", "[small]");
     let node = node(&text, &["quality=draft"], "small");
-    assert_eq!(node.parameters["min_rays"], of(Quality::Draft, "train-ss", "min_rays"));
+    assert_eq!(node.parameters["min_rays"], parameter_of(Quality::Draft, "train-ss", "min_rays"));
 }
 
 #[test]
@@ -197,7 +198,7 @@ fn other_variants_have_no_quality() {
     let refiner = "default: [train-refine]\nstages:\n  train-refine: {}\n";
     assert_eq!(
         node(refiner, &["quality=draft"], "train-refine").parameters["steps"],
-        of(Quality::Draft, "train-refine", "steps")
+        parameter_of(Quality::Draft, "train-refine", "steps")
     );
     assert_eq!(
         node(refiner, &["net=paper", "quality=draft"], "train-refine").parameters["steps"],
@@ -208,9 +209,9 @@ fn other_variants_have_no_quality() {
 #[test]
 fn an_unknown_quality_is_refused_with_the_known_ones() {
     let known = "choose draft, fast, balanced or best";
-    for word in ["good", "2", "", "Best"] {
-        let problem = problem(PIPELINE, &[&format!("quality={word}")]);
-        assert!(problem.starts_with(&format!("-p quality={word}: no quality")), "{problem}");
+    for name in ["good", "2", "", "Best"] {
+        let problem = problem(PIPELINE, &[&format!("quality={name}")]);
+        assert!(problem.starts_with(&format!("-p quality={name}: no quality")), "{problem}");
         assert!(problem.ends_with(known) && !problem.contains('\n'), "{problem}");
     }
     let file = PIPELINE.replace("stages:", "quality: good\nstages:");
@@ -221,8 +222,8 @@ fn an_unknown_quality_is_refused_with_the_known_ones() {
     }
     let experiment = format!("{PIPELINE}experiment:\n  sweeps: {{quality: [good]}}\n");
     assert!(problem(&experiment, &[]).ends_with(known));
-    let of_stage = problem(PIPELINE, &["train-ss.quality=best"]);
-    assert!(of_stage.contains("train-ss has no such parameter"), "{of_stage}");
+    let stage_problem = problem(PIPELINE, &["train-ss.quality=best"]);
+    assert!(stage_problem.contains("train-ss has no such parameter"), "{stage_problem}");
 }
 
 /// A file's own quality overrides those of the files that it extends, of which the first wins.

@@ -13,7 +13,7 @@ fn store_and_data() -> (tempfile::TempDir, Store, PathBuf) {
     (dir, store, data)
 }
 
-fn content(store: &Store, folder: &Path) -> String {
+fn hash_of(store: &Store, folder: &Path) -> String {
     Source::read(store, folder, None).unwrap().content_hash()
 }
 
@@ -25,13 +25,13 @@ fn unpack(file: &Path, text: &str) {
 }
 
 /// Reads a folder after its files have become old enough for the cache.
-fn settled(store: &Store, folder: &Path) -> Source {
+fn read_settled(store: &Store, folder: &Path) -> Source {
     std::thread::sleep(Duration::from_secs(4));
     Source::read(store, folder, None).unwrap()
 }
 
 #[test]
-fn what_is_no_folder_is_refused() {
+fn a_source_must_be_a_folder() {
     let (dir, store, _) = store_and_data();
     let (file, absent) = (dir.path().join("file"), dir.path().join("absent"));
     fs::write(&file, "x").unwrap();
@@ -40,22 +40,21 @@ fn what_is_no_folder_is_refused() {
     assert_eq!(problem(&absent), format!("{absent:?}: no such folder; name an existing one"));
 }
 
-/// Editors' temporary files don't change the hash.
 #[test]
-fn what_is_passed_over_has_no_part_in_the_hash() {
+fn editors_temporary_files_do_not_change_the_hash() {
     let (_dir, store, data) = store_and_data();
     fs::write(data.join("transforms.json"), "{}").unwrap();
-    let before = content(&store, &data);
+    let before = hash_of(&store, &data);
     std::os::unix::fs::symlink("me@host.1", data.join(".#transforms.json")).unwrap();
     fs::write(data.join("._transforms.json"), "x").unwrap();
-    assert_eq!(content(&store, &data), before);
+    assert_eq!(hash_of(&store, &data), before);
 }
 
 /// Every file name is allowed, and each gives a different hash.
 #[test]
 fn any_name_has_a_hash() {
     let (_dir, store, data) = store_and_data();
-    let mut seen = std::collections::BTreeSet::new();
+    let mut hashes = std::collections::BTreeSet::new();
     for name in [
         &b"plain"[..],
         b"\xff",
@@ -67,30 +66,30 @@ fn any_name_has_a_hash() {
     ] {
         fs::create_dir_all(&data).unwrap();
         fs::write(data.join(OsStr::from_bytes(name)), "x").unwrap();
-        assert!(seen.insert(content(&store, &data)), "{name:?}");
+        assert!(hashes.insert(hash_of(&store, &data)), "{name:?}");
         fs::remove_dir_all(&data).unwrap();
     }
 }
 
 /// Exchanging two files of one archive changes neither names, sizes nor times.
 #[test]
-fn files_that_change_places_are_hashed_anew() {
+fn exchanged_files_are_hashed_again() {
     let (_dir, store, data) = store_and_data();
-    let [a, b, aside] = ["a", "b", "aside"].map(|name| data.join(name));
+    let [a, b, third] = ["a", "b", "third"].map(|name| data.join(name));
     unpack(&a, "one");
     unpack(&b, "two");
-    let before = settled(&store, &data);
-    fs::rename(&a, &aside).unwrap();
+    let before = read_settled(&store, &data);
+    fs::rename(&a, &third).unwrap();
     fs::rename(&b, &a).unwrap();
-    fs::rename(&aside, &b).unwrap();
-    let now = Source::read(&store, &data, None).unwrap();
-    assert_ne!(now.content_hash(), before.content_hash());
-    assert_eq!(now.change_since(&before).as_deref(), Some("a was changed"));
+    fs::rename(&third, &b).unwrap();
+    let after = Source::read(&store, &data, None).unwrap();
+    assert_ne!(after.content_hash(), before.content_hash());
+    assert_eq!(after.change_since(&before).as_deref(), Some("a was changed"));
 }
 
 /// A file that was changed counts as changed, even if content and time were restored.
 #[test]
-fn what_was_done_to_a_file_is_seen() {
+fn every_change_of_a_file_is_reported() {
     let (_dir, store, data) = store_and_data();
     let (file, other) = (data.join("a"), data.join("b"));
     unpack(&file, "one");
@@ -105,7 +104,7 @@ fn what_was_done_to_a_file_is_seen() {
     unpack(&file, "two");
     assert_eq!(change().as_deref(), Some("a was changed"));
     unpack(&file, "one");
-    assert_eq!(content(&store, &data), before.content_hash());
+    assert_eq!(hash_of(&store, &data), before.content_hash());
     assert_eq!(change().as_deref(), Some("a was changed"));
     fs::remove_file(&file).unwrap();
     assert_eq!(change().as_deref(), Some("a was removed"));
@@ -116,19 +115,19 @@ fn what_was_done_to_a_file_is_seen() {
 fn a_known_file_is_not_read_again() {
     let (_dir, store, data) = store_and_data();
     unpack(&data.join("a"), "one");
-    let before = settled(&store, &data);
+    let before = read_settled(&store, &data);
     let cache = CacheFile::new(&store, &data.canonicalize().unwrap());
     let mut files = cache.files();
     files.get_mut("a").unwrap().blake3 = "0".repeat(64);
     cache.write(&files);
-    assert_ne!(content(&store, &data), before.content_hash());
+    assert_ne!(hash_of(&store, &data), before.content_hash());
     // A damaged cache counts as empty.
     fs::write(&cache.path, "{").unwrap();
-    assert_eq!(content(&store, &data), before.content_hash());
+    assert_eq!(hash_of(&store, &data), before.content_hash());
 }
 
 #[test]
-fn hashing_ends_with_the_signal_and_tells_how_far_it_is() {
+fn hashing_stops_at_a_signal_and_reports_progress() {
     let (_dir, store, data) = store_and_data();
     File::create(data.join("large")).unwrap().set_len(1 << 40).unwrap();
     let stop = AtomicBool::new(true);
@@ -142,7 +141,7 @@ fn hashing_ends_with_the_signal_and_tells_how_far_it_is() {
 }
 
 #[test]
-fn a_socket_is_named_before_anything_waits_for_it() {
+fn a_socket_is_refused_instead_of_read() {
     let (_dir, store, data) = store_and_data();
     let _socket = std::os::unix::net::UnixListener::bind(data.join("r_0.png")).unwrap();
     let problem = Source::read(&store, &data, None).unwrap_err().to_string();

@@ -1,5 +1,5 @@
 //! Parameters of a stage whose `field` selects a variant, in every notation of files and command
-//! lines, by the example of train-ss.
+//! lines, with train-ss as the example.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::*;
 
-/// Part of the shipped pipeline: a training, and one that extends it.
+/// Part of the shipped pipeline: a training block and a block that extends it.
 const PIPELINE: &str = "default: [train-ss]
 stages:
   scene: {}
@@ -22,8 +22,8 @@ stages:
       ensemble: 2
 ";
 
-fn named(one: Value) -> (String, Description) {
-    (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
+fn named_description(json: Value) -> (String, Description) {
+    (json["name"].as_str().unwrap().to_owned(), serde_json::from_value(json).unwrap())
 }
 
 fn descriptions() -> BTreeMap<String, Description> {
@@ -37,12 +37,12 @@ fn descriptions() -> BTreeMap<String, Description> {
                "inputs": {"scene": {"kinds": ["scene"], "summary": ""}},
                "output": {"kind": "field", "resolved": "training.json"}}),
     ];
-    described.into_iter().map(named).collect()
+    described.into_iter().map(named_description).collect()
 }
 
 fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
     let request = Request {
-        parameters: arguments.iter().map(|word| (*word).to_owned()).collect(),
+        parameters: arguments.iter().map(|argument| (*argument).to_owned()).collect(),
         ..Request::default()
     };
     let pipeline = Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?;
@@ -53,7 +53,7 @@ fn values(node: &Node, names: &[&str]) -> Vec<Value> {
     names.iter().map(|name| node.parameters.get(name).cloned().unwrap_or(json!("absent"))).collect()
 }
 
-/// Returns the trainings of a plan: point and some parameters.
+/// Returns the point and the named parameters of each training of a plan.
 fn trainings(text: &str, arguments: &[&str], names: &[&str]) -> Vec<(String, Vec<Value>)> {
     let plan = plan_of(text, arguments).unwrap();
     let nodes = plan.nodes.iter().filter(|node| node.stage == "train-ss");
@@ -68,65 +68,66 @@ fn mlp(rays: Value, layers: u32) -> Vec<Value> {
     vec![json!("mlp"), rays, json!("absent"), json!(layers), json!(256)]
 }
 
-fn pointed(points: &[(&str, Vec<Value>)]) -> Vec<(String, Vec<Value>)> {
+fn at_points(points: &[(&str, Vec<Value>)]) -> Vec<(String, Vec<Value>)> {
     points.iter().map(|(point, values)| ((*point).to_owned(), values.clone())).collect()
 }
 
 #[test]
-fn every_form_reaches_a_parameter_of_a_variant() {
+fn every_notation_sets_a_variants_parameters() {
     let names = ["field", "rays", "n_levels", "layers", "hidden_dim"];
-    let one = |values: Vec<Value>| vec![(String::new(), values)];
+    let single = |values: Vec<Value>| vec![(String::new(), values)];
     let nested = &PIPELINE.replace("rays: 12000000", "field: {grid: {n_levels: 4}}")[..];
-    let beside = &PIPELINE.replace("rays: 12000000", "rays: 12000000\n      n_levels: 4")[..];
-    let paper = &PIPELINE.replace("rays: 12000000", "field: mlp\n      layers: 4")[..];
-    let all = Some(12_000_000);
+    let flat = &PIPELINE.replace("rays: 12000000", "rays: 12000000\n      n_levels: 4")[..];
+    let with_mlp = &PIPELINE.replace("rays: 12000000", "field: mlp\n      layers: 4")[..];
+    let rays = Some(12_000_000);
     for (text, arguments, expected) in [
-        (PIPELINE, &[][..], one(grid(all, 8))),
-        (PIPELINE, &["n_levels=4"], one(grid(all, 4))),
-        (PIPELINE, &["train-ss.n_levels=4"], one(grid(all, 4))),
-        (PIPELINE, &["n_levels=5", "train-ss.n_levels=4"], one(grid(all, 4))),
-        (PIPELINE, &["field={\"grid\":{\"n_levels\":4}}"], one(grid(all, 4))),
-        (PIPELINE, &["field=mlp"], one(mlp(json!(all), 8))),
-        (PIPELINE, &["train-ss.field=mlp"], one(mlp(json!(all), 8))),
-        (PIPELINE, &["field=mlp", "layers=4"], one(mlp(json!(all), 4))),
-        (PIPELINE, &["layers=4", "field=mlp"], one(mlp(json!(all), 4))),
-        (PIPELINE, &["field=mlp", "rays="], one(mlp(json!(null), 8))),
-        (PIPELINE, &["field={\"mlp\":{\"layers\":4}}"], one(mlp(json!(all), 4))),
+        (PIPELINE, &[][..], single(grid(rays, 8))),
+        (PIPELINE, &["n_levels=4"], single(grid(rays, 4))),
+        (PIPELINE, &["train-ss.n_levels=4"], single(grid(rays, 4))),
+        (PIPELINE, &["n_levels=5", "train-ss.n_levels=4"], single(grid(rays, 4))),
+        (PIPELINE, &["field={\"grid\":{\"n_levels\":4}}"], single(grid(rays, 4))),
+        (PIPELINE, &["field=mlp"], single(mlp(json!(rays), 8))),
+        (PIPELINE, &["train-ss.field=mlp"], single(mlp(json!(rays), 8))),
+        (PIPELINE, &["field=mlp", "layers=4"], single(mlp(json!(rays), 4))),
+        (PIPELINE, &["layers=4", "field=mlp"], single(mlp(json!(rays), 4))),
+        (PIPELINE, &["field=mlp", "rays="], single(mlp(json!(null), 8))),
+        (PIPELINE, &["field={\"mlp\":{\"layers\":4}}"], single(mlp(json!(rays), 4))),
         (
             PIPELINE,
             &["n_levels=4,8"],
-            pointed(&[("n_levels=4", grid(all, 4)), ("n_levels=8", grid(all, 8))]),
+            at_points(&[("n_levels=4", grid(rays, 4)), ("n_levels=8", grid(rays, 8))]),
         ),
         (
             PIPELINE,
             &["field=grid,mlp"],
-            pointed(&[("field=grid", grid(all, 8)), ("field=mlp", mlp(json!(all), 8))]),
+            at_points(&[("field=grid", grid(rays, 8)), ("field=mlp", mlp(json!(rays), 8))]),
         ),
         (
             PIPELINE,
             &["field=mlp", "layers=2,4"],
-            pointed(&[("layers=2", mlp(json!(all), 2)), ("layers=4", mlp(json!(all), 4))]),
+            at_points(&[("layers=2", mlp(json!(rays), 2)), ("layers=4", mlp(json!(rays), 4))]),
         ),
-        (nested, &[], one(grid(None, 4))),
-        (nested, &["n_levels=6"], one(grid(None, 6))),
-        (beside, &[], one(grid(all, 4))),
+        (nested, &[], single(grid(None, 4))),
+        (nested, &["n_levels=6"], single(grid(None, 6))),
+        (flat, &[], single(grid(rays, 4))),
         // The variant has its own defaults; the file's parameters for another one don't apply.
-        (nested, &["field=mlp"], one(mlp(json!(null), 8))),
-        (beside, &["field=mlp"], one(mlp(json!(all), 8))),
+        (nested, &["field=mlp"], single(mlp(json!(null), 8))),
+        (flat, &["field=mlp"], single(mlp(json!(rays), 8))),
         (
-            beside,
+            flat,
             &["field=grid,mlp"],
-            pointed(&[("field=grid", grid(all, 4)), ("field=mlp", mlp(json!(all), 8))]),
+            at_points(&[("field=grid", grid(rays, 4)), ("field=mlp", mlp(json!(rays), 8))]),
         ),
-        (paper, &[], one(mlp(json!(null), 4))),
-        (paper, &["layers=6"], one(mlp(json!(null), 6))),
-        (paper, &["field=grid"], one(grid(None, 8))),
+        (with_mlp, &[], single(mlp(json!(null), 4))),
+        (with_mlp, &["layers=6"], single(mlp(json!(null), 6))),
+        (with_mlp, &["field=grid"], single(grid(None, 8))),
     ] {
         assert_eq!(trainings(text, arguments, &names), expected, "{arguments:?} over {text}");
     }
 }
 
-fn of_other(text: &str, arguments: &[&str], name: &str) -> Value {
+/// Returns a parameter of the block `other`.
+fn other_parameter(text: &str, arguments: &[&str], name: &str) -> Value {
     let text = text.replace("default: [train-ss]", "default: [train-ss, other]");
     let plan = plan_of(&text, arguments).unwrap();
     let node = plan.nodes.iter().find(|node| node.stage == "other").unwrap();
@@ -135,7 +136,7 @@ fn of_other(text: &str, arguments: &[&str], name: &str) -> Value {
 
 /// A block inherits the variant of the block that it extends, unless it selects another.
 #[test]
-fn a_block_that_extends_follows_the_choice() {
+fn an_extending_block_inherits_the_variant() {
     let own = &PIPELINE.replace("ensemble: 2", "field: {grid: {n_levels: 3}}")[..];
     for (text, arguments, name, expected) in [
         (PIPELINE, &["field=mlp"][..], "field", json!("mlp")),
@@ -145,13 +146,13 @@ fn a_block_that_extends_follows_the_choice() {
         (own, &["train-ss.n_levels=4"], "n_levels", json!(3)),
         (own, &["train-ss.field=mlp"], "field", json!("grid")),
     ] {
-        assert_eq!(of_other(text, arguments, name), expected, "{arguments:?}");
+        assert_eq!(other_parameter(text, arguments, name), expected, "{arguments:?}");
     }
 }
 
 #[test]
 fn wrong_and_foreign_names_are_refused() {
-    for (arguments, words) in [
+    for (arguments, expected) in [
         (
             &["layers=4"][..],
             "stage train-ss: parameter layers: belongs to field: mlp; leave it out, or choose \
@@ -172,15 +173,14 @@ fn wrong_and_foreign_names_are_refused() {
     ] {
         let problem = plan_of(PIPELINE, arguments).map(|plan| plan.nodes.len()).unwrap_err();
         assert!(matches!(problem, PlanError::Usage(_)), "{problem:?}");
-        assert!(problem.to_string().contains(words), "{arguments:?}: {problem}");
+        assert!(problem.to_string().contains(expected), "{arguments:?}: {problem}");
     }
     assert!(plan_of(PIPELINE, &["field=mlp", "hidden_dim=200"]).is_ok());
 }
 
-/// Errors in a file name their lines.
 #[test]
-fn files_with_wrong_variants() {
-    for (from, to, line, words) in [
+fn errors_in_files_name_their_lines() {
+    for (from, to, line, expected) in [
         ("rays: 12000000", "layers: 4", 7, "parameter layers: belongs to field: mlp"),
         (
             "rays: 12000000",
@@ -203,7 +203,8 @@ fn files_with_wrong_variants() {
             .unwrap_err()
             .to_string();
         assert!(
-            problem.starts_with(&format!("dir/pipeline.yaml:{line}: ")) && problem.contains(words),
+            problem.starts_with(&format!("dir/pipeline.yaml:{line}: "))
+                && problem.contains(expected),
             "{to}: {problem}"
         );
     }
@@ -216,16 +217,17 @@ fn training_key(text: &str, arguments: &[&str]) -> String {
 
 /// The key contains the selected variant's parameters by name, in every notation.
 #[test]
-fn one_choice_is_one_key() {
+fn equal_parameters_have_equal_keys() {
     let nested =
         PIPELINE.replace("rays: 12000000", "rays: 12000000\n      field: {grid: {n_levels: 4}}");
     assert_eq!(training_key(&nested, &[]), training_key(PIPELINE, &["n_levels=4"]));
     assert_eq!(training_key(PIPELINE, &["field=grid"]), training_key(PIPELINE, &[]));
     assert_ne!(training_key(PIPELINE, &["field=mlp"]), training_key(PIPELINE, &[]));
     let plan = plan_of(PIPELINE, &[]).unwrap();
-    let open: Vec<String> = plan.nodes[1].scene_defaults(Path::new("")).keys().cloned().collect();
+    let by_scene: Vec<String> =
+        plan.nodes[1].scene_defaults(Path::new("")).keys().cloned().collect();
     assert!(
-        ["march_steps", "supervision"].iter().all(|name| open.contains(&(*name).to_owned())),
-        "{open:?}"
+        ["march_steps", "supervision"].iter().all(|name| by_scene.contains(&(*name).to_owned())),
+        "{by_scene:?}"
     );
 }

@@ -258,24 +258,24 @@ mod tests {
     }
 
     #[test]
-    fn encodings() {
+    fn only_utf8_is_decoded() {
         assert_eq!(decode(b"\xef\xbb\xbfa: 1"), Ok("a: 1"));
         assert_eq!(decode("ä: 1\r\n".as_bytes()), Ok("ä: 1\r\n"));
-        let utf16 = |bytes: &[u8]| {
+        let is_refused_as_utf16 = |bytes: &[u8]| {
             decode(bytes).unwrap_err().problem.contains("UTF-16; save the file as UTF-8")
         };
         assert!(
-            utf16(b"\xff\xfea\0:\0")
-                && utf16(b"\xfe\xff\0a\0:")
-                && utf16(b"a\0:\0")
-                && utf16(b"\0a\0:")
+            is_refused_as_utf16(b"\xff\xfea\0:\0")
+                && is_refused_as_utf16(b"\xfe\xff\0a\0:")
+                && is_refused_as_utf16(b"a\0:\0")
+                && is_refused_as_utf16(b"\0a\0:")
         );
         let DecodeError { line, problem } = decode(b"a: 1\nb: \xe4\n").unwrap_err();
         assert!(line == Some(2) && problem.contains("save the file as UTF-8"), "{problem}");
     }
 
     #[test]
-    fn merge_keys_are_followed() {
+    fn merge_keys_are_expanded() {
         for (text, expected) in [
             ("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}", "a: {x: 1, y: 2}\nb: {y: 3, x: 1}"),
             ("a: &a {x: 1}\nb: &b {<<: *a}\nc: {<<: *b}", "a: {x: 1}\nb: {x: 1}\nc: {x: 1}"),
@@ -284,10 +284,10 @@ mod tests {
                 "a: {x: 1}\nb: {y: 1}\nc: {x: 1, y: 1}",
             ),
         ] {
-            let [mut found, expected] =
-                [text, expected].map(|t| serde_yaml::from_str::<Value>(t).unwrap());
-            assert!(expand_merge_keys(&mut found).unwrap());
-            assert_eq!(found, expected, "{text}");
+            let [mut expanded, expected] =
+                [text, expected].map(|yaml| serde_yaml::from_str::<Value>(yaml).unwrap());
+            assert!(expand_merge_keys(&mut expanded).unwrap());
+            assert_eq!(expanded, expected, "{text}");
         }
         let mut scalar = serde_yaml::from_str("a: {<<: 1}").unwrap();
         assert!(expand_merge_keys(&mut scalar).is_err());

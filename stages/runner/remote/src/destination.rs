@@ -89,9 +89,9 @@ mod tests {
 
     use super::*;
 
-    /// A file that appears while the archive is written stays, unless it may be replaced.
+    /// A file that is created while the archive is written is replaced only with `force`.
     #[test]
-    fn what_appears_meanwhile_stays() {
+    fn a_file_created_meanwhile_is_kept_without_force() {
         for force in [false, true] {
             let dir = tempfile::tempdir().unwrap();
             let file = dir.path().join("export.tar");

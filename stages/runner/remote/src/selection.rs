@@ -117,8 +117,8 @@ mod tests {
     }
 
     #[test]
-    fn selections() {
-        let words = |list: &[&str]| list.iter().map(|&word| word.to_owned()).collect::<Vec<_>>();
+    fn selections_resolve_to_keys_or_an_error() {
+        let owned = |list: &[&str]| list.iter().map(|&text| text.to_owned()).collect::<Vec<_>>();
         for (keys, artifacts, history, expected) in [
             (&[][..], &[][..], false, Ok(&["k1", "k2", "k3"][..])),
             (&["k3"], &[], false, Ok(&["k3"])),
@@ -130,7 +130,7 @@ mod tests {
             (&[""], &[], false, Err("no action \"\"")),
             (&[], &["h2"], false, Err("no artifact \"h2\"")),
         ] {
-            let selection = Selection { keys: words(keys), artifacts: words(artifacts), history };
+            let selection = Selection { keys: owned(keys), artifacts: owned(artifacts), history };
             match (selection.keys_among(&records(), "there"), expected) {
                 (Ok(found), Ok(expected)) => {
                     assert_eq!(found.into_iter().collect::<Vec<_>>(), expected);
@@ -138,7 +138,7 @@ mod tests {
                 (Err(error), Err(expected)) => {
                     assert!(error.to_string().contains(expected), "{error}");
                 }
-                (found, expected) => panic!("{found:?} where {expected:?}"),
+                (found, expected) => panic!("found {found:?}, expected {expected:?}"),
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Export and import, with the real program and with archives that mean harm.
+//! Export and import with the real program, including imports of hostile archives.
 
 mod common;
 
@@ -11,12 +11,12 @@ use common::{assert_clean, assert_equal, assert_tidy, command, said, sample, suc
 use serde_json::{Value, json};
 use store::{Record, Store};
 
-fn exported(dir: &Path, store: &Store, what: &str, options: &[&str]) -> PathBuf {
+fn export(dir: &Path, store: &Store, target: &str, options: &[&str]) -> PathBuf {
     let file = dir.join("export.tar");
     let name = file.display().to_string();
-    let words: Vec<&str> =
-        ["export", what, &name, "--force"].into_iter().chain(options.iter().copied()).collect();
-    succeed(&mut command(store.root(), &words));
+    let arguments: Vec<&str> =
+        ["export", target, &name, "--force"].into_iter().chain(options.iter().copied()).collect();
+    succeed(&mut command(store.root(), &arguments));
     file
 }
 
@@ -25,16 +25,15 @@ fn import(file: &Path, store: &Path) -> (i32, String, String) {
 }
 
 #[test]
-fn an_artifact_travels_with_its_history() {
+fn an_artifact_is_exported_with_its_history() {
     let dir = tempfile::tempdir().unwrap();
     let (store, records) = sample(&dir.path().join("store"));
     let eval = &records[3];
-    let file = exported(dir.path(), &store, &eval.output[..9], &[]);
+    let file = export(dir.path(), &store, &eval.output[..9], &[]);
     let bytes = fs::read(&file).unwrap();
-    // Equal histories make equal bytes, whatever the file's name and whichever way they were asked
-    // for.
-    let (again, _) = sample(&dir.path().join("again"));
-    assert!(bytes == fs::read(exported(dir.path(), &again, &eval.key(), &[])).unwrap());
+    // Equal histories give equal bytes, requested by the artifact's hash or by the action's key.
+    let (equal_store, _) = sample(&dir.path().join("again"));
+    assert!(bytes == fs::read(export(dir.path(), &equal_store, &eval.key(), &[])).unwrap());
     let other = dir.path().join("other");
     let (code, out, err) = import(&file, &other);
     assert!(
@@ -49,18 +48,18 @@ fn an_artifact_travels_with_its_history() {
     }
     let (code, out, _) = import(&file, other.root());
     assert!(code == 0 && out.contains("0 records new"), "{out}");
-    // An artifact that two actions made comes with both.
-    exported(dir.path(), &store, &records[0].output, &[]);
+    // An artifact that two actions created is exported with the records of both.
+    export(dir.path(), &store, &records[0].output, &[]);
     assert!(import(&file, other.root()).1.contains("2 records and 1 artifact read"));
     assert_equal(&store, &other);
     assert!(store.runs().unwrap().is_empty());
 }
 
 #[test]
-fn a_history_may_be_records_alone() {
+fn a_history_may_be_exported_as_records_only() {
     let dir = tempfile::tempdir().unwrap();
     let (store, records) = sample(&dir.path().join("store"));
-    let file = exported(dir.path(), &store, &records[3].key(), &["--records-only"]);
+    let file = export(dir.path(), &store, &records[3].key(), &["--records-only"]);
     assert!(fs::metadata(&file).unwrap().len() < 20_000);
     let other = dir.path().join("other");
     assert!(import(&file, &other).1.contains("3 records and 1 artifact read"));
@@ -68,22 +67,22 @@ fn a_history_may_be_records_alone() {
     assert_eq!(other.hit(&records[3].key()).unwrap().as_ref(), Some(&records[3]));
     assert_eq!(other.record(&records[2].key()).unwrap().as_ref(), Some(&records[2]));
     assert_eq!(other.hit(&records[2].key()).unwrap(), None);
-    // The artifacts may follow.
-    let file = exported(dir.path(), &store, &records[3].key(), &[]);
+    // The artifacts can be imported later.
+    let file = export(dir.path(), &store, &records[3].key(), &[]);
     import(&file, other.root());
     assert_clean(&other);
 }
 
 #[track_caller]
-fn assert_not_exported(dir: &Path, store: &Store, what: &str, code: i32, reason: &str) {
+fn assert_not_exported(dir: &Path, store: &Store, target: &str, code: i32, reason: &str) {
     let file = dir.join("x.tar").display().to_string();
-    let (found, _, err) = said(&mut command(store.root(), &["export", what, &file]));
+    let (found, _, err) = said(&mut command(store.root(), &["export", target, &file]));
     assert!(found == code && err.contains(reason) && err.lines().count() == 1, "{found} {err}");
-    assert_eq!(fs::read_dir(dir).unwrap().count(), 1, "nothing is left behind");
+    assert_eq!(fs::read_dir(dir).unwrap().count(), 1, "nothing must be left behind");
 }
 
 #[test]
-fn what_is_not_whole_is_not_exported() {
+fn damaged_artifacts_are_not_exported() {
     let dir = tempfile::tempdir().unwrap();
     let (store, records) = sample(&dir.path().join("store"));
     assert_not_exported(dir.path(), &store, "zz", 2, "no artifact or action \"zz\"");
@@ -110,7 +109,7 @@ struct Entry {
     bytes: Vec<u8>,
 }
 
-fn plain(path: &str, bytes: &[u8]) -> Entry {
+fn regular_entry(path: &str, bytes: &[u8]) -> Entry {
     Entry {
         path: path.to_owned(),
         kind: tar::EntryType::Regular,
@@ -125,13 +124,13 @@ fn entries_of(file: &Path) -> Vec<Entry> {
         let mut entry = entry.unwrap();
         let mut bytes = Vec::new();
         entry.read_to_end(&mut bytes).unwrap();
-        plain(entry.path().unwrap().to_str().unwrap(), &bytes)
+        regular_entry(entry.path().unwrap().to_str().unwrap(), &bytes)
     });
     entries.collect()
 }
 
-/// The archive, without any of the checks of a library that means well.
-fn archive(entries: &[Entry]) -> Vec<u8> {
+/// Returns the archive of entries, without the checks that a library would make.
+fn tar_bytes(entries: &[Entry]) -> Vec<u8> {
     let mut out = Vec::new();
     for entry in entries {
         let mut header = tar::Header::new_gnu();
@@ -151,7 +150,7 @@ fn archive(entries: &[Entry]) -> Vec<u8> {
     out
 }
 
-/// An archive of one small artifact, in which anything may be changed.
+/// Archive of one small artifact, for changes of any part.
 struct Sample {
     entries: Vec<Entry>,
     record: Record,
@@ -164,13 +163,14 @@ const FILE: usize = 2;
 const RECORD: usize = 3;
 
 impl Sample {
+    /// Changes the index.
     fn index(&mut self, change: impl FnOnce(&mut Value)) {
         let mut index: Value = serde_json::from_slice(&self.entries[INDEX].bytes).unwrap();
         change(&mut index);
         self.entries[INDEX].bytes = serde_json::to_vec(&index).unwrap();
     }
 
-    /// All agrees, but the manifest is this one.
+    /// Changes the manifest, and everything that depends on it.
     fn manifest(&mut self, change: impl FnOnce(&mut Manifest)) {
         change(&mut self.manifest);
         let identity = self.manifest.identity();
@@ -180,11 +180,12 @@ impl Sample {
         });
         let path = |file: &str| format!("objects/{identity}/{file}");
         self.entries[MANIFEST] =
-            plain(&path("artifact.json"), &serde_json::to_vec(&self.manifest).unwrap());
+            regular_entry(&path("artifact.json"), &serde_json::to_vec(&self.manifest).unwrap());
         self.entries[FILE].path = path(&self.manifest.files[0].path);
         self.entries[RECORD].bytes = serde_json::to_vec(&record).unwrap();
     }
 
+    /// Changes the record, but not its name.
     fn record(&mut self, change: impl FnOnce(&mut Record)) {
         let mut record = self.record.clone();
         change(&mut record);
@@ -194,6 +195,7 @@ impl Sample {
 
 type Harm = fn(&mut Sample);
 
+/// Changes of an archive, each with the reason of its refusal.
 const HARM: &[(&str, Harm)] = &[
     ("found \"../../evil\"", |s| s.entries[FILE].path = "../../evil".into()),
     ("found \"/tmp/evil\"", |s| s.entries[FILE].path = "/tmp/evil".into()),
@@ -220,10 +222,12 @@ const HARM: &[(&str, Harm)] = &[
     ("not a regular file (XHeader)", |s| s.entries[FILE].kind = tar::EntryType::XHeader),
     ("expected \"export.json\"", |s| {
         let long = vec![b'x'; 1 << 20];
-        s.entries.insert(0, Entry { kind: tar::EntryType::GNULongName, ..plain("long", &long) });
+        s.entries
+            .insert(0, Entry { kind: tar::EntryType::GNULongName, ..regular_entry("long", &long) });
     }),
     ("not a regular file (GNULongName)", |s| {
-        let long = Entry { kind: tar::EntryType::GNULongName, ..plain("long", b"export.json") };
+        let long =
+            Entry { kind: tar::EntryType::GNULongName, ..regular_entry("long", b"export.json") };
         s.entries.splice(0..0, [long.clone(), long]);
     }),
     ("17 bytes, but 15 in the manifest", |s| s.entries[FILE].bytes.extend(b"  ")),
@@ -254,7 +258,7 @@ const HARM: &[(&str, Harm)] = &[
     ("store format 2", |s| s.index(|i| i["store"] = json!(2))),
     ("export format null", |s| s.index(|i| *i = json!([]))),
     ("unknown field `more`", |s| s.index(|i| i["more"] = json!(1))),
-    ("after the last entry", |s| s.entries.push(plain("more", b""))),
+    ("after the last entry", |s| s.entries.push(regular_entry("more", b""))),
     ("the archive ends before \"actions/", |s| s.entries.truncate(RECORD)),
     ("expected \"export.json\", found", |s| drop(s.entries.remove(INDEX))),
     ("expected \"objects/", |s| s.entries.swap(MANIFEST, FILE)),
@@ -264,13 +268,13 @@ fn small_export(dir: &Path) -> (Vec<Entry>, Record, Manifest) {
     let store = Store::open(&dir.join("store")).unwrap();
     let record =
         common::make(&store, "eval", &[], &[("metrics.json", b"{\"psnr\": 31.25}".to_vec())]);
-    let entries = entries_of(&exported(dir, &store, &record.output, &[]));
+    let entries = entries_of(&export(dir, &store, &record.output, &[]));
     let manifest = store.manifest(&record.output).unwrap();
     (entries, record, manifest)
 }
 
-/// Imports bytes that must be refused in one line, and leave nothing behind.
-fn refused(dir: &Path, bytes: &[u8], reason: &str) {
+/// Checks that the import of an archive is refused in one line and leaves nothing behind.
+fn assert_refused(dir: &Path, bytes: &[u8], reason: &str) {
     let (file, folder) = (dir.join("hostile.tar"), dir.join("inner/other"));
     fs::write(&file, bytes).unwrap();
     let (code, _, err) = import(&file, &folder);
@@ -285,8 +289,9 @@ fn refused(dir: &Path, bytes: &[u8], reason: &str) {
     );
     assert_tidy(&other);
     fs::remove_dir_all(dir.join("inner")).unwrap();
-    let left: Vec<_> = fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-    assert_eq!(left.len(), 3, "{reason}: {left:?}");
+    let names: Vec<_> =
+        fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(names.len(), 3, "{reason}: {names:?}");
     assert!(!Path::new("/tmp/evil").exists());
 }
 
@@ -296,37 +301,36 @@ fn hostile_archives_are_refused_in_one_line() {
     let (entries, record, manifest) = small_export(dir.path());
     let sample =
         || Sample { entries: entries.clone(), record: record.clone(), manifest: manifest.clone() };
-    let whole = archive(&sample().entries);
-    fs::write(dir.path().join("hostile.tar"), &whole).unwrap();
+    let bytes = tar_bytes(&sample().entries);
+    fs::write(dir.path().join("hostile.tar"), &bytes).unwrap();
     assert_eq!(
         import(&dir.path().join("hostile.tar"), &dir.path().join("fine")).0,
         0,
-        "the builder's archives are read"
+        "an unchanged archive must be imported"
     );
     fs::remove_dir_all(dir.path().join("fine")).unwrap();
     for (reason, harm) in HARM {
         let mut sample = sample();
         harm(&mut sample);
-        refused(dir.path(), &archive(&sample.entries), reason);
+        assert_refused(dir.path(), &tar_bytes(&sample.entries), reason);
     }
 }
 
-/// Wherever an archive is cut, and whichever byte of the small one is flipped, nothing wrong comes
-/// in.
+/// A cut archive is refused. With a flipped bit, an archive is refused or its artifact is intact.
 #[test]
-fn cut_and_flipped_archives() {
+fn damaged_archives_import_nothing_wrong() {
     let dir = tempfile::tempdir().unwrap();
     let (entries, record, _) = small_export(dir.path());
-    let whole = archive(&entries);
-    let end = whole.len() - 1024;
+    let intact = tar_bytes(&entries);
+    let end = intact.len() - 1024;
     for length in [0, 1, 511, 512, 700, 1024, 1536, 2048, 2600, end - 600, end - 512] {
-        refused(dir.path(), &whole[..length], "");
+        assert_refused(dir.path(), &intact[..length], "");
     }
-    refused(dir.path(), b"neither tar nor anything else\n", "not a tar file");
-    refused(dir.path(), &vec![b'x'; 2048], "not a tar file");
-    for place in (0..end).step_by(41) {
-        let mut bytes = whole.clone();
-        bytes[place] ^= 1;
+    assert_refused(dir.path(), b"neither tar nor anything else\n", "not a tar file");
+    assert_refused(dir.path(), &vec![b'x'; 2048], "not a tar file");
+    for position in (0..end).step_by(41) {
+        let mut bytes = intact.clone();
+        bytes[position] ^= 1;
         let file = dir.path().join("flipped.tar");
         fs::write(&file, bytes).unwrap();
         let (code, _, err) = import(&file, &dir.path().join("flipped"));
@@ -335,7 +339,7 @@ fn cut_and_flipped_archives() {
         assert!(
             code == 0
                 || (code == 3 && err.lines().count() == 1 && store.objects().unwrap().is_empty()),
-            "{place}: {code} {err}"
+            "{position}: {code} {err}"
         );
         store.objects().unwrap().iter().for_each(|object| assert_eq!(*object, record.output));
         assert_clean(&store);

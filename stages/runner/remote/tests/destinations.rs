@@ -28,9 +28,9 @@ fn listing(folder: &Path) -> Vec<String> {
 
 /// Only a regular file is replaced, and only with --force.
 #[test]
-fn export_replaces_nothing_unasked() {
-    type Make = fn(&Path);
-    let cases: &[(&str, &str, Make)] = &[
+fn export_replaces_only_files_and_only_with_force() {
+    type Create = fn(&Path);
+    let cases: &[(&str, &str, Create)] = &[
         ("file", "the file exists", |path| fs::write(path, "precious").unwrap()),
         ("pipe", "is a named pipe (FIFO)", make_pipe),
         ("socket", "is a socket", |path| drop(UnixListener::bind(path).unwrap())),
@@ -41,39 +41,42 @@ fn export_replaces_nothing_unasked() {
         }),
         ("dangling", "is a symbolic link", |path| symlink("nowhere", path).unwrap()),
         ("device", "is a device", |path| {
-            let made = Command::new("mknod").arg(path).args(["c", "1", "3"]).output();
+            let output = Command::new("mknod").arg(path).args(["c", "1", "3"]).output();
             if !path.symlink_metadata().is_ok_and(|found| found.file_type().is_char_device()) {
-                eprintln!("only root makes devices: {made:?}; a link to one stands in");
+                eprintln!("only root creates devices: {output:?}; testing a link to one");
                 symlink("/dev/null", path).unwrap();
             }
         }),
     ];
     let setup = Setup::new();
-    let what = setup.records[3].output.as_str();
-    for (name, reason, make) in cases {
+    let artifact = setup.records[3].output.as_str();
+    for (name, reason, create) in cases {
         let folder = setup.path(&format!("{name}-folder"));
         fs::create_dir(&folder).unwrap();
         let file = folder.join(name);
-        make(&file);
+        create(&file);
         let before = listing(&folder);
         for options in [&[][..], &["--force"]] {
             if *name == "file" && !options.is_empty() {
                 continue;
             }
-            let words = [&["export", what, file.to_str().unwrap()], options].concat();
-            let (code, out, err) = said(&mut command(setup.store.root(), &words));
-            let is_said = err.contains(reason) || (*name == "device" && err.contains("link"));
-            assert!(code == 2 && is_said && err.lines().count() == 1, "{name}: {code} {out}{err}");
+            let arguments = [&["export", artifact, file.to_str().unwrap()], options].concat();
+            let (code, out, err) = said(&mut command(setup.store.root(), &arguments));
+            let is_reported = err.contains(reason) || (*name == "device" && err.contains("link"));
+            assert!(
+                code == 2 && is_reported && err.lines().count() == 1,
+                "{name}: {code} {out}{err}"
+            );
             assert_eq!(listing(&folder), before, "{name}");
         }
     }
     let file = setup.path("file-folder/file").display().to_string();
-    succeed(&mut command(setup.store.root(), &["export", what, &file, "--force"]));
+    succeed(&mut command(setup.store.root(), &["export", artifact, &file, "--force"]));
     succeed(&mut command(&setup.path("other"), &["import", &file]));
     assert_eq!(listing(&setup.path("file-folder")).len(), 1);
 }
 
-/// A pipe that nobody writes to isn't waited for, a device without end isn't read.
+/// Import doesn't wait for a pipe without a writer, and doesn't read an endless device.
 #[test]
 fn import_reads_regular_files_only() {
     let dir = tempfile::tempdir().unwrap();
@@ -95,8 +98,8 @@ fn import_reads_regular_files_only() {
     }
 }
 
-/// A file of a command that was killed so long ago.
-fn leave(path: &Path, age: Duration) {
+/// Writes a file of a command that was killed `age` ago.
+fn write_leftover(path: &Path, age: Duration) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
     fs::write(path, "half").unwrap();
     for path in [path, path.parent().unwrap()] {
@@ -104,32 +107,32 @@ fn leave(path: &Path, age: Duration) {
     }
 }
 
-/// The next command removes what killed ones left, but nothing that may be in use, and no user's
-/// file.
+/// The next command removes leftovers of killed commands, but no file that may be in use, and no
+/// user's file.
 #[test]
-fn leftovers_of_killed_commands_go() {
+fn leftovers_of_killed_commands_are_removed() {
     let setup = Setup::pushed();
     let long_ago = Duration::from_secs(2 * 3600);
-    let gone = ["remote/uploads/push-a1B2c3/0#1", "exports/.nerf-sr-export-a1B2c3.partial"];
+    let removed = ["remote/uploads/push-a1B2c3/0#1", "exports/.nerf-sr-export-a1B2c3.partial"];
     let user = ["remote/uploads/notes", "exports/.a1B2c3.partial", "exports/notes.partial"];
     let in_use = ["remote/uploads/push-d4E5f6/1", "exports/.nerf-sr-export-d4E5f6.partial"];
-    for file in gone.iter().chain(&user) {
-        leave(&setup.path(file), long_ago);
+    for file in removed.iter().chain(&user) {
+        write_leftover(&setup.path(file), long_ago);
     }
     for file in in_use {
-        leave(&setup.path(file), Duration::ZERO);
+        write_leftover(&setup.path(file), Duration::ZERO);
     }
     let store = setup.store.root();
     succeed(&mut command(store, &["push", &setup.remote()]));
     let file = setup.path("exports/eval.tar").display().to_string();
     succeed(&mut command(store, &["export", &setup.records[3].output, &file]));
-    for file in gone {
+    for file in removed {
         assert!(!setup.path(file).exists(), "{file}");
     }
     for file in user.iter().chain(&in_use) {
         assert!(setup.path(file).exists(), "{file}");
     }
     assert_eq!(setup.pull("other", &[]).0, 0);
-    let left = fs::read_dir(setup.path("remote/uploads")).unwrap();
-    assert_eq!(left.count(), 2, "a push leaves nothing there");
+    let entries = fs::read_dir(setup.path("remote/uploads")).unwrap();
+    assert_eq!(entries.count(), 2, "push leaves no uploads");
 }

@@ -1,4 +1,4 @@
-//! Push and pull through a folder, with the real program.
+//! Tests of push and pull through a folder, with the real program.
 
 mod common;
 
@@ -15,14 +15,14 @@ use common::{
 use store::{Record, Store};
 
 #[test]
-fn what_is_pushed_is_pulled() {
+fn pushed_actions_are_pulled() {
     let setup = Setup::new();
     let remote = setup.remote();
     let out = succeed(&mut command(setup.store.root(), &["push", &remote]));
     assert!(out.contains("4 actions pushed (13.6 MB), 0 already present"), "{out}");
     let out = succeed(&mut command(setup.store.root(), &["push", &remote]));
     assert!(out.contains("0 actions pushed (0 bytes), 4 already present"), "{out}");
-    assert!(setup.store.runs().unwrap().is_empty(), "a push keeps nothing longer");
+    assert!(setup.store.runs().unwrap().is_empty(), "a push must not protect actions");
     let out = succeed(&mut command(&setup.path("other"), &["pull", &remote]));
     assert!(out.contains("4 actions pulled (13.6 MB), 0 already present"), "{out}");
     let other = Store::open(&setup.path("other")).unwrap();
@@ -31,11 +31,11 @@ fn what_is_pushed_is_pulled() {
     let run = other.runs().unwrap().remove(0);
     assert!(
         run.ended_unix.is_some() && run.keys.len() == 4,
-        "collection must leave what was pulled"
+        "pulled actions must be protected from collection"
     );
     let out = succeed(&mut command(&setup.path("other"), &["pull", &remote]));
     assert!(out.contains("0 actions pulled (0 bytes), 4 already present"), "{out}");
-    // The layout is a store's.
+    // The remote has a store's layout.
     let train = &setup.records[2];
     for file in [
         "format",
@@ -47,17 +47,17 @@ fn what_is_pushed_is_pulled() {
 }
 
 #[test]
-fn some_are_selected() {
+fn selected_actions_are_pulled_and_pushed() {
     let setup = Setup::pushed();
     let keys: Vec<String> = setup.records.iter().map(Record::key).collect();
     let (prep, eval) = (&setup.records[0].output[..8], &keys[3][..8]);
-    for (name, words, expected) in [
+    for (name, arguments, expected) in [
         ("a", &["--key", eval][..], &[3][..]),
         ("b", &["--key", eval, "--history"], &[0, 2, 3]),
         ("c", &["--artifact", prep], &[0, 1]),
         ("d", &["--artifact", prep, "--key", eval], &[0, 1, 3]),
     ] {
-        let (code, err, store) = setup.pull(name, words);
+        let (code, err, store) = setup.pull(name, arguments);
         assert_eq!((code, err.as_str()), (0, ""));
         let mut expected: Vec<&String> = expected.iter().map(|&index| &keys[index]).collect();
         expected.sort();
@@ -76,7 +76,7 @@ fn some_are_selected() {
 
 /// Pulling replaces an existing artifact only if it is damaged.
 #[test]
-fn what_is_here_is_not_overwritten() {
+fn undamaged_artifacts_are_not_overwritten() {
     let setup = Setup::pushed();
     let other = Store::open(&setup.path("other")).unwrap();
     let own = make(&other, "eval", &[], &[("metrics.json", b"mine".to_vec())]);
@@ -88,9 +88,9 @@ fn what_is_here_is_not_overwritten() {
     assert_clean(&other);
 }
 
-type Harm = fn(&Setup);
+type Damage = fn(&Setup);
 
-fn on_remote(setup: &Setup, record: usize, file: &str) -> PathBuf {
+fn remote_file(setup: &Setup, record: usize, file: &str) -> PathBuf {
     setup.path("remote/objects").join(&setup.records[record].output).join(file)
 }
 
@@ -109,8 +109,8 @@ fn replace(path: &Path, make: impl FnOnce(&Path)) {
     make(path);
 }
 
-/// A record whose artifact's manifest names a file outside.
-fn lead_outside(setup: &Setup, path: &str) {
+/// Writes a record to the remote, whose artifact's manifest names its first file `path`.
+fn forge_path(setup: &Setup, path: &str) {
     let mut manifest = Manifest::read(&setup.store.object(&setup.records[3].output)).unwrap();
     path.clone_into(&mut manifest.files[0].path);
     let record = Record { output: manifest.identity(), ..setup.records[3].clone() };
@@ -120,62 +120,63 @@ fn lead_outside(setup: &Setup, path: &str) {
     write_json(&record_file(setup, 3), &record).unwrap();
 }
 
-/// Harm to eval on the remote: it is refused by name, nothing of it comes in, and the rest does.
+/// Damage to eval on the remote is reported with the file's name. Nothing of eval is pulled, all
+/// other artifacts are.
 #[test]
-fn harm_is_refused_by_name() {
-    let cases: &[(&str, &str, Harm)] = &[
+fn damaged_files_are_refused_by_name() {
+    let cases: &[(&str, &str, Damage)] = &[
         ("metrics.json", "differs from the manifest (blake3)", |s| {
-            edit(&on_remote(s, 3, "metrics.json"), |b| b[3] ^= 1);
+            edit(&remote_file(s, 3, "metrics.json"), |b| b[3] ^= 1);
         }),
         ("metrics.json", "more than the 15 bytes", |s| {
-            edit(&on_remote(s, 3, "metrics.json"), |b| b.push(b' '));
+            edit(&remote_file(s, 3, "metrics.json"), |b| b.push(b' '));
         }),
         ("metrics.json", "14 bytes, but 15 in the manifest", |s| {
-            edit(&on_remote(s, 3, "metrics.json"), |b| b.truncate(14));
+            edit(&remote_file(s, 3, "metrics.json"), |b| b.truncate(14));
         }),
         ("metrics.json", "not found", |s| {
-            fs::remove_file(on_remote(s, 3, "metrics.json")).unwrap();
+            fs::remove_file(remote_file(s, 3, "metrics.json")).unwrap();
         }),
         (MANIFEST_FILE, "not found", |s| {
-            fs::remove_file(on_remote(s, 3, MANIFEST_FILE)).unwrap();
+            fs::remove_file(remote_file(s, 3, MANIFEST_FILE)).unwrap();
         }),
         (MANIFEST_FILE, "not a manifest", |s| {
-            edit(&on_remote(s, 3, MANIFEST_FILE), |b| b.truncate(20));
+            edit(&remote_file(s, 3, MANIFEST_FILE), |b| b.truncate(20));
         }),
         (MANIFEST_FILE, "its blake3 differs from the artifact's name", |s| {
-            fs::copy(on_remote(s, 0, MANIFEST_FILE), on_remote(s, 3, MANIFEST_FILE))
+            fs::copy(remote_file(s, 0, MANIFEST_FILE), remote_file(s, 3, MANIFEST_FILE))
                 .map(|_| ())
                 .unwrap();
         }),
-        (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, "../../../../evil")),
-        (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, "/tmp/evil")),
-        (MANIFEST_FILE, "not the path of an artifact's file", |s| lead_outside(s, MANIFEST_FILE)),
+        (MANIFEST_FILE, "not a path inside", |s| forge_path(s, "../../../../evil")),
+        (MANIFEST_FILE, "not a path inside", |s| forge_path(s, "/tmp/evil")),
+        (MANIFEST_FILE, "not the path of an artifact's file", |s| forge_path(s, MANIFEST_FILE)),
         (MANIFEST_FILE, "not the path of an artifact's file", |s| {
-            lead_outside(s, "./metrics.json");
+            forge_path(s, "./metrics.json");
         }),
         ("metrics.json", "is a named pipe (FIFO)", |s| {
-            replace(&on_remote(s, 3, "metrics.json"), make_pipe);
+            replace(&remote_file(s, 3, "metrics.json"), make_pipe);
         }),
         (MANIFEST_FILE, "is a named pipe (FIFO)", |s| {
-            replace(&on_remote(s, 3, MANIFEST_FILE), make_pipe);
+            replace(&remote_file(s, 3, MANIFEST_FILE), make_pipe);
         }),
         (".json", "is a named pipe (FIFO)", |s| replace(&record_file(s, 3), make_pipe)),
         ("metrics.json", "symbolic links", |s| {
-            replace(&on_remote(s, 3, "metrics.json"), |p| symlink("metrics.json", p).unwrap());
+            replace(&remote_file(s, 3, "metrics.json"), |p| symlink("metrics.json", p).unwrap());
         }),
         (".json", "symbolic links", |s| {
             replace(&record_file(s, 3), |p| symlink(p.file_name().unwrap(), p).unwrap());
         }),
         (MANIFEST_FILE, "is a folder", |s| {
-            replace(&on_remote(s, 3, MANIFEST_FILE), |p| fs::create_dir(p).unwrap());
+            replace(&remote_file(s, 3, MANIFEST_FILE), |p| fs::create_dir(p).unwrap());
         }),
-        ("/xxxx", "File name too long", |s| lead_outside(s, &"x".repeat(300))),
+        ("/xxxx", "File name too long", |s| forge_path(s, &"x".repeat(300))),
         (MANIFEST_FILE, "not the path of an artifact's file", |s| {
-            lead_outside(s, &format!("{}x", "folder/".repeat(150)));
+            forge_path(s, &format!("{}x", "folder/".repeat(150)));
         }),
-        (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, &"../".repeat(2000))),
+        (MANIFEST_FILE, "not a path inside", |s| forge_path(s, &"../".repeat(2000))),
         (MANIFEST_FILE, "not the path of an artifact's file", |s| {
-            lead_outside(s, &format!("{}x", "a/".repeat(400)));
+            forge_path(s, &format!("{}x", "a/".repeat(400)));
         }),
         (".json", "not a record", |s| edit(&record_file(s, 3), |b| b.truncate(40))),
         (".json", "its key differs from its name", |s| {
@@ -198,11 +199,11 @@ fn harm_is_refused_by_name() {
     ];
     // One push serves all cases.
     let pushed = Setup::pushed();
-    for (name, reason, harm) in cases {
+    for (name, reason, damage) in cases {
         let dir = tempfile::tempdir().unwrap();
         copy(&pushed.path("remote"), &dir.path().join("remote"));
         let setup = Setup { dir, store: pushed.store.clone(), records: pushed.records.clone() };
-        harm(&setup);
+        damage(&setup);
         let (code, err, store) = setup.pull("other", &[]);
         let lines: Vec<&str> = err.lines().collect();
         assert!(
@@ -230,9 +231,10 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// Whatever lies among the records, all records come in; what may be a lost one is named.
+/// All records are pulled despite unexpected files among them; a file that may be a misnamed record
+/// is reported.
 #[test]
-fn odd_names_stop_nothing() {
+fn unexpected_files_stop_neither_pull_nor_push() {
     type Make = fn(&Path);
     let file: Make = |path| fs::write(path, "{}").unwrap();
     let cases: &[(&[u8], i32, Make)] = &[
@@ -250,74 +252,74 @@ fn odd_names_stop_nothing() {
     ];
     let setup = Setup::pushed();
     for &(name, expected, make) in cases {
-        let odd = setup.path("remote/actions").join(std::ffi::OsStr::from_bytes(name));
-        make(&odd);
+        let path = setup.path("remote/actions").join(std::ffi::OsStr::from_bytes(name));
+        make(&path);
         let (code, err, store) = setup.pull("other", &[]);
         let lines: Vec<&str> = err.lines().collect();
         assert_eq!(code, expected, "{name:?}: {err}");
         if expected == 0 {
             assert!(lines.is_empty(), "{name:?}: {err}");
         } else {
-            let shown = String::from_utf8_lossy(name);
-            assert!(lines.len() == 2 && lines[0].contains(&*shown), "{name:?}: {err}");
+            let printed_name = String::from_utf8_lossy(name);
+            assert!(lines.len() == 2 && lines[0].contains(&*printed_name), "{name:?}: {err}");
         }
         assert_equal(&setup.store, &store);
-        // Nor do they stop a push.
+        // A push succeeds, too.
         succeed(&mut command(setup.store.root(), &["push", &setup.remote()]));
         fs::remove_dir_all(setup.path("other")).unwrap();
-        if odd.is_dir() && !odd.is_symlink() {
-            fs::remove_dir(&odd)
+        if path.is_dir() && !path.is_symlink() {
+            fs::remove_dir(&path)
         } else {
-            fs::remove_file(&odd)
+            fs::remove_file(&path)
         }
         .unwrap();
     }
 }
 
-fn refused(words: &[&str], store: &Path, code: i32, reason: &str) {
-    let (found, _, err) = said(&mut command(store, words));
+fn assert_refused(arguments: &[&str], store: &Path, code: i32, reason: &str) {
+    let (found, _, err) = said(&mut command(store, arguments));
     assert!(
         found == code && err.contains(reason) && err.lines().count() == 1,
-        "{words:?}: {found} {err}"
+        "{arguments:?}: {found} {err}"
     );
 }
 
 #[test]
-fn other_formats_and_places_are_refused_in_one_line() {
+fn other_formats_and_locations_are_refused_in_one_line() {
     let setup = Setup::pushed();
     let (remote, store) = (setup.remote(), setup.store.root());
     for text in ["2\n", "new", ""] {
         fs::write(setup.path("remote/format"), text).unwrap();
-        refused(&["pull", &remote], &setup.path("other"), 3, "use the newer nerf-sr-remote");
-        refused(&["push", &remote], store, 3, "use the newer nerf-sr-remote");
+        assert_refused(&["pull", &remote], &setup.path("other"), 3, "use the newer nerf-sr-remote");
+        assert_refused(&["push", &remote], store, 3, "use the newer nerf-sr-remote");
     }
     // A program that writes into a store of an older format marks the store, so that older
     // programs don't use its new entries.
     fs::write(setup.path("remote/format"), "0\n").unwrap();
-    for (words, store, format) in [
+    for (arguments, store, format) in [
         (["pull", &remote], setup.path("other").as_path(), "0\n"),
         (["push", &remote], store, "1\n"),
     ] {
-        succeed(&mut command(store, &words));
+        succeed(&mut command(store, &arguments));
         assert_eq!(fs::read_to_string(setup.path("remote/format")).unwrap(), format);
     }
     fs::remove_file(setup.path("remote/format")).unwrap();
-    refused(&["pull", &remote], &setup.path("other"), 3, "nothing was pushed here");
-    let inside = store.display().to_string();
-    refused(&["push", &inside], store, 2, "the folder is a store");
-    refused(&["pull", "gs://bucket"], &setup.path("other"), 2, "unknown scheme gs://");
-    refused(&["pull", "s3://"], &setup.path("other"), 2, "bucket missing");
-    refused(&["pull", "/nowhere"], &setup.path("other"), 3, "no such folder");
-    refused(&["push", &remote], &setup.path("none"), 3, "not a store of nerf-sr");
+    assert_refused(&["pull", &remote], &setup.path("other"), 3, "nothing was pushed here");
+    let store_path = store.display().to_string();
+    assert_refused(&["push", &store_path], store, 2, "the folder is a store");
+    assert_refused(&["pull", "gs://bucket"], &setup.path("other"), 2, "unknown scheme gs://");
+    assert_refused(&["pull", "s3://"], &setup.path("other"), 2, "bucket missing");
+    assert_refused(&["pull", "/nowhere"], &setup.path("other"), 3, "no such folder");
+    assert_refused(&["push", &remote], &setup.path("none"), 3, "not a store of nerf-sr");
     assert!(!setup.path("none").exists());
     fs::write(store.join("format"), "2\n").unwrap();
-    for words in [&["push", &remote][..], &["export", "abc", "/tmp/x.tar"]] {
-        refused(words, store, 1, "use the newer nerf-sr,");
+    for arguments in [&["push", &remote][..], &["export", "abc", "/tmp/x.tar"]] {
+        assert_refused(arguments, store, 1, "use the newer nerf-sr,");
     }
-    refused(&["pull", &remote], store, 1, "use the newer nerf-sr,");
+    assert_refused(&["pull", &remote], store, 1, "use the newer nerf-sr,");
 }
 
-/// A flipped byte in the store that is pushed never arrives.
+/// An artifact with a flipped byte in the local store is not pushed.
 #[test]
 fn a_damaged_artifact_is_not_pushed() {
     for (record, file) in [(3, "metrics.json"), (2, "field.bin")] {
@@ -325,31 +327,33 @@ fn a_damaged_artifact_is_not_pushed() {
         edit(&setup.store.object(&setup.records[record].output).join(file), |bytes| bytes[7] ^= 1);
         let (code, _, err) = said(&mut command(setup.store.root(), &["push", &setup.remote()]));
         assert!(code == 3 && err.contains(file) && err.contains("(blake3)"), "{err}");
-        assert!(!on_remote(&setup, record, file).exists() && !record_file(&setup, record).exists());
+        assert!(
+            !remote_file(&setup, record, file).exists() && !record_file(&setup, record).exists()
+        );
         let (code, err, store) = setup.pull("other", &[]);
         assert_eq!((code, err.as_str()), (0, ""));
         assert_clean(&store);
     }
 }
 
-fn start(store: &Path, words: &[&str]) -> Child {
-    command(store, words).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+fn start(store: &Path, arguments: &[&str]) -> Child {
+    command(store, arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
 #[test]
-fn several_at_once_pull_into_one_store_and_push_to_one_remote() {
+fn several_processes_share_a_store_and_a_remote() {
     let setup = Setup::new();
     let remote = setup.remote();
-    for (store, words) in [
+    for (store, arguments) in [
         (setup.store.root().to_path_buf(), ["push", &remote]),
         (setup.path("other"), ["pull", &remote]),
     ] {
-        let children: Vec<_> = (0..4).map(|_| start(&store, &words)).collect();
+        let children: Vec<_> = (0..4).map(|_| start(&store, &arguments)).collect();
         for child in children {
             let output = child.wait_with_output().unwrap();
             assert!(
                 output.status.success(),
-                "{words:?}: {}",
+                "{arguments:?}: {}",
                 String::from_utf8_lossy(&output.stderr)
             );
         }

@@ -1,4 +1,5 @@
-//! Push and pull that are killed, interrupted, or wait for a server, with the real program.
+//! Tests of a push and pull that is killed, interrupted, or waits for a server, with the real
+//! program.
 
 mod common;
 
@@ -10,7 +11,7 @@ use std::time::{Duration, Instant};
 use common::{Setup, assert_clean, assert_equal, bytes, command, make, succeed};
 use store::Store;
 
-/// A server that takes connections and says nothing holds up nobody who interrupts.
+/// A server that accepts connections and never answers does not delay an interrupt.
 #[test]
 fn an_interrupt_ends_the_wait_for_a_silent_server() {
     let dir = tempfile::tempdir().unwrap();
@@ -37,30 +38,31 @@ fn interrupt(child: &std::process::Child) {
     );
 }
 
-/// Number of times that a push or pull is stopped.
-const TURNS: u32 = 12;
+/// Number of attempts to stop a push or pull.
+const ATTEMPTS: u32 = 12;
 
-/// A store with enough in it that a kill comes in the middle.
-fn much(setup: &Setup) {
+/// Adds artifacts large enough that a kill comes in the middle of their transfer.
+fn add_large_artifacts(setup: &Setup) {
     for index in 0..12 {
         let files = [("a", bytes(2 << 20, index)), ("b/c", bytes(9 << 20, index + 100))];
         make(&setup.store, &format!("stage{index}"), &[], &files);
     }
 }
 
-/// Kills, interrupts, begins anew what got to its end in the folder it fills, and at last lets end;
-/// how often it was stopped.
-fn stop_often(store: &Path, words: &[&str], fills: &Path, after: impl Fn()) -> usize {
+/// Kills or interrupts a command at varied moments, runs `check` after each attempt, and finally
+/// lets the command finish. `destination` is emptied after each run that finishes. Returns the
+/// number of stopped runs.
+fn stop_often(store: &Path, arguments: &[&str], destination: &Path, check: impl Fn()) -> usize {
     let since = Instant::now();
-    succeed(&mut command(store, words));
-    let whole = since.elapsed();
-    fs::remove_dir_all(fills).unwrap();
+    succeed(&mut command(store, arguments));
+    let duration = since.elapsed();
+    fs::remove_dir_all(destination).unwrap();
     let mut stopped = 0;
-    for turn in 0..TURNS {
+    for attempt in 0..ATTEMPTS {
         let mut child =
-            command(store, words).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        std::thread::sleep(whole * (1 + turn * 7 % TURNS) / TURNS);
-        if turn % 3 == 0 {
+            command(store, arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        std::thread::sleep(duration * (1 + attempt * 7 % ATTEMPTS) / ATTEMPTS);
+        if attempt % 3 == 0 {
             interrupt(&child);
         } else {
             child.kill().unwrap();
@@ -68,29 +70,29 @@ fn stop_often(store: &Path, words: &[&str], fills: &Path, after: impl Fn()) -> u
         let status = child.wait().unwrap();
         assert!(matches!(status.code(), None | Some(0 | 130)), "{status}");
         stopped += usize::from(!status.success());
-        after();
+        check();
         if status.success() {
-            fs::remove_dir_all(fills).unwrap();
+            fs::remove_dir_all(destination).unwrap();
         }
     }
-    succeed(&mut command(store, words));
-    after();
+    succeed(&mut command(store, arguments));
+    check();
     stopped
 }
 
 #[test]
-fn kills_leave_nothing_half_seen() {
+fn stopped_transfers_leave_no_partial_artifact() {
     let setup = Setup::new();
-    much(&setup);
+    add_large_artifacts(&setup);
     let remote = setup.remote();
     let stopped = stop_often(setup.store.root(), &["push", &remote], &setup.path("remote"), || {
-        // Whatever has a record on the remote is whole there.
-        let (code, err, seen) = setup.pull("seen", &[]);
+        // Every record on the remote has its complete artifact there.
+        let (code, err, pulled) = setup.pull("seen", &[]);
         assert!(
             code == 0 || err.contains("nothing was pushed here") || err.contains("no such folder"),
             "{code} {err}"
         );
-        assert_clean(&seen);
+        assert_clean(&pulled);
         fs::remove_dir_all(setup.path("seen")).unwrap();
     });
     assert!(stopped > 2, "{stopped}");

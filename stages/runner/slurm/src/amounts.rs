@@ -164,8 +164,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn amounts_of_memory() {
-        for (text, mib, shown) in [
+    fn memory_sizes_are_parsed_and_formatted() {
+        for (text, mib, formatted) in [
             ("512M", 512, "512M"),
             ("8G", 8192, "8G"),
             ("1024M", 1024, "1G"),
@@ -173,7 +173,7 @@ mod tests {
             ("1500M", 1500, "1500M"),
         ] {
             let memory: Memory = text.parse().unwrap();
-            assert_eq!((memory.mib, memory.to_string().as_str()), (mib, shown));
+            assert_eq!((memory.mib, memory.to_string().as_str()), (mib, formatted));
         }
         for text in
             ["", "G", "8", "0G", "-8G", "8GB", "8g", "1.5G", "8 G", "18446744073709551615T", "８G"]
@@ -184,8 +184,8 @@ mod tests {
     }
 
     #[test]
-    fn times() {
-        for (text, seconds, minutes, shown) in [
+    fn durations_are_parsed_and_formatted() {
+        for (text, seconds, minutes, formatted) in [
             ("90s", 90, 2, "1m30s"),
             ("30m", 1800, 30, "30m"),
             ("2h", 7200, 120, "2h"),
@@ -195,7 +195,7 @@ mod tests {
             let period: Period = text.parse().unwrap();
             assert_eq!(
                 (period.seconds, period.minutes(), period.to_string().as_str()),
-                (seconds, minutes, shown)
+                (seconds, minutes, formatted)
             );
         }
         for text in [

@@ -87,7 +87,7 @@ fn escape_patterns(path: &Path) -> OsString {
 mod tests {
     use super::*;
 
-    fn words(resources: &str, site: &str, after: &[&str]) -> String {
+    fn joined_arguments(resources: &str, site: &str, after: &[&str]) -> String {
         let resources: Resources = serde_yaml::from_str(resources).unwrap();
         let site: Site = serde_yaml::from_str(site).unwrap();
         let job = JobRequest {
@@ -100,12 +100,12 @@ mod tests {
             script: Path::new("/s/job.sh"),
             number: 7,
         };
-        let words: Vec<String> =
-            job.arguments().into_iter().map(|word| word.into_string().unwrap()).collect();
-        words.join("|")
+        let arguments: Vec<String> =
+            job.arguments().into_iter().map(|argument| argument.into_string().unwrap()).collect();
+        arguments.join("|")
     }
 
-    const BEFORE: &str = "--parsable|--nodes=1|--ntasks=1|--requeue|--open-mode=append|\
+    const COMMON: &str = "--parsable|--nodes=1|--ntasks=1|--requeue|--open-mode=append|\
         --job-name=train-ss [supersample=2]|--chdir=/work|--output=/s/50%%/7.log|\
         --signal=B:USR1@90";
 
@@ -129,7 +129,10 @@ mod tests {
                 "|--time=60|--dependency=afterok:5|--kill-on-invalid-dep=yes|--exclusive|--time=5",
             ),
         ] {
-            assert_eq!(words(resources, site, after), format!("{BEFORE}{expected}|/s/job.sh|7"));
+            assert_eq!(
+                joined_arguments(resources, site, after),
+                format!("{COMMON}{expected}|/s/job.sh|7")
+            );
         }
     }
 }

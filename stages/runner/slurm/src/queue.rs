@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_of_the_queue() {
+    fn queue_lines_are_parsed() {
         for (line, expected) in [
             (
                 "17|PENDING|Dependency|/a b/s/slurm/1-2-0/job.sh 4",
@@ -153,12 +153,12 @@ mod tests {
             });
             assert_eq!(
                 found,
-                expected.map(|(id, run, number, words, live)| (
+                expected.map(|(id, submission, number, text, can_finish_task)| (
                     id,
-                    run,
+                    submission,
                     number,
-                    words.to_owned(),
-                    live
+                    text.to_owned(),
+                    can_finish_task
                 )),
                 "{line}"
             );
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn without_submissions_nobody_is_asked() {
+    fn squeue_runs_only_if_there_are_submissions() {
         let root = tempfile::tempdir().unwrap();
         assert!(Queue::read(&Slurm::in_folder("/nowhere"), root.path()).unwrap().jobs.is_empty());
         std::fs::create_dir_all(root.path().join("slurm/1-2-0")).unwrap();

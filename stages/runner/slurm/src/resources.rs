@@ -56,18 +56,18 @@ mod tests {
     #[test]
     fn a_block_overrides_single_resources() {
         let read = |text: &str| serde_yaml::from_str::<Resources>(text).unwrap();
-        let both = read("{cpus: 4, mem: 8G, gpus: 1}")
+        let merged = read("{cpus: 4, mem: 8G, gpus: 1}")
             .overridden_by(&read("{cpus: 8, gpus: 0, time: 2h}"));
-        assert_eq!(both, read("{cpus: 8, mem: 8G, gpus: 0, time: 2h}"));
-        assert!(!both.has_gpu() && read("gpus: 2").has_gpu() && !Resources::default().has_gpu());
-        let text = serde_json::to_string(&both).unwrap();
+        assert_eq!(merged, read("{cpus: 8, mem: 8G, gpus: 0, time: 2h}"));
+        assert!(!merged.has_gpu() && read("gpus: 2").has_gpu() && !Resources::default().has_gpu());
+        let text = serde_json::to_string(&merged).unwrap();
         assert_eq!(text, r#"{"cpus":8,"mem":"8G","gpus":0,"time":"2h"}"#);
-        assert_eq!(serde_json::from_str::<Resources>(&text).unwrap(), both);
+        assert_eq!(serde_json::from_str::<Resources>(&text).unwrap(), merged);
     }
 
     #[test]
     fn invalid_resources_are_refused_in_one_line() {
-        for (text, words) in [
+        for (text, expected) in [
             ("mem: 8", "mem: invalid amount of memory \"8\""),
             ("time: 90", "time: invalid duration \"90\""),
             ("time: 1.5", "time: invalid duration \"1.5\""),
@@ -77,7 +77,7 @@ mod tests {
             ("cores: 4", "unknown field `cores`, expected one of `cpus`, `mem`, `gpus`, `time`"),
         ] {
             let problem = serde_yaml::from_str::<Resources>(text).unwrap_err().to_string();
-            assert!(problem.contains(words) && !problem.contains('\n'), "{text}: {problem}");
+            assert!(problem.contains(expected) && !problem.contains('\n'), "{text}: {problem}");
         }
     }
 }

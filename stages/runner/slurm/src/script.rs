@@ -41,23 +41,23 @@ mod tests {
     use super::*;
     use std::process::Command;
 
-    /// The shell itself says what it read.
+    /// The shell itself prints the arguments that it read.
     #[test]
-    fn a_shell_reads_the_same_words() {
+    fn a_shell_passes_on_equal_arguments() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("job.sh");
         let site = Site { setup: vec!["export GREETING='good day'".to_owned()], ..Site::default() };
         let awkward = "a b'c\"$HOME`x`\\*";
         let print = "printf '[%s]' \"$GREETING\" \"$@\"";
-        let words = ["sh", "-c", print, "sh", awkward].map(OsStr::new);
-        std::fs::write(&path, script(&site, &words)).unwrap();
+        let arguments = ["sh", "-c", print, "sh", awkward].map(OsStr::new);
+        std::fs::write(&path, script(&site, &arguments)).unwrap();
         let output = Command::new("bash").arg(&path).arg("17").output().unwrap();
         assert_eq!(String::from_utf8_lossy(&output.stdout), format!("[good day][{awkward}][17]"));
         let failing = Site { setup: vec!["false".to_owned()], ..Site::default() };
         std::fs::write(&path, script(&failing, &[OsStr::new("true")])).unwrap();
         assert!(
             !Command::new("bash").arg(&path).status().unwrap().success(),
-            "a set-up line that fails ends the job"
+            "a set-up line that fails must end the job"
         );
     }
 }

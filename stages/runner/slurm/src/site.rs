@@ -87,17 +87,17 @@ impl Site {
 mod tests {
     use super::*;
 
-    fn site_of(file: &Path, text: &str) -> Result<Site, SlurmError> {
+    fn write_and_find(file: &Path, text: &str) -> Result<Site, SlurmError> {
         std::fs::write(file, text).unwrap();
         Site::find(Some(file))
     }
 
     #[test]
-    fn a_site_is_a_file() {
+    fn site_files_are_read_or_refused() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("slurm.yaml");
-        assert_eq!(site_of(&file, "# nothing yet\n").unwrap(), Site::default());
-        let site = site_of(
+        assert_eq!(write_and_find(&file, "# nothing yet\n").unwrap(), Site::default());
+        let site = write_and_find(
             &file,
             "partition: gpu\nsetup: [module load cuda]\narguments: \
                 [--exclusive]\nmax_submit: 5\nnotice: 5m\n",
@@ -114,14 +114,14 @@ mod tests {
             problem("6m").is_none()
                 && problem("5m").unwrap().contains("`notice` of the site file, 5m")
         );
-        for (text, words) in [
+        for (text, expected) in [
             ("partitions: gpu", "unknown field `partitions`"),
             ("notice: 90", "notice: invalid duration \"90\""),
             ("notice: 1d", "maximum is 18h"),
             ("setup: module load cuda", "setup: invalid type"),
         ] {
-            let problem = site_of(&file, text).unwrap_err().to_string();
-            assert!(problem.contains(words) && problem.contains("slurm.yaml"), "{problem}");
+            let problem = write_and_find(&file, text).unwrap_err().to_string();
+            assert!(problem.contains(expected) && problem.contains("slurm.yaml"), "{problem}");
         }
         assert!(
             Site::find(Some(&folder.path().join("none")))

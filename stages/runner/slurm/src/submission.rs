@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn a_submission_is_read_again() {
+    fn submissions_are_read_back() {
         let root = tempfile::tempdir().unwrap();
         assert!(list_submissions(root.path()).unwrap().is_empty());
         for id in ["b", "a"] {
@@ -189,16 +189,16 @@ mod tests {
         assert_eq!(Submission::read(root.path(), "a").unwrap().tasks, [task("x"), task("a")]);
         assert!(Submission::read(root.path(), "c").is_none());
         let logs = newest_logs(root.path()).unwrap();
-        assert_eq!(logs.keys().collect::<Vec<_>>(), ["a", "b"], "x has none");
+        assert_eq!(logs.keys().collect::<Vec<_>>(), ["a", "b"], "x has no log");
         assert!(logs["b"].ends_with("slurm/b/1.log"));
     }
 
     #[test]
-    fn one_submits_at_a_time() {
+    fn only_one_process_submits_at_a_time() {
         let root = tempfile::tempdir().unwrap();
-        let held = lock_submissions(root.path(), &|| false).unwrap();
-        assert!(held.is_some() && lock_submissions(root.path(), &|| true).unwrap().is_none());
-        drop(held);
+        let lock = lock_submissions(root.path(), &|| false).unwrap();
+        assert!(lock.is_some() && lock_submissions(root.path(), &|| true).unwrap().is_none());
+        drop(lock);
         assert!(lock_submissions(root.path(), &|| true).unwrap().is_some());
     }
 }

@@ -125,9 +125,9 @@ mod tests {
     use std::path::PathBuf;
     use std::process::Command;
 
-    /// A store, and programs that play Slurm's: `sbatch` writes its arguments down and counts,
-    /// `squeue` prints a file.
-    struct Fake {
+    /// Store, and substitutes for Slurm's programs: `sbatch` logs its arguments and numbers the
+    /// jobs, `squeue` prints a file.
+    struct FakeSlurm {
         dir: tempfile::TempDir,
     }
 
@@ -142,30 +142,32 @@ mod tests {
     }
 
     fn queue_line(folder: &Path, (id, state, n): &(&str, &str, usize)) -> String {
-        let here = folder.display();
-        format!("{id}|{state}|None|{here}/slurm/one/job.sh {n}\n")
+        let store = folder.display();
+        format!("{id}|{state}|None|{store}/slurm/one/job.sh {n}\n")
     }
 
-    fn tells_apart(w: &&str) -> bool {
-        w.starts_with("--job-name") || w.starts_with("--dep") || w.starts_with("--kill")
+    fn is_job_specific(argument: &&str) -> bool {
+        argument.starts_with("--job-name")
+            || argument.starts_with("--dep")
+            || argument.starts_with("--kill")
     }
 
-    impl Fake {
+    impl FakeSlurm {
         fn new() -> Self {
             let fake = Self { dir: tempfile::tempdir().unwrap() };
             std::fs::create_dir(fake.path("bin")).unwrap();
             std::fs::write(fake.path("queue"), "").unwrap();
-            let here = fake.dir.path().display();
+            let store = fake.dir.path().display();
             fake.program(
                 "sbatch",
                 &format!(
-                    "echo \"$@\" >> {here}/argv\nn=$(wc -l < \
-                {here}/argv)\n[ \"$n\" -le ${{MOST:-3}} ] || \
+                    "echo \"$@\" >> {store}/argv\nn=$(wc -l < \
+                {store}/argv)\n[ \"$n\" -le ${{MOST:-3}} ] || \
                 {{ echo 'sbatch: error: QOSMaxSubmitJobPerUserLimit' >&2; exit 1; }}\necho $((100 \
                 + n))"
                 ),
             );
-            fake.program("squeue", &format!("echo \"$@\" >> {here}/asked\ncat {here}/queue"));
+            fake.program("squeue", &format!("echo \"$@\" >> {store}/asked\ncat {store}/queue"));
             fake
         }
 
@@ -173,7 +175,7 @@ mod tests {
             self.dir.path().join(name)
         }
 
-        /// Written by another process: a file that this one has open can't be run.
+        /// Installs a program in another process: a file that this process has open can't be run.
         fn program(&self, name: &str, text: &str) {
             let source = self.path("source");
             std::fs::write(&source, format!("#!/bin/sh\n{text}\n")).unwrap();
@@ -185,11 +187,11 @@ mod tests {
             assert!(status.unwrap().success());
         }
 
-        /// A chain of two, and one by itself.
-        fn submit(&self, id: &str, done: [bool; 3], most: usize) -> Submitted {
+        /// Submits a chain of two tasks, and an independent task.
+        fn submit(&self, id: &str, done: [bool; 3], max_submit: usize) -> Submitted {
             let tasks = vec![task("prep", &[]), task("train", &[0, 0]), task("other", &[])];
             let (slurm, site) =
-                (Slurm::in_folder(self.path("bin")), Site { max_submit: most, ..Site::default() });
+                (Slurm::in_folder(self.path("bin")), Site { max_submit, ..Site::default() });
             let options = SubmitOptions {
                 slurm: &slurm,
                 site: &site,
@@ -204,24 +206,24 @@ mod tests {
                 .unwrap()
         }
 
-        /// Sets the queue: jobs of the submission "one".
+        /// Sets the queue to jobs of the submission "one".
         fn queue(&self, jobs: &[(&str, &str, usize)]) {
             let lines = jobs.iter().map(|job| queue_line(self.dir.path(), job));
             std::fs::write(self.path("queue"), lines.collect::<String>()).unwrap();
         }
 
-        /// The arguments that tell jobs apart, a call each.
+        /// Returns the arguments that distinguish jobs, one line per call.
         fn argv(&self) -> Vec<String> {
             let text = std::fs::read_to_string(self.path("argv")).unwrap_or_default();
             text.lines()
-                .map(|line| line.split(' ').filter(tells_apart).collect::<Vec<_>>().join(" "))
+                .map(|line| line.split(' ').filter(is_job_specific).collect::<Vec<_>>().join(" "))
                 .collect()
         }
     }
 
     #[test]
-    fn a_job_waits_for_those_that_were_submitted() {
-        let fake = Fake::new();
+    fn a_job_waits_for_its_submitted_parents() {
+        let fake = FakeSlurm::new();
         let submitted = fake.submit("one", [false; 3], 10);
         assert_eq!(
             submitted.jobs,
@@ -238,24 +240,25 @@ mod tests {
     }
 
     #[test]
-    fn what_is_done_is_not_waited_for() {
-        let fake = Fake::new();
+    fn finished_tasks_are_not_waited_for() {
+        let fake = FakeSlurm::new();
         assert_eq!(fake.submit("one", [true, false, true], 10).jobs.len(), 1);
         assert_eq!(fake.argv(), ["--job-name=train"]);
-        let nothing = fake.submit("two", [true; 3], 10);
+        let empty = fake.submit("two", [true; 3], 10);
         assert!(
-            nothing.jobs.is_empty() && list_submissions(fake.dir.path()).unwrap().len() == 1,
+            empty.jobs.is_empty() && list_submissions(fake.dir.path()).unwrap().len() == 1,
             "a submission without jobs leaves nothing"
         );
     }
 
     #[test]
-    fn what_is_queued_is_not_submitted_again() {
-        let fake = Fake::new();
+    fn queued_tasks_are_not_submitted_again() {
+        let fake = FakeSlurm::new();
         fake.submit("one", [false; 3], 10);
         fake.queue(&[("101", "RUNNING", 0), ("103", "PENDING", 2)]);
         let second = fake.submit("two", [false, false, false], 10);
-        // The fake refuses a fourth call: train was cancelled, and waits for the queued job.
+        // Train was cancelled and is submitted again, after the queued job; the fake refuses this
+        // fourth call.
         assert_eq!((second.already_queued, second.remaining), (2, 1));
         assert_eq!(
             fake.argv()[3],
@@ -268,17 +271,17 @@ mod tests {
             0,
             "a completing job finishes no task"
         );
-        let asked = std::fs::read_to_string(fake.path("asked")).unwrap();
+        let queries = std::fs::read_to_string(fake.path("asked")).unwrap();
         assert_eq!(
-            asked.lines().count(),
+            queries.lines().count(),
             2,
-            "once a submission, and not before there was one: {asked}"
+            "one query per submission, and none before the first: {queries}"
         );
     }
 
     #[test]
     fn the_queue_is_bounded() {
-        let fake = Fake::new();
+        let fake = FakeSlurm::new();
         let first = fake.submit("one", [false; 3], 1);
         assert_eq!((first.jobs.len(), first.remaining), (1, 2));
         fake.queue(&[("101", "RUNNING", 0)]);

@@ -227,7 +227,7 @@ mod tests {
         store.verify(&done.output).unwrap();
     }
 
-    /// An unreadable record is not a missing one; every access names it.
+    /// An unreadable record isn't treated as missing: every access fails and names the file.
     #[test]
     fn unreadable_records_are_errors() {
         for damage in UNREADABLE {
@@ -241,8 +241,8 @@ mod tests {
                 store.hit_or_repair(&entered(&store), &key, "text").err(),
                 store.records().err(),
             ] {
-                let said = problem.unwrap().to_string();
-                assert!(said.contains(&format!("actions/{key}.json: ")), "{said}");
+                let message = problem.unwrap().to_string();
+                assert!(message.contains(&format!("actions/{key}.json: ")), "{message}");
             }
         }
     }
@@ -254,7 +254,7 @@ mod tests {
         let store = Store::open(dir.path()).unwrap();
         let (a, b) = (finish_action(&store, "a", "1234"), finish_action(&store, "b", "5678"));
         let path = store.action(&a.key(), "json");
-        for (bytes, words) in [
+        for (bytes, expected) in [
             (Vec::new(), "the record is damaged"),
             (b"{\"stage\":".to_vec(), "the record is damaged"),
             (fs::read(store.action(&b.key(), "json")).unwrap(), "belongs to another action"),
@@ -262,18 +262,18 @@ mod tests {
             fs::write(&path, bytes).unwrap();
             assert_eq!(store.hit(&a.key()).unwrap(), None);
             assert_eq!(store.records().unwrap(), std::slice::from_ref(&b));
-            let said = store.undamaged_record(&a.key()).unwrap_err().to_string();
-            assert!(said.contains(words) && said.contains("verify --remove"), "{said}");
+            let message = store.undamaged_record(&a.key()).unwrap_err().to_string();
+            assert!(message.contains(expected) && message.contains("verify --remove"), "{message}");
         }
         fs::write(dir.path().join("actions/notes.txt"), "mine").unwrap();
         fs::write(dir.path().join("actions/notes.json"), "mine").unwrap();
         let mut keys = [a.key(), b.key()];
         keys.sort();
-        assert_eq!(store.action_keys().unwrap(), keys, "other files are foreign");
+        assert_eq!(store.action_keys().unwrap(), keys, "other files are ignored");
     }
 
     #[test]
-    fn unreadable_actions_that_were_begun_are_errors() {
+    fn unreadable_unfinished_actions_are_errors() {
         for damage in UNREADABLE {
             let dir = tempfile::tempdir().unwrap();
             let store = Store::open(dir.path()).unwrap();
@@ -285,15 +285,15 @@ mod tests {
             fs::write(&file, "{\"sta").unwrap();
             assert_eq!(store.unfinished(&key).unwrap(), None, "cut by a kill");
             damage(&file);
-            let said = store.unfinished(&key).unwrap_err().to_string();
-            assert!(said.contains("action.json: "), "{said}");
+            let message = store.unfinished(&key).unwrap_err().to_string();
+            assert!(message.contains("action.json: "), "{message}");
             fs::create_dir_all(&attempt.work).unwrap();
             fs::write(attempt.work.join("checkpoint"), "").unwrap();
             assert!(store.has_checkpoint(&key).unwrap());
         }
     }
 
-    /// Damaged manifests are rewritten; anything in the place of an object is replaced.
+    /// Damaged manifests are rewritten. A file at the path of an object is replaced.
     #[test]
     fn manifests_are_repaired_and_objects_replaced() {
         let dir = tempfile::tempdir().unwrap();

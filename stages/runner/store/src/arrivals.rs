@@ -64,7 +64,8 @@ mod tests {
     use super::*;
     use crate::testing::entered;
 
-    fn arriving(store: &Store, content: &str) -> (PathBuf, String) {
+    /// Writes an artifact into a scratch folder; returns the folder and the identity.
+    fn write_arrival(store: &Store, content: &str) -> (PathBuf, String) {
         let folder = store.scratch("run").join("arriving");
         fs::create_dir_all(&folder).unwrap();
         fs::write(folder.join("x"), content).unwrap();
@@ -82,34 +83,34 @@ mod tests {
         }
     }
 
-    fn take_from(store: &Store, entered: &Entered, host: &str) -> (bool, String) {
-        let (folder, identity) = arriving(store, "1234");
+    /// Imports an artifact and its record; returns whether the record is new, and the identity.
+    fn import_from(store: &Store, entered: &Entered, host: &str) -> (bool, String) {
+        let (folder, identity) = write_arrival(store, "1234");
         store.import_object(entered, &store.check_arrival(&folder, &identity).unwrap()).unwrap();
         (store.import_record(entered, &record(&identity, host)).unwrap(), identity)
     }
 
-    /// The first record of a complete artifact stays; damaged objects are replaced.
     #[test]
-    fn what_is_whole_stays() {
+    fn existing_records_stay_and_damaged_objects_are_replaced() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let entered = entered(&store);
-        let (is_new, identity) = take_from(&store, &entered, "first");
+        let (is_new, identity) = import_from(&store, &entered, "first");
         assert!(is_new);
-        assert!(!take_from(&store, &entered, "second").0);
+        assert!(!import_from(&store, &entered, "second").0);
         let key = record("", "").key();
         assert_eq!(store.hit(&key).unwrap().unwrap().host, "first");
         fs::write(store.object(&identity).join("x"), "12").unwrap();
-        take_from(&store, &entered, "third");
+        import_from(&store, &entered, "third");
         store.verify(&identity).unwrap();
         assert_eq!(store.hit(&key).unwrap().unwrap().host, "first");
     }
 
     #[test]
-    fn what_is_not_whole_is_not_taken_in() {
+    fn incomplete_or_changed_artifacts_are_refused() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let (folder, identity) = arriving(&store, "1234");
+        let (folder, identity) = write_arrival(&store, "1234");
         assert!(matches!(
             store.check_arrival(&folder, &"0".repeat(64)),
             Err(StoreError::Damage(Damage::Content { .. }))

@@ -152,7 +152,7 @@ mod tests {
     use crate::testing::{begin, entered, finish_action};
 
     #[test]
-    fn two_actions_may_end_in_one_object() {
+    fn equal_outputs_of_two_actions_are_one_object() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let (a, b) = (finish_action(&store, "a", "same"), finish_action(&store, "b", "same"));
@@ -163,17 +163,17 @@ mod tests {
         assert!(store.partials().unwrap().is_empty());
     }
 
-    /// Links are never followed for writing, and the next attempt starts over.
+    /// Links in an output are refused instead of followed, and the next attempt starts anew.
     #[test]
     fn links_and_special_files_are_refused() {
         type Harm = fn(&Path, &Path);
         let cases: [(&str, Harm); 5] = [
-            ("output is a symbolic link", |out, own| symlink(own, out).unwrap()),
+            ("output is a symbolic link", |out, user_folder| symlink(user_folder, out).unwrap()),
             ("output is a symbolic link", |out, _| symlink("nowhere", out).unwrap()),
             ("output is a regular file", |out, _| fs::write(out, "").unwrap()),
-            ("output/in/x is a symbolic link", |out, own| {
+            ("output/in/x is a symbolic link", |out, user_folder| {
                 fs::create_dir_all(out.join("in")).unwrap();
-                symlink(own.join("x"), out.join("in/x")).unwrap();
+                symlink(user_folder.join("x"), out.join("in/x")).unwrap();
             }),
             ("output/socket is a socket", |out, _| {
                 fs::create_dir(out).unwrap();
@@ -181,36 +181,38 @@ mod tests {
             }),
         ];
         let dir = tempfile::tempdir().unwrap();
-        let (store, own) = (Store::open(&dir.path().join("s")).unwrap(), dir.path().join("own"));
-        fs::create_dir(&own).unwrap();
-        fs::write(own.join("x"), "mine").unwrap();
-        for (words, harm) in cases {
+        let (store, user_folder) =
+            (Store::open(&dir.path().join("s")).unwrap(), dir.path().join("own"));
+        fs::create_dir(&user_folder).unwrap();
+        fs::write(user_folder.join("x"), "mine").unwrap();
+        for (expected, harm) in cases {
             let attempt = begin(&store, "k", None);
-            harm(&attempt.output, &own);
+            harm(&attempt.output, &user_folder);
             let message = store.check(attempt, "text").unwrap_err().to_string();
-            assert!(message.contains(words) && !message.contains('\n'), "{words}: {message}");
+            assert!(message.contains(expected) && !message.contains('\n'), "{expected}: {message}");
         }
-        assert_eq!(fs::read_dir(&own).unwrap().count(), 1);
+        assert_eq!(fs::read_dir(&user_folder).unwrap().count(), 1);
         assert_eq!(store.hit(&finish_action(&store, "k", "1").key()).unwrap().unwrap().stage, "k");
     }
 
-    /// Writing to a file by its other name doesn't change the artifact.
+    /// Writing to a hard-linked file outside of the store doesn't change the artifact.
     #[test]
     fn hard_links_become_copies() {
         let dir = tempfile::tempdir().unwrap();
-        let (store, own) = (Store::open(&dir.path().join("s")).unwrap(), dir.path().join("own"));
-        fs::write(&own, "before").unwrap();
+        let (store, user_file) =
+            (Store::open(&dir.path().join("s")).unwrap(), dir.path().join("own"));
+        fs::write(&user_file, "before").unwrap();
         let attempt = begin(&store, "k", Some("1"));
-        fs::hard_link(&own, attempt.output.join("linked")).unwrap();
+        fs::hard_link(&user_file, attempt.output.join("linked")).unwrap();
         let checked = store.check(attempt, "text").unwrap();
         let record = Record { stage: "k".to_owned(), ..Record::default() };
         let output = store.publish(&entered(&store), checked, record).unwrap().output;
-        fs::write(&own, "after!").unwrap();
+        fs::write(&user_file, "after!").unwrap();
         store.verify(&output).unwrap();
     }
 
     #[test]
-    fn success_without_an_artifact_is_a_failure() {
+    fn an_attempt_without_an_artifact_fails() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         assert!(matches!(

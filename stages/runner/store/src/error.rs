@@ -87,8 +87,8 @@ mod tests {
             (Errno::IO, false),
         ] {
             let message = lock_error("s/gate".as_ref(), errno.into()).to_string();
-            let words = "file locks don't work on the file system of s/gate";
-            assert_eq!(message.starts_with(words) && message.contains("--store"), is_named);
+            let expected = "file locks don't work on the file system of s/gate";
+            assert_eq!(message.starts_with(expected) && message.contains("--store"), is_named);
             assert!(message.contains("s/gate") && message.contains("os error"), "{message}");
         }
     }

@@ -97,20 +97,20 @@ mod tests {
         }
     }
 
-    /// A newer program marks the store when it opens it, after which an older one changes nothing.
+    /// A newer program marks a store when opening it. Then an older program changes nothing.
     #[test]
-    fn an_older_program_at_work_stops_when_a_newer_one_comes() {
+    fn a_running_older_program_is_refused_after_a_newer_one() {
         let dir = tempfile::tempdir().unwrap();
         let older = Store::open_as(dir.path(), 1).unwrap();
         let done = finish_action(&older, "a", "1234");
         let checked = older.check(begin(&older, "b", Some("5678")), "text").unwrap();
         let newer = Store::open_as(dir.path(), 2).unwrap();
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");
-        for refused in
+        for error in
             [older.try_enter().err(), older.try_close().err(), Store::open_as(dir.path(), 1).err()]
         {
             assert_eq!(
-                refused.unwrap().to_string(),
+                error.unwrap().to_string(),
                 format!(
                     "{}: the store has format 2, this nerf-sr supports format 1; use the newer \
                     nerf-sr, or another folder with --store",
@@ -124,14 +124,14 @@ mod tests {
             (vec![done.output.clone()], Some(done))
         );
         // The newer program completes the action of the older one.
-        let made = finish_action(&newer, "b", "5678");
-        assert_eq!(newer.hit(&made.key()).unwrap(), Some(made));
+        let completed = finish_action(&newer, "b", "5678");
+        assert_eq!(newer.hit(&completed.key()).unwrap(), Some(completed));
         Store::open_as(dir.path(), 2).unwrap();
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");
     }
 
     /// Returns the number of processes waiting for the lock of a store (from `/proc/locks`).
-    fn waiting(store: &Store) -> usize {
+    fn waiting_count(store: &Store) -> usize {
         let file = format!(":{} ", fs::metadata(store.gate_path()).unwrap().ino());
         let locks = fs::read_to_string("/proc/locks").unwrap();
         locks.lines().filter(|line| line.contains("->") && line.contains(&file)).count()
@@ -139,7 +139,7 @@ mod tests {
 
     /// A newer program waits until others have left the store. Of several, the newest wins.
     #[test]
-    fn a_newer_program_waits_for_who_is_inside() {
+    fn a_newer_program_waits_until_the_store_is_left() {
         let dir = tempfile::tempdir().unwrap();
         let older = Store::open_as(dir.path(), 1).unwrap();
         let inside = entered(&older);
@@ -149,18 +149,18 @@ mod tests {
             let openings =
                 formats.map(|format| scope.spawn(move || Store::open_as(root, format).is_ok()));
             let has_opened = || openings.iter().any(ScopedJoinHandle::is_finished);
-            while waiting(&older) < formats.len() && !has_opened() {
+            while waiting_count(&older) < formats.len() && !has_opened() {
                 std::thread::yield_now();
             }
             assert_eq!(
                 fs::read_to_string(dir.path().join("format")).unwrap(),
                 "1\n",
-                "not while another process is inside"
+                "unchanged while another process is inside"
             );
             drop(inside);
             openings.map(|opening| opening.join().unwrap())
         });
-        assert!(opened[1], "the newest");
+        assert!(opened[1], "the newest has opened the store");
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "4\n");
     }
 }

@@ -50,7 +50,7 @@ mod tests {
     use crate::testing::{begin, finish_action};
 
     #[test]
-    fn temporary_files_of_killed_writers_go() {
+    fn temporary_files_of_killed_writers_are_removed() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let done = finish_action(&store, "a", "1234");
@@ -62,7 +62,7 @@ mod tests {
         let key = done.key();
         fs::create_dir_all(store.partial(&key).join("work")).unwrap();
         begin(&store, "unfinished", None);
-        let Locked::Acquired(closed) = store.try_close().unwrap() else { panic!("somebody is in") };
+        let Locked::Acquired(closed) = store.try_close().unwrap() else { panic!("in use") };
         store.remove_leftovers(&closed).unwrap();
         for folder in FOLDERS {
             assert!(!dir.path().join(folder).join(".aB3xYz.partial").exists(), "{folder}");

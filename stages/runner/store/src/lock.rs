@@ -188,7 +188,7 @@ mod tests {
         (dir, store)
     }
 
-    fn held<T>(locked: Locked<T>) -> T {
+    fn acquired<T>(locked: Locked<T>) -> T {
         match locked {
             Locked::Acquired(lock) => lock,
             Locked::HeldBy(holder) => panic!("held by {holder:?}"),
@@ -198,17 +198,17 @@ mod tests {
     #[test]
     fn a_lock_is_exclusive_and_dropped_with_its_last_owner() {
         let (_dir, store) = store();
-        let lock = held(store.try_lock("k").unwrap());
+        let lock = acquired(store.try_lock("k").unwrap());
         let shared = lock.file().try_clone().unwrap();
         let Locked::HeldBy(Some(holder)) = store.try_lock("k").unwrap() else { panic!("not held") };
         assert_eq!((holder.pid, holder.host), (std::process::id(), host_name()));
         drop(lock);
         assert!(
             matches!(store.try_lock("k").unwrap(), Locked::HeldBy(Some(_))),
-            "the stage still holds it"
+            "the stage still holds the lock"
         );
         drop(shared);
-        held(store.try_lock("k").unwrap());
+        acquired(store.try_lock("k").unwrap());
     }
 
     /// The stage's standard input reads as empty, although the lock's file has content.
@@ -216,7 +216,7 @@ mod tests {
     fn a_shared_lock_reads_as_empty() {
         let (_dir, store) = store();
         for _ in 0..2 {
-            let lock = held(store.try_lock("k").unwrap());
+            let lock = acquired(store.try_lock("k").unwrap());
             let mut text = String::new();
             io::Read::read_to_string(&mut lock.file(), &mut text).unwrap();
             assert_eq!(text, "");
@@ -226,7 +226,7 @@ mod tests {
     #[test]
     fn a_lock_file_in_use_is_not_removed() {
         let (dir, store) = store();
-        let lock = held(store.try_lock("k").unwrap());
+        let lock = acquired(store.try_lock("k").unwrap());
         store.remove_lock("k").unwrap();
         assert!(dir.path().join("locks/k").exists());
         drop(lock);
@@ -234,27 +234,28 @@ mod tests {
         assert!(!dir.path().join("locks/k").exists());
     }
 
-    /// An unreadable lock file may be held.
+    /// A lock whose file can't be read may be held.
     #[test]
     fn unreadable_locks_are_errors() {
         let (dir, store) = store();
-        drop(held(store.try_lock("k").unwrap()));
+        drop(acquired(store.try_lock("k").unwrap()));
         assert!(store.locked_keys().unwrap().is_empty());
-        let [_, loops] = UNREADABLE;
-        loops(&dir.path().join("locks/k"));
-        let said = store.locked_keys().unwrap_err().to_string();
-        assert!(said.contains("locks/k: "), "{said}");
+        let [_, replace_by_loop] = UNREADABLE;
+        replace_by_loop(&dir.path().join("locks/k"));
+        let message = store.locked_keys().unwrap_err().to_string();
+        assert!(message.contains("locks/k: "), "{message}");
     }
 
     #[test]
     fn nobody_enters_a_closed_store() {
         let (_dir, store) = store();
-        let (one, two) = (held(store.try_enter().unwrap()), held(store.try_enter().unwrap()));
+        let (first, second) =
+            (acquired(store.try_enter().unwrap()), acquired(store.try_enter().unwrap()));
         assert!(matches!(store.try_close().unwrap(), Locked::HeldBy(None)));
-        drop((one, two));
-        let closed = held(store.try_close().unwrap());
+        drop((first, second));
+        let closed = acquired(store.try_close().unwrap());
         assert!(matches!(store.try_enter().unwrap(), Locked::HeldBy(Some(_))));
         drop(closed);
-        held(store.try_enter().unwrap());
+        acquired(store.try_enter().unwrap());
     }
 }

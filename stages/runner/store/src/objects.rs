@@ -146,9 +146,9 @@ mod tests {
     use crate::action::Record;
     use crate::testing::{UNREADABLE, begin, entered, finish_action};
 
-    /// A name is either an object's or foreign.
+    /// Every name in the folder is either an object's hash or foreign.
     #[test]
-    fn a_name_in_upper_case_is_foreign() {
+    fn names_that_are_not_hashes_are_foreign() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let object = "0a".repeat(32);
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_no_path_is_made_of() {
+    fn a_hash_has_64_lower_case_digits() {
         assert!(is_hash(&"0a".repeat(32)));
         for name in ["", "..", &"0A".repeat(32), &"g".repeat(64), &"0".repeat(63), "/etc/passwd"] {
             assert!(!is_hash(name), "{name}");
@@ -185,17 +185,17 @@ mod tests {
                 store.verify(&done.output).map_err(StoreError::from).err(),
                 store.publish(&entered(&store), checked, Record::default()).err(),
             ] {
-                let said = problem.unwrap().to_string();
-                let words = format!("cannot read {}", path.display());
-                assert!(said.starts_with(&words) && !said.contains("--remove"), "{said}");
+                let message = problem.unwrap().to_string();
+                let start = format!("cannot read {}", path.display());
+                assert!(message.starts_with(&start) && !message.contains("--remove"), "{message}");
             }
-            assert!(path.symlink_metadata().is_ok(), "it stays");
+            assert!(path.symlink_metadata().is_ok(), "{} is kept", path.display());
         }
     }
 
     /// Actions with different keys repair one damaged object concurrently.
     #[test]
-    fn actions_at_once_make_one_object() {
+    fn concurrent_actions_publish_one_object() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let output = finish_action(&store, "a", "1234").output;

@@ -219,7 +219,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_waiting_node_may_be_any_record_of_its_stage_and_parameters() {
+    fn a_waiting_node_matches_any_record_of_its_stage_and_parameters() {
         let waiting = PartialKey {
             program: "prep".into(),
             parameters: json!({"lr": 2, "kernel": null}).as_object().unwrap().clone(),

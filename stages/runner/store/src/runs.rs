@@ -126,7 +126,7 @@ mod tests {
     use crate::testing::{UNREADABLE, entered};
 
     #[test]
-    fn a_run_is_in_progress_while_its_file_is_held() {
+    fn a_run_is_in_progress_while_its_file_is_locked() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let file = store.begin_run(&entered(&store), vec!["nerf-sr".into(), "run".into()]).unwrap();
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn pins_come_and_go() {
+    fn pins_are_added_and_removed() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         store.pin(&entered(&store), "paper", Vec::new(), &[("prep".into(), "k".into())]).unwrap();
@@ -169,14 +169,14 @@ mod tests {
     /// one is damaged.
     #[test]
     fn damaged_files_of_runs_and_pins_are_errors() {
-        let (whole, ended) = (format!("{FIRST}\n{ACTION}\n"), r#"{"ended":{"unix":9}}"#);
+        let (complete, ended) = (format!("{FIRST}\n{ACTION}\n"), r#"{"ended":{"unix":9}}"#);
         for (text, is_run, is_pin) in [
-            (whole.clone(), true, true),
+            (complete.clone(), true, true),
             (format!("{FIRST}\n{ACTION}"), true, true),
             (format!("{FIRST}\n"), true, false),
             (FIRST[..20].to_owned(), true, false),
             (String::new(), true, false),
-            (format!("{whole}{{\"act"), true, false),
+            (format!("{complete}{{\"act"), true, false),
             (format!("{FIRST}\n{{\"act{ACTION}\n{ended}\n"), true, false),
             (format!("{ACTION}\n"), false, false),
             ("my notes".to_owned(), false, false),
@@ -189,15 +189,18 @@ mod tests {
             }
             assert_eq!((store.runs().is_ok(), store.pins().is_ok()), (is_run, is_pin), "{text:?}");
             if let Err(error) = store.runs() {
-                let said = error.to_string();
+                let message = error.to_string();
                 assert!(
-                    said.contains("runs/x.jsonl") && said.contains("move the file away"),
-                    "{said}"
+                    message.contains("runs/x.jsonl") && message.contains("move the file away"),
+                    "{message}"
                 );
             }
             if let Err(error) = store.pins() {
-                let said = error.to_string();
-                assert!(said.contains("pins/x.jsonl") && said.contains("unpin x`"), "{said}");
+                let message = error.to_string();
+                assert!(
+                    message.contains("pins/x.jsonl") && message.contains("unpin x`"),
+                    "{message}"
+                );
             }
             assert_eq!(store.pin_names().unwrap(), ["x"]);
             assert!(store.unpin("x").unwrap() && store.pins().unwrap().is_empty());
@@ -214,15 +217,15 @@ mod tests {
                 let dir = tempfile::tempdir().unwrap();
                 let store = Store::open(dir.path()).unwrap();
                 damage(&dir.path().join(file));
-                let said = read(&store).unwrap_err().to_string();
-                assert!(said.contains(file), "{said}");
+                let message = read(&store).unwrap_err().to_string();
+                assert!(message.contains(file), "{message}");
                 assert!(store.run_or_pin("x").is_err());
                 assert_eq!(store.unpin("x").unwrap(), file.starts_with("pins"));
             }
         }
     }
 
-    /// Two containers may share a store, a second and the process id 1.
+    /// Two containers may share a store, a start time in seconds and the process id 1.
     #[test]
     fn names_of_runs_have_random_digits() {
         let dir = tempfile::tempdir().unwrap();

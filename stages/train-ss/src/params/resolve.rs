@@ -230,7 +230,7 @@ mod tests {
         let coarse = with_grid(GridParams { cells_per_pixel: 1.28, ..GridParams::default() });
         let forward = facts(ndc(), Background::Opaque);
         let boxed = facts(Space::Box, Background::White);
-        let open = facts(Space::Box, Background::Alpha);
+        let transparent = facts(Space::Box, Background::Alpha);
         for (params, scene, name, expected) in [
             (&grid, forward, "distortion", json!(0.004)),
             (&grid, forward, "floater_loss", json!(0.0)),
@@ -252,11 +252,11 @@ mod tests {
             (&grid, boxed, "supersample_warmup", json!(0.3)),
             (&grid, boxed, "supervision", json!("kernel")),
             (&grid, boxed, "exposure", json!(null)),
-            (&grid, open, "exposure", json!(false)),
+            (&grid, transparent, "exposure", json!(false)),
             (&grid, SceneFacts { is_fine_tuning: true, ..boxed }, "exposure", json!(false)),
             (&mlp, boxed, "exposure", json!(false)),
             (&grid, boxed, "combine", json!("ensemble")),
-            (&grid, open, "supervision", json!("average")),
+            (&grid, transparent, "supervision", json!("average")),
             (&grid, SceneFacts { has_kernel: false, ..boxed }, "supervision", json!("average")),
             (&grid, SceneFacts { is_fine_tuning: true, ..boxed }, "supersample_warmup", json!(0.0)),
             (&with_grid(own.clone()), forward, "distortion", json!(0.5)),
@@ -272,15 +272,15 @@ mod tests {
         ] {
             assert_eq!(value(params, &scene, name), expected, "{name} of {params:?} for {scene:?}");
         }
-        let many = with_grid(GridParams { march_steps: Some(8192), ..GridParams::default() })
+        let max_steps = with_grid(GridParams { march_steps: Some(8192), ..GridParams::default() })
             .resolve(&forward);
-        assert!(matches!(many.field, ResolvedField::Grid { architecture,
+        assert!(matches!(max_steps.field, ResolvedField::Grid { architecture,
                 .. } if architecture.check().is_ok()));
     }
 
-    /// `training.json` says every default that `plan` leaves to the scene.
+    /// `training.json` contains every default that `plan` leaves to the scene.
     #[test]
-    fn what_is_by_scene_is_recorded() {
+    fn defaults_by_scene_are_recorded() {
         let schema = stage::Schema::new(&crate::TrainSs::describe("", "").parameters).unwrap();
         let scene = facts(Space::Box, Background::White);
         for (name, field) in
@@ -289,9 +289,9 @@ mod tests {
             let recorded = Params { field, ..Params::default() }.resolve(&scene).record();
             let parameters =
                 schema.resolve(&json!({ "field": name }).as_object().cloned().unwrap()).unwrap();
-            let open = schema.by_scene(&parameters);
-            assert!(open.len() > 3, "{open:?}");
-            for name in open {
+            let by_scene = schema.by_scene(&parameters);
+            assert!(by_scene.len() > 3, "{by_scene:?}");
+            for name in by_scene {
                 assert!(recorded.contains_key(name), "{name} isn't recorded");
             }
         }
@@ -326,14 +326,14 @@ mod tests {
         Resolved { supersample_warmup, supersample, ..resolved.clone() }.precrop_bundles()
     }
 
-    /// However many rays a bundle has at first, as many steps are drawn from the middle.
+    /// The number of steps drawn from the middle doesn't depend on the number of rays per bundle.
     #[test]
-    fn precrop_steps_are_steps_whatever_is_cast() {
+    fn precrop_steps_are_steps_for_any_bundle() {
         let resolved = Params::default().resolve(&facts(Space::Box, Background::White));
         let resolved =
             Resolved { precrop_steps: 10, max_rays_per_step: 64, rays: 6400, ..resolved };
-        // 16 bundles of 4 rays a step; 64 of one ray; 3 steps of those, 3 with 4 rays and 4 with
-        // 16.
+        // 16 bundles of 4 rays a step; 64 of one ray; and 3 steps with one ray per bundle, 3 with 4
+        // rays and 4 with 16.
         assert_eq!(
             [
                 bundles(&resolved, 0.0, 2.0),
@@ -344,14 +344,14 @@ mod tests {
         );
     }
 
-    /// The fields of an ensemble spend all rays between them, each with a seed of its own.
+    /// The fields of an ensemble share all rays, and each has a seed of its own.
     #[test]
     fn members_share_the_rays() {
-        let all = Params { ensemble: 3, seed: 7, ..Params::default() }
+        let ensemble = Params { ensemble: 3, seed: 7, ..Params::default() }
             .resolve(&facts(Space::Box, Background::White));
-        let all = Resolved { rays: 100, ..all };
+        let ensemble = Resolved { rays: 100, ..ensemble };
         let members: Vec<(u64, u64)> =
-            (0..3).map(|i| all.member(i)).map(|own| (own.rays, own.seed)).collect();
+            (0..3).map(|i| ensemble.member(i)).map(|member| (member.rays, member.seed)).collect();
         assert_eq!(members, [(34, 7), (33, 8), (33, 9)]);
     }
 }

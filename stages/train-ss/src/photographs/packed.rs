@@ -247,7 +247,7 @@ mod tests {
         /// Every PNG's content needs a byte per sample, and is restored exactly from memory and
         /// from a file.
         #[test]
-        fn eight_bits_come_back(bytes in prop::collection::vec(any::<u8>(), 4 * 6), opaque: bool,
+        fn bytes_are_restored(bytes in prop::collection::vec(any::<u8>(), 4 * 6), opaque: bool,
             background in 0.0f32..1.0) {
             let mut bytes = bytes;
             if opaque {
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn floats_and_masks_come_back() {
+    fn floats_and_masks_are_restored() {
         let image = Image::new(2, 1, 4, vec![0.1, 0.2, 0.3, 0.77, 0.5, 0.25, 0.125, 1.0]);
         let mask = Mask { width: 2, height: 1, counts: vec![false, true] };
         let packed =
@@ -284,10 +284,11 @@ mod tests {
         );
         assert_eq!(packed.unpack(), Photograph { image, mask: Some(mask) });
         assert!(packed.has_valid_pixels());
-        let none = Mask { width: 2, height: 1, counts: vec![false; 2] };
+        let empty_mask = Mask { width: 2, height: 1, counts: vec![false; 2] };
         let grey = Image::new(2, 1, 3, vec![0.5; 6]);
         assert!(
-            !packed_photograph(grey, Some(none), &mut PixelMemory::unlimited()).has_valid_pixels()
+            !packed_photograph(grey, Some(empty_mask), &mut PixelMemory::unlimited())
+                .has_valid_pixels()
         );
     }
 }

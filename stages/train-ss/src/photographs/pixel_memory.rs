@@ -131,7 +131,7 @@ mod tests {
 
     /// Overwritten bytes are read back, and a file that can't be read reports an error.
     #[test]
-    fn files_are_written_and_their_errors_known() {
+    fn files_are_written_and_their_errors_reported() {
         let folder = tempfile::tempdir().unwrap();
         let mut memory = PixelMemory::new(2, folder.path().to_path_buf());
         let mut first = memory.store(vec![1, 2]).unwrap();

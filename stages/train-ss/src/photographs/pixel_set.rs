@@ -79,8 +79,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_is_the_list_of_its_pixels(pixels in prop::collection::vec(prop::bool::weighted(0.2),
-            0..2000)) {
+        fn a_set_equals_the_list_of_its_pixels(
+            pixels in prop::collection::vec(prop::bool::weighted(0.2), 0..2000),
+        ) {
             let mut set: PixelSet = pixels.iter().copied().take(700).collect();
             set.extend(pixels.iter().copied().skip(700));
             let list: Vec<u64> = (0..).zip(&pixels).filter(|(_, is_in)| **is_in).map(|(pixel,

@@ -126,7 +126,7 @@ mod tests {
 
     use super::*;
 
-    /// Patches with fine stripes, as seen from there.
+    /// Returns an image as the photograph of camera `name`.
     fn photographs(name: &str, image: Image) -> Photographs {
         let (width, height) = (image.width as u32, image.height as u32);
         let intrinsics = Intrinsics {
@@ -143,6 +143,7 @@ mod tests {
         Photographs::taken_by(camera, image)
     }
 
+    /// Returns sample `i` of an image of random patches with fine stripes.
     fn hr_sample(i: usize) -> f32 {
         let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
         0.2 + 0.5 * numerics::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64)
@@ -153,35 +154,36 @@ mod tests {
         Image::new(32, 32, 3, (0..32 * 32 * 3).map(hr_sample).collect())
     }
 
-    /// Returns the rest of the changed HR image, the number of views, and the message.
-    fn checked_with(name: &str, change: &dyn Fn(f32) -> f32) -> (Option<Image>, usize, String) {
+    /// Checks the changed HR image of camera `name`. Returns the reference, unless it was left out,
+    /// the number of references, and the log.
+    fn check_changed(name: &str, change: &dyn Fn(f32) -> f32) -> (Option<Image>, usize, String) {
         let lr = Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr());
         let lr = photographs("a", lr);
-        let said = std::cell::RefCell::new(String::new());
+        let messages = std::cell::RefCell::new(String::new());
         let mut image = hr();
         image.data.iter_mut().for_each(|v| *v = change(*v));
-        let say = |text: String| said.borrow_mut().push_str(&text);
+        let log = |text: String| messages.borrow_mut().push_str(&text);
         let kept = check_references(
             photographs(name, image),
             &lr,
             Kernel::Lanczos,
             &mut PixelMemory::unlimited(),
-            &say,
+            &log,
         )
         .unwrap();
         (
             kept.images.first().map(|packed| packed.unmasked().over(0.0)),
             kept.views.views.len(),
-            said.into_inner(),
+            messages.into_inner(),
         )
     }
 
     #[test]
-    fn exposures_are_taken_back_and_other_images_are_left_out() {
-        let (same, views, said) = checked_with("a", &|v| v);
-        assert!(same.unwrap().data == hr().data && views == 1 && said.is_empty(), "{said}");
-        let (dark, views, said) = checked_with("a", &|v| 0.6 * v + 0.1);
-        let off = dark
+    fn exposures_are_corrected_and_other_images_are_left_out() {
+        let (same, views, message) = check_changed("a", &|v| v);
+        assert!(same.unwrap().data == hr().data && views == 1 && message.is_empty(), "{message}");
+        let (dark, views, message) = check_changed("a", &|v| 0.6 * v + 0.1);
+        let error = dark
             .unwrap()
             .data
             .iter()
@@ -189,24 +191,24 @@ mod tests {
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, f32::max);
         assert!(
-            off < 0.01 && views == 1 && said.contains("another exposure (0.60, 0.60, 0.60"),
-            "{off} {said}"
+            error < 0.01 && views == 1 && message.contains("another exposure (0.60, 0.60, 0.60"),
+            "{error} {message}"
         );
-        let (other, views, said) = checked_with("a", &|v| 1.0 - v);
-        assert!(other.is_none() && views == 0 && said.contains("left out"), "{said}");
+        let (other, views, message) = check_changed("a", &|v| 1.0 - v);
+        assert!(other.is_none() && views == 0 && message.contains("left out"), "{message}");
         // Nothing is known of a view that has no LR photograph.
-        let (unknown, _, said) = checked_with("b", &|v| 1.0 - v);
-        assert!(unknown.is_some() && said.is_empty(), "{said}");
+        let (unknown, _, message) = check_changed("b", &|v| 1.0 - v);
+        assert!(unknown.is_some() && message.is_empty(), "{message}");
     }
 
     fn ball_pixel(size: usize, i: usize) -> [u8; 4] {
         let (x, y) = ((i % size) as f32 + 0.5, (i / size) as f32 + 0.5);
-        let away = (x - 0.45 * size as f32).hypot(y - 0.55 * size as f32);
-        if away < 0.3 * size as f32 { [250, 240, 90 + (x * 2.0) as u8 / 4, 255] } else { [0; 4] }
+        let radius = (x - 0.45 * size as f32).hypot(y - 0.55 * size as f32);
+        if radius < 0.3 * size as f32 { [250, 240, 90 + (x * 2.0) as u8 / 4, 255] } else { [0; 4] }
     }
 
-    /// A ball before nothing, of a colour that Lanczos overshoots at its border, as `prep` stores
-    /// it at both sizes.
+    /// The image is a ball over a transparent background, stored as by `prep` at both sizes.
+    /// Lanczos overshoots the ball's colour at its border.
     #[test]
     fn an_lr_photograph_with_alpha_is_its_own_reference_at_any_size() {
         for size in [32, 48, 64, 100] {
@@ -230,14 +232,14 @@ mod tests {
                     )),
                 };
                 let hr = Image::premultiplied(&hr);
-                let said = std::cell::RefCell::new(String::new());
+                let messages = std::cell::RefCell::new(String::new());
                 let given = photographs("a", lr.clone());
-                let say = |text: String| said.borrow_mut().push_str(&text);
+                let log = |text: String| messages.borrow_mut().push_str(&text);
                 let memory = &mut PixelMemory::unlimited();
                 let kept =
-                    check_references(photographs("a", hr.clone()), &given, kernel, memory, &say)
+                    check_references(photographs("a", hr.clone()), &given, kernel, memory, &log)
                         .unwrap();
-                assert_eq!(said.into_inner(), "", "{size} {kernel:?}");
+                assert_eq!(messages.into_inner(), "", "{size} {kernel:?}");
                 assert_eq!(kept.images[0].unmasked(), hr);
                 let [shrunk, own] = comparable_images(&hr, &lr, kernel);
                 assert_eq!(premultiplied_psnr(&shrunk, &own), 100.0, "{size} {kernel:?}");
@@ -245,12 +247,13 @@ mod tests {
         }
     }
 
-    fn under_alpha((i, p): (usize, &[f32]), gain: f32, offset: f32) -> [f32; 4] {
+    fn premultiplied_pixel((i, p): (usize, &[f32]), gain: f32, offset: f32) -> [f32; 4] {
         let alpha = [1.0, 0.5, 0.0][(i % 32 / 4) % 3];
         let [r, g, b] = [0, 1, 2].map(|c| alpha * (gain * p[c] + offset));
         [r, g, b, alpha]
     }
 
+    /// Returns the HR image with an exposure, in stripes of different alpha.
     fn striped(gain: f32, offset: f32) -> Image {
         let hr = hr();
         Image::new(
@@ -260,22 +263,22 @@ mod tests {
             hr.data
                 .chunks_exact(3)
                 .enumerate()
-                .flat_map(|one| under_alpha(one, gain, offset))
+                .flat_map(|pixel| premultiplied_pixel(pixel, gain, offset))
                 .collect(),
         )
     }
 
-    /// Only what is there has an exposure.
+    /// An offset is multiplied by alpha, like the colours.
     #[test]
-    fn exposures_are_taken_back_from_under_alpha() {
+    fn exposures_of_transparent_pixels_are_undone() {
         let mut dark = striped(0.6, 0.1);
         Exposure { gain: [0.6; 3], offset: [0.1; 3] }.undo(&mut dark);
-        let off = dark
+        let error = dark
             .data
             .iter()
             .zip(&striped(1.0, 0.0).data)
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, f32::max);
-        assert!(off < 1e-6, "{off}");
+        assert!(error < 1e-6, "{error}");
     }
 }

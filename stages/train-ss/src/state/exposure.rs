@@ -247,23 +247,23 @@ mod tests {
                 "{found:?} {expected:?}"
             );
         }
-        let mut other = Exposures::new(3);
-        assert_eq!(exposures.to_bytes().len(), other.to_bytes().len());
-        other.restore(&exposures.to_bytes());
-        other.update_gains(0.5);
-        assert_eq!(other.gains(), exposures.gains());
+        let mut restored = Exposures::new(3);
+        assert_eq!(exposures.to_bytes().len(), restored.to_bytes().len());
+        restored.restore(&exposures.to_bytes());
+        restored.update_gains(0.5);
+        assert_eq!(restored.gains(), exposures.gains());
     }
 
     /// Returns the differences measured between photographs with gains of e^±`spread`, by a field
     /// whose error is `error` times its colours.
-    fn measured(spread: f32, error: f32, progress: f64) -> Vec<ExposureDifference> {
+    fn measure_differences(spread: f32, error: f32, progress: f64) -> Vec<ExposureDifference> {
         let mut measurement = ExposureMeasurement::new(5, true);
         let mut differences = Vec::new();
         for _ in 0..600 {
             measurement.start_step();
             for i in 0..70 {
                 let (view, rendered) = (i % 5, [0.1 + 0.3 * (i % 7) as f32 / 7.0; 3]);
-                // The fifth view is a reference of another exposure, which doesn't count.
+                // The fifth view is a reference of another exposure, which isn't counted.
                 let gain = if view == 4 { 1.2 } else { (spread * [1.0, -1.0][view % 2]).exp() };
                 let error = if i < 35 { 1.0 + error } else { 1.0 - error };
                 measurement.add_pixel(view, rendered.map(|x| error * gain * x), rendered);
@@ -284,16 +284,19 @@ mod tests {
             (0.06, 0.5, [false; 5]),
             (0.3, 0.5, [true; 5]),
         ] {
-            let differences = measured(spread, error, 0.1);
+            let differences = measure_differences(spread, error, 0.1);
             let found: Vec<bool> = differences.iter().map(|d| d.is_clear()).collect();
             assert_eq!(found, is_clear, "{differences:?}");
-            let off = differences.iter().map(|d| (d.spread - f64::from(spread)).abs());
-            assert!(off.fold(0.0, f64::max) < 0.15 * f64::from(spread) + 1e-9, "{differences:?}");
+            let errors = differences.iter().map(|d| (d.spread - f64::from(spread)).abs());
+            assert!(
+                errors.fold(0.0, f64::max) < 0.15 * f64::from(spread) + 1e-9,
+                "{differences:?}"
+            );
         }
         assert!(!ExposureMeasurement::new(5, false).measurements.contains(&EARLY_MEASUREMENT));
-        let text = measured(0.06, 0.2, 0.1)[3].to_string();
+        let text = measure_differences(0.06, 0.2, 0.1)[3].to_string();
         assert!(text.contains("differ by 5.9 % after 384 steps, at least 4."), "{text}");
-        assert_eq!(measured(0.5, 0.1, 0.3), []);
+        assert_eq!(measure_differences(0.5, 0.1, 0.3), []);
     }
 
     /// A measurement resumed from a checkpoint has the same result.
@@ -306,14 +309,14 @@ mod tests {
             measurement.add_pixel(0, [0.5; 3], [0.4; 3]);
             measurement.add_pixel(1, [0.4; 3], [0.5; 3]);
             if step == 150 {
-                let mut other = ExposureMeasurement::new(2, true);
-                other.restore(&measurement.to_bytes());
-                assert_eq!(other.to_bytes(), measurement.to_bytes());
-                measurement = other;
+                let mut restored = ExposureMeasurement::new(2, true);
+                restored.restore(&measurement.to_bytes());
+                assert_eq!(restored.to_bytes(), measurement.to_bytes());
+                measurement = restored;
             }
             assert_eq!(measurement.difference(0.1, 2).is_some(), [35, 191].contains(&step));
         }
-        let gains = measurement.difference(0.1, 2).unwrap().spread;
-        assert!((gains - 1.25f64.ln()).abs() < 0.03, "{gains}");
+        let spread = measurement.difference(0.1, 2).unwrap().spread;
+        assert!((spread - 1.25f64.ln()).abs() < 0.03, "{spread}");
     }
 }

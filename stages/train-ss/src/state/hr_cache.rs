@@ -290,7 +290,7 @@ mod tests {
     use super::*;
 
     fn pattern(width: usize, height: usize) -> Image {
-        // Whole 8-bit levels, away from black and white.
+        // Exact 8-bit levels, away from black and white.
         let sample = |i: usize| (40 + (i * 7919 + i * i * 31) % 170) as f32 / 255.0;
         Image::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
@@ -301,10 +301,10 @@ mod tests {
         cache
     }
 
-    /// If a filter's footprint is the pixel's own block, the residual of every HR pixel equals that
-    /// of the mean.
+    /// If a filter's footprint is the pixel's own block, every HR pixel gets an equal share of the
+    /// mean's residual.
     #[test]
-    fn a_whole_box_is_the_mean() {
+    fn a_box_of_one_block_is_the_mean() {
         let (hr, lr) = ((12, 8), (6, 4));
         assert!(
             !HrCache::is_needed(Filter::Box, hr, lr) && HrCache::is_needed(Filter::Lanczos, hr, lr)
@@ -317,15 +317,15 @@ mod tests {
         let colours = [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9], [0.2, 0.1, 0.0]];
         let mut back_projected = [[9.0; 3]; 4];
         let pixel = LrPixel { view: 0, x: 2, y: 1 };
-        let own =
+        let residual =
             cache.back_project(pixel, &colours, &targets, |_, p, t| p - t, &mut back_projected);
         for c in 0..3 {
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() / 4.0;
-            assert!((own[c] - (mean - targets.pixel(8)[c])).abs() < 1e-6);
+            assert!((residual[c] - (mean - targets.pixel(8)[c])).abs() < 1e-6);
             assert!(
                 back_projected
                     .iter()
-                    .all(|p| (p[c] - own[c] / 4.0).abs() < 0.02 * own[c].abs() + 1e-6),
+                    .all(|p| (p[c] - residual[c] / 4.0).abs() < 0.02 * residual[c].abs() + 1e-6),
                 "{back_projected:?}"
             );
         }
@@ -334,7 +334,7 @@ mod tests {
     /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole images, at any
     /// scale, also where the block is freshly rendered.
     #[test]
-    fn back_projections_are_the_operators_own() {
+    fn back_projections_equal_those_of_the_operators() {
         for (lr, hr) in [
             ((9, 8), (18, 16)),
             ((10, 6), (27, 15)),
@@ -370,7 +370,7 @@ mod tests {
                     residual.data.iter_mut().zip(&targets.data).for_each(|(r, t)| *r -= t);
                     let expected = inverse.adjoint(&residual);
                     let mut back_projected = vec![[9.0; 3]; fresh.len()];
-                    let own = cache.back_project(
+                    let pixel_residual = cache.back_project(
                         pixel,
                         &fresh,
                         &packed,
@@ -379,7 +379,8 @@ mod tests {
                     );
                     for c in 0..3 {
                         assert!(
-                            (own[c] - residual.data[3 * (y * lr.0 + x) + c]).abs() < 1e-5,
+                            (pixel_residual[c] - residual.data[3 * (y * lr.0 + x) + c]).abs()
+                                < 1e-5,
                             "{lr:?} {hr:?} ({x}, {y})"
                         );
                         for (k, projection) in back_projected.iter().enumerate() {
@@ -394,7 +395,7 @@ mod tests {
         }
     }
 
-    fn written(cache: &HrCache) -> Vec<u8> {
+    fn bytes_of(cache: &HrCache) -> Vec<u8> {
         let mut bytes = Vec::new();
         cache.write(&mut bytes).unwrap();
         bytes
@@ -405,16 +406,16 @@ mod tests {
         let kernel = Arc::new(KernelOperator::new(Filter::Box, (8, 6), (4, 3)));
         let mut first = cache([2, 2], &pattern(8, 6), kernel.clone());
         first.store(LrPixel { view: 0, x: 3, y: 1 }, &[[255, 0, 51]; 4]);
-        let kept = written(&first);
-        assert_eq!(first.byte_length(), kept.len());
-        assert_eq!(kept[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
+        let stored = bytes_of(&first);
+        assert_eq!(first.byte_length(), stored.len());
+        assert_eq!(stored[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
         let mut other = cache([2, 2], &pattern(8, 6), kernel);
-        other.restore(&mut &kept[..]).unwrap();
-        assert_eq!(written(&other), kept);
-        assert!(other.restore(&mut &kept[1..]).is_err(), "a byte is missing");
+        other.restore(&mut &stored[..]).unwrap();
+        assert_eq!(bytes_of(&other), stored);
+        assert!(other.restore(&mut &stored[1..]).is_err(), "a byte is missing");
     }
 
-    /// Every HR pixel belongs to some block, so none is left unseen.
+    /// Every HR pixel belongs to a block, so every HR pixel is rendered during training.
     #[test]
     fn blocks_cover_the_image() {
         for (lr, hr) in
@@ -423,10 +424,10 @@ mod tests {
             let supersample = (hr as f64 / lr as f64).ceil() as usize;
             let kernel = Arc::new(KernelOperator::new(Filter::Lanczos, (hr, hr), (lr, lr)));
             let cache = cache([supersample; 2], &pattern(hr, hr), kernel);
-            let mut seen = vec![false; hr];
+            let mut is_covered = vec![false; hr];
             let start = |x: usize| cache.block_start(LrPixel { view: 0, x, y: 0 })[0];
-            (0..lr).for_each(|x| seen[start(x)..][..supersample].fill(true));
-            assert!(seen.iter().all(|s| *s), "{lr} {hr}");
+            (0..lr).for_each(|x| is_covered[start(x)..][..supersample].fill(true));
+            assert!(is_covered.iter().all(|covered| *covered), "{lr} {hr}");
         }
     }
 }

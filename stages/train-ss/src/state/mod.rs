@@ -82,7 +82,7 @@ mod tests {
     use super::*;
     use crate::photographs::{Photographs, PixelMemory};
 
-    /// State of one photograph from `height` above the scene.
+    /// Returns the state for one photograph, taken from `height` above the scene.
     fn state(height: f64) -> SupervisionState {
         let image = Image::new(24, 24, 3, vec![0.5; 24 * 24 * 3]);
         let kernel = Arc::new(KernelOperator::new(Filter::Lanczos, (24, 24), (12, 12)));
@@ -103,7 +103,7 @@ mod tests {
         }
     }
 
-    fn written(state: &SupervisionState) -> Vec<u8> {
+    fn state_bytes(state: &SupervisionState) -> Vec<u8> {
         let mut bytes = Vec::new();
         state.write(&mut bytes).unwrap();
         bytes
@@ -118,22 +118,21 @@ mod tests {
         first.exposures.as_mut().unwrap().add_pixel(0, [0.5; 3], [0.25; 3]);
         let measurement = first.measurement.as_mut().unwrap();
         measurement.start_step();
-        let bytes = written(&first);
+        let bytes = state_bytes(&first);
         assert_eq!(bytes.len(), first.byte_length());
         let mut other = state(5.0);
-        assert_ne!(written(&other), bytes);
+        assert_ne!(state_bytes(&other), bytes);
         other.restore(&mut &bytes[..]).unwrap();
-        assert_eq!(written(&other), bytes);
+        assert_eq!(state_bytes(&other), bytes);
         let cameras = |state: &SupervisionState| state.cameras.as_ref().unwrap().cameras().to_vec();
         assert_eq!(cameras(&other), cameras(&first));
         assert!(other.restore(&mut &bytes[1..]).is_err());
     }
 
-    /// Disabled parts write nothing.
     #[test]
     fn disabled_parts_write_nothing() {
-        let nothing =
+        let disabled =
             SupervisionState { cache: None, exposures: None, measurement: None, cameras: None };
-        assert_eq!((written(&nothing).len(), nothing.byte_length()), (0, 0));
+        assert_eq!((state_bytes(&disabled).len(), disabled.byte_length()), (0, 0));
     }
 }

@@ -132,10 +132,9 @@ mod tests {
         }
     }
 
-    /// Rounds are due at their times, each once, and a checkpoint restores their number and the
-    /// poses.
+    /// Each round is due once, and a checkpoint restores the number of rounds and the poses.
     #[test]
-    fn rounds_are_counted_and_kept() {
+    fn rounds_are_counted_and_restored() {
         let bounds = Bounds::cube(1.0, 2.0, 6.0);
         let field = Field::new(
             Architecture {
@@ -150,8 +149,8 @@ mod tests {
         let image = Image::new(24, 24, 3, (0..24 * 24 * 3).map(|i| (i % 7) as f32 / 7.0).collect());
         let photographs =
             [0.0, 0.5].map(|x| Photographs::taken_by(camera(x), image.clone()).over_background());
-        let new = || MovingCameras::new(photographs.iter());
-        let mut moving = new();
+        let new_cameras = || MovingCameras::new(photographs.iter());
+        let mut moving = new_cameras();
         assert!(!moving.is_round_due(0.01) && moving.is_round_due(0.02));
         moving.step(&field, 0.02, 1.0, |_| [1.0; 3]).unwrap();
         assert!(!moving.is_round_due(0.02) && moving.is_round_due(0.05));
@@ -163,10 +162,10 @@ mod tests {
         moving.current[1].camera_to_world[2][3] = 4.25;
         let moved = moving.mean_motion(&field, 2, 1.0).unwrap();
         assert!((moved.distance - 0.125).abs() < 0.05 && moved.pixels.is_finite(), "{moved:?}");
-        let mut other = new();
+        let mut restored = new_cameras();
         let bytes = moving.to_bytes();
-        assert_eq!(bytes.len(), other.to_bytes().len());
-        other.restore(&bytes);
-        assert_eq!((other.rounds, &other.current), (moving.rounds, &moving.current));
+        assert_eq!(bytes.len(), restored.to_bytes().len());
+        restored.restore(&bytes);
+        assert_eq!((restored.rounds, &restored.current), (moving.rounds, &moving.current));
     }
 }

@@ -118,9 +118,9 @@ mod tests {
         training_memory(&options, &views, &[], false)
     }
 
-    /// Only kernels other than the mean of whole HR pixels need a cache.
+    /// Every kernel needs a cache, except the mean of whole HR pixels.
     #[test]
-    fn pixels_take_what_their_kernel_asks_for() {
+    fn pixel_memory_depends_on_the_kernel() {
         for (filter, has_cache) in [(Filter::Box, false), (Filter::Lanczos, true)] {
             for refines_poses in [false, true] {
                 let found = need(10, filter, refines_poses);
@@ -133,9 +133,9 @@ mod tests {
         }
     }
 
-    /// Pixels stay in memory as far as it suffices; an error names the need and the free memory.
+    /// Pixels that memory has no space for are in a file. An error names needed and free memory.
     #[test]
-    fn little_memory_sends_pixels_to_a_file() {
+    fn pixels_beyond_the_memory_are_in_a_file() {
         let need = TrainingMemory {
             field: 300_000_000,
             pixels: 5_000_000_000,

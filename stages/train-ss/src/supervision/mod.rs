@@ -392,6 +392,7 @@ mod tests {
         Image::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
 
+    /// Returns the supersampling of a 5×4 photograph, and its camera.
     fn example(
         supervision: Supervision,
         supersample: f64,
@@ -429,7 +430,7 @@ mod tests {
         references: Option<Photographs>,
         options: &SupersamplingOptions,
     ) -> Supersampling {
-        // All but the first bytes go to a file.
+        // All but the first 100 bytes go to a file.
         let memory = PixelMemory::new(100, std::env::temp_dir());
         let references = references.map(Photographs::over_background);
         Supersampling::new(photographs.over_background(), references, options, memory).unwrap()
@@ -451,11 +452,11 @@ mod tests {
             let size = [(5.0 * supersample).round(), (4.0 * supersample).round()];
             let hr = camera.resized(size[0] as u32, size[1] as u32);
             let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
-            let mut seen = vec![false; (size[0] * size[1]) as usize];
+            let mut has_ray = vec![false; (size[0] * size[1]) as usize];
             for bundle in 0..200 {
                 supersampling.sample_rays(bundle, &mut rays);
                 for ray in &rays {
-                    let pixel = (0..seen.len()).find(|i| {
+                    let pixel = (0..has_ray.len()).find(|i| {
                         let (x, y) = (
                             (i % size[0] as usize) as f64 + 0.5,
                             (i / size[0] as usize) as f64 + 0.5,
@@ -463,15 +464,19 @@ mod tests {
                         let expected = hr.ray(x, y).direction;
                         (0..3).all(|c| (ray.direction[c] - expected[c]).abs() < 1e-6)
                     });
-                    seen[pixel.unwrap_or_else(|| {
+                    has_ray[pixel.unwrap_or_else(|| {
                         panic!("{kind:?} {supersample}: {ray:?} is no pixel's ray")
                     })] = true;
                 }
             }
-            assert!(seen.iter().all(|s| *s), "{kind:?} {supersample}: every HR pixel is seen");
+            assert!(
+                has_ray.iter().all(|has| *has),
+                "{kind:?} {supersample}: every HR pixel has a ray"
+            );
         }
     }
 
+    /// Returns the background colours of 40 bundles.
     fn backgrounds(background: Background) -> Vec<[f32; 3]> {
         let (mut supersampling, _) = example(Supervision::Kernel, 2.0, None);
         supersampling.background = background;
@@ -487,7 +492,7 @@ mod tests {
     /// Each bundle of an opaque scene has its own background colour, but the photographs stay the
     /// same, so only an opaque field can match them.
     #[test]
-    fn nothing_can_pretend_to_be_an_opaque_scenes_background() {
+    fn backgrounds_of_opaque_scenes_are_random() {
         assert!(backgrounds(Background::White).iter().all(|b| *b == [1.0; 3]));
         let colours = backgrounds(Background::Opaque);
         assert!((0..40).all(|i| (0..i).all(|j| colours[i] != colours[j])));
@@ -498,26 +503,27 @@ mod tests {
     }
 
     #[test]
-    fn gradient_is_that_of_the_loss() {
+    fn gradients_equal_numerical_derivatives_of_the_loss() {
         let (supersampling, _) = example(Supervision::Average, 2.0, None);
         let colours: Vec<[f32; 3]> = (0..4).map(|k| [0.1 * k as f32, 0.5, 0.9]).collect();
         let mut gradients = vec![[0.0; 3]; 4];
         supersampling.loss_and_gradient(7, &colours, &mut gradients);
         for (k, c) in (0..4).flat_map(|k| (0..3).map(move |c| (k, c))) {
-            let mut moved = colours.clone();
-            let mut scrap = vec![[0.0; 3]; 4];
-            moved[k][c] += 0.01;
-            let up = supersampling.loss_and_gradient(7, &moved, &mut scrap);
-            moved[k][c] -= 0.02;
-            let numeric = (up - supersampling.loss_and_gradient(7, &moved, &mut scrap)) / 0.02;
+            let mut perturbed = colours.clone();
+            let mut unused = vec![[0.0; 3]; 4];
+            perturbed[k][c] += 0.01;
+            let higher = supersampling.loss_and_gradient(7, &perturbed, &mut unused);
+            perturbed[k][c] -= 0.02;
+            let numeric =
+                (higher - supersampling.loss_and_gradient(7, &perturbed, &mut unused)) / 0.02;
             assert!((f64::from(gradients[k][c]) - numeric).abs() < 1e-5, "{k} {c}");
         }
     }
 
-    /// The largest loss and the largest gradient, once the cache is full of the truth.
-    fn worst(truth: &Image, lr: &Image, kind: Supervision) -> (f64, f32) {
+    /// Returns the largest loss and gradient after the cache has been filled with the ground truth.
+    fn largest_loss_and_gradient(truth: &Image, lr: &Image, kind: Supervision) -> (f64, f32) {
         let (mut supersampling, _) = example(kind, 2.0, Some(lr.clone()));
-        let mut worst = (0.0f64, 0.0f32);
+        let mut largest = (0.0f64, 0.0f32);
         for bundle in 0..800 {
             let pixel = supersampling.drawn_pixel(bundle).1;
             let (x, y) = (pixel % 5 * 2, pixel / 5 * 2);
@@ -529,63 +535,65 @@ mod tests {
             let mut gradients = [[0.0; 3]; 4];
             let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
             record_colours(&mut supersampling, bundle, &colours);
-            // Until then the cache isn't full of the truth.
+            // The first 400 bundles fill the cache with the ground truth.
             if bundle >= 400 {
                 let gradient =
                     gradients.as_flattened().iter().fold(0.0f32, |most, g| most.max(g.abs()));
-                worst = (worst.0.max(loss), worst.1.max(gradient));
+                largest = (largest.0.max(loss), largest.1.max(gradient));
             }
         }
-        worst
+        largest
     }
 
-    /// Once the field renders the true HR image, the kernel is content: no loss and no gradient.
-    /// The average isn't.
+    /// When the field renders the true HR image, supervision by the kernel has neither loss nor
+    /// gradient. Supervision by the average has both.
     #[test]
-    fn only_the_kernel_is_content_with_the_truth() {
+    fn only_the_kernel_has_no_loss_at_the_truth() {
         let truth = hr_image(10, 8);
         let lr = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
-        let (kernel, average) =
-            (worst(&truth, &lr, Supervision::Kernel), worst(&truth, &lr, Supervision::Average));
+        let [kernel, average] = [Supervision::Kernel, Supervision::Average]
+            .map(|kind| largest_loss_and_gradient(&truth, &lr, kind));
         assert!(kernel.0 < 1e-9 && kernel.1 < 1e-5, "{kernel:?}");
         assert!(average.0 > 1e-4 && average.1 > 1e-3, "{average:?}");
     }
 
-    /// A photograph's pixel clipped to white doesn't require a rendering of exactly white.
+    /// A pixel that is clipped to white in a photograph may be rendered as white or brighter.
     #[test]
-    fn clipped_white_asks_for_white_or_more() {
+    fn clipped_white_accepts_white_or_more() {
         let white = Image::new(5, 4, 3, vec![1.0; 60]);
         let (supersampling, _) = example(Supervision::Kernel, 2.0, Some(white));
         let mut gradients = [[0.0; 3]; 4];
-        assert!(
-            supersampling.loss_and_gradient(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10,
-            "rounding alone"
-        );
+        for colour in [1.0, 1.2] {
+            assert!(
+                supersampling.loss_and_gradient(3, &[[colour; 3]; 4], &mut gradients) < 1e-10,
+                "only rounding errors remain at {colour}"
+            );
+        }
         assert!(
             supersampling.loss_and_gradient(3, &[[0.1; 3]; 4], &mut gradients) > 0.1,
-            "what is too dark is still wrong"
+            "darker colours have a loss"
         );
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
-    fn drawn(supersampling: &Supersampling, range: std::ops::Range<u64>) -> Vec<usize> {
+    fn drawn_pixels(supersampling: &Supersampling, range: std::ops::Range<u64>) -> Vec<usize> {
         range.map(|g| supersampling.drawn_pixel(g).1).collect()
     }
 
-    /// In epochs every pixel comes once before any comes again, each time in another order; the
-    /// first come from the middle.
+    /// In epochs every pixel is drawn once before any is drawn again, in a new order each time. The
+    /// first bundles are drawn from the middle.
     #[test]
     fn epochs_draw_without_replacement() {
         let (mut supersampling, _) = example(Supervision::Average, 1.0, None);
         (supersampling.sampler.in_epochs, supersampling.sampler.precrop_bundles) = (true, 50);
         // 5 × 4 pixels.
         assert!(
-            drawn(&supersampling, 0..50)
+            drawn_pixels(&supersampling, 0..50)
                 .iter()
                 .all(|p| (1..3).contains(&(p % 5)) && (1..3).contains(&(p / 5)))
         );
         let (mut first, mut second) =
-            (drawn(&supersampling, 50..70), drawn(&supersampling, 70..90));
+            (drawn_pixels(&supersampling, 50..70), drawn_pixels(&supersampling, 70..90));
         assert_ne!(first, second);
         for epoch in [&mut first, &mut second] {
             epoch.sort_unstable();
@@ -593,17 +601,17 @@ mod tests {
         }
     }
 
-    fn judged(of: &Supersampling, pixel: usize) -> (f64, [[f32; 3]; 4]) {
-        let bundle = (0..).find(|&g| of.drawn_pixel(g).1 == pixel).unwrap();
+    fn loss_and_gradients_at(supersampling: &Supersampling, pixel: usize) -> (f64, [[f32; 3]; 4]) {
+        let bundle = (0..).find(|&g| supersampling.drawn_pixel(g).1 == pixel).unwrap();
         let mut gradients = [[0.0; 3]; 4];
-        let loss = of.loss_and_gradient(bundle, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
+        let loss = supersampling.loss_and_gradient(bundle, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
         (loss, gradients)
     }
 
-    /// Pixels that don't count are neither drawn, nor pulled to what the photograph has there; what
-    /// counts beside them is.
+    /// Masked pixels are neither drawn nor compared with the photograph. Unmasked pixels next to a
+    /// mask are.
     #[test]
-    fn masked_pixels_say_nothing() {
+    fn masked_pixels_have_no_influence() {
         for kind in [Supervision::Average, Supervision::Kernel] {
             let (plain, camera) = example(kind, 2.0, None);
             let mask =
@@ -617,17 +625,19 @@ mod tests {
             let mut drawn = [false; 20];
             (0..800).for_each(|g| drawn[masked.drawn_pixel(g).1] = true);
             assert!(drawn.iter().enumerate().all(|(i, d)| *d == (i % 5 < 3)), "{kind:?} {drawn:?}");
-            // Far from the masked pixels all is as without them; beside them the kernel feels less.
-            assert!(judged(&masked, 7).1.as_flattened().iter().all(|g| g.is_finite()));
+            // Pixel 7 is next to masked pixels, which only the kernel's footprint includes.
+            assert!(
+                loss_and_gradients_at(&masked, 7).1.as_flattened().iter().all(|g| g.is_finite())
+            );
             if kind == Supervision::Kernel {
-                assert_ne!(judged(&masked, 7), judged(&plain, 7));
+                assert_ne!(loss_and_gradients_at(&masked, 7), loss_and_gradients_at(&plain, 7));
             } else {
-                assert_eq!(judged(&masked, 7), judged(&plain, 7));
+                assert_eq!(loss_and_gradients_at(&masked, 7), loss_and_gradients_at(&plain, 7));
             }
         }
     }
 
-    fn given(camera: &Camera, name: &str, width: usize, height: usize) -> Photographs {
+    fn photograph_of_size(camera: &Camera, name: &str, width: usize, height: usize) -> Photographs {
         let camera = Camera { name: name.into(), ..camera.resized(width as u32, height as u32) };
         Photographs::taken_by(camera, hr_image(width, height))
     }
@@ -640,7 +650,7 @@ mod tests {
     /// References are used at their full size, with either supervision: each sub-pixel ray goes
     /// through one pixel of the reference, and every pixel of the reference gets a ray.
     #[test]
-    fn references_are_compared_with_themselves() {
+    fn references_are_used_at_their_full_size() {
         let (_, camera) = example(Supervision::Kernel, 2.0, None);
         // The last column of blocks overlaps the one before it.
         let (width, height) = (9, 8);
@@ -648,13 +658,13 @@ mod tests {
         let large = camera.resized(9, 8);
         for kind in [Supervision::Average, Supervision::Kernel] {
             let mut joined = supersampling(
-                given(&camera, "a", 5, 4),
-                Some(given(&camera, "a", width, height)),
+                photograph_of_size(&camera, "a", 5, 4),
+                Some(photograph_of_size(&camera, "a", width, height)),
                 &options(kind, 2.0),
             );
             assert_eq!(joined.sampler.count(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
             let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
-            let mut seen = [false; 72];
+            let mut has_ray = [false; 72];
             for bundle in 0..800 {
                 if joined.drawn_pixel(bundle).0 == 0 {
                     continue;
@@ -667,22 +677,22 @@ mod tests {
                         })
                         .expect("a pixel's ray")
                 });
-                pixels.iter().for_each(|&pixel| seen[pixel] = true);
-                // A tenth too bright in the last sub-pixel ray's red, and right in all else.
+                pixels.iter().for_each(|&pixel| has_ray[pixel] = true);
+                // Only the red of the last sub-pixel ray is wrong: 0.1 too bright.
                 let mut colours = pixels.map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
                 colours[3][0] += 0.1;
                 let mut gradients = [[9.0; 3]; 4];
                 let loss = joined.loss_and_gradient(bundle, &colours, &mut gradients);
                 assert!((loss - 0.01 / 12.0).abs() < 1e-6, "{kind:?} {loss}");
-                let pulled = gradients[3][0];
+                let red_gradient = gradients[3][0];
                 assert!(
-                    (pulled - 0.2 / 12.0).abs() < 1e-6
+                    (red_gradient - 0.2 / 12.0).abs() < 1e-6
                         && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
                 );
                 record_colours(&mut joined, bundle, &colours);
             }
-            assert!(seen.iter().all(|s| *s), "{kind:?}");
-            // With fewer sub-pixel rays they meet the block's mean together.
+            assert!(has_ray.iter().all(|has| *has), "{kind:?}");
+            // During the warm-up, fewer sub-pixel rays are compared with the block's mean.
             joined.schedule.warmup = 0.5;
             joined.set_progress(0.0);
             let bundle = (0..).find(|&bundle| joined.drawn_pixel(bundle) == (1, 4)).unwrap();
@@ -695,19 +705,22 @@ mod tests {
             let mean = [0, 1, 2].map(|c| block.iter().map(|p| p[c]).sum::<f32>() / 4.0);
             assert!(joined.loss_and_gradient(bundle, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
             joined.set_progress(1.0);
-            // LR images have what they had.
-            let plain = supersampling(given(&camera, "a", 5, 4), None, &options(kind, 2.0));
-            let drawn = |of: &Supersampling| (0..).find(|&g| of.drawn_pixel(g) == (0, 7)).unwrap();
+            // The gradients of LR images stay unchanged.
+            let plain =
+                supersampling(photograph_of_size(&camera, "a", 5, 4), None, &options(kind, 2.0));
+            let first_draw = |supersampling: &Supersampling| {
+                (0..).find(|&g| supersampling.drawn_pixel(g) == (0, 7)).unwrap()
+            };
             let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
             let mut gradients = [[[0.0; 3]; 4]; 2];
-            joined.loss_and_gradient(drawn(&joined), &colours, &mut gradients[0]);
-            plain.loss_and_gradient(drawn(&plain), &colours, &mut gradients[1]);
+            joined.loss_and_gradient(first_draw(&joined), &colours, &mut gradients[0]);
+            plain.loss_and_gradient(first_draw(&plain), &colours, &mut gradients[1]);
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
         }
         // A larger reference doesn't get more draws.
         let larger = supersampling(
-            given(&camera, "a", 5, 4),
-            Some(given(&camera, "a", 20, 16)),
+            photograph_of_size(&camera, "a", 5, 4),
+            Some(photograph_of_size(&camera, "a", 20, 16)),
             &options(Supervision::Kernel, 2.0),
         );
         assert_eq!(larger.sampler.count(), 20 + 80);
@@ -723,7 +736,7 @@ mod tests {
     /// photograph and not for another. Then the pixels of both are cached, each compared with its
     /// own photograph.
     #[test]
-    fn sizes_share_a_cache() {
+    fn photographs_of_different_sizes_share_a_cache() {
         let (_, camera) = example(Supervision::Kernel, 2.0, None);
         let mut both = Photographs::taken_by(camera.resized(1, 1), hr_image(1, 1));
         let second = Photographs::taken_by(camera.resized(3, 2), hr_image(3, 2));
@@ -746,8 +759,8 @@ mod tests {
     #[test]
     fn every_pixel_is_drawn() {
         let (supersampling, _) = example(Supervision::Average, 1.0, None);
-        let mut seen = [false; 20];
-        (0..400).for_each(|g| seen[supersampling.drawn_pixel(g).1] = true);
-        assert!(seen.iter().all(|s| *s));
+        let mut is_drawn = [false; 20];
+        (0..400).for_each(|g| is_drawn[supersampling.drawn_pixel(g).1] = true);
+        assert!(is_drawn.iter().all(|drawn| *drawn));
     }
 }

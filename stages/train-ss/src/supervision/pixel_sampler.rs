@@ -223,12 +223,12 @@ mod tests {
     /// Pixels with detail are drawn at the given ratio, and the expected weighted loss is that of
     /// uniform draws.
     #[test]
-    fn focus_keeps_the_expectation() {
+    fn importance_sampling_keeps_the_expectation() {
         let mut flat = Image::new(20, 10, 3, vec![0.5; 600]);
         flat.data[3 * (3 * 20 + 4)] = 0.9;
-        let around_dot =
+        let is_near_dot =
             |pixel: usize| (2..5).contains(&(pixel / 20)) && (3..6).contains(&(pixel % 20));
-        assert!(detailed_pixels(&flat).into_iter().eq((0..200).map(around_dot)));
+        assert!(detailed_pixels(&flat).into_iter().eq((0..200).map(is_near_dot)));
         let importance = Importance::new(7.0, 200, detailed_pixels(&flat).into_iter().collect());
         let (mut counts, draws) = ([0u32; 200], 400_000);
         (0..draws).for_each(|k| {
@@ -240,19 +240,19 @@ mod tests {
             assert!((mean - 1.0).abs() < 0.12, "{pixel}: {mean}");
         }
         let (dot, elsewhere) = (counts[3 * 20 + 4], counts[6 * 20..].iter().sum::<u32>());
-        let often = f64::from(dot) / (f64::from(elsewhere) / 80.0);
-        assert!((often - 7.0).abs() < 0.6, "{often}");
-        let third = [false, false, false, true].into_iter().collect();
-        for even in
-            [Importance::new(1.0, 200, third), Importance::new(5.0, 200, PixelSet::default())]
+        let ratio = f64::from(dot) / (f64::from(elsewhere) / 80.0);
+        assert!((ratio - 7.0).abs() < 0.6, "{ratio}");
+        let one_pixel = [false, false, false, true].into_iter().collect();
+        for uniform in
+            [Importance::new(1.0, 200, one_pixel), Importance::new(5.0, 200, PixelSet::default())]
         {
-            assert!(even.weight(3) == 1.0 && even.uniform_share == 1.0);
+            assert!(uniform.weight(3) == 1.0 && uniform.uniform_share == 1.0);
         }
     }
 
-    /// Bundles of the precrop come from the middle half, and skip masked pixels there.
+    /// Bundles of the precrop are drawn from the middle half, and never from masked pixels there.
     #[test]
-    fn precrop_draws_pixels_that_count() {
+    fn precrop_draws_unmasked_pixels_of_the_middle() {
         let view = PixelNumbers { width: 8, height: 8, start: 0 };
         let importance = Importance::new(1.0, 64, PixelSet::default());
         let sampler = PixelSampler::new(vec![view], 64, importance, (true, 1000), 3);
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn an_epoch_has_every_number_once() {
+    fn an_epoch_contains_every_number_once() {
         for n in [1, 2, 3, 17, 1000] {
             let mut order: Vec<u64> = (0..n).map(|i| permuted(7, 3, i, n)).collect();
             order.sort_unstable();

@@ -115,7 +115,7 @@ mod tests {
 
     /// A clipped sample bounds the true value from one side only.
     #[test]
-    fn clipped_samples_have_no_residual_beyond() {
+    fn predictions_beyond_a_clipped_sample_have_no_residual() {
         let cases = [
             (1.1, 1.0, 0.0),
             (0.9, 1.0, -0.1),
@@ -131,7 +131,7 @@ mod tests {
             );
         }
         assert!(may_be_clipped(1.0) && may_be_clipped(0.0) && !may_be_clipped(0.99));
-        // White in a photograph half as bright as the scene is a lower bound of the scene's colour.
+        // White in a photograph twice as bright as the scene is a lower bound of the true colour.
         let bright = LossContext { inverse_gains: [0.5; 3], allows_clipping: true, ..PLAIN };
         let mut gradients = [[9.0; 3]; 2];
         assert_eq!(bright.loss_of_mean(&[[0.9; 3]; 2], [1.0; 4], &mut gradients), 0.0);
@@ -140,7 +140,6 @@ mod tests {
         assert!(plain.loss_of_mean(&[[0.9; 3]; 2], [1.0; 4], &mut gradients) > 0.1);
     }
 
-    /// Unknown samples have no residual.
     #[test]
     fn unknown_samples_have_no_residual() {
         let unknown = [f32::NAN; 4];
@@ -153,7 +152,7 @@ mod tests {
         assert_eq!(gradients, [[0.0; 3]; 2]);
     }
 
-    /// Exposure is corrected, and transparent samples show the background.
+    /// Exposure is corrected, and transparent samples are composited over the background.
     #[test]
     fn samples_become_target_colours() {
         let context =

@@ -216,7 +216,7 @@ mod tests {
 
     use super::*;
 
-    /// A small field with two thin cells, one of them beside an opaque cell.
+    /// Returns a small field with two thin cells, one of them next to an opaque cell.
     fn field() -> Field {
         let architecture =
             Architecture { n_levels: 2, log2_hashmap_size: 8, ..Architecture::default() };
@@ -241,8 +241,8 @@ mod tests {
         let read = Field::read(&path, architecture, bounds).unwrap();
         let (.., occupancy) = read.parts();
         let cells = occupancy.to_bytes();
-        let held: Vec<usize> = (0..cells.len()).filter(|&cell| cells[cell] != 0).collect();
-        assert_eq!(held, [5000, 5001]);
+        let occupied: Vec<usize> = (0..cells.len()).filter(|&cell| cells[cell] != 0).collect();
+        assert_eq!(occupied, [5000, 5001]);
     }
 
     #[test]

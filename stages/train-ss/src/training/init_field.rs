@@ -89,8 +89,12 @@ mod tests {
 
     use super::*;
 
-    /// Reads a field to initialise another from; both have the given bounds and positions.
-    fn read(init: (Bounds, bool), wanted: (Bounds, bool)) -> Result<(Bounds, bool), String> {
+    /// Initialises the requested field from another and returns the result. Each pair consists of a
+    /// field's bounds and its `scaled_positions`.
+    fn initialise(
+        init: (Bounds, bool),
+        requested: (Bounds, bool),
+    ) -> Result<(Bounds, bool), String> {
         let file = |(bounds, scaled_positions)| FieldFile {
             format: FIELD_FORMAT,
             field: FieldModel::Mlp(MlpArchitecture { scaled_positions, ..Default::default() }),
@@ -100,22 +104,23 @@ mod tests {
         };
         let folder = tempfile::tempdir().unwrap();
         artifact::write_json(&folder.path().join(FIELD_FILE), &file(init)).unwrap();
-        let (input, mut wanted) = (GivenInput::open("init", folder.path()).unwrap(), file(wanted));
-        InitField::read(&input, &mut wanted, DVec3::Y).map_err(|error| error.to_string())?;
-        let FieldModel::Mlp(architecture) = wanted.field else { panic!("the model stays") };
-        Ok((wanted.bounds, architecture.scaled_positions))
+        let (input, mut requested) =
+            (GivenInput::open("init", folder.path()).unwrap(), file(requested));
+        InitField::read(&input, &mut requested, DVec3::Y).map_err(|error| error.to_string())?;
+        let FieldModel::Mlp(architecture) = requested.field else { panic!("the model stays") };
+        Ok((requested.bounds, architecture.scaled_positions))
     }
 
-    /// A field from before bounds were rounded and positions scaled keeps its own frame.
+    /// A field written before bounds were rounded and positions scaled keeps its own frame.
     #[test]
     fn older_fields_keep_their_frame() {
         let bounds =
             Bounds { min: [-1.1; 3], max: [1.3; 3], near: 0.7, far: 6.1, ..Bounds::default() };
         let rounded = bounds.rounded(DVec3::Y);
-        assert_eq!(read((bounds, false), (rounded, true)), Ok((bounds, false)));
-        assert_eq!(read((rounded, true), (rounded, true)), Ok((rounded, true)));
-        let elsewhere = bounds.moved(DVec3::splat(1e-4));
-        let refused = read((elsewhere, true), (rounded, true)).unwrap_err();
-        assert!(refused.contains("bounds differ"), "{refused}");
+        assert_eq!(initialise((bounds, false), (rounded, true)), Ok((bounds, false)));
+        assert_eq!(initialise((rounded, true), (rounded, true)), Ok((rounded, true)));
+        let moved = bounds.moved(DVec3::splat(1e-4));
+        let error = initialise((moved, true), (rounded, true)).unwrap_err();
+        assert!(error.contains("bounds differ"), "{error}");
     }
 }

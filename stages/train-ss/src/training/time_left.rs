@@ -153,7 +153,8 @@ mod tests {
         (336, 154_062, 19.85),
     ];
 
-    fn new() -> TimeLeft {
+    /// Returns an estimate before the first step.
+    fn unmeasured() -> TimeLeft {
         let zero = TimeLeft {
             has_course: true,
             last: Instant::now(),
@@ -169,57 +170,60 @@ mod tests {
         TrainingRays { total, remaining: total - done, further: 0 }
     }
 
-    /// Returns the estimates at each point of a measured course, with the seconds so far.
+    /// Returns the elapsed and the estimated remaining seconds at each point of a measured course.
     fn estimates(course: &[(u64, u64, f64)], total: u64) -> Vec<(f64, f64)> {
-        let mut left = new();
-        let mut before = (0, 0, 0.0);
+        let mut time_left = unmeasured();
+        let mut previous = (0, 0, 0.0);
         let mut estimates = Vec::new();
         for &(step, done, seconds) in course {
-            let steps = step - before.0;
+            let steps = step - previous.0;
             for _ in 0..steps {
-                let rays = (done - before.1) / steps;
-                left.add_seconds(rays as usize, (seconds - before.2) / steps as f64);
+                let rays = (done - previous.1) / steps;
+                time_left.add_seconds(rays as usize, (seconds - previous.2) / steps as f64);
             }
-            before = (step, done, seconds);
-            estimates.push((seconds, left.seconds(step, rays(total, done))));
+            previous = (step, done, seconds);
+            estimates.push((seconds, time_left.seconds(step, rays(total, done))));
         }
         estimates
     }
 
     /// From a tenth of the time on, the estimate is within a factor of 1.5 of the measured time.
     #[test]
-    fn the_course_of_a_training_is_foreseen() {
-        for (course, total, whole) in [
-            // The end of this very training; published times of the protocols (docs/results).
+    fn remaining_time_is_predicted() {
+        for (course, total, expected) in [
+            // The end of this training; then published times of the protocols (docs/results).
             (&LEGO[..], 500_000, 20.0),
             (&LEGO[..], 32_000_000, 408.0),
             (&FERN[..], 15_000_000, 420.0),
         ] {
             let estimates = estimates(course, total);
-            println!("{total} rays in {whole} s: {estimates:.1?}");
+            println!("{total} rays in {expected} s: {estimates:.1?}");
             for (seconds, left) in estimates.into_iter().filter(|(seconds, _)| *seconds > 6.0) {
-                let error = (seconds + left) / whole;
-                assert!((1.0 / 1.5..1.5).contains(&error), "{seconds} s + {left} s of {whole} s");
+                let ratio = (seconds + left) / expected;
+                assert!(
+                    (1.0 / 1.5..1.5).contains(&ratio),
+                    "{seconds} s + {left} s of {expected} s"
+                );
             }
         }
     }
 
-    /// An even pace is continued, by further trainings, too.
+    /// With a known grid, rays have equal costs, also in further trainings.
     #[test]
     fn a_known_grid_has_an_even_pace() {
-        let mut left = TimeLeft { has_course: false, ..new() };
+        let mut time_left = TimeLeft { has_course: false, ..unmeasured() };
         for _ in 0..500 {
-            left.add_seconds(100, 0.5);
+            time_left.add_seconds(100, 0.5);
         }
         let further = TrainingRays { total: 60_000, remaining: 10_000, further: 120_000 };
-        assert!((left.seconds(500, further) - 650.0).abs() < 1e-6);
-        assert_eq!(left.seconds(600, rays(60_000, 60_000)), 0.0);
+        assert!((time_left.seconds(500, further) - 650.0).abs() < 1e-6);
+        assert_eq!(time_left.seconds(600, rays(60_000, 60_000)), 0.0);
     }
 
     #[test]
     fn costs_fall_to_one() {
-        let left = new();
-        let costs: Vec<f64> = (0..100).map(|i| left.cost(f64::from(i * 50))).collect();
+        let time_left = unmeasured();
+        let costs: Vec<f64> = (0..100).map(|i| time_left.cost(f64::from(i * 50))).collect();
         assert!(costs.is_sorted_by(|a, b| a >= b));
         assert_eq!((costs[0], costs[99]), (COURSE[0].1, 1.0));
     }

@@ -231,16 +231,16 @@ mod tests {
     use super::*;
     use radiance::Architecture;
 
-    /// A field of one opacity everywhere.
-    struct Even(f32);
+    /// Field with the same opacity everywhere.
+    struct UniformField(f32);
 
-    impl RayField for Even {
+    impl RayField for UniformField {
         fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
             Ok(vec![Pixel { opacity: self.0, ..Pixel::default() }; rays.len()])
         }
     }
 
-    fn seen(opacity: f32) -> Result<Vec<Pixel>, RenderError> {
+    fn render_with_opacity(opacity: f32) -> Result<Vec<Pixel>, RenderError> {
         let file = FieldFile {
             format: FIELD_FORMAT,
             field: FieldModel::Grid(Architecture::default()),
@@ -248,24 +248,24 @@ mod tests {
             bounds: Bounds::default(),
             background: Background::White,
         };
-        let members = FieldArtifact { file, fields: vec![Box::new(Even(opacity))] };
+        let members = FieldArtifact { file, fields: vec![Box::new(UniformField(opacity))] };
         members.render(&[Ray::default()])
     }
 
-    /// Pixels that aren't finite have exit code 4, a library's error 1.
+    /// Pixels that aren't finite give exit code 4, an error of the backend 1.
     #[test]
     fn rendering_failures_have_exit_codes() {
-        assert_eq!(seen(0.5).unwrap()[0].opacity, 0.5);
-        let failure = rendering_failure(seen(f32::NAN).unwrap_err());
+        assert_eq!(render_with_opacity(0.5).unwrap()[0].opacity, 0.5);
+        let failure = rendering_failure(render_with_opacity(f32::NAN).unwrap_err());
         assert_eq!(artifact::exit_code(&failure), 4);
-        let refused = rendering_failure(RenderError::Backend("out of memory".to_owned()));
-        assert_eq!(artifact::exit_code(&refused), 1);
-        assert_eq!(refused.to_string(), "cannot render the field: out of memory");
+        let backend_failure = rendering_failure(RenderError::Backend("out of memory".to_owned()));
+        assert_eq!(artifact::exit_code(&backend_failure), 1);
+        assert_eq!(backend_failure.to_string(), "cannot render the field: out of memory");
     }
 
-    /// Order and ties change nothing.
+    /// The result doesn't depend on the items' order, even with ties, infinities and NaN.
     #[test]
-    fn the_middle_one_is_found_in_any_order() {
+    fn the_lower_median_is_found_in_any_order() {
         let nan = f32::NAN.copysign(1.0);
         let cases: [(&[f32], Option<f32>); 9] = [
             (&[], None),
@@ -279,19 +279,18 @@ mod tests {
             (&[-nan, 1.0, 2.0], Some(1.0)),
         ];
         for (distances, expected) in cases {
-            for turn in 0..distances.len().max(1) {
+            for shift in 0..distances.len().max(1) {
                 let mut items = distances.to_vec();
-                items.rotate_left(turn);
-                let mut mirrored: Vec<f32> = items.iter().rev().copied().collect();
+                items.rotate_left(shift);
+                let mut reversed: Vec<f32> = items.iter().rev().copied().collect();
                 assert_eq!(lower_median(&mut items, |d| *d).copied(), expected, "{distances:?}");
-                assert_eq!(lower_median(&mut mirrored, |d| *d).copied(), expected, "{distances:?}");
+                assert_eq!(lower_median(&mut reversed, |d| *d).copied(), expected, "{distances:?}");
             }
         }
     }
 
-    /// The median item is returned whole, not its distance alone.
     #[test]
-    fn the_middle_one_keeps_what_belongs_to_it() {
+    fn the_whole_median_item_is_returned() {
         let mut items = [(3.0, "far"), (1.0, "near"), (2.0, "middle")];
         assert_eq!(lower_median(&mut items, |item| item.0), Some(&(2.0, "middle")));
         assert_eq!(mean(&items, |item| item.0 + 1.0), 3.0);
@@ -333,17 +332,20 @@ mod tests {
             || FieldArtifact::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu");
         let rays: Vec<Ray> = [-0.5, 0.0, 0.7].map(ray).into();
         write_file(folder.path(), architecture, bounds, 2);
-        let together = RayField::render(&read().unwrap(), &rays).unwrap();
-        let apart: Vec<_> = fields.iter().map(|f| f.render(&rays)).collect();
-        for (i, pixel) in together.iter().enumerate() {
-            let mean = |of: fn(&Pixel) -> f32| 0.5 * (of(&apart[0][i]) + of(&apart[1][i]));
+        let averaged = RayField::render(&read().unwrap(), &rays).unwrap();
+        let separate: Vec<_> = fields.iter().map(|f| f.render(&rays)).collect();
+        for (i, pixel) in averaged.iter().enumerate() {
+            let mean =
+                |value: fn(&Pixel) -> f32| 0.5 * (value(&separate[0][i]) + value(&separate[1][i]));
             assert!(
                 (pixel.colour[1] - mean(|p| p.colour[1])).abs() < 1e-6
                     && (pixel.opacity - mean(|p| p.opacity)).abs() < 1e-6
             );
-            assert!((pixel.depth - mean(|p| p.depth)).abs() < 1e-5 && apart[0][i] != apart[1][i]);
-            // Of two the nearer: space between them may be empty.
-            let nearer = apart[0][i].median_depth.min(apart[1][i].median_depth);
+            assert!(
+                (pixel.depth - mean(|p| p.depth)).abs() < 1e-5 && separate[0][i] != separate[1][i]
+            );
+            // The nearer of two depths: the space between them may be empty.
+            let nearer = separate[0][i].median_depth.min(separate[1][i].median_depth);
             assert_eq!(pixel.median_depth, nearer);
         }
         for (members, expected) in [(3, "field-2.safetensors"), (0, "members = 0")] {

@@ -1,6 +1,6 @@
-//! Fields trained by an older build render unchanged, or are rejected. The files in `goldens/` are
-//! of the demo scene at 16 px: weights of `mlp` are from commit 5af0c3e, those of `grid` from the
-//! first commit with format 2. Descriptions have today's names.
+//! Fields trained by an older build render unchanged, or are refused. The files in `goldens/` are
+//! of the demo scene at 16 px: weights of `mlp` are from commit 5af0c3e, weights of `grid` from the
+//! first commit with format 2. Descriptions have today's format and names.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -16,7 +16,7 @@ fn goldens() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/goldens"))
 }
 
-/// Creates a field artifact like the older build's from compressed weights.
+/// Creates a field artifact from the older build's compressed weights.
 fn artifact(name: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     std::fs::copy(goldens().join(format!("{name}.json")), folder.path().join(FIELD_FILE)).unwrap();
@@ -38,7 +38,7 @@ fn rays(camera: &Camera) -> Vec<Ray> {
 }
 
 /// Compares a render with the older build's EXR file, whose colours have half precision.
-fn renders_as_before(name: &str) {
+fn assert_renders_as_before(name: &str) {
     let folder = artifact(name);
     let members =
         FieldArtifact::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").unwrap();
@@ -50,25 +50,28 @@ fn renders_as_before(name: &str) {
     assert_eq!(rendered.len(), channel("A").len());
     assert!(
         channel("A").iter().any(|a| *a > 0.5) && channel("A").iter().any(|a| *a < 0.99),
-        "the view shows something"
+        "the view must contain opaque and transparent pixels"
     );
     for (i, pixel) in rendered.iter().enumerate() {
         for (value, name) in
             pixel.premultiplied.into_iter().chain([pixel.opacity]).zip(["R", "G", "B", "A"])
         {
-            let before = channel(name)[i];
-            assert!((value - before).abs() < 1e-3, "pixel {i} {name}: {value} was {before}");
+            let expected_value = channel(name)[i];
+            assert!(
+                (value - expected_value).abs() < 1e-3,
+                "pixel {i} {name}: {value}, expected {expected_value}"
+            );
         }
     }
 }
 
 #[test]
 fn a_grid_renders_as_before() {
-    renders_as_before("grid");
+    assert_renders_as_before("grid");
 }
 
 #[test]
-fn a_grid_of_the_first_format_is_refused() {
+fn a_grid_without_a_format_is_refused() {
     let folder = artifact("grid");
     let file = folder.path().join(FIELD_FILE);
     let mut description: serde_json::Value =
@@ -79,17 +82,17 @@ fn a_grid_of_the_first_format_is_refused() {
     let error = FieldArtifact::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu")
         .err()
         .unwrap();
-    let line = format!("{error:#}");
+    let message = format!("{error:#}");
     assert!(
-        line.ends_with(
+        message.ends_with(
             "field has format 1 of another build; this build reads format 3: train the field again"
         ),
-        "{line}"
+        "{message}"
     );
 }
 
 #[cfg(feature = "torch")]
 #[test]
 fn the_papers_mlps_render_as_before() {
-    renders_as_before("mlp");
+    assert_renders_as_before("mlp");
 }

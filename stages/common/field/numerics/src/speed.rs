@@ -98,9 +98,9 @@ mod tests {
     use super::*;
     use crate::simd::test_every_family;
 
-    /// Layers sum 64 products, and the table's sum approaches a fixed point.
+    /// Each output of a layer sums 64 products, and the sum of table entries converges.
     #[test]
-    fn the_work_has_equal_results_in_every_family() {
+    fn every_family_has_equal_results() {
         let mut results = Vec::new();
         test_every_family(|_| {
             let mut test = SpeedTest::default();

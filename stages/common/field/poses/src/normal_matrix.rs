@@ -89,32 +89,36 @@ mod tests {
     ];
 
     #[test]
-    fn solves_what_its_rows_ask_for() {
-        let asked = [DVec3::new(0.3, -0.7, 0.2), DVec3::new(-1.1, 0.4, 2.5)];
+    fn solve_recovers_the_motion_of_its_rows() {
+        let expected = [DVec3::new(0.3, -0.7, 0.2), DVec3::new(-1.1, 0.4, 2.5)];
         let (mut matrix, mut right) = (NormalMatrix::ZERO, [DVec3::ZERO; 2]);
         for (i, row) in ROWS.into_iter().enumerate() {
             let weight = 1.0 + i as f64;
-            let value = weight * (row[0].dot(asked[0]) + row[1].dot(asked[1]));
+            let value = weight * (row[0].dot(expected[0]) + row[1].dot(expected[1]));
             matrix.add(weight, row);
             right = [0, 1].map(|part| right[part] + value * row[part]);
         }
         let found = matrix.solve(right).unwrap();
-        for (found, asked) in found.into_iter().zip(asked) {
-            assert!((found - asked).length() < 1e-9, "{found} instead of {asked}");
+        for (found, expected) in found.into_iter().zip(expected) {
+            assert!((found - expected).length() < 1e-9, "found {found}, expected {expected}");
         }
     }
 
     #[test]
-    fn damping_bounds_a_direction_that_no_row_has() {
+    fn damping_bounds_directions_without_rows() {
         let mut matrix = NormalMatrix::ZERO;
         matrix.add(4.0, [DVec3::X, DVec3::ZERO]);
         assert!(matrix.solve([DVec3::X, DVec3::ZERO]).is_none());
-        let [turn, shift] = matrix.damped(1.0).solve([8.0 * DVec3::X, DVec3::ZERO]).unwrap();
-        assert!((turn - DVec3::X).length() < 1e-6 && shift == DVec3::ZERO, "{turn} {shift}");
+        let [rotation, translation] =
+            matrix.damped(1.0).solve([8.0 * DVec3::X, DVec3::ZERO]).unwrap();
+        assert!(
+            (rotation - DVec3::X).length() < 1e-6 && translation == DVec3::ZERO,
+            "{rotation} {translation}"
+        );
     }
 
     #[test]
-    fn matrices_that_are_not_positive_have_no_solution() {
+    fn matrices_that_are_not_positive_definite_have_no_solution() {
         for diagonal in [DVec3::new(-1.0, -1.0, 1.0), DVec3::new(1.0, -1.0, -1.0), -DVec3::X] {
             let rotation = DMat3::from_diagonal(diagonal);
             let matrix =
@@ -127,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_seen_and_numbers_out_of_range_have_no_motion() {
+    fn empty_and_overflowing_matrices_have_no_solution() {
         assert!(NormalMatrix::ZERO.damped(1e-3).solve([DVec3::ZERO; 2]).is_none());
         for value in [f64::NAN, f64::INFINITY, 1e200] {
             let mut matrix = NormalMatrix::ZERO;

@@ -166,7 +166,7 @@ mod tests {
     use super::*;
     use numerics::simd::test_every_family;
 
-    /// Rounded moments differ by at most half of their last bit from a random one.
+    /// Rounding changes a moment by at most half of its last stored bit.
     #[test]
     fn moments_are_rounded_to_nearest() {
         for i in 0..10_000 {
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn equals_adam_in_f64_with_rounded_moments_where_touched() {
+    fn touched_entries_equal_adam_in_f64_with_rounded_moments() {
         let n = 32;
         let mut w: Vec<f32> = (0..n).map(|i| i as f32 / 10.0).collect();
         let mut moments = vec![0; n];
@@ -214,15 +214,15 @@ mod tests {
         assert_eq!(w[3], 0.3);
     }
 
-    /// Number of bricks of the tests.
+    /// Number of bricks in these tests.
     const BRICKS: usize = 4501;
 
     fn is_touched(block: usize) -> bool {
         uniform(8, 0, block as u64) < 0.1
     }
 
-    /// Returns weights and moments of many bricks, few of whose halves are touched, after a step in
-    /// pieces of `bricks` bricks.
+    /// Returns weights and moments of [`BRICKS`] bricks after a step in pieces of `bricks` bricks.
+    /// A tenth of the blocks, which are halves of bricks, are touched.
     fn after_step(bricks: usize) -> (Vec<f32>, Vec<u32>) {
         let n = (2 * BRICKS * LANES) as u64;
         let mut weights: Vec<f32> = (0..n).map(|i| uniform(7, 0, i)).collect();
@@ -236,15 +236,15 @@ mod tests {
         });
         let step = AdamStep::new(3, 0.01, 0.0);
         for first in (0..BRICKS).step_by(bricks) {
-            let here = first..(first + bricks).min(BRICKS);
-            let blocks = here.start * LANES..here.end * LANES;
+            let piece = first..(first + bricks).min(BRICKS);
+            let blocks = piece.start * LANES..piece.end * LANES;
             let table = 2 * blocks.start..2 * blocks.end;
             let (weights, moments) = (&mut weights[table.clone()], &mut moments[table]);
             let [even, odd] = &mut sums;
             let [even_marks, odd_marks] = &mut marks;
             let mut halves = [
-                (&mut even[blocks.clone()], &mut even_marks[here.clone()]),
-                (&mut odd[blocks], &mut odd_marks[here]),
+                (&mut even[blocks.clone()], &mut even_marks[piece.clone()]),
+                (&mut odd[blocks], &mut odd_marks[piece]),
             ];
             adam_of_bricks(&step, &mut halves, weights, moments);
         }
@@ -254,15 +254,15 @@ mod tests {
     }
 
     #[test]
-    fn pieces_and_families_give_equal_bits_and_leave_what_is_untouched() {
-        let whole = after_step(BRICKS);
-        for (block, numbers) in whole.0.chunks(LANES).enumerate() {
-            let begin = uniform(7, 0, (block * LANES) as u64);
-            assert_eq!(numbers[0] != begin, is_touched(block), "block {block}");
+    fn pieces_and_families_give_equal_bits_and_leave_untouched_blocks() {
+        let undivided = after_step(BRICKS);
+        for (block, weights) in undivided.0.chunks(LANES).enumerate() {
+            let initial = uniform(7, 0, (block * LANES) as u64);
+            assert_eq!(weights[0] != initial, is_touched(block), "block {block}");
         }
         test_every_family(|family| {
-            for pieces in [1, 127, 2048] {
-                assert!(after_step(pieces) == whole, "{family:?}, pieces of {pieces}");
+            for bricks in [1, 127, 2048] {
+                assert!(after_step(bricks) == undivided, "{family:?}, pieces of {bricks}");
             }
         });
     }

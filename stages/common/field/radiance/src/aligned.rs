@@ -97,14 +97,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_begin_at_a_brick_and_stay_when_they_grow() {
+    fn numbers_are_aligned_and_survive_growth() {
         let mut numbers = Aligned::<f32>::default();
         for len in [1, 31, 32, 33, 5000, 4, 1 << 20] {
             let last = numbers.last().copied();
-            let was = numbers.len();
+            let before = numbers.len();
             assert_eq!(numbers.grow(len).len(), len);
-            assert!(numbers.as_ptr().align_offset(ALIGNMENT) == 0 && numbers.len() >= was.max(len));
-            assert_eq!(was.checked_sub(1).map(|i| numbers[i]), last);
+            assert!(
+                numbers.as_ptr().align_offset(ALIGNMENT) == 0 && numbers.len() >= before.max(len)
+            );
+            assert_eq!(before.checked_sub(1).map(|i| numbers[i]), last);
             let end = numbers.len() - 1;
             numbers[end] = len as f32;
         }

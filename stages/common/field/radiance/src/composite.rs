@@ -47,6 +47,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    /// Returns transmittances, weights and the light left behind the last sample.
     fn composite(tau: &[f32]) -> (Vec<f32>, Vec<f32>, f32) {
         let mut before = vec![0.0; tau.len()];
         let mut sum = 0.0f32;
@@ -59,19 +60,22 @@ mod tests {
         (transmittance, weight, exp(-sum))
     }
 
+    /// Computes a ray's composited shade in f64.
     fn loss(shade: &[f32], behind: f32, tau: &[f64]) -> f64 {
-        let (mut od, mut sum) = (0.0f64, 0.0f64);
+        let (mut optical_depth, mut sum) = (0.0f64, 0.0f64);
         for (t, s) in tau.iter().zip(shade) {
-            sum += (-od).exp() * -(-t).exp_m1() * f64::from(*s);
-            od += t;
+            sum += (-optical_depth).exp() * -(-t).exp_m1() * f64::from(*s);
+            optical_depth += t;
         }
-        sum + (-od).exp() * f64::from(behind)
+        sum + (-optical_depth).exp() * f64::from(behind)
     }
 
     proptest! {
-        /// From nothing to far beyond opaque.
+        /// Optical depths range from almost zero to far beyond opaque.
         #[test]
-        fn weights_are_a_partition(exponents in prop::collection::vec(-40.0f32..16.0, 1..200)) {
+        fn weights_sum_to_stopped_light(
+            exponents in prop::collection::vec(-40.0f32..16.0, 1..200),
+        ) {
             let tau: Vec<f32> = exponents.iter().map(|e| e.exp2()).collect();
             let (transmittance, weight, end) = composite(&tau);
             prop_assert!(weight.iter().all(|w| *w >= 0.0 && w.is_finite()));
@@ -91,12 +95,12 @@ mod tests {
             let mut gradient = vec![0.0; tau.len()];
             optical_depth_gradients(&shade, &transmittance, &weight, end * behind, &mut gradient);
             for i in 0..tau.len() {
-                let mut wide: Vec<f64> = tau.iter().map(|&t| f64::from(t)).collect();
+                let mut shifted: Vec<f64> = tau.iter().map(|&t| f64::from(t)).collect();
                 let h = 1e-5;
-                wide[i] += h;
-                let up = loss(&shade, behind, &wide);
-                wide[i] -= 2.0 * h;
-                let numeric = (up - loss(&shade, behind, &wide)) / (2.0 * h);
+                shifted[i] += h;
+                let up = loss(&shade, behind, &shifted);
+                shifted[i] -= 2.0 * h;
+                let numeric = (up - loss(&shade, behind, &shifted)) / (2.0 * h);
                 prop_assert!((f64::from(gradient[i]) - numeric).abs() < 3e-6, "{i}: {} {numeric}",
                     gradient[i]);
             }

@@ -171,7 +171,7 @@ mod tests {
         field.grid.iter().chain(&*field.network).copied().collect()
     }
 
-    /// Every parameter is the mean of both fields', and the occupancy stays the field's own.
+    /// Every parameter is the mean of both fields' parameters; the occupancy stays unchanged.
     #[test]
     fn fields_are_averaged() {
         let architecture = Architecture {

@@ -299,6 +299,7 @@ mod tests {
         p
     }
 
+    /// Returns all x, then all y, then all z.
     fn rows(p: &[[f32; 3]]) -> Vec<f32> {
         (0..3).flat_map(|axis| p.iter().map(move |q| q[axis])).collect()
     }
@@ -356,9 +357,9 @@ mod tests {
             let mut gradients = LevelGradients::zeros(&level);
             for half in &mut gradients.halves {
                 half.scatter(&level, &rows, &d);
-                for (brick, numbers) in half.sums.chunks(LANES).enumerate() {
+                for (brick, sums) in half.sums.chunks(LANES).enumerate() {
                     let is_marked = half.touched[brick] == 1;
-                    assert!(is_marked || numbers.iter().all(|g| *g == 0.0), "brick {brick}");
+                    assert!(is_marked || sums.iter().all(|g| *g == 0.0), "brick {brick}");
                 }
             }
             let mut gradient = vec![0.0; table.len()];

@@ -78,9 +78,9 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// ∫ Yi·Yj over the sphere is 1 for i = j, else 0.
+    /// ∫ Yi·Yj over the sphere is 1 for i = j, otherwise 0.
     #[test]
-    fn orthonormal() {
+    fn spherical_harmonics_are_orthonormal() {
         let n = 200;
         let mut gram = [[0.0f64; BASIS]; BASIS];
         for a in 0..n {
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn floor_is_the_whole_part() {
+    fn floor_is_the_integer_part() {
         for x in (0..200_000).map(|i| i as f32 * 0.021).chain([
             0.0,
             0.5,
@@ -122,14 +122,14 @@ mod tests {
 
     proptest! {
         #[test]
-        fn close_to_f64(x in -86.0f32..86.0) {
+        fn exp_is_close_to_f64(x in -86.0f32..86.0) {
             let exact = f64::from(x).exp();
             prop_assert!(((f64::from(exp(x)) - exact) / exact).abs() < 2e-7, "{} {}", exp(x),
                 exact);
         }
 
         #[test]
-        fn small_optical_depths_keep_their_digits(e in -30.0f32..4.0) {
+        fn small_optical_depths_keep_their_precision(e in -30.0f32..4.0) {
             let x = e.exp2();
             let exact = -(-f64::from(x)).exp_m1();
             prop_assert!(((f64::from(one_minus_exp_neg(x)) - exact) / exact).abs() < 4e-7, "{x}");

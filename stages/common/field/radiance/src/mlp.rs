@@ -282,7 +282,7 @@ mod tests {
         (0..len).map(|i| 2.0 * uniform(seed, 0, i as u64) - 1.0).collect()
     }
 
-    /// Shapes that use every remainder of the tiling.
+    /// Shapes (inputs, outputs, samples) that exercise every remainder of the tiling.
     const SHAPES: [(usize, usize, usize); 5] =
         [(32, 32, 64), (24, 16, 48), (32, 3, 16), (3, 5, 80), (7, 9, 16)];
 
@@ -328,7 +328,7 @@ mod tests {
         }
     }
 
-    fn outcome() -> Vec<u32> {
+    fn result_bits() -> Vec<u32> {
         let mut bits = Vec::new();
         for (inputs, outputs, n) in SHAPES {
             let (w, x, dy) =
@@ -344,7 +344,7 @@ mod tests {
 
     #[test]
     fn all_families_give_equal_bits() {
-        let best = outcome();
-        test_every_family(|family| assert_eq!(outcome(), best, "{family:?}"));
+        let expected_bits = result_bits();
+        test_every_family(|family| assert_eq!(result_bits(), expected_bits, "{family:?}"));
     }
 }

@@ -499,8 +499,8 @@ impl Occupancy {
 mod tests {
     use super::*;
 
-    /// Fine-tuning keeps to the cells that were occupied and their neighbours, whatever density is
-    /// found elsewhere, and to a mask.
+    /// Fine-tuning is limited to the occupied cells with their neighbours, and to a mask, whatever
+    /// densities other cells get.
     #[test]
     fn limits_hold_for_all_densities() {
         let mut occupancy = Occupancy::full();
@@ -518,14 +518,14 @@ mod tests {
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
         let updates = (1..=OCCUPIED_PERIOD as u64)
-            .map(|turn| occupancy.cells_to_update(turn * STEPS_PER_UPDATE).len());
-        assert_eq!(updates.sum::<usize>(), 26 + 8, "each once a round of turns");
+            .map(|update| occupancy.cells_to_update(update * STEPS_PER_UPDATE).len());
+        assert_eq!(updates.sum::<usize>(), 26 + 8, "each once in a period");
         occupancy.update(&all, &vec![1e3; CELLS], 0.003, &PhaseClock::start());
         assert_eq!(occupancy.cells().count(), 26 + 8);
     }
 
     #[test]
-    fn cells_to_update_are_those_whose_turn_it_is() {
+    fn cells_to_update_are_those_that_are_due() {
         let mut occupancy = Occupancy::full();
         occupancy.set(|cell| if cell / 5 % 7 == 0 { Cell::Thin } else { Cell::Empty });
         for step in [
@@ -544,22 +544,22 @@ mod tests {
         assert!(occupancy.cells_to_update(WARM_UP_STEPS + STEPS_PER_UPDATE).is_empty());
     }
 
-    /// A cell becomes empty when updates miss its surface, unless rays meet the surface.
+    /// A cell becomes empty when updates miss its surface, unless rays hit the surface.
     #[test]
-    fn a_cell_that_rays_meet_stays() {
-        let (missed, found, place) = (200_100, 1e3, [0.6, 0.2, 0.9]);
-        let hit = CellHit::at(place, found);
-        assert_eq!(cell_coordinates(hit.cell as usize, GRID), cell_at(place));
+    fn a_cell_that_rays_hit_stays_occupied() {
+        let (missed_cell, high_density, position) = (200_100, 1e3, [0.6, 0.2, 0.9]);
+        let hit = CellHit::at(position, high_density);
+        assert_eq!(cell_coordinates(hit.cell as usize, GRID), cell_at(position));
         let mut occupancy = Occupancy::full();
         let all: Vec<u32> = (0..CELLS as u32).collect();
         let mut densities = vec![0.0; CELLS];
         occupancy.raise_densities(&[hit]);
         assert_eq!(occupancy.density(hit.cell as usize), UNKNOWN_DENSITY);
-        (densities[missed], densities[hit.cell as usize]) = (found, found);
+        (densities[missed_cell], densities[hit.cell as usize]) = (high_density, high_density);
         occupancy.update(&all, &densities, 0.003, &PhaseClock::start());
         assert_eq!(occupancy.cells().count(), 2);
         densities.fill(0.0);
-        densities[0] = found;
+        densities[0] = high_density;
         for _ in 0..50 {
             occupancy.raise_densities(&[hit, CellHit { density: 0.1, ..hit }]);
             occupancy.update(&all, &densities, 0.003, &PhaseClock::start());
@@ -567,45 +567,45 @@ mod tests {
         assert!(occupancy.cells().eq([0, hit.cell as usize]));
     }
 
-    /// Cells equal those of a cast by `as u32`.
+    /// Cells equal those of a cast by `as u32`, which saturates.
     #[test]
-    fn places_lie_in_their_cells() {
+    fn coordinates_are_in_their_cells() {
         for x in (0..40_000).map(|i| i as f32 * 3e-5 - 0.1).chain([f32::NAN, f32::INFINITY]) {
             let expected = (x * GRID as f32).max(0.0).min(GRID as f32 - 1.0) as u32;
             assert_eq!(cell_along(x), expected, "{x}");
         }
     }
 
-    /// The largest cube of cells is empty that begins at a multiple of its side.
+    /// The cube is the largest empty one that begins at a multiple of its side.
     #[test]
-    fn cubes_are_as_large_as_what_is_empty() {
+    fn empty_cubes_have_the_maximum_size() {
         let mut occupancy = Occupancy::full();
         occupancy.set(|cell| match cell_coordinates(cell, GRID) {
             [x, y, z] if x > 64 && (cell / 3) % 67 == 0 && y + z < 150 => Cell::Thin,
             [x, _, 40] if x % 16 == 3 => Cell::Dense,
             _ => Cell::Empty,
         });
-        let is_empty = |low: [usize; 3], side: usize| {
+        let is_empty = |corner: [usize; 3], side: usize| {
             (0..side * side * side).all(|i| {
                 let [x, y, z] = cell_coordinates(i, side);
-                let cell = low[0] + x + GRID * (low[1] + y + GRID * (low[2] + z));
+                let cell = corner[0] + x + GRID * (corner[1] + y + GRID * (corner[2] + z));
                 !occupancy.is_occupied(cell)
             })
         };
-        let (mut rng, mut seen) = (CounterRng::new(6, 0, 0), [0; 6]);
+        let (mut rng, mut counts) = (CounterRng::new(6, 0, 0), [0; 6]);
         for _ in 0..3000 {
             let cell = [(); 3].map(|()| rng.below(GRID as u64) as usize);
             let largest =
                 (0..=4).rev().find(|size| is_empty(cell.map(|c| c >> size << size), 1 << size));
             let [size] = occupancy.empty_cube_sizes(&cell.map(|c| [c as u32]));
             assert_eq!(size, largest.unwrap_or(OCCUPIED), "{cell:?}");
-            seen[size.min(5) as usize] += 1;
+            counts[size.min(5) as usize] += 1;
         }
-        assert!(seen.iter().all(|&cells| cells > 0), "{seen:?}");
+        assert!(counts.iter().all(|&cells| cells > 0), "{counts:?}");
     }
 
     #[test]
-    fn cells_are_those_set() {
+    fn occupied_cells_are_those_set() {
         let mut occupancy = Occupancy::full();
         assert_eq!(occupancy.cells().count(), GRID * GRID * GRID);
         occupancy.set(|cell| if cell % 1000 == 3 { Cell::Dense } else { Cell::Empty });

@@ -169,9 +169,8 @@ mod tests {
     use crate::ray::{Ray, clip};
     use scene::Bounds;
 
-    /// Point samples along a ray, composited by hand, give the colour that the engine renders.
     #[test]
-    fn places_hold_what_rays_see() {
+    fn composited_point_samples_equal_a_rendered_ray() {
         let architecture = Architecture {
             max_resolution: 32,
             n_levels: 4,
@@ -196,14 +195,14 @@ mod tests {
         let clipped = clip(&bounds, &ray);
         let step = field.march_step();
         let t = (0..).map(|k| (k as f32 + 0.5).mul_add(step, clipped.enter));
-        let places: Vec<[f32; 3]> =
+        let positions: Vec<[f32; 3]> =
             t.take_while(|&t| t < clipped.leave).map(|t| clipped.position(t)).collect();
-        let samples = field.sample_points(&places);
-        let (mut weights, mut through) = (Vec::new(), 1.0f32);
+        let samples = field.sample_points(&positions);
+        let (mut weights, mut transmittance) = (Vec::new(), 1.0f32);
         for sample in &samples {
-            let kept = (-sample.density * step).exp();
-            weights.push(through * (1.0 - kept));
-            through *= kept;
+            let transmitted = (-sample.density * step).exp();
+            weights.push(transmittance * (1.0 - transmitted));
+            transmittance *= transmitted;
         }
         let mut features = [0.0; VIEW_FEATURES];
         for (sample, weight) in samples.iter().zip(&weights) {
@@ -211,16 +210,16 @@ mod tests {
         }
         let view_colour = field.view_colours(&features, &[clipped.view, [0.0, 1.0, 0.0]]);
         let colour: [f32; 3] = std::array::from_fn(|c| {
-            let lights = samples.iter().zip(&weights);
-            lights
+            let weighted = samples.iter().zip(&weights);
+            weighted
                 .map(|(s, weight)| weight * sigmoid(s.raw_colour[c] + view_colour[0][c]))
                 .sum::<f32>()
-                + through
+                + transmittance
         });
         let pixel = field.render(&[ray])[0];
         assert!(
-            through > 0.01 && through < 0.9 && view_colour[0] != view_colour[1],
-            "{through} {view_colour:?}"
+            transmittance > 0.01 && transmittance < 0.9 && view_colour[0] != view_colour[1],
+            "{transmittance} {view_colour:?}"
         );
         assert!(samples.iter().any(|s| s.density == 0.0));
         for c in 0..3 {
@@ -229,17 +228,17 @@ mod tests {
     }
 
     #[test]
-    fn a_region_holds_something_where_one_of_its_cells_does() {
+    fn a_box_with_an_occupied_cell_is_occupied() {
         let bounds = Bounds::cube(1.0, 0.0, 9.0);
         let mut field = Field::new(Architecture::default(), bounds, 3);
-        let only = 100 + OCCUPANCY_CELLS * (20 + OCCUPANCY_CELLS * 30);
-        field.occupancy.set(|cell| match cell == only {
+        let occupied_cell = 100 + OCCUPANCY_CELLS * (20 + OCCUPANCY_CELLS * 30);
+        field.occupancy.set(|cell| match cell == occupied_cell {
             true => crate::occupancy::Cell::Thin,
             false => crate::occupancy::Cell::Empty,
         });
-        let at = |x: f32, y: f32, z: f32| [x, y, z].map(|c| (c + 0.5) / OCCUPANCY_CELLS as f32);
-        assert!(field.has_occupied_cell(at(98.0, 20.0, 28.0), at(101.0, 23.0, 30.0)));
-        assert!(!field.has_occupied_cell(at(98.0, 20.0, 28.0), at(101.0, 23.0, 29.0)));
-        assert!(!field.has_occupied_cell(at(101.0, 20.0, 28.0), [1.0; 3]));
+        let centre = |x: f32, y: f32, z: f32| [x, y, z].map(|c| (c + 0.5) / OCCUPANCY_CELLS as f32);
+        assert!(field.has_occupied_cell(centre(98.0, 20.0, 28.0), centre(101.0, 23.0, 30.0)));
+        assert!(!field.has_occupied_cell(centre(98.0, 20.0, 28.0), centre(101.0, 23.0, 29.0)));
+        assert!(!field.has_occupied_cell(centre(101.0, 20.0, 28.0), [1.0; 3]));
     }
 }

@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn rays_meet_the_box_or_not() {
+    fn rays_hit_or_miss_the_box() {
         for scale in [1e-6, 1.0, 1e6f64] {
             let s = scale as f32;
             let bounds = Bounds {
@@ -334,9 +334,9 @@ mod tests {
             let hit = clip(&bounds, &ray([0., 0., 4. * scale], [0., 0., -1.]));
             assert!((hit.enter - 1.5).abs() < 1e-5 && (hit.leave - 2.5).abs() < 1e-5, "{hit:?}");
             assert!((hit.distance(hit.enter) - 3.0 * s).abs() < 1e-5 * s);
-            // Starting inside, missing, parallel to a face inside and outside, behind, zero length,
-            // NaN.
+            // A ray that starts inside.
             assert_eq!(clip(&bounds, &ray([0.; 3], [1., 0., 0.])).enter, 0.0);
+            // Rays next to the box, parallel to a face, away from it, of length zero, and with NaN.
             for (o, d) in [
                 ([0., 3., 4.], [0., 0., -1.]),
                 ([2., 0., 0.], [0., 1., 0.]),
@@ -350,13 +350,13 @@ mod tests {
         }
     }
 
-    /// A scene's ray is the same in the unit cube wherever the scene lies, and whatever its unit.
+    /// Moving a scene doesn't change its rays in the unit cube.
     #[test]
-    fn rays_do_not_know_where_a_scene_lies() {
-        let turned = glam::DMat3::from_axis_angle(unit([0.3, 1.0, -0.2]), 0.4);
-        let from = DVec3::new(0.1, -0.4, 3.2);
+    fn normalized_rays_do_not_depend_on_the_scenes_position() {
+        let rotation = glam::DMat3::from_axis_angle(unit([0.3, 1.0, -0.2]), 0.4);
+        let centre = DVec3::new(0.1, -0.4, 3.2);
         let frustum = Frustum {
-            camera_to_world: scene::pose_of(turned, from),
+            camera_to_world: scene::pose_of(rotation, centre),
             min: [-0.9, -0.6],
             max: [0.8, 0.7],
             near: 0.8,
@@ -367,24 +367,24 @@ mod tests {
             DVec3::new(4_027_893.7, 307_045.6, 4_919_474.9),
         );
         for space in [Space::Box, Space::Ndc(frustum), Space::Contraction] {
-            let here = Bounds { min: [-1.1; 3], max: [1.1; 3], near: 0.1, far: 90.0, space };
+            let original = Bounds { min: [-1.1; 3], max: [1.1; 3], near: 0.1, far: 90.0, space };
             for (shift, tolerance) in [(utm, 1e-6), (ecef, 1e-6), (DVec3::splat(1024.0), 1e-7)] {
-                let there = here.moved(shift);
+                let moved = original.moved(shift);
                 for k in 0..200 {
                     let mut rng = numerics::CounterRng::new(5, 1, k);
                     let mut draw = || f64::from(rng.uniform()) - 0.5;
                     let direction =
-                        (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
-                    let origin = from + DVec3::new(draw(), draw(), draw());
+                        (-rotation.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
+                    let origin = centre + DVec3::new(draw(), draw(), draw());
                     let cast = |bounds: &Bounds, origin: DVec3| {
                         clip(bounds, &ray(origin.to_array(), direction.to_array()))
                     };
-                    let (a, b) = (cast(&here, origin), cast(&there, origin + shift));
+                    let (a, b) = (cast(&original, origin), cast(&moved, origin + shift));
                     assert_eq!(a.enter < a.leave, b.enter < b.leave);
-                    let numbers = |r: &NormalizedRay| {
+                    let components = |r: &NormalizedRay| {
                         [&r.origin[..], &r.direction, &r.view, &[r.enter, r.leave]].concat()
                     };
-                    for (a, b) in numbers(&a).into_iter().zip(numbers(&b)) {
+                    for (a, b) in components(&a).into_iter().zip(components(&b)) {
                         assert!((a - b).abs() <= tolerance * a.abs().max(1.0), "{space:?} {a} {b}");
                     }
                 }
@@ -396,21 +396,22 @@ mod tests {
         DVec3::from(v).normalize()
     }
 
+    /// Maps a world point to the unit cube by the contraction, in double precision.
     fn contract(scale: f64, p: DVec3) -> DVec3 {
         let u = p / scale;
         let u = if u.length() > 1.0 { (2.0 - 1.0 / u.length()) * u.normalize() } else { u };
         0.25 * u + 0.5
     }
 
-    /// In every space the place at t is the mapped world point at the distance that t stands for,
-    /// in the cube all the way, and t grows with the distance.
+    /// The position at t is that of the world point at the ray's distance at t. All positions are
+    /// in the cube, and the distance never decreases with t.
     #[test]
-    fn places_and_distances_agree_in_every_space() {
-        let turned = glam::DMat3::from_axis_angle(unit([0.3, 1.0, -0.2]), 0.4);
+    fn positions_and_distances_agree_in_ndc_and_contraction() {
+        let rotation = glam::DMat3::from_axis_angle(unit([0.3, 1.0, -0.2]), 0.4);
         for scale in [1e-4, 1.0, 1e4f64] {
             let centre = scale * DVec3::new(0.1, 0.2, 0.3);
             let frustum = Frustum {
-                camera_to_world: scene::pose_of(turned, centre),
+                camera_to_world: scene::pose_of(rotation, centre),
                 min: [-0.9, -0.6],
                 max: [0.8, 0.7],
                 near: 0.8 * scale,
@@ -418,26 +419,26 @@ mod tests {
             };
             let (near, far) = (0.1 * scale, 90.0 * scale);
             let bounds = |space| Bounds { min: [-scale; 3], max: [scale; 3], near, far, space };
-            let mut met = [0; 2];
+            let mut hits = [0; 2];
             for k in 0..200 {
                 let mut rng = numerics::CounterRng::new(5, 0, k);
                 let mut draw = || f64::from(rng.uniform()) - 0.5;
-                let from = centre + scale * DVec3::new(draw(), draw(), draw());
+                let origin = centre + scale * DVec3::new(draw(), draw(), draw());
                 let direction =
-                    (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
-                let ray = ray(from.to_array(), direction.to_array());
+                    (-rotation.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
+                let ray = ray(origin.to_array(), direction.to_array());
                 for (i, space) in [Space::Ndc(frustum), Space::Contraction].into_iter().enumerate()
                 {
-                    let seen = clip(&bounds(space), &ray);
-                    if seen.enter >= seen.leave {
+                    let clipped = clip(&bounds(space), &ray);
+                    if clipped.enter >= clipped.leave {
                         continue;
                     }
-                    met[i] += 1;
-                    let mut before = f64::from(seen.distance(seen.enter)) - 1e-5 * scale;
+                    hits[i] += 1;
+                    let mut previous = f64::from(clipped.distance(clipped.enter)) - 1e-5 * scale;
                     for j in 0..=20 {
-                        let t = seen.enter + (seen.leave - seen.enter) * j as f32 / 20.0;
-                        let (p, distance) = (seen.position(t), f64::from(seen.distance(t)));
-                        let world = from + distance * direction;
+                        let t = clipped.enter + (clipped.leave - clipped.enter) * j as f32 / 20.0;
+                        let (p, distance) = (clipped.position(t), f64::from(clipped.distance(t)));
+                        let world = origin + distance * direction;
                         let expected = match space {
                             Space::Ndc(_) => frustum.to_cube(frustum.to_camera(world)),
                             _ => contract(scale, world),
@@ -445,19 +446,20 @@ mod tests {
                         let error = (DVec3::from(p.map(f64::from)) - expected).length();
                         assert!(error < 2e-5, "{space:?} {j}: {p:?} {expected} at {distance}");
                         assert!(p.iter().all(|x| (-1e-5..1.00001).contains(x)), "{p:?}");
-                        assert!(distance >= before, "{distance} after {before}");
-                        before = distance;
+                        assert!(distance >= previous, "{distance} after {previous}");
+                        previous = distance;
                     }
                 }
             }
-            assert!(met[0] > 100 && met[1] == 200, "{met:?}");
+            assert!(hits[0] > 100 && hits[1] == 200, "{hits:?}");
         }
     }
 
-    /// A contracted ray's speed is at most [`MAX_SPEED`], its velocity is that of its places, and
-    /// changes by at most [`MAX_ACCELERATION`], however it passes: what leaping relies on.
+    /// A contracted ray's speed is at most [`MAX_SPEED`] and its acceleration at most
+    /// [`MAX_ACCELERATION`]: leaping relies on both. The velocity is the derivative of the
+    /// position.
     #[test]
-    fn contracted_rays_keep_their_bounds() {
+    fn contracted_rays_keep_their_speed_limits() {
         let bounds = Bounds {
             min: [-1.0; 3],
             max: [1.0; 3],
@@ -465,35 +467,38 @@ mod tests {
             far: 1e4,
             space: Space::Contraction,
         };
-        let length =
+        let distance =
             |a: [f32; 3], b: [f32; 3]| (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt();
-        let mut most_bent: f32 = 0.0;
+        let mut max_acceleration: f32 = 0.0;
         for k in 0..300 {
             let mut rng = numerics::CounterRng::new(6, 0, k);
             let mut draw = || 2.0 * f64::from(rng.uniform()) - 1.0;
-            let far = [0.5, 3.0, 40.0, 0.0][k as usize % 4];
-            let origin = [far * draw(), far * draw(), far * draw()];
+            let extent = [0.5, 3.0, 40.0, 0.0][k as usize % 4];
+            let origin = [extent * draw(), extent * draw(), extent * draw()];
             let direction = unit([draw(), draw(), draw()]).to_array();
-            let seen = clip(&bounds, &ray(origin, direction));
-            let RayMap::Contracted { radii, .. } = seen.map else {
+            let clipped = clip(&bounds, &ray(origin, direction));
+            let RayMap::Contracted { radii, .. } = clipped.map else {
                 panic!("the space is contracted");
             };
             let step = 2e-3;
-            let mut t = seen.enter;
-            while t + step < seen.leave {
-                let [a, b] = [t, t + step].map(|t| seen.position(t));
-                assert!(length(a, b) < MAX_SPEED * step + 1e-6, "at {t} of {seen:?}");
+            let mut t = clipped.enter;
+            while t + step < clipped.leave {
+                let [a, b] = [t, t + step].map(|t| clipped.position(t));
+                assert!(distance(a, b) < MAX_SPEED * step + 1e-6, "at {t} of {clipped:?}");
                 let [before, after] = [t, t + step]
-                    .map(|t| contracted_velocity(seen.origin, seen.direction, radii, t));
+                    .map(|t| contracted_velocity(clipped.origin, clipped.direction, radii, t));
                 let measured: [f32; 3] = std::array::from_fn(|i| (b[i] - a[i]) / step);
                 let middle = std::array::from_fn(|i| 0.5 * (before[i] + after[i]));
-                assert!(length(measured, middle) < 0.01, "{measured:?} {middle:?} at {t}");
-                let bent = length(before, after) / step;
-                assert!(bent < MAX_ACCELERATION + 0.01, "{bent} at {t} of {seen:?}");
-                most_bent = most_bent.max(bent);
+                assert!(distance(measured, middle) < 0.01, "{measured:?} {middle:?} at {t}");
+                let acceleration = distance(before, after) / step;
+                assert!(
+                    acceleration < MAX_ACCELERATION + 0.01,
+                    "{acceleration} at {t} of {clipped:?}"
+                );
+                max_acceleration = max_acceleration.max(acceleration);
                 t += step;
             }
         }
-        assert!(most_bent > 11.0, "the bound is near what happens: {most_bent}");
+        assert!(max_acceleration > 11.0, "{max_acceleration} is far below its bound");
     }
 }

@@ -116,16 +116,16 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn exact(t: &[f32], weight: &[f32], factor: f32, i: usize) -> f64 {
-        let apart: f64 = (0..t.len())
+    fn exact_gradient(t: &[f32], weight: &[f32], factor: f32, i: usize) -> f64 {
+        let weighted_distance: f64 = (0..t.len())
             .map(|j| f64::from(weight[j]) * (f64::from(t[i]) - f64::from(t[j])).abs())
             .sum();
-        2.0 * f64::from(factor) * (apart + 0.003 / 3.0 * f64::from(weight[i]))
+        2.0 * f64::from(factor) * (weighted_distance + 0.003 / 3.0 * f64::from(weight[i]))
     }
 
     proptest! {
         #[test]
-        fn distortion_gradients_equal_f64_differences(
+        fn distortion_gradients_equal_f64_sums(
             samples in prop::collection::vec((0.001f32..0.2, 1e-4f32..0.5), 1..40),
             factor in 0.01f32..2.0,
         ) {
@@ -146,15 +146,16 @@ mod tests {
             let regularisers = Regularisers { distortion: factor, ..Regularisers::default() };
             regularisers.add_gradients(&ray, &mut gradients);
             prop_assert_eq!(gradients.behind, 0.0);
-            // Distances are differences of f32 numbers: known to a few parts in 10^7 of how far
-            // along the ray they lie.
-            let whole: f32 = weight.iter().sum();
-            let rounding = 4e-7 * f64::from(factor * whole * t[t.len() - 1]);
-            let largest = (0..t.len()).map(|i| exact(&t, &weight, factor, i)).fold(1e-3, f64::max);
+            // Distances are differences of f32 depths: their error is a few parts in 10^7 of the
+            // depth.
+            let total_weight: f32 = weight.iter().sum();
+            let rounding = 4e-7 * f64::from(factor * total_weight * t[t.len() - 1]);
+            let exact = |i| exact_gradient(&t, &weight, factor, i);
+            let largest = (0..t.len()).map(exact).fold(1e-3, f64::max);
             for i in 0..t.len() {
-                let error = (f64::from(by_weight[i]) - exact(&t, &weight, factor, i)).abs();
+                let error = (f64::from(by_weight[i]) - exact(i)).abs();
                 prop_assert!(error < 1e-5 * largest + rounding, "{i}: {} {}", by_weight[i],
-                    exact(&t, &weight, factor, i));
+                    exact(i));
             }
         }
     }

@@ -80,19 +80,19 @@ mod tests {
         x + GRID * (y + GRID * z)
     }
 
-    /// Returns whether each of some occupied cells, given with its density, is left after specks
-    /// are removed. All other cells are empty.
-    fn left(held: &[(usize, f32)]) -> Vec<bool> {
+    /// Removes specks from a field with the given occupied cells and their densities. Returns
+    /// whether each of these cells remains occupied.
+    fn remaining(occupied: &[(usize, f32)]) -> Vec<bool> {
         let mut field = Field::new(Architecture::default(), Bounds::default(), 1);
-        let (mut density, mut cells) = (vec![0.0; CELLS], vec![0; CELLS]);
-        for &(cell, of_cell) in held {
-            (density[cell], cells[cell]) = (of_cell, 1 + (cell % 2) as u8);
+        let (mut densities, mut before) = (vec![0.0; CELLS], vec![0; CELLS]);
+        for &(cell, density) in occupied {
+            (densities[cell], before[cell]) = (density, 1 + (cell % 2) as u8);
         }
-        field.occupancy.restore(density, &cells);
+        field.occupancy.restore(densities, &before);
         field.remove_specks();
-        let kept = field.occupancy.to_bytes();
-        assert!((0..CELLS).all(|cell| [0, cells[cell]].contains(&kept[cell])), "none changes");
-        held.iter().map(|(cell, _)| kept[*cell] != 0).collect()
+        let after = field.occupancy.to_bytes();
+        assert!((0..CELLS).all(|cell| [0, before[cell]].contains(&after[cell])), "only removals");
+        occupied.iter().map(|(cell, _)| after[*cell] != 0).collect()
     }
 
     fn faint(cells: impl IntoIterator<Item = usize>) -> Vec<(usize, f32)> {
@@ -102,33 +102,33 @@ mod tests {
     #[test]
     fn only_small_faint_groups_are_specks() {
         let row = |n: usize| faint((0..n).map(|x| cell(x + 50, 7, 127)));
-        assert!(left(&row(MAX_SPECK_CELLS)).iter().all(|left| !left));
-        assert!(left(&row(MAX_SPECK_CELLS + 1)).iter().all(|left| *left));
+        assert!(remaining(&row(MAX_SPECK_CELLS)).iter().all(|remains| !remains));
+        assert!(remaining(&row(MAX_SPECK_CELLS + 1)).iter().all(|remains| *remains));
         for density in [OPAQUE, -1.0] {
             let mut with_opaque = row(3);
             with_opaque[2].1 = density;
-            assert_eq!(left(&with_opaque), [true; 3], "{density}");
+            assert_eq!(remaining(&with_opaque), [true; 3], "{density}");
         }
     }
 
-    /// Cells are connected by corners, also of bricks. Opposite faces of the cube aren't.
+    /// Corners connect cells of different bricks, too. Opposite faces of the cube aren't connected.
     #[test]
-    fn corners_connect() {
+    fn cells_are_connected_by_corners() {
         let diagonal = |n: usize| faint((0..n).map(|i| cell(i, i, 127 - i)));
-        assert!(left(&diagonal(MAX_SPECK_CELLS + 1)).iter().all(|left| *left));
-        let mut beside = diagonal(1);
-        beside.push((cell(2, 0, 127), OPAQUE));
-        assert_eq!(left(&beside), [false, true]);
-        // Neighbours by number, at opposite sides of the cube.
+        assert!(remaining(&diagonal(MAX_SPECK_CELLS + 1)).iter().all(|remains| *remains));
+        let mut apart = diagonal(1);
+        apart.push((cell(2, 0, 127), OPAQUE));
+        assert_eq!(remaining(&apart), [false, true]);
+        // Consecutive cell indices at opposite faces of the cube.
         assert_eq!(
-            left(&[(cell(127, 4, 4), FAINT), (cell(0, 5, 4), OPAQUE)]),
+            remaining(&[(cell(127, 4, 4), FAINT), (cell(0, 5, 4), OPAQUE)]),
             [false, true],
             "not connected"
         );
     }
 
     #[test]
-    fn nothing_and_everything_stay() {
+    fn empty_and_full_grids_stay_unchanged() {
         for byte in [0, 1] {
             let mut field = Field::new(Architecture::default(), Bounds::default(), 1);
             field.occupancy.restore(vec![0.0; CELLS], &vec![byte; CELLS]);

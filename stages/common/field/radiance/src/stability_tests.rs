@@ -11,8 +11,8 @@ use crate::ray::{NormalizedRay, Ray, clip};
 use crate::reference::{Judge, example, samples};
 use crate::spec::Strides;
 
-/// A figure of the table.
-struct Figure {
+/// Row of the table.
+struct Row {
     part: &'static str,
     case: String,
     /// Largest error.
@@ -35,7 +35,7 @@ fn position_error(bounds: &Bounds, rays: &[Ray]) -> f64 {
         for k in 0..=16 {
             let t = (leave - enter).mul_add(k as f32 / 16.0, enter);
             let position = DVec3::from(clipped.position(t).map(f64::from));
-            let off = if bounds.space == Space::Contraction {
+            let offset = if bounds.space == Space::Contraction {
                 // The bounds' ball has radius 1 and centre 0.
                 let radii = (origin + nearest * direction).length().max(1.0);
                 exact(nearest + radii * (4.0 * f64::from(t)).sinh()) - position
@@ -44,7 +44,7 @@ fn position_error(bounds: &Bounds, rays: &[Ray]) -> f64 {
                 let (a, b) = (exact(nearest.max(2.0)), exact(nearest.max(2.0) + 1.0));
                 (position - a).reject_from(b - a)
             };
-            error = error.max(off.length());
+            error = error.max(offset.length());
         }
     }
     error
@@ -53,12 +53,12 @@ fn position_error(bounds: &Bounds, rays: &[Ray]) -> f64 {
 /// Creates rays from a distance to points near the centre of the bounds.
 fn rays_from(distance: f64) -> Vec<Ray> {
     let ray = |k: u32| {
-        let (turn, height) = (2.4 * f64::from(k), f64::from(k) / 20.0 - 0.5);
-        let away = DVec3::new(turn.cos(), turn.sin(), height).normalize();
-        let target = 0.3 * DVec3::new(height, away.x, away.y);
-        let direction = (target - distance * away).normalize();
+        let (angle, height) = (2.4 * f64::from(k), f64::from(k) / 20.0 - 0.5);
+        let outward = DVec3::new(angle.cos(), angle.sin(), height).normalize();
+        let target = 0.3 * DVec3::new(height, outward.x, outward.y);
+        let direction = (target - distance * outward).normalize();
         Ray {
-            origin: (distance * away).to_array(),
+            origin: (distance * outward).to_array(),
             direction: direction.to_array(),
             ..Ray::default()
         }
@@ -66,13 +66,13 @@ fn rays_from(distance: f64) -> Vec<Ray> {
     (0..20).map(ray).collect()
 }
 
-fn positions(figures: &mut Vec<Figure>) {
+fn measure_positions(rows: &mut Vec<Row>) {
     for distance in [4.0, 1e4, 1e9] {
         for space in [Space::Box, Space::Contraction] {
             let far = 2.0 * distance;
             let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far, space };
             let name = if space == Space::Box { "box" } else { "contraction" };
-            figures.push(Figure {
+            rows.push(Row {
                 part: "positions",
                 case: format!("{name}, camera {distance:.0e} units away"),
                 error: position_error(&bounds, &rays_from(distance)),
@@ -94,7 +94,7 @@ fn positions(figures: &mut Vec<Figure>) {
                 Ray { origin: [0.1, 0.05, 0.0], direction, ..Ray::default() }
             })
             .collect();
-        figures.push(Figure {
+        rows.push(Row {
             part: "positions",
             case: format!("ndc, far = {ratio:.0e} × near"),
             error: position_error(&bounds, &rays),
@@ -104,40 +104,40 @@ fn positions(figures: &mut Vec<Figure>) {
     }
 }
 
-fn exponentials(figures: &mut Vec<Figure>) {
+fn measure_exponentials(rows: &mut Vec<Row>) {
     let relative = |approximate: f32, exact: f64| (f64::from(approximate) / exact - 1.0).abs();
     let steps = (0..200_000).map(|k| (k as f32 / 200_000.0).mul_add(172.0, -86.0));
     let error = steps.map(|x| relative(exp(x), f64::from(x).exp())).fold(0.0, f64::max);
     let (part, unit) = ("exponential", "relative");
-    figures.push(Figure { part, case: "e^-86 to e^86".into(), error, limit: 2e-7, unit });
+    rows.push(Row { part, case: "e^-86 to e^86".into(), error, limit: 2e-7, unit });
     let depths = (0..200_000).map(|k| (k as f32 / 1_600.0 - 120.0).exp2());
     let error = depths.map(|x| relative(one_minus_exp_neg(x), -f64::from(-x).exp_m1()));
     let error = error.fold(0.0, f64::max);
     let case = "opacity of optical depths 2^-120 to 32".into();
-    figures.push(Figure { part, case, error, limit: 4e-7, unit });
+    rows.push(Row { part, case, error, limit: 4e-7, unit });
 }
 
-/// A ray of 512 samples with one density.
-fn densities(figures: &mut Vec<Figure>) {
+/// Measures transmittances and weights of a ray of 512 samples with equal density.
+fn measure_weights(rows: &mut Vec<Row>) {
     for raw in [f32::MIN, -20.0, 0.0, 5.0, 15.0, 88.0, f32::MAX] {
         const STEP: f32 = 1.0 / 512.0;
         let mut tau = [0.0; 512];
         optical_depths(&[raw; 512], STEP, &mut tau);
-        let mut before = [0.0; 512];
+        let mut tau_before = [0.0; 512];
         for i in 1..512 {
-            before[i] = before[i - 1] + tau[i - 1];
+            tau_before[i] = tau_before[i - 1] + tau[i - 1];
         }
         let (mut transmittance, mut weight) = ([0.0; 512], [0.0; 512]);
-        weights(&before, &tau, &mut transmittance, &mut weight);
-        let density = f64::from(raw).exp() * f64::from(STEP);
+        weights(&tau_before, &tau, &mut transmittance, &mut weight);
+        let optical_depth = f64::from(raw).exp() * f64::from(STEP);
         let mut error: f64 = 0.0;
         for i in 0..512 {
-            let exact = if i == 0 { 1.0 } else { (-density * i as f64).exp() };
-            let share = exact * -(-density).exp_m1();
+            let exact = if i == 0 { 1.0 } else { (-optical_depth * i as f64).exp() };
+            let exact_weight = exact * -(-optical_depth).exp_m1();
             error = error.max((f64::from(transmittance[i]) - exact).abs());
-            error = error.max((f64::from(weight[i]) - share).abs());
+            error = error.max((f64::from(weight[i]) - exact_weight).abs());
         }
-        figures.push(Figure {
+        rows.push(Row {
             part: "weights",
             case: if raw.abs() < 1e3 {
                 format!("density e^{raw}")
@@ -151,9 +151,9 @@ fn densities(figures: &mut Vec<Figure>) {
     }
 }
 
-/// Whole rays through a field whose parameters are multiplied.
-fn parameters(figures: &mut Vec<Figure>) {
-    // Large products cancel: their colours are finite, and no more than that.
+/// Measures colours of rays through a field whose parameters are multiplied by a factor.
+fn measure_colours(rows: &mut Vec<Row>) {
+    // With large factors, large products cancel: only finite colours are required.
     let limits = [(0.0, 1e-6), (1e-3, 1e-6), (1.0, 1e-5), (2.0, 1e-4), (16.0, 1.0), (1e5, 1.0)];
     for (factor, limit) in limits {
         let (mut field, rays) = example();
@@ -163,19 +163,24 @@ fn parameters(figures: &mut Vec<Figure>) {
         let offsets = [0.5; 20];
         let mut chunk = Chunk::default();
         chunk.forward(&field, &clipped, &offsets, Strides::Single);
-        let wide = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect();
-        let judge = Judge { field: &field, grid: wide(&field.grid), network: wide(&field.network) };
+        let widen = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect();
+        let judge =
+            Judge { field: &field, grid: widen(&field.grid), network: widen(&field.network) };
         let samples = samples(&field, &clipped, &offsets, Strides::Single);
         let mut error: f64 = 0.0;
         for (r, sum) in chunk.sums.iter().enumerate() {
             let exact = judge.ray_colour(&rays[r], &samples[r]);
             for c in 0..3 {
-                let ours = sum.transmittance.mul_add(rays[r].background[c], sum.colour[c]);
-                assert!(ours.is_finite() && exact[c].is_finite(), "{factor}: {ours} {}", exact[c]);
-                error = error.max((f64::from(ours) - exact[c]).abs());
+                let colour = sum.transmittance.mul_add(rays[r].background[c], sum.colour[c]);
+                assert!(
+                    colour.is_finite() && exact[c].is_finite(),
+                    "{factor}: {colour} {}",
+                    exact[c]
+                );
+                error = error.max((f64::from(colour) - exact[c]).abs());
             }
         }
-        figures.push(Figure {
+        rows.push(Row {
             part: "colours of rays",
             case: format!("parameters × {factor:e}"),
             error,
@@ -187,15 +192,15 @@ fn parameters(figures: &mut Vec<Figure>) {
 
 #[test]
 fn errors_of_single_precision_are_small() {
-    let mut figures = Vec::new();
-    positions(&mut figures);
-    exponentials(&mut figures);
-    densities(&mut figures);
-    parameters(&mut figures);
-    for Figure { part, case, error, unit, .. } in &figures {
+    let mut rows = Vec::new();
+    measure_positions(&mut rows);
+    measure_exponentials(&mut rows);
+    measure_weights(&mut rows);
+    measure_colours(&mut rows);
+    for Row { part, case, error, unit, .. } in &rows {
         println!("|{part}|{case}|{error:.1e}|{unit}|");
     }
-    for Figure { part, case, error, limit, .. } in figures {
+    for Row { part, case, error, limit, .. } in rows {
         assert!(error <= limit, "{part}, {case}: {error:e} is more than {limit:e}");
     }
 }

@@ -423,7 +423,7 @@ mod tests {
 
     use numerics::simd::test_every_family;
 
-    /// Rays through the cube, before black or white, that should all be white.
+    /// Supervisor that fits every ray through the cube to white, over a black or white background.
     struct White {
         background: f32,
     }
@@ -476,6 +476,7 @@ mod tests {
         }
     }
 
+    /// Returns the trained field and its mean opacity.
     fn trained(field: Field, background: f32, floater_loss: f32, steps: u64) -> (Field, f32) {
         let regularisers = Regularisers { floater_loss, ..Regularisers::default() };
         let options = TrainingOptions { regularisers, ..options(steps) };
@@ -504,13 +505,13 @@ mod tests {
         Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, space }
     }
 
-    /// All numbers of a trained field, in bits.
+    /// Returns all parameters of a field, as bits.
     fn bits(field: &Field) -> Vec<u32> {
         field.grid.iter().chain(field.network.iter()).map(|x| x.to_bits()).collect()
     }
 
-    /// A trainer that can't resume trains on as if it hadn't tried, whether the weights' size is
-    /// wrong or what is read last.
+    /// A trainer that fails to resume trains as if it had not tried. The error is either in the
+    /// weights' size, or in the occupancy, which is read last.
     #[test]
     fn a_failed_resume_leaves_no_trace() {
         let folder = tempfile::tempdir().unwrap();
@@ -521,28 +522,29 @@ mod tests {
         for (name, architecture) in [("size", larger), ("cells", SMALL)] {
             let path = folder.path().join(name);
             let mut other = new(architecture);
-            // Late enough for an average of the weights.
+            // Late enough that averaged weights exist.
             (0..28).for_each(|_| assert!(other.step(&mut White::black()).unwrap().is_some()));
             other.write_checkpoint(&path).unwrap();
             if name == "cells" {
-                without_last_cell(&path);
+                remove_last_cell(&path);
             }
-            let mut tried = new(SMALL);
-            assert!(tried.resume(&path).is_err());
-            assert!(finished(tried) == finished(new(SMALL)), "{name}");
+            let mut failed = new(SMALL);
+            assert!(failed.resume(&path).is_err());
+            assert!(finish_training(failed) == finish_training(new(SMALL)), "{name}");
         }
     }
 
-    fn finished(mut trainer: Trainer) -> Vec<u32> {
+    /// Trains to the end and returns the field's bits.
+    fn finish_training(mut trainer: Trainer) -> Vec<u32> {
         while trainer.step(&mut White::black()).unwrap().is_some() {}
         bits(&trainer.finish())
     }
 
-    /// Writes a checkpoint anew with one cell of the occupancy less.
-    fn without_last_cell(path: &std::path::Path) {
+    /// Removes the last cell of the occupancy grid from a checkpoint.
+    fn remove_last_cell(path: &std::path::Path) {
         let bytes = std::fs::read(path).unwrap();
         let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
-        let cut = tensors.iter().map(|(name, view)| {
+        let edited = tensors.iter().map(|(name, view)| {
             let (mut shape, mut data) = (view.shape().to_vec(), view.data().to_vec());
             if name == "occupied" {
                 data.pop();
@@ -550,21 +552,21 @@ mod tests {
             }
             (name.to_owned(), view.dtype(), shape, data)
         });
-        let cut: Vec<_> = cut.collect();
-        let views = cut.iter().map(|(name, kind, shape, data)| {
+        let edited: Vec<_> = edited.collect();
+        let views = edited.iter().map(|(name, kind, shape, data)| {
             (name, safetensors::tensor::TensorView::new(*kind, shape.clone(), data).unwrap())
         });
         std::fs::write(path, safetensors::serialize(views, None).unwrap()).unwrap();
     }
 
-    /// Some steps of a training give equal bits by every SIMD family: in a box by double strides,
-    /// and through the contraction by strides that depend on the cell.
+    /// Every SIMD family trains to equal bits, in a box with double strides and in the contraction
+    /// with strides that depend on the cell.
     #[test]
     fn every_family_trains_to_equal_bits() {
-        for (space, is_known) in [(Space::Box, false), (Space::Contraction, true)] {
+        for (space, is_limited) in [(Space::Box, false), (Space::Contraction, true)] {
             let train = || {
                 let mut field = Field::new(SMALL, cube(space), 5);
-                if is_known {
+                if is_limited {
                     field.limit_to_occupied();
                 }
                 bits(&trained(field, 0.0, 1e-3, 40).0)
@@ -574,9 +576,10 @@ mod tests {
         }
     }
 
-    /// A white floater before white has no colour error and stays; the floater loss removes it.
+    /// A white floater before a white background has no colour error and stays; the floater loss
+    /// removes the floater.
     #[test]
-    fn what_passes_for_the_background_goes() {
+    fn floater_loss_removes_floaters_of_the_background_colour() {
         let (floater, opacity) = trained(Field::new(SMALL, cube(Space::Box), 5), 0.0, 0.0, 40);
         let ((_, without), (_, with)) =
             (trained(floater.clone(), 1.0, 0.0, 200), trained(floater, 1.0, 1e-3, 200));

@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_step_has_what_is_wanted_or_what_is_left() {
+    fn a_step_has_the_target_or_the_remaining_rays() {
         let mut state = TrainingState::default();
         assert_eq!(state.bundles_of_step(100, 40, 9), Some(4));
         assert_eq!(state.bundles_of_step(100, 4, 9), Some(1));
@@ -97,12 +97,12 @@ mod tests {
     }
 
     #[test]
-    fn one_fault_is_forgiven_and_a_second_only_later() {
+    fn a_second_nonfinite_step_within_100_steps_ends_the_run() {
         let mut state = TrainingState { steps: 7, ..TrainingState::default() };
         assert!(state.record_nonfinite_step() && state.learning_rate_scale == 0.5);
-        let kept = TrainingState::from_counters(state.counters());
-        assert_eq!(kept, state);
-        let later = |steps: u64| TrainingState { steps, ..kept }.record_nonfinite_step();
-        assert!(!later(7) && !later(106) && later(107));
+        let restored = TrainingState::from_counters(state.counters());
+        assert_eq!(restored, state);
+        let may_continue = |steps: u64| TrainingState { steps, ..restored }.record_nonfinite_step();
+        assert!(!may_continue(7) && !may_continue(106) && may_continue(107));
     }
 }

@@ -1,4 +1,4 @@
-//! Against PyTorch: `tests/goldens/mlp.safetensors` is made by `scripts/goldens/torch_field.py`
+//! Comparison with PyTorch: `scripts/goldens/torch_field.py` writes `tests/goldens/mlp.safetensors`
 //! (`make goldens`).
 
 use numerics::uniform;
@@ -15,7 +15,7 @@ use crate::sampling::{importance, midpoints, stratified};
 
 const GOLDENS: &[u8] = include_bytes!("../tests/goldens/mlp.safetensors");
 
-/// Draws the numbers that the script's `draw` draws.
+/// Returns the same numbers as the script's `draw`.
 fn draw(purpose: u64, shape: &[i64]) -> Tensor {
     let values: Vec<f64> = (0..shape.iter().product::<i64>())
         .map(|i| f64::from(uniform(11, purpose, i as u64)))
@@ -32,7 +32,7 @@ fn golden(name: &str) -> Tensor {
 }
 
 #[track_caller]
-fn close(name: &str, ours: &Tensor, tolerance: f64) {
+fn assert_close(name: &str, ours: &Tensor, tolerance: f64) {
     let theirs = golden(name).to_kind(Kind::Double);
     let ours = ours.detach().to_kind(Kind::Double);
     assert_eq!(ours.size(), theirs.size(), "{name}");
@@ -40,37 +40,38 @@ fn close(name: &str, ours: &Tensor, tolerance: f64) {
     assert!(error <= tolerance, "{name}: relative error {error:e}");
 }
 
-/// A network with the script's weights.
+/// Creates a network with the script's weights.
 fn network(architecture: MlpArchitecture, purpose: u64, kind: Kind) -> MlpNetwork {
     let mut next = purpose;
     let read = MlpNetwork::read(architecture, |_, shape| {
-        let drawn = draw(next, shape);
+        let values = draw(next, shape);
         next += 1;
         Ok(if shape.len() == 2 {
-            (6.0 / shape[1] as f64).sqrt() * (2.0 * drawn - 1.0)
+            (6.0 / shape[1] as f64).sqrt() * (2.0 * values - 1.0)
         } else {
-            0.2 * drawn - 0.05
+            0.2 * values - 0.05
         })
     });
     read.unwrap().to(Device::Cpu, kind).unwrap()
 }
 
 #[test]
-fn published_size_forward_in_f32() {
-    let spread =
-        |purpose, reach: f64| (draw(purpose, &[8, 3]) * (2.0 * reach) - reach).to_kind(Kind::Float);
-    let (position, direction) = (spread(1, 2.0), spread(2, 1.0));
+fn published_size_matches_pytorch_in_f32() {
+    let draw_uniform = |purpose, half_width: f64| {
+        (draw(purpose, &[8, 3]) * (2.0 * half_width) - half_width).to_kind(Kind::Float)
+    };
+    let (position, direction) = (draw_uniform(1, 2.0), draw_uniform(2, 1.0));
     let code = encode(&position, 10).unwrap();
-    close("encoding", &code, 1e-6);
+    assert_close("encoding", &code, 1e-6);
     let network = network(MlpArchitecture::default(), 1000, Kind::Float);
     assert_eq!(network.parameters.iter().map(Tensor::numel).sum::<usize>(), 595_844);
     let (colour, density) = network.forward(&code, &encode(&direction, 4).unwrap()).unwrap();
-    close("full.colour", &colour, 1e-5);
-    close("full.density", &density, 1e-5);
+    assert_close("full.colour", &colour, 1e-5);
+    assert_close("full.density", &density, 1e-5);
 }
 
-/// The small field, its rays and draws.
-fn small() -> (Mlp, Batch, SampleDraws) {
+/// Returns a small field, a batch of rays, and the draws of their samples.
+fn small_case() -> (Mlp, Batch, SampleDraws) {
     let architecture = MlpArchitecture {
         position_frequencies: 4,
         direction_frequencies: 2,
@@ -92,27 +93,31 @@ fn small() -> (Mlp, Batch, SampleDraws) {
 }
 
 #[test]
-fn sampling_and_compositing_in_f64() {
-    let (field, batch, draws) = small();
-    let ends = [2.0, 6.0].map(|x| Tensor::full([8, 1], x, (Kind::Double, Device::Cpu)));
-    let t = stratified(&ends[0], &ends[1], 8, Some(&draws.coarse)).unwrap();
-    close("stratified", &t, 1e-12);
-    let seen = field.forward(&batch, Some(&draws)).unwrap();
+fn sampling_and_compositing_match_pytorch_in_f64() {
+    let (field, batch, draws) = small_case();
+    let [near, far] = [2.0, 6.0].map(|x| Tensor::full([8, 1], x, (Kind::Double, Device::Cpu)));
+    let t = stratified(&near, &far, 8, Some(&draws.coarse)).unwrap();
+    assert_close("stratified", &t, 1e-12);
+    let output = field.forward(&batch, Some(&draws)).unwrap();
     // The reference implementation multiplies by 1 - α + 1e-10; `composite` adds optical depths.
-    close("coarse.weights", &seen.coarse.weights, 1e-8);
-    let inner = seen.coarse.weights.narrow(1, 1, 6);
-    close("importance", &importance(&midpoints(&t).unwrap(), &inner, &draws.fine).unwrap(), 1e-9);
-    let even = stratified(&ends[0], &ends[1], 8, None).unwrap();
-    let shares =
-        Tensor::linspace(0, 1, 8, (Kind::Double, Device::Cpu)).expand([8, 8], false).contiguous();
-    close(
-        "importance.even",
-        &importance(&midpoints(&even).unwrap(), &inner, &shares).unwrap(),
+    assert_close("coarse.weights", &output.coarse.weights, 1e-8);
+    let inner = output.coarse.weights.narrow(1, 1, 6);
+    assert_close(
+        "importance",
+        &importance(&midpoints(&t).unwrap(), &inner, &draws.fine).unwrap(),
         1e-9,
     );
-    close("fine.weights", &seen.fine.weights, 1e-8);
-    close("coarse.colour", &seen.coarse.colour, 1e-8);
-    close("fine.colour", &seen.fine.colour, 1e-8);
+    let even = stratified(&near, &far, 8, None).unwrap();
+    let quantiles =
+        Tensor::linspace(0, 1, 8, (Kind::Double, Device::Cpu)).expand([8, 8], false).contiguous();
+    assert_close(
+        "importance.even",
+        &importance(&midpoints(&even).unwrap(), &inner, &quantiles).unwrap(),
+        1e-9,
+    );
+    assert_close("fine.weights", &output.fine.weights, 1e-8);
+    assert_close("coarse.colour", &output.coarse.colour, 1e-8);
+    assert_close("fine.colour", &output.fine.colour, 1e-8);
 }
 
 fn flat(tensors: &[Tensor]) -> Tensor {
@@ -124,10 +129,10 @@ fn image_loss(colour: &Tensor, target: &Tensor) -> Tensor {
     (mean - target).square().mean(Kind::Double)
 }
 
-/// Loss, every parameter's gradient, and all parameters after three steps of Adam.
+/// Compares the loss, every parameter's gradient, and all parameters after three steps of Adam.
 #[test]
-fn gradients_and_three_steps_in_f64() {
-    let (field, batch, draws) = small();
+fn gradients_and_three_steps_match_pytorch_in_f64() {
+    let (field, batch, draws) = small_case();
     let options = MlpTraining {
         rays: 1,
         max_rays_per_step: 8,
@@ -140,16 +145,16 @@ fn gradients_and_three_steps_in_f64() {
     let mut trainer = MlpTrainer::new(field, options).unwrap();
     let target = draw(6, &[2, 3]);
     for step in 0..3 {
-        let seen = trainer.field().forward(&batch, Some(&draws)).unwrap();
+        let output = trainer.field().forward(&batch, Some(&draws)).unwrap();
         let loss =
-            image_loss(&seen.coarse.colour, &target) + image_loss(&seen.fine.colour, &target);
+            image_loss(&output.coarse.colour, &target) + image_loss(&output.fine.colour, &target);
         let parameters: Vec<Tensor> = trainer.field().parameters().collect();
         let gradients = Tensor::run_backward(&[&loss], &parameters, false, false);
         if step == 0 {
-            close("loss", &loss.reshape([1]), 1e-9);
-            close("gradient", &flat(&gradients), 1e-7);
+            assert_close("loss", &loss.reshape([1]), 1e-9);
+            assert_close("gradient", &flat(&gradients), 1e-7);
         }
         trainer.apply_gradients(&gradients, 0.0).unwrap();
     }
-    close("parameters", &flat(&trainer.field().parameters().collect::<Vec<_>>()), 1e-9);
+    assert_close("parameters", &flat(&trainer.field().parameters().collect::<Vec<_>>()), 1e-9);
 }

@@ -512,14 +512,15 @@ mod tests {
 
     use super::*;
 
+    /// Returns a ray from a distance of 4 towards a random point of the cube of side 2·`reach`.
     fn random_ray(i: u64, reach: f32) -> Ray {
         let mut rng = CounterRng::new(3, 1, i);
-        let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
-        let (from, to) = (around(1.0), around(reach));
+        let mut random_vector = |range: f32| [0, 1, 2].map(|_| range * (2.0 * rng.uniform() - 1.0));
+        let (from, to) = (random_vector(1.0), random_vector(reach));
         let length = |v: [f32; 3]| v.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-6);
         let origin = from.map(|x| 4.0 * x / length(from));
-        let d: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
-        let direction = d.map(|x| f64::from(x / length(d)));
+        let difference: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
+        let direction = difference.map(|x| f64::from(x / length(difference)));
         Ray { origin: origin.map(f64::from), direction, background: [1.0; 3] }
     }
 
@@ -527,25 +528,26 @@ mod tests {
         (0..count).map(|i| random_ray(i, reach)).collect()
     }
 
-    /// A field whose features spread so far.
+    /// Returns a field whose features are uniform in ±`spread` instead of ±1e-4.
     fn example(architecture: Architecture, bounds: Bounds, spread: f32) -> Field {
         let mut field = Field::new(architecture, bounds, 5);
         field.parts_mut().0.iter_mut().for_each(|x| *x *= spread / 1e-4);
         field
     }
 
-    fn error(ours: &[f32], judge: &[f32]) -> f64 {
-        let norm = |of: &mut dyn Iterator<Item = f64>| of.map(|x| x * x).sum::<f64>().sqrt();
-        let difference = norm(&mut ours.iter().zip(judge).map(|(a, b)| f64::from(a - b)));
-        difference / norm(&mut judge.iter().map(|&b| f64::from(b))).max(1e-12)
+    /// Returns the norm of the difference relative to the norm of `reference`.
+    fn relative_error(values: &[f32], reference: &[f32]) -> f64 {
+        let norm = |v: &mut dyn Iterator<Item = f64>| v.map(|x| x * x).sum::<f64>().sqrt();
+        let difference = norm(&mut values.iter().zip(reference).map(|(a, b)| f64::from(a - b)));
+        difference / norm(&mut reference.iter().map(|&b| f64::from(b))).max(1e-12)
     }
 
-    fn values_of(pixels: &[Pixel], of: &dyn Fn(&Pixel) -> Vec<f32>) -> Vec<f32> {
-        pixels.iter().flat_map(of).collect()
+    fn values_of(pixels: &[Pixel], values: &dyn Fn(&Pixel) -> Vec<f32>) -> Vec<f32> {
+        pixels.iter().flat_map(values).collect()
     }
 
-    /// Colours and gradients of the hand-written field and of libtorch's autograd, over dense and
-    /// hashed levels, faint density and walls, and the same field on a GPU where there is one.
+    /// Colours and gradients equal those of the hand-written field, with dense and hashed levels,
+    /// faint and opaque density, on the CPU and on a GPU if one exists.
     #[test]
     fn agrees_with_the_hand_written_field() {
         let bounds = Bounds {
@@ -574,45 +576,46 @@ mod tests {
             passes.scatter(&field);
             let table = passes.grid_gradient(&field);
             let network = passes.network_gradient();
-            let own = field.render(&rays);
+            let ours = field.render(&rays);
             for &device in &devices {
-                let judge = TorchGrid::new(&field, device).unwrap();
-                let seen = judge
+                let torch_field = TorchGrid::new(&field, device).unwrap();
+                let rendered = torch_field
                     .forward(
                         &rays,
                         &Tensor::full([300], 0.5, (Kind::Float, device)),
                         Strides::Single,
                     )
                     .unwrap();
-                let background = seen.transmittance.unsqueeze(-1);
+                let background = rendered.transmittance.unsqueeze(-1);
                 let gradients = Tensor::run_backward(
-                    &[(seen.premultiplied + background).sum(Kind::Float)],
-                    &judge.parameters(),
+                    &[(rendered.premultiplied + background).sum(Kind::Float)],
+                    &torch_field.parameters(),
                     false,
                     false,
                 );
                 let flat: Vec<f32> =
                     gradients[1..].iter().flat_map(|g| to_host(g).unwrap()).collect();
-                let said = format!("spread {spread} on {device:?}");
-                let (by_table, by_network) = (
-                    error(&table, &to_host(&gradients[0]).unwrap()),
-                    error(&network[..flat.len()], &flat),
+                let case = format!("spread {spread} on {device:?}");
+                let (table_error, network_error) = (
+                    relative_error(&table, &to_host(&gradients[0]).unwrap()),
+                    relative_error(&network[..flat.len()], &flat),
                 );
                 assert!(
-                    by_table < 1e-4 && by_network < 1e-4,
-                    "{said}: gradients {by_table} {by_network}"
+                    table_error < 1e-4 && network_error < 1e-4,
+                    "{case}: gradients {table_error} {network_error}"
                 );
-                let theirs = judge.render(&rays).unwrap();
-                for (what, of) in [
+                let theirs = torch_field.render(&rays).unwrap();
+                for (quantity, values) in [
                     ("colour", &(|p: &Pixel| p.colour.to_vec()) as &dyn Fn(&Pixel) -> Vec<f32>),
                     ("opacity", &|p| vec![p.opacity]),
                     ("depth", &|p| vec![p.depth]),
                     ("median depth", &|p| vec![p.median_depth]),
                 ] {
-                    let error = error(&values_of(&own, of), &values_of(&theirs, of));
+                    let error =
+                        relative_error(&values_of(&ours, values), &values_of(&theirs, values));
                     // A median may fall on the next sample.
-                    let tolerance = if what == "median depth" { 5e-3 } else { 1e-4 };
-                    assert!(error < tolerance, "{said}: {what} {error}");
+                    let tolerance = if quantity == "median depth" { 5e-3 } else { 1e-4 };
+                    assert!(error < tolerance, "{case}: {quantity} {error}");
                 }
             }
         }
@@ -624,7 +627,7 @@ mod tests {
 
     /// Rays that miss the box, run along its faces, start inside, have no length or aren't finite.
     #[test]
-    fn extreme_rays_are_finite_alike() {
+    fn extreme_rays_have_equal_finite_colours() {
         let bounds = Bounds::cube(1.0, 0.0, 1e6);
         let architecture = Architecture {
             max_resolution: 64,
@@ -634,7 +637,7 @@ mod tests {
             ..Architecture::default()
         };
         let field = example(architecture, bounds, 1.0);
-        let judge = TorchGrid::new(&field, Device::Cpu).unwrap();
+        let torch_field = TorchGrid::new(&field, Device::Cpu).unwrap();
         let rays: Vec<Ray> = [
             ([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]),
             ([0.0, 3.0, 4.0], [0.0, 0.0, -1.0]),
@@ -649,7 +652,7 @@ mod tests {
         .map(|(origin, direction)| Ray { origin, direction, background: [0.3, 0.6, 0.9] })
         .to_vec();
         for (i, (ours, theirs)) in
-            field.render(&rays).iter().zip(judge.render(&rays).unwrap()).enumerate()
+            field.render(&rays).iter().zip(torch_field.render(&rays).unwrap()).enumerate()
         {
             assert!(is_finite(ours) && is_finite(&theirs), "{i}: {ours:?} {theirs:?}");
             let close = ours.colour.iter().zip(&theirs.colour).all(|(a, b)| (a - b).abs() < 1e-4);

@@ -377,24 +377,26 @@ mod tests {
 
     use super::*;
 
-    /// Bundles of four rays through the middle, of which each should have a colour of its own: in
-    /// the mean.
-    struct Painted {
-        seen: Vec<f32>,
+    /// Supervisor of bundles of four rays through the middle. Each bundle has a target for the mean
+    /// colour of its rays.
+    struct MeanColours {
+        /// Red of each bundle's first ray, as rendered.
+        reds: Vec<f32>,
     }
 
-    impl Supervisor for Painted {
+    impl Supervisor for MeanColours {
         fn rays_per_bundle(&self) -> usize {
             4
         }
 
         fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
             let mut rng = CounterRng::new(1, 2, bundle);
-            // White, or like the density before it.
+            // White, or the grey of an untrained field.
             let background = [[1.0; 3], [0.5; 3]][bundle as usize % 2];
-            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
+            let mut random_point =
+                |extent: f32| [0, 1, 2].map(|_| extent * (2.0 * rng.uniform() - 1.0));
             for ray in rays {
-                let (from, to) = (around(0.3), around(0.7));
+                let (from, to) = (random_point(0.3), random_point(0.7));
                 let origin = [from[0], from[1], from[2] + 4.0];
                 let d: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
                 let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
@@ -409,13 +411,13 @@ mod tests {
             colours: &[[f32; 3]],
             gradients: &mut [[f32; 3]],
         ) -> f64 {
-            let share = 1.0 / colours.len() as f32;
+            let weight = 1.0 / colours.len() as f32;
             let mut loss = 0.0;
             for c in 0..3 {
-                let mean = colours.iter().map(|x| x[c]).sum::<f32>() * share;
-                let off = mean - [0.2, 0.5, 0.8][(bundle as usize + c) % 3];
-                loss += f64::from(off * off);
-                gradients.iter_mut().for_each(|g| g[c] = 2.0 * off * share);
+                let mean = colours.iter().map(|x| x[c]).sum::<f32>() * weight;
+                let error = mean - [0.2, 0.5, 0.8][(bundle as usize + c) % 3];
+                loss += f64::from(error * error);
+                gradients.iter_mut().for_each(|g| g[c] = 2.0 * error * weight);
             }
             loss
         }
@@ -423,7 +425,7 @@ mod tests {
         fn record_colours(&mut self, rendered: &[RenderedBundles<'_>], _: &PhaseClock) {
             for bundles in rendered {
                 let rays = self.rays_per_bundle();
-                self.seen.extend(bundles.bundles(rays).map(|(_, colours)| colours[0][0]));
+                self.reds.extend(bundles.bundles(rays).map(|(_, colours)| colours[0][0]));
             }
         }
     }
@@ -456,7 +458,6 @@ mod tests {
         Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 40.0, space }
     }
 
-    /// The middle of the cube alone: looks are slow on a CPU.
     fn is_in_the_middle(cell: usize) -> bool {
         [cell % 128, cell / 128 % 128, cell / 128 / 128].iter().all(|c| (44..84).contains(c))
     }
@@ -473,6 +474,7 @@ mod tests {
         Field::new(architecture, bounds(space), 5)
     }
 
+    /// Creates a field limited to the middle of the cube: evaluating all cells is slow on a CPU.
     fn field(space: Space) -> Field {
         let mut field = new_field(space);
         field.limit_to((0..128 * 128 * 128).map(is_in_the_middle).collect());
@@ -483,31 +485,38 @@ mod tests {
         std::iter::once(Device::Cpu).chain(nets::device("cuda").ok()).collect()
     }
 
-    /// Training from scratch begins with double strides everywhere, which [`field`] has nowhere:
-    /// equal losses and samples, in a space of straight rays and in one of bent rays.
+    /// Training from scratch begins with double strides everywhere; [`field`] has none. Losses and
+    /// samples equal the hand-written trainer's, for straight and for curved rays.
     #[test]
     fn begins_with_double_strides_as_the_hand_written_trainer_does() {
         for space in [Space::Box, Space::Contraction] {
             let start = new_field(space);
-            let mut ours = Trainer::new(start.clone(), options());
-            let mut judge = GridTrainer::new(&start, options(), Device::Cpu).unwrap();
-            let [mut mine, mut its] = [(); 2].map(|()| Painted { seen: Vec::new() });
+            let mut hand_written = Trainer::new(start.clone(), options());
+            let mut torch = GridTrainer::new(&start, options(), Device::Cpu).unwrap();
+            let [mut colours, mut torch_colours] =
+                [(); 2].map(|()| MeanColours { reds: Vec::new() });
             for _ in 0..3 {
-                let report = ours.step(&mut mine).unwrap().unwrap();
-                let other = judge.step(&mut its).unwrap().unwrap();
-                assert_eq!((report.rays, report.samples), (other.rays, other.samples));
-                assert!((report.loss / other.loss - 1.0).abs() < 1e-5, "{report:?} {other:?}");
+                let report = hand_written.step(&mut colours).unwrap().unwrap();
+                let torch_report = torch.step(&mut torch_colours).unwrap().unwrap();
+                assert_eq!(
+                    (report.rays, report.samples),
+                    (torch_report.rays, torch_report.samples)
+                );
+                assert!(
+                    (report.loss / torch_report.loss - 1.0).abs() < 1e-5,
+                    "{report:?} {torch_report:?}"
+                );
                 // A ray crosses the cube in at most 64 steps.
                 assert!(report.samples <= 33 * report.rays, "{report:?}");
             }
         }
     }
 
-    /// Steps have as many rays as the hand-written trainer's where their number follows from the
-    /// samples: before walls, where a ray ends after a round of eight, in fog, where it ends after
-    /// some rounds, and in mist, where it doesn't.
+    /// Steps have as many rays as the hand-written trainer's where the number of rays follows from
+    /// the samples. Rays end at walls after one round of eight samples, in fog after several
+    /// rounds; in mist they cross the cube.
     #[test]
-    fn steps_have_as_many_rays_as_the_hand_written_trainer_s() {
+    fn steps_have_as_many_rays_as_the_hand_written_trainers() {
         for (weight, samples) in [(0.5, 8.0..8.1), (0.12, 9.0..30.0), (-0.1, 34.0..64.0)] {
             let mut start = new_field(Space::Box);
             start.limit_to_occupied();
@@ -516,22 +525,29 @@ mod tests {
             network.fill(weight);
             let options =
                 TrainingOptions { max_rays_per_step: 4096, samples_per_step: 8000, ..options() };
-            let mut ours = Trainer::new(start.clone(), options);
-            let mut judge = GridTrainer::new(&start, options, Device::Cpu).unwrap();
-            let [mut mine, mut its] = [(); 2].map(|()| Painted { seen: Vec::new() });
+            let mut hand_written = Trainer::new(start.clone(), options);
+            let mut torch = GridTrainer::new(&start, options, Device::Cpu).unwrap();
+            let [mut colours, mut torch_colours] =
+                [(); 2].map(|()| MeanColours { reds: Vec::new() });
             for _ in 0..3 {
-                let report = ours.step(&mut mine).unwrap().unwrap();
-                let other = judge.step(&mut its).unwrap().unwrap();
-                assert_eq!((report.rays, report.samples), (other.rays, other.samples));
-                let mean = report.samples as f64 / report.rays as f64;
-                assert!(samples.contains(&mean), "{weight}: {mean} samples a ray");
+                let report = hand_written.step(&mut colours).unwrap().unwrap();
+                let torch_report = torch.step(&mut torch_colours).unwrap().unwrap();
+                assert_eq!(
+                    (report.rays, report.samples),
+                    (torch_report.rays, torch_report.samples)
+                );
+                let samples_per_ray = report.samples as f64 / report.rays as f64;
+                assert!(
+                    samples.contains(&samples_per_ray),
+                    "{weight}: {samples_per_ray} samples per ray"
+                );
             }
         }
     }
 
-    /// Step by step the same losses as the hand-written trainer's, through an update of the
-    /// occupancy and into the average of the weights, in every space; in the end the same densities
-    /// of cells, also where rays met something, and the same field.
+    /// In every space, the loss of each step equals the hand-written trainer's, through an
+    /// occupancy update and into the averaging of weights. The final fields and densities of cells
+    /// are equal, too, also where rays hit a surface.
     #[test]
     fn trains_as_the_hand_written_trainer_does() {
         let ndc = Space::Ndc(Frustum {
@@ -544,46 +560,47 @@ mod tests {
         for device in devices() {
             for space in [Space::Box, ndc, Space::Contraction] {
                 let start = field(space);
-                let mut ours = Trainer::new(start.clone(), options());
-                let mut judge = GridTrainer::new(&start, options(), device).unwrap();
-                let (mut mine, mut its) =
-                    (Painted { seen: Vec::new() }, Painted { seen: Vec::new() });
+                let mut hand_written = Trainer::new(start.clone(), options());
+                let mut torch = GridTrainer::new(&start, options(), device).unwrap();
+                let (mut colours, mut torch_colours) =
+                    (MeanColours { reds: Vec::new() }, MeanColours { reds: Vec::new() });
                 let mut losses = Vec::new();
-                while let Some(report) = ours.step(&mut mine).unwrap() {
-                    let other = judge.step(&mut its).unwrap().unwrap();
-                    assert_eq!(report.rays, other.rays);
-                    let off = (report.loss - other.loss).abs() / report.loss;
-                    // On a CPU; a GPU adds in any order.
+                while let Some(report) = hand_written.step(&mut colours).unwrap() {
+                    let torch_report = torch.step(&mut torch_colours).unwrap().unwrap();
+                    assert_eq!(report.rays, torch_report.rays);
+                    let error = (report.loss - torch_report.loss).abs() / report.loss;
+                    // A GPU adds in any order.
                     assert!(
-                        off < if device == Device::Cpu { 1e-5 } else { 1e-2 },
-                        "{device:?} {space:?} step {}: {report:?} {other:?}",
-                        ours.steps()
+                        error < if device == Device::Cpu { 1e-5 } else { 1e-2 },
+                        "{device:?} {space:?} step {}: {report:?} {torch_report:?}",
+                        hand_written.steps()
                     );
                     losses.push(report.loss);
                 }
-                assert!(judge.step(&mut its).unwrap().is_none() && losses.len() == 36);
+                assert!(torch.step(&mut torch_colours).unwrap().is_none() && losses.len() == 36);
                 assert!(losses[35] < 0.9 * losses[0], "{losses:?}");
-                assert_eq!(mine.seen.len(), its.seen.len());
-                let (known, other) =
-                    (ours.field().parts().2.densities(), judge.occupancy.densities());
-                let pairs = known.iter().zip(&other).filter(|(a, _)| **a > 0.0);
-                let differ = pairs.filter(|(a, b)| (**a / **b - 1.0).abs() > 1e-3).count();
-                // Without what rays met in the last steps, 4 cells and more differ. A GPU's
+                assert_eq!(colours.reds.len(), torch_colours.reds.len());
+                let (expected, found) =
+                    (hand_written.field().parts().2.densities(), torch.occupancy.densities());
+                let pairs = expected.iter().zip(&found).filter(|(a, _)| **a > 0.0);
+                let differing = pairs.filter(|(a, b)| (**a / **b - 1.0).abs() > 1e-3).count();
+                // Without the hits of the last steps, at least 4 cells differ. A GPU's
                 // rounding may put samples into other cells.
-                assert!(device != Device::Cpu || differ < 3, "{space:?}: {differ} cells");
+                assert!(device != Device::Cpu || differing < 3, "{space:?}: {differing} cells");
                 let rays: Vec<Ray> = (0..50)
                     .flat_map(|g| {
                         let mut rays = [Ray::default(); 4];
-                        mine.sample_rays(g, &mut rays);
+                        colours.sample_rays(g, &mut rays);
                         rays
                     })
                     .collect();
-                let (a, b) = (ours.finish().render(&rays), judge.field().unwrap().render(&rays));
+                let (a, b) =
+                    (hand_written.finish().render(&rays), torch.field().unwrap().render(&rays));
                 for (a, b) in a.iter().zip(&b) {
-                    let off =
+                    let error =
                         (a.colour[0] - b.colour[0]).abs().max((a.depth / b.depth - 1.0).abs());
                     assert!(
-                        off < if device == Device::Cpu { 1e-3 } else { 5e-2 },
+                        error < if device == Device::Cpu { 1e-3 } else { 5e-2 },
                         "{device:?} {space:?}: {a:?} {b:?}"
                     );
                 }
@@ -593,37 +610,39 @@ mod tests {
 
     /// Empty cells render the background and get no gradient.
     #[test]
-    fn nothing_is_learnt_where_nothing_may_be() {
+    fn empty_cells_are_not_trained() {
         let mut start = field(Space::Box);
         start.limit_to(vec![false; 128 * 128 * 128]);
-        let mut judge = GridTrainer::new(&start, options(), Device::Cpu).unwrap();
-        let report = judge.step(&mut Painted { seen: Vec::new() }).unwrap().unwrap();
+        let mut trainer = GridTrainer::new(&start, options(), Device::Cpu).unwrap();
+        let report = trainer.step(&mut MeanColours { reds: Vec::new() }).unwrap().unwrap();
         assert_eq!((report.samples, report.skipped), (0, false));
-        assert_eq!(judge.field().unwrap().parts().0, start.parts().0);
+        assert_eq!(trainer.field().unwrap().parts().0, start.parts().0);
     }
 
-    fn run_until(mut judge: GridTrainer, steps: u64) -> GridTrainer {
-        while judge.steps() < steps
-            && judge.step(&mut Painted { seen: Vec::new() }).unwrap().is_some()
+    fn run_until(mut trainer: GridTrainer, steps: u64) -> GridTrainer {
+        while trainer.steps() < steps
+            && trainer.step(&mut MeanColours { reds: Vec::new() }).unwrap().is_some()
         {}
-        judge
+        trainer
     }
 
-    /// A training resumed from a checkpoint ends with the same numbers.
+    /// A training resumed from a checkpoint ends with the same field.
     #[test]
-    fn a_checkpoint_holds_all() {
+    fn a_checkpoint_restores_everything() {
         let new = || GridTrainer::new(&field(Space::Box), options(), Device::Cpu).unwrap();
-        let path = tempfile::tempdir().unwrap().keep().join("checkpoint.safetensors");
-        for at in [3, 33] {
-            run_until(new(), at).write_checkpoint(&path).unwrap();
-            assert_eq!(GridTrainer::checkpoint_step(&path).unwrap(), at);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.safetensors");
+        for step in [3, 33] {
+            run_until(new(), step).write_checkpoint(&path).unwrap();
+            assert_eq!(GridTrainer::checkpoint_step(&path).unwrap(), step);
             let mut resumed = new();
             resumed.resume(&path).unwrap();
-            let (through, on) =
+            let (uninterrupted, continued) =
                 (run_until(new(), 36).field().unwrap(), run_until(resumed, 36).field().unwrap());
             assert!(
-                through.parts().0 == on.parts().0 && through.parts().1 == on.parts().1,
-                "from step {at}"
+                uninterrupted.parts().0 == continued.parts().0
+                    && uninterrupted.parts().1 == continued.parts().1,
+                "from step {step}"
             );
         }
         std::fs::write(&path, b"cut short").unwrap();

@@ -407,7 +407,7 @@ mod tests {
     /// In NDC and in a contraction, rays are sampled between their intersections with the cube,
     /// more densely near the camera. A ray that misses the cube renders its background.
     #[test]
-    fn rays_are_sampled_in_every_space() {
+    fn rays_are_sampled_inside_the_cube() {
         let pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
         let frustum =
             Frustum { camera_to_world: pose, min: [-0.5; 2], max: [0.5; 2], near: 2.0, far: 90.0 };
@@ -425,9 +425,9 @@ mod tests {
         for space in [Space::Ndc(frustum), Space::Contraction] {
             let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 90.0, space };
             let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
-            let seen =
+            let output =
                 no_grad(|| field.forward(&Batch::new(&rays, &field).unwrap(), None)).unwrap();
-            for (i, distances) in to_host(&seen.distances).unwrap().chunks_exact(24).enumerate() {
+            for (i, distances) in to_host(&output.distances).unwrap().chunks_exact(24).enumerate() {
                 let ray = clip(&bounds, &rays[i]);
                 let ends = [ray.distance(ray.enter), ray.distance(ray.leave)];
                 let close = |a: f32, b: f32| (a / b - 1.0).abs() < 2e-3;
@@ -461,11 +461,11 @@ mod tests {
     }
 
     /// In a box, a field with scaled positions renders the same at any position and scale of the
-    /// scene. A field without, like that of the reference implementation, depends on both.
+    /// scene. A field without them, like the reference implementation's, depends on both.
     #[test]
     fn scaled_positions_move_with_the_scene() {
         let utm = DVec3::new(500_000.0, 4_649_776.0, 120.0);
-        let rendered = |scaled_positions, shift: DVec3, scale: f64| {
+        let render = |scaled_positions, shift: DVec3, scale: f64| {
             let architecture = MlpArchitecture {
                 scaled_positions,
                 layers: 5,
@@ -486,18 +486,21 @@ mod tests {
             let [r, g, b] = pixel.colour.map(f64::from);
             [r, g, b, f64::from(pixel.opacity), f64::from(pixel.depth) / scale]
         };
-        let off = |a: [f64; 5], b: [f64; 5]| {
+        let difference = |a: [f64; 5], b: [f64; 5]| {
             a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
         };
-        let here = rendered(true, DVec3::ZERO, 1.0);
-        assert!(off(here, rendered(false, DVec3::ZERO, 1.0)) < 1e-6, "a unit of 1 at the origin");
+        let expected = render(true, DVec3::ZERO, 1.0);
+        assert!(
+            difference(expected, render(false, DVec3::ZERO, 1.0)) < 1e-6,
+            "a unit of 1 at the origin"
+        );
         for (shift, scale) in [(utm, 1.0), (DVec3::ZERO, 1024.0), (DVec3::ZERO, 1.0 / 65_536.0)] {
-            assert!(off(here, rendered(true, shift, scale)) < 1e-5, "{shift} {scale}");
-            assert!(off(here, rendered(false, shift, scale)) > 1e-3, "{shift} {scale}");
+            assert!(difference(expected, render(true, shift, scale)) < 1e-5, "{shift} {scale}");
+            assert!(difference(expected, render(false, shift, scale)) > 1e-3, "{shift} {scale}");
         }
     }
 
-    /// Every number of both networks is the mean of both fields'.
+    /// Every parameter of both networks is the mean of the two fields' parameters.
     #[test]
     fn fields_are_averaged() {
         let architecture =

@@ -198,10 +198,10 @@ mod tests {
         Bounds { min: [1.0, 1.0, -2.0], max: [4.0, 3.0, 0.5], near: 0.5, far: 20.0, space }
     }
 
-    /// Densities and colours at points along a ray are those of the fine network in rays' own
+    /// Densities and colours at points along a ray equal those of the fine network in rays'
     /// coordinates, in every space.
     #[test]
-    fn points_have_the_values_that_rays_have() {
+    fn points_have_the_values_of_rays() {
         let pose = [[1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 2.0], [0.0, 0.0, 1.0, 4.0]];
         let frustum =
             Frustum { camera_to_world: pose, min: [-0.5; 2], max: [0.5; 2], near: 2.0, far: 90.0 };
@@ -238,10 +238,10 @@ mod tests {
                 let direction = direction.unwrap().expand([40, -1], false);
                 field.fine.forward(&code.unwrap(), &direction).unwrap()
             });
-            let points_of = MlpPoints::new(field);
-            let samples = points_of.samples(&points).unwrap();
+            let mlp_points = MlpPoints::new(field);
+            let samples = mlp_points.samples(&points).unwrap();
             let expected = to_host(&(raw.relu() * scale)).unwrap();
-            assert_eq!(samples.densities, points_of.densities(&points).unwrap());
+            assert_eq!(samples.densities, mlp_points.densities(&points).unwrap());
             assert!(expected.iter().any(|&density| density > 0.0), "{space:?}");
             // The density at a ray's end extends to infinity.
             let end = (samples.densities[39], expected[39]);
@@ -251,14 +251,14 @@ mod tests {
                 assert!((found - expected).abs() < 1e-2 * expected.max(0.1), "{found} {expected}");
             }
             let directions = vec![vec![direction.map(|x| x as f32)]; 40];
-            let found = points_of.view_colours(&samples.view_features, &directions).unwrap();
+            let found = mlp_points.view_colours(&samples.view_features, &directions).unwrap();
             let found: Vec<f32> = found.into_iter().flatten().flatten().collect();
             let found = Tensor::from_slice(&found).sigmoid().reshape([40, 3]);
             let error = (found - colours).abs().max().to_kind(Kind::Float).double_value(&[]);
             assert!(error < 1e-2, "{space:?}: {error}");
-            let most = expected.iter().copied().fold(0.0, f32::max);
-            assert!(!points_of.may_have_density([0.4; 3], [0.6; 3], 1e6).unwrap());
-            assert!(points_of.may_have_density([0.0; 3], [1.0; 3], 0.01 * most).unwrap());
+            let max_density = expected.iter().copied().fold(0.0, f32::max);
+            assert!(!mlp_points.may_have_density([0.4; 3], [0.6; 3], 1e6).unwrap());
+            assert!(mlp_points.may_have_density([0.0; 3], [1.0; 3], 0.01 * max_density).unwrap());
         }
     }
 }

@@ -354,7 +354,7 @@ mod tests {
     use super::*;
     use crate::network::MlpNetwork;
 
-    /// Rays side by side, every other of which should be dark.
+    /// Supervisor of four parallel rays, of which every other should be dark.
     struct Stripes;
 
     impl Supervisor for Stripes {
@@ -363,12 +363,9 @@ mod tests {
         }
 
         fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
-            let across = 0.2 * (bundle % 4) as f64;
-            rays[0] = Ray {
-                origin: [across, 0.0, 4.0],
-                direction: [0.0, 0.0, -1.0],
-                background: [1.0; 3],
-            };
+            let x = 0.2 * (bundle % 4) as f64;
+            rays[0] =
+                Ray { origin: [x, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
         }
 
         fn loss_and_gradient(
@@ -377,14 +374,14 @@ mod tests {
             colours: &[[f32; 3]],
             gradients: &mut [[f32; 3]],
         ) -> f64 {
-            let off = colours[0].map(|x| x - (bundle % 2) as f32);
-            gradients[0] = off.map(|x| 2.0 * x);
-            off.iter().map(|&x| f64::from(x * x)).sum()
+            let difference = colours[0].map(|x| x - (bundle % 2) as f32);
+            gradients[0] = difference.map(|x| 2.0 * x);
+            difference.iter().map(|&x| f64::from(x * x)).sum()
         }
     }
 
-    /// Trains after shifting one network's raw densities; returns the error of a failed run.
-    fn collapse(network: fn(&Mlp) -> &MlpNetwork, shift: f64) -> Option<String> {
+    /// Trains after shifting one network's raw densities. Returns the error, if training fails.
+    fn training_error(network: fn(&Mlp) -> &MlpNetwork, shift: f64) -> Option<String> {
         let architecture = MlpArchitecture {
             layers: 5,
             hidden_dim: 16,
@@ -421,11 +418,11 @@ mod tests {
         }
     }
 
-    /// A stuck network is reported: its samples stop no light, or its first samples stop all light.
-    /// Other fields train on.
+    /// Training fails if a network's samples stop no light, or its first samples stop all light.
+    /// Training of other fields continues to the end.
     #[test]
-    fn collapses_are_told() {
-        assert_eq!(collapse(|f| &f.fine, 0.5), None);
+    fn collapses_are_reported() {
+        assert_eq!(training_error(|f| &f.fine, 0.5), None);
         for (network, shift, expected) in [
             (
                 (|f| &f.coarse) as fn(&Mlp) -> &MlpNetwork,
@@ -438,7 +435,7 @@ mod tests {
                 "the fine network has collapsed: a wall is rendered in front of every camera",
             ),
         ] {
-            let error = collapse(network, shift).expect("a collapse");
+            let error = training_error(network, shift).expect("training must fail");
             assert!(error.contains("step 200") && error.contains(expected), "{error}");
         }
     }

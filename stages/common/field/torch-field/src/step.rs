@@ -145,7 +145,8 @@ pub(crate) fn run_in_pieces<T>(
 mod tests {
     use super::*;
 
-    fn three_at_most(range: Range<usize>) -> Result<Range<usize>, TchError> {
+    /// Returns CUDA's out-of-memory error for more than three bundles.
+    fn run_at_most_three(range: Range<usize>) -> Result<Range<usize>, TchError> {
         if range.len() > 3 {
             Err(TchError::Torch("CUDA out of memory. Tried".to_owned()))
         } else {
@@ -157,16 +158,17 @@ mod tests {
     #[test]
     fn pieces_get_smaller_until_they_fit() {
         let step = Step::new(&TrainingState::default(), 17, 4);
-        let pieces = step.run_in_pieces(three_at_most).unwrap();
+        let pieces = step.run_in_pieces(run_at_most_three).unwrap();
         assert!(pieces.iter().all(|p| p.len() <= 3) && pieces.len() < 10);
         assert_eq!(pieces.into_iter().flatten().collect::<Vec<_>>(), (0..17).collect::<Vec<_>>());
-        let never = |_| -> Result<(), _> { Err(TchError::Torch("CUDA out of memory".to_owned())) };
-        assert!(step.run_in_pieces(never).is_err());
+        let always_fails =
+            |_| -> Result<(), _> { Err(TchError::Torch("CUDA out of memory".to_owned())) };
+        assert!(step.run_in_pieces(always_fails).is_err());
     }
 
-    /// The rates are those in the reference implementation's log for 20 epochs.
+    /// Expected rates are from the reference implementation's log of 20 epochs.
     #[test]
-    fn epochs_are_the_references() {
+    fn learning_rates_equal_the_reference_implementation() {
         let rate = |epoch: u64| learning_rate(5e-4, 1e-2, 20, (epoch as f64 + 0.5) / 20.0);
         assert!((0..10).all(|e| rate(e) == 5e-4));
         let falling = [

@@ -56,41 +56,43 @@ mod tests {
     use super::*;
     use crate::photograph::tests::write_png;
 
-    fn folder(train: &str) -> tempfile::TempDir {
+    /// Writes a data set with one image; both splits have a frame of it.
+    fn write_dataset(train_json: &str) -> tempfile::TempDir {
         let dir = tempfile::tempdir().unwrap();
-        std::fs::write(dir.path().join("transforms_train.json"), train).unwrap();
-        std::fs::write(dir.path().join("transforms_test.json"), with_pose("1")).unwrap();
+        std::fs::write(dir.path().join("transforms_train.json"), train_json).unwrap();
+        std::fs::write(dir.path().join("transforms_test.json"), transforms("1")).unwrap();
         std::fs::create_dir(dir.path().join("train")).unwrap();
         write_png(&dir.path().join("train/r_0.png"), 10, 6);
         dir
     }
 
-    fn with_pose(entry: &str) -> String {
+    /// Returns the JSON of one frame whose pose has the given upper left entry.
+    fn transforms(first_entry: &str) -> String {
         format!(
             r#"{{"camera_angle_x": 0.7, "frames": [{{"file_path": "./train/r_0",
-                "transform_matrix": [[{entry},0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}}]}}"#
+                "transform_matrix": [[{first_entry},0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}}]}}"#
         )
     }
 
     #[test]
-    fn a_good_one() {
-        let set = Dataset::read(folder(&with_pose("1")).path()).unwrap();
+    fn valid_splits_are_read() {
+        let set = Dataset::read(write_dataset(&transforms("1")).path()).unwrap();
         assert_eq!((set.format, set.frames.len()), (Format::Blender, 2));
         assert_eq!(set.split, Some(Split { train: vec![0], test: vec![1] }));
         let frame = &set.frames[0];
         assert_eq!(frame.name, "r_0");
         assert_eq!(frame.camera_to_world[2], [0., 0., 1., 4.]);
         assert_eq!(frame.stored_intrinsics, scene::Intrinsics::from_angle_x(10, 6, 0.7));
-        // Both sides have an r_0.
+        // Both splits have a frame r_0.
         let merged = set.without_split();
         assert_eq!([&merged.frames[0].name, &merged.frames[1].name], ["r_0", "test_r_0"]);
         assert_eq!(merged.split, None);
     }
 
-    /// A missing and an empty file of test views mean the same.
+    /// A missing and an empty file of test views give equal data sets.
     #[test]
-    fn there_need_be_no_test_views() {
-        let dir = folder(&with_pose("1"));
+    fn test_views_are_optional() {
+        let dir = write_dataset(&transforms("1"));
         let test = dir.path().join("transforms_test.json");
         std::fs::write(&test, r#"{"camera_angle_x": 0.7, "frames": []}"#).unwrap();
         let empty = Dataset::read(dir.path()).unwrap();
@@ -106,18 +108,18 @@ mod tests {
     }
 
     #[test]
-    fn text_may_have_a_mark_and_other_line_ends() {
-        let json = with_pose("1").replace(", ", ",\r\n");
-        let dir = folder(&format!("\u{feff}{json}"));
+    fn byte_order_marks_and_crlf_are_accepted() {
+        let json = transforms("1").replace(", ", ",\r\n");
+        let dir = write_dataset(&format!("\u{feff}{json}"));
         assert_eq!(Dataset::read(dir.path()).unwrap(), {
-            std::fs::write(dir.path().join("transforms_train.json"), with_pose("1")).unwrap();
+            std::fs::write(dir.path().join("transforms_train.json"), transforms("1")).unwrap();
             Dataset::read(dir.path()).unwrap()
         });
     }
 
     #[test]
-    fn what_stands_where_an_image_should_be_is_named() {
-        let dir = folder(&with_pose("1"));
+    fn missing_and_unusable_images_are_named() {
+        let dir = write_dataset(&transforms("1"));
         let image = dir.path().join("train/r_0.png");
         std::fs::remove_file(&image).unwrap();
         let message = || Dataset::read(dir.path()).unwrap_err().to_string();
@@ -137,11 +139,11 @@ mod tests {
         assert!(message().contains("r_0.png is a folder, not an image"), "{}", message());
     }
 
-    /// Whatever a frame is called, a message stays on its line and moves no cursor.
+    /// Control characters in a frame's name neither break a message's line nor move the cursor.
     #[test]
     fn names_are_printed_without_control_characters() {
         let title = r"\u001b]0;PWN\u0007\n";
-        let dir = folder(&with_pose("1").replace("r_0", title));
+        let dir = write_dataset(&transforms("1").replace("r_0", title));
         let message = Dataset::read(dir.path()).unwrap_err().to_string();
         assert!(
             !message.contains(char::is_control)
@@ -153,83 +155,89 @@ mod tests {
     }
 
     #[test]
-    fn bad_ones_are_named() {
-        for (json, words) in [
+    fn invalid_transforms_are_refused() {
+        for (json, expected) in [
             (
-                with_pose("NaN"),
+                transforms("NaN"),
                 "frame 0 (./train/r_0): transform_matrix: camera_to_world[0][0] is NaN",
             ),
             (
-                with_pose("Infinity"),
+                transforms("Infinity"),
                 "frame 0 (./train/r_0): transform_matrix: camera_to_world[0][0] is infinite",
             ),
-            (with_pose("-Infinity"), "camera_to_world[0][0] is infinite"),
-            (with_pose("-1"), "transform_matrix: camera_to_world is a reflection"),
+            (transforms("-Infinity"), "camera_to_world[0][0] is infinite"),
+            (transforms("-1"), "transform_matrix: camera_to_world is a reflection"),
             (
-                with_pose("1").replace("1,4]", "1,1e30]"),
+                transforms("1").replace("1,4]", "1,1e30]"),
                 "transform_matrix: the camera's centre (0e0, 0e0, 1e30)",
             ),
-            (with_pose("1").replace("0.7", "NaN"), "camera_angle_x is NaN"),
-            (format!("\u{feff}\u{feff}{}", with_pose("1")), "line 1"),
-            (with_pose("2"), "not a rigid motion"),
-            (with_pose("1").replace("0.7", "0"), "focal length inf"),
-            (with_pose("1").replace("0.7", "3.2"), "between 0 and π"),
-            (with_pose("1").replace("./train/r_0", "../r_0"), "not a path inside"),
-            (with_pose("1").replace("r_0", "r_1"), "r_1.png not found"),
+            (transforms("1").replace("0.7", "NaN"), "camera_angle_x is NaN"),
+            (format!("\u{feff}\u{feff}{}", transforms("1")), "line 1"),
+            (transforms("2"), "not a rigid motion"),
+            (transforms("1").replace("0.7", "0"), "focal length inf"),
+            (transforms("1").replace("0.7", "3.2"), "between 0 and π"),
+            (transforms("1").replace("./train/r_0", "../r_0"), "not a path inside"),
+            (transforms("1").replace("r_0", "r_1"), "r_1.png not found"),
             (r#"{"camera_angle_x": 0.7, "frames": []}"#.to_owned(), "`frames` is empty"),
-            (with_pose("1")[..60].to_owned(), "line 1"),
-            (with_pose("1").replace("[0,1,0,0],", ""), "transform_matrix"),
+            (transforms("1")[..60].to_owned(), "line 1"),
+            (transforms("1").replace("[0,1,0,0],", ""), "transform_matrix"),
         ] {
-            let message = Dataset::read(folder(&json).path()).unwrap_err().to_string();
-            assert!(message.contains(words), "{message}");
+            let message = Dataset::read(write_dataset(&json).path()).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
             assert!(message.contains("transforms_train.json"), "{message}");
         }
     }
 
-    /// A pose's text with another left 3×3 part, given row by row.
-    fn with_axes(axes: [[f64; 3]; 3]) -> String {
-        let [x, y, z] = axes.map(|[a, b, c]| format!("[{a},{b},{c}"));
+    /// Returns the JSON of one frame whose pose has the given rotation part, row by row.
+    fn with_rotation(rotation: [[f64; 3]; 3]) -> String {
+        let [x, y, z] = rotation.map(|[a, b, c]| format!("[{a},{b},{c}"));
         let pose = format!("[{x},7],{y},8],{z},4],[0,0,0,1]]");
-        with_pose("1").replace("[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]", &pose)
+        transforms("1").replace("[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]", &pose)
     }
 
-    /// instant-ngp's users scale scenes by the whole matrix, or by its rotation alone.
+    /// Users of instant-ngp scale the whole pose matrix, or its rotation part alone.
     #[test]
-    fn a_scale_of_all_axes_is_removed_and_said() {
-        let dir = folder(&with_axes([[0.0, 0.0, 0.25], [0.25, 0.0, 0.0], [0.0, 0.25, 0.0]]));
+    fn a_uniform_scale_is_removed_and_reported() {
+        let dir =
+            write_dataset(&with_rotation([[0.0, 0.0, 0.25], [0.25, 0.0, 0.0], [0.0, 0.25, 0.0]]));
         let set = Dataset::read(dir.path()).unwrap();
         let rigid = [[0.0, 0.0, 1.0, 7.0], [1.0, 0.0, 0.0, 8.0], [0.0, 1.0, 0.0, 4.0]];
         assert_eq!(set.frames[0].camera_to_world, rigid);
         let note = "warning: rotations of 1 of 2 views have a scale of 0.25, which is removed; \
             centres are unchanged";
         assert!(set.notes.iter().any(|found| found == note), "{:?}", set.notes);
-        let plain = Dataset::read(folder(&with_pose("1.004")).path()).unwrap();
-        assert_eq!(plain.notes.len(), 1, "rounding is no scale: {:?}", plain.notes);
+        let plain = Dataset::read(write_dataset(&transforms("1.004")).path()).unwrap();
+        assert_eq!(plain.notes.len(), 1, "rounding is not a scale: {:?}", plain.notes);
     }
 
     #[test]
-    fn other_matrices_are_refused() {
-        let half =
+    fn poses_that_are_not_rigid_are_refused() {
+        let half_scale =
             |[a, b, c]: [f64; 3]| [[0.5 * a, 0.0, 0.0], [0.0, 0.5 * b, 0.0], [0.0, 0.0, 0.5 * c]];
         let sheared = [[1.0, 0.2, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-        for (axes, words) in [
-            (half([1.0, 1.0, -1.0]), "camera_to_world is a reflection (its determinant is -1.000)"),
-            (half([1.0, 1.0, 1.2]), "camera_to_world is not a rigid motion"),
-            (half([0.0; 3]), "camera_to_world is not a rigid motion"),
+        for (rotation, expected) in [
+            (
+                half_scale([1.0, 1.0, -1.0]),
+                "camera_to_world is a reflection (its determinant is -1.000)",
+            ),
+            (half_scale([1.0, 1.0, 1.2]), "camera_to_world is not a rigid motion"),
+            (half_scale([0.0; 3]), "camera_to_world is not a rigid motion"),
             (sheared, "camera_to_world is not a rigid motion"),
             (sheared.map(|row| row.map(|x| 0.1 * x)), "camera_to_world is not a rigid motion"),
         ] {
-            let message = Dataset::read(folder(&with_axes(axes)).path()).unwrap_err().to_string();
-            let place = "transforms_train.json: frame 0 (./train/r_0): transform_matrix: ";
-            assert!(message.contains(&format!("{place}{words}")), "{message}");
+            let message = Dataset::read(write_dataset(&with_rotation(rotation)).path())
+                .unwrap_err()
+                .to_string();
+            let prefix = "transforms_train.json: frame 0 (./train/r_0): transform_matrix: ";
+            assert!(message.contains(&format!("{prefix}{expected}")), "{message}");
         }
     }
 
     #[test]
-    fn any_bytes_are_an_error_and_no_panic() {
-        let whole = with_pose("1");
-        for end in 0..whole.len() - 1 {
-            assert!(Dataset::read(folder(&whole[..end]).path()).is_err());
+    fn truncated_json_is_refused() {
+        let json = transforms("1");
+        for end in 0..json.len() - 1 {
+            assert!(Dataset::read(write_dataset(&json[..end]).path()).is_err());
         }
     }
 }

@@ -195,9 +195,9 @@ mod tests {
 
     const POSE: &str = "[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]";
 
-    /// Three views of 40×30 pixels with fisheye lenses that see 200°, 200° and 100° across; the
-    /// second has a mask that leaves the left half out.
-    fn fisheye_set(folder: &std::path::Path) -> Dataset {
+    /// Writes and reads three views of 40×30 pixels through fisheye lenses with fields of view of
+    /// 200°, 200° and 100°. The second view's mask excludes the left half.
+    fn write_fisheye_dataset(folder: &std::path::Path) -> Dataset {
         let focal = |degrees: f64| 40.0 / degrees.to_radians();
         let mut frames = Vec::new();
         for (name, degrees) in [("a", 200.0), ("b", 200.0), ("c", 100.0)] {
@@ -210,49 +210,49 @@ mod tests {
             let image = Rgba8::new(40, 30, vec![255; 4 * 40 * 30]);
             pixels::write_png(&folder.join(format!("{name}.png")), &image).unwrap();
         }
-        let half = |i: usize| if i % 40 < 20 { [0, 0, 0, 255] } else { [255; 4] };
-        let mask = Rgba8::new(40, 30, (0..40 * 30).flat_map(half).collect());
+        let right_half = |i: usize| if i % 40 < 20 { [0, 0, 0, 255] } else { [255; 4] };
+        let mask = Rgba8::new(40, 30, (0..40 * 30).flat_map(right_half).collect());
         pixels::write_png(&folder.join("mask.png"), &mask).unwrap();
         let text = format!(r#"{{"frames": [{}]}}"#, frames.join(","));
         std::fs::write(folder.join("transforms.json"), text).unwrap();
         Dataset::read(folder).unwrap()
     }
 
-    /// Pixels without a ray are left out, in addition to those that a mask excludes.
+    /// Pixels without a ray are masked, in addition to those that a view's mask excludes.
     #[test]
-    fn masks_of_lenses_join_those_of_the_data() {
+    fn lens_masks_combine_with_given_masks() {
         let dir = tempfile::tempdir().unwrap();
-        let set = fisheye_set(dir.path()).with_lens_mask_note();
-        let is_cut = |i: usize| {
+        let set = write_fisheye_dataset(dir.path()).with_lens_mask_note();
+        let is_outside_lens = |i: usize| {
             let (x, y) = ((i % 40) as f64 - 19.5, (i / 40) as f64 - 14.5);
             x.hypot(y) / 40.0 * 200.0 >= 89.0
         };
         let [a, b, c] = &set.frames[..] else { panic!("three frames") };
-        let whole = a.mask().unwrap().unwrap();
-        let half = b.mask().unwrap().unwrap();
+        let lens_mask = a.mask().unwrap().unwrap();
+        let combined_mask = b.mask().unwrap().unwrap();
         assert!(c.mask().unwrap().is_none());
         assert_eq!([a, b, c].map(Frame::is_masked), [true, true, false]);
         for i in 0..40 * 30 {
-            assert_eq!(whole.counts[i], !is_cut(i), "{i}");
-            assert_eq!(half.counts[i], !is_cut(i) && i % 40 >= 20, "{i}");
+            assert_eq!(lens_mask.counts[i], !is_outside_lens(i), "{i}");
+            assert_eq!(combined_mask.counts[i], !is_outside_lens(i) && i % 40 >= 20, "{i}");
         }
-        let cut = (0..40 * 30).filter(|i| is_cut(*i)).count();
+        let count = (0..40 * 30).filter(|i| is_outside_lens(*i)).count();
         assert!(set.notes.contains(&"3 photographs were taken with a fisheye lens".to_owned()));
-        let said = format!(
+        let note = format!(
             "{} pixels of 2 photographs are more than 89° from the axis of a fisheye lens and are \
             masked",
-            2 * cut
+            2 * count
         );
-        assert!(set.notes.contains(&said), "{said}: {:?}", set.notes);
+        assert!(set.notes.contains(&note), "{note}: {:?}", set.notes);
     }
 
     #[test]
-    fn undone_fisheye_lenses_have_a_known_angle() {
+    fn undistorted_fisheye_lenses_report_their_field_of_view() {
         let dir = tempfile::tempdir().unwrap();
-        let set = fisheye_set(dir.path()).undistorted().unwrap();
-        let said = "3 fisheye photographs are resampled to pinhole cameras with a field of view of \
+        let set = write_fisheye_dataset(dir.path()).undistorted().unwrap();
+        let note = "3 fisheye photographs are resampled to pinhole cameras with a field of view of \
             91.3°×75.0° to 100.0°×83.6°; the rest is cropped";
-        assert_eq!(set.notes.last().unwrap(), said);
+        assert_eq!(set.notes.last().unwrap(), note);
         assert!(set.frames[0].mask().unwrap().is_none() && set.frames[1].is_masked());
     }
 }

@@ -143,18 +143,18 @@ mod tests {
     #[test]
     fn messages_name_the_kind_of_non_file() {
         let dir = tempfile::tempdir().unwrap();
-        let at = |name: &str| dir.path().join(name);
-        fs::write(at("file"), "").unwrap();
-        fs::create_dir(at("folder")).unwrap();
-        let _listening = UnixListener::bind(at("socket")).unwrap();
-        assert!(std::process::Command::new("mkfifo").arg(at("pipe")).status().unwrap().success());
-        symlink("/dev/zero", at("device")).unwrap();
-        symlink("loop", at("loop")).unwrap();
-        symlink("gone", at("dangling")).unwrap();
-        symlink("file", at("link")).unwrap();
-        let found = |name: &str| file_status(&at(name), "an image");
+        let path = |name: &str| dir.path().join(name);
+        fs::write(path("file"), "").unwrap();
+        fs::create_dir(path("folder")).unwrap();
+        let _listening = UnixListener::bind(path("socket")).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(path("pipe")).status().unwrap().success());
+        symlink("/dev/zero", path("device")).unwrap();
+        symlink("loop", path("loop")).unwrap();
+        symlink("gone", path("dangling")).unwrap();
+        symlink("file", path("link")).unwrap();
+        let found = |name: &str| file_status(&path(name), "an image");
         assert!(matches!((found("file"), found("link")), (FileStatus::File, FileStatus::File)));
-        for (name, words) in [
+        for (name, expected) in [
             ("folder", "folder is a folder, not an image"),
             ("pipe", "pipe is a named pipe (FIFO), not an image"),
             ("socket", "socket is a socket, not an image"),
@@ -171,21 +171,21 @@ mod tests {
                 panic!("{name}: {:?}", found(name))
             };
             let text = problem.to_string();
-            assert!(text.contains(words), "{text}");
+            assert!(text.contains(expected), "{text}");
         }
-        for (name, words) in
+        for (name, expected) in
             [("nothing", "nothing not found"), ("file/x.png", "file/x.png not found")]
         {
             let FileStatus::Missing(problem) = found(name) else {
                 panic!("{name}: {:?}", found(name))
             };
             let text = problem.to_string();
-            assert!(text.contains(words), "{text}");
+            assert!(text.contains(expected), "{text}");
         }
     }
 
     #[test]
-    fn paths_are_shown_on_one_line() {
+    fn paths_are_printed_on_one_line() {
         assert_eq!(path_text(Path::new("a\u{1b}[31m/b\n.png")), "a\\u{1b}[31m/b\\n.png");
         assert_eq!(path_text(Path::new(OsStr::from_bytes(b"a\xff\n.png"))), "a\\xFF\\n.png");
     }

@@ -89,8 +89,9 @@ mod tests {
 
     use super::*;
 
-    /// A new format doesn't compile here, and then needs its place in the list, too.
-    fn number(format: Format) -> usize {
+    /// Returns the index of a format in [`Format::ALL`]. The match doesn't compile until a
+    /// new format has an index.
+    fn index_of(format: Format) -> usize {
         match format {
             Format::Blender => 0,
             Format::Transforms => 1,
@@ -101,10 +102,10 @@ mod tests {
 
     #[test]
     fn formats_differ_and_are_all_listed() {
-        assert_eq!(Format::ALL.map(number), [0, 1, 2, 3]);
+        assert_eq!(Format::ALL.map(index_of), [0, 1, 2, 3]);
         let names: BTreeSet<String> = Format::ALL.iter().map(Format::to_string).collect();
         assert_eq!(names.len(), Format::ALL.len());
-        let words = expected_files();
-        assert!(Format::ALL.iter().all(|format| words.contains(format.description().sign)));
+        let message = expected_files();
+        assert!(Format::ALL.iter().all(|format| message.contains(format.description().sign)));
     }
 }

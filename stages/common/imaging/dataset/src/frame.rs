@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_as_short_as_can_be() {
+    fn names_are_as_short_as_possible() {
         for (paths, names) in [
             (&["images/a.jpg", "images/b.png"][..], &["a", "b"][..]),
             (&["left/a.jpg", "right/a.jpg"], &["left_a", "right_a"]),
@@ -212,7 +212,7 @@ mod tests {
         ] {
             assert_eq!(names_of(paths).unwrap(), names);
         }
-        for (paths, words) in [
+        for (paths, expected) in [
             (
                 &["x/a.jpg", "x/a.png"][..],
                 "frame 1 (x/a.png): view name \"x__a\" is already that of x/a.jpg; rename",
@@ -223,24 +223,25 @@ mod tests {
             ),
         ] {
             let message = names_of(paths).unwrap_err().to_string();
-            assert!(message.contains(words), "{message}");
+            assert!(message.contains(expected), "{message}");
         }
-        let odd =
+        let path =
             <std::ffi::OsStr as std::os::unix::ffi::OsStrExt>::from_bytes(b"images/\xff\xfe.png");
-        let message = unique_names("list".as_ref(), &[PathBuf::from(odd)]).unwrap_err().to_string();
+        let message =
+            unique_names("list".as_ref(), &[PathBuf::from(path)]).unwrap_err().to_string();
         assert_eq!(
             message,
             "list: frame 0 (images/\\xFF\\xFE.png): file name is not UTF-8; rename the file"
         );
     }
 
-    /// A point in front of an OpenCV camera is seen by ours at the same pixel.
+    /// The converted OpenCV camera projects a point to the same pixel.
     #[test]
-    fn axes_are_turned() {
+    fn opencv_axes_are_converted() {
         let rotation = DMat3::from_axis_angle(DVec3::new(0.3, -0.5, 0.8).normalize(), 1.1);
         let translation = DVec3::new(0.2, -0.4, 3.0);
         let point = DVec3::new(0.3, 0.1, -0.2);
-        let seen = rotation * point + translation;
+        let in_camera = rotation * point + translation;
         let intrinsics = scene::Intrinsics {
             width: 100,
             height: 80,
@@ -256,8 +257,8 @@ mod tests {
             camera_to_world: pose_from_world_to_camera(rotation, translation),
         };
         let (x, y, depth) = camera.project(point).unwrap();
-        assert!((x - (48.0 + 90.0 * seen.x / seen.z)).abs() < 1e-9);
-        assert!((y - (41.0 + 95.0 * seen.y / seen.z)).abs() < 1e-9);
-        assert!((depth - seen.z).abs() < 1e-9);
+        assert!((x - (48.0 + 90.0 * in_camera.x / in_camera.z)).abs() < 1e-9);
+        assert!((y - (41.0 + 95.0 * in_camera.y / in_camera.z)).abs() < 1e-9);
+        assert!((depth - in_camera.z).abs() < 1e-9);
     }
 }

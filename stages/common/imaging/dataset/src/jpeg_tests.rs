@@ -1,7 +1,8 @@
 use super::*;
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 
-/// Makes a noisy JPEG.
+/// Encodes a noisy image as JPEG: grey if `sampling` is `None`, without restart markers if
+/// `restart_interval` is 0.
 pub(crate) fn jpeg(
     (width, height): (u16, u16),
     sampling: Option<SamplingFactor>,
@@ -27,7 +28,7 @@ pub(crate) fn jpeg(
     bytes
 }
 
-/// Returns a JPEG that only the decoder reads: it takes a restart marker for a segment.
+/// Returns a JPEG that only the decoder reads: the decoder takes a restart marker for a segment.
 pub(crate) fn hidden_jpeg() -> Vec<u8> {
     let bytes = jpeg(SIZE, None, false, 0);
     let hidden = [&bytes[..2], b"\xff\xd7\0\x08\xff\xe0\xff\xff\0\0", &bytes[2..]].concat();
@@ -51,7 +52,7 @@ fn decoded(bytes: &[u8]) -> Option<Vec<u8>> {
     image::load_from_memory(bytes).ok().map(|image| image.into_rgb8().into_raw())
 }
 
-/// Rows are counted as the decoder shows them: those before the missing ones are whole.
+/// Rows above the counted missing ones are decoded as in the complete image.
 #[test]
 fn missing_rows_are_counted() {
     for sampling in SAMPLINGS {
@@ -60,65 +61,68 @@ fn missing_rows_are_counted() {
             let case = format!("{sampling:?}, restart {restart_interval}");
             assert_eq!(extent(&bytes), Extent::Whole, "{case}");
             assert_eq!(extent(&[&bytes, &b"\xff\xd8 more"[..]].concat()), Extent::Whole);
-            let whole = decoded(&bytes).unwrap();
-            let head = bytes.windows(2).position(|w| w == [0xff, SOS]).unwrap();
-            let mut most = ROWS;
-            for end in (head + 20..bytes.len()).step_by(13) {
+            let complete = decoded(&bytes).unwrap();
+            let scan = bytes.windows(2).position(|w| w == [0xff, SOS]).unwrap();
+            let mut previous = ROWS;
+            for end in (scan + 20..bytes.len()).step_by(13) {
                 let cut = &bytes[..end];
                 let zeros = [cut, &[0; 512]].concat();
-                let ended = [cut, &END_MARKER].concat();
+                let terminated = [cut, &END_MARKER].concat();
                 let (found, rows) = match extent(cut) {
-                    it @ Extent::Missing { rows, height: ROWS } => (it, rows),
+                    missing @ Extent::Missing { rows, height: ROWS } => (missing, rows),
                     Extent::Unterminated { end: found } if found == end => (Extent::Whole, 0),
                     other => panic!("{case}: {other:?} at {end}"),
                 };
-                assert!(rows <= most, "{case}: {rows} rows missing at {end}, {most} before");
-                most = rows;
-                assert_eq!(extent(&ended), found, "{case} at {end}");
+                assert!(
+                    rows <= previous,
+                    "{case}: {rows} rows missing at {end}, {previous} before"
+                );
+                previous = rows;
+                assert_eq!(extent(&terminated), found, "{case} at {end}");
                 if rows > 0 {
                     assert_eq!(extent(&zeros), found, "{case} at {end}");
                 }
-                // The row above the missing ones is blended with them. After a restart marker
-                // the decoder may give up earlier.
-                let same = 3 * usize::from(SIZE.0) * (ROWS - rows).saturating_sub(1) as usize;
-                if let Some(shown) = decoded(&ended) {
-                    let is_same = restart_interval > 0 || shown[..same] == whole[..same];
+                // The decoder blends the row above the missing ones with them. After a restart
+                // marker, the decoder may stop earlier.
+                let compared = 3 * usize::from(SIZE.0) * (ROWS - rows).saturating_sub(1) as usize;
+                if let Some(pixels) = decoded(&terminated) {
+                    let is_same =
+                        restart_interval > 0 || pixels[..compared] == complete[..compared];
                     assert!(is_same, "{case}: rows above the {rows} missing ones at {end}");
-                    assert!(rows > 0 || shown == whole, "{case}: no row is missing at {end}");
+                    assert!(rows > 0 || pixels == complete, "{case}: no row is missing at {end}");
                 }
             }
-            assert!(most < 20, "{case}: {most} rows missing near the end");
+            assert!(previous < 20, "{case}: {previous} rows missing near the end");
             let end = bytes.len() - END_MARKER.len();
             assert_eq!(extent(&bytes[..end]), Extent::Unterminated { end }, "{case}");
         }
     }
 }
 
-/// At a marker that the decoder doesn't know, it would give up the last blocks.
+/// At an unknown marker, the decoder would drop the last blocks.
 #[test]
 fn unknown_markers_end_the_image_data() {
     for sampling in SAMPLINGS {
         let bytes = jpeg(SIZE, sampling, false, 0);
-        let whole = decoded(&bytes).unwrap();
+        let complete = decoded(&bytes).unwrap();
         let end = bytes.len() - END_MARKER.len();
-        for (marker, filling) in [(&b"\xff\x46"[..], 0), (b"\xff\xe5", 0), (b"\xff\xff\xff\xf3", 2)]
-        {
+        for (marker, fill) in [(&b"\xff\x46"[..], 0), (b"\xff\xe5", 0), (b"\xff\xff\xff\xf3", 2)] {
             let tail = [marker, &b"\x00\x04ab"[..], &END_MARKER].concat();
-            let mut followed = [&bytes[..end], &tail].concat();
-            let found = extent(&followed);
-            assert_eq!(found, Extent::Unterminated { end: end + filling }, "{sampling:?}");
-            followed.truncate(end + filling);
-            followed.extend(END_MARKER);
-            assert!(decoded(&followed).unwrap() == whole, "{sampling:?} {marker:?}");
+            let mut extended = [&bytes[..end], &tail].concat();
+            let found = extent(&extended);
+            assert_eq!(found, Extent::Unterminated { end: end + fill }, "{sampling:?}");
+            extended.truncate(end + fill);
+            extended.extend(END_MARKER);
+            assert!(decoded(&extended).unwrap() == complete, "{sampling:?} {marker:?}");
         }
         let known = [&bytes[..end], b"\xff\xe1\x00\x04ab", &END_MARKER].concat();
         assert_eq!(extent(&known), Extent::Whole);
-        assert!(decoded(&known).unwrap() == whole, "{sampling:?}");
+        assert!(decoded(&known).unwrap() == complete, "{sampling:?}");
     }
 }
 
 #[test]
-fn a_progressive_jpeg_needs_its_end() {
+fn a_truncated_progressive_jpeg_is_coarse() {
     for sampling in SAMPLINGS {
         for restart_interval in [0, 4] {
             let bytes = jpeg(SIZE, sampling, true, restart_interval);
@@ -136,7 +140,7 @@ fn an_invalid_scan_header_is_damage() {
     for is_progressive in [false, true] {
         let bytes = jpeg(SIZE, Some(SamplingFactor::R_4_2_0), is_progressive, 0);
         let scan = bytes.windows(2).position(|w| w == [0xff, SOS]).unwrap();
-        // After marker, length and the number of components: the first component's number.
+        // The first component's number follows the marker, the length and the number of components.
         let mut unknown = bytes.clone();
         unknown[scan + 5] = 9;
         let expected = if is_progressive {
@@ -146,17 +150,17 @@ fn an_invalid_scan_header_is_damage() {
         };
         assert_eq!(extent(&unknown), expected);
         if is_progressive {
-            let mut band = bytes;
-            let components = usize::from(band[scan + 4]);
-            band[scan + 5 + 2 * components] = 34;
-            assert_eq!(extent(&band), expected);
+            let mut invalid_band = bytes;
+            let components = usize::from(invalid_band[scan + 4]);
+            invalid_band[scan + 5 + 2 * components] = 34;
+            assert_eq!(extent(&invalid_band), expected);
         }
     }
 }
 
-/// A lost piece is found even if restart markers let the decoder resume after it.
+/// The loss of a piece is found even if restart markers let the decoder resume after it.
 #[test]
-fn a_lost_piece_is_missing() {
+fn rows_of_a_lost_piece_are_missing() {
     let bytes = jpeg(SIZE, Some(SamplingFactor::R_4_4_4), false, 6);
     let marker = |n: u8| bytes.windows(2).position(|w| w == [0xff, 0xd0 + n]).unwrap();
     let (from, to) = (marker(2), marker(3));
@@ -168,13 +172,13 @@ fn a_lost_piece_is_missing() {
 fn any_bytes_have_an_extent() {
     for sampling in SAMPLINGS {
         let bytes = jpeg((20, 20), sampling, false, 2);
-        for at in 0..bytes.len() {
+        for offset in 0..bytes.len() {
             for value in [0, 1, 0x11, 0x7f, 0xff] {
                 let mut damaged = bytes.clone();
-                damaged[at] = value;
+                damaged[offset] = value;
                 extent(&damaged);
             }
-            extent(&bytes[at..]);
+            extent(&bytes[offset..]);
         }
     }
     assert_eq!(extent(b""), Extent::Unknown);

@@ -121,10 +121,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_of_no_form_is_told_them() {
+    fn an_unknown_folder_is_refused_with_the_known_formats() {
         let message = Dataset::read("/nowhere".as_ref()).unwrap_err().to_string();
-        let words = "/nowhere: no data set; expected transforms_train.json (Blender), ";
-        assert!(message.starts_with(words), "{message}");
+        let expected = "/nowhere: no data set; expected transforms_train.json (Blender), ";
+        assert!(message.starts_with(expected), "{message}");
         assert!(message.contains("sparse/0 (COLMAP)"), "{message}");
     }
 }

@@ -271,7 +271,7 @@ mod tests {
     use super::*;
     use crate::photograph::tests::write_png;
 
-    /// A camera at (1, 2, 3) with axes right = x, up = y, back = z.
+    /// Row of a camera at (1, 2, 3) with axes right = x, up = y, back = z.
     const ROW: [f64; NUMBERS] =
         [0., 1., 0., 1., 60., -1., 0., 0., 2., 80., 0., 0., 1., 3., 70., 1.5, 9.];
 
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn axes_and_sizes_are_turned_into_ours() {
+    fn axes_and_sizes_are_converted() {
         let dir = folder(&npy(&[ROW, ROW]), &[("images", 3), ("images_4", 2)]);
         let set = Dataset::read(dir.path()).unwrap();
         assert_eq!((set.format, set.frames.len()), (Format::Llff, 2));
@@ -329,15 +329,15 @@ mod tests {
         (set.frames[0].stored_intrinsics.distortion.radial[0], set.notes.join("; "))
     }
 
-    /// The file can't say what its poses' lens does to lines; the model that they come from can.
+    /// `poses_bounds.npy` has no lens distortion; the COLMAP model next to it has.
     #[test]
-    fn distortion_is_that_of_the_model_beside_them() {
+    fn distortion_is_that_of_the_colmap_model() {
         let dir = folder(&npy(&[ROW]), &[("images", 1)]);
         assert_eq!(distortion_and_notes(dir.path()).0, 0.0);
         std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
         let cameras =
             |text: &str| std::fs::write(dir.path().join("sparse/0/cameras.txt"), text).unwrap();
-        // Its images are twice as large.
+        // The model's images are twice as large.
         cameras("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n");
         assert_eq!(
             distortion_and_notes(dir.path()),
@@ -348,7 +348,7 @@ mod tests {
                     .into()
             )
         );
-        for (text, words) in [
+        for (text, expected) in [
             ("1 SIMPLE_RADIAL 160 120 150 80 60 0.02\n", "a different focal length"),
             ("1 SIMPLE_RADIAL 160 120 nothing\n", "distortion is unknown"),
             (
@@ -359,7 +359,7 @@ mod tests {
         ] {
             cameras(text);
             let (found, notes) = distortion_and_notes(dir.path());
-            assert!(found == 0.0 && notes.contains(words), "{text}: {found} {notes}");
+            assert!(found == 0.0 && notes.contains(expected), "{text}: {found} {notes}");
         }
     }
 
@@ -371,7 +371,7 @@ mod tests {
         bad_range[15] = 10.0;
         let mut bad_width = ROW;
         bad_width[9] = -3.0;
-        for (bytes, images, words) in [
+        for (bytes, images, expected) in [
             (npy(&[ROW, ROW]), 3, "2 poses for 3 images in images/; counts must match"),
             (npy(&[ROW, ROW])[..200].to_vec(), 2, "not a NumPy array"),
             (b"nothing of the kind".to_vec(), 2, "not a NumPy array"),
@@ -382,7 +382,10 @@ mod tests {
             let message = Dataset::read(folder(&bytes, &[("images", images)]).path())
                 .unwrap_err()
                 .to_string();
-            assert!(message.contains(words) && message.contains("poses_bounds.npy"), "{message}");
+            assert!(
+                message.contains(expected) && message.contains("poses_bounds.npy"),
+                "{message}"
+            );
         }
         let dir = folder(&npy(&[ROW, ROW]), &[("images", 1)]);
         std::fs::create_dir(dir.path().join("images/IMG_9.png")).unwrap();
@@ -392,14 +395,14 @@ mod tests {
                 && message.contains("IMG_9.png is a folder, not an image)"),
             "{message}"
         );
-        // A header that claims more than there is.
+        // A header that claims more rows than the file has.
         let mut claimed = npy(&[ROW]);
-        let place = claimed.windows(7).position(|w| w == b"(1, 17)").unwrap();
-        claimed[place + 1] = b'9';
+        let position = claimed.windows(7).position(|w| w == b"(1, 17)").unwrap();
+        claimed[position + 1] = b'9';
         let message =
             Dataset::read(folder(&claimed, &[("images", 9)]).path()).unwrap_err().to_string();
         assert!(message.contains("not a NumPy array"), "{message}");
-        // One nested so deep that reading it would take years, or all of the stack.
+        // A header nested so deeply that parsing it would take years, or all of the stack.
         for version in [1, 2] {
             let mut nested = b"\x93NUMPY".to_vec();
             nested.extend([version, 0]);
@@ -419,11 +422,11 @@ mod tests {
     }
 
     #[test]
-    fn any_bytes_are_an_error_and_no_panic() {
-        let whole = npy(&[ROW]);
-        for end in 0..whole.len() {
+    fn truncated_files_are_errors() {
+        let bytes = npy(&[ROW]);
+        for end in 0..bytes.len() {
             assert!(
-                Dataset::read(folder(&whole[..end], &[("images", 1)]).path()).is_err(),
+                Dataset::read(folder(&bytes[..end], &[("images", 1)]).path()).is_err(),
                 "{end}"
             );
         }

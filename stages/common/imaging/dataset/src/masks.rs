@@ -212,11 +212,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn masks_lie_beside_image_folders_in_any_case() {
-        for (parent, rest) in
+    fn the_images_folder_is_removed_in_any_case() {
+        for (parent, expected) in
             [("images/a", "a"), ("Images_4/a", "a"), ("IMAGES", ""), ("other/a", "other/a")]
         {
-            assert_eq!(without_images_folder(Path::new(parent)), Path::new(rest), "{parent}");
+            assert_eq!(without_images_folder(Path::new(parent)), Path::new(expected), "{parent}");
         }
     }
 }

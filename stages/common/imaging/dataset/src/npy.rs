@@ -137,11 +137,11 @@ mod tests {
                 assert_eq!(read_matrix(&bytes), matrix(data), "{version} {kind}");
             }
         }
-        // Column by column.
+        // Column-major order.
         let bytes = file(1, &padded_header("<f8", "True"), &little);
         assert_eq!(read_matrix(&bytes), matrix([1.5, 3.0, 5.0, 2.0, 4.0, -6.5]));
-        let old = r#"{"descr": "<f8", "fortran_order": False, "shape": (2L, 3L)}"#;
-        assert_eq!(read_matrix(&file(1, old, &little)), matrix(data));
+        let python_2 = r#"{"descr": "<f8", "fortran_order": False, "shape": (2L, 3L)}"#;
+        assert_eq!(read_matrix(&file(1, python_2, &little)), matrix(data));
     }
 
     fn header(kind: &str, shape: &str) -> String {
@@ -149,10 +149,10 @@ mod tests {
     }
 
     #[test]
-    fn other_files_are_refused_in_words() {
+    fn unsupported_files_are_refused_with_a_reason() {
         let data = [0; 48];
         let huge = format!("({0}, {0})", usize::MAX);
-        for (kind, shape, words) in [
+        for (kind, shape, expected) in [
             ("'<i8'", "(2, 3)", "element type is \"<i8\""),
             ("[('x', '<f8')]", "(2, 3)", "no descr"),
             ("'<f8'", "(2, 3, 1)", "unsupported shape [2, 3, 1]"),
@@ -164,45 +164,45 @@ mod tests {
         ] {
             let reason =
                 read_matrix(&file(1, &header(kind, shape), &data)).unwrap_err().to_string();
-            assert!(reason.contains(words), "{kind} {shape}: {reason}");
+            assert!(reason.contains(expected), "{kind} {shape}: {reason}");
         }
-        let whole = file(1, &header("'<f8'", "(2, 3)"), &data);
-        assert!(read_matrix(&whole).is_ok());
-        for end in 0..whole.len() {
-            assert!(read_matrix(&whole[..end]).is_err(), "{end} of {} bytes", whole.len());
+        let complete = file(1, &header("'<f8'", "(2, 3)"), &data);
+        assert!(read_matrix(&complete).is_ok());
+        for end in 0..complete.len() {
+            assert!(read_matrix(&complete[..end]).is_err(), "{end} of {} bytes", complete.len());
         }
     }
 
     /// Returns a file of version 2 whose header claims `length` bytes.
-    fn claiming(length: u32, header: &str, data: &[u8]) -> Vec<u8> {
+    fn file_claiming(length: u32, header: &str, data: &[u8]) -> Vec<u8> {
         [&b"\x93NUMPY\x02\0"[..], &length.to_le_bytes(), header.as_bytes(), data].concat()
     }
 
     #[track_caller]
-    fn assert_refused(bytes: &[u8], words: &str) {
+    fn assert_refused(bytes: &[u8], expected: &str) {
         let reason = read_matrix(bytes).unwrap_err().to_string();
-        assert!(reason.contains(words), "{reason}");
+        assert!(reason.contains(expected), "{reason}");
     }
 
     #[test]
-    fn headers_that_cannot_be_are_refused_in_words() {
+    fn invalid_headers_are_refused_with_a_reason() {
         let (good, data) = (header("'<f8'", "(2, 3)"), [0; 48]);
         for version in [0, 4, 255] {
             assert_refused(&file(version, &good, &data), "magic string or version is wrong");
         }
         // A header whose stated length exceeds the file: by one byte, and by the maximum.
-        let all = (good.len() + data.len()) as u32;
-        assert_refused(&claiming(all + 1, &good, &data), "magic string or version is wrong");
-        assert_refused(&claiming(u32::MAX, &good, &data), "magic string or version is wrong");
+        let rest = (good.len() + data.len()) as u32;
+        assert_refused(&file_claiming(rest + 1, &good, &data), "magic string or version is wrong");
+        assert_refused(&file_claiming(u32::MAX, &good, &data), "magic string or version is wrong");
         // A header of length 0, and one that includes a byte of the data, which isn't text.
-        assert_refused(&claiming(0, &good, &data), "no descr");
+        assert_refused(&file_claiming(0, &good, &data), "no descr");
         let numbers = [0xff; 48];
-        let mut reaching = file(1, &good, &numbers);
-        reaching[8] += 1;
-        assert_refused(&reaching, "magic string or version is wrong");
+        let mut overlapping = file(1, &good, &numbers);
+        overlapping[8] += 1;
+        assert_refused(&overlapping, "magic string or version is wrong");
         for order in ["", "Truth", "1", "'True'", "true", "None"] {
-            let odd = file(1, &padded_header("<f8", order), &data);
-            assert_refused(&odd, "no fortran_order that is True or False");
+            let invalid = file(1, &padded_header("<f8", order), &data);
+            assert_refused(&invalid, "no fortran_order that is True or False");
         }
         for (length, is_read) in [(MAX_HEADER_BYTES, true), (MAX_HEADER_BYTES + 1, false)] {
             let padded = good.clone() + &" ".repeat(length - good.len());
@@ -220,7 +220,7 @@ mod tests {
     /// The size in the header is compared with the data before memory is allocated.
     #[test]
     fn a_matrix_has_the_numbers_that_its_shape_claims() {
-        let most = usize::MAX;
+        let max = usize::MAX;
         for order in ["False", "True"] {
             for (shape, expected) in [
                 ("(6, 1)".to_owned(), Some([6, 1, 6])),
@@ -230,13 +230,13 @@ mod tests {
                 ("(7, 1)".to_owned(), None),
                 // A matrix without rows or columns has no numbers, whatever the other length is.
                 ("(0, 17)".to_owned(), Some([0, 17, 0])),
-                (format!("({most}, 0)"), Some([most, 0, 0])),
-                (format!("(0, {most})"), Some([0, most, 0])),
+                (format!("({max}, 0)"), Some([max, 0, 0])),
+                (format!("(0, {max})"), Some([0, max, 0])),
                 // The largest possible count, a count that overflows, and a length that isn't a
                 // usize.
-                (format!("({}, 17)", most / 17), None),
-                (format!("({}, 17)", most / 17 + 1), None),
-                (format!("({most}0, 17)"), None),
+                (format!("({}, 17)", max / 17), None),
+                (format!("({}, 17)", max / 17 + 1), None),
+                (format!("({max}0, 17)"), None),
             ] {
                 assert_eq!(sizes(order, &shape), expected, "{order} {shape}");
             }
@@ -245,11 +245,11 @@ mod tests {
 
     /// Every number is accepted here. Callers check values: `llff` refuses NaN, for example.
     #[test]
-    fn every_number_is_read_as_it_is() {
-        let odd = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -0.0, 5e-324, f64::MAX];
-        let data: Vec<u8> = odd.iter().flat_map(|v| v.to_le_bytes()).collect();
+    fn every_number_is_read_unchanged() {
+        let numbers = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -0.0, 5e-324, f64::MAX];
+        let data: Vec<u8> = numbers.iter().flat_map(|v| v.to_le_bytes()).collect();
         let read = read_matrix(&file(1, &header("'<f8'", "(2, 3)"), &data)).unwrap();
         let bits = |numbers: &[f64]| numbers.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
-        assert_eq!(bits(&read.numbers), bits(&odd));
+        assert_eq!(bits(&read.numbers), bits(&numbers));
     }
 }

@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_words_outside_strings_are_numbers() {
+    fn only_python_numbers_outside_strings_are_quoted() {
         let json = r#"{"NaN.png \" Infinity": [1, NaN, -Infinity, Infinity, "NaN é", -2.5e3]}"#;
         let text = quote_python_numbers(json).unwrap();
         assert_eq!(
@@ -89,8 +89,8 @@ mod tests {
         let numbers: Vec<Number> =
             serde_json::from_str(r#"[1, -1, "NaN", "-Infinity", "Infinity", 0.5]"#).unwrap();
         assert!(numbers[2].0.is_nan());
-        let others: Vec<f64> = [0, 1, 3, 4, 5].map(|i: usize| numbers[i].0).to_vec();
-        assert_eq!(others, [1.0, -1.0, f64::NEG_INFINITY, f64::INFINITY, 0.5]);
+        let without_nan: Vec<f64> = [0, 1, 3, 4, 5].map(|i: usize| numbers[i].0).to_vec();
+        assert_eq!(without_nan, [1.0, -1.0, f64::NEG_INFINITY, f64::INFINITY, 0.5]);
         assert!(
             serde_json::from_str::<Number>(r#""ten""#)
                 .unwrap_err()

@@ -51,12 +51,12 @@ fn is_utf16(bytes: &[u8]) -> bool {
 mod tests {
     use super::*;
 
-    fn utf16(text: &str, bytes_of: fn(u16) -> [u8; 2]) -> Vec<u8> {
-        text.encode_utf16().flat_map(bytes_of).collect()
+    fn utf16(text: &str, to_bytes: fn(u16) -> [u8; 2]) -> Vec<u8> {
+        text.encode_utf16().flat_map(to_bytes).collect()
     }
 
     #[test]
-    fn marks_are_no_text_and_other_encodings_are_named() {
+    fn byte_order_marks_are_removed_and_other_encodings_are_named() {
         assert_eq!(decode(b"\xef\xbb\xbf{}".to_vec()).unwrap(), "{}");
         assert_eq!(decode("Bäume\r\n".into()).unwrap(), "Bäume\r\n");
         assert_eq!(decode(Vec::new()).unwrap(), "");
@@ -68,11 +68,11 @@ mod tests {
                 );
             }
         }
-        let latin = b"# list\n1 2 B\xe4ume.png \xff\n".to_vec();
-        let reason = decode(latin).unwrap_err().to_string();
+        let latin1 = b"# list\n1 2 B\xe4ume.png \xff\n".to_vec();
+        let message = decode(latin1).unwrap_err().to_string();
         assert!(
-            reason.starts_with(r"line 2: B\xe4ume.png is not UTF-8; save the file as UTF-8"),
-            "{reason}"
+            message.starts_with(r"line 2: B\xe4ume.png is not UTF-8; save the file as UTF-8"),
+            "{message}"
         );
     }
 }

@@ -144,7 +144,8 @@ mod tests {
 
     const POSE: &str = r#""transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]"#;
 
-    fn set(json: &str) -> Result<Dataset, DatasetError> {
+    /// Reads a data set with the given `transforms.json` and two images.
+    fn read(json: &str) -> Result<Dataset, DatasetError> {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("transforms.json"), json).unwrap();
         std::fs::create_dir(dir.path().join("images")).unwrap();
@@ -154,6 +155,8 @@ mod tests {
         Dataset::read(dir.path())
     }
 
+    /// Returns three frames with shared keys `head` and the first frame's keys `first`. The third
+    /// frame's image doesn't exist.
     fn frames(head: &str, first: &str) -> String {
         format!(
             r#"{{{head}, "frames": [{{"file_path": "images/a.png", {first} {POSE}}},
@@ -163,14 +166,14 @@ mod tests {
     }
 
     #[test]
-    fn what_a_frame_says_goes_before_what_holds_for_all() {
+    fn a_frames_intrinsics_override_the_shared_ones() {
         let head = r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1,
             "p2": 0.01, "camera_model": "OPENCV""#;
-        let set = set(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
-        let of = |i: usize| set.frames[i].stored_intrinsics;
+        let set = read(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
+        let [first, second] = [0, 1].map(|i| set.frames[i].stored_intrinsics);
         let distortion = Distortion::brown([0.0; 3], [0.0, 0.01]);
         assert_eq!(
-            of(0),
+            first,
             Intrinsics {
                 width: 40,
                 height: 30,
@@ -181,9 +184,9 @@ mod tests {
                 distortion
             }
         );
-        assert_eq!(of(1).fx, 50.0);
-        assert_eq!((of(0).distortion.radial[0], of(1).distortion.radial[0]), (0.0, 0.1));
-        assert_eq!(of(1).distortion.tangential, [0.0, 0.01]);
+        assert_eq!(second.fx, 50.0);
+        assert_eq!((first.distortion.radial[0], second.distortion.radial[0]), (0.0, 0.1));
+        assert_eq!(second.distortion.tangential, [0.0, 0.01]);
         assert_eq!(set.frames.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
         assert!(
             set.notes
@@ -194,11 +197,11 @@ mod tests {
         );
     }
 
-    /// Numbers for the original hold for a smaller copy of it.
+    /// Intrinsics of the original image are scaled to its smaller copy.
     #[test]
-    fn smaller_copies_keep_their_angle() {
+    fn smaller_copies_keep_the_angle_of_view() {
         let set =
-            set(&frames(r#""fl_x": 200, "cx": 80, "cy": 60, "w": 160, "h": 120"#, "")).unwrap();
+            read(&frames(r#""fl_x": 200, "cx": 80, "cy": 60, "w": 160, "h": 120"#, "")).unwrap();
         assert_eq!(
             set.frames[0].stored_intrinsics,
             Intrinsics {
@@ -214,23 +217,23 @@ mod tests {
     }
 
     #[test]
-    fn a_split_of_its_own_is_kept() {
+    fn a_given_split_is_read() {
         let head = r#""fl_x": 50, "train_filenames": ["images/b.png"],
             "test_filenames": ["./images/a.png"]"#;
         assert_eq!(
-            set(&frames(head, "")).unwrap().split,
+            read(&frames(head, "")).unwrap().split,
             Some(Split { train: vec![1], test: vec![0] })
         );
-        assert_eq!(set(&frames(r#""fl_x": 50"#, "")).unwrap().split, None);
+        assert_eq!(read(&frames(r#""fl_x": 50"#, "")).unwrap().split, None);
     }
 
     fn lens(head: &str) -> Distortion {
-        set(&frames(&format!(r#""fl_x": 50, {head}"#), "")).unwrap().frames[0]
+        read(&frames(&format!(r#""fl_x": 50, {head}"#), "")).unwrap().frames[0]
             .stored_intrinsics
             .distortion
     }
 
-    /// A letter names different coefficients in different models.
+    /// A key such as `k4` has different meanings in different camera models.
     #[test]
     fn coefficients_belong_to_their_model() {
         let all = r#""k1": 0.1, "k2": -0.02, "k3": 0.003, "k4": -0.0004, "p1": 0.01, "p2": 0.002"#;
@@ -261,7 +264,7 @@ mod tests {
 
     #[test]
     fn mistakes_are_named() {
-        for (head, first, words) in [
+        for (head, first, expected) in [
             (r#""w": 40"#, "", "no focal length"),
             (r#""fl_x": -5"#, "", "fx is -5"),
             (r#""fl_x": 50, "camera_model": "EQUIRECTANGULAR""#, "", "\"EQUIRECTANGULAR\" is not"),
@@ -274,15 +277,15 @@ mod tests {
             (r#""fl_x": 50"#, r#""mask_path": "../a.png","#, "not a path inside"),
             (r#""camera_angle_x": 7"#, "", "between 0 and π"),
         ] {
-            let message = set(&frames(head, first)).unwrap_err().to_string();
+            let message = read(&frames(head, first)).unwrap_err().to_string();
             assert!(
-                message.contains(words) && message.contains("frame 0 (images/a.png)"),
+                message.contains(expected) && message.contains("frame 0 (images/a.png)"),
                 "{message}"
             );
         }
-        let nothing = r#"{"fl_x": 50, "frames": [{"file_path": "x.png", "transform_matrix": []}]}"#;
+        let missing = r#"{"fl_x": 50, "frames": [{"file_path": "x.png", "transform_matrix": []}]}"#;
         assert!(
-            set(nothing)
+            read(missing)
                 .unwrap_err()
                 .to_string()
                 .contains("none of the 1 images exists (first missing: x.png)")

@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn formats_are_told_by_content_and_by_name() {
+    fn formats_are_recognised_by_content_and_by_name() {
         let dir = tempfile::tempdir().unwrap();
         for (name, bytes, format) in [
             ("a.png", &b"RIFF\x10\0\0\0WEBPVP8 "[..], "WebP"),
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn commands_are_quoted() {
+    fn paths_in_commands_are_quoted() {
         assert_eq!(
             HEIC.command([Path::new("/data/Tom's set/IMG 1.HEIC")].into_iter()),
             r"magick mogrify -format jpg -quality 98 '/data/Tom'\''s set'/*.HEIC"

@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_of_masks_are_told_from_others() {
+    fn names_of_masks_are_recognised() {
         for name in ["masks", "Mask", "a_mask", "a.mask", "mask001", "dynamic_mask_a", "masks_4"] {
             assert!(looks_like_mask(name), "{name}");
         }

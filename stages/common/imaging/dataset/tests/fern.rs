@@ -1,4 +1,4 @@
-//! A real LLFF scene.
+//! Reads a real LLFF scene.
 
 use std::path::{Path, PathBuf};
 
@@ -22,7 +22,7 @@ fn fern_is_read() {
     let k = frame.stored_intrinsics;
     assert_eq!((k.width, k.height, k.cx, k.cy), (4032, 3024, 2016.0, 1512.0));
     assert!((k.fx - 3260.5).abs() < 1.0, "{}", k.fx);
-    // All look the same way, from near each other, at what is some focal lengths of a scene away.
+    // All cameras face about the same direction, and are closer together than the near bound.
     let first = frame.camera();
     for frame in &set.frames {
         let camera = frame.camera();
@@ -36,6 +36,6 @@ fn fern_is_read() {
     }
     let image = frame.photograph().unwrap();
     assert_eq!((image.width, image.height), (4032, 3024));
-    // COLMAP's model says what poses_bounds.npy can't.
+    // Lens distortion is in COLMAP's model; poses_bounds.npy has none.
     assert!((k.distortion.radial[0] - 0.01975).abs() < 1e-5, "{:?}", k.distortion);
 }

@@ -49,19 +49,19 @@ pub fn palette_colour(palette: Palette, value: f32) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn linear_light_comes_back() {
+    fn srgb_levels_survive_a_round_trip() {
         for level in 0..=255 {
             let encoded = f64::from(level) / 255.0;
-            let back = super::srgb_from_linear(super::linear_from_srgb(encoded));
-            assert!((back - encoded).abs() < 1e-6, "{encoded} comes back as {back}");
+            let reencoded = super::srgb_from_linear(super::linear_from_srgb(encoded));
+            assert!((reencoded - encoded).abs() < 1e-6, "{encoded} becomes {reencoded}");
         }
     }
 
     #[test]
-    fn ends_and_middle() {
+    fn black_white_and_middle_grey_are_encoded() {
         assert_eq!(super::srgb_from_linear(0.0), 0.0);
         assert!((super::srgb_from_linear(1.0) - 1.0).abs() < 1e-12);
-        // 18 % grey is displayed at 46.1 %.
+        // 18 % grey is encoded as 46.1 %.
         assert!((super::srgb_from_linear(0.18) - 0.4613).abs() < 1e-4);
     }
 }

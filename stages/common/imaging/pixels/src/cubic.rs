@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pixels_are_met_and_lines_are_kept() {
+    fn interpolation_reproduces_pixels_and_linear_ramps() {
         let image = Image::new(
             8,
             6,

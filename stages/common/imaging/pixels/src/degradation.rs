@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn means_of_blocks() {
+    fn average_pool_returns_block_means() {
         let mut data = vec![0; 4 * 2 * 4];
         data[..4].copy_from_slice(&[255, 0, 0, 255]);
         data[16..20].copy_from_slice(&[255, 0, 255, 0]);

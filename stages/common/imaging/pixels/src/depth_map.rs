@@ -86,37 +86,37 @@ mod tests {
     fn an_image_needs_both_channels() {
         let channel = |name: &str, value: f32| (name.to_owned(), vec![value; 2]);
         let image = |channels| ExrImage { width: 2, height: 1, channels };
-        let whole = image(vec![channel("A", 0.5), channel("Z", 3.0)]);
-        let map = DepthMap::of(&whole).unwrap();
+        let complete = image(vec![channel("A", 0.5), channel("Z", 3.0)]);
+        let map = DepthMap::of(&complete).unwrap();
         assert_eq!((map.depth, map.opacity), (&[3.0; 2][..], &[0.5; 2][..]));
         assert!(DepthMap::of(&image(vec![channel("A", 0.5)])).is_none());
         assert!(DepthMap::of(&image(vec![channel("Z", 3.0)])).is_none());
     }
 
     #[test]
-    fn surfaces_alone_make_the_range() {
+    fn only_surfaces_determine_the_range() {
         let map = DepthMap { depth: &[9.0, 2.0, 3.0, 1.0], opacity: &[0.49, 0.5, 1.0, 0.0] };
         assert_eq!([0, 1, 2, 3].map(|pixel| map.has_surface(pixel)), [false, true, true, false]);
-        assert_eq!(map.range(), Some((2.0, 2.0)), "the farthest hundredth of two is left out");
+        assert_eq!(map.range(), Some((2.0, 2.0)), "quantiles are rounded down");
         assert_eq!(DepthMap { opacity: &[0.2; 4], ..map }.range(), None);
     }
 
-    /// One image spans little, the other much: alone the first is even in depth, the second in
-    /// disparity.
+    /// With separate ranges, the first image is linear in depth, and the second, with its larger
+    /// range, in disparity. Pixel 50 of the first and pixel 2 of the second have the same depth.
     #[test]
     fn a_depth_has_one_colour_in_all_images() {
         let depths = |step: f32| (0..=100).map(|i| 2.0 + step * i as f32).collect::<Vec<f32>>();
-        let (close, deep, opaque) = (depths(0.02), depths(0.5), [1.0; 101]);
-        let maps = [&close, &deep].map(|depth| DepthMap { depth, opacity: &opaque });
+        let (narrow, wide, opaque) = (depths(0.02), depths(0.5), [1.0; 101]);
+        let maps = [&narrow, &wide].map(|depth| DepthMap { depth, opacity: &opaque });
         let ranges = maps.map(|map| map.range().unwrap());
-        let drawn = |i: usize, range| maps[i].draw(101, range);
-        let at_three = |image: &Rgba8, i: usize| image.data[4 * i..4 * i + 4].to_vec();
+        let draw = |i: usize, range| maps[i].draw(101, range);
+        let colour = |image: &Rgba8, i: usize| image.data[4 * i..4 * i + 4].to_vec();
         let range = common_range(ranges).unwrap();
-        assert_eq!(at_three(&drawn(0, range), 50), at_three(&drawn(1, range), 2));
+        assert_eq!(colour(&draw(0, range), 50), colour(&draw(1, range), 2));
         assert_ne!(
-            at_three(&drawn(0, ranges[0]), 50),
-            at_three(&drawn(1, ranges[1]), 2),
-            "each by itself"
+            colour(&draw(0, ranges[0]), 50),
+            colour(&draw(1, ranges[1]), 2),
+            "separate ranges"
         );
         assert_eq!(common_range([]), None);
     }

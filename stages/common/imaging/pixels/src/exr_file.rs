@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_back() {
+    fn written_images_are_read_back() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.exr");
         for (width, height) in [(1, 1), (5, 40), (33, 16)] {
@@ -359,7 +359,7 @@ mod tests {
         }
     }
 
-    /// A header of a few bytes doesn't make the reader allocate gigabytes.
+    /// The header declares 60 million rows, for which the reader must not allocate memory.
     #[test]
     fn a_file_without_its_offset_table_is_refused() {
         let dir = tempfile::tempdir().unwrap();
@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn forty_writes_give_one_file() {
+    fn repeated_writes_give_equal_files() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.exr");
         let hashes: std::collections::BTreeSet<_> = (0..40)
@@ -406,7 +406,7 @@ mod tests {
     }
 
     #[test]
-    fn a_nan_that_is_read_is_named() {
+    fn nonfinite_samples_are_named_when_read() {
         let path = Path::new("a.exr");
         let image = |value: f32| ExrImage {
             width: 3,
@@ -416,10 +416,9 @@ mod tests {
                 ("Z".to_owned(), vec![1.0, 1.0, 1.0, 1.0, 1.0, value]),
             ],
         };
-        for (value, words) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf"), (-f32::INFINITY, "-inf")]
-        {
+        for (value, text) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf"), (-f32::INFINITY, "-inf")] {
             let message = image(value).with_finite(&DEPTH_CHANNELS, path).unwrap_err().to_string();
-            let expected = format!("a.exr: channel Z is {words} at column 2, row 1; export");
+            let expected = format!("a.exr: channel Z is {text} at column 2, row 1; export");
             assert!(message.starts_with(&expected), "{message}");
             // Channel Z isn't checked if only colour channels are read.
             assert!(image(value).with_finite(&COLOUR_CHANNELS, path).is_ok());
@@ -427,14 +426,14 @@ mod tests {
     }
 
     #[test]
-    fn a_file_cut_anywhere_is_an_error() {
+    fn truncated_files_are_refused() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.exr");
         write(&path, 20, 20);
-        let whole = std::fs::read(&path).unwrap();
-        for end in (0..whole.len()).step_by(37) {
-            std::fs::write(&path, &whole[..end]).unwrap();
-            assert!(read_exr(&path).is_err(), "{end} of {} bytes", whole.len());
+        let bytes = std::fs::read(&path).unwrap();
+        for end in (0..bytes.len()).step_by(37) {
+            std::fs::write(&path, &bytes[..end]).unwrap();
+            assert!(read_exr(&path).is_err(), "{end} of {} bytes", bytes.len());
         }
     }
 }

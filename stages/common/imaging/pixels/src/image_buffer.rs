@@ -141,7 +141,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pixels_become_what_the_library_makes_of_them() {
+    fn conversions_equal_those_of_the_image_crate() {
         let bytes = |channels: usize| (0..5 * 3 * channels).map(|i| (i * 37 % 256) as u8).collect();
         let images = [
             DynamicImage::ImageRgb8(image::RgbImage::from_raw(5, 3, bytes(3)).unwrap()),

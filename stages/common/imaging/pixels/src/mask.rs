@@ -128,21 +128,21 @@ mod tests {
         assert_eq!(mask(4, &["#..#"]).counted_fraction(), 0.5);
     }
 
-    /// A resized mask leaves out each new pixel that overlaps one that doesn't count, and no other.
+    /// A new pixel counts if and only if all old pixels under it and its margin count.
     #[test]
-    fn resized_masks_are_careful() {
-        let whole = mask(6, &["######", "#####.", "######", "######"]);
-        assert_eq!(whole.resized((3, 2), 0), mask(3, &["##.", "###"]));
-        assert_eq!(whole.resized((3, 2), 1), mask(3, &["#..", "#.."]));
-        assert_eq!(whole.resized((6, 4), 0), whole);
-        // Each of the four columns covers one and a half old ones: only the last overlaps column 5.
-        assert_eq!(whole.resized((4, 4), 0), mask(4, &["####", "###.", "####", "####"]));
-        assert_eq!(whole.resized((4, 1), 0), mask(4, &["###."]));
-        assert_eq!(whole.resized((12, 8), 0).counted_fraction(), 23.0 / 24.0);
+    fn resized_masks_exclude_partly_masked_pixels() {
+        let original = mask(6, &["######", "#####.", "######", "######"]);
+        assert_eq!(original.resized((3, 2), 0), mask(3, &["##.", "###"]));
+        assert_eq!(original.resized((3, 2), 1), mask(3, &["#..", "#.."]));
+        assert_eq!(original.resized((6, 4), 0), original);
+        // Each of the four columns covers 1.5 old columns: only the last overlaps column 5.
+        assert_eq!(original.resized((4, 4), 0), mask(4, &["####", "###.", "####", "####"]));
+        assert_eq!(original.resized((4, 1), 0), mask(4, &["###."]));
+        assert_eq!(original.resized((12, 8), 0).counted_fraction(), 23.0 / 24.0);
     }
 
     #[test]
-    fn what_does_not_count_is_filled() {
+    fn masked_pixels_are_filled() {
         let mut image = Image::new(2, 1, 3, vec![0.1; 6]);
         mask(2, &["#."]).fill(&mut image, &Image::new(2, 1, 4, vec![0.7; 8]));
         assert_eq!(image.data, [0.1, 0.1, 0.1, 0.7, 0.7, 0.7]);

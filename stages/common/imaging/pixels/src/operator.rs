@@ -240,8 +240,8 @@ mod tests {
         Image::new(width, height, 3, data.collect())
     }
 
-    /// K·(s·Pᵀ) is the identity but for the ridge, for every filter that blurs no more than it
-    /// must; and a flat residual asks the same of all inputs.
+    /// K·(s·Pᵀ) is the identity except for the ridge, for every filter that blurs no more than
+    /// necessary. A flat residual changes all inputs equally.
     #[test]
     fn inverse_undoes_the_map() {
         for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
@@ -287,9 +287,9 @@ mod tests {
         }
     }
 
-    /// The operator is what made the LR images: only Pillow's rounding lies between.
+    /// The operator agrees with Pillow, which makes the LR images, except for Pillow's rounding.
     #[test]
-    fn agrees_with_the_bytes_that_pillow_makes() {
+    fn operator_agrees_with_pillow() {
         for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
             for (width, height) in [(20, 15), (27, 11), (13, 30), (40, 45)] {
                 let mut image = image(40, 30, 7).to_rgba8();

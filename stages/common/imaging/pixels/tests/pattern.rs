@@ -1,6 +1,6 @@
-//! The byte pattern of scripts/goldens/images.py, repeated.
+//! Byte pattern, equal to that of scripts/goldens/images.py.
 
-/// Flat areas, edges, noise, and alpha of every kind; `channels` interleaved.
+/// Returns noise, checkerboards and gradients, with alpha of every kind; `channels` interleaved.
 pub fn pattern(width: usize, height: usize, channels: usize, seed: u32) -> Vec<u8> {
     let mut state = seed;
     let mut out = Vec::with_capacity(width * height * channels);

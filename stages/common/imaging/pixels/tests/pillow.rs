@@ -1,5 +1,5 @@
-//! Every sample of our resampling equals pinned Pillow's: odd sizes, one axis alone, enlarging,
-//! transparent edges.
+//! Comparison of our resampling with pinned Pillow's, sample by sample: odd sizes, one axis alone,
+//! enlarging, transparent edges.
 
 #![allow(missing_docs, reason = "a test")]
 #[allow(unreachable_pub, reason = "shared with eval's tests")]

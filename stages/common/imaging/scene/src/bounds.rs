@@ -121,9 +121,9 @@ mod tests {
 
     /// Returns bounds of each space around a point; all lengths are multiplied by `scale`.
     fn spaces(middle: DVec3, scale: f64) -> [Bounds; 3] {
-        let turn = DMat3::from_rotation_y(0.3);
+        let rotation = DMat3::from_rotation_y(0.3);
         let frustum = Frustum {
-            camera_to_world: pose_of(turn, middle),
+            camera_to_world: pose_of(rotation, middle),
             min: [-0.71, -0.43],
             max: [0.83, 0.52],
             near: 0.9 * scale,
@@ -139,13 +139,13 @@ mod tests {
         })
     }
 
-    /// Rounds a vector to few binary digits.
-    fn short(v: DVec3) -> DVec3 {
+    /// Rounds a vector to multiples of 1/1024, whose sums are exact.
+    fn rounded_to_1024ths(v: DVec3) -> DVec3 {
         (1024.0 * v).round() / 1024.0
     }
 
     proptest! {
-        /// Rounding removes errors of the last digits, which depend on the scene's position. The
+        /// Rounding removes errors in the last digits, which depend on the scene's position. The
         /// rounded bounds move and scale with the scene.
         #[test]
         fn rounding_removes_rounding_errors(
@@ -153,17 +153,17 @@ mod tests {
             shift in prop::array::uniform3(-1e5..1e5f64),
             exponent in -40..40i32,
         ) {
-            let (anchor, shift) = (short(anchor.into()), short(shift.into()));
+            let [anchor, shift] = [anchor, shift].map(|v| rounded_to_1024ths(v.into()));
             let scale = f64::from(exponent).exp2();
             let middle = DVec3::new(0.1234, -0.377, 0.731);
             for (bounds, scaled) in spaces(middle, 1.0).into_iter().zip(spaces(scale * middle, scale)) {
                 let rounded = bounds.rounded(anchor);
                 prop_assert!(rounded != bounds && rounded.is_valid());
                 prop_assert!((rounded.middle() - middle).length() < 1e-6);
-                let off = bounds.moved(DVec3::splat(2e-15)).rounded(anchor);
-                prop_assert_eq!(off, rounded);
-                let there = bounds.moved(shift).rounded(anchor + shift);
-                prop_assert_eq!(there, rounded.moved(shift));
+                let perturbed = bounds.moved(DVec3::splat(2e-15)).rounded(anchor);
+                prop_assert_eq!(perturbed, rounded);
+                let moved = bounds.moved(shift).rounded(anchor + shift);
+                prop_assert_eq!(moved, rounded.moved(shift));
                 let scaled = scaled.rounded(scale * anchor);
                 prop_assert_eq!(scaled.min, rounded.min.map(|x| scale * x));
                 prop_assert_eq!([scaled.near, scaled.far], [rounded.near, rounded.far].map(|x| scale * x));
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn thin_bounds_stay() {
+    fn bounds_too_thin_for_rounding_stay_unchanged() {
         let thin = Bounds { near: 1.0, far: 1.0 + 1e-9, ..spaces(DVec3::ZERO, 1.0)[0] };
         assert_eq!(thin.rounded(DVec3::ZERO), thin);
         let tiny = spaces(DVec3::ZERO, 1e-300)[0];

@@ -285,25 +285,25 @@ mod tests {
         }
     }
 
-    fn unit() -> impl Strategy<Value = f64> {
+    fn coordinate() -> impl Strategy<Value = f64> {
         -1.0..1.0f64
     }
 
     #[test]
-    fn what_a_distortion_would_fold_into_the_image_is_not_seen() {
+    fn points_that_distortion_folds_into_the_image_are_not_projected() {
         let mut camera = camera(DVec3::Z, 0.0, DVec3::ZERO);
         camera.intrinsics.distortion.radial[0] = -0.4;
         camera.check().unwrap();
-        // Out to a slope of 0.91 places move outwards; 1.6 would be seen near the centre, from the
-        // other side.
-        let at = |slope: f64| camera.project(DVec3::new(slope, 0.0, -1.0));
-        assert!(at(0.4).is_some());
+        // Image positions move outwards up to a slope of 0.91; a slope of 1.6 would fold back to
+        // near the centre.
+        let project = |slope: f64| camera.project(DVec3::new(slope, 0.0, -1.0));
+        assert!(project(0.4).is_some());
         let folded = camera.intrinsics.distort([18.0 + 40.0 * 1.6, 12.5]);
         assert!((0.0..37.0).contains(&folded[0]), "{folded:?}");
-        assert_eq!(at(1.6), None);
+        assert_eq!(project(1.6), None);
     }
 
-    fn mild() -> impl Strategy<Value = Distortion> {
+    fn mild_distortion() -> impl Strategy<Value = Distortion> {
         let radial = (-0.2..0.2f64, -0.05..0.05f64, -0.02..0.02f64);
         (radial, -0.01..0.01f64, -0.01..0.01f64)
             .prop_map(|((k1, k2, k3), p1, p2)| Distortion::brown([k1, k2, k3], [p1, p2]))
@@ -314,9 +314,9 @@ mod tests {
             .prop_map(|(k1, k2)| Distortion::fisheye([k1, k2, 0.0, 0.0]))
     }
 
-    /// Rays of a fisheye end 89° from its axis, with positive depth, and nothing beyond is seen.
+    /// A fisheye camera's rays end 89° from its axis, and points beyond are not projected.
     #[test]
-    fn a_fisheye_sees_up_to_89_degrees() {
+    fn a_fisheye_covers_89_degrees_from_its_axis() {
         let mut camera = camera(DVec3::Y, 0.4, DVec3::ONE);
         camera.intrinsics.distortion = Distortion::fisheye([-0.02, 0.006, -0.003, 0.0005]);
         (camera.intrinsics.fx, camera.intrinsics.fy) = (10.0, 10.0);
@@ -325,21 +325,21 @@ mod tests {
         let angle = corner.direction.dot(camera.forward()).acos().to_degrees();
         assert!((angle - 89.0).abs() < 1e-9, "{angle}");
         let r = camera.rotation();
-        let seen = |degrees: f64| {
+        let project = |degrees: f64| {
             let (sin, cos) = degrees.to_radians().sin_cos();
             camera.project(camera.centre() + r * DVec3::new(sin, 0.0, -cos))
         };
-        assert!(seen(88.9).is_some());
-        assert_eq!([seen(89.1), seen(90.1), seen(180.0)], [None; 3]);
+        assert!(project(88.9).is_some());
+        assert_eq!([project(89.1), project(90.1), project(180.0)], [None; 3]);
     }
 
     proptest! {
         #[test]
         fn projecting_a_ray_gives_its_pixel_back(
-            a in (unit(), unit(), 0.1..1.0f64), angle in -3.0..3.0f64,
-            c in (unit(), unit(), unit()),
+            a in (coordinate(), coordinate(), 0.1..1.0f64), angle in -3.0..3.0f64,
+            c in (coordinate(), coordinate(), coordinate()),
             x in 0.0..37.0f64, y in 0.0..23.0f64, t in 0.1..100.0f64,
-            distortion in prop_oneof![Just(Distortion::default()), mild(), fisheye()],
+            distortion in prop_oneof![Just(Distortion::default()), mild_distortion(), fisheye()],
         ) {
             let mut camera = camera(DVec3::from(a), angle, DVec3::from(c) * 5.0);
             camera.intrinsics.distortion = distortion;
@@ -352,8 +352,8 @@ mod tests {
             prop_assert!(camera.project(ray.at(-t)).is_none());
         }
 
-        /// A half-pixel shift would show here: the s×s pixels of an HR image have their mean at the
-        /// LR pixel's centre.
+        /// Corners of LR pixels keep their rays, and s×s HR pixels have their mean at the LR
+        /// pixel's centre: a half-pixel shift would fail.
         #[test]
         fn resizing_keeps_pixel_footprints(i in 0u32..37, j in 0u32..23, s in 1u32..6) {
             let lr = camera(DVec3::Z, 0.3, DVec3::ONE);
@@ -374,15 +374,15 @@ mod tests {
         let good = camera(DVec3::Y, 0.5, DVec3::ZERO);
         let mut bad = good.clone();
         bad.camera_to_world[1][2] = f64::NAN;
-        let refused = |camera: &Camera, words: &str| {
+        let assert_refused = |camera: &Camera, reason: &str| {
             let message = camera.check().unwrap_err().to_string();
-            assert!(message.contains(words), "{message}");
+            assert!(message.contains(reason), "{message}");
         };
-        refused(&bad, "camera_to_world[1][2] is NaN; poses must be finite");
+        assert_refused(&bad, "camera_to_world[1][2] is NaN; poses must be finite");
         let mut bad = good.clone();
         bad.intrinsics.fx = 0.0;
-        refused(&bad, "fx is 0; focal lengths must be above 0");
-        for (fx, cy, words) in [
+        assert_refused(&bad, "fx is 0; focal lengths must be above 0");
+        for (fx, cy, reason) in [
             (
                 1e300,
                 12.5,
@@ -399,22 +399,22 @@ mod tests {
             let mut bad = good.clone();
             (bad.intrinsics.fx, bad.intrinsics.cy) = (fx, cy);
             let message = bad.check().unwrap_err().to_string();
-            assert!(message.starts_with(words), "{message}");
+            assert!(message.starts_with(reason), "{message}");
         }
         let mut bad = good.clone();
         bad.camera_to_world[0][0] *= 1.1;
         bad.camera_to_world[0][1] += 0.2;
-        refused(&bad, "camera_to_world is not a rigid motion");
+        assert_refused(&bad, "camera_to_world is not a rigid motion");
         let mut bad = good.clone();
         bad.camera_to_world.iter_mut().for_each(|row| row[1] = -row[1]);
-        refused(&bad, "camera_to_world is a reflection (its determinant is -1.000)");
+        assert_refused(&bad, "camera_to_world is a reflection (its determinant is -1.000)");
         let mut bad = good.clone();
         bad.camera_to_world[0][3] = 1e30;
-        refused(&bad, "centre (1e30, 0e0, 0e0) is farther from the origin than 1e18");
+        assert_refused(&bad, "centre (1e30, 0e0, 0e0) is farther from the origin than 1e18");
         bad.camera_to_world[0][3] = f64::NEG_INFINITY;
-        refused(&bad, "camera_to_world[0][3] is infinite; poses must be finite");
+        assert_refused(&bad, "camera_to_world[0][3] is infinite; poses must be finite");
         let mut bad = good;
         bad.intrinsics.height = 0;
-        refused(&bad, "image size 37×0; both must be at least 1");
+        assert_refused(&bad, "image size 37×0; both must be at least 1");
     }
 }

@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pinhole_stays_as_it_is() {
+    fn a_pinhole_stays_unchanged() {
         let pinhole = camera(Distortion::default());
         assert_eq!(pinhole.pinhole(), Some(pinhole));
         let [x, y] = pinhole.source_position(&pinhole, [17.5, 3.25]);
@@ -283,14 +283,14 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_no_lens() {
-        let bent = |radial, tangential| camera(Distortion::brown(radial, tangential));
-        let folded = bent([-40.0, 0.0, 0.0], [0.0; 2]);
+    fn folding_and_nan_distortions_are_rejected() {
+        let distorted = |radial, tangential| camera(Distortion::brown(radial, tangential));
+        let folded = distorted([-40.0, 0.0, 0.0], [0.0; 2]);
         assert_eq!(folded.pinhole(), None);
         assert!(!folded.has_unique_rays());
-        assert!(!bent([f64::NAN, 0.0, 0.0], [0.0; 2]).has_unique_rays());
-        // Bent a little further than any mild lens, the image folds in one corner alone.
-        assert!(!bent([-0.193, -0.047, -0.0156], [-0.0056, 0.0078]).has_unique_rays());
+        assert!(!distorted([f64::NAN, 0.0, 0.0], [0.0; 2]).has_unique_rays());
+        // With slightly more distortion than any mild lens, the image folds in only one corner.
+        assert!(!distorted([-0.193, -0.047, -0.0156], [-0.0056, 0.0078]).has_unique_rays());
     }
 
     /// Creates a fisheye camera without distortion whose view is `degrees` wide.
@@ -299,23 +299,23 @@ mod tests {
         Intrinsics { fx: focal, fy: focal, ..camera(Distortion::fisheye([0.0; 4])) }
     }
 
-    /// Pixels beyond 89° are masked, by the angle of their centres.
+    /// Pixels whose centres are at least 89° from the axis are masked.
     #[test]
-    fn pixels_beyond_the_last_ray_are_masked() {
+    fn pixels_with_clamped_rays_are_masked() {
         let wide = fisheye(200.0);
         assert!(wide.has_unique_rays());
         let mask = wide.lens_mask().unwrap();
-        for (i, counts) in mask.counts.iter().enumerate() {
+        for (i, is_valid) in mask.counts.iter().enumerate() {
             let (x, y) = ((i % 400) as f64 + 0.5 - wide.cx, (i / 400) as f64 + 0.5 - wide.cy);
-            assert_eq!(*counts, (x.hypot(y) / wide.fx).to_degrees() < 89.0, "{x} {y}");
+            assert_eq!(*is_valid, (x.hypot(y) / wide.fx).to_degrees() < 89.0, "{x} {y}");
         }
         assert_eq!(fisheye(140.0).lens_mask(), None);
         assert_eq!(camera(Distortion::default()).lens_mask(), None);
     }
 
-    /// In place of a fisheye a pinhole sees at most 100° across, and less if the lens does.
+    /// A pinhole that replaces a fisheye is at most 100° wide, and less for a narrower lens.
     #[test]
-    fn a_fisheyes_pinhole_has_a_known_angle() {
+    fn a_fisheyes_pinhole_has_a_limited_angle_of_view() {
         for (degrees, expected) in [(200.0, 100.0), (120.0, 100.0)] {
             let pinhole = fisheye(degrees).pinhole().unwrap();
             let [across, down] = pinhole.pinhole_angles();
@@ -326,16 +326,16 @@ mod tests {
         assert!((50.0..60.0).contains(&across), "{across}");
     }
 
-    /// Cameras with lenses that bend, but fold no corner of the image.
+    /// Generates cameras whose distortion folds no corner of the image.
     fn mild() -> impl Strategy<Value = Intrinsics> {
         use crate::lens::tests::{fisheye, higher, mild};
         prop_oneof![mild(), higher(), fisheye()].prop_map(camera)
     }
 
     proptest! {
-        /// The pinhole camera's view lies inside the image; that of a slightly wider one would not.
+        /// The pinhole's view is inside the image; a slightly wider pinhole's view isn't.
         #[test]
-        fn a_pinhole_sees_as_much_as_there_is(camera in mild()) {
+        fn a_pinhole_has_the_widest_view_inside_the_image(camera in mild()) {
             let pinhole = camera.pinhole().expect("a mild distortion");
             prop_assert!(camera.contains_view(&pinhole));
             let wider = Intrinsics { fx: pinhole.fx * 0.99, fy: pinhole.fy * 0.99, ..pinhole };

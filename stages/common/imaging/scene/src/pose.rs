@@ -61,7 +61,7 @@ pub fn without_scale(pose: &Pose) -> Option<(Pose, f64)> {
 mod tests {
     use super::*;
 
-    fn turned(scale: f64) -> DMat3 {
+    fn scaled_rotation(scale: f64) -> DMat3 {
         DMat3::from_axis_angle(DVec3::new(0.3, -0.5, 0.8).normalize(), 1.1) * scale
     }
 
@@ -69,20 +69,20 @@ mod tests {
     fn a_uniform_scale_is_removed() {
         let centre = DVec3::new(1.0, -2.0, 4e6);
         for scale in [0.25, 1e-20, 3e20, 1.1] {
-            let (rigid, found) = without_scale(&pose_of(turned(scale), centre)).unwrap();
+            let (rigid, found) = without_scale(&pose_of(scaled_rotation(scale), centre)).unwrap();
             assert!((found / scale - 1.0).abs() < 1e-12, "{found}");
             assert!(rotation_error(rotation_of(&rigid)) < 1e-12);
             assert_eq!([0, 1, 2].map(|i| rigid[i][3]), centre.to_array());
         }
-        let (mirrored, _) = without_scale(&pose_of(turned(-0.5), centre)).unwrap();
+        let (mirrored, _) = without_scale(&pose_of(scaled_rotation(-0.5), centre)).unwrap();
         assert!((rotation_of(&mirrored).determinant() + 1.0).abs() < 1e-12);
     }
 
     #[test]
-    fn rotations_and_other_matrices_stay() {
+    fn rotations_and_other_matrices_stay_unchanged() {
         let sheared = DMat3::from_cols(DVec3::X, DVec3::new(0.2, 1.0, 0.0), DVec3::Z);
         let stretched = DMat3::from_diagonal(DVec3::new(1.0, 1.0, 1.1));
-        for rotation in [1.0, 1.004, f64::NAN, f64::INFINITY, 1e200, 1e-200].map(turned) {
+        for rotation in [1.0, 1.004, f64::NAN, f64::INFINITY, 1e200, 1e-200].map(scaled_rotation) {
             assert_eq!(without_scale(&pose_of(rotation, DVec3::ZERO)), None);
         }
         for matrix in [sheared, 3.0 * stretched, DMat3::ZERO, 2.0 * sheared] {

@@ -71,7 +71,8 @@ impl<E> From<PixelError> for Stopped<E> {
 mod tests {
     use super::*;
 
-    fn written(colour: f32) -> anyhow::Result<()> {
+    /// Writes an image of one colour; fails for a negative colour.
+    fn write_image(colour: f32) -> anyhow::Result<()> {
         let folder = tempfile::tempdir()?;
         let path = folder.path().join("view.exr");
         write_view_image(&path, (2, 1), &VIEW_CHANNELS[..4], |_, _, samples| {
@@ -83,9 +84,9 @@ mod tests {
 
     #[test]
     fn failures_keep_their_kind() {
-        written(0.5).unwrap();
-        let error = written(f32::NAN).unwrap_err();
+        write_image(0.5).unwrap();
+        let error = write_image(f32::NAN).unwrap_err();
         assert!(matches!(error.downcast_ref(), Some(Failure::Numerical(_))), "{error}");
-        assert_eq!(written(-1.0).unwrap_err().to_string(), "below black");
+        assert_eq!(write_image(-1.0).unwrap_err().to_string(), "below black");
     }
 }

@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn json_round_trip() {
+    fn views_are_restored_from_json() {
         let views = views();
         views.check().unwrap();
         let text = serde_json::to_string(&views).unwrap();
@@ -289,19 +289,19 @@ mod tests {
 
     #[test]
     fn hostile_lists_are_refused() {
-        let refused = |views: &Views, words: &str| {
+        let assert_refused = |views: &Views, reason: &str| {
             let message = views.check().unwrap_err().to_string();
-            assert!(message.starts_with(VIEWS_FILE) && message.contains(words), "{message}");
+            assert!(message.starts_with(VIEWS_FILE) && message.contains(reason), "{message}");
         };
         let mut v = views();
         v.views.push(v.views[0].clone());
-        refused(&v, "is used twice or can't name a file");
+        assert_refused(&v, "is used twice or can't name a file");
         let mut v = views();
         v.views[0].image = Some("../../etc/passwd".into());
-        refused(&v, "../../etc/passwd");
+        assert_refused(&v, "../../etc/passwd");
         let mut v = views();
         v.views[0].camera.name = "../x".into();
-        refused(&v, "is used twice or can't name a file");
+        assert_refused(&v, "is used twice or can't name a file");
         let mut v = views();
         v.views[0].camera.name = "\u{1b}]0;PWN\u{7}".into();
         assert!(!v.check().unwrap_err().to_string().contains(char::is_control));
@@ -310,9 +310,9 @@ mod tests {
         assert!(!v.check().unwrap_err().to_string().contains(char::is_control));
         let mut v = views();
         v.bounds.max[1] = -1.0;
-        refused(&v, "are empty or not finite");
+        assert_refused(&v, "are empty or not finite");
         let mut v = views();
         v.views.clear();
-        refused(&v, "no views found");
+        assert_refused(&v, "no views found");
     }
 }

@@ -158,8 +158,8 @@ mod tests {
     use super::*;
     use crate::intrinsics::Intrinsics;
 
-    fn camera(centre: DVec3, turn: f64) -> Camera {
-        let r = DMat3::from_axis_angle(DVec3::Y, turn);
+    fn camera(centre: DVec3, angle: f64) -> Camera {
+        let r = DMat3::from_axis_angle(DVec3::Y, angle);
         Camera {
             name: "c".into(),
             intrinsics: Intrinsics::from_angle_x(64, 48, 0.9),
@@ -167,8 +167,8 @@ mod tests {
         }
     }
 
-    /// A wall at z = 0 and, before it, a plate at z = 1 over x in -0.3..=0.3: depth along each
-    /// pixel's ray.
+    /// Returns the depth along each pixel's ray of a wall at z = 0 and, if `has_plate`, of a plate
+    /// before the wall, at z = 1 over x in -0.3..=0.3.
     fn depths(camera: &Camera, has_plate: bool) -> Vec<f32> {
         (0..64 * 48)
             .map(|i| {
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn places_are_those_of_the_same_surface_point() {
+    fn positions_are_those_of_the_same_surface_point() {
         let (a, b) =
             (camera(DVec3::new(-0.3, 0.0, 4.0), -0.05), camera(DVec3::new(0.5, 0.2, 4.5), 0.1));
         let opacity = vec![1.0; 64 * 48];
@@ -191,73 +191,75 @@ mod tests {
                 SurfaceMap { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } },
                 SurfaceMap { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } },
             );
-            let mut seen = 0;
-            for (i, place) in from_a.positions_in(&from_b).into_iter().enumerate() {
+            let mut visible_count = 0;
+            for (i, found) in from_a.positions_in(&from_b).into_iter().enumerate() {
                 let ray = a.ray((i % 64) as f64 + 0.5, (i / 64) as f64 + 0.5);
                 let point = ray.at(f64::from(da[i]) / a.depth_per_distance(&ray));
                 let (x, y, _) = b.project(point).unwrap();
                 let inside = (0.0..=64.0).contains(&x) && (0.0..=48.0).contains(&y);
                 // From b, the plate hides the wall where the line of sight passes it.
-                let way = point - b.centre();
-                let at_plate = b.centre() + way * ((1.0 - b.centre().z) / way.z);
+                let line_of_sight = point - b.centre();
+                let at_plate =
+                    b.centre() + line_of_sight * ((1.0 - b.centre().z) / line_of_sight.z);
                 let hidden = has_plate && point.z < 0.5 && at_plate.x.abs() <= 0.3;
                 let at_edge = has_plate && (at_plate.x.abs() - 0.3).abs() < 0.1;
-                let through = from_a
+                let projected = from_a
                     .projection_ignoring_occlusion(i % 64, i / 64, &b)
                     .map(|projection| projection.position);
                 assert!(
-                    through.is_some() == inside && (place.is_none() || place == through),
-                    "pixel {i} through what hides it"
+                    projected.is_some() == inside && (found.is_none() || found == projected),
+                    "pixel {i} without occlusion"
                 );
-                match place {
+                match found {
                     Some([px, py]) => {
                         assert!(
                             (f64::from(px) - x).abs() < 1e-3 && (f64::from(py) - y).abs() < 1e-3
                         );
                         assert!(inside && (!hidden || at_edge), "pixel {i} is hidden");
-                        seen += 1;
+                        visible_count += 1;
                     }
                     None => assert!(!inside || hidden || at_edge, "pixel {i} isn't hidden"),
                 }
             }
-            assert!(seen > 1000, "{seen}");
+            assert!(visible_count > 1000, "{visible_count}");
         }
-        let nothing = vec![0.0; 64 * 48];
+        let transparent = vec![0.0; 64 * 48];
         let (da, db) = (depths(&a, false), depths(&b, false));
-        let empty = SurfaceMap { camera: &a, map: DepthMap { depth: &da, opacity: &nothing } };
+        let empty = SurfaceMap { camera: &a, map: DepthMap { depth: &da, opacity: &transparent } };
         let other = SurfaceMap { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
         assert!(empty.positions_in(&other).iter().all(Option::is_none));
     }
 
-    /// Pixels that a camera so far aside sees, too, where its depth is off by a factor.
-    fn seen_from_beside(baseline: f64, off: f32) -> usize {
+    /// Returns the number of pixels that are visible to a second camera at the distance `baseline`,
+    /// whose depth is multiplied by `factor`.
+    fn visible_pixels(baseline: f64, factor: f32) -> usize {
         let opacity = vec![1.0; 64 * 48];
         let a = camera(DVec3::new(0.0, 0.0, 4.0), 0.0);
         let b = camera(DVec3::new(baseline, 0.0, 4.0), 0.0);
         let (da, db): (Vec<f32>, Vec<f32>) =
-            (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
+            (depths(&a, false), depths(&b, false).into_iter().map(|d| d * factor).collect());
         let other = SurfaceMap { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
         let from = SurfaceMap { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } };
         from.positions_in(&other).iter().flatten().count()
     }
 
-    /// Depth that is 5 % off elsewhere is another surface, unless both look from nearly one place:
-    /// then it is seen in the same pixel.
+    /// Depths that differ by 5 % are of two surfaces, unless the cameras are so close that the
+    /// difference moves a point by less than a pixel.
     #[test]
-    fn depth_matters_as_far_as_it_moves_what_is_seen() {
+    fn depth_errors_matter_if_they_move_a_point_in_the_image() {
         let all = 64 * 48;
-        // 66 pixels of focal length: from 0.5 units aside 5 % of 4 units are 0.4 pixels, from 2
-        // units 1.6.
+        // The focal length is 66 pixels. 5 % of the depth of 4 units moves a point by 0.4 pixels
+        // with a baseline of 0.5 units, and by 1.6 pixels with a baseline of 2 units.
         assert!(
-            seen_from_beside(0.5, 1.05) > all * 3 / 4
-                && seen_from_beside(0.5, 1.05) == seen_from_beside(0.5, 1.0)
+            visible_pixels(0.5, 1.05) > all * 3 / 4
+                && visible_pixels(0.5, 1.05) == visible_pixels(0.5, 1.0)
         );
-        assert_eq!(seen_from_beside(2.0, 1.05), 0);
-        assert!(seen_from_beside(2.0, 1.015) > 0);
+        assert_eq!(visible_pixels(2.0, 1.05), 0);
+        assert!(visible_pixels(2.0, 1.015) > 0);
     }
 
     #[test]
-    fn any_depth_is_no_panic() {
+    fn no_depth_panics() {
         let (a, b) =
             (camera(DVec3::new(0.0, 0.0, 4.0), 0.0), camera(DVec3::new(0.5, 0.2, 4.5), 3.0));
         let opacity = vec![1.0; 64 * 48];

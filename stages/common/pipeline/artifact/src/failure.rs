@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_from_files_move_no_terminal() {
+    fn control_characters_are_escaped() {
         let error =
             anyhow::anyhow!("r_\u{1b}]0;PWN\u{7}.png: No such file").context("frame 3\nof many");
         assert_eq!(one_line(&error), r"frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file");
@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn advice_names_the_owner_of_what_refuses_access() {
+    fn advice_names_the_owner_of_an_inaccessible_folder() {
         let dir = tempfile::tempdir().unwrap();
         let owner = dir.path().metadata().unwrap().uid();
         let path = dir.path().join("absent/file");

@@ -70,14 +70,14 @@ mod tests {
     #[test]
     fn permissions_are_left_to_the_umask() {
         let dir = tempfile::tempdir().unwrap();
-        let place = |name: &str| dir.path().join(name);
+        let path_of = |name: &str| dir.path().join(name);
         let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode();
-        fs::write(place("plain"), "").unwrap();
-        write_atomically(&place("atomic"), b"").unwrap();
-        assert_eq!(mode(&place("atomic")), mode(&place("plain")));
-        fs::create_dir(place("folder")).unwrap();
+        fs::write(path_of("plain"), "").unwrap();
+        write_atomically(&path_of("atomic"), b"").unwrap();
+        assert_eq!(mode(&path_of("atomic")), mode(&path_of("plain")));
+        fs::create_dir(path_of("folder")).unwrap();
         let temporary = temporary(0o777).tempdir_in(dir.path()).unwrap();
-        assert_eq!(mode(temporary.path()), mode(&place("folder")));
+        assert_eq!(mode(temporary.path()), mode(&path_of("folder")));
     }
 
     fn any_json() -> impl Strategy<Value = Value> {
@@ -101,9 +101,9 @@ mod tests {
         #[test]
         fn canonical_form_parses_back_and_is_stable(value in any_json()) {
             let text = canonical_json(&value);
-            let back: Value = serde_json::from_str(&text).unwrap();
-            prop_assert_eq!(&back, &value);
-            prop_assert_eq!(canonical_json(&back), text);
+            let parsed: Value = serde_json::from_str(&text).unwrap();
+            prop_assert_eq!(&parsed, &value);
+            prop_assert_eq!(canonical_json(&parsed), text);
         }
 
         #[test]

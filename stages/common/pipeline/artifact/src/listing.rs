@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_that_leads_back_is_named() {
+    fn a_link_to_its_own_parent_is_named() {
         let dir = example();
         symlink(dir.path(), dir.path().join("train/loop")).unwrap();
         let message = list_files(dir.path()).unwrap_err().to_string();
@@ -188,15 +188,15 @@ mod tests {
 
     /// Dangling links and editors' files are ignored in a user's folder, but not in an artifact.
     #[test]
-    fn files_in_a_users_folder_are_ignored() {
+    fn editor_files_in_a_users_folder_are_ignored() {
         let dir = example();
-        let at = |name: &str| dir.path().join(name);
+        let path = |name: &str| dir.path().join(name);
         let ignored = [".#b.txt", ".DS_Store", ".b.txt.swp", ".~lock.b.txt#", "._b.txt"];
         for name in ignored {
-            fs::write(at(name), "").unwrap();
+            fs::write(path(name), "").unwrap();
         }
-        symlink("nowhere", at("train/gone")).unwrap();
-        symlink("b.txt", at("c.txt")).unwrap();
+        symlink("nowhere", path("train/gone")).unwrap();
+        symlink("b.txt", path("c.txt")).unwrap();
         let names = |files: Vec<(PathBuf, PathBuf)>| {
             files.into_iter().map(|(relative, _)| relative.display().to_string()).collect()
         };
@@ -207,15 +207,15 @@ mod tests {
         let expected = ignored.iter().chain(&["train/gone"]).map(|name| (*name).to_owned());
         assert_eq!(left_out, expected.collect());
         assert!(list_files(dir.path()).unwrap_err().to_string().contains("train/gone"));
-        fs::remove_file(at("train/gone")).unwrap();
+        fs::remove_file(path("train/gone")).unwrap();
         assert_eq!(list_files(dir.path()).unwrap().len(), files.len() + ignored.len());
         // A circular link, or one to an unreadable file, is not dangling.
-        symlink("round", at("round")).unwrap();
+        symlink("round", path("round")).unwrap();
         assert!(list_source_files(dir.path()).unwrap_err().to_string().contains("round"));
     }
 
     #[test]
-    fn what_is_neither_file_nor_folder_is_named() {
+    fn a_socket_is_named() {
         let dir = example();
         let _socket = UnixListener::bind(dir.path().join("train/s")).unwrap();
         let message = list_files(dir.path()).unwrap_err().to_string();
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn a_manifest_can_not_point_outside() {
+    fn a_manifest_cannot_point_outside() {
         for path in ["../x", "/etc/passwd", "a/../../x", "", "a\0b"] {
             assert!(relative_path(path).is_err(), "{path:?}");
         }
@@ -232,8 +232,8 @@ mod tests {
 
     #[test]
     fn only_folders_and_regular_files_are_plain() {
-        type Harm = fn(&Path);
-        let cases: [(&str, Harm); 6] = [
+        type Change = fn(&Path);
+        let cases: [(&str, Change); 6] = [
             ("out is a symbolic link", |out| {
                 fs::rename(out, out.with_extension("real")).unwrap();
                 symlink(out.with_extension("real"), out).unwrap();
@@ -247,7 +247,7 @@ mod tests {
             ("out/gone is a symbolic link", |out| symlink("nowhere", out.join("gone")).unwrap()),
             ("out/socket is a socket", |out| drop(UnixListener::bind(out.join("socket")).unwrap())),
         ];
-        for (words, harm) in cases {
+        for (expected, change) in cases {
             let dir = tempfile::tempdir().unwrap();
             let out = dir.path().join("out");
             fs::create_dir_all(out.join("in")).unwrap();
@@ -257,9 +257,9 @@ mod tests {
                 files.into_iter().map(|file| file.0).collect::<Vec<_>>(),
                 [out.join("in/a")]
             );
-            harm(&out);
+            change(&out);
             let message = list_output_files(&out).unwrap_err().to_string();
-            assert!(message.contains(words) && !message.contains('\n'), "{words}: {message}");
+            assert!(message.contains(expected) && !message.contains('\n'), "{expected}: {message}");
         }
     }
 }

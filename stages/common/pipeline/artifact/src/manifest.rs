@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flipped_byte_is_noticed_and_named() {
+    fn a_flipped_byte_is_found_and_named() {
         let (dir, manifest) = example();
         manifest.check_contents(dir.path()).unwrap();
         fs::write(dir.path().join("train/a.txt"), "alphb").unwrap();
@@ -267,15 +267,15 @@ mod tests {
         assert!(matches!(problem(), Damage::Missing { path } if path == file));
         std::os::unix::fs::symlink("a.txt", &file).unwrap();
         assert!(matches!(problem(), Damage::Unreadable { path, .. } if path == file));
-        let said = problem().to_string();
-        assert!(said.starts_with("cannot read ") && !said.contains("--remove"), "{said}");
+        let message = problem().to_string();
+        assert!(message.starts_with("cannot read ") && !message.contains("--remove"), "{message}");
         fs::remove_dir_all(&folder).unwrap();
         fs::write(&folder, "").unwrap();
         assert!(matches!(problem(), Damage::Missing { path } if path == file));
     }
 
     #[test]
-    fn names_that_no_manifest_can_have_are_refused() {
+    fn names_that_are_not_utf8_are_refused() {
         use std::os::unix::ffi::OsStrExt as _;
         let (dir, _) = example();
         let name = std::ffi::OsStr::from_bytes(b"r_\xff\x1b.png");

@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sweeps_folders_are_numbered_and_named() {
+    fn folders_of_a_sweep_are_numbered_and_named() {
         let nodes = [node("rays=3, scale=2"), node("data=a/../b"), node("")];
         assert_eq!(
             sink_folders(&nodes.each_ref()),

@@ -193,8 +193,8 @@ pub fn format_utc(unix: u64) -> String {
 mod tests {
     use super::*;
 
-    struct Closed;
-    impl Write for Closed {
+    struct ClosedPipe;
+    impl Write for ClosedPipe {
         fn write(&mut self, _: &[u8]) -> std::io::Result<usize> {
             Err(std::io::ErrorKind::BrokenPipe.into())
         }
@@ -204,16 +204,16 @@ mod tests {
     }
 
     #[test]
-    fn lines_are_escaped_and_a_closed_pipe_is_no_panic() {
+    fn lines_are_escaped_and_a_closed_pipe_causes_no_panic() {
         let mut written = Vec::new();
         write_line(&mut written, "a\u{1b}[31mb\nc");
         assert_eq!(written, b"a\\u{1b}[31mb\\nc\n");
-        write_line(&mut Closed, "nobody hears this");
+        write_line(&mut ClosedPipe, "nobody hears this");
     }
 
     #[test]
-    fn control_characters_are_spelled_out() {
-        for (text, shown) in [
+    fn control_characters_are_escaped() {
+        for (text, escaped) in [
             ("Bäume/写真 🌲 \\ \"r_0\"", "Bäume/写真 🌲 \\ \"r_0\""),
             ("\u{1b}]0;PWN\u{7}\u{1b}[31mred", "\\u{1b}]0;PWN\\u{7}\\u{1b}[31mred"),
             ("two\nlines\r\n\tand a tab", "two\\nlines\\r\\n\\tand a tab"),
@@ -222,14 +222,14 @@ mod tests {
                 "C1: \\u{9b}31m \\u{85}, delete: \\u{7f}, null: \\u{0}",
             ),
         ] {
-            assert_eq!(printable(text), shown);
-            assert_eq!(printable(shown), shown);
+            assert_eq!(printable(text), escaped);
+            assert_eq!(printable(escaped), escaped);
         }
         assert!(matches!(printable("r_0"), Cow::Borrowed("r_0")));
     }
 
     #[test]
-    fn one_is_no_plural_and_little_is_not_nothing() {
+    fn counts_have_plurals_and_amounts_are_grouped() {
         assert_eq!(
             [0, 1, 2].map(|n| format_count(n, "training view")),
             ["0 training views", "1 training view", "2 training views"]
@@ -246,13 +246,13 @@ mod tests {
     }
 
     #[test]
-    fn sizes_in_words() {
+    fn sizes_have_units() {
         let sizes = [1, 999, 1_500, 99_532_800, 2_580_000_000].map(format_size);
         assert_eq!(sizes, ["1 byte", "999 bytes", "1.5 kB", "99.5 MB", "2.6 GB"]);
     }
 
     #[test]
-    fn slips_are_recognised_and_other_words_are_not() {
+    fn typos_are_recognised_and_other_names_are_not() {
         let known = ["eval", "prep", "report", "render-depth", "train-ss"];
         for (name, expected) in [
             ("evla", Some("eval")),
@@ -273,14 +273,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_known_is_listed() {
+    fn known_names_are_listed() {
         assert_eq!(known_names("evla", ["prep", "eval"]), "did you mean eval? known: eval, prep");
         assert_eq!(known_names("nothing", ["prep", "eval"]), "known: eval, prep");
         assert_eq!(known_names("a", []), "none are known");
     }
 
     #[test]
-    fn warnings_come_back() {
+    fn warnings_round_trip() {
         let warnings = ["one".to_owned(), "another: two".to_owned()];
         let summary = with_warnings("3 views", &warnings);
         assert_eq!(summary, "3 views\nwarning: one\nwarning: another: two");
@@ -290,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn times_are_those_of_date() {
+    fn times_equal_those_of_the_date_command() {
         for (unix, text) in [
             (0, "1970-01-01 00:00:00 UTC"),
             (951_782_400, "2000-02-29 00:00:00 UTC"),

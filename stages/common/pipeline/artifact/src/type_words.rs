@@ -62,7 +62,7 @@ mod tests {
 
     #[test]
     fn types_are_named_in_english() {
-        for (text, words) in [
+        for (text, expected) in [
             (
                 "a.yaml:3: gpus: invalid type: integer `-1`, expected u32",
                 "a.yaml:3: gpus: expected a whole number from 0 to 4294967295, found -1",
@@ -85,15 +85,15 @@ mod tests {
             ("missing field `a`", "missing field `a`"),
             ("invalid type: string \"yyy…", "invalid type: string \"yyy…"),
         ] {
-            assert_eq!(in_words(text), words);
+            assert_eq!(in_words(text), expected);
         }
     }
 
-    /// The terms are serde's.
+    /// A new version of serde may change its messages.
     #[test]
-    fn the_parsers_messages_are_known() {
+    fn serdes_messages_are_recognised() {
         let message = |text: &str| serde_json::from_str::<(u32, bool)>(text).unwrap_err();
-        for (text, words) in [
+        for (text, expected) in [
             ("[2.5, true]", "expected a whole number from 0 to 4294967295, found 2.5 at line"),
             ("[4294967296, true]", "expected a whole number from 0 to 4294967295, found 4294"),
             ("[2, 1]", "expected true or false, found 1 at line"),
@@ -101,7 +101,7 @@ mod tests {
             ("[2]", "expected a list of 2 values, found 1 at line"),
         ] {
             let found = in_words(&message(text).to_string());
-            assert!(found.starts_with(words), "{found}");
+            assert!(found.starts_with(expected), "{found}");
         }
     }
 }

@@ -195,8 +195,8 @@ fn text<'a>(package: &'a Table, key: &str) -> &'a str {
 mod tests {
     use super::*;
 
-    /// A workspace of four crates: `stage` uses `shared` and the package `used`, `extra` with a
-    /// feature alone, and the package `linux` on one system; nothing uses `other`.
+    /// Workspace of four crates. `stage` depends on `shared`, on `extra` with a feature, and on the
+    /// package `linux` on one system; `shared` depends on the package `used`. `other` is unused.
     const FILES: [(&str, &str); 11] = [
         (
             "Cargo.toml",
@@ -233,7 +233,7 @@ mod tests {
         ("other/src/lib.rs", "// other"),
     ];
 
-    /// The fingerprint of `stage`, where `edit` replaces words in a file of that workspace.
+    /// Returns the fingerprint of `stage` after `edit`: a file, a text in it and the replacement.
     fn fingerprint(edit: Option<(&str, &str, &str)>) -> String {
         let root = tempfile::tempdir().unwrap();
         for (file, text) in FILES {
@@ -254,10 +254,10 @@ mod tests {
         hash.0.finalize().to_hex().to_string()
     }
 
-    /// The key covers direct and indirect dependencies, and neither unused crates nor folders.
+    /// The fingerprint covers direct and indirect dependencies, but not unused crates or tests.
     #[test]
-    fn an_edited_dependency_changes_it_and_an_unused_one_does_not() {
-        let own = fingerprint(None);
+    fn only_edits_of_used_sources_change_the_fingerprint() {
+        let unedited = fingerprint(None);
         for edit in [
             ("stage/src/main.rs", "main() {}", "main() { }"),
             ("shared/src/lib.rs", "shared", "shared better"),
@@ -268,7 +268,7 @@ mod tests {
             ("Cargo.lock", "checksum = \"dd\"", "checksum = \"de\""),
             ("Cargo.toml", "lto = true", "lto = false"),
         ] {
-            assert_ne!(fingerprint(Some(edit)), own, "{edit:?}");
+            assert_ne!(fingerprint(Some(edit)), unedited, "{edit:?}");
         }
         for edit in [
             ("other/src/lib.rs", "other", "otherwise"),
@@ -276,7 +276,7 @@ mod tests {
             ("stage/tests/it.rs", "a test", "another test"),
             ("Cargo.lock", "checksum = \"cc\"", "checksum = \"cd\""),
         ] {
-            assert_eq!(fingerprint(Some(edit)), own, "{edit:?}");
+            assert_eq!(fingerprint(Some(edit)), unedited, "{edit:?}");
         }
     }
 
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_do_not_run_into_each_other() {
+    fn boundaries_between_parts_are_hashed() {
         assert_ne!(hash_of(&[("a", "bc")]), hash_of(&[("ab", "c")]));
         assert_ne!(hash_of(&[("a", "b"), ("c", "")]), hash_of(&[("a", ""), ("b", "c")]));
     }

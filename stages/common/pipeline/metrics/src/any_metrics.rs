@@ -91,8 +91,8 @@ mod tests {
 
     #[test]
     fn figures_may_have_more_fields_and_no_direction() {
-        let figures = |figures: Value| AnyMetrics::from(json!({"figures": figures})).figures();
-        let found = figures(json!([
+        let read_figures = |figures: Value| AnyMetrics::from(json!({"figures": figures})).figures();
+        let found = read_figures(json!([
             {"path": "a/b", "label": "b", "digits": 1, "colour": "red"},
             {"path": "c", "label": "c", "digits": 3, "higher_is_better": false, "missing": "no c"},
         ]));
@@ -105,18 +105,18 @@ mod tests {
             Some("2.3".to_owned())
         );
         assert_eq!(found[1].value_in(&scores), None);
-        assert_eq!(figures(json!([{"path": "a"}])), None);
+        assert_eq!(read_figures(json!([{"path": "a"}])), None);
     }
 
     #[test]
-    fn a_file_is_named_where_it_cannot_be_read() {
+    fn an_unreadable_file_is_named_in_the_error() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join(METRICS_FILE);
-        let place = format!("{}: ", file.display());
+        let prefix = format!("{}: ", file.display());
         let problem = || AnyMetrics::read(folder.path()).unwrap_err().to_string();
-        assert!(problem().starts_with(&place), "{}", problem());
+        assert!(problem().starts_with(&prefix), "{}", problem());
         std::fs::write(&file, "{").unwrap();
-        assert!(problem().starts_with(&place), "{}", problem());
+        assert!(problem().starts_with(&prefix), "{}", problem());
         std::fs::write(&file, r#"{"mean": {"psnr": 30.5}}"#).unwrap();
         assert_eq!(AnyMetrics::read(folder.path()).unwrap().mean(), &json!({"psnr": 30.5}));
     }

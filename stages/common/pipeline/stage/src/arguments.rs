@@ -124,7 +124,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cpu_and_numbered_gpus_alone() {
+    fn devices_are_the_cpu_and_cuda_gpus() {
         for name in ["cpu", "cuda", "cuda:0", "cuda:12"] {
             assert!(check_device(name).is_ok(), "{name}");
         }

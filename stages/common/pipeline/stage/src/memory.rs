@@ -117,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_machine_has_some_memory() {
+    fn machine_memory_is_plausible() {
         assert!(
             machine_memory().is_some_and(|bytes| (1 << 28..1 << 50).contains(&bytes)),
             "{:?}",
@@ -126,13 +126,13 @@ mod tests {
     }
 
     #[test]
-    fn some_of_it_is_free() {
+    fn some_memory_is_free() {
         let free = free_memory().unwrap();
         assert!(free > 1 << 26 && free <= machine_memory().unwrap(), "{free}");
         assert_eq!(parse_bytes("4000000000").unwrap(), 4_000_000_000);
-        let said = parse_bytes("4GB").unwrap_err().to_string();
+        let message = parse_bytes("4GB").unwrap_err().to_string();
         assert_eq!(
-            said,
+            message,
             "NERF_SR_MEMORY: \"4GB\" is not a number of bytes; for 4 GB write 4000000000"
         );
     }
@@ -142,13 +142,13 @@ mod tests {
         let remaining = |need, free| remaining_memory("a mesh", need, free, "make it smaller");
         assert_eq!(remaining(3, Some(10)).unwrap(), 7);
         assert_eq!(remaining(3, None).unwrap(), u64::MAX);
-        let said = remaining(2_000_000, Some(1_000_000)).unwrap_err().to_string();
-        assert_eq!(said, "a mesh needs 2.0 MB of memory, and 1.0 MB are free; make it smaller");
+        let message = remaining(2_000_000, Some(1_000_000)).unwrap_err().to_string();
+        assert_eq!(message, "a mesh needs 2.0 MB of memory, and 1.0 MB are free; make it smaller");
     }
 
     #[test]
-    fn allocators_are_understood() {
-        for (said, amount) in [
+    fn allocation_errors_are_recognised() {
+        for (text, amount) in [
             ("memory allocation of 99532800 bytes failed", Some("99.5 MB")),
             (
                 "DefaultCPUAllocator: can't allocate memory: you tried to allocate 4000000000 \
@@ -168,13 +168,13 @@ mod tests {
             ("memory allocation of ", None),
             ("r_0.png: No such file", None),
         ] {
-            let found = out_of_memory_message(said);
+            let found = out_of_memory_message(text);
             let expected = amount.map(|amount| {
                 format!("out of memory: {amount} more were requested; {MEMORY_REMEDY}")
             });
-            assert_eq!(found, expected, "{said}");
+            assert_eq!(found, expected, "{text}");
         }
-        for said in [
+        for text in [
             "terminate called after throwing an instance of 'std::bad_alloc'",
             "  what():  std::bad_alloc",
             "train-refine: error while loading shared libraries: libtorch_cpu.so: failed to map \
@@ -183,7 +183,7 @@ mod tests {
             "cannot fork: Cannot allocate memory (os error 12)",
         ] {
             let expected = format!("out of memory; {MEMORY_REMEDY}");
-            assert_eq!(out_of_memory_message(said), Some(expected), "{said}");
+            assert_eq!(out_of_memory_message(text), Some(expected), "{text}");
         }
     }
 }

@@ -107,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lists_of_the_kernel_are_counted() {
+    fn processors_in_kernel_lists_are_counted() {
         for (list, count) in [
             ("0\n", Some(1)),
             ("\t0-1\n", Some(2)),
@@ -122,14 +122,14 @@ mod tests {
     }
 
     #[test]
-    fn the_least_limit_gives_the_number() {
-        let (one, slurm) = ("SLURM_CPUS_PER_TASK", |n| Some(("SLURM_CPUS_PER_TASK", n)));
+    fn the_least_limit_sets_the_number() {
+        let (variable, slurm) = ("SLURM_CPUS_PER_TASK", |n| Some(("SLURM_CPUS_PER_TASK", n)));
         for (online, allowed, available, slurm, count, limit) in [
             (8, 8, 8, None, 8, ProcessorLimit::Machine),
             (8, 4, 4, None, 4, ProcessorLimit::Affinity),
             (8, 8, 2, None, 2, ProcessorLimit::Quota),
             (8, 4, 2, None, 2, ProcessorLimit::Quota),
-            (8, 8, 8, slurm(3), 3, ProcessorLimit::Slurm(one)),
+            (8, 8, 8, slurm(3), 3, ProcessorLimit::Slurm(variable)),
             (8, 2, 2, slurm(3), 2, ProcessorLimit::Affinity),
             (8, 8, 8, slurm(16), 8, ProcessorLimit::Machine),
         ] {

@@ -252,11 +252,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn time_left_follows_from_this_run_alone() {
+    fn time_left_depends_on_this_run_only() {
         let mut pace = Pace { first: None };
         assert_eq!(pace.time_left(900, 1000, None), "");
-        let (since, _) = pace.first.unwrap();
-        pace.first = Some((since.checked_sub(Duration::from_secs(60)).unwrap(), 900));
+        let (start, _) = pace.first.unwrap();
+        pace.first = Some((start.checked_sub(Duration::from_secs(60)).unwrap(), 900));
         assert_eq!(
             [(920, None), (901, None), (901, Some(61.4)), (900, Some(600.0))]
                 .map(|(done, estimate)| pace.time_left(done, 1000, estimate)),

@@ -94,6 +94,7 @@ impl EndClaim {
 mod tests {
     use super::*;
 
+    /// Returns the `/proc/PID/status` of a process with a mask of ignored signals.
     fn status(mask: &str) -> String {
         format!(
             "Name:\tprep\nSigBlk:\tffffffffffffffff\nSigIgn:\t{mask}\n\
@@ -102,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nohup_leaves_behind_is_seen() {
+    fn a_hangup_ignored_through_nohup_is_detected() {
         assert!(is_ignored(&status("0000000000001001"), SIGHUP));
         assert!(!is_ignored(&status("0000000000001000"), SIGHUP));
         assert!(!is_ignored("", SIGHUP));

@@ -101,15 +101,15 @@ mod tests {
 
     /// Training whose errors are 1, 2, 3, …; its checkpoint is the number of steps as text.
     #[derive(Default)]
-    struct Counting {
+    struct CountingTraining {
         steps: u64,
-        /// Number of steps of this run.
+        /// Number of steps taken in this run.
         taken: u64,
         /// Error of the step after a number of steps.
         failure: Option<(u64, anyhow::Error)>,
     }
 
-    impl Training for Counting {
+    impl Training for CountingTraining {
         fn steps(&self) -> u64 {
             self.steps
         }
@@ -137,79 +137,81 @@ mod tests {
     }
 
     /// Takes steps without checkpoints; returns the result and the reports.
-    fn reports_of(trainer: &mut Counting) -> (anyhow::Result<()>, Vec<(u64, f64)>) {
+    fn reports_of(training: &mut CountingTraining) -> (anyhow::Result<()>, Vec<(u64, f64)>) {
         let reports = RefCell::new(Vec::new());
         let report = |done, mean| reports.borrow_mut().push((done, mean));
-        let ended = take_steps(trainer, None, || false, report);
-        (ended, reports.into_inner())
+        let result = take_steps(training, None, || false, report);
+        (result, reports.into_inner())
     }
 
     #[test]
-    fn a_resumed_training_takes_the_steps_that_are_left() {
+    fn a_resumed_training_takes_the_remaining_steps() {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join("checkpoint");
         std::fs::write(&checkpoint, "100").unwrap();
-        let mut trainer = Counting::default();
-        assert_eq!(resume(&mut trainer, &checkpoint), "resuming from step 100");
-        reports_of(&mut trainer).0.unwrap();
-        assert_eq!((trainer.steps, trainer.taken), (STEPS, 20));
+        let mut training = CountingTraining::default();
+        assert_eq!(resume(&mut training, &checkpoint), "resuming from step 100");
+        reports_of(&mut training).0.unwrap();
+        assert_eq!((training.steps, training.taken), (STEPS, 20));
     }
 
     #[test]
-    fn a_checkpoint_that_cannot_be_used_starts_over() {
+    fn an_unusable_checkpoint_restarts_the_training() {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join("checkpoint");
         std::fs::write(&checkpoint, "torn").unwrap();
-        let mut trainer = Counting::default();
-        let said = resume(&mut trainer, &checkpoint);
-        assert_eq!(said, "no number; starting over");
-        reports_of(&mut trainer).0.unwrap();
-        assert_eq!((trainer.steps, trainer.taken), (STEPS, STEPS));
+        let mut training = CountingTraining::default();
+        let message = resume(&mut training, &checkpoint);
+        assert_eq!(message, "no number; starting over");
+        reports_of(&mut training).0.unwrap();
+        assert_eq!((training.steps, training.taken), (STEPS, STEPS));
     }
 
     #[test]
     fn an_interruption_leaves_a_checkpoint_to_resume_from() {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join("checkpoint");
-        let mut trainer = Counting::default();
-        let looks = Cell::new(0);
-        let interrupted = || looks.replace(looks.get() + 1) == 3;
-        let ended = take_steps(&mut trainer, Some(&checkpoint), interrupted, |_, _| {});
-        let failure = ended.unwrap_err();
+        let mut training = CountingTraining::default();
+        let checks = Cell::new(0);
+        let interrupted = || checks.replace(checks.get() + 1) == 3;
+        let result = take_steps(&mut training, Some(&checkpoint), interrupted, |_, _| {});
+        let failure = result.unwrap_err();
         assert!(matches!(failure.downcast_ref(), Some(Failure::Interrupted)), "{failure}");
-        assert_eq!((trainer.steps, exit_code(&failure)), (3, 130));
+        assert_eq!((training.steps, exit_code(&failure)), (3, 130));
         assert_eq!(std::fs::read_to_string(&checkpoint).unwrap(), "3");
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing partial is left");
-        let mut trainer = Counting::default();
-        assert_eq!(resume(&mut trainer, &checkpoint), "resuming from step 3");
-        reports_of(&mut trainer).0.unwrap();
-        assert_eq!(trainer.taken, STEPS - 3);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file is left");
+        let mut training = CountingTraining::default();
+        assert_eq!(resume(&mut training, &checkpoint), "resuming from step 3");
+        reports_of(&mut training).0.unwrap();
+        assert_eq!(training.taken, STEPS - 3);
     }
 
     #[test]
-    fn a_checkpoint_that_cannot_be_written_is_an_error_of_its_own() {
+    fn a_failed_checkpoint_is_not_reported_as_an_interruption() {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join("absent/checkpoint");
-        let ended = take_steps(&mut Counting::default(), Some(&checkpoint), || true, |_, _| {});
-        let failure = ended.unwrap_err();
-        let said = "cannot write the checkpoint: unwritable";
-        assert_eq!((format!("{failure:#}").as_str(), exit_code(&failure)), (said, 1));
+        let result =
+            take_steps(&mut CountingTraining::default(), Some(&checkpoint), || true, |_, _| {});
+        let failure = result.unwrap_err();
+        let expected = "cannot write the checkpoint: unwritable";
+        assert_eq!((format!("{failure:#}").as_str(), exit_code(&failure)), (expected, 1));
     }
 
     #[test]
     fn a_failed_step_ends_the_training() {
         let failure = Failure::Numerical("not finite".to_owned()).into();
-        let mut trainer = Counting { failure: Some((7, failure)), ..Counting::default() };
-        let failure = reports_of(&mut trainer).0.unwrap_err();
+        let mut training =
+            CountingTraining { failure: Some((7, failure)), ..CountingTraining::default() };
+        let failure = reports_of(&mut training).0.unwrap_err();
         assert_eq!((failure.to_string().as_str(), exit_code(&failure)), ("not finite", 4));
-        assert_eq!(trainer.taken, 7);
+        assert_eq!(training.taken, 7);
     }
 
     #[test]
     fn a_report_is_the_mean_since_the_last_one() {
-        let (ended, reports) = reports_of(&mut Counting::default());
-        ended.unwrap();
-        // Means of 1 to 50 and of 51 to 100; 20 more steps make no report.
+        let (result, reports) = reports_of(&mut CountingTraining::default());
+        result.unwrap();
+        // Means of 1 to 50 and of 51 to 100; the last 20 steps aren't reported.
         assert_eq!(reports, [(50, 25.5), (100, 75.5)]);
     }
 }

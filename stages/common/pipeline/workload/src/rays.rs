@@ -47,7 +47,7 @@ mod tests {
 
     use super::*;
 
-    /// Rays follow from LR pixels within their limits, unless they are given.
+    /// Unless given, the number of rays follows from the number of LR pixels, within limits.
     #[test]
     fn rays_follow_from_the_pixels() {
         for (rays, rays_per_pixel, is_opaque, is_fine_tuning, expected) in [
@@ -65,8 +65,8 @@ mod tests {
             let budget = RayBudget { rays, rays_per_pixel, min_rays: 100, max_rays: 1000 };
             assert_eq!(budget.total(25, is_opaque, is_fine_tuning), expected, "{budget:?}");
         }
-        let nothing = RayBudget { rays: None, rays_per_pixel: 0.1, min_rays: 0, max_rays: 9 };
-        assert_eq!(nothing.total(0, false, false), 1);
+        let minimal = RayBudget { rays: None, rays_per_pixel: 0.1, min_rays: 0, max_rays: 9 };
+        assert_eq!(minimal.total(0, false, false), 1);
     }
 
     /// Other parameters of the stage are ignored.

@@ -102,10 +102,10 @@ pub fn grid_training_bytes(parameters: u64, has_checkpoints: bool) -> u64 {
 mod tests {
     use super::*;
 
-    /// Images of three megapixels: three bytes a pixel and two bits, and twelve more bytes if HR
-    /// pixels are cached.
+    /// Images of three megapixels use three bytes and two bits per pixel, and twelve more bytes if
+    /// HR pixels are cached.
     #[test]
-    fn pixels_take_what_their_kernel_asks_for() {
+    fn pixel_memory_depends_on_the_hr_cache() {
         for (has_cache, bytes) in [(false, 3), (true, 15)] {
             for refines_poses in [false, true] {
                 let storage = PixelStorage { is_opaque: true, has_cache, refines_poses };

@@ -180,8 +180,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_written_is_read() {
-        let path = tempfile::tempdir().unwrap().keep().join("w.safetensors");
+    fn written_weights_are_read_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("w.safetensors");
         let (a, b) =
             (Tensor::from_slice(&[1.5f32, -2.0]).reshape([2, 1]), Tensor::from_slice(&[3i64, -1]));
         write(&path, &[("a".to_owned(), a.shallow_clone()), ("b".to_owned(), b)]).unwrap();

@@ -99,11 +99,11 @@ mod tests {
 
     fn gradients(refiner: &Refiner, step: usize) -> Vec<Vec<f32>> {
         let gradient = |i: usize| ((i * (step + 3)) % 17) as f32 / 8.0 - 1.0;
-        let gradients = refiner.parameters.iter();
-        gradients.map(|parameter| (0..parameter.len()).map(gradient).collect()).collect()
+        let parameters = refiner.parameters.iter();
+        parameters.map(|parameter| (0..parameter.len()).map(gradient).collect()).collect()
     }
 
-    /// Steps are those of `nets::Adam`, which is tested against PyTorch.
+    /// Steps equal those of `nets::Adam`, which is tested against PyTorch.
     #[test]
     fn steps_are_those_of_libtorch() -> Result<(), RefinementError> {
         let architecture = RefinerArchitecture { channels: 6, blocks: 1, guidance: None };
@@ -124,8 +124,8 @@ mod tests {
             expected.step(parameters(), &shaped, 1e-2)?;
         }
         for ((name, found), expected) in refiner.named_parameters()?.iter().zip(&tensors) {
-            let apart = (found - expected).abs().max().double_value(&[]);
-            assert!(apart < 1e-6, "{name}: {apart}");
+            let difference = (found - expected).abs().max().double_value(&[]);
+            assert!(difference < 1e-6, "{name}: {difference}");
         }
         Ok(())
     }

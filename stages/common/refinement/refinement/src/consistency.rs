@@ -84,26 +84,27 @@ impl<'a> LrObservations<'a> {
 mod tests {
     use super::*;
 
-    fn level(hr_width: usize, i: usize, c: usize) -> f32 {
+    /// Returns channel `c` of pixel `i` in a smooth HR image.
+    fn sample(hr_width: usize, i: usize, c: usize) -> f32 {
         0.5 + 0.3
             * ((i % hr_width * (c + 3)) as f32 * 0.08).sin()
             * ((i / hr_width) as f32 * 0.21).cos()
     }
 
-    fn error(a: &Image, b: &Image) -> f64 {
+    fn rms_error(a: &Image, b: &Image) -> f64 {
         let squares = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2));
         (squares.sum::<f64>() / a.data.len() as f64).sqrt()
     }
 
     #[test]
-    fn what_is_consistent_stays_and_what_is_not_is_moved() {
+    fn consistent_views_stay_and_others_are_corrected() {
         for (filter, hr_width, lr_width) in
             [(Filter::Lanczos, 48, 24), (Filter::Box, 45, 30), (Filter::Bicubic, 48, 12)]
         {
             let hr_size = (hr_width, hr_width * 2 / 3);
             let lr_size = (lr_width, lr_width * 2 / 3);
             let data = (0..hr_size.0 * hr_size.1)
-                .flat_map(|i| [0, 1, 2].map(|c| level(hr_width, i, c)))
+                .flat_map(|i| [0, 1, 2].map(|c| sample(hr_width, i, c)))
                 .collect();
             let truth = Image::new(hr_size.0, hr_size.1, 3, data);
             let kernel = Resampling::new(filter, hr_size, lr_size);
@@ -112,28 +113,28 @@ mod tests {
             let folder = tempfile::tempdir().unwrap();
             let input = GivenInput::open("photographs", folder.path()).unwrap();
             let observations = LrObservations { input: &input, views, filter };
-            assert!(error(&observations.project(&truth, &lr), &truth) < 1e-5, "{filter:?}");
-            let softer = Image {
+            assert!(rms_error(&observations.project(&truth, &lr), &truth) < 1e-5, "{filter:?}");
+            let low_contrast = Image {
                 data: truth.data.iter().map(|v| 0.45 + 0.2 * (v - 0.5)).collect(),
                 ..truth.clone()
             };
-            let projected = observations.project(&softer, &lr);
-            let (off, was) = (
-                error(&kernel.apply(&projected), &lr.image),
-                error(&kernel.apply(&softer), &lr.image),
+            let projected = observations.project(&low_contrast, &lr);
+            let (after, before) = (
+                rms_error(&kernel.apply(&projected), &lr.image),
+                rms_error(&kernel.apply(&low_contrast), &lr.image),
             );
-            assert!(off < 0.1 * was, "{filter:?}: {off} of {was} is left");
-            let (off, was) = (error(&projected, &truth), error(&softer, &truth));
-            assert!(off < 0.9 * was, "{filter:?}: {off} of {was} is left");
-            let none = pixels::Mask {
+            assert!(after < 0.1 * before, "{filter:?}: error {before} before, {after} after");
+            let (after, before) = (rms_error(&projected, &truth), rms_error(&low_contrast, &truth));
+            assert!(after < 0.9 * before, "{filter:?}: error {before} before, {after} after");
+            let empty_mask = pixels::Mask {
                 width: lr_size.0,
                 height: lr_size.1,
                 counts: vec![false; lr_size.0 * lr_size.1],
             };
-            let lr = Photograph { mask: Some(none), ..lr };
+            let lr = Photograph { mask: Some(empty_mask), ..lr };
             assert!(
-                error(&observations.project(&softer, &lr), &softer) < 1e-7,
-                "{filter:?}: what doesn't count moves nothing"
+                rms_error(&observations.project(&low_contrast, &lr), &low_contrast) < 1e-7,
+                "{filter:?}: masked pixels change nothing"
             );
         }
     }

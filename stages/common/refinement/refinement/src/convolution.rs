@@ -769,7 +769,7 @@ mod tests {
 
     use super::*;
 
-    /// Layer with random kernels, and the same numbers in f64.
+    /// Random kernels, bias and input of a layer, which the methods evaluate in f64.
     struct Case {
         inputs: usize,
         kernels: Vec<f32>,
@@ -777,6 +777,7 @@ mod tests {
         x: Maps,
     }
 
+    /// Returns random numbers between −0.5 and 0.5.
     fn numbers(count: usize, stream: u64) -> Vec<f32> {
         let mut rng = CounterRng::new(7, 1, stream);
         (0..count).map(|_| rng.uniform() - 0.5).collect()
@@ -823,11 +824,12 @@ mod tests {
         }
     }
 
+    /// Inputs, outputs, width and height of each case.
     const CASES: [(usize, usize, usize, usize); 4] =
         [(16, 32, 9, 7), (5, 3, 3, 3), (32, 32, 30, 22), (44, 12, 6, 15)];
 
     #[test]
-    fn outputs_are_those_of_the_definition() {
+    fn outputs_match_the_definition() {
         for (inputs, outputs, width, height) in CASES {
             let case = case(inputs, outputs, width, height);
             let layer = Convolution::new(&case.kernels, &case.bias);
@@ -861,9 +863,9 @@ mod tests {
         }
     }
 
-    /// Gradients of Σ w·y, for random weights w, equal their definition in f64.
+    /// Gradients of Σ w·y, for random weights w, match their definition in f64.
     #[test]
-    fn gradients_are_those_of_the_definition() {
+    fn gradients_match_the_definition() {
         for (inputs, outputs, width, height) in CASES {
             let case = case(inputs, outputs, width, height);
             let layer = Convolution::new(&case.kernels, &case.bias);

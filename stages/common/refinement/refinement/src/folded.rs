@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_folded_unfolds() {
+    fn unfolding_restores_folded_pixels() {
         let image = Image::new(7, 5, 3, (0..105).map(|v| v as f32).collect());
         let window = Window { x: -2, y: 1, size: (6, 4) };
         let mut folded = Vec::new();
@@ -129,18 +129,18 @@ mod tests {
     }
 
     #[test]
-    fn turns_are_eight_and_lose_nothing() {
+    fn orientations_are_eight_permutations() {
         let window = Window { x: 3, y: 4, size: (6, 2) };
-        let mut seen = std::collections::BTreeSet::new();
+        let mut orders = std::collections::BTreeSet::new();
         for orientation in Orientation::ALL {
-            let mut places = Vec::new();
-            orientation.oriented(window).fold(|x, y| places.push(orientation.source(window, x, y)));
-            let all: std::collections::BTreeSet<_> = places.iter().copied().collect();
-            assert_eq!(all.len(), 12);
-            assert!(all.iter().all(|&(x, y)| x < 6 && y < 2));
-            seen.insert(places);
+            let mut pixels = Vec::new();
+            orientation.oriented(window).fold(|x, y| pixels.push(orientation.source(window, x, y)));
+            let distinct: std::collections::BTreeSet<_> = pixels.iter().copied().collect();
+            assert_eq!(distinct.len(), 12);
+            assert!(distinct.iter().all(|&(x, y)| x < 6 && y < 2));
+            orders.insert(pixels);
         }
-        assert_eq!(seen.len(), 8);
+        assert_eq!(orders.len(), 8);
         assert_eq!(Orientation::ALL[0].source(window, 4, 1), (4, 1));
     }
 }

@@ -110,9 +110,9 @@ mod tests {
         layer(&x, 1 + 2 * BLOCKS)
     }
 
-    /// Outputs and gradients are those of libtorch's convolutions and autograd.
+    /// Outputs and gradients equal those of libtorch's convolutions and autograd.
     #[test]
-    fn passes_are_those_of_libtorch() {
+    fn passes_equal_those_of_libtorch() {
         let [inputs, hidden, outputs] = SHAPE;
         let (width, height) = SIZE;
         let shapes: Vec<(usize, usize)> = (0..2 * BLOCKS + 2)

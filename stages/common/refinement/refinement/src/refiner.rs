@@ -309,8 +309,8 @@ mod tests {
         )
     }
 
-    /// A network with no zero weights.
-    fn random(architecture: RefinerArchitecture) -> Refiner {
+    /// Returns a refiner with random weights, none of which is 0.
+    fn random_refiner(architecture: RefinerArchitecture) -> Refiner {
         let mut refiner = Refiner::new(architecture, 5);
         let mut rng = CounterRng::new(5, 6, 7);
         for parameter in &mut refiner.parameters {
@@ -324,7 +324,7 @@ mod tests {
     fn tiles_leave_no_seams() {
         nets::deterministic();
         let architecture = RefinerArchitecture { channels: 6, blocks: 2, guidance: None };
-        let refiner = random(architecture);
+        let refiner = random_refiner(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
             let view = image(width, height);
             let window = Window {
@@ -337,18 +337,18 @@ mod tests {
             around.fold(|x, y| input.extend_from_slice(around.pixel(&view, x, y)));
             let mut pass = Pass::default();
             let output = pass.forward(&refiner.layers(), around.folds(), &input);
-            let mut added = Vec::new();
-            output.copy_samples(OUTPUTS * FOLD * FOLD, &mut added);
+            let mut residual = Vec::new();
+            output.copy_samples(OUTPUTS * FOLD * FOLD, &mut residual);
             let refined = refiner.refine(&view).unwrap();
-            window.unfold(&added, OUTPUTS, |x, y, added| {
+            window.unfold(&residual, OUTPUTS, |x, y, residual| {
                 if x < width && y < height {
                     for c in 0..OUTPUTS {
-                        let whole =
-                            (view.data[(y * width + x) * INPUTS + c] + added[c]).clamp(0.0, 1.0);
+                        let expected =
+                            (view.data[(y * width + x) * INPUTS + c] + residual[c]).clamp(0.0, 1.0);
                         let tiled = refined.data[(y * width + x) * OUTPUTS + c];
                         assert!(
-                            (whole - tiled).abs() < 1e-5,
-                            "{width}×{height} at {x}, {y}: {tiled} where {whole} is right"
+                            (expected - tiled).abs() < 1e-5,
+                            "{width}×{height} at {x}, {y}: {tiled}, expected {expected}"
                         );
                     }
                 }
@@ -356,7 +356,8 @@ mod tests {
         }
     }
 
-    fn added_to(refiner: &Refiner, view: &Image) -> Vec<f32> {
+    /// Returns the residual of a window of 8×8 pixels.
+    fn window_residual(refiner: &Refiner, view: &Image) -> Vec<f32> {
         let window = Window { x: 4, y: 4, size: (8, 8) };
         let layers = refiner.layers();
         let (architecture, mut pass) = (refiner.architecture, Pass::default());
@@ -366,23 +367,25 @@ mod tests {
     /// Training on few images pushes features below 0 everywhere. The residual must still depend
     /// on the input, or gradients would vanish for good.
     #[test]
-    fn a_network_does_not_fall_silent() {
+    fn residuals_depend_on_the_input_if_features_are_negative() {
         nets::deterministic();
-        let mut refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
+        let mut refiner =
+            random_refiner(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         refiner.parameters[1] = vec![-10.0; 6];
         let (dark, view) = (Image::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), image(16, 16));
-        let apart = added_to(&refiner, &dark)
+        let difference = window_residual(&refiner, &dark)
             .iter()
-            .zip(added_to(&refiner, &view))
+            .zip(window_residual(&refiner, &view))
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, f32::max);
-        assert!(apart > 0.01, "{apart}");
+        assert!(difference > 0.01, "{difference}");
     }
 
     /// A tile without opacity in its surroundings stays unchanged; one opaque pixel changes it.
     #[test]
-    fn transparent_tiles_stay() {
-        let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
+    fn transparent_tiles_are_unchanged() {
+        let refiner =
+            random_refiner(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         let mut view = image(2 * TILE_SIDE, 8);
         for pixel in view.data.chunks_exact_mut(INPUTS) {
             pixel[3] = 0.0;
@@ -404,40 +407,55 @@ mod tests {
         assert_eq!(changed_tiles(&view), [true, true]);
     }
 
-    fn mirrored(p: &Image) -> Image {
-        let data = p
+    fn mirrored(view: &Image) -> Image {
+        let data = view
             .data
-            .chunks_exact(p.width * p.channels)
-            .flat_map(|row| row.chunks_exact(p.channels).rev().flatten().copied());
-        Image::new(p.width, p.height, p.channels, data.collect())
+            .chunks_exact(view.width * view.channels)
+            .flat_map(|row| row.chunks_exact(view.channels).rev().flatten().copied());
+        Image::new(view.width, view.height, view.channels, data.collect())
     }
 
-    fn apart_by(refiner: &Refiner, view: &Image, turns: u32) -> f32 {
-        let straight = mirrored(&refiner.refine_weighted(view, 1.0, turns).unwrap());
-        let turned = refiner.refine_weighted(&mirrored(view), 1.0, turns).unwrap();
-        straight.data.iter().zip(&turned.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    /// Returns the largest difference between mirroring after and before refinement.
+    fn mirroring_error(refiner: &Refiner, view: &Image, orientations: u32) -> f32 {
+        let mirrored_after = mirrored(&refiner.refine_weighted(view, 1.0, orientations).unwrap());
+        let mirrored_before = refiner.refine_weighted(&mirrored(view), 1.0, orientations).unwrap();
+        mirrored_after
+            .data
+            .iter()
+            .zip(&mirrored_before.data)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max)
     }
 
     /// With all eight orientations, refining a mirrored view equals mirroring the refined view.
     #[test]
-    fn all_turns_together_prefer_no_direction() {
+    fn all_orientations_together_prefer_no_direction() {
         nets::deterministic();
-        let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
+        let refiner =
+            random_refiner(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         let view = image(150, 10);
-        assert!(apart_by(&refiner, &view, 8) < 1e-5, "{}", apart_by(&refiner, &view, 8));
-        assert!(apart_by(&refiner, &view, 1) > 0.01, "{}", apart_by(&refiner, &view, 1));
+        assert!(
+            mirroring_error(&refiner, &view, 8) < 1e-5,
+            "{}",
+            mirroring_error(&refiner, &view, 8)
+        );
+        assert!(
+            mirroring_error(&refiner, &view, 1) > 0.01,
+            "{}",
+            mirroring_error(&refiner, &view, 1)
+        );
     }
 
     #[test]
-    fn what_is_written_is_read_and_other_networks_are_refused() {
+    fn written_weights_are_read_and_other_networks_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(WEIGHTS_FILE);
         let architecture =
             RefinerArchitecture { channels: 6, blocks: 1, guidance: Some(WarpOptions::default()) };
-        let refiner = random(architecture);
+        let refiner = random_refiner(architecture);
         refiner.write(&path).unwrap();
-        let again = Refiner::read(&path, architecture).unwrap();
-        assert_eq!(refiner.parameters, again.parameters);
+        let read = Refiner::read(&path, architecture).unwrap();
+        assert_eq!(refiner.parameters, read.parameters);
         for other in [
             RefinerArchitecture { channels: 7, ..architecture },
             RefinerArchitecture { blocks: 2, ..architecture },
@@ -456,7 +474,7 @@ mod tests {
             );
         }
         assert_eq!(
-            again.refine(&image(8, 8)).unwrap_err().to_string(),
+            read.refine(&image(8, 8)).unwrap_err().to_string(),
             format!("expected a view of {REFERENCE_INPUTS} channels, found 4")
         );
         let bytes = std::fs::read(&path).unwrap();

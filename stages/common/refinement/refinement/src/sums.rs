@@ -46,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sums_are_those_of_the_pixels_around() {
+    fn sums_cover_the_window_around_a_pixel() {
         let (width, height) = (17, 13);
         let value = |i: usize| [(i * i % 29) as f64, 1.0];
         let sums = Sums::new(width, &(0..width * height).map(value).collect::<Vec<_>>());

@@ -470,13 +470,13 @@ mod tests {
     use crate::refiner::RefinerArchitecture;
     use crate::view::Rendered;
 
-    fn level(phase: usize, i: usize, blur: bool) -> f32 {
-        let at = |x: usize| if ((x + phase) / 4).is_multiple_of(2) { 0.2 } else { 0.8f32 };
+    fn level(phase: usize, i: usize, is_blurred: bool) -> f32 {
+        let stripe = |x: usize| if ((x + phase) / 4).is_multiple_of(2) { 0.2 } else { 0.8f32 };
         let x = i % 32 + 1;
-        if blur { (at(x - 1) + at(x) + at(x + 1)) / 3.0 } else { at(x) }
+        if is_blurred { (stripe(x - 1) + stripe(x) + stripe(x + 1)) / 3.0 } else { stripe(x) }
     }
 
-    /// Stripes, and the same blurred by a pixel.
+    /// Returns a view of stripes, whose render is blurred by a pixel.
     fn example(phase: usize) -> KnownView {
         let view = (0..32 * 32)
             .flat_map(|i| {
@@ -495,7 +495,7 @@ mod tests {
                 cy: 16.0,
                 distortion: Default::default(),
             },
-            // A wall at distance 2, along which the camera moves by a pixel a phase.
+            // A wall at distance 2, along which the camera moves by one pixel per phase.
             camera_to_world: [
                 [1.0, 0.0, 0.0, phase as f64 / 16.0],
                 [0.0, 1.0, 0.0, 0.0],
@@ -526,7 +526,7 @@ mod tests {
     }
 
     #[test]
-    fn a_blur_is_unlearnt() {
+    fn a_blur_is_removed() {
         for guidance in [None, Some(WarpOptions::default())] {
             let (trainer, examples) = trained(guidance);
             let scores = trainer.score(&[example(5)], &examples).unwrap();
@@ -535,31 +535,34 @@ mod tests {
         }
     }
 
-    /// References of the same wall display the stripes unchanged and in place, with full
+    /// References of the same wall display the stripes unchanged and in place, with high
     /// confidence. Pixels that no reference observes have no features.
     #[test]
-    fn references_show_what_is_there() {
+    fn warped_references_equal_the_truth() {
         let (view, other) = (example(5), example(2));
         let pixels = with_references(&view.rendered, &[&other], WarpOptions::default()).view;
-        let (mut seen, mut worst) = (0, 0.0f32);
+        let (mut n_visible, mut max_error) = (0, 0.0f32);
         for (i, pixel) in pixels.data.chunks_exact(REFERENCE_INPUTS).enumerate() {
             let column = i % 32;
             if pixel[7] == 0.0 {
-                // The other camera stands three pixels to the left: it doesn't see the last three
-                // columns.
+                // The last three columns are not visible from the other camera, which is three
+                // pixels to the left.
                 assert!(column >= 29 && pixel[4..7] == [0.0; 3], "column {column}");
                 continue;
             }
-            seen += 1;
-            worst = worst.max((pixel[0] + pixel[4] - view.truth.data[i * 3]).abs());
-            // At the border half a stripe is seen, which isn't as dark as the blurred one.
+            n_visible += 1;
+            max_error = max_error.max((pixel[0] + pixel[4] - view.truth.data[i * 3]).abs());
+            // The half stripe that is visible at the border isn't as dark as the blurred one.
             assert!(
                 pixel[7] > if (5..20).contains(&column) { 0.8 } else { 0.5 },
                 "column {column}: {}",
                 pixel[7]
             );
         }
-        assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
+        assert!(
+            n_visible >= 28 * 32 && max_error < 1e-3,
+            "{n_visible} visible pixels, maximum error {max_error}"
+        );
         assert!(
             with_references(&view.rendered, &[], WarpOptions::default())
                 .view

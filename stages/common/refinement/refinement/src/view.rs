@@ -153,7 +153,8 @@ mod tests {
 
     use super::*;
 
-    /// A view of coarse patches, and an image that differs from it by fine detail and an exposure.
+    /// Creates a view of coarse patches, and a ground truth that differs from the view by fine
+    /// detail and an exposure.
     fn view(gain: f32, offset: f32) -> KnownView {
         let (width, height) = (96, 64);
         let camera = Camera {
@@ -188,11 +189,11 @@ mod tests {
     }
 
     #[test]
-    fn another_exposure_is_found_and_taken_away() {
+    fn a_different_exposure_is_estimated_and_removed() {
         assert!(view(1.0, 0.0).exposure().unwrap().is_negligible());
         for (gain, offset) in [(0.6, 0.0), (0.8, 0.1), (1.2, -0.05)] {
-            let dark = view(gain, offset);
-            let exposure = dark.exposure().unwrap();
+            let exposed = view(gain, offset);
+            let exposure = exposed.exposure().unwrap();
             assert!(
                 !exposure.is_negligible()
                     && exposure.gain.iter().all(|g| (g / gain - 1.0).abs() < 0.05),
@@ -200,8 +201,9 @@ mod tests {
             );
             let offsets = exposure.offset.map(|o| (o - offset).abs());
             assert!(offsets.iter().all(|o| *o < 0.02), "{exposure:?}");
-            let (same, again) = (view(1.0, 0.0), dark.with_corrected_exposure(&exposure));
-            let pairs = || same.truth.data.iter().zip(&again.truth.data);
+            let (reference, corrected) =
+                (view(1.0, 0.0), exposed.with_corrected_exposure(&exposure));
+            let pairs = || reference.truth.data.iter().zip(&corrected.truth.data);
             let mean = pairs().map(|(a, b)| (a - b).abs()).sum::<f32>() / pairs().count() as f32;
             assert!(mean < 0.02, "{mean}");
         }

@@ -297,6 +297,7 @@ mod tests {
     const WIDTH: usize = 96;
     const HEIGHT: usize = 48;
 
+    /// Returns a colour channel of the wall at a pixel of [`wall`]'s view.
     fn level(right: usize, x: isize, y: isize, c: u64) -> f32 {
         let patch = (x + right as isize).div_euclid(6) * 1000 + y.div_euclid(6);
         0.2 + 0.6 * uniform(4, c, patch as u64)
@@ -342,80 +343,84 @@ mod tests {
 
     /// Returns the fraction of the view's pixels that are visible in the reference, their mean
     /// confidence, and the mean error of warped colours, weighted by confidence.
-    fn judged(view: &KnownView, reference: &KnownView, options: WarpOptions) -> (f64, f64, f64) {
+    fn warp_quality(
+        view: &KnownView,
+        reference: &KnownView,
+        options: WarpOptions,
+    ) -> (f64, f64, f64) {
         let ConditionedView { view: conditioned, statistics } =
             with_references(&view.rendered, &[reference], options);
-        let visible = statistics[0].visible_pixels;
-        let (seen, confidence) = (
-            visible as f64 / (WIDTH * HEIGHT) as f64,
-            statistics[0].confidence / visible.max(1) as f64,
+        let visible_pixels = statistics[0].visible_pixels;
+        let (visible, confidence) = (
+            visible_pixels as f64 / (WIDTH * HEIGHT) as f64,
+            statistics[0].confidence / visible_pixels.max(1) as f64,
         );
-        let (mut sum, mut all) = (0.0, 0.0);
+        let (mut weighted_sum, mut weight_sum) = (0.0, 0.0);
         for (pixel, truth) in
             conditioned.data.chunks_exact(REFERENCE_INPUTS).zip(view.truth.data.chunks_exact(3))
         {
-            let off =
+            let error =
                 (0..3).map(|c| f64::from(pixel[c] + pixel[4 + c] - truth[c]).abs()).sum::<f64>()
                     / 3.0;
-            sum += off * f64::from(pixel[7]);
-            all += f64::from(pixel[7]);
+            weighted_sum += error * f64::from(pixel[7]);
+            weight_sum += f64::from(pixel[7]);
         }
-        (seen, confidence, sum / f64::max(all, 1e-9))
+        (visible, confidence, weighted_sum / f64::max(weight_sum, 1e-9))
     }
 
     #[test]
-    fn confidence_falls_where_it_looks_otherwise_than_rendered() {
+    fn confidence_falls_where_reference_and_render_differ() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
-        let (seen, confidence, off) = judged(&view, &reference, WarpOptions::default());
+        let (visible, confidence, error) = warp_quality(&view, &reference, WarpOptions::default());
         assert!(
-            (0.7..0.8).contains(&seen) && confidence > 0.85 && off < 0.01,
-            "right: {seen} {confidence} {off}"
+            (0.7..0.8).contains(&visible) && confidence > 0.85 && error < 0.01,
+            "correct: {visible} {confidence} {error}"
         );
         // Depth 3 instead of 2 displaces warped references by eight pixels.
         let (_, confidence, _) =
-            judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0), WarpOptions::default());
+            warp_quality(&wall(0, |_| 3.0), &wall(24, |_| 3.0), WarpOptions::default());
         assert!(confidence < 0.5, "shifted: {confidence}");
         // Depths with noise within the tolerance of the visibility test, from a distant camera.
         let noisy = |seed: u64| move |i: usize| 2.0 + 0.03 * (uniform(seed, 1, i as u64) - 0.5);
-        let (_, calm, _) = judged(&wall(0, |_| 2.0), &wall(60, |_| 2.0), WarpOptions::default());
+        let (_, noiseless, _) =
+            warp_quality(&wall(0, |_| 2.0), &wall(60, |_| 2.0), WarpOptions::default());
         let (_, confidence, _) =
-            judged(&wall(0, noisy(1)), &wall(60, noisy(2)), WarpOptions::default());
-        assert!(confidence < 0.8 * calm, "noisy: {confidence} of {calm}");
+            warp_quality(&wall(0, noisy(1)), &wall(60, noisy(2)), WarpOptions::default());
+        assert!(confidence < 0.8 * noiseless, "noisy: {confidence} of {noiseless}");
         // A reference with other colours.
-        let mut other = wall(24, |_| 2.0);
-        other.truth.data.iter_mut().for_each(|v| *v = 1.0 - *v);
-        let (_, confidence, _) = judged(&view, &other, WarpOptions::default());
-        assert!(confidence < 0.5, "other: {confidence}");
+        let mut recoloured = wall(24, |_| 2.0);
+        recoloured.truth.data.iter_mut().for_each(|v| *v = 1.0 - *v);
+        let (_, confidence, _) = warp_quality(&view, &recoloured, WarpOptions::default());
+        assert!(confidence < 0.5, "recoloured: {confidence}");
         // A reference that observes another part of the wall.
-        assert_eq!(judged(&view, &wall(500, |_| 2.0), WarpOptions::default()).0, 0.0);
+        assert_eq!(warp_quality(&view, &wall(500, |_| 2.0), WarpOptions::default()).0, 0.0);
     }
 
-    fn seen(view: &KnownView, reference: &KnownView, occlusion: bool) -> usize {
+    fn visible_pixels(view: &KnownView, reference: &KnownView, occlusion: bool) -> usize {
         let options = WarpOptions { occlusion };
         with_references(&view.rendered, &[reference], options).statistics[0].visible_pixels
     }
 
-    /// Hidden points are warped only without the test for occlusion.
     #[test]
-    fn what_is_hidden_is_not_shown() {
-        // The reference has a plate before the middle third of its image.
+    fn hidden_points_are_warped_only_without_the_occlusion_test() {
+        // A plate hides the middle third of the reference.
         let plate =
             |i: usize| if (WIDTH / 3..2 * WIDTH / 3).contains(&(i % WIDTH)) { 1.0 } else { 2.0 };
         let (view, reference) = (wall(0, |_| 2.0), wall(24, plate));
-        let hidden = (seen(&view, &reference, false) - seen(&view, &reference, true)) as f64
+        let hidden = (visible_pixels(&view, &reference, false)
+            - visible_pixels(&view, &reference, true)) as f64
             / (WIDTH * HEIGHT) as f64;
         assert!((0.28..0.36).contains(&hidden), "{hidden} of the view is hidden");
     }
 
-    /// Features of a band of rows equal those of the complete view.
     #[test]
-    fn bands_are_those_of_the_whole() {
+    fn features_of_a_band_equal_those_of_the_complete_view() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
         let options = WarpOptions::default();
-        let whole = with_references(&view.rendered, &[&reference], options).view;
+        let complete = with_references(&view.rendered, &[&reference], options).view;
         let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, options);
         assert_eq!(band.features.len(), 34 * WIDTH);
-        let expected = whole.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
+        let expected = complete.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
         for (found, expected) in band.features.iter().zip(expected) {
             assert!(
                 found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5),

@@ -194,7 +194,7 @@ mod tests {
     use super::super::work::SceneKind;
     use super::*;
 
-    /// Returns square images, whose LR width is that of the field.
+    /// Returns work with square images; the field's LR width is their width.
     fn work(kind: SceneKind, count: u64, width: u64) -> Work {
         let images = Images { count, pixels: count * width * width, largest_size: (width, width) };
         Work {
@@ -222,7 +222,7 @@ mod tests {
         })
     }
 
-    /// Published times (docs/results/engine.md), twice the minutes of two cores.
+    /// Expected times are published (docs/results/engine.md): twice the elapsed time on two cores.
     #[test]
     fn published_times_are_estimated_within_30_percent() {
         let rendering = |samples: u32| json!({"samples_per_axis": samples, "tolerance": 0.0025});
@@ -233,25 +233,25 @@ mod tests {
         draft["march_steps"] = json!(256);
         draft["hidden_dim"] = json!(32);
         // Rows of docs/results/time.md, with the parameters of these qualities.
-        let quick = |rays: u64, step_samples: u64, cells: f64| {
-            let mut quick = training(rays);
-            quick["samples_per_step"] = json!(step_samples);
-            quick["cells_per_pixel"] = json!(cells);
-            quick["hidden_dim"] = json!(32);
-            quick
+        let small_network = |rays: u64, step_samples: u64, cells: f64| {
+            let mut parameters = training(rays);
+            parameters["samples_per_step"] = json!(step_samples);
+            parameters["cells_per_pixel"] = json!(cells);
+            parameters["hidden_dim"] = json!(32);
+            parameters
         };
         let withheld = work(object, 88, 100);
         let short = |rays: u64| {
-            let mut short = draft.clone();
-            short["rays"] = json!(rays);
-            short
+            let mut parameters = draft.clone();
+            parameters["rays"] = json!(rays);
+            parameters
         };
         let (demo, backdrop) = (work(object, 80, 100), work(SceneKind::Unbounded, 80, 100));
         for (name, program, parameters, work, seconds) in [
             ("lego 100×2", "train-ss", training(32_000_000), &lego, 408.0),
             ("lego 100×2, short", "train-ss", training(2_000_000), &lego, 46.8),
-            ("draft", "train-ss", quick(1_056_000, 6_144, 1.28), &withheld, 11.4),
-            ("fast", "train-ss", quick(3_080_000, 12_288, 1.6), &withheld, 30.2),
+            ("draft", "train-ss", small_network(1_056_000, 6_144, 1.28), &withheld, 11.4),
+            ("fast", "train-ss", small_network(3_080_000, 12_288, 1.6), &withheld, 30.2),
             ("balanced", "train-ss", training(9_680_000), &withheld, 138.0),
             ("best", "train-ss", training(28_160_000), &withheld, 390.0),
             ("half the steps and width", "train-ss", draft.clone(), &lego, 16.3),
@@ -274,7 +274,7 @@ mod tests {
         }
     }
 
-    /// Processor time of `demo-scene` on two busy cores: 90 views of 200 pixels, and others.
+    /// Expected values are processor time on two busy cores; the default is 90 views of 200 pixels.
     #[test]
     fn the_demo_scene_is_estimated_within_30_percent() {
         for (changes, seconds) in [
@@ -301,7 +301,7 @@ mod tests {
         assert!(Work::of_demo(&json!({"size": 200}), 2).is_none());
     }
 
-    /// Peak memory in the records of runs, in MB.
+    /// Expected values are peak memory, in MB, from records of runs.
     #[test]
     fn measured_memory_is_estimated_within_20_percent() {
         let (object, opaque) = (SceneKind::Object, SceneKind::Frustum);
@@ -310,8 +310,9 @@ mod tests {
         let lego = work(object, 50, 800);
         let scored = Work { computes_lpips: true, ..lego.clone() };
         let photographs = |bytes| Work { preparation_bytes: bytes, ..work(object, 20, 1) };
-        let without = |work: Work| Work { has_libtorch: false, ..work };
-        let [demo_100, demo_200] = [work(object, 80, 100), work(object, 10, 200)].map(without);
+        let without_libtorch = |work: Work| Work { has_libtorch: false, ..work };
+        let [demo_100, demo_200] =
+            [work(object, 80, 100), work(object, 10, 200)].map(without_libtorch);
         let demo_200 = Work { pixels_across: 100.0, ..demo_200 };
         let refiner = json!({
             "net": "compact", "patch_size": 64, "batch_size": 8, "steps": 1, "self_ensemble": 1,

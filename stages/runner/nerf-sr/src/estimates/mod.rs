@@ -314,8 +314,8 @@ mod tests {
         assert_eq!(corrections(&record(15.0, 500), model), Some((1.5, 0.5)));
         assert_eq!(corrections(&record(100.0, 9000), model), Some((10.0, MAX_CORRECTION)));
         assert_eq!(corrections(&Record { model: None, ..record(15.0, 500) }, model), None);
-        let size = |peak_memory| ModelCost { peak_memory, ..model };
-        assert_eq!(corrections(&record(15.0, 500), size(2000)), Some((1.5, 0.75)));
-        assert_eq!(corrections(&record(15.0, 500), size(600)), Some((1.5, 0.5)));
+        let with_memory = |peak_memory| ModelCost { peak_memory, ..model };
+        assert_eq!(corrections(&record(15.0, 500), with_memory(2000)), Some((1.5, 0.75)));
+        assert_eq!(corrections(&record(15.0, 500), with_memory(600)), Some((1.5, 0.5)));
     }
 }

@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_follow_from_the_path() {
+    fn frames_follow_from_parameters_or_a_recorded_path() {
         let demo = json!({"size": 200, "aspect": 2.0, "train": 8, "test": 2, "backdrop": false});
         let scene = SceneImages::of_demo(&demo, &json!({"scale": 2})).unwrap();
         let images = |count, largest_size: (u64, u64)| {

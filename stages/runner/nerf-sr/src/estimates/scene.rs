@@ -188,7 +188,7 @@ impl SceneImages {
     pub(crate) fn summary(&self) -> String {
         let [train, test] = ["train", "cameras"].map(|folder| {
             let images = self.images(folder).unwrap_or_default();
-            (images.count, images.pixels as f64 / 1e6)
+            (images.count as usize, images.pixels as f64 / 1e6)
         });
         let kind = match self.kind {
             SceneKind::Object => "object in front of a plain background",
@@ -296,7 +296,7 @@ mod tests {
         assert_eq!(scene.images("other"), None);
     }
 
-    /// Photographs keep their size for training, and views are larger.
+    /// Photographs are trained on at their own size; views are larger.
     #[test]
     fn photographs_are_the_lr_images() {
         let planned = PlannedScene {
@@ -322,24 +322,24 @@ mod tests {
     }
 
     #[test]
-    fn an_artifact_has_its_own_sizes() {
+    fn sizes_are_read_from_an_artifact() {
         let folder = tempfile::tempdir().unwrap();
         assert!(SceneImages::of_artifact(folder.path()).unwrap().images("train").is_none());
         let train = folder.path().join("train");
         std::fs::create_dir(&train).unwrap();
-        let size = json!({"camera": {"intrinsics": {"width": 30, "height": 20, "fx": 45.0}}});
-        let write = |space: Value| {
+        let view = json!({"camera": {"intrinsics": {"width": 30, "height": 20, "fx": 45.0}}});
+        let scene_in = |space: Value| {
             let views = json!({
-                "background": "opaque", "bounds": {"space": space}, "views": [size, size],
+                "background": "opaque", "bounds": {"space": space}, "views": [view, view],
             });
             std::fs::write(train.join("views.json"), views.to_string()).unwrap();
             SceneImages::of_artifact(folder.path()).unwrap()
         };
-        let scene = write(json!("contraction"));
+        let scene = scene_in(json!("contraction"));
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Unbounded, 2.0));
         let images = Images { count: 2, pixels: 1200, largest_size: (30, 20) };
         assert_eq!(scene.images("train"), Some(images));
-        let scene = write(json!({"ndc": {"min": [-0.5, -0.25], "max": [0.5, 0.25]}}));
+        let scene = scene_in(json!({"ndc": {"min": [-0.5, -0.25], "max": [0.5, 0.25]}}));
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Frustum, 1.5));
         std::fs::write(train.join("views.json"), "{").unwrap();
         assert!(SceneImages::of_artifact(folder.path()).is_none());

@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_memory_and_the_sum_of_times_count() {
+    fn a_total_has_the_largest_memory_and_the_sum_of_times() {
         let text = "about 40.0 s of processor time: 20.0 s on 2 processors; at most 2.0 MB of \
             memory for a stage";
         assert_eq!(estimates(0).total_text(2).unwrap(), text);
@@ -144,9 +144,9 @@ mod tests {
         );
         assert_eq!(comparison_text(&estimate(10.0, 1), &Record::default()), None);
         let (first, other) = (record(12.0), record(99.0));
-        let ran = [(0, &first), (1, &other)].into_iter();
+        let runs = [(0, &first), (1, &other)].into_iter();
         assert_eq!(
-            total_comparison_text(&estimates(0), ran).unwrap(),
+            total_comparison_text(&estimates(0), runs).unwrap(),
             "12.0 s of processor time, estimated 10.0 s (+20 %)"
         );
         assert_eq!(total_comparison_text(&estimates(0), [(1, &other)].into_iter()), None);

@@ -146,7 +146,7 @@ mod tests {
         Demand { cores, memory: gb * GB }
     }
 
-    fn admission_beside(running: &[Demand], demand: Demand) -> Admission {
+    fn admission_while_running(running: &[Demand], demand: Demand) -> Admission {
         BUDGET.admission(&running.iter().copied().enumerate().collect(), demand)
     }
 
@@ -158,19 +158,22 @@ mod tests {
 
     #[test]
     fn a_stage_starts_while_a_core_a_slot_and_its_memory_are_free() {
-        assert_eq!(admission_beside(&[], demand(64, 8)), Admission::Start);
-        assert_eq!(admission_beside(&[demand(3, 0)], demand(4, 0)), Admission::Start);
-        assert_eq!(admission_beside(&[demand(4, 0)], demand(1, 0)), Admission::Wait);
-        assert_eq!(admission_beside(&[DEFAULT_DEMAND; 3], DEFAULT_DEMAND), Admission::Wait);
+        assert_eq!(admission_while_running(&[], demand(64, 8)), Admission::Start);
+        assert_eq!(admission_while_running(&[demand(3, 0)], demand(4, 0)), Admission::Start);
+        assert_eq!(admission_while_running(&[demand(4, 0)], demand(1, 0)), Admission::Wait);
+        assert_eq!(admission_while_running(&[DEFAULT_DEMAND; 3], DEFAULT_DEMAND), Admission::Wait);
         let wait = "needs 4.0 GB of memory, as in its most similar earlier run, but 3.0 GB of \
             8.0 GB are free";
         assert_eq!(
-            admission_beside(&[demand(1, 5)], demand(1, 4)),
+            admission_while_running(&[demand(1, 5)], demand(1, 4)),
             Admission::WaitForMemory(wait.to_owned())
         );
         let too_large = "needs 9.0 GB of memory, as in its most similar earlier run, but the limit \
             is 8.0 GB; change the limit with --memory";
-        assert_eq!(admission_beside(&[], demand(1, 9)), Admission::TooLarge(too_large.to_owned()));
+        assert_eq!(
+            admission_while_running(&[], demand(1, 9)),
+            Admission::TooLarge(too_large.to_owned())
+        );
     }
 
     fn parts(scale: u64, seed: u64) -> Map<String, Value> {

@@ -22,12 +22,12 @@ struct Action {
     /// Content of the output; equal contents are one object.
     content: u8,
     days_old: u64,
-    state: Finished,
+    state: State,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Finished {
-    Yes,
+enum State {
+    Finished,
     WithCheckpoint,
     WithoutCheckpoint,
 }
@@ -51,9 +51,9 @@ struct Case {
 
 fn cases() -> impl Strategy<Value = Case> {
     let state = prop_oneof![
-        6 => Just(Finished::Yes),
-        1 => Just(Finished::WithCheckpoint),
-        1 => Just(Finished::WithoutCheckpoint)
+        6 => Just(State::Finished),
+        1 => Just(State::WithCheckpoint),
+        1 => Just(State::WithoutCheckpoint)
     ];
     let inputs = prop::collection::vec(any::<u8>(), 0..3);
     let action = (0..3u8, 0..2u8, inputs, 0..6u8, 0..20u64, state).prop_map(
@@ -66,12 +66,12 @@ fn cases() -> impl Strategy<Value = Case> {
             state,
         },
     );
-    let some = || prop::collection::vec(any::<u8>(), 0..3);
+    let numbers = || prop::collection::vec(any::<u8>(), 0..3);
     let waiting = || prop::collection::vec((0..3u8, 0..2u8), 0..2);
     let holder = prop_oneof![
         prop::collection::vec(any::<u8>(), 1..3).prop_map(Holder::Pin),
         any::<u8>().prop_map(Holder::Lock),
-        (some(), waiting(), 0..20u64, any::<bool>()).prop_map(
+        (numbers(), waiting(), 0..20u64, any::<bool>()).prop_map(
             |(keys, waiting, days_ago, in_progress)| Holder::Run {
                 keys,
                 waiting,
@@ -83,7 +83,7 @@ fn cases() -> impl Strategy<Value = Case> {
     (
         prop::collection::vec(action, 1..12),
         prop::collection::vec(holder, 0..4),
-        (some(), waiting()),
+        (numbers(), waiting()),
         prop_oneof![Just(0u64), Just(7)],
         any::<bool>(),
     )
@@ -97,7 +97,7 @@ fn cases() -> impl Strategy<Value = Case> {
 }
 
 /// Store of a case, with its open locks and runs.
-struct Made {
+struct Setup {
     _dir: tempfile::TempDir,
     store: Store,
     /// Keys of all actions, in order.
@@ -110,10 +110,10 @@ struct Made {
 
 /// Repeats an attempt until it gets the lock: other tests start programs, and a file that was open
 /// at such a start stays locked until the program is loaded.
-fn held<T>(mut attempt: impl FnMut() -> Result<Locked<T>, store::StoreError>) -> T {
+fn acquire<T>(mut attempt: impl FnMut() -> Result<Locked<T>, store::StoreError>) -> T {
     loop {
-        if let Locked::Acquired(held) = attempt().unwrap() {
-            return held;
+        if let Locked::Acquired(lock) = attempt().unwrap() {
+            return lock;
         }
         std::thread::yield_now();
     }
@@ -128,8 +128,8 @@ fn waiting((stage, parameter): (u8, u8)) -> PartialKey {
     PartialKey { program: format!("s{stage}"), parameters }
 }
 
-fn make(case: &Case) -> Made {
-    // In memory if possible, since objects are synced to disk.
+fn set_up(case: &Case) -> Setup {
+    // The store is in memory if possible, since objects are synced to disk.
     let memory = std::path::Path::new("/dev/shm");
     let dir =
         if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap();
@@ -154,7 +154,7 @@ fn make(case: &Case) -> Made {
     let (mut locks, mut runs) = (Vec::new(), Vec::new());
     let key = |number: &u8| keys[*number as usize % keys.len()].clone();
     for (i, holder) in case.holders.iter().enumerate() {
-        let entered = held(|| store.try_enter());
+        let entered = acquire(|| store.try_enter());
         match holder {
             Holder::Pin(numbers) => {
                 let actions: Vec<(String, String)> =
@@ -178,14 +178,14 @@ fn make(case: &Case) -> Made {
                     drop(run);
                     let text = fs::read_to_string(&path).unwrap()
                         + &format!("{{\"ended\":{{\"unix\":{}}}}}\n", days_ago(*days));
-                    // Replaced by a file that was never locked.
+                    // Replace the file by one that was never locked.
                     fs::remove_file(&path).unwrap();
                     fs::write(&path, text).unwrap();
                 }
             }
         }
     }
-    Made { _dir: dir, store, keys, parts, _locks: locks, _runs: runs }
+    Setup { _dir: dir, store, keys, parts, _locks: locks, _runs: runs }
 }
 
 /// Creates an action. Returns its key.
@@ -200,7 +200,7 @@ fn make_action(
     if store.record(&key).unwrap().is_some() {
         return key;
     }
-    let entered = held(|| store.try_enter());
+    let entered = acquire(|| store.try_enter());
     let unfinished = Unfinished {
         stage: stage.clone(),
         key_parts: key_parts.clone(),
@@ -208,9 +208,9 @@ fn make_action(
         ..Default::default()
     };
     let attempt = store.begin(&entered, &unfinished, &json!({})).unwrap();
-    if action.state != Finished::Yes {
+    if action.state != State::Finished {
         fs::create_dir_all(&attempt.work).unwrap();
-        if action.state == Finished::WithCheckpoint {
+        if action.state == State::WithCheckpoint {
             fs::write(attempt.work.join("checkpoint"), "x").unwrap();
         }
         return key;
@@ -226,49 +226,49 @@ fn make_action(
 }
 
 /// Returns the keys to keep by definition: repeats passes until a pass adds none.
-fn expected(case: &Case, made: &Made) -> BTreeSet<String> {
-    let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
+fn expected_keys(case: &Case, setup: &Setup) -> BTreeSet<String> {
+    let key = |number: &u8| setup.keys[*number as usize % setup.keys.len()].clone();
     let recent = |days: u64| days < case.keep_days;
-    // `named` keeps single actions, `whole` also all actions behind their inputs.
-    let mut named: BTreeSet<String> = case.plan.0.iter().map(key).collect();
-    let mut whole: BTreeSet<String> = BTreeSet::new();
+    // `single` keeps actions alone, `with_inputs` together with all actions of their inputs.
+    let mut single: BTreeSet<String> = case.plan.0.iter().map(key).collect();
+    let mut with_inputs: BTreeSet<String> = BTreeSet::new();
     let mut nodes: Vec<(u8, u8)> = case.plan.1.clone();
     for holder in &case.holders {
         match holder {
-            Holder::Pin(numbers) => named.extend(numbers.iter().map(key)),
-            Holder::Lock(number) => whole.extend([key(number)]),
+            Holder::Pin(numbers) => single.extend(numbers.iter().map(key)),
+            Holder::Lock(number) => with_inputs.extend([key(number)]),
             Holder::Run { keys, waiting, days_ago, in_progress }
                 if *in_progress || recent(*days_ago) =>
             {
-                named.extend(keys.iter().map(key));
+                single.extend(keys.iter().map(key));
                 nodes.extend(waiting);
             }
             Holder::Run { .. } => {}
         }
     }
-    for (number, (parts, _)) in &made.parts {
-        let record = made.store.record(number).unwrap();
-        let fits = nodes.iter().any(|(stage, parameter)| {
+    for (action, (parts, _)) in &setup.parts {
+        let record = setup.store.record(action).unwrap();
+        let is_waiting = nodes.iter().any(|(stage, parameter)| {
             parts["stage"] == json!(format!("s{stage}")) && parts["parameter p"] == json!(parameter)
         });
-        if record.is_some() && fits {
-            named.insert(number.clone());
+        if record.is_some() && is_waiting {
+            single.insert(action.clone());
         }
         let is_recent =
             record.is_some_and(|r| unix_time() - r.started_unix < case.keep_days * 86_400);
         let has_checkpoint =
-            made.store.partial(number).join("work/checkpoint").exists() && !case.drop_unfinished;
+            setup.store.partial(action).join("work/checkpoint").exists() && !case.drop_unfinished;
         if is_recent || has_checkpoint {
-            whole.insert(number.clone());
+            with_inputs.insert(action.clone());
         }
     }
     loop {
-        let more: BTreeSet<String> =
-            whole.iter().flat_map(|key| made.parts[key].1.clone()).collect();
-        if more.is_subset(&whole) {
-            return named.union(&whole).cloned().collect();
+        let inputs: BTreeSet<String> =
+            with_inputs.iter().flat_map(|key| setup.parts[key].1.clone()).collect();
+        if inputs.is_subset(&with_inputs) {
+            return single.union(&with_inputs).cloned().collect();
         }
-        whole.extend(more);
+        with_inputs.extend(inputs);
     }
 }
 
@@ -277,17 +277,17 @@ proptest! {
 
     /// An entry is kept if and only if a root reaches it.
     #[test]
-    fn what_roots_reach_stays_and_all_else_goes(case in cases()) {
-        let made = make(&case);
-        let store = &made.store;
-        let stays = expected(&case, &made);
+    fn only_entries_that_roots_reach_are_kept(case in cases()) {
+        let setup = set_up(&case);
+        let store = &setup.store;
+        let kept = expected_keys(&case, &setup);
         let records: BTreeSet<String> =
-            stays.iter().filter(|key| store.record(key).unwrap().is_some()).cloned().collect();
+            kept.iter().filter(|key| store.record(key).unwrap().is_some()).cloned().collect();
         let unfinished: BTreeSet<String> =
-            stays.iter().filter(|key| store.partial(key).exists()).cloned().collect();
+            kept.iter().filter(|key| store.partial(key).exists()).cloned().collect();
         let objects: BTreeSet<String> =
             records.iter().map(|key| store.record(key).unwrap().unwrap().output).collect();
-        let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
+        let key = |number: &u8| setup.keys[*number as usize % setup.keys.len()].clone();
         let plan = Root {
             reason: "the plan".into(),
             keys: case.plan.0.iter().map(key).collect(),
@@ -300,13 +300,13 @@ proptest! {
         let collection = Collection::new(store, plan, policy).unwrap();
         prop_assert_eq!(collection.decisions().len(),
             store.objects().unwrap().len() + store.partials().unwrap().len());
-        collection.carry_out(store, &held(|| store.try_close())).unwrap();
+        collection.carry_out(store, &acquire(|| store.try_close())).unwrap();
         store.empty_trash().unwrap();
 
-        let left = |names: Vec<String>| -> BTreeSet<String> { names.into_iter().collect() };
-        prop_assert_eq!(left(store.action_keys().unwrap()), records);
-        prop_assert_eq!(left(store.objects().unwrap()), objects);
-        prop_assert_eq!(left(store.partials().unwrap()), unfinished);
+        let set = |names: Vec<String>| -> BTreeSet<String> { names.into_iter().collect() };
+        prop_assert_eq!(set(store.action_keys().unwrap()), records);
+        prop_assert_eq!(set(store.objects().unwrap()), objects);
+        prop_assert_eq!(set(store.partials().unwrap()), unfinished);
         for object in store.objects().unwrap() {
             store.verify(&object).unwrap();
         }
@@ -320,10 +320,10 @@ proptest! {
 
 const POLICY: Policy = Policy { keep_days: 7, drop_unfinished: false, drop_old: true };
 
-/// An object that no record names is deleted with its leftover log, and the reason is printed. A
-/// damaged record may be the one that names it: nothing is deleted then.
+/// An object that no record names is deleted with its leftover log, and the reason is printed. If
+/// a record is damaged, nothing is deleted, since that record may name the object.
 #[test]
-fn orphans_go() {
+fn orphans_are_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let store = Store::open(dir.path()).unwrap();
     let parts = json!({"stage": "s0"}).as_object().unwrap().clone();
@@ -331,30 +331,30 @@ fn orphans_go() {
     let record = store.action(&key, "json");
     fs::write(store.action(&key, "log"), "done").unwrap();
     fs::write(&record, "{").unwrap();
-    let said = Collection::new(&store, Root::default(), POLICY).err().unwrap().to_string();
-    assert!(said.contains(&format!("{key}.json: the record is damaged")), "{said}");
+    let message = Collection::new(&store, Root::default(), POLICY).err().unwrap().to_string();
+    assert!(message.contains(&format!("{key}.json: the record is damaged")), "{message}");
     fs::remove_file(&record).unwrap();
     let collection = Collection::new(&store, Root::default(), POLICY).unwrap();
     let decision = collection.decisions()[0].to_string();
     assert!(decision.ends_with("no record names it: delete"), "{decision}");
-    collection.carry_out(&store, &held(|| store.try_close())).unwrap();
+    collection.carry_out(&store, &acquire(|| store.try_close())).unwrap();
     assert!(store.objects().unwrap().is_empty() && store.action_keys().unwrap().is_empty());
 }
 
 /// An unreadable entry may be needed, or may name needed ones. A loop of links is unreadable even
-/// for root.
+/// for the superuser.
 #[test]
-fn what_can_not_be_read_is_an_error() {
+fn unreadable_entries_are_errors() {
     let key = hash_json(&json!({"stage": "s0", "unfinished": true}));
-    let begun = |folder: &str| format!("partial/{key}/{folder}");
+    let unfinished_path = |folder: &str| format!("partial/{key}/{folder}");
     for file in [
         "actions/{record}.json".to_owned(),
         "objects/{object}/artifact.json".to_owned(),
         "runs/x.jsonl".to_owned(),
         "pins/x.jsonl".to_owned(),
         format!("locks/{key}"),
-        begun("action.json"),
-        begun("work"),
+        unfinished_path("action.json"),
+        unfinished_path("work"),
         "slurm/1-2-x".to_owned(),
     ] {
         let dir = tempfile::tempdir().unwrap();
@@ -362,24 +362,24 @@ fn what_can_not_be_read_is_an_error() {
         let parts = json!({"stage": "s0"}).as_object().unwrap().clone();
         let record = make_action(&store, &old_action(1), &parts, &[]);
         let object = store.objects().unwrap().remove(0);
-        fs::create_dir_all(dir.path().join(begun(""))).unwrap();
+        fs::create_dir_all(dir.path().join(unfinished_path(""))).unwrap();
         let file = file.replace("{record}", &record).replace("{object}", &object);
         let path = dir.path().join(&file);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         fs::remove_file(&path).ok();
         std::os::unix::fs::symlink(path.file_name().unwrap(), &path).unwrap();
-        let said = Collection::new(&store, Root::default(), POLICY).err().unwrap().to_string();
-        assert!(said.contains(&file), "{file}: {said}");
+        let message = Collection::new(&store, Root::default(), POLICY).err().unwrap().to_string();
+        assert!(message.contains(&file), "{file}: {message}");
     }
 }
 
 fn old_action(content: u8) -> Action {
-    Action { stage: 0, parameter: 0, inputs: vec![], content, days_old: 90, state: Finished::Yes }
+    Action { stage: 0, parameter: 0, inputs: vec![], content, days_old: 90, state: State::Finished }
 }
 
 /// An artifact with a key of an older version is kept, with its inputs, unless `drop_old` is set.
 #[test]
-fn what_an_older_version_made_stays_until_it_is_dropped() {
+fn artifacts_of_older_versions_are_kept_until_dropped() {
     let dir = tempfile::tempdir().unwrap();
     let store = Store::open(dir.path()).unwrap();
     let map = |parts: Value| parts.as_object().unwrap().clone();
@@ -398,7 +398,7 @@ fn what_an_older_version_made_stays_until_it_is_dropped() {
             Policy { keep_days: 7, drop_unfinished: false, drop_old },
         )
         .unwrap();
-        let reason = collection
+        let reason_count = collection
             .decisions()
             .iter()
             .map(ToString::to_string)
@@ -406,8 +406,8 @@ fn what_an_older_version_made_stays_until_it_is_dropped() {
                 line.ends_with("created by an older version of nerf-sr; deleted by --drop-old")
             })
             .count();
-        assert_eq!(reason, expected.len());
-        collection.carry_out(&store, &held(|| store.try_close())).unwrap();
+        assert_eq!(reason_count, expected.len());
+        collection.carry_out(&store, &acquire(|| store.try_close())).unwrap();
         assert_eq!(store.action_keys().unwrap(), expected);
     }
 }

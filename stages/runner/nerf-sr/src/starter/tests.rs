@@ -18,9 +18,9 @@ fn set(format: Format, sizes: &[(u32, u32)]) -> Dataset {
     Dataset { format, frames: frames.collect(), split: None, notes: Vec::new() }
 }
 
-/// Large photographs are shrunk. The narrowest one decides, since images are never enlarged.
+/// Large photographs are shrunk. The narrowest photograph decides: images are never enlarged.
 #[test]
-fn images_keep_their_size_where_a_cpu_can_do_with_it() {
+fn images_keep_a_size_that_a_cpu_can_train() {
     for (format, sizes, line) in [
         (Format::Colmap, vec![(640, 480)], "lr_source: photographs"),
         (Format::Transforms, vec![(800, 600), (4000, 3000)], "lr_source: photographs"),
@@ -34,22 +34,22 @@ fn images_keep_their_size_where_a_cpu_can_do_with_it() {
 }
 
 #[test]
-fn what_was_found_is_said() {
+fn summaries_describe_the_data_set() {
     let several = set(Format::Colmap, &[(640, 480), (480, 640)]);
     assert_eq!(summarize(&several), "COLMAP (sparse): 2 photographs of several sizes");
-    let one = set(Format::Llff, &[(640, 480)]);
-    assert_eq!(summarize(&one), "LLFF (poses_bounds.npy): 1 photograph of 640×480");
-    let tested = Split { train: vec![0], test: vec![1] };
-    for (split, words) in [(None, "every eighth view"), (Some(tested), "own test views")] {
+    let single = set(Format::Llff, &[(640, 480)]);
+    assert_eq!(summarize(&single), "LLFF (poses_bounds.npy): 1 photograph of 640×480");
+    let own_split = Split { train: vec![0], test: vec![1] };
+    for (split, expected) in [(None, "every eighth view"), (Some(own_split), "own test views")] {
         let text = pipeline_text(&Dataset { split, ..several.clone() }, "found", "./data");
-        assert!(text.contains(words) && !text.contains(['{', '}']), "{text}");
+        assert!(text.contains(expected) && !text.contains(['{', '}']), "{text}");
     }
 }
 
-/// Pixels of photographs, training and views, and what the unmodified photographs would give.
+/// The text has the sizes of photographs, training images and views, with and without shrinking.
 #[test]
-fn the_sizes_are_said() {
-    for (format, sizes_of_photographs, words) in [
+fn sizes_are_described() {
+    for (format, sizes_of_photographs, expected) in [
         (
             Format::Colmap,
             vec![(1080, 1920); 2],
@@ -74,7 +74,7 @@ fn the_sizes_are_said() {
             photograph",
         ),
     ] {
-        assert_eq!(sizes(&set(format, &sizes_of_photographs)), words);
+        assert_eq!(sizes(&set(format, &sizes_of_photographs)), expected);
     }
 }
 
@@ -82,14 +82,14 @@ fn the_sizes_are_said() {
 #[test]
 fn no_target_is_missing() {
     for folder in ["pipelines", "experiments"] {
-        let shelf = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..").join(folder);
-        let mut names: Vec<String> = fs::read_dir(shelf)
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..").join(folder);
+        let mut names: Vec<String> = fs::read_dir(path)
             .unwrap()
             .map(|entry| entry.unwrap().file_name().into_string().unwrap())
             .collect();
         names.sort();
-        let inside = TARGETS.iter().filter(|target| target.0 == folder);
-        let targets: Vec<&str> = inside.map(|target| target.1).collect();
+        let shipped = TARGETS.iter().filter(|target| target.0 == folder);
+        let targets: Vec<&str> = shipped.map(|target| target.1).collect();
         assert_eq!(names, targets);
     }
 }

@@ -202,21 +202,21 @@ fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Co
 mod tests {
     use super::*;
 
-    fn all() -> Vec<QualityCosts> {
-        let sizes = Quality::ALL.into_iter().zip([1u32, 3, 10, 30]);
-        sizes
-            .map(|(quality, size)| QualityCosts {
+    fn costs() -> Vec<QualityCosts> {
+        let factors = Quality::ALL.into_iter().zip([1u32, 3, 10, 30]);
+        factors
+            .map(|(quality, factor)| QualityCosts {
                 quality,
                 parts: [Cost::default(); COLUMNS.len()],
-                total: Cost { seconds: 60.0 * f64::from(size), memory: 200_000_000 },
-                min_memory: 100_000_000 * u64::from(size),
+                total: Cost { seconds: 60.0 * f64::from(factor), memory: 200_000_000 },
+                min_memory: 100_000_000 * u64::from(factor),
                 unknown: 0,
                 excludes_refining: false,
             })
             .collect()
     }
 
-    /// Two processors need half of the processor time.
+    /// Two processors halve the duration of a quality.
     #[test]
     fn the_best_quality_within_the_limits_is_chosen() {
         for (minutes, memory, expected) in [
@@ -230,8 +230,8 @@ mod tests {
             (Some(0.6), Some("1G"), Quality::Draft),
         ] {
             let memory = memory.map(|amount| amount.parse().unwrap());
-            let all = all();
-            let chosen = choose(&all, Limits { minutes, memory }, 2).quality;
+            let costs = costs();
+            let chosen = choose(&costs, Limits { minutes, memory }, 2).quality;
             assert_eq!(chosen, expected, "{minutes:?}, {memory:?}");
         }
     }

@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_character_has_two_pixels_and_the_shape_stays() {
+    fn a_character_has_two_pixels_and_proportions_are_kept() {
         let pixel = |i: usize| if i < 8 { [255, 0, 0, 255] } else { [0, 0, 255, 255] };
         let image = Rgba8::new(4, 4, (0..16).flat_map(pixel).collect());
         let text = half_blocks(&image, 2, 24);

@@ -56,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn looks_take_their_share_and_no_more() {
+    fn looks_use_their_share_and_no_more() {
         for (threads, pixels, cost) in [(1, 1 << 12, 0.2), (2, 640_000, 3.0), (16, 640_000, 9.0)] {
             let mut budget = LookBudget::new(threads, pixels);
             budget.record_miss(Duration::from_secs_f64(0.1));
@@ -65,13 +65,13 @@ mod tests {
                 budget.record_look(Duration::from_secs_f64(cost));
                 (spent, looks) = (spent + cost, looks + 1);
             }
-            let most = MAX_TIME_SHARE * 3600.0 * threads as f64;
-            assert!(spent <= most && spent > most - 2.0 * cost, "{looks} looks took {spent} s");
+            let limit = MAX_TIME_SHARE * 3600.0 * threads as f64;
+            assert!(spent <= limit && spent > limit - 2.0 * cost, "{looks} looks took {spent} s");
         }
     }
 
     #[test]
-    fn a_look_without_a_checkpoint_leaves_the_estimate() {
+    fn a_look_without_a_checkpoint_keeps_the_estimate() {
         let mut budget = LookBudget::new(2, 640_000);
         let expected = budget.expected();
         budget.record_miss(Duration::from_millis(50));

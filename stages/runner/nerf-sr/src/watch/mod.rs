@@ -243,7 +243,7 @@ mod tests {
     use super::picture_file_name;
 
     #[test]
-    fn labels_become_names_of_files() {
+    fn labels_become_file_names() {
         assert_eq!(picture_file_name("train-ss"), "train-ss.png");
         assert_eq!(
             picture_file_name("train-ss [supersample=2 a/b]"),

@@ -80,16 +80,16 @@ mod tests {
     #[test]
     fn other_views_are_left_out_and_other_files_are_linked() {
         let folder = tempfile::tempdir().unwrap();
-        let (whole, one) = (folder.path().join("whole"), folder.path().join("one"));
-        std::fs::create_dir_all(whole.join("images")).unwrap();
-        std::fs::write(whole.join("images/b.png"), "b").unwrap();
-        std::fs::write(whole.join(MANIFEST_FILE), "{}").unwrap();
+        let (source, copy) = (folder.path().join("source"), folder.path().join("copy"));
+        std::fs::create_dir_all(source.join("images")).unwrap();
+        std::fs::write(source.join("images/b.png"), "b").unwrap();
+        std::fs::write(source.join(MANIFEST_FILE), "{}").unwrap();
         let view = |name| json!({"camera": {"name": name}, "image": "images/b.png"});
-        let list_of = |views: &[Value]| json!({"background": "white", "views": views});
-        artifact::write_json(&whole.join(VIEWS_FILE), &list_of(&[view("a"), view("b")])).unwrap();
-        WatchedView { name: "b".to_owned(), pixels: 1 }.copy_cut(&whole, &one).unwrap();
-        assert_eq!(read_list(&one).unwrap(), list_of(&[view("b")]));
-        assert_eq!(std::fs::read_to_string(one.join("images/b.png")).unwrap(), "b");
-        assert!(!one.join(MANIFEST_FILE).exists());
+        let list = |views: &[Value]| json!({"background": "white", "views": views});
+        artifact::write_json(&source.join(VIEWS_FILE), &list(&[view("a"), view("b")])).unwrap();
+        WatchedView { name: "b".to_owned(), pixels: 1 }.copy_cut(&source, &copy).unwrap();
+        assert_eq!(read_list(&copy).unwrap(), list(&[view("b")]));
+        assert_eq!(std::fs::read_to_string(copy.join("images/b.png")).unwrap(), "b");
+        assert!(!copy.join(MANIFEST_FILE).exists());
     }
 }

@@ -1,4 +1,4 @@
-//! Lines and memory of a stage, as they reach the caller.
+//! Lines and peak memory of a stage, as reported to the caller.
 
 use std::sync::Mutex;
 
@@ -9,7 +9,7 @@ use super::*;
 /// Watcher that collects lines, and creates a file at the first one.
 struct Lines {
     lines: Mutex<Vec<String>>,
-    seen: PathBuf,
+    seen_file: PathBuf,
 }
 
 impl Watcher for Lines {
@@ -17,25 +17,25 @@ impl Watcher for Lines {
 
     fn stderr_line(&self, line: &str) {
         self.lines.lock().unwrap().push(line.to_owned());
-        std::fs::write(&self.seen, "").unwrap();
+        std::fs::write(&self.seen_file, "").unwrap();
     }
 }
 
-/// Runs a stage, a shell script in which `$SEEN` is the file that the first line creates. Returns
-/// the lines and the reason of the failure.
-fn lines_of(script: &str) -> (Vec<String>, Option<String>) {
+/// Runs a shell script as a stage. Returns its lines and the reason of its failure.
+fn lines_and_reason(script: &str) -> (Vec<String>, Option<String>) {
     let (lines, result) = run(script);
     (lines, result.err().map(|failure| failure.message))
 }
 
-/// Runs a stage, a shell script. Returns its lines and its result.
+/// Runs a shell script as a stage; `$SEEN` is the file that its first line creates. Returns its
+/// lines and its result.
 fn run(script: &str) -> (Vec<String>, Result<Usage, StageFailure>) {
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name);
-    let seen = file("seen");
-    let text = format!("#!/bin/sh\nSEEN='{}'\n{script}\n", seen.display());
+    let seen_file = file("seen");
+    let text = format!("#!/bin/sh\nSEEN='{}'\n{script}\n", seen_file.display());
     std::fs::write(file("source"), text).unwrap();
-    // Written by another process: a file that this one has open can't be run.
+    // Another process writes the program: a file that this process has open can't be run.
     let mut install = Command::new("install");
     assert!(
         install
@@ -62,32 +62,33 @@ fn run(script: &str) -> (Vec<String>, Result<Usage, StageFailure>) {
         threads: 1,
         lock: None,
     };
-    let watcher = Lines { lines: Mutex::default(), seen };
+    let watcher = Lines { lines: Mutex::default(), seen_file };
     let result = call.run(&file("log"), &watcher, &AtomicBool::new(false));
     (watcher.lines.into_inner().unwrap(), result)
 }
 
-/// A small stage of a large runner has its own peak memory; a program that the stage calls counts.
+/// A stage's peak memory includes the programs that the stage calls, but not the runner.
 #[test]
-fn memory_of_the_runner_is_not_the_stages() {
+fn peak_memory_excludes_the_runner() {
     let large = std::hint::black_box(vec![1u8; 100_000_000]);
     let peak_of = |script: &str| run(script).1.unwrap().peak_memory;
     let small = peak_of("sleep 0.3");
     assert!((100_000..20_000_000).contains(&small), "{small}");
     drop(large);
-    let called = peak_of("tail -c 200000000 /dev/zero | head -c 200000000 | tail -n 1 >/dev/null");
-    assert!(called > 150_000_000, "{called}");
+    let with_children =
+        peak_of("tail -c 200000000 /dev/zero | head -c 200000000 | tail -n 1 >/dev/null");
+    assert!(with_children > 150_000_000, "{with_children}");
 }
 
-/// The stage waits for its only line to be seen, as a long training would work on.
+/// The stage waits until its only line is reported: a long training would still be running.
 #[test]
-fn a_line_appears_when_it_is_printed() {
+fn lines_are_reported_while_the_stage_runs() {
     let wait = "for i in $(seq 600); do [ -e $SEEN ] && exit 0; sleep 0.1; done; exit 9";
-    let (lines, failure) = lines_of(&format!("echo resumed at step 5 >&2; {wait}"));
+    let (lines, failure) = lines_and_reason(&format!("echo resumed at step 5 >&2; {wait}"));
     assert_eq!((lines, failure), (vec!["resumed at step 5".to_owned()], None));
 }
 
-/// The caller prints the reason, so it isn't a line as well, however long the stage takes to end.
+/// The caller prints the reason, so it isn't one of the lines, even if the stage ends late.
 #[test]
 fn the_reason_of_a_failure_is_printed_once() {
     for (script, lines, reason) in [
@@ -95,7 +96,7 @@ fn the_reason_of_a_failure_is_printed_once() {
         ("echo one >&2; echo ValueError: bad >&2; exit 1", vec!["one"], "ValueError: bad"),
         ("echo one >&2; echo two >&2", vec!["one", "two"], ""),
     ] {
-        let (found, failure) = lines_of(script);
+        let (found, failure) = lines_and_reason(script);
         assert_eq!(
             (found, failure.unwrap_or_default().as_str()),
             (lines.iter().map(|l| (*l).to_owned()).collect(), reason)

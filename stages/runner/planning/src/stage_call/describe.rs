@@ -153,9 +153,9 @@ fn read_in_background(pipe: Option<impl Read + Send + 'static>) -> mpsc::Receive
 mod tests {
     use super::*;
 
-    /// A program, written by another process: while this one's threads start others, a file that it
-    /// has open itself can't be run.
-    fn program(folder: &Path, name: &str, text: &str) -> PathBuf {
+    /// Writes a program with `install`. A file written by this process can't be run while a child
+    /// just forked by another thread still has the file open.
+    fn write_program(folder: &Path, name: &str, text: &str) -> PathBuf {
         let (source, target) = (folder.join(format!("{name}.sh")), folder.join(name));
         std::fs::write(&source, text).unwrap();
         assert!(
@@ -170,9 +170,9 @@ mod tests {
     }
 
     #[test]
-    fn programs_that_give_no_description() {
+    fn programs_without_a_description_are_refused() {
         let folder = tempfile::tempdir().unwrap();
-        for (text, limit, words) in [
+        for (text, limit, expected) in [
             ("#!/bin/sh\nsleep 1000\n", Duration::from_millis(50), "didn't finish within 50ms"),
             ("#!/bin/sh\nsleep 1000 &\n", Duration::from_millis(200), "didn't finish within 200ms"),
             (
@@ -188,11 +188,11 @@ mod tests {
             ("#!/bin/sh\necho '{}'\n", MAX_DESCRIBE_TIME, "isn't a description: missing field"),
             ("#!/nowhere/at/all\n", MAX_DESCRIBE_TIME, "describe`: No such file"),
         ] {
-            let path = program(folder.path(), "stage", text);
+            let path = write_program(folder.path(), "stage", text);
             let problem = describe(&path, limit, None).unwrap_err().to_string();
-            assert!(problem.contains(words), "{problem}");
+            assert!(problem.contains(expected), "{problem}");
         }
-        let path = program(folder.path(), "waits", "#!/bin/sh\nsleep 1000\n");
+        let path = write_program(folder.path(), "waits", "#!/bin/sh\nsleep 1000\n");
         let stop = AtomicBool::new(true);
         assert!(matches!(describe_all(std::slice::from_ref(&path), Some(&stop)), Err(Interrupted)));
         // Stopped while the program runs.

@@ -115,7 +115,7 @@ fn signal_reason(signal: i32, last_line: Option<&str>) -> String {
 mod tests {
     use super::*;
 
-    /// Creates an exit. The second byte of `status` is the exit code, the first one the signal.
+    /// Creates an exit from a wait status: signal in the low byte, exit code in the second byte.
     fn exit(status: i32, tail: &[&str]) -> Exit {
         let tail = tail.iter().map(|line| (*line).to_owned()).collect();
         let status = ExitStatus::from_raw(status);
@@ -123,8 +123,8 @@ mod tests {
     }
 
     #[test]
-    fn the_reason_is_not_the_last_line_by_position() {
-        for (status, tail, code, starts, ends) in [
+    fn reasons_follow_from_the_status_and_the_last_lines() {
+        for (status, tail, code, start, end) in [
             (3 << 8, &["eval: r_0.png: cut short"][..], 3, "r_0.png: cut short", "short"),
             (1 << 8, &["Traceback", "ValueError: bad"], 1, "ValueError: bad", "bad"),
             (101 << 8, &["thread 'main' panicked at x.rs:1:2:", "a name"], 101, "a name", "name"),
@@ -157,7 +157,7 @@ mod tests {
             let failure = exit(status, tail).failure("eval");
             assert_eq!(failure.code, code, "{tail:?}");
             assert!(
-                failure.message.starts_with(starts) && failure.message.ends_with(ends),
+                failure.message.starts_with(start) && failure.message.ends_with(end),
                 "{tail:?}: {}",
                 failure.message
             );
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_kernel_ended_was_out_of_memory() {
+    fn a_kill_with_exhausted_memory_is_out_of_memory() {
         for (status, expected) in [(9, true), (137 << 8, true), (1 << 8, false), (15, false)] {
             let exit = Exit { was_memory_exhausted: true, ..exit(status, &["Killed"]) };
             let found = exit.failure("eval").message.starts_with("out of memory: killed");
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn what_rusts_runtime_adds_is_no_reason() {
+    fn lines_of_rusts_runtime_are_noise() {
         for line in [
             "note: run with `RUST_BACKTRACE=1` environment variable to display a backtrace",
             "stack backtrace:",
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_stage_states_comes_before_what_it_printed() {
+    fn a_stated_reason_precedes_printed_lines() {
         let stated = Exit {
             stated_reason: Some("no space left".to_owned()),
             ..exit(1 << 8, &["eval: no space left", "warning: slow"])

@@ -1,6 +1,6 @@
-//! A store with a few finished actions, and the program.
+//! Store with a few finished actions, and calls of `nerf-sr-remote`.
 
-#![allow(dead_code, reason = "no test uses all of it")]
+#![allow(dead_code, reason = "no test uses all of these helpers")]
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,20 +10,20 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 use store::{Entered, Locked, Record, Store, Unfinished};
 
-/// A process that another thread has just forked holds the gate of a new store until it becomes a
-/// program.
+/// Enters a store. Retries, because a child that another thread has just forked holds the gate of a
+/// new store until its exec.
 pub(crate) fn entered(store: &Store) -> Entered {
-    let since = Instant::now();
-    while since.elapsed() < PATIENCE {
+    let start = Instant::now();
+    while start.elapsed() < MAX_DURATION {
         if let Locked::Acquired(entered) = store.try_enter().unwrap() {
             return entered;
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    panic!("closed")
+    panic!("the store stays closed")
 }
 
-/// An action as a runner carries it out.
+/// Carries out an action as a runner does. Returns its record.
 pub(crate) fn make(
     store: &Store,
     stage: &str,
@@ -58,14 +58,14 @@ fn next_byte(state: &mut u64) -> u8 {
     (*state >> 56) as u8
 }
 
-/// Bytes that no compression and no hole in a file makes smaller.
+/// Returns random bytes, which neither compression nor sparse files make smaller.
 pub(crate) fn bytes(count: usize, seed: u64) -> Vec<u8> {
     let mut state = seed;
     (0..count).map(|_| next_byte(&mut state)).collect()
 }
 
-/// prep and again make one artifact, train is made of prep and has a file in several parts, eval is
-/// made of both.
+/// Creates a store of four actions. `prep` and `again` create equal artifacts; `train` has the
+/// input `prep` and a file in several parts; `eval` has the inputs `prep` and `train`.
 pub(crate) fn sample(folder: &Path) -> (Store, Vec<Record>) {
     let store = Store::open(folder).unwrap();
     let images = [
@@ -78,66 +78,66 @@ pub(crate) fn sample(folder: &Path) -> (Store, Vec<Record>) {
     let prep = make(&store, "prep", &[], &images);
     let again = make(&store, "again", &[], &images);
     assert_eq!(prep.output, again.output);
-    let long = format!("{}/{}.bin", "folder".repeat(15), "name".repeat(20));
+    let long_path = format!("{}/{}.bin", "folder".repeat(15), "name".repeat(20));
     let train = make(
         &store,
         "train",
         &[&prep],
-        &[("field.bin", bytes((13 << 20) + 5, 4)), (&long, bytes(100, 5))],
+        &[("field.bin", bytes((13 << 20) + 5, 4)), (&long_path, bytes(100, 5))],
     );
     let eval =
         make(&store, "eval", &[&prep, &train], &[("metrics.json", b"{\"psnr\": 31.25}".to_vec())]);
     (store, vec![prep, again, train, eval])
 }
 
-/// A command line of the program on a store; nothing of the environment's AWS settings is in it.
-pub(crate) fn command(store: &Path, words: &[&str]) -> Command {
+/// Returns a command of the program on a store, without AWS settings from the environment.
+pub(crate) fn command(store: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_nerf-sr-remote"));
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("AWS_")) {
         command.env_remove(name);
     }
-    command.args(words).arg("--store").arg(store).stdin(Stdio::null());
+    command.args(arguments).arg("--store").arg(store).stdin(Stdio::null());
     command
 }
 
-/// Exit code, stdout, and stderr.
+/// Runs a command. Returns its exit code, stdout and stderr.
 pub(crate) fn said(command: &mut Command) -> (i32, String, String) {
-    said_by(command.output().unwrap())
+    code_and_texts(command.output().unwrap())
 }
 
 pub(crate) fn make_pipe(path: &Path) {
     assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
 }
 
-/// Longest time for a command that has nothing to wait for.
-const PATIENCE: Duration = Duration::from_secs(60);
+/// Maximum duration of a command that has nothing to wait for.
+const MAX_DURATION: Duration = Duration::from_secs(60);
 
-/// Likewise, of a command that may wait for what never comes: then it is killed.
+/// Runs a command like [`said`], but kills a command that runs longer than [`MAX_DURATION`].
 pub(crate) fn said_in_time(command: &mut Command) -> (i32, String, String) {
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let pid = child.id().to_string();
     let (sender, receiver) = std::sync::mpsc::channel();
     std::thread::spawn(move || sender.send(child.wait_with_output()));
-    let output = receiver.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+    let output = receiver.recv_timeout(MAX_DURATION).unwrap_or_else(|_| {
         Command::new("kill").args(["-KILL", &pid]).status().unwrap();
-        panic!("it waits: {command:?}")
+        panic!("killed after {MAX_DURATION:?}: {command:?}")
     });
-    said_by(output.unwrap())
+    code_and_texts(output.unwrap())
 }
 
-fn said_by(output: Output) -> (i32, String, String) {
+fn code_and_texts(output: Output) -> (i32, String, String) {
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
     (output.status.code().unwrap_or(-1), text(output.stdout), text(output.stderr))
 }
 
-/// Stdout of a command that succeeds.
+/// Runs a command that must succeed. Returns its stdout.
 pub(crate) fn succeed(command: &mut Command) -> String {
     let (code, out, err) = said(command);
     assert_eq!(code, 0, "{out}{err}");
     out
 }
 
-/// Every record is of a whole artifact, and nothing is left over.
+/// Checks that every record has a complete artifact, and that every object is undamaged.
 pub(crate) fn assert_clean(store: &Store) {
     for record in store.records().unwrap() {
         assert_eq!(store.hit(&record.key()).unwrap().as_ref(), Some(&record));
@@ -147,20 +147,20 @@ pub(crate) fn assert_clean(store: &Store) {
     }
 }
 
-/// No scratch folder is left, and nothing unfinished.
+/// Checks that no scratch folder and no unfinished action is left.
 pub(crate) fn assert_tidy(store: &Store) {
     assert_eq!(fs::read_dir(store.root().join("sinks")).unwrap().count(), 0);
     assert!(store.partials().unwrap().is_empty());
 }
 
-/// Two stores have equal records and objects, clean ones.
-pub(crate) fn assert_equal(one: &Store, other: &Store) {
-    assert_clean(other);
-    assert_eq!(one.records().unwrap(), other.records().unwrap());
-    assert_eq!(one.objects().unwrap(), other.objects().unwrap());
+/// Checks that two stores have equal records and objects, and that the second store is clean.
+pub(crate) fn assert_equal(first: &Store, second: &Store) {
+    assert_clean(second);
+    assert_eq!(first.records().unwrap(), second.records().unwrap());
+    assert_eq!(first.objects().unwrap(), second.objects().unwrap());
 }
 
-/// A sample store in a folder of its own, and the place of a remote beside it.
+/// Sample store in a folder of its own, and the path of a remote next to it.
 pub(crate) struct Setup {
     pub(crate) dir: tempfile::TempDir,
     pub(crate) store: Store,
@@ -188,11 +188,12 @@ impl Setup {
         self.path("remote").display().to_string()
     }
 
-    /// Pulls into a store; exit code and stderr.
-    pub(crate) fn pull(&self, store: &str, words: &[&str]) -> (i32, String, Store) {
+    /// Pulls into a store. Returns the exit code, stderr and the store.
+    pub(crate) fn pull(&self, store: &str, arguments: &[&str]) -> (i32, String, Store) {
         let remote = self.remote();
-        let words: Vec<&str> = ["pull", &remote].into_iter().chain(words.iter().copied()).collect();
-        let (code, _, err) = said_in_time(&mut command(&self.path(store), &words));
+        let arguments: Vec<&str> =
+            ["pull", &remote].into_iter().chain(arguments.iter().copied()).collect();
+        let (code, _, err) = said_in_time(&mut command(&self.path(store), &arguments));
         (code, err, Store::open(&self.path(store)).unwrap())
     }
 }

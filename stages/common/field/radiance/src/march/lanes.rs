@@ -266,8 +266,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn steps_are_counted_exactly() {
-        for (number, step) in [
+    fn steps_are_rounded_up_exactly() {
+        for (steps, expected) in [
             (f32::NAN, 0),
             (f32::NEG_INFINITY, 0),
             (-0.5, 0),
@@ -279,7 +279,7 @@ mod tests {
             (1e9, 4_194_304),
             (f32::INFINITY, 4_194_304),
         ] {
-            assert_eq!(ceil_steps(number), step, "{number}");
+            assert_eq!(ceil_steps(steps), expected, "{steps}");
         }
     }
 }

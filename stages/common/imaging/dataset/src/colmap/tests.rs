@@ -10,7 +10,8 @@ const IMAGES: &str = "# Image list\n7 1 0 0 0 0 0 3 1 b 1.png\n10 10 5 20 20 6 3
     0 0 2 1 2 3 2 a.png\n\n";
 const POINTS: &str = "5 0 0 1 255 0 0 0.1 7 0\n6 0 0 2 255 0 0 0.1 7 1\n";
 
-fn binary() -> [Vec<u8>; 3] {
+/// Returns the content of `CAMERAS`, `IMAGES` and `POINTS` as binary files.
+fn binary_model() -> [Vec<u8>; 3] {
     let mut cameras = 2u64.to_le_bytes().to_vec();
     for (id, model, parameters) in [
         (1u32, 2u32, &[70., 40., 30., -0.1][..]),
@@ -48,9 +49,10 @@ fn binary() -> [Vec<u8>; 3] {
     [cameras, images, points]
 }
 
+/// Creates a data set of two images and a model of the given files.
 fn folder(model: &str, files: &[(&str, &[u8])]) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
-    add(&dir, model, files);
+    add_model(&dir, model, files);
     std::fs::create_dir(dir.path().join("images")).unwrap();
     for name in ["a.png", "b 1.png"] {
         write_png(&dir.path().join("images").join(name), 40, 30);
@@ -58,13 +60,17 @@ fn folder(model: &str, files: &[(&str, &[u8])]) -> tempfile::TempDir {
     dir
 }
 
-fn add(dir: &tempfile::TempDir, model: &str, files: &[(&str, &[u8])]) {
+fn add_model(dir: &tempfile::TempDir, model: &str, files: &[(&str, &[u8])]) {
     let sparse = dir.path().join(model);
     std::fs::create_dir_all(&sparse).unwrap();
     files.iter().for_each(|(name, bytes)| std::fs::write(sparse.join(name), bytes).unwrap());
 }
 
-fn text<'a>(cameras: &'a str, images: &'a str, points: &'a str) -> [(&'static str, &'a [u8]); 3] {
+fn text_files<'a>(
+    cameras: &'a str,
+    images: &'a str,
+    points: &'a str,
+) -> [(&'static str, &'a [u8]); 3] {
     [
         ("cameras.txt", cameras.as_bytes()),
         ("images.txt", images.as_bytes()),
@@ -72,7 +78,7 @@ fn text<'a>(cameras: &'a str, images: &'a str, points: &'a str) -> [(&'static st
     ]
 }
 
-fn with_relative_images(set: &Dataset) -> Vec<Frame> {
+fn frames_without_folders(set: &Dataset) -> Vec<Frame> {
     set.frames
         .iter()
         .map(|f| Frame { image: f.image.file_name().unwrap().into(), ..f.clone() })
@@ -80,25 +86,25 @@ fn with_relative_images(set: &Dataset) -> Vec<Frame> {
 }
 
 #[test]
-fn binary_and_text_are_the_same() {
-    let [cameras, images, points] = binary();
+fn binary_and_text_models_are_equal() {
+    let [cameras, images, points] = binary_model();
     let binary = folder(
         "sparse/0",
         &[("cameras.bin", &cameras), ("images.bin", &images), ("points3D.bin", &points)],
     );
-    let text = folder("sparse/0", &text(CAMERAS, IMAGES, POINTS));
-    let (one, other) = (Dataset::read(binary.path()).unwrap(), Dataset::read(text.path()).unwrap());
-    assert_eq!(one.notes, other.notes);
+    let text = folder("sparse/0", &text_files(CAMERAS, IMAGES, POINTS));
+    let [from_binary, from_text] = [&binary, &text].map(|dir| Dataset::read(dir.path()).unwrap());
+    assert_eq!(from_binary.notes, from_text.notes);
     assert!(
-        one.notes.contains(&"2 photographs have lens distortion".to_owned()),
+        from_binary.notes.contains(&"2 photographs have lens distortion".to_owned()),
         "{:?}",
-        one.notes
+        from_binary.notes
     );
-    assert_eq!(with_relative_images(&one), with_relative_images(&other));
-    let [a, b] = &one.frames[..] else { panic!("two frames") };
+    assert_eq!(frames_without_folders(&from_binary), frames_without_folders(&from_text));
+    let [a, b] = &from_binary.frames[..] else { panic!("two frames") };
     assert_eq!((a.name.as_str(), b.name.as_str()), ("a", "b 1"));
-    // Images of half the size; a turn by 180° about z; a camera that looks along +z sees (0, 0,
-    // 1) at depth 1 + 3.
+    // The files have half the model's image size. Image 7's camera looks along +z, so that
+    // (0, 0, 1) has depth 1 + 3; image 3's camera is rotated by 180° about z.
     assert_eq!(
         b.stored_intrinsics,
         Intrinsics {
@@ -129,16 +135,16 @@ fn read_frames(dir: &Path) -> Vec<(String, Intrinsics, scene::Pose, Option<[f64;
     frames.into_iter().map(|f| (f.name, f.stored_intrinsics, f.camera_to_world, f.depths)).collect()
 }
 
-/// Byte order mark and line ends of an editor on Windows.
+/// Editors on Windows write a byte order mark and CRLF line ends.
 #[test]
-fn text_may_have_a_mark_and_other_line_ends() {
+fn text_may_have_a_byte_order_mark_and_crlf() {
     let changed =
         [CAMERAS, IMAGES, POINTS].map(|text| format!("\u{feff}{}", text.replace('\n', "\r\n")));
-    let (plain, other) = (
-        folder("sparse/0", &text(CAMERAS, IMAGES, POINTS)),
-        folder("sparse/0", &text(&changed[0], &changed[1], &changed[2])),
+    let (unix, windows) = (
+        folder("sparse/0", &text_files(CAMERAS, IMAGES, POINTS)),
+        folder("sparse/0", &text_files(&changed[0], &changed[1], &changed[2])),
     );
-    assert_eq!(read_frames(plain.path()), read_frames(other.path()));
+    assert_eq!(read_frames(unix.path()), read_frames(windows.path()));
     let latin = folder(
         "sparse/0",
         &[("cameras.txt", CAMERAS.as_bytes()), ("images.txt", b"1 1 0 0 0 0 0 3 1 \xe4.png\n\n")],
@@ -147,16 +153,16 @@ fn text_may_have_a_mark_and_other_line_ends() {
     assert!(message.contains(r"images.txt: line 1: \xe4.png is not UTF-8"), "{message}");
 }
 
-/// Depths are those without the wild points, which are counted.
+/// Points that are too far or not finite don't affect depths; a note counts them.
 #[test]
-fn wild_points_are_left_out() {
-    let plain = folder("sparse/0", &text(CAMERAS, IMAGES, POINTS));
-    for place in ["0 0 1e300", "0 0 1e6", "-1e6 0 1e6", "0 0 inf", "nan 0 1"] {
-        let points = format!("{POINTS}8 {place} 255 0 0 0.1 7 0\n");
+fn outlying_points_are_left_out() {
+    let plain = folder("sparse/0", &text_files(CAMERAS, IMAGES, POINTS));
+    for position in ["0 0 1e300", "0 0 1e6", "-1e6 0 1e6", "0 0 inf", "nan 0 1"] {
+        let points = format!("{POINTS}8 {position} 255 0 0 0.1 7 0\n");
         let images = IMAGES.replace("30 30 -1", "30 30 8");
-        let wild = folder("sparse/0", &text(CAMERAS, &images, &points));
-        assert_eq!(read_frames(wild.path()), read_frames(plain.path()), "{place}");
-        let notes = Dataset::read(wild.path()).unwrap().notes;
+        let outlying = folder("sparse/0", &text_files(CAMERAS, &images, &points));
+        assert_eq!(read_frames(outlying.path()), read_frames(plain.path()), "{position}");
+        let notes = Dataset::read(outlying.path()).unwrap().notes;
         assert!(notes[1].starts_with("1 of 3 points removed: too far"), "{notes:?}");
     }
     let notes = Dataset::read(plain.path()).unwrap().notes;
@@ -165,8 +171,8 @@ fn wild_points_are_left_out() {
 
 /// Dangling links are errors, even where a file is optional.
 #[test]
-fn links_to_nothing_are_named() {
-    let files = text(CAMERAS, IMAGES, POINTS);
+fn dangling_links_are_named() {
+    let files = text_files(CAMERAS, IMAGES, POINTS);
     for link in ["sparse", "images", "sparse/0/images.bin", "sparse/0/points3D.txt", "images/a.png"]
     {
         let dir = folder("sparse/0", &files);
@@ -178,16 +184,17 @@ fn links_to_nothing_are_named() {
         }
         std::os::unix::fs::symlink("gone", &path).unwrap();
         let message = Dataset::read(dir.path()).unwrap_err().to_string();
-        let words = format!("{} is a symbolic link to gone, which does not exist", path.display());
-        assert!(message.contains(&words), "{message}");
+        let expected =
+            format!("{} is a symbolic link to gone, which does not exist", path.display());
+        assert!(message.contains(&expected), "{message}");
     }
 }
 
 #[test]
-fn the_largest_model_is_taken_and_said() {
+fn the_largest_model_is_read_and_reported() {
     let small = "1 1 0 0 0 0 0 3 1 a.png\n\n";
-    let dir = folder("sparse/0", &text(CAMERAS, small, ""));
-    add(&dir, "sparse/1", &text(CAMERAS, IMAGES, POINTS));
+    let dir = folder("sparse/0", &text_files(CAMERAS, small, ""));
+    add_model(&dir, "sparse/1", &text_files(CAMERAS, IMAGES, POINTS));
     let set = Dataset::read(dir.path()).unwrap();
     assert_eq!(set.frames.len(), 2);
     assert!(set.notes[0].contains("sparse/1"), "{:?}", set.notes);
@@ -195,12 +202,12 @@ fn the_largest_model_is_taken_and_said() {
 }
 
 fn read_texts(cameras: &str, images: &str) -> Result<Dataset, DatasetError> {
-    Dataset::read(folder("sparse/0", &text(cameras, images, POINTS)).path())
+    Dataset::read(folder("sparse/0", &text_files(cameras, images, POINTS)).path())
 }
 
 #[test]
 fn mistakes_are_named() {
-    for (from, to, words) in [
+    for (from, to, expected) in [
         ("SIMPLE_RADIAL", "FOV", "line 2: FOV has 5 parameters"),
         (
             "SIMPLE_RADIAL 80 60 70 40 30 -0.1",
@@ -216,16 +223,16 @@ fn mistakes_are_named() {
         ("70 40 30", "70 x 30", "line 2: parameter: \"x\""),
     ] {
         let message = read_texts(&CAMERAS.replace(from, to), IMAGES).unwrap_err().to_string();
-        assert!(message.contains(words), "{message}");
+        assert!(message.contains(expected), "{message}");
     }
-    for (from, to, words) in [
+    for (from, to, expected) in [
         ("7 1 0 0 0", "7 0 0 0 0", "line 2: (0, 0, 0, 0) is not a rotation quaternion"),
         ("a.png", "../a.png", "not a path inside"),
         (" 1 b 1.png", "", "line 2: camera id is missing"),
         (" b 1.png", "", "line 2: an image's name is missing"),
     ] {
         let message = read_texts(CAMERAS, &IMAGES.replace(from, to)).unwrap_err().to_string();
-        assert!(message.contains(words), "{message}");
+        assert!(message.contains(expected), "{message}");
     }
     let gone = read_texts(CAMERAS, &IMAGES.replace("a.png", "gone.png")).unwrap();
     assert!(
@@ -245,8 +252,8 @@ fn mistakes_are_named() {
     );
 }
 
-fn with_number(number: u8) -> [Vec<u8>; 3] {
-    let mut files = binary();
+fn with_model_number(number: u8) -> [Vec<u8>; 3] {
+    let mut files = binary_model();
     files[0][12] = number;
     files
 }
@@ -254,15 +261,15 @@ fn with_number(number: u8) -> [Vec<u8>; 3] {
 #[test]
 fn unknown_model_numbers_are_named() {
     for number in [11, 12, 13, 16, 17, 200] {
-        let message = read_binaries(&with_number(number)).unwrap_err().to_string();
-        let words = format!(
+        let message = read_binaries(&with_model_number(number)).unwrap_err().to_string();
+        let expected = format!(
             "camera 1 has unknown model {number} (from a newer COLMAP?); \
             undistort with colmap image_undistorter"
         );
-        assert!(message.ends_with(&words), "{message}");
+        assert!(message.ends_with(&expected), "{message}");
     }
-    // A fisheye model with as many parameters.
-    let set = read_binaries(&with_number(8)).unwrap();
+    // SIMPLE_RADIAL_FISHEYE has as many parameters as SIMPLE_RADIAL.
+    let set = read_binaries(&with_model_number(8)).unwrap();
     assert_eq!(
         set.frames[1].stored_intrinsics.distortion,
         Distortion::fisheye([-0.1, 0.0, 0.0, 0.0])
@@ -284,22 +291,22 @@ fn read_binaries(files: &[Vec<u8>; 3]) -> Result<Dataset, DatasetError> {
 }
 
 #[test]
-fn binaries_cut_anywhere_or_with_other_bytes_are_errors_and_no_panic() {
-    let whole = binary();
-    assert!(read_binaries(&whole).is_ok());
+fn truncated_binaries_are_errors_and_corrupted_ones_never_panic() {
+    let intact = binary_model();
+    assert!(read_binaries(&intact).is_ok());
     for file in 0..3 {
-        for end in 0..whole[file].len() {
-            let mut cut = whole.clone();
+        for end in 0..intact[file].len() {
+            let mut cut = intact.clone();
             cut[file].truncate(end);
             assert!(read_binaries(&cut).is_err(), "{file} {end}");
         }
-        for place in 0..whole[file].len() {
-            let mut other = whole.clone();
-            other[file][place] ^= 0xff;
-            // Many are still a model; none may panic or allocate what isn't there.
-            drop(read_binaries(&other));
+        for position in 0..intact[file].len() {
+            let mut corrupted = intact.clone();
+            corrupted[file][position] ^= 0xff;
+            // Many corrupted files are valid models; none may cause a panic or a huge allocation.
+            drop(read_binaries(&corrupted));
         }
-        let mut longer = whole.clone();
+        let mut longer = intact.clone();
         longer[file].push(0);
         assert!(
             read_binaries(&longer)
@@ -308,7 +315,7 @@ fn binaries_cut_anywhere_or_with_other_bytes_are_errors_and_no_panic() {
                 .contains("unexpected data after the last")
         );
     }
-    let mut huge = whole.clone();
+    let mut huge = intact.clone();
     huge[1][..8].copy_from_slice(&u64::MAX.to_le_bytes());
     assert!(read_binaries(&huge).unwrap_err().to_string().contains("don't fit into the"));
 }

@@ -126,9 +126,9 @@ fn is_drive(part: &str) -> bool {
 mod tests {
     use super::*;
 
-    fn names_of(name: &str, extensions: Extensions) -> Vec<String> {
-        let of = |v: Variant| format!("{}{}", v.stem, v.extension);
-        variants(name, extensions).into_iter().map(of).collect()
+    fn variant_names(name: &str, extensions: Extensions) -> Vec<String> {
+        let file_name = |v: Variant| format!("{}{}", v.stem, v.extension);
+        variants(name, extensions).into_iter().map(file_name).collect()
     }
 
     #[test]
@@ -142,15 +142,15 @@ mod tests {
             ),
             ("a.HEIC", vec!["a.png", "a.jpg", "a.jpeg", "a.exr"]),
         ] {
-            assert_eq!(names_of(name, Extensions::Similar), expected);
+            assert_eq!(variant_names(name, Extensions::Similar), expected);
         }
         let any = ["a.png", "a.jpg", "a.jpeg", "a.exr"];
-        assert_eq!(names_of("a.JPG", Extensions::Any), any);
-        assert_eq!(names_of("a", Extensions::Any), any);
+        assert_eq!(variant_names("a.JPG", Extensions::Any), any);
+        assert_eq!(variant_names("a", Extensions::Any), any);
     }
 
     #[test]
-    fn paths_of_other_computers_are_taken_apart() {
+    fn absolute_paths_of_any_system_are_split() {
         for (text, parts) in [
             (r"C:\Users\x\a.png", Some(vec!["C:", "Users", "x", "a.png"])),
             ("d:/x//a.png", Some(vec!["d:", "x", "a.png"])),

@@ -1,6 +1,6 @@
 use super::*;
 
-/// A folder with empty files.
+/// Creates a folder with empty files.
 fn folder(files: &[&str]) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     for file in files {
@@ -11,7 +11,8 @@ fn folder(files: &[&str]) -> tempfile::TempDir {
     dir
 }
 
-fn found(lookup: &mut Lookup, name: &str) -> String {
+/// Returns the path of the file with the given name, or the error message.
+fn find(lookup: &mut Lookup, name: &str) -> String {
     match lookup.find(name) {
         Ok(Located::File(file)) => path_text(&file.path),
         Ok(Located::Missing(problem) | Located::Unusable(problem)) => problem.to_string(),
@@ -20,7 +21,7 @@ fn found(lookup: &mut Lookup, name: &str) -> String {
 }
 
 #[test]
-fn steps_are_taken_in_order_and_combine() {
+fn steps_are_tried_in_order_and_combine() {
     let dir = folder(&[
         "images/a.png",
         r"images\b.png",
@@ -55,10 +56,10 @@ fn steps_are_taken_in_order_and_combine() {
         ("images/f.png", "images/f.png"),
     ] {
         let mut lookup = Lookup::in_folder(dir.path(), &[name], &[]);
-        assert_eq!(found(&mut lookup, name), file, "{name}");
+        assert_eq!(find(&mut lookup, name), file, "{name}");
         assert_eq!(lookup.notes().is_empty(), name == file || name == "./images/a", "{name}");
     }
-    for (name, words) in [
+    for (name, expected) in [
         ("images/f", r#"images/f.exr and images/f.png both match "images/f"; remove one"#),
         ("images/G.PNG", r#"images/G.png and images/g.png both match "images/G.PNG""#),
         ("images/h.png", "images/h.png not found"),
@@ -69,42 +70,44 @@ fn steps_are_taken_in_order_and_combine() {
         ("/home/x.png", "no file in the data set matches the end of the absolute path"),
         ("", "\"\" is not a path inside the folder"),
     ] {
-        let message = found(&mut Lookup::in_folder(dir.path(), &[name], &[]), name);
-        assert!(message.contains(words), "{message}");
+        let message = find(&mut Lookup::in_folder(dir.path(), &[name], &[]), name);
+        assert!(message.contains(expected), "{message}");
     }
-    // A name's own file is not another's: depth next to a photograph, one of two in another case.
+    // A file that one name matches literally is not found for another name: depth next to a
+    // photograph, or two names that differ in case.
     for (name, other, file) in [
         ("images/f", "images/f.exr", "images/f.png"),
         ("images/i", "images/i.jpg", "images/i.png not found"),
         ("images/A.png", "images/a.png", "images/A.png not found"),
     ] {
         let mut lookup = Lookup::in_folder(dir.path(), &[name, other], &[]);
-        assert!(found(&mut lookup, name).ends_with(file), "{name}");
-        assert_eq!(found(&mut lookup, other), other);
+        assert!(find(&mut lookup, name).ends_with(file), "{name}");
+        assert_eq!(find(&mut lookup, other), other);
     }
 }
 
-/// Equally many parts are removed for all names: what finds most, the longest tail first.
+/// All names lose equally many leading parts: the smallest number that finds the most files.
 #[test]
-fn tails_are_the_same_for_all() {
+fn absolute_names_lose_equally_many_parts() {
     let dir = folder(&["scene/images/a.png", "images/a.png", "images/b.png", "b.png"]);
     let names = ["/x/scene/images/a.png", "/x/scene/images/b.png", "/x/scene/images/c.png"];
     let mut lookup = Lookup::in_folder(dir.path(), &names, &[]);
-    assert_eq!(found(&mut lookup, names[0]), "images/a.png");
-    assert_eq!(found(&mut lookup, names[1]), "images/b.png");
-    assert!(found(&mut lookup, names[2]).contains("no file in the data set"));
+    assert_eq!(find(&mut lookup, names[0]), "images/a.png");
+    assert_eq!(find(&mut lookup, names[1]), "images/b.png");
+    assert!(find(&mut lookup, names[2]).contains("no file in the data set"));
     assert_eq!(
         lookup.notes(),
         ["2 file names found without the first 2 parts of absolute paths (first: \
             /x/scene/images/a.png is images/a.png)"]
     );
-    let mut one = Lookup::in_folder(dir.path(), &names[..1], &[]);
-    assert_eq!(found(&mut one, names[0]), "scene/images/a.png");
+    let mut lookup = Lookup::in_folder(dir.path(), &names[..1], &[]);
+    assert_eq!(find(&mut lookup, names[0]), "scene/images/a.png");
 }
 
-/// Reduced copies may have another format; the largest that has most names is taken.
+/// Reduced copies may have another format. Among the folders that contain the most names, the one
+/// with the largest images is read.
 #[test]
-fn reduced_copies_stand_in_for_missing_images() {
+fn reduced_copies_replace_missing_images() {
     let files =
         ["images_8/a.png", "images_8/b.png", "images_4/a.PNG", "images_4/b.png", "images_2/a.png"];
     let dir = folder(&files);
@@ -112,8 +115,8 @@ fn reduced_copies_stand_in_for_missing_images() {
         ("", Lookup::in_images(dir.path(), &["a.jpg", "b.jpg"])),
         ("images/", Lookup::in_folder(dir.path(), &["images/a.jpg", "images/b.jpg"], &[])),
     ] {
-        assert_eq!(found(&mut lookup, &format!("{base}a.jpg")), "images_4/a.PNG");
-        assert_eq!(found(&mut lookup, &format!("{base}b.jpg")), "images_4/b.png");
+        assert_eq!(find(&mut lookup, &format!("{base}a.jpg")), "images_4/a.PNG");
+        assert_eq!(find(&mut lookup, &format!("{base}b.jpg")), "images_4/b.png");
         let note = format!(
             "2 file names found in images_4, because images is missing or empty (first: \
             {base}a.jpg is images_4/a.PNG)"
@@ -129,22 +132,21 @@ fn reduced_copies_stand_in_for_missing_images() {
     }
     std::fs::create_dir(dir.path().join("images")).unwrap();
     let mut lookup = Lookup::in_images(dir.path(), &["a.jpg"]);
-    assert_eq!(found(&mut lookup, "a.jpg"), "images_2/a.png");
+    assert_eq!(find(&mut lookup, "a.jpg"), "images_2/a.png");
     std::fs::write(dir.path().join("images/b.jpg"), "").unwrap();
     let mut lookup = Lookup::in_images(dir.path(), &["a.jpg"]);
-    assert!(found(&mut lookup, "a.jpg").contains("images/a.jpg not found"));
+    assert!(find(&mut lookup, "a.jpg").contains("images/a.jpg not found"));
 }
 
-/// COLMAP's names may start from the data set's folder.
 #[test]
-fn names_of_models_start_from_images_or_from_the_folder() {
+fn colmap_names_are_relative_to_images_or_the_folder() {
     let dir = folder(&["images/x/a  b.png", "c.png"]);
     for (name, file) in [
         ("x/a  b.png", "images/x/a  b.png"),
         ("images/x/a  b.png", "images/x/a  b.png"),
         ("c.png", "c.png"),
     ] {
-        assert_eq!(found(&mut Lookup::in_images(dir.path(), &[name]), name), file);
+        assert_eq!(find(&mut Lookup::in_images(dir.path(), &[name]), name), file);
     }
     assert!(Lookup::in_images(dir.path(), &["d.png"]).base().ends_with("images"));
 }

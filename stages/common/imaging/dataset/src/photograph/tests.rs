@@ -15,7 +15,7 @@ pub(crate) fn write_png(path: &Path, width: usize, height: usize) {
 }
 
 #[test]
-fn a_jpeg_is_read_by_what_it_is() {
+fn images_are_read_by_their_content() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.png");
     let image = ramp(32, 16);
@@ -30,16 +30,17 @@ fn a_jpeg_is_read_by_what_it_is() {
         ImageHeader { size: (32, 16), orientation: Orientation::NoTransforms }
     );
     let read = super::read_image(&path, false).unwrap().0;
-    let worst = read.data.iter().zip(&image.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
-    assert!(worst < 12, "{worst}");
+    let max_difference =
+        read.data.iter().zip(&image.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+    assert!(max_difference < 12, "{max_difference}");
     for end in 0..bytes.len() {
         std::fs::write(&path, &bytes[..end]).unwrap();
         drop(super::read_image(&path, false));
     }
     // The header is checked before anything is allocated, and the message names the limit.
     let mut huge = bytes.clone();
-    let frame = huge.windows(2).position(|marker| marker == b"\xff\xc0").unwrap();
-    huge[frame + 5..frame + 9]
+    let frame_header = huge.windows(2).position(|marker| marker == b"\xff\xc0").unwrap();
+    huge[frame_header + 5..frame_header + 9]
         .copy_from_slice(&[20_000u16.to_be_bytes(), 20_000u16.to_be_bytes()].concat());
     std::fs::write(&path, &huge).unwrap();
     let message = read_header(&path).unwrap_err().to_string();
@@ -61,12 +62,18 @@ fn a_jpeg_is_read_by_what_it_is() {
     std::fs::write(&path, &turned).unwrap();
     let stored = read_header(&path).unwrap();
     assert!(stored.size == (32, 16) && stored.is_sideways());
-    let of = |width, height| Intrinsics::from_angle_x(width, height, 0.5);
-    assert_eq!(fit_camera(of(32, 16), stored).unwrap(), (of(32, 16), Turn::Stored));
-    assert_eq!(fit_camera(of(64, 32), stored).unwrap(), (of(64, 32).resized(32, 16), Turn::Stored));
-    assert_eq!(fit_camera(of(16, 32), stored).unwrap(), (of(16, 32), Turn::Upright));
+    let intrinsics = |width, height| Intrinsics::from_angle_x(width, height, 0.5);
+    assert_eq!(fit_camera(intrinsics(32, 16), stored).unwrap(), (intrinsics(32, 16), Turn::Stored));
+    assert_eq!(
+        fit_camera(intrinsics(64, 32), stored).unwrap(),
+        (intrinsics(64, 32).resized(32, 16), Turn::Stored)
+    );
+    assert_eq!(
+        fit_camera(intrinsics(16, 32), stored).unwrap(),
+        (intrinsics(16, 32), Turn::Upright)
+    );
     assert!(
-        fit_camera(of(32, 32), stored)
+        fit_camera(intrinsics(32, 32), stored)
             .unwrap_err()
             .to_string()
             .contains("aspect ratios must match")
@@ -75,7 +82,7 @@ fn a_jpeg_is_read_by_what_it_is() {
     assert_eq!((upright.width, upright.height), (16, 32));
     assert!(
         upright.data[0] < 20 && upright.data[1] > 200,
-        "its bottom left corner is now its top left one"
+        "the bottom left corner becomes the top left one"
     );
     std::fs::write(&path, "no image").unwrap();
     assert!(read_header(&path).unwrap_err().to_string().contains("a.png"));
@@ -99,11 +106,11 @@ fn pixels_that_are_not_finite_are_refused() {
     };
     assert!(read_with([1e9, -1.0, 0.0, 1.0]).is_ok());
     for (index, channel) in COLOUR_CHANNELS.into_iter().enumerate() {
-        for (value, words) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf")] {
+        for (value, name) in [(f32::NAN, "NaN"), (f32::INFINITY, "inf")] {
             let mut bad = [0.25; 4];
             bad[index] = value;
             let message = read_with(bad).unwrap_err().to_string();
-            let expected = format!("a.exr: channel {channel} is {words} at column 1, row 2;");
+            let expected = format!("a.exr: channel {channel} is {name} at column 1, row 2;");
             assert!(message.contains(&expected), "{message}");
         }
     }
@@ -118,13 +125,16 @@ fn a_jpeg_that_is_cut_is_refused() {
         super::read_image(&path, false).map_err(|error| error.to_string())
     };
     let bytes = jpeg((40, 64), Some(SamplingFactor::R_4_2_0), false, 3);
-    let whole = read(&bytes).unwrap();
-    assert_eq!(read(&bytes[..bytes.len() - 2]), Ok(whole.clone()), "only the end marker is cut");
-    assert_eq!(read(&[&bytes, &b"more"[..]].concat()), Ok(whole));
+    let complete = read(&bytes).unwrap();
+    assert_eq!(read(&bytes[..bytes.len() - 2]), Ok(complete.clone()), "only the end marker is cut");
+    assert_eq!(read(&[&bytes, &b"more"[..]].concat()), Ok(complete));
     let progressive = jpeg((40, 64), Some(SamplingFactor::R_4_2_0), true, 0);
-    let third = bytes.windows(2).position(|w| w == [0xff, 0xd1]).unwrap();
-    for (bytes, words) in [
-        (&bytes[..third], "a.jpg: cut short or damaged: 32 of 64 rows are missing; export"),
+    let second_restart = bytes.windows(2).position(|w| w == [0xff, 0xd1]).unwrap();
+    for (bytes, expected) in [
+        (
+            &bytes[..second_restart],
+            "a.jpg: cut short or damaged: 32 of 64 rows are missing; export",
+        ),
         (&bytes[..bytes.len() - 9], "a.jpg: cut short or damaged: 16 of 64 rows are missing;"),
         (&bytes[..100], "a.jpg: cut short or damaged: 64 of 64 rows are missing; export"),
         (&bytes[..20], "a.jpg: cannot read its header (Format error"),
@@ -132,7 +142,7 @@ fn a_jpeg_that_is_cut_is_refused() {
         (&hidden_jpeg(), "a.jpg: damaged JPEG: headers and image data don't match; export"),
     ] {
         let message = read(bytes).unwrap_err();
-        assert!(message.contains(words), "{message}");
+        assert!(message.contains(expected), "{message}");
     }
 }
 
@@ -144,13 +154,16 @@ fn colour_towards([u, v]: [f64; 2]) -> [u8; 4] {
 
 /// Returns the ray through a distorted position, by fixed-point iteration.
 fn ray_through(intrinsics: &Intrinsics, x: f64, y: f64) -> [f64; 2] {
-    let seen = [(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy];
-    let mut at = seen;
+    let distorted = [(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy];
+    let mut undistorted = distorted;
     for _ in 0..50 {
-        let there = intrinsics.distortion.distort(at);
-        at = [at[0] + seen[0] - there[0], at[1] + seen[1] - there[1]];
+        let distorted_again = intrinsics.distortion.distort(undistorted);
+        undistorted = [
+            undistorted[0] + distorted[0] - distorted_again[0],
+            undistorted[1] + distorted[1] - distorted_again[1],
+        ];
     }
-    at
+    undistorted
 }
 
 fn image_of(ray: &dyn Fn(f64, f64) -> [f64; 2]) -> Rgba8 {
@@ -160,7 +173,7 @@ fn image_of(ray: &dyn Fn(f64, f64) -> [f64; 2]) -> Rgba8 {
 
 /// Removing the distortion of a distorted image returns the pinhole image.
 #[test]
-fn distortion_is_undone() {
+fn distortion_is_removed() {
     let distortion = Distortion::brown([-0.12, 0.02, 0.0], [0.002, -0.001]);
     let intrinsics =
         Intrinsics { width: 120, height: 90, fx: 110.0, fy: 108.0, cx: 61.0, cy: 44.0, distortion };
@@ -169,6 +182,7 @@ fn distortion_is_undone() {
     let expected = image_of(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
     let found =
         undistort_image(&image_of(&|x, y| ray_through(&intrinsics, x, y)), &intrinsics, &pinhole);
-    let worst = found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
-    assert!(worst <= 3, "{worst}");
+    let max_difference =
+        found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+    assert!(max_difference <= 3, "{max_difference}");
 }

@@ -2,14 +2,14 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// Lenses that bend, but fold no corner of a common image.
+/// Generates lenses that bend rays, but fold no corner of a common image.
 pub(crate) fn mild() -> impl Strategy<Value = Distortion> {
     let (tangential, k3) = (-0.01..0.01f64, -0.02..0.02f64);
     (-0.15..0.3f64, -0.05..0.05f64, k3, tangential.clone(), tangential)
         .prop_map(|(k1, k2, k3, p1, p2)| Distortion::brown([k1, k2, k3], [p1, p2]))
 }
 
-/// Perspective lenses with a fourth radial term, and with a denominator.
+/// Generates perspective lenses with a fourth radial term, and with a denominator.
 pub(crate) fn higher() -> impl Strategy<Value = Distortion> {
     (mild(), -0.01..0.01f64, -0.05..0.1f64, -0.02..0.02f64, -0.01..0.01f64).prop_map(
         |(brown, k4, d1, d2, d3)| {
@@ -19,7 +19,7 @@ pub(crate) fn higher() -> impl Strategy<Value = Distortion> {
     )
 }
 
-/// Fisheye lenses that fold nowhere before 89°.
+/// Generates fisheye lenses that fold nowhere before 89°.
 pub(crate) fn fisheye() -> impl Strategy<Value = Distortion> {
     let tangential = -0.001..0.001f64;
     let tangential =
@@ -32,19 +32,19 @@ pub(crate) fn fisheye() -> impl Strategy<Value = Distortion> {
     )
 }
 
-fn slope_between(d: &Distortion, a: [f64; 2], b: [f64; 2], step: f64) -> [f64; 2] {
+fn central_difference(d: &Distortion, a: [f64; 2], b: [f64; 2], step: f64) -> [f64; 2] {
     let (a, b) = (d.distort(a), d.distort(b));
     [0, 1].map(|i| (a[i] - b[i]) / (2.0 * step))
 }
 
-/// A ray at an angle from the axis, by its slopes.
-fn at_angle(degrees: f64, azimuth: f64) -> [f64; 2] {
+/// Returns the slopes of a ray at an angle from the axis.
+fn ray_at_angle(degrees: f64, azimuth: f64) -> [f64; 2] {
     scaled([azimuth.cos(), azimuth.sin()], degrees.to_radians().tan())
 }
 
-/// The formula of Brown's fourth term and of OpenCV's rational model, term by term.
+/// Distortion follows Brown's formula with a fourth term, and OpenCV's rational model.
 #[test]
-fn higher_terms_are_those_of_the_formula() {
+fn higher_terms_follow_the_formula() {
     let lens = Distortion {
         radial: [0.11, -0.07, 0.02, 0.013],
         tangential: [0.003, -0.002],
@@ -56,28 +56,29 @@ fn higher_terms_are_those_of_the_formula() {
         let radial = 1.0 + 0.11 * square - 0.07 * square.powi(2)
             + 0.02 * square.powi(3)
             + 0.013 * square.powi(4);
-        let below = 1.0 + 0.2 * square - 0.05 * square.powi(2) + 0.01 * square.powi(3);
+        let denominator_value = 1.0 + 0.2 * square - 0.05 * square.powi(2) + 0.01 * square.powi(3);
         let tangential = [
             2.0 * 0.003 * x * y - 0.002 * (square + 2.0 * x * x),
             0.003 * (square + 2.0 * y * y) - 2.0 * 0.002 * x * y,
         ];
-        for (lens, r) in [(lens, radial), (rational, radial / below)] {
+        for (lens, r) in [(lens, radial), (rational, radial / denominator_value)] {
             let distorted = lens.distort([x, y]);
             assert!((distorted[0] - (x * r + tangential[0])).abs() < 1e-14);
             assert!((distorted[1] - (y * r + tangential[1])).abs() < 1e-14);
-            let back = lens.undistort(distorted);
-            assert!((back[0] - x).abs().max((back[1] - y).abs()) < 1e-12, "{back:?}");
+            let found = lens.undistort(distorted);
+            assert!((found[0] - x).abs().max((found[1] - y).abs()) < 1e-12, "{found:?}");
         }
     }
 }
 
-/// OpenCV's fisheye formula, term by term, out to the limit; beyond it rays are clamped.
+/// Distortion follows OpenCV's fisheye formula up to the limit of 89°. Beyond the limit, rays are
+/// clamped.
 #[test]
-fn a_fisheye_ray_is_seen_at_the_polynomial_of_its_angle() {
+fn a_fisheye_radius_is_the_polynomial_of_the_angle() {
     let lens = Distortion::fisheye([-0.02, 0.006, -0.003, 0.0005]);
     for degrees in [0.0, 1e-7, 3.0, 45.0, 60.0, 80.0, 88.9] {
         let angle = f64::to_radians(degrees);
-        let distorted = lens.distort(at_angle(degrees, 0.7));
+        let distorted = lens.distort(ray_at_angle(degrees, 0.7));
         let expected = angle
             * (1.0 - 0.02 * angle.powi(2) + 0.006 * angle.powi(4) - 0.003 * angle.powi(6)
                 + 0.0005 * angle.powi(8));
@@ -96,11 +97,11 @@ fn a_fisheye_ray_is_seen_at_the_polynomial_of_its_angle() {
     }
 }
 
-/// A lens whose polynomial falls before 89° has no ray for what lies beyond.
+/// A lens whose polynomial decreases before 89° has no ray beyond the polynomial's maximum.
 #[test]
-fn folds_are_found() {
+fn folded_points_are_not_invertible() {
     let folded = Distortion::fisheye([-0.2, 0.0, 0.0, 0.0]);
-    // The angle's polynomial rises up to 1.29, where it is 0.86.
+    // The polynomial of the angle rises up to angle 1.29, where its value is 0.86.
     assert!(folded.is_invertible_at([0.8, 0.0]) && !folded.is_invertible_at([0.9, 0.0]));
     let [x, _] = folded.undistort([0.8, 0.0]);
     assert!((x.atan() * (1.0 - 0.2 * x.atan().powi(2)) - 0.8).abs() < 1e-12);
@@ -112,7 +113,7 @@ fn folds_are_found() {
 }
 
 #[test]
-fn three_radial_terms_keep_their_bytes() {
+fn three_radial_terms_keep_their_json() {
     let brown = Distortion::brown([0.1, 0.0, -0.5], [0.0, 0.25]);
     let text = r#"{"radial":[0.1,0.0,-0.5],"tangential":[0.0,0.25]}"#;
     assert_eq!(serde_json::to_string(&brown).unwrap(), text);
@@ -131,27 +132,27 @@ fn three_radial_terms_keep_their_bytes() {
 
 proptest! {
     #[test]
-    fn slopes_are_differences(
+    fn the_jacobian_matches_central_differences(
         d in prop_oneof![mild(), higher(), fisheye()],
         x in -0.6..0.6f64, y in -0.5..0.5f64
     ) {
         let step = 1e-6;
-        let [xx, yx] = slope_between(&d, [x + step, y], [x - step, y], step);
-        let [xy, yy] = slope_between(&d, [x, y + step], [x, y - step], step);
+        let [xx, yx] = central_difference(&d, [x + step, y], [x - step, y], step);
+        let [xy, yy] = central_difference(&d, [x, y + step], [x, y - step], step);
         let [by_x, by_y] = d.jacobian([x, y]);
         for (slope, difference) in [(by_x[0], xx), (by_x[1], xy), (by_y[0], yx), (by_y[1], yy)] {
             prop_assert!((slope - difference).abs() < 1e-8, "{slope} {difference}");
         }
     }
 
-    /// Up to the limit a fisheye ray comes back from where it is seen.
+    /// Undistortion inverts a fisheye's distortion up to the limit.
     #[test]
-    fn fisheye_rays_come_back(d in fisheye(), degrees in 0.0..88.9f64, azimuth in 0.0..6.3f64) {
-        let ray = at_angle(degrees, azimuth);
+    fn fisheye_rays_round_trip(d in fisheye(), degrees in 0.0..88.9f64, azimuth in 0.0..6.3f64) {
+        let ray = ray_at_angle(degrees, azimuth);
         let distorted = d.distort(ray);
         prop_assert!(d.is_invertible_at(distorted) && !d.is_clamped(distorted));
         let [x, y] = d.undistort(distorted);
-        let off = (x - ray[0]).hypot(y - ray[1]) * degrees.to_radians().cos().powi(2);
-        prop_assert!(off < 1e-10, "off by {off} radians");
+        let error = (x - ray[0]).hypot(y - ray[1]) * degrees.to_radians().cos().powi(2);
+        prop_assert!(error < 1e-10, "off by {error} radians");
     }
 }

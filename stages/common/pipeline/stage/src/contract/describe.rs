@@ -198,8 +198,8 @@ mod tests {
     }
 
     #[test]
-    fn rules_hold_where_they_apply() {
-        let open = || Some(json!({"background": "alpha"}));
+    fn rules_apply_under_their_conditions() {
+        let alpha_scene = || Some(json!({"background": "alpha"}));
         for (parameters, inputs, expected) in [
             (json!({"method": "imdn"}), vec![], Some("weights are needed")),
             (json!({"method": "imdn"}), vec![("weights", None)], None),
@@ -209,15 +209,15 @@ mod tests {
             (json!({"kernel": "average", "scale": null}), vec![], None),
             (json!({"kernel": "average"}), vec![], None),
             (json!({"kernel": "box", "scale": 2.7}), vec![], None),
-            (json!({"method": "b"}), vec![("scene", open())], Some("it must be closed")),
-            (json!({"method": "a"}), vec![("scene", open())], None),
+            (json!({"method": "b"}), vec![("scene", alpha_scene())], Some("it must be closed")),
+            (json!({"method": "a"}), vec![("scene", alpha_scene())], None),
             (json!({"method": "b"}), vec![("scene", Some(json!({"background": "white"})))], None),
             (json!({"method": "b"}), vec![("scene", Some(json!({})))], None),
             (json!({"method": "b"}), vec![("scene", None)], None),
         ] {
             let given = inputs
                 .iter()
-                .map(|(name, made_by)| ((*name).to_owned(), made_by.clone()))
+                .map(|(name, made_with)| ((*name).to_owned(), made_with.clone()))
                 .collect();
             assert_eq!(
                 description().broken_rule(&parameters, &given).as_deref(),
@@ -228,13 +228,13 @@ mod tests {
     }
 
     #[test]
-    fn folders_must_contain_what_a_rule_names() {
+    fn folders_must_contain_the_files_of_a_rule() {
         let folder = tempfile::tempdir().unwrap();
         for file in ["a_x2", "b", "b.heads"] {
             std::fs::write(folder.path().join(file), "").unwrap();
         }
         let folders = BTreeMap::from([("weights".to_owned(), folder.path().to_path_buf())]);
-        let lacking = |rule: Rule, parameters: Value| {
+        let missing = |rule: Rule, parameters: Value| {
             let rule = rule.when("method", json!({"const": "imdn"}));
             let description = Description { rules: vec![rule], ..description() };
             description.check().unwrap();
@@ -245,30 +245,30 @@ mod tests {
             let found = description.missing_files(&parameters, &GivenInputs::new(), &folders);
             found.map(|(input, message)| format!("{input}: {message}"))
         };
-        let one = || Rule::new("no a_x{scale}").or_files("weights", &["a_x{scale}"]);
+        let one_file = || Rule::new("no a_x{scale}").or_files("weights", &["a_x{scale}"]);
         let imdn = |scale: u32| json!({"method": "imdn", "scale": scale});
-        assert_eq!(lacking(one(), imdn(2)), None);
-        assert_eq!(lacking(one(), imdn(3)).unwrap(), "weights: no a_x3");
-        assert_eq!(lacking(one(), json!({"method": "liif", "scale": 3})), None);
-        let heads = Rule::new("no b").or_files("weights", &["c", "c.heads"]);
-        assert!(lacking(heads.clone(), imdn(2)).is_some());
-        assert_eq!(lacking(heads.or_files("weights", &["b", "b.heads"]), imdn(2)), None);
+        assert_eq!(missing(one_file(), imdn(2)), None);
+        assert_eq!(missing(one_file(), imdn(3)).unwrap(), "weights: no a_x3");
+        assert_eq!(missing(one_file(), json!({"method": "liif", "scale": 3})), None);
+        let two_files = Rule::new("no b").or_files("weights", &["c", "c.heads"]);
+        assert!(missing(two_files.clone(), imdn(2)).is_some());
+        assert_eq!(missing(two_files.or_files("weights", &["b", "b.heads"]), imdn(2)), None);
     }
 
     #[test]
-    fn a_description_that_cannot_be_meant_is_refused() {
+    fn invalid_descriptions_are_refused() {
         description().check().unwrap();
-        let no_schema = json!({"type": "nonsense"});
+        let invalid_schema = json!({"type": "nonsense"});
         let with = |rule: Rule| Description { rules: vec![rule], ..description() };
-        for (broken, words) in [
+        for (broken, expected) in [
             (with(Rule::new("").needs("nothing")), "rule 1: no input \"nothing\""),
             (with(Rule::new("").when("nothing", json!({}))), "no parameter \"nothing\""),
             (with(Rule::new("").must("nothing.x", json!({}))), "no parameter \"nothing.x\""),
             (
-                with(Rule::new("").must("scale", no_schema.clone())),
+                with(Rule::new("").must("scale", invalid_schema.clone())),
                 "scale: invalid or unsupported JSON Schema",
             ),
-            (Description { parameters: no_schema, ..description() }, "parameter schema"),
+            (Description { parameters: invalid_schema, ..description() }, "parameter schema"),
             (Description { name: String::new(), ..description() }, "no name"),
             (
                 Description {
@@ -279,7 +279,7 @@ mod tests {
             ),
         ] {
             let problem = broken.check().unwrap_err().to_string();
-            assert!(problem.contains(words), "{problem}");
+            assert!(problem.contains(expected), "{problem}");
         }
     }
 }

@@ -283,12 +283,12 @@ mod tests {
         assert_eq!(resolve(&json!({"scale": 4})).unwrap(), all);
     }
 
-    /// Equal values have one form, and so one key; an explicit default and an omitted parameter,
-    /// too.
+    /// Equal values have one form, and hence one key. An explicit default has the form of an
+    /// omitted parameter.
     #[test]
     fn equal_values_have_one_form() {
-        let unsaid = resolve(&json!({})).unwrap();
-        for said in [
+        let defaults = resolve(&json!({})).unwrap();
+        for explicit in [
             json!({"scale": 2}),
             json!({"scale": 2.0}),
             json!({"rate": 2}),
@@ -298,7 +298,11 @@ mod tests {
             json!({"assumed": null}),
             json!({"place": [1.0, 0.5]}),
         ] {
-            assert_eq!(canonical_json(&resolve(&said).unwrap()), canonical_json(&unsaid), "{said}");
+            assert_eq!(
+                canonical_json(&resolve(&explicit).unwrap()),
+                canonical_json(&defaults),
+                "{explicit}"
+            );
         }
         for (one, other) in [
             (json!({"scale": 6e4}), json!({"scale": 60000})),
@@ -308,7 +312,7 @@ mod tests {
         ] {
             let [one, other] = [one, other].map(|given| canonical_json(&resolve(&given).unwrap()));
             assert_eq!(one, other);
-            assert_ne!(one, canonical_json(&unsaid));
+            assert_ne!(one, canonical_json(&defaults));
         }
         let problems = resolve(&json!({"rate": null})).unwrap_err();
         assert!(
@@ -319,8 +323,8 @@ mod tests {
     }
 
     #[test]
-    fn unknown_names_types_and_ranges_are_refused() {
-        for (given, name, word) in [
+    fn unknown_names_and_invalid_values_are_refused() {
+        for (given, name, expected) in [
             (
                 json!({"kernal": "box"}),
                 "kernal",
@@ -337,7 +341,7 @@ mod tests {
         ] {
             let problems = resolve(&given).unwrap_err();
             assert_eq!(problems[0].name, name);
-            assert!(problems[0].problem.contains(word), "{}", problems[0]);
+            assert!(problems[0].problem.contains(expected), "{}", problems[0]);
         }
     }
 }

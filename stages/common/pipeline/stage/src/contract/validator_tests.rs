@@ -1,10 +1,10 @@
 use super::*;
 use serde_json::json;
 
-/// Each schema with a valid value, and an invalid one with its message.
+/// Each schema accepts its valid value, and refuses its invalid value with the expected message.
 #[test]
-fn values_fit_or_not() {
-    for (schema, fits, fails, problem) in [
+fn values_fit_schemas_or_are_refused() {
+    for (schema, valid, invalid, expected) in [
         (json!({"type": "integer"}), json!(2.0), json!(2.5), "2.5 is not a whole number"),
         (
             json!({"type": ["integer", "null"]}),
@@ -85,6 +85,7 @@ fn values_fit_or_not() {
             json!(1),
             "1 is not null",
         ),
+        // No value is invalid, and no message is expected.
         (json!({"not": false, "x-own": 1, "format": "uri"}), json!(1), json!(1), ""),
         (json!({"properties": {"a": false}}), json!({}), json!({"a": 1}), "1 isn't allowed"),
         // Keywords of other types don't apply.
@@ -96,18 +97,18 @@ fn values_fit_or_not() {
         ),
     ] {
         let validator = Validator::new(&schema).unwrap();
-        assert!(validator.is_valid(&fits), "{schema} {fits}");
+        assert!(validator.is_valid(&valid), "{schema} {valid}");
         let problems: Vec<String> =
-            validator.misfits(&fails).into_iter().map(|misfit| misfit.problem).collect();
+            validator.misfits(&invalid).into_iter().map(|misfit| misfit.problem).collect();
         assert!(
-            problem.is_empty() || (problems.len() == 1 && problems[0].contains(problem)),
-            "{schema} {fails}: {problems:?}"
+            expected.is_empty() || (problems.len() == 1 && problems[0].contains(expected)),
+            "{schema} {invalid}: {problems:?}"
         );
     }
 }
 
 #[test]
-fn a_misfit_says_where_it_is() {
+fn a_misfit_contains_the_path_of_its_value() {
     let schema = json!({"properties": {"a": {"items": {"type": "null"}}}});
     let misfits = Validator::new(&schema).unwrap().misfits(&json!({"a": [null, 2]}));
     let [Misfit { path, value, .. }] = &misfits[..] else { panic!("{misfits:?}") };
@@ -116,8 +117,8 @@ fn a_misfit_says_where_it_is() {
 
 /// Unsupported keywords are refused at any depth: no value may pass unchecked.
 #[test]
-fn schemas_that_cannot_be_used() {
-    for (schema, words) in [
+fn unsupported_schemas_are_refused() {
+    for (schema, expected) in [
         (json!(1), "neither an object nor true or false"),
         (json!({"type": "nonsense"}), "keyword type cannot have the value \"nonsense\""),
         (json!({"type": 1}), "type cannot have the value 1"),
@@ -134,16 +135,16 @@ fn schemas_that_cannot_be_used() {
         (json!({"items": {"not": 3}}), "3 is neither"),
     ] {
         let problem = Validator::new(&schema).unwrap_err().to_string();
-        assert!(problem.contains(words), "{schema}: {problem}");
+        assert!(problem.contains(expected), "{schema}: {problem}");
     }
 }
 
 /// A schema may refer to itself for nested values, but not for the value itself.
 #[test]
-fn schemas_that_lead_back_to_themselves() {
-    let tree = json!({"type": "array", "items": {"$ref": "#"}});
-    let tree = Validator::new(&tree).unwrap();
-    assert!(tree.is_valid(&json!([[], [[]]])) && !tree.is_valid(&json!([[], [1]])));
+fn recursive_schemas_accept_nested_values_only() {
+    let nested_lists = json!({"type": "array", "items": {"$ref": "#"}});
+    let nested_lists = Validator::new(&nested_lists).unwrap();
+    assert!(nested_lists.is_valid(&json!([[], [[]]])) && !nested_lists.is_valid(&json!([[], [1]])));
     for schema in [json!({"$ref": "#"}), json!({"anyOf": [{"$ref": "#"}]})] {
         assert!(!Validator::new(&schema).unwrap().is_valid(&json!(1)), "{schema}");
     }

@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json};
 
 use crate::contract::Schema;
 
-fn described() -> Value {
+fn schema_json() -> Value {
     json!({
         "type": "object",
         "additionalProperties": false,
@@ -34,13 +34,14 @@ fn described() -> Value {
 }
 
 fn schema() -> Schema {
-    Schema::new(&described()).unwrap()
+    Schema::new(&schema_json()).unwrap()
 }
 
 fn map(value: &Value) -> Map<String, Value> {
     value.as_object().cloned().unwrap()
 }
 
+/// Returns a copy of `base` with one entry changed.
 fn with(base: &Value, name: &str, value: u32) -> Value {
     let mut changed = base.clone();
     changed[name] = json!(value);
@@ -48,7 +49,7 @@ fn with(base: &Value, name: &str, value: u32) -> Value {
 }
 
 #[test]
-fn both_ways_of_writing_resolve_alike() {
+fn flat_and_nested_parameters_resolve_alike() {
     let grid = json!({"field": "grid", "rays": 30, "levels": 8, "steps": null, "seed": 0});
     let mlp = json!({"field": "mlp", "rays": null, "layers": 8, "seed": 0});
     for (given, expected) in [
@@ -69,7 +70,7 @@ fn both_ways_of_writing_resolve_alike() {
 
 #[test]
 fn foreign_and_unknown_parameters_are_refused() {
-    for (given, words) in [
+    for (given, expected) in [
         (
             json!({"layers": 2}),
             "parameter layers: belongs to field: mlp; leave it out, or choose field: mlp",
@@ -91,13 +92,13 @@ fn foreign_and_unknown_parameters_are_refused() {
         (json!({"field": null}), "null is not one of"),
     ] {
         let problems = schema().resolve(&map(&given)).unwrap_err();
-        assert!(problems[0].to_string().contains(words), "{given}: {}", problems[0]);
+        assert!(problems[0].to_string().contains(expected), "{given}: {}", problems[0]);
     }
 }
 
 /// A variant that is selected later has its own defaults; common parameters stay.
 #[test]
-fn a_later_choice_drops_what_it_does_not_have() {
+fn a_later_variant_drops_parameters_that_it_lacks() {
     for (earlier, later, expected) in [
         (
             json!({"levels": 4, "rays": 9}),
@@ -127,7 +128,7 @@ fn a_later_choice_drops_what_it_does_not_have() {
 }
 
 #[test]
-fn the_stage_gets_what_its_type_has() {
+fn the_stage_gets_nested_parameters() {
     let resolved = schema().resolve(&map(&json!({"field": "mlp"}))).unwrap();
     assert_eq!(
         schema().nested(&resolved),
@@ -139,16 +140,16 @@ fn the_stage_gets_what_its_type_has() {
 }
 
 #[test]
-fn a_name_means_one_parameter() {
-    let mut twice = described();
-    twice["properties"]["layers"] = json!({"default": 1});
+fn ambiguous_names_are_refused() {
+    let mut duplicate = schema_json();
+    duplicate["properties"]["layers"] = json!({"default": 1});
     assert!(
-        Schema::new(&twice)
+        Schema::new(&duplicate)
             .unwrap_err()
             .to_string()
             .contains("variant mlp of field has a parameter layers, like the stage itself")
     );
-    let mut two = described();
-    two["properties"]["other"] = two["properties"]["field"].clone();
-    assert!(Schema::new(&two).unwrap_err().to_string().contains("both select a variant"));
+    let mut two_variants = schema_json();
+    two_variants["properties"]["other"] = two_variants["properties"]["field"].clone();
+    assert!(Schema::new(&two_variants).unwrap_err().to_string().contains("both select a variant"));
 }

@@ -184,17 +184,22 @@ mod tests {
     }
 
     #[test]
-    fn patches_that_do_nothing_are_stitched_to_the_image() {
+    fn blended_unchanged_patches_equal_the_image() {
         for (width, height) in [(64, 64), (65, 200), (150, 112), (129, 300)] {
-            let whole = image(width, height, 3);
+            let original = image(width, height, 3);
             let corners = patch_starts(height)
                 .into_iter()
                 .flat_map(|y| patch_starts(width).into_iter().map(move |x| (x, y)));
-            let patches: Vec<_> = corners.map(|corner| (corner, patch(&whole, corner))).collect();
-            let again = blend(width, height, &patches);
-            let worst =
-                whole.data.iter().zip(&again.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(worst < 1e-6, "{width}×{height}: {worst}");
+            let patches: Vec<_> =
+                corners.map(|corner| (corner, patch(&original, corner))).collect();
+            let blended = blend(width, height, &patches);
+            let max_error = original
+                .data
+                .iter()
+                .zip(&blended.data)
+                .map(|(a, b)| (a - b).abs())
+                .fold(0.0, f32::max);
+            assert!(max_error < 1e-6, "{width}×{height}: {max_error}");
         }
     }
 
@@ -205,8 +210,8 @@ mod tests {
         assert_eq!(patch_starts(150), [0, 48, 86]);
     }
 
-    /// Creates the view of a wall at distance 2 by a camera moved along it by a number of pixels.
-    fn known(pixels: f64) -> KnownView {
+    /// Creates a view of a wall at distance 2 by a camera moved parallel to the wall by `pixels`.
+    fn wall_view(pixels: f64) -> KnownView {
         let (width, height) = (160, 96);
         let camera = Camera {
             name: format!("{pixels}"),
@@ -231,30 +236,30 @@ mod tests {
         KnownView { rendered, truth: image(width as usize, height as usize, 3) }
     }
 
-    /// Before a wall, a reference shows all pixels of a patch at one place; a reference that
-    /// doesn't look there has none.
+    /// In a moved reference, the matching patch is shifted by the camera's movement. A reference
+    /// that doesn't observe the patch has no match.
     #[test]
-    fn reference_patches_show_the_same_place() {
-        let (view, right, away) = (known(0.0), known(20.0), known(400.0));
+    fn matching_patches_display_the_same_part_of_the_wall() {
+        let (view, right, elsewhere) = (wall_view(0.0), wall_view(20.0), wall_view(400.0));
         assert_eq!(matching_patches(&view.rendered, &[&right], (48, 16), 8), [(0, (28, 16))]);
         assert_eq!(
-            matching_patches(&view.rendered, &[&away, &right], (48, 16), 8),
+            matching_patches(&view.rendered, &[&elsewhere, &right], (48, 16), 8),
             [(1, (28, 16))]
         );
-        assert!(matching_patches(&view.rendered, &[&away], (48, 16), 8).is_empty());
+        assert!(matching_patches(&view.rendered, &[&elsewhere], (48, 16), 8).is_empty());
         // At the border the patch is moved into the image.
         assert_eq!(matching_patches(&view.rendered, &[&right], (0, 0), 8), [(0, (0, 0))]);
     }
 
     #[test]
-    fn a_view_is_redrawn_at_its_size_or_refused() {
+    fn views_keep_their_size_and_small_ones_are_refused() {
         nets::deterministic();
         let network = PaperRefiner::new(4, 1).unwrap();
-        let (view, other) = (known(0.0), known(20.0));
-        for references in [vec![], vec![&other]] {
-            let drawn = network.refine(&view.rendered, &references, 8).unwrap();
-            assert_eq!((drawn.width, drawn.height, drawn.channels), (160, 96, 3));
-            assert!(drawn.data.iter().all(|v| (0.0..=1.0).contains(v)));
+        let (view, reference) = (wall_view(0.0), wall_view(20.0));
+        for references in [vec![], vec![&reference]] {
+            let refined = network.refine(&view.rendered, &references, 8).unwrap();
+            assert_eq!((refined.width, refined.height, refined.channels), (160, 96, 3));
+            assert!(refined.data.iter().all(|v| (0.0..=1.0).contains(v)));
         }
         let mut small = view.rendered.clone();
         small.view = image(63, 96, 4);

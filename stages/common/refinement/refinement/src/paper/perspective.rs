@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn corners_go_where_they_should() {
+    fn a_homography_maps_corners_to_corners() {
         let from = [(3.0, 2.0), (30.0, 1.0), (28.0, 20.0), (2.0, 19.0)];
         let to = [(0.0, 0.0), (31.0, 0.0), (31.0, 23.0), (0.0, 23.0)];
         let [a, b, c, d, e, f, g, h] = homography(from, to).unwrap();
@@ -121,19 +121,22 @@ mod tests {
     }
 
     #[test]
-    fn nothing_changes_by_none_and_the_filled_rectangle_holds_all() {
+    fn the_identity_keeps_pixels_and_warps_are_black_outside_filled() {
         let image = Image::new(40, 30, 3, (0..3600).map(|i| 0.1 + i as f32 / 4000.0).collect());
-        let none = Perspective::identity(40, 30);
-        assert_eq!(none.colour(&image, 7, 5), [0, 1, 2].map(|c| image.data[(5 * 40 + 7) * 3 + c]));
+        let identity = Perspective::identity(40, 30);
+        assert_eq!(
+            identity.colour(&image, 7, 5),
+            [0, 1, 2].map(|c| image.data[(5 * 40 + 7) * 3 + c])
+        );
         for seed in 0..20 {
             let warp = Perspective::draw(40, 30, &mut CounterRng::new(seed, 1, 2));
             let [left, top, right, bottom] = warp.filled;
             assert!(right <= 40 && bottom <= 30 && right - left > 20 && bottom - top > 15);
             for (x, y) in (0..40).flat_map(|x| (0..30).map(move |y| (x, y))) {
                 // The border fades over a pixel.
-                let inside = x + 1 >= left && x <= right && y + 1 >= top && y <= bottom;
+                let is_inside = x + 1 >= left && x <= right && y + 1 >= top && y <= bottom;
                 assert!(
-                    inside || warp.colour(&image, x, y).iter().all(|c| *c < 1e-6),
+                    is_inside || warp.colour(&image, x, y).iter().all(|c| *c < 1e-6),
                     "seed {seed} at {x}, {y}"
                 );
             }

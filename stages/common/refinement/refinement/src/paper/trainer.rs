@@ -237,7 +237,7 @@ mod tests {
 
     use super::*;
 
-    /// Returns an example of stripes, whose render has less contrast.
+    /// Returns a striped example whose render has less contrast.
     fn example() -> KnownView {
         let level = |i: usize| if (i % 48 / 6).is_multiple_of(2) { 0.2f32 } else { 0.8 };
         let view = (0..48 * 40)
@@ -273,13 +273,14 @@ mod tests {
     };
 
     #[test]
-    fn training_learns_and_goes_on_where_it_was() {
+    fn training_reduces_the_error_and_resumes_exactly() {
         nets::deterministic();
         let examples = [example()];
         OPTIONS.check(&examples).unwrap();
         let start = || PaperTrainer::new(PaperRefiner::new(4, 2).unwrap(), OPTIONS, None).unwrap();
         let mut trainer = start();
-        let path = tempfile::tempdir().unwrap().keep().join("checkpoint.safetensors");
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.safetensors");
         let mut errors = Vec::new();
         while let Some(error) = trainer.step(&examples).unwrap() {
             errors.push(error);
@@ -289,16 +290,16 @@ mod tests {
         }
         let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
         assert!(mean(&errors[50..]) < 0.6 * mean(&errors[..5]), "{errors:?}");
-        let mut again = start();
-        again.resume(&path).unwrap();
-        while again.step(&examples).unwrap().is_some() {}
-        let same = trainer
+        let mut resumed = start();
+        resumed.resume(&path).unwrap();
+        while resumed.step(&examples).unwrap().is_some() {}
+        let is_equal = trainer
             .network()
             .named_tensors()
             .iter()
-            .zip(again.network().named_tensors())
+            .zip(resumed.network().named_tensors())
             .all(|((_, a), (_, b))| *a == b);
-        assert!(same, "a resumed training ends elsewhere");
+        assert!(is_equal, "a resumed training must end with equal weights");
     }
 
     #[test]

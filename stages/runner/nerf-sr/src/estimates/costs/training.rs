@@ -136,7 +136,7 @@ mod tests {
     use super::super::tests::training;
     use super::*;
 
-    /// Half of the steps and of the width make rays cheaper, by the measured exponents.
+    /// Half of the steps or of the width makes rays cheaper, by the measured exponents.
     #[test]
     fn smaller_networks_and_fewer_steps_are_cheaper() {
         let factor = |march_steps: Value, hidden_dim: u32, kind| {
