@@ -10,7 +10,7 @@ pub(crate) struct Figures(BTreeMap<String, ScoreFormat>);
 
 /// Values that the table adds to those of metrics: name, title, digits, and true if higher values
 /// are better.
-const ADDED: [(&str, &str, usize, bool); 10] = [
+const ADDED: [(&str, &str, usize, bool); 12] = [
     ("least_gain", "least gain", 2, true),
     ("near_psnr", "near psnr", 2, true),
     ("gain", "gain", 2, true),
@@ -19,6 +19,8 @@ const ADDED: [(&str, &str, usize, bool); 10] = [
     ("samples_per_ray", "samples per ray", 1, false),
     ("rays_per_s", "rays/s", 0, true),
     ("views", "views", 0, true),
+    ("near_views", "near views", 0, true),
+    ("seconds_per_view", "seconds per view", 1, false),
     ("peak_mb", "peak memory, MB", 0, false),
     ("field_mb", "field, MB", 1, false),
 ];
@@ -38,6 +40,11 @@ impl Figures {
             Some(figure) => figure.higher_is_better == Some(false),
             None => !added(name).is_some_and(|(.., higher_is_better)| higher_is_better),
         }
+    }
+
+    /// True if no value of the column is better than another: numbers of views.
+    pub(crate) fn has_no_best(name: &str) -> bool {
+        ["views", "near_views"].contains(&name)
     }
 
     /// Formats a value with its digits and unit.
@@ -119,6 +126,7 @@ mod tests {
             ("rays_per_s", 114_000.0, "114 k"),
             ("gain", 0.5, "0.50"),
             ("views", 25.0, "25"),
+            ("seconds_per_view", 3.9962, "4.0"),
             ("something", 3.0, "3"),
             ("something", 0.12345, "0.1235"),
         ] {

@@ -169,6 +169,9 @@ impl Layout<'_> {
 
     /// Returns the best mean of a value in a column with several lines.
     fn best(&self, rivals: &[Row], column: &[String], name: &str) -> Option<f64> {
+        if Figures::has_no_best(name) {
+            return None;
+        }
         let lines = distinct(rivals, &self.keys);
         let means = lines.iter().filter_map(|keys| {
             let line = select(rivals, &self.keys, keys);

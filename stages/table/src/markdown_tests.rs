@@ -75,6 +75,17 @@ fn results_of_one_row_are_averaged_and_the_best_is_marked() {
 }
 
 #[test]
+fn numbers_of_views_have_no_best() {
+    let mut rows = rows();
+    for (row, views) in rows.iter_mut().zip([9, 9, 12, 12]) {
+        row.insert("near_views".to_owned(), json!(views));
+    }
+    let params = Params { values: vec!["near_views".to_owned()], ..Params::default() };
+    let text = markdown(&params, &rows, &figures(), &[]).unwrap();
+    assert!(text.contains("| no warm-up | 12 | abc1234 |"), "{text}");
+}
+
+#[test]
 fn columns_are_the_values_of_a_key() {
     let params = Params {
         rows: vec!["variant".to_owned()],
