@@ -140,7 +140,14 @@ table: build ## Write the paper's tables with all methods: make table SCENES="le
 	@mkdir -p $(dir $(TABLE)) && cat $(TABLES:%=out/%/table.md) > $(TABLE)
 	@for kind in json csv; do cp out/paper-table/rows.$$kind $(basename $(TABLE)).$$kind; done
 
-results: ## Update the tables in docs/results from out/; the comment above each table is the command that writes it
+# The comment above a table is the command that writes the table into out/. An interrupted run resumes.
+PAGES ?= *
+results: SCENES = lego chair fern
+results: build held-out ## Run the experiments of docs/results (hours) and update its tables: make results PAGES=objects
+	@cat docs/results/$(PAGES).md | sed -n 's/^<!-- nerf-sr \(.*\) -->$$/\1/p' | awk '!seen[$$0]++' > out/experiments.txt
+	@while read -r words; do echo "nerf-sr $$words"; \
+	  case "$$words" in "run tradeoff"*) data=out/held-out;; *) data=$(DATA);; esac; \
+	  $(NERF_SR) $$words -j 1 --data "$$data" </dev/null || exit 1; done < out/experiments.txt
 	UPDATE=1 cargo test --release -p end-to-end --test results --quiet -- --nocapture what_was_measured
 
 REFERENCES ?= 1
