@@ -1,11 +1,16 @@
 #!/usr/bin/env python3
-"""Reads an artifact of `export` with trimesh, plyfile and pycolmap, and compares it with a true surface.
+"""Reads an artifact of `export` with trimesh, plyfile and, if installed, pycolmap, and compares it with a true surface.
 
     check-export.py EXPORT TRUTH.ply SEEN.ply
 
-TRUTH.ply has points of the true surface with their normals; SEEN.ply has the points that are visible from the cameras. Prints JSON:
-mean distances to TRUTH.ply and from SEEN.ply over the scene's longest side, and shares of normals that point to the same side as the
-nearest true normal. Without pycolmap, cameras are omitted.
+TRUTH.ply has points of the true surface, SEEN.ply the points that are visible from the cameras; both have normals. Prints JSON:
+
+* `mesh`, `points`, `splats`: `count` of points (of the mesh, samples), mean distance from these points to TRUTH.ply (`to_truth`) and from
+  SEEN.ply to these points (`from_truth`), both divided by the scene's longest side, and the share of normals that point to the same side
+  as the nearest true normal (`outward`). The mesh also has its number of triangles, `outward` of its vertices and facts on its colours;
+  points and splats have the properties of their files.
+* `frames`: number of cameras in transforms.json.
+* `colmap`, only with pycolmap: numbers of points and cameras, and the cameras' poses.
 """
 
 import json
@@ -50,8 +55,8 @@ def main():
 
     found = {}
     (mesh,) = trimesh.load(export / "mesh.glb", process=False).geometry.values()
+    # The number of samples is chosen by hand.
     samples, faces = trimesh.sample.sample_surface(mesh, 200_000, seed=1)
-    # 200,000 samples are dense enough to represent the surface.
     found["mesh"] = figures(samples, mesh.face_normals[faces], cKDTree(samples).query(seen)[0])
     found["mesh"]["triangles"] = len(mesh.faces)
     found["mesh"]["vertices_outward"] = outward(mesh.vertices, mesh.vertex_normals, tree, truth_normals)

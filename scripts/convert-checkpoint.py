@@ -33,10 +33,13 @@ def octaves(path: pathlib.Path, inputs: int) -> int:
 def sizes(path: pathlib.Path, state: dict) -> dict:
     """Returns the network's sizes, read from its layers."""
     try:
-        width, position = state["xyz_encoding_1.0.weight"][0]
-        direction = state["dir_encoding.0.weight"][0][1] - width
-    except (KeyError, ValueError) as error:
+        first, directional = (state[f"{layer}.0.weight"].shape for layer in ("xyz_encoding_1", "dir_encoding"))
+    except KeyError as error:
         sys.exit(f"{path}: tensor {error} is missing; expected the weights of a VanillaMLP")
+    if len(first) != 2 or len(directional) != 2:
+        sys.exit(f"{path}: weights have the shapes {first} and {directional}; expected matrices, as in a VanillaMLP")
+    width, position = first
+    direction = directional[1] - width
     depth = sum(name.startswith("xyz_encoding_") and name.endswith(".0.weight") for name in state)
     return {"position_frequencies": octaves(path, position), "direction_frequencies": octaves(path, direction), "layers": depth, "hidden_dim": width}
 
@@ -62,6 +65,7 @@ if networks[0] != networks[1]:
     sys.exit(f"{options.fine}: network sizes {networks[1]} differ from {networks[0]} in {options.coarse}")
 
 checkpoints.write(options.out / "field-0.safetensors", tensors)
+# The box is chosen by hand: positions are world coordinates, and rays end at --far. Numbers of samples are those of the authors' scripts.
 reach = options.far
 description = {
     "field": {"mlp": networks[0] | {"coarse_samples": 64, "fine_samples": 64}},

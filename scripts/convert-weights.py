@@ -5,8 +5,8 @@
     scripts/convert-weights.py liif edsr-baseline-liif.pth weights/liif.safetensors
     scripts/convert-weights.py swinir 001_classicalSR_DF2K_s64w8_SwinIR-M_x2.pth weights/swinir_x2.safetensors
 
-Needs only Python's standard library. Sizes are read from the layers; all names and shapes are checked. Tensors that `upsample` doesn't
-use or computes itself (LIIF's colour shifts, SwinIR's masks and indices) are left out.
+Needs only Python's standard library. Sizes are read from some tensors; all names, and all other shapes against these sizes, are checked.
+Tensors that `upsample` doesn't use or computes itself (LIIF's colour shifts, SwinIR's masks and indices) are left out.
 """
 
 import argparse
@@ -106,7 +106,7 @@ def swinir(state: dict) -> dict:
 
 
 whole = checkpoints.read(options.checkpoint)
-# Keys under which the projects save the weights.
+# Nested keys under which the projects save the weights, outermost first.
 for key in ("params_ema", "params", "model", "sd"):
     if isinstance(whole, dict) and isinstance(whole.get(key), dict):
         whole = whole[key]

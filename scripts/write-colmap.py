@@ -1,7 +1,10 @@
 #!/usr/bin/env python3
-"""Writes transforms.json's cameras as a COLMAP model with pycolmap: write-colmap.py FOLDER sparse/0.
+"""Writes the cameras of FOLDER/transforms.json as a COLMAP model with pycolmap.
 
-tests/photographs.rs checks that `prep` reads pycolmap's models. Needs `pip install pycolmap`.
+    write-colmap.py FOLDER MODEL
+
+All cameras must have one focal length, a centred principal point and no distortion. tests/photographs.rs checks that `prep` reads
+pycolmap's models. Needs `pip install pycolmap`.
 """
 
 import json
@@ -21,9 +24,9 @@ reconstruction.add_camera_with_trivial_rig(camera)
 for number, frame in enumerate(transforms["frames"], 1):
     # COLMAP's poses are world to camera, with axes right, down, forward.
     pose = numpy.array(frame["transform_matrix"]) @ numpy.diag([1, -1, -1, 1])
-    inverse = pycolmap.Rigid3d(numpy.linalg.inv(pose)[:3])
+    world_to_camera = pycolmap.Rigid3d(numpy.linalg.inv(pose)[:3])
     image = pycolmap.Image(name=pathlib.Path(frame["file_path"]).name, camera_id=1, image_id=number)
-    reconstruction.add_image_with_trivial_frame(image, inverse)
+    reconstruction.add_image_with_trivial_frame(image, world_to_camera)
 model.mkdir(parents=True, exist_ok=True)
 reconstruction.write_binary(model)
 print(f"pycolmap {pycolmap.__version__}: {reconstruction.num_reg_images()} images in {model}")

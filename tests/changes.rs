@@ -187,7 +187,7 @@ fn unusable_folders_are_refused_before_a_stage_starts() {
     let table: [(&[std::ffi::OsString], i32, &[&str]); 5] = [
         (&store, 3, &[r"f\xFF", "the path of the store must be UTF-8"]),
         (&pages, 3, &[r"f\xFF", "the path of the folder of pages must be UTF-8"]),
-        (&pipe, 3, &["piped/a", "is a FIFO, socket or device"]),
+        (&pipe, 3, &["piped/a", "is a named pipe (FIFO)"]),
         (&around_store, 2, &["input from", "contains the store", ".nerf-sr"]),
         (&around_pages, 2, &["input from", "contains the folder of pages", "data/pages"]),
     ];

@@ -149,5 +149,5 @@ fn gc_reports_as_json() {
     assert_eq!(deleted[0]["stage"], "prep [kernel=box]");
     assert_eq!(deleted[0]["bytes"], report["bytes_gone"]);
     let plain = project.ok(&["gc", "--dry-run", "--keep-days", "0", "-p", "kernel=lanczos"]);
-    assert!(plain.lines().last().unwrap().contains("MB would be deleted"), "{plain}");
+    assert!(plain.lines().last().unwrap().contains("B would be deleted"), "{plain}");
 }

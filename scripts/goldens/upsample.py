@@ -5,7 +5,8 @@ The networks are built here from their papers' descriptions, small and with fixe
 network's weights, inputs (golden.input.N) and outputs (golden.output.N). Some weights are also saved in the format of their project's
 releases, for tests/checkpoint.rs.
 
-If NERF_SR_DATA (or ../shared/data) exists, the scores of IMDN's released weights on ten test views are also written.
+If weights/imdn_x2.safetensors is in NERF_SR_DATA (or ../shared/data), scores of IMDN's released weights on ten test views, run in f32, are
+also written.
 """
 
 import json
@@ -102,19 +103,20 @@ class Liif(nn.Module):
         features = functional.unfold(features, 3, padding=1).view(1, 9 * width, low_rows, low_columns)
         centres = lambda n: -1 + (2 * torch.arange(n, dtype=x.dtype) + 1) / n
         grid = lambda h, w: torch.stack(torch.meshgrid(centres(h), centres(w), indexing="ij"), -1)
-        at, known = grid(rows, columns), grid(low_rows, low_columns).permute(2, 0, 1)[None]
+        target_centres, source_centres = grid(rows, columns), grid(low_rows, low_columns).permute(2, 0, 1)[None]
         low = torch.tensor([low_rows, low_columns], dtype=x.dtype)
         cell = (2 / torch.tensor([rows, columns], dtype=x.dtype) * low).expand(rows, columns, 2)
         colours, areas = [], []
         for down in (-1, 1):
             for across in (-1, 1):
-                moved = (at + torch.tensor([down, across]) / low + 1e-6).clamp(-1 + 1e-6, 1 - 1e-6).flip(-1)[None]
-                take = lambda of: functional.grid_sample(of, moved, mode="nearest", align_corners=False)[0].permute(1, 2, 0)
-                offset = (at - take(known)) * low
-                colours.append(self.imnet["layers"](torch.cat([take(features), offset, cell], -1)))
+                shifted = target_centres + torch.tensor([down, across]) / low + 1e-6
+                shifted = shifted.clamp(-1 + 1e-6, 1 - 1e-6).flip(-1)[None]
+                nearest = lambda of: functional.grid_sample(of, shifted, mode="nearest", align_corners=False)[0].permute(1, 2, 0)
+                offset = (target_centres - nearest(source_centres)) * low
+                colours.append(self.imnet["layers"](torch.cat([nearest(features), offset, cell], -1)))
                 areas.append(offset.prod(-1).abs() + 1e-9)
-        whole = sum(areas)
-        shares = [area / whole for area in reversed(areas)]
+        total_area = sum(areas)
+        shares = [area / total_area for area in reversed(areas)]
         colour = sum(c * s[..., None] for c, s in zip(colours, shares))
         return (colour * 0.5 + 0.5).permute(2, 0, 1)[None]
 
@@ -127,15 +129,15 @@ class Attention(nn.Module):
         self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
 
     def forward(self, x, mask):
-        windows, places, width = x.shape
-        q, k, v = self.qkv(x).reshape(windows, places, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
-        place = torch.stack(torch.meshgrid(*[torch.arange(self.window)] * 2, indexing="ij"), -1).reshape(-1, 2)
-        apart = place[:, None] - place[None] + self.window - 1
-        bias = self.relative_position_bias_table[apart[..., 0] * (2 * self.window - 1) + apart[..., 1]].permute(2, 0, 1)
+        windows, pixels, width = x.shape
+        q, k, v = self.qkv(x).reshape(windows, pixels, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
+        position = torch.stack(torch.meshgrid(*[torch.arange(self.window)] * 2, indexing="ij"), -1).reshape(-1, 2)
+        relative = position[:, None] - position[None] + self.window - 1
+        bias = self.relative_position_bias_table[relative[..., 0] * (2 * self.window - 1) + relative[..., 1]].permute(2, 0, 1)
         score = q @ k.transpose(-1, -2) / math.sqrt(width // self.heads) + bias
         if mask is not None:
             score = score + mask[:, None]
-        return self.proj((score.softmax(-1) @ v).transpose(1, 2).reshape(windows, places, width))
+        return self.proj((score.softmax(-1) @ v).transpose(1, 2).reshape(windows, pixels, width))
 
 
 class Block(nn.Module):
@@ -167,8 +169,8 @@ class Block(nn.Module):
         return x + self.mlp["fc2"](functional.gelu(self.mlp["fc1"](self.norm2(x))))
 
 
-def residual(width, three):
-    if not three:
+def residual(width, three_convs):
+    if not three_convs:
         return conv(width, width)
     narrow = width // 4
     leak = nn.LeakyReLU(0.2)
@@ -176,7 +178,7 @@ def residual(width, three):
 
 
 class SwinIr(nn.Module):
-    def __init__(self, width, depths, heads, window, kind, scale, three=False):
+    def __init__(self, width, depths, heads, window, kind, scale, three_convs=False):
         super().__init__()
         self.window, self.kind, self.scale = window, kind, scale
         self.conv_first = conv(3, width)
@@ -184,10 +186,10 @@ class SwinIr(nn.Module):
         self.layers = nn.ModuleList()
         for depth in depths:
             blocks = nn.ModuleList(Block(width, heads, window, (i % 2) * (window // 2)) for i in range(depth))
-            group = nn.ModuleDict({"residual_group": nn.ModuleDict({"blocks": blocks}), "conv": residual(width, three)})
+            group = nn.ModuleDict({"residual_group": nn.ModuleDict({"blocks": blocks}), "conv": residual(width, three_convs)})
             self.layers.append(group)
         self.norm = nn.LayerNorm(width)
-        self.conv_after_body = residual(width, three)
+        self.conv_after_body = residual(width, three_convs)
         if kind == "direct":
             self.upsample = nn.Sequential(conv(width, 3 * scale**2))
             return
@@ -248,10 +250,11 @@ liif = golden("liif", Liif(6, 2, [24, 16]), [(9, 7, 18, 14), (7, 10, round(7 * 3
 golden("swinir_classical", SwinIr(12, [2, 3], 3, 4, "shuffled", 4), [(8, 12), (9, 13), (5, 7)])
 golden("swinir_classical_x3", SwinIr(8, [2], 2, 4, "shuffled", 3), [(7, 9)])
 light = golden("swinir_light", SwinIr(8, [2], 2, 4, "direct", 2), [(7, 9)])
-golden("swinir_real", SwinIr(16, [2, 2], 2, 8, "repeated", 4, three=True), [(16, 8), (11, 21)])
+golden("swinir_real", SwinIr(16, [2, 2], 2, 8, "repeated", 4, three_convs=True), [(16, 8), (11, 21)])
 golden("swinir_real_x2", SwinIr(8, [2], 2, 4, "repeated", 2), [(10, 6)])
 
 released("imdn", {f"module.{key}": value for key, value in imdn.items()})
+# `shifts` and `extra` are tensors that the converter must ignore.
 shifts = {f"encoder.{side}_mean.{part}": torch.eye(3) for side in ("sub", "add") for part in ("weight", "bias")}
 released("liif", {"model": {"name": "liif", "args": {"cell_decode": True}, "sd": liif | shifts}, "epoch": 1000})
 first = "layers.0.residual_group.blocks"
@@ -260,7 +263,8 @@ released("swinir", {"params": light | extra})
 
 # Scores of IMDN's released weights on ten test views at 200 px over white; LR images by Pillow's bicubic filter.
 data = pathlib.Path(os.environ.get("NERF_SR_DATA", ROOT.parent / "shared/data"))
-if (data / "weights/imdn_x2.safetensors").is_file():
+imdn_x2 = data / "weights/imdn_x2.safetensors"
+if imdn_x2.is_file():
     scores = {}
     for scale in (2, 4):
         weights = load_file(data / f"weights/imdn_x{scale}.safetensors")
@@ -282,4 +286,4 @@ if (data / "weights/imdn_x2.safetensors").is_file():
         scores[f"x{scale}"] = rows
     (TO / "imdn-lego.json").write_text(json.dumps(scores, indent=2) + "\n")
 else:
-    print("IMDN on ten views: skipped: no data")
+    print(f"IMDN on ten views: skipped: no {imdn_x2}")

@@ -31,13 +31,12 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Rule, Stage};
 
-use derived::{least_gain, near_references};
 use metric::{Metric, mean_of};
 use scored_view::{ScoredScene, ScoredView};
 #[cfg(feature = "torch")]
 pub use scoring::Lpips;
 pub use scoring::{DepthError, LpipsNetwork, Ssim, WarpScore, depth_error, psnr, ssim};
-use scoring::{Perceptual, metrics, weights_rule};
+use scoring::{Perceptual, all_metrics, weights_rule};
 
 /// Parameters of `eval`: none.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -96,7 +95,7 @@ impl Stage for Eval {
     fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
         let (views_input, truth_input) = (context.input("views")?, context.input("truth")?);
         let (views, truth) = (Views::read(views_input)?, Views::read(truth_input)?);
-        let metrics = metrics(Perceptual::new(context.optional_input("weights"))?);
+        let metrics = all_metrics(Perceptual::new(context.optional_input("weights"))?);
         let degradation: Option<Degradation> = truth_input.read_optional_json(DEGRADATION_FILE)?;
         let scene =
             ScoredScene { views_input, views: &views, truth_input, truth: &truth, degradation };
@@ -109,10 +108,10 @@ impl Stage for Eval {
         });
         let scored = scored.collect::<anyhow::Result<Vec<ViewScores>>>()?;
         let baseline = context.optional_input("baseline");
-        let least_gain = baseline.map(|baseline| least_gain(&scored, baseline)).transpose()?;
+        let least_gain = baseline.map(|input| derived::least_gain(&scored, input)).transpose()?;
         let references = context.optional_input("references").map(Views::read).transpose()?;
         let near_references =
-            references.and_then(|references| near_references(&scored, &truth, &references));
+            references.and_then(|views| derived::near_references(&scored, &truth, &views));
         let result = Metrics {
             conventions: conventions(&scene, &metrics),
             figures: metrics.iter().flat_map(|metric| metric.figures()).collect(),
@@ -148,10 +147,8 @@ fn score(
 ) -> anyhow::Result<ViewScores> {
     let name = &view.true_view.camera.name;
     let error_map = format!("errors/{name}.png");
-    if let Some((render, truth)) = view.compared_images() {
-        let map = draw_error_map(render, truth);
-        write_png(&context.output_path(&error_map)?, &map)?;
-    }
+    let (render, truth) = view.compared_images();
+    write_png(&context.output_path(&error_map)?, &draw_error_map(render, truth))?;
     let mut scores = Scores::new();
     let mut pictures = BTreeMap::new();
     for metric in metrics {
@@ -171,8 +168,8 @@ fn draw_error_map(render: &Image, truth: &Image) -> Rgba8 {
     let truth_pixels = truth.data.as_chunks::<3>().0;
     let mut data = Vec::with_capacity(4 * truth_pixels.len());
     for (i, [r, g, b]) in render.data.as_chunks::<3>().0.iter().enumerate() {
-        let truth = truth_pixels[i];
-        let error = ((r - truth[0]).abs() + (g - truth[1]).abs() + (b - truth[2]).abs()) / 3.0;
+        let [true_r, true_g, true_b] = truth_pixels[i];
+        let error = ((r - true_r).abs() + (g - true_g).abs() + (b - true_b).abs()) / 3.0;
         data.extend(palette_colour(Palette::Error, error / ERROR_MAP_RANGE as f32));
         data.push(255);
     }

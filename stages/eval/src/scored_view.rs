@@ -64,15 +64,16 @@ impl<'a> ScoredView<'a> {
     }
 
     /// Returns render and truth for the error map: at HR, or at LR if there is no HR truth.
-    pub(crate) fn compared_images(&self) -> Option<(&Image, &Image)> {
+    pub(crate) fn compared_images(&self) -> (&Image, &Image) {
         let hr = self.truth.as_ref().map(|truth| (&self.render, truth));
         hr.or_else(|| self.lr.as_ref().map(|lr| (&lr.render, &lr.truth)))
+            .expect("views without HR and LR truth are refused")
     }
 
     /// Replaces the truth by the render at pixels that don't count.
     fn apply_mask(&mut self) -> anyhow::Result<()> {
         let name = &self.true_view.camera.name;
-        let Some((_, truth)) = self.compared_images() else { return Ok(()) };
+        let (_, truth) = self.compared_images();
         let mask = self.true_view.read_mask(self.scene.truth_input, (truth.width, truth.height));
         let Some(mask) = mask.bad_input(format!("view {name}"))? else { return Ok(()) };
         if let Some(truth) = &mut self.truth {

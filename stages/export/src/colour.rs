@@ -8,10 +8,14 @@ use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 use crate::surface_view::{PointState, SurfaceView};
 
+/// Minimum total weight of the views that observe a vertex: a single view at 88.2° from the normal,
+/// or more, has less. Chosen by hand.
+const MIN_TOTAL_WEIGHT: f32 = 1e-3;
+
 /// Returns the colours of a mesh's vertices, display-encoded sRGB: the mean over the views that
 /// observe the vertex, weighted by the squared cosine between the vertex normal and the direction
-/// to the camera. Other vertices get the colour that the field renders against the normal. `offset`
-/// is the origin of the mesh's frame, in the world.
+/// to the camera. Other vertices, and those seen only at grazing angles, get the colour that the
+/// field renders against the normal. `offset` is the origin of the mesh's frame, in the world.
 pub(crate) fn vertex_colours(
     field: &FieldArtifact,
     views: &[SurfaceView],
@@ -29,6 +33,8 @@ pub(crate) fn vertex_colours(
         .iter()
         .map(|&vertex| {
             let (position, normal) = (mesh.positions[vertex], mesh.normals[vertex].as_dvec3());
+            // Fields render beyond the distance `near`; the field's surface may be in front of the
+            // vertex by the truncation distance.
             let distance = field.file.bounds.near + f64::from(truncation_at(lattice, position));
             let origin = (offset + position.as_dvec3() + distance * normal).to_array();
             Ray { origin, direction: (-normal).to_array(), background }
@@ -47,7 +53,7 @@ fn truncation_at(lattice: &Lattice, position: Vec3) -> f32 {
     truncation_distance(lattice, lattice.to_lattice(position.as_dvec3()))
 }
 
-/// Returns the mean colour over the views that observe a vertex, if any do.
+/// Returns the mean colour over the views that observe a vertex, if their weights suffice.
 fn mean_colour(
     views: &[SurfaceView],
     mesh: &Mesh,
@@ -67,5 +73,5 @@ fn mean_colour(
         sum = [0, 1, 2].map(|c| weight.mul_add(f32::from(colour[c]) / 255.0, sum[c]));
         weights += weight;
     }
-    (weights > 1e-3).then(|| sum.map(|v| v / weights))
+    (weights > MIN_TOTAL_WEIGHT).then(|| sum.map(|v| v / weights))
 }

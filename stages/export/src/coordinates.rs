@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 pub const OFFSET_FILE: &str = "offset.json";
 
 /// Files whose coordinates have single precision; the last two are the mesh.
-const SINGLE_FILES: [&str; 4] = ["points.ply", "splats.ply", "mesh.glb", "mesh.ply"];
+const SINGLE_PRECISION_FILES: [&str; 4] = ["points.ply", "splats.ply", "mesh.glb", "mesh.ply"];
 
 /// Maximum distance of a scene's middle from the origin, in scene sizes, up to which files need no
 /// offset: single precision moves a point by less than a millionth of the size (design note 043).
@@ -40,6 +40,7 @@ impl Coordinates {
     /// enough.
     pub(crate) fn new(bounds: &Bounds) -> Self {
         let (middle, size) = match bounds.space {
+            // A frustum is narrowest at its near plane, where rounding matters most.
             Space::Ndc(frustum) => (frustum.centre(), frustum.near),
             _ => (bounds.middle(), bounds.longest_side()),
         };
@@ -56,7 +57,7 @@ impl Coordinates {
 
     /// Returns the content of [`OFFSET_FILE`].
     pub(crate) fn offset_file(&self, has_mesh: bool) -> ExportOffset {
-        let files = &SINGLE_FILES[..if has_mesh { 4 } else { 2 }];
+        let files = &SINGLE_PRECISION_FILES[..if has_mesh { 4 } else { 2 }];
         ExportOffset {
             note: "add the offset to the coordinates of these files for the input's coordinates"
                 .to_owned(),
@@ -72,7 +73,7 @@ impl fmt::Display for Coordinates {
         if self.is_moved() {
             let [x, y, z] = self.offset.to_array();
             write!(f, ", less the offset ({x}, {y}, {z}) of {OFFSET_FILE} where single precision")?;
-            f.write_str(" can't hold them (points.ply, splats.ply, mesh.glb, mesh.ply)")?;
+            write!(f, " can't hold them ({})", SINGLE_PRECISION_FILES.join(", "))?;
         }
         Ok(())
     }

@@ -1,4 +1,4 @@
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
@@ -15,7 +15,7 @@ use stage::{Context, Input, Output, Progress, SUMMARY_FILE, Stage};
 pub struct CopyParams {}
 
 /// Number of bytes copied between two reports of progress; chosen by hand.
-const CHUNK_BYTES: usize = 1 << 20;
+const CHUNK_BYTES: u64 = 1 << 20;
 
 /// Stage `copy`: a sink that copies a run's artifacts to a folder next to its pages, for other
 /// programs. Each point of a sweep has its own folder.
@@ -76,17 +76,12 @@ fn copy_file(
     progress: &Progress,
 ) -> anyhow::Result<()> {
     let (mut from, mut to) = (std::fs::File::open(source)?, std::fs::File::create(target)?);
-    let mut buffer = vec![0; CHUNK_BYTES];
     loop {
         context.check_interrupt()?;
-        let count = match from.read(&mut buffer) {
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            count => count?,
-        };
+        let count = io::copy(&mut from.by_ref().take(CHUNK_BYTES), &mut to)?;
         if count == 0 {
             return Ok(());
         }
-        to.write_all(&buffer[..count])?;
-        progress.add(count as u64);
+        progress.add(count);
     }
 }

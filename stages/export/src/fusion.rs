@@ -14,7 +14,7 @@ const TRUNCATION_SPACINGS: f64 = 2.5;
 const MAX_PIXEL_DISTANCE: f64 = 0.75;
 /// Minimum cosine between a vertex's normal and a view's normal at which the view observes the
 /// vertex's side of the surface; chosen by hand.
-const MIN_SAME_SIDE_COSINE: f64 = 0.3;
+const MIN_OBSERVED_SIDE_COSINE: f64 = 0.3;
 /// Number of rows of triangles that are removed next to unseen parts (design note 043).
 const UNCERTAIN_ROWS: usize = 3;
 
@@ -35,8 +35,8 @@ pub(crate) fn fuse(views: &[SurfaceView], lattice: &Lattice, progress: &Progress
 }
 
 /// Returns the truncation distance at lattice coordinates, in scene units.
-pub(crate) fn truncation_distance(lattice: &Lattice, node: [f64; 3]) -> f32 {
-    (TRUNCATION_SPACINGS * lattice.spacing_at(node)) as f32
+pub(crate) fn truncation_distance(lattice: &Lattice, lattice_position: [f64; 3]) -> f32 {
+    (TRUNCATION_SPACINGS * lattice.spacing_at(lattice_position)) as f32
 }
 
 /// Returns the bounding box of all observed surfaces: min, max.
@@ -54,9 +54,11 @@ fn fused_distance(
     lattice: &Lattice,
     node: [usize; 3],
 ) -> f32 {
-    let node = node.map(|i| i as f64);
-    let point = lattice.to_world(node);
-    let truncation = truncation_distance(lattice, node);
+    let lattice_position = node.map(|i| i as f64);
+    let point = lattice.to_world(lattice_position);
+    let truncation = truncation_distance(lattice, lattice_position);
+    // Chosen by hand. Surfaces farther away are ignored, also slanted ones, near which `point_state`
+    // accepts larger differences in depth.
     let margin = DVec3::splat(2.0 * f64::from(truncation));
     if point.cmplt(min - margin).any() || point.cmpgt(max + margin).any() {
         // No surface is near, so one view suffices.
@@ -90,9 +92,9 @@ pub(crate) fn remove_unseen(views: &[SurfaceView], lattice: &Lattice, mesh: &mut
         .map(|vertex| {
             let position = mesh.positions[vertex].as_dvec3();
             let normal = mesh.normals[vertex].as_dvec3();
-            let node = lattice.to_lattice(position);
-            let truncation = truncation_distance(lattice, node);
-            let cell = lattice.spacing_at(node);
+            let lattice_position = lattice.to_lattice(position);
+            let truncation = truncation_distance(lattice, lattice_position);
+            let cell = lattice.spacing_at(lattice_position);
             views.iter().any(|view| is_observed(view, (position, normal), truncation, cell))
         })
         .collect();
@@ -123,7 +125,7 @@ fn is_observed(
     };
     let observed_normal = view.world_normal(index);
     let offset = position - view.world_point(index);
-    let along = offset - offset.dot(observed_normal) * observed_normal;
-    observed_normal.dot(normal) > MIN_SAME_SIDE_COSINE
-        && along.length() <= cell.max(MAX_PIXEL_DISTANCE * view.pixel_width(index))
+    let tangential = offset - offset.dot(observed_normal) * observed_normal;
+    observed_normal.dot(normal) > MIN_OBSERVED_SIDE_COSINE
+        && tangential.length() <= cell.max(MAX_PIXEL_DISTANCE * view.pixel_width(index))
 }

@@ -393,7 +393,7 @@ fn assert_equal_cameras(set: &Dataset, cameras: &[Camera]) {
     assert_eq!(set.frames.len(), cameras.len());
     for camera in cameras {
         let frame = set.frames.iter().find(|f| f.name == camera.name).unwrap();
-        assert_eq!(frame.stored_intrinsics, camera.intrinsics);
+        assert_eq!(frame.lens_intrinsics, camera.intrinsics);
         let error =
             |r: usize, c: usize| (frame.camera_to_world[r][c] - camera.camera_to_world[r][c]).abs();
         assert!((0..12).all(|i| error(i / 4, i % 4) < 1e-12), "{}", camera.name);

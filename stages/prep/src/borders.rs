@@ -100,7 +100,8 @@ impl Borders {
         let strips: Vec<Option<Strips>> = views.iter().map(|view| view.strips).collect();
         let common = Strips::common(&strips).filter(|_| self.evidence != BorderEvidence::Alpha);
         if let Some((strips, count)) = common {
-            let are_masked = views.iter().all(|view| view.strips.is_none() || view.are_masked);
+            let are_masked =
+                views.iter().all(|view| view.strips.is_none() || view.has_masked_strips);
             self.strips = Some(CommonStrips { strips, views: count, are_masked });
             if strips.is_frame() {
                 self.evidence = BorderEvidence::Scene;

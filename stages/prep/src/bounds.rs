@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DVec3};
 use scene::{
-    Bounds, Camera, CameraRay, Frustum, Space, common_direction, pose_of, power_of_two_below,
+    Bounds, Camera, CameraRay, Frustum, Space, common_direction, pose_of, power_of_two_floor,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -95,7 +95,7 @@ fn near_point(views: &[CameraDepths]) -> DVec3 {
         let farthest = depths.map_or(0.0, |[_, farthest]| farthest);
         extent = extent.max(camera.centre().distance(first)).max(farthest);
     }
-    let step = NEAR_POINT_STEP * power_of_two_below(extent);
+    let step = NEAR_POINT_STEP * power_of_two_floor(extent);
     let point = (first / step).round() * step;
     // For cameras at one position without known depths, the step is 0.
     if point.is_finite() { point } else { DVec3::ZERO }

@@ -42,11 +42,14 @@ impl ImagePlan {
             for &i in split.train.iter().chain(&split.test) {
                 let sizes = plan.sizes_of(&set.frames[i].intrinsics());
                 if !sizes.is_integer() {
+                    let Sizes { lr, hr } = sizes;
                     bail_usage!(
-                        "parameter kernel: average requires an integer scale, found {:?} → {:?}; \
-                        choose box",
-                        sizes.hr,
-                        sizes.lr
+                        "parameter kernel: average requires an integer scale, found {}×{} → \
+                        {}×{}; choose box",
+                        hr.0,
+                        hr.1,
+                        lr.0,
+                        lr.1
                     );
                 }
             }

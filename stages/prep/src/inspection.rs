@@ -21,12 +21,12 @@ pub(crate) struct Inspection {
     pub(crate) spectrum: Spectrum,
 }
 
-/// Border of one view's image.
+/// Border and strips of one view's image.
 pub(crate) struct ViewBorder {
     pub(crate) border: Border,
     pub(crate) strips: Option<Strips>,
-    /// True if the view's mask excludes the strips.
-    pub(crate) are_masked: bool,
+    /// True if there are strips, and the view's mask excludes them.
+    pub(crate) has_masked_strips: bool,
 }
 
 impl Inspection {
@@ -36,7 +36,7 @@ impl Inspection {
         let count = frames.len().min(MAX_VIEWS);
         let mut views: Vec<(ViewBorder, Spectrum)> =
             frames.first().map(|first| inspect_view(first)).transpose()?.into_iter().collect();
-        if views.iter().any(|(view, _)| view.border != Border::Alpha) {
+        if views.first().is_some_and(|(view, _)| view.border != Border::Alpha) {
             let others =
                 (1..count).into_par_iter().map(|i| inspect_view(frames[i * frames.len() / count]));
             views.extend(others.collect::<anyhow::Result<Vec<_>>>()?);
@@ -56,10 +56,10 @@ fn inspect_view(frame: &Frame) -> anyhow::Result<(ViewBorder, Spectrum)> {
         border = Border::Mixed;
     }
     let strips = if border == Border::Alpha { None } else { Strips::of(&image) };
-    let mut are_masked = false;
+    let mut has_masked_strips = false;
     if let Some(strips) = &strips {
         let mask = frame.mask().bad_input(frame_label(frame))?;
-        are_masked = mask.is_some_and(|mask| strips.are_masked(&mask));
+        has_masked_strips = mask.is_some_and(|mask| strips.are_masked(&mask));
     }
-    Ok((ViewBorder { border, strips, are_masked }, Spectrum::of(&image)))
+    Ok((ViewBorder { border, strips, has_masked_strips }, Spectrum::of(&image)))
 }

@@ -20,7 +20,7 @@ struct MemoryNeed {
 impl MemoryNeed {
     fn of(frame: &Frame, images: &ImagePlan) -> Result<Self, Failure> {
         let reading = frame.reading_bytes().bad_input(frame_label(frame))?;
-        let size = (frame.stored_intrinsics.width, frame.stored_intrinsics.height);
+        let size = (frame.lens_intrinsics.width, frame.lens_intrinsics.height);
         let hr_size = images.sizes_of(&frame.intrinsics()).hr;
         let hr_pixels = if images.has_truth { pixel_count(hr_size) } else { 0 };
         let bytes = preparation_bytes(reading, pixel_count(size), hr_pixels);

@@ -220,7 +220,7 @@ mod tests {
             }
             let set = dataset::Dataset::read(&folder).unwrap();
             let split =
-                set.split.clone().unwrap_or_else(|| dataset::Split::hold_out(set.frames.len(), 8));
+                set.split.clone().unwrap_or_else(|| dataset::Split::hold_out(set.frames.len()));
             let cameras =
                 |views: &[usize]| views.iter().map(|&i| set.frames[i].camera()).collect::<Vec<_>>();
             let (training, test) = (cameras(&split.train), cameras(&split.test));

@@ -104,7 +104,7 @@ fn bounds(
 
 /// Pairs cameras with their depth ranges, or with the given range where a view's own is unknown.
 fn camera_depths(frames: &[&Frame], given: Option<[f64; 2]>) -> Vec<CameraDepths> {
-    frames.iter().map(|f| (f.camera(), f.depths.or(given))).collect()
+    frames.iter().map(|f| (f.camera(), f.depth_range.or(given))).collect()
 }
 
 /// Returns warnings about implausible poses; fails if all training poses are equal.
@@ -171,11 +171,11 @@ mod tests {
             image: PathBuf::from(format!("r_{i}.png")),
             turn: Turn::Stored,
             mask: None,
-            depth: None,
-            stored_intrinsics: Intrinsics::from_angle_x(80, 60, 0.7),
+            depth_file: None,
+            lens_intrinsics: Intrinsics::from_angle_x(80, 60, 0.7),
             pinhole: None,
             camera_to_world,
-            depths: None,
+            depth_range: None,
         }
     }
 
@@ -273,7 +273,7 @@ mod tests {
     fn boxes_without_volume_are_refused() {
         let mut set = ring(Format::Blender, 8);
         for frame in &mut set.frames {
-            (frame.stored_intrinsics.fx, frame.stored_intrinsics.fy) = (1e300, 1e300);
+            (frame.lens_intrinsics.fx, frame.lens_intrinsics.fy) = (1e300, 1e300);
         }
         let failure = planned(&set, &Params::default(), Background::White).unwrap_err();
         assert!(matches!(failure, Failure::BadInput(_)));

@@ -4,9 +4,6 @@ use glam::DVec3;
 
 use crate::params::{Params, SplitKind};
 
-/// Interval of held-out views: every eighth, as in LLFF's code.
-const HOLD_OUT_EVERY: usize = 8;
-
 /// Divides the frames into training and test views; `test_views` limits the latter.
 pub(crate) fn split_views(set: &Dataset, params: &Params) -> Result<Split, Failure> {
     let mut split = full_split(set, params)?;
@@ -28,7 +25,7 @@ fn full_split(set: &Dataset, params: &Params) -> Result<Split, Failure> {
                 "parameter split: the data set has no split of its own; choose holdout or paper"
             )
         }
-        (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count, HOLD_OUT_EVERY)),
+        (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count)),
         (Some(SplitKind::Paper), _) => {
             let mut split = Split::all(count);
             let limit = (params.hr_references as usize).min(count.saturating_sub(1));
@@ -45,9 +42,8 @@ fn full_split(set: &Dataset, params: &Params) -> Result<Split, Failure> {
 /// gives a prefix of a larger one's choice.
 pub(crate) fn choose_references(centres: impl Iterator<Item = DVec3>, count: usize) -> Vec<usize> {
     let centres: Vec<DVec3> = centres.collect();
-    let count = count.min(centres.len());
     let mut distances = vec![f64::INFINITY; centres.len()];
-    let mut chosen = Vec::with_capacity(count);
+    let mut chosen = Vec::new();
     while chosen.len() < count {
         // The first of several at equal distance.
         let next = (0..centres.len())

@@ -67,7 +67,7 @@ impl SceneSummary {
             detail,
             train: train.len(),
             test: test.len(),
-            has_depth: images.has_truth && test.iter().any(|frame| frame.depth.is_some()),
+            has_depth: images.has_truth && test.iter().any(|frame| frame.depth_file.is_some()),
             notes,
         }
     }

@@ -151,7 +151,7 @@ impl<'a> SceneWriter<'a> {
             image: images.has_truth.then(|| format!("images/{}.png", frame.name)),
             mask: mask_path(frame),
             depth: frame
-                .depth
+                .depth_file
                 .as_ref()
                 .filter(|_| images.has_truth)
                 .map(|_| format!("depth/{}.exr", frame.name)),
@@ -223,9 +223,8 @@ impl<'a> SceneWriter<'a> {
             };
             self.write_mask("truth", &frame.name, &mask)?;
         }
-        if let (Some(depth), Some(hr)) = (&frame.depth, hr) {
-            self.write_depth(depth, &frame.name, (hr.width, hr.height))
-                .bad_input(frame_label(frame))?;
+        if let (Some(depth), Some(hr)) = (&frame.depth_file, hr) {
+            self.write_depth(frame, depth, (hr.width, hr.height))?;
         }
         Ok(())
     }
@@ -258,8 +257,8 @@ impl<'a> SceneWriter<'a> {
         Ok(write_png(&path, &mask.to_rgba8())?)
     }
 
-    /// Returns the mask of an LR image: all HR pixels under an LR pixel must count. Photographs
-    /// that are the LR images keep their masks.
+    /// Shrinks a mask to an LR image: all old pixels under an LR pixel, and under its neighbours
+    /// within the kernel's reach, must count. A mask of the same size is kept.
     fn lr_mask(&self, mask: &Mask, image: &LrImage) -> Mask {
         let is_same_size = image.size() == (mask.width, mask.height);
         let kernel = self.plan.images.kernel;
@@ -298,15 +297,18 @@ impl<'a> SceneWriter<'a> {
     /// depths across an edge would invent surfaces.
     fn write_depth(
         &self,
+        frame: &Frame,
         source: &Path,
-        name: &str,
         (width, height): (usize, usize),
     ) -> anyhow::Result<()> {
-        let native = read_exr(source)?.with_finite(&DEPTH_CHANNELS, source)?;
+        let native = read_exr(source)
+            .and_then(|image| image.with_finite(&DEPTH_CHANNELS, source))
+            .bad_input(frame_label(frame))?;
         let source = source.display().to_string();
         let map = DepthMap::of(&native)
-            .with_context(|| format!("{}: depth requires channels Z and A", printable(&source)))?;
-        let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
+            .with_context(|| format!("{}: depth requires channels Z and A", printable(&source)))
+            .bad_input(frame_label(frame))?;
+        let path = self.context.output_path(&format!("truth/depth/{}.exr", frame.name))?;
         let channels = [
             Channel { name: "A", sample_type: SampleType::Half },
             Channel { name: "Z", sample_type: SampleType::Float },

@@ -15,7 +15,7 @@ impl<'a> EnlargedPhotographs<'a> {
 
     /// True if a camera has an enlarged photograph.
     pub(crate) fn has(&self, camera: &Camera) -> bool {
-        self.views.taken_by(camera).is_some()
+        self.views.taken_by(camera).is_some_and(|view| view.image.is_some())
     }
 
     /// Averages an image with the same camera's enlarged photograph, if any. Pixels that the mask

@@ -102,11 +102,11 @@ impl Stage for Refine {
         nets::deterministic();
         let refiner = context.input("refiner")?;
         let file: RefinerFile = refiner.read_json(REFINER_FILE)?;
-        let input = context.input("views")?;
-        let mut views = Views::read(input)?;
+        let views_input = context.input("views")?;
+        let mut views = Views::read(views_input)?;
         let job = RefineJob {
             context,
-            input,
+            views_input,
             background: views.background.grey_level(),
             network: AnyRefiner::read(refiner, &file)?,
             application: Application::new(params, &file),

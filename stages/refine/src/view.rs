@@ -33,7 +33,7 @@ pub(crate) struct RefinedView {
 /// Settings and inputs of all views.
 pub(crate) struct RefineJob<'a> {
     pub(crate) context: &'a Context,
-    pub(crate) input: &'a GivenInput,
+    pub(crate) views_input: &'a GivenInput,
     pub(crate) background: f32,
     pub(crate) network: AnyRefiner,
     pub(crate) application: Application,
@@ -54,7 +54,7 @@ pub(crate) struct ViewToRefine {
 }
 
 impl RefineJob<'_> {
-    /// Refines one view and writes its files.
+    /// Refines one view and writes its files at the paths of image and preview in the output.
     pub(crate) fn refine(
         &self,
         view: &View,
@@ -77,7 +77,7 @@ impl RefineJob<'_> {
 
     /// Reads a view.
     pub(crate) fn read(&self, view: &View) -> Result<ViewToRefine, Failure> {
-        let (mut rendered, file) = read_view(self.input, view, self.background)?;
+        let (mut rendered, file) = read_view(self.views_input, view, self.background)?;
         let photograph = match &self.photographs {
             Some(photographs) => photographs.photograph(&view.camera)?,
             None => None,
@@ -98,8 +98,8 @@ impl RefineJob<'_> {
     }
 }
 
-/// Writes a view's file with new colours, which are composited on the background. The other
-/// channels stay unchanged.
+/// Writes a view's file with new colours. `refined` is composited on the background, which is
+/// subtracted, so that the file stays premultiplied. The other channels stay unchanged.
 fn write_recoloured(
     path: &Path,
     image: &ExrImage,

@@ -82,7 +82,7 @@ impl Stage for Report {
         let budget = MAX_PAGE_BYTES.saturating_sub(text + CAPTION_BYTES);
         let data = data::Data::new(context, &report, params, budget)?;
         let html = page::page(&report, Some(&data))?.into_string();
-        std::fs::write(context.output_path("index.html")?, &html)?;
+        context.write_text("index.html", &html)?;
         context.write_json("results.json", &results::results(&run))?;
         let results = format_count(report.rows.len(), "result");
         let pictures = format_count(data.pictures.len(), "picture");

@@ -61,7 +61,7 @@ pub(crate) fn page(report: &Report<'_>, data: Option<&Data>) -> anyhow::Result<M
     })
 }
 
-/// Maximum number of data sets in a title; chosen by hand.
+/// Maximum number of data sets in the title and in the list; chosen by hand.
 const MAX_NAMES: usize = 4;
 
 /// Lists the data sets' short names.
@@ -96,6 +96,7 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
     let run = report.run;
     let views: usize = report.scenes.iter().map(|scene| scene.views.len()).sum();
     let has_pipeline = has_pipeline(run);
+    let sets = data_sets(report);
     let links = [
         ("compare", "Compare", has_pictures),
         ("scores", "Scores", !report.rows.is_empty()),
@@ -111,7 +112,8 @@ fn header(report: &Report<'_>, title: &str, has_pictures: bool) -> Markup {
                 div {
                     dt { "Data set" }
                     dd {
-                        @for set in data_sets(report).iter().take(MAX_NAMES) { code { (set) } " " }
+                        @for set in sets.iter().take(MAX_NAMES) { code { (set) } " " }
+                        @if sets.len() > MAX_NAMES { "and " (sets.len() - MAX_NAMES) " more" }
                     }
                 }
                 @if let Some(ended) = end_time(run) {

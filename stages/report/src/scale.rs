@@ -14,7 +14,7 @@ pub(crate) struct Scale {
 /// Number of a scale's colours; a browser's interpolation between two neighbours is
 /// indistinguishable from the exact colours. Chosen by hand.
 const COLOURS: usize = 24;
-/// Minimum length of a scale in steps between round numbers; chosen by hand.
+/// Minimum length of a scale, in intervals between ticks; chosen by hand.
 const MIN_INTERVALS: f64 = 4.0;
 
 impl Scale {
@@ -23,7 +23,7 @@ impl Scale {
     pub(crate) fn error(range: f64, at_lr: bool) -> Self {
         let subject = if at_lr { "Absolute error at LR" } else { "Absolute error" };
         let mut ticks = ticks(0.0, range);
-        // Larger errors have the brightest colour, too.
+        // Larger errors have the brightest colour, too. Above 0.999 is the end, to rounding errors.
         if let Some((_, text)) = ticks.last_mut().filter(|(position, _)| *position > 0.999) {
             text.insert_str(0, "≥ ");
         }
@@ -58,13 +58,13 @@ fn css([r, g, b]: [u8; 3]) -> String {
 fn ticks(low: f64, high: f64) -> Vec<(f64, String)> {
     let span = high - low;
     if !(span > 0.0 && span.is_finite()) {
-        // As single precision, which has the digits that a depth is written with.
+        // `f32`, so that 2.13 isn't printed as 2.130000114.
         return vec![(0.0, format!("{}", low as f32))];
     }
     let power = 10f64.powf((span / MIN_INTERVALS).log10().floor());
-    let factors = [5.0, 2.0, 1.0].map(|factor| factor * power);
-    let step =
-        factors.into_iter().find(|step| span / step >= MIN_INTERVALS - 0.01).unwrap_or(power);
+    // A step of `power` is always short enough. Tolerances (0.01, 1e-9) are for rounding errors.
+    let steps = [5.0, 2.0].map(|factor| factor * power);
+    let step = steps.into_iter().find(|step| span / step >= MIN_INTERVALS - 0.01).unwrap_or(power);
     let digits = (-step.log10().floor()).max(0.0) as usize;
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;

@@ -4,7 +4,8 @@
 //! * `rows`: a row for every result of a run, with scores, times, commit and machine.
 //! * `markdown`: the document: tables, gains, spreads, failed points.
 //! * `grid`: one table, with means where several results share a cell, and the best marked.
-//! * `front`: results that no other one beats in two values, and their picture.
+//! * `front`: Pareto front, the results that no other result beats in both values; its picture.
+//! * `figures`: titles, digits and directions of values.
 //! * `values`: a row, and values of rows by name.
 //!
 //! The stage is a sink: it gets the run's record and is never cached. Failed points are listed, and
@@ -63,17 +64,12 @@ impl Stage for Table {
         context.write_json("rows.json", &rows)?;
         write_csv(context, &rows)?;
         let document = markdown::document(params, &rows, &figures, &run.failed)?;
-        write_text(context, "table.md", &document.text)?;
+        context.write_text("table.md", &document.text)?;
         if let Some(picture) = &document.picture {
-            write_text(context, markdown::PICTURE, picture)?;
+            context.write_text(markdown::PICTURE, picture)?;
         }
         context.write_summary(&artifact::format_count(rows.len(), "result"))
     }
-}
-
-fn write_text(context: &Context, name: &str, text: &str) -> anyhow::Result<()> {
-    let path = context.output_path(name)?;
-    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Writes rows as CSV, with a column for every name that any row has.

@@ -41,8 +41,8 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     };
     let trainer = RefinerTrainer::new(refiner, options);
     let mut training = ExampleTraining { trainer, examples: &examples.training };
-    context.train(options.steps, &mut training, |error| {
-        format!("PSNR of training patches {:.2} dB", psnr_of(error))
+    context.train(options.steps, &mut training, |loss| {
+        format!("PSNR of training patches {:.2} dB", psnr_of(loss))
     })?;
     let trainer = training.trainer;
     let scores = trainer.score(&examples.left_out, &examples.training)?;

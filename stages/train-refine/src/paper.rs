@@ -37,9 +37,8 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     let network = PaperRefiner::new(width, seed)?;
     let trainer = PaperTrainer::new(network, options, perceptual)?;
     let mut training = ExampleTraining { trainer, examples: &known };
-    context.train(options.steps, &mut training, |error| {
-        format!("L1 of training patches {error:.4}")
-    })?;
+    context
+        .train(options.steps, &mut training, |loss| format!("L1 of training patches {loss:.4}"))?;
     let trainer = training.trainer;
     trainer.network().write(&context.output_path(WEIGHTS_FILE)?)?;
     let (mut rendered, mut refined) = (0.0, 0.0);

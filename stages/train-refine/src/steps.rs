@@ -27,7 +27,7 @@ impl<T: refinement::Training> stage::Training for ExampleTraining<'_, T> {
     }
 }
 
-/// Converts the error of a step: numbers that aren't finite are a numerical failure.
+/// Converts the failure of a step: numbers that aren't finite are a numerical failure.
 fn step_error(error: RefinementError) -> anyhow::Error {
     match error {
         RefinementError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),

@@ -11,7 +11,7 @@ use flate2::{Compression, write::ZlibEncoder};
 use stage::Progress;
 
 use crate::bake::Volume;
-use crate::bricks::{Bricks, SIDE, VOXELS};
+use crate::bricks::{BRICK_SIDE, Bricks, VOXELS};
 use crate::view::Components;
 
 /// Number of components of view dependence: the channels of one texture (docs/design/042).
@@ -40,10 +40,10 @@ impl Atlas {
         volume: &Volume,
         progress_of: impl FnOnce(u64) -> Progress,
     ) -> std::io::Result<Self> {
-        let side = volume.resolution / SIDE;
+        let side = volume.resolution / BRICK_SIDE;
         let mut is_kept = vec![false; side * side * side];
         for voxel in &volume.voxels {
-            let [x, y, z] = voxel.position.map(|c| usize::from(c) / SIDE);
+            let [x, y, z] = voxel.position.map(|c| usize::from(c) / BRICK_SIDE);
             is_kept[x + side * (y + side * z)] = true;
         }
         let bricks = Bricks::new(volume.resolution, |[x, y, z]| is_kept[x + side * (y + side * z)]);

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use scene::{Bounds, Camera};
 use stage::Progress;
 
-use crate::bricks::{Bricks, SIDE, VOXELS};
+use crate::bricks::{BRICK_SIDE, Bricks, VOXELS};
 use crate::space::{is_reachable, to_world};
 use crate::view::{COEFFICIENTS, fit};
 use crate::visibility::visible_from;
@@ -80,21 +80,22 @@ pub(crate) struct Baker<'a> {
 impl Baker<'_> {
     /// Returns the maximum number of bricks.
     pub(crate) fn max_bricks(&self) -> u64 {
-        (self.resolution / SIDE).pow(3) as u64
+        (self.resolution / BRICK_SIDE).pow(3) as u64
     }
 
     /// Returns the bricks in which some source may have density.
     pub(crate) fn bricks(&self, progress: &Progress) -> Result<Bricks, RenderError> {
-        let side = self.resolution / SIDE;
+        let side = self.resolution / BRICK_SIDE;
         let min_density = -(-MIN_OPACITY).ln_1p() * self.resolution as f32;
         let is_kept: Vec<bool> = (0..side * side * side)
             .into_par_iter()
             .map(|i| {
                 progress.add(1);
                 let brick = [i % side, i / side % side, i / (side * side)];
-                let low = brick.map(|c| (c * SIDE) as f32 / self.resolution as f32);
+                let low = brick.map(|c| (c * BRICK_SIDE) as f32 / self.resolution as f32);
                 // The upper corner itself belongs to the next brick.
-                let high = brick.map(|c| ((c + 1) * SIDE) as f32 / self.resolution as f32 - 1e-6);
+                let high =
+                    brick.map(|c| ((c + 1) * BRICK_SIDE) as f32 / self.resolution as f32 - 1e-6);
                 if !is_reachable(self.bounds, low, high) {
                     return Ok(false);
                 }
@@ -228,10 +229,14 @@ fn sample_positions(
     voxels: impl Iterator<Item = usize>,
     resolution: usize,
 ) -> Vec<[f32; 3]> {
-    let corner = brick.map(|c| c * SIDE);
+    let corner = brick.map(|c| c * BRICK_SIDE);
     voxels
         .flat_map(|voxel| {
-            let own = [voxel % SIDE, voxel / SIDE % SIDE, voxel / (SIDE * SIDE) % SIDE];
+            let own = [
+                voxel % BRICK_SIDE,
+                voxel / BRICK_SIDE % BRICK_SIDE,
+                voxel / (BRICK_SIDE * BRICK_SIDE) % BRICK_SIDE,
+            ];
             (0..SAMPLES_PER_VOXEL).map(move |i| {
                 let sub = [
                     i % SAMPLES_PER_SIDE,

@@ -1,9 +1,9 @@
 //! Sparse grid of voxels over the unit cube: bricks of 8³ voxels where density is possible.
 
 /// Voxels along a brick's side.
-pub(crate) const SIDE: usize = 8;
+pub(crate) const BRICK_SIDE: usize = 8;
 /// Number of voxels in a brick.
-pub(crate) const VOXELS: usize = SIDE * SIDE * SIDE;
+pub(crate) const VOXELS: usize = BRICK_SIDE * BRICK_SIDE * BRICK_SIDE;
 /// Index at a grid position without brick.
 const NO_BRICK: u32 = u32::MAX;
 
@@ -23,13 +23,13 @@ impl Bricks {
     /// Creates the bricks whose grid position fulfils a condition.
     ///
     /// # Panics
-    /// When the resolution isn't a multiple of [`SIDE`].
+    /// When the resolution isn't a multiple of [`BRICK_SIDE`].
     pub(crate) fn new(resolution: usize, is_kept: impl Fn([usize; 3]) -> bool) -> Self {
-        assert_eq!(resolution % SIDE, 0, "whole bricks");
+        assert_eq!(resolution % BRICK_SIDE, 0, "whole bricks");
         let mut bricks = Self { resolution, indices: Vec::new(), positions: Vec::new() };
-        let side = bricks.bricks_per_side();
-        for i in 0..side * side * side {
-            let position = [i % side, i / side % side, i / (side * side)];
+        let grid_side = bricks.bricks_per_side();
+        for i in 0..grid_side * grid_side * grid_side {
+            let position = [i % grid_side, i / grid_side % grid_side, i / (grid_side * grid_side)];
             if is_kept(position) {
                 bricks.indices.push(bricks.positions.len() as u32);
                 bricks.positions.push(position);
@@ -40,9 +40,9 @@ impl Bricks {
         bricks
     }
 
-    /// Returns the number of bricks' grid positions along each side.
+    /// Returns the number of bricks along the grid's side.
     pub(crate) fn bricks_per_side(&self) -> usize {
-        self.resolution / SIDE
+        self.resolution / BRICK_SIDE
     }
 
     /// Returns the number of bricks.
@@ -57,42 +57,42 @@ impl Bricks {
 
     /// Returns the index of the brick at a grid position, if any.
     pub(crate) fn brick_index(&self, [x, y, z]: [usize; 3]) -> Option<usize> {
-        let side = self.bricks_per_side();
-        let index = self.indices[x + side * (y + side * z)];
+        let grid_side = self.bricks_per_side();
+        let index = self.indices[x + grid_side * (y + grid_side * z)];
         (index != NO_BRICK).then_some(index as usize)
     }
 
     /// Returns the index of a voxel among those of all bricks; `None` outside of bricks.
     pub(crate) fn voxel_index(&self, position: [usize; 3]) -> Option<usize> {
-        let brick = self.brick_index(position.map(|c| c / SIDE))?;
-        let [x, y, z] = position.map(|c| c % SIDE);
-        Some(brick * VOXELS + x + SIDE * (y + SIDE * z))
+        let brick = self.brick_index(position.map(|c| c / BRICK_SIDE))?;
+        let [x, y, z] = position.map(|c| c % BRICK_SIDE);
+        Some(brick * VOXELS + x + BRICK_SIDE * (y + BRICK_SIDE * z))
     }
 
     /// Returns the position of a voxel by its index.
     pub(crate) fn voxel_position(&self, voxel: usize) -> [usize; 3] {
-        let [x, y, z] = self.positions[voxel / VOXELS].map(|c| c * SIDE);
+        let [x, y, z] = self.positions[voxel / VOXELS].map(|c| c * BRICK_SIDE);
         let i = voxel % VOXELS;
-        [x + i % SIDE, y + i / SIDE % SIDE, z + i / (SIDE * SIDE)]
+        [x + i % BRICK_SIDE, y + i / BRICK_SIDE % BRICK_SIDE, z + i / (BRICK_SIDE * BRICK_SIDE)]
     }
 
     /// Returns the distance from each grid position to the nearest brick: the maximum of the
     /// differences along the axes, 0 in a brick, at most 255.
     pub(crate) fn distances(&self) -> Vec<u8> {
-        let side = self.bricks_per_side();
+        let grid_side = self.bricks_per_side();
         let mut distances: Vec<u8> =
             self.indices.iter().map(|&index| if index == NO_BRICK { 255 } else { 0 }).collect();
         // Each pass takes the minimum over the 26 neighbours, one axis after the other, plus 1.
         // Passes repeat until nothing changes.
-        for _ in 0..side {
+        for _ in 0..grid_side {
             let mut next = distances.clone();
             for axis in 0..3 {
                 let before = next.clone();
-                let step = side.pow(axis);
+                let step = grid_side.pow(axis);
                 for (i, value) in next.iter_mut().enumerate() {
-                    let along = i / step % side;
+                    let along = i / step % grid_side;
                     let low = if along > 0 { before[i - step] } else { 255 };
-                    let high = if along + 1 < side { before[i + step] } else { 255 };
+                    let high = if along + 1 < grid_side { before[i + step] } else { 255 };
                     *value = (*value).min(low).min(high);
                 }
             }

@@ -145,8 +145,7 @@ fn write_page(
         cameras: page_cameras(params, &folder, &views)?,
     };
     let html = page::page(&scene, &atlas)?.into_string();
-    let path = context.output_path(&format!("{prefix}index.html"))?;
-    std::fs::write(&path, html).with_context(|| format!("cannot write {}", path.display()))
+    context.write_text(&format!("{prefix}index.html"), &html)
 }
 
 /// Returns the name of the run's data set: the last part of its path.

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use scene::{Bounds, Camera};
 use stage::Progress;
 
-use crate::bricks::{Bricks, SIDE};
+use crate::bricks::{BRICK_SIDE, Bricks};
 use crate::space::{leap_along, step_along};
 
 /// Maximum number of observing cameras: one bit each (docs/design/042).
@@ -73,7 +73,7 @@ impl March<'_> {
     fn trace(&self, bounds: &Bounds, ray: &Ray, mut visit: impl FnMut(usize)) {
         let ray = clip(bounds, ray);
         let voxel = 1.0 / self.bricks.resolution as f32;
-        let per_brick = SIDE as f32 * voxel;
+        let per_brick = BRICK_SIDE as f32 * voxel;
         let mut t = ray.enter + 0.5 * voxel;
         let mut transmittance = 1.0f32;
         while t < ray.leave && transmittance > MIN_STOPPED_LIGHT {
@@ -100,7 +100,7 @@ impl March<'_> {
     /// Returns the distance in bricks from a position in voxels to the nearest brick.
     fn distance(&self, position: [f32; 3]) -> u8 {
         let side = self.bricks.bricks_per_side();
-        let [x, y, z] = position.map(|c| (c.max(0.0) as usize / SIDE).min(side - 1));
+        let [x, y, z] = position.map(|c| (c.max(0.0) as usize / BRICK_SIDE).min(side - 1));
         self.distances[x + side * (y + side * z)]
     }
 

@@ -49,7 +49,8 @@ impl Folder {
             }
             for frame in &set.frames {
                 let mask = frame.mask.as_ref().map(|mask| &mask.path);
-                for file in [Some(&frame.image), mask, frame.depth.as_ref()].into_iter().flatten() {
+                let files = [Some(&frame.image), mask, frame.depth_file.as_ref()];
+                for file in files.into_iter().flatten() {
                     self.check_inside(file);
                 }
             }
@@ -58,8 +59,8 @@ impl Folder {
                 frame.photograph().ok();
                 if let Ok(Some(mask)) = frame.mask() {
                     let size = (
-                        frame.stored_intrinsics.width as usize,
-                        frame.stored_intrinsics.height as usize,
+                        frame.lens_intrinsics.width as usize,
+                        frame.lens_intrinsics.height as usize,
                     );
                     assert_eq!((mask.width, mask.height), size, "a mask has its image's size");
                 }

@@ -1,4 +1,4 @@
-//! All metrics. A new one is a type in this file and a line in [`metrics`]. Long formulas have
+//! All metrics. A new one is a type in this file and a line in [`all_metrics`]. Long formulas have
 //! files of their own; only LPIPS, which has networks, implements [`Metric`] elsewhere.
 
 mod depth;
@@ -30,7 +30,7 @@ pub use warp::WarpScore;
 
 /// Returns all metrics in order of display. The page ranks results by the first figure, and its
 /// summary has the first four figures with a value.
-pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
+pub(crate) fn all_metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
     vec![
         Box::new(PsnrMetric),
         Box::new(SsimMetric),
@@ -260,7 +260,7 @@ mod tests {
 
     #[test]
     fn figures_have_distinct_paths_and_labels() {
-        let all = metrics(Perceptual::new(None).unwrap());
+        let all = all_metrics(Perceptual::new(None).unwrap());
         let figures: Vec<ScoreFormat> = all.iter().flat_map(|metric| metric.figures()).collect();
         for (i, figure) in figures.iter().enumerate() {
             assert!(figures[..i].iter().all(|f| f.path != figure.path && f.label != figure.label));

@@ -112,8 +112,8 @@ fn colmap_cases() -> Vec<Case> {
                 10,
                 &[
                     COLMAP_NOTE,
-                    "warning: 2 unused files in masks look like masks (first: masks/b0.png); name the mask of NAME.EXT masks/NAME.png or masks/NAME.EXT.png",
-                    "warning: 1 unused file in segmentation looks like a mask (first: segmentation/a0.png); name the mask of NAME.EXT masks/NAME.png or masks/NAME.EXT.png",
+                    "warning: 2 unused files in masks look like masks (first: masks/b0.png); the mask of a photograph NAME.EXT must be called masks/NAME.png or masks/NAME.EXT.png",
+                    "warning: 1 unused file in segmentation looks like a mask (first: segmentation/a0.png); the mask of a photograph NAME.EXT must be called masks/NAME.png or masks/NAME.EXT.png",
                 ],
             )),
         ),
@@ -232,7 +232,7 @@ fn transforms_cases() -> Vec<Case> {
                     &[
                         TRANSFORMS_NOTE,
                         "2 of 3 views have masks (2 by dynamic_mask_NAME.png, where white is excluded)",
-                        "warning: 1 unused file in images looks like a mask (first: images/b_mask.png); name masks in their frames' mask_path",
+                        "warning: 1 unused file in images looks like a mask (first: images/b_mask.png); list masks as mask_path of their frames",
                     ],
                 ),
                 &[0, 1],
@@ -251,7 +251,7 @@ fn transforms_cases() -> Vec<Case> {
                 3,
                 &[
                     TRANSFORMS_NOTE,
-                    "warning: 3 unused files in masks look like masks (first: masks/a0.png); name masks in their frames' mask_path",
+                    "warning: 3 unused files in masks look like masks (first: masks/a0.png); list masks as mask_path of their frames",
                 ],
             )),
         ),

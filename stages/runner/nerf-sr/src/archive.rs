@@ -1,6 +1,5 @@
 //! Archiving of pages that a new one replaces, by one rule: a page is archived if it shows a result
-//! that the new page lacks. A result is a stage with parameter values
-//! and a data set.
+//! that the new page lacks. A result is a stage with parameter values and a data set.
 
 use std::ffi::OsStr;
 use std::io;
@@ -28,10 +27,10 @@ pub(crate) fn archive_path(
     target: &Path,
     kind: &str,
 ) -> io::Result<Option<PathBuf>> {
-    let old = PageMark::read(page)?.filter(|old| !newer.has_results_of(old));
-    let (Some(old), Some(name)) = (old, target.file_name().and_then(OsStr::to_str)) else {
+    let Some(old) = PageMark::read(page)?.filter(|old| !newer.has_results_of(old)) else {
         return Ok(None);
     };
+    let name = target.file_name().unwrap_or_default().to_string_lossy();
     let name = format!("{name}-{}", data_sets_name(&old.data_sets));
     let mut path = target.with_file_name(&name);
     let mut number = 1;

@@ -2,7 +2,8 @@
 //! carries them out. It knows stages by their `describe` and artifacts by their hashes; `estimates`
 //! also knows what the rays and pixels of some stages cost.
 //!
-//! * `cli`, `session`, `verbs`: the command line, its pipeline and store, and one function a verb.
+//! * `cli`, `session`, `verbs`: the command line, its pipeline and store, and one function per
+//!   verb.
 //! * `starter`: the pipeline file that `init` writes. `stage_inputs`: inputs that the command line
 //!   gives by a stage's name.
 //! * `execute`: carries out a plan on this machine or as a cluster's jobs, each node under its
@@ -11,8 +12,8 @@
 //! * `garbage`: deletes the artifacts that nothing needs.
 //! * `estimates`: processor time of the stages to run.
 //! * `identities`: identities of nodes whose keys aren't known yet.
-//! * `node_report`: a plan's nodes as JSON. `state_text`: their states as text. `lineage`: two
-//!   results and their inputs, compared.
+//! * `node_report`: a plan's nodes as JSON. `state_text`: their states as text. `lineage` compares
+//!   two results and their inputs.
 //! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: gives the run's record (`run_record`) to stages that show it, such as the report, and
 //!   publishes their pages (`publish`, `page`, `archive`).
@@ -47,7 +48,7 @@ use artifact::report_line;
 use planning::PlanError;
 use planning::stage_call::StageFailure;
 
-/// Runs the program and returns the exit code, which a closed stdout doesn't change:
+/// Runs the program and returns the exit code. A closed stdout isn't a failure. Codes:
 ///
 /// * 0: success
 /// * 1: other failures, such as those of the store
@@ -65,7 +66,7 @@ pub fn main() -> ExitCode {
     })
 }
 
-/// Returns a failure with exit code 1: neither invalid input nor a numerical failure.
+/// Returns a failure with exit code 1.
 fn failure(error: impl std::fmt::Display) -> StageFailure {
     StageFailure { code: 1, message: error.to_string() }
 }

@@ -42,9 +42,9 @@ impl Pipeline {
         read_extended(file, &mut chain)
     }
 
-    /// Joins two pipelines. Fails if blocks of the same name differ. The default targets, and the
-    /// quality if both set one, are those of `self`; parts of the experiment that both set are
-    /// those of `other`.
+    /// Joins two pipelines. Fails if blocks of the same name differ. Default targets come from
+    /// `self`. If both set the quality, `self` wins. If both set a part of the experiment, `other`
+    /// wins.
     pub fn joined(mut self, other: Self) -> Result<Self, JoinError> {
         let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
         if let Some(name) = shared.find(|name| !self.has_equal_block(&other, name)) {
@@ -66,8 +66,8 @@ impl Pipeline {
     }
 }
 
-/// Joins the files that a file extends, and overrides them with the file. In `chain`, each file
-/// extends the next; the last one is this file.
+/// Joins the files that a file extends, then applies this file's own blocks over them. In `chain`,
+/// each file extends the next; the last one is this file.
 fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineError> {
     let mut joined: Option<Pipeline> = None;
     for extended in &file.content.extends {
@@ -81,8 +81,9 @@ fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline,
         }
         if chain.len() == MAX_CHAINED_FILES {
             let problem = format!(
-                "more than {MAX_CHAINED_FILES} files in a chain of `extends`; extend the chain's \
-                last file directly"
+                "more than {MAX_CHAINED_FILES} files in a chain of `extends`; extend {} in an \
+                earlier file of the chain",
+                display_path(&path).display()
             );
             return Err(extends_error(&file, extended, problem));
         }

@@ -1,4 +1,4 @@
-//! Check of the folders outside the store that a plan's stages read, before any stage runs.
+//! Checks, before any stage runs, the input folders that are outside the store.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -37,7 +37,8 @@ impl Plan {
     }
 }
 
-/// Returns a node's inputs, with the parameters of the nodes that produce them.
+/// Returns a node's inputs, each with the parameters of the node that produces the input; `None`
+/// for a folder.
 pub(crate) fn given_inputs(node: &Node, nodes: &[Node]) -> GivenInputs {
     let mut inputs = GivenInputs::new();
     for input in &node.inputs {

@@ -43,9 +43,9 @@ impl fmt::Display for Imported {
         let objects = format_count(self.objects, "artifact");
         write!(
             f,
-            "{records} and {objects} read ({}), {} records new",
+            "{records} and {objects} read ({}), {}",
             format_size(self.bytes),
-            self.new
+            format_count(self.new, "new record")
         )
     }
 }
@@ -230,7 +230,8 @@ impl<'a, R: Read> Reader<'a, R> {
         }
     }
 
-    /// Fails if the archive has further entries, or an object without a record.
+    /// Fails if the archive has further entries, or if an object or the index's artifact has no
+    /// record.
     fn check_end(&mut self, index: &Index, records: &[Record]) -> anyhow::Result<()> {
         if let Some(entry) = self.entries.next() {
             let name = entry.map_or_else(
@@ -252,10 +253,14 @@ impl<'a, R: Read> Reader<'a, R> {
 fn parse_index(bytes: &[u8]) -> Result<Index, String> {
     let value: Value = serde_json::from_slice(bytes).map_err(|e| format!("{INDEX_FILE}: {e}"))?;
     for (field, known) in [("export", EXPORT_FORMAT), ("store", store::FORMAT)] {
-        let found = value.get(field).cloned().unwrap_or_default();
-        if found.as_u64().is_none_or(|found| found > u64::from(known)) {
+        let Some(found) = value.get(field).and_then(Value::as_u64) else {
             return Err(format!(
-                "{field} format {found}, this nerf-sr-remote supports {known}; use the newer \
+                "{INDEX_FILE}: the {field} format is missing or not a whole number"
+            ));
+        };
+        if found > u64::from(known) {
+            return Err(format!(
+                "{field} format {found}, this nerf-sr-remote supports {known}; update \
                 nerf-sr-remote"
             ));
         }

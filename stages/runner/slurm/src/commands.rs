@@ -13,7 +13,7 @@ const MAX_IDS_PER_CALL: usize = 500;
 /// Slurm's programs.
 #[derive(Clone, Debug, Default)]
 pub struct Slurm {
-    /// Folder of the programs; `None` if they are found by PATH.
+    /// Folder of the programs in tests; `None` if they are found by PATH.
     folder: Option<PathBuf>,
 }
 
@@ -24,7 +24,8 @@ pub fn current_job_id() -> Option<String> {
 
 impl Slurm {
     /// Returns the programs in a folder.
-    pub fn in_folder(folder: impl Into<PathBuf>) -> Self {
+    #[cfg(test)]
+    pub(crate) fn in_folder(folder: impl Into<PathBuf>) -> Self {
         Self { folder: Some(folder.into()) }
     }
 

@@ -18,10 +18,11 @@ impl Store {
         Ok(run)
     }
 
-    /// Creates the locked file of a run that starts at `unix`.
-    fn create_run(&self, unix: u64) -> Result<RunFile, StoreError> {
+    /// Creates and locks the file of a run that starts at `start_unix`. On a read-only file system,
+    /// the run has no file.
+    fn create_run(&self, start_unix: u64) -> Result<RunFile, StoreError> {
         loop {
-            let id = unique_name(unix)?;
+            let id = unique_name(start_unix)?;
             let path = FileKind::Run.path(self, &id);
             let opened = fs::create_dir_all(self.root().join(FileKind::Run.folder()))
                 .and_then(|()| File::options().create_new(true).append(true).open(&path));

@@ -26,10 +26,7 @@ impl PixelSet {
 
     /// Returns the n-th element in ascending order, counted from 0.
     pub(crate) fn nth(&self, n: u64) -> Option<u64> {
-        if n >= self.count {
-            return None;
-        }
-        let block = self.before.partition_point(|&before| before <= n) - 1;
+        let block = self.before.partition_point(|&before| before <= n).checked_sub(1)?;
         let mut left = n - self.before[block];
         for (i, word) in self.words.iter().enumerate().skip(block * WORDS_PER_BLOCK) {
             let ones = u64::from(word.count_ones());
@@ -54,9 +51,7 @@ impl Extend<bool> for PixelSet {
                 }
                 self.words.push(0);
             }
-            if let Some(word) = self.words.last_mut() {
-                *word |= u64::from(is_element) << bit;
-            }
+            self.words[(self.length / 64) as usize] |= u64::from(is_element) << bit;
             self.length += 1;
             self.count += u64::from(is_element);
         }

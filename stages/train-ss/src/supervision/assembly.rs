@@ -6,7 +6,7 @@ use pixels::{Filter, Image, Resampling};
 use scene::{Camera, Space};
 
 use super::options::SupersamplingOptions;
-use super::pixel_sampler::{Importance, PixelNumbers, PixelSampler, detailed_pixels};
+use super::pixel_sampler::{Importance, PixelSampler, ViewPixels, detailed_pixels};
 use super::{Supersampling, TrainingView};
 use crate::params::Exposure;
 use crate::photographs::{PackedPhotograph, Photographs, PixelMemory, PixelSet};
@@ -42,11 +42,13 @@ impl Supersampling {
         for (view, reference) in references.into_iter().flat_map(Photographs::into_pairs) {
             assembly.add_reference(&view.camera, reference)?;
         }
-        let Assembly { supersample, views, numbers, count, detailed, cache, memory, .. } = assembly;
-        let importance = Importance::new(params.pixel_importance, count, detailed);
+        let Assembly {
+            supersample, views, view_pixels, index_count, detailed, cache, memory, ..
+        } = assembly;
+        let importance = Importance::new(params.pixel_importance, index_count, detailed);
         let order = (params.in_epochs, params.precrop_bundles());
         Ok(Self {
-            sampler: PixelSampler::new(numbers, count, importance, order, params.seed),
+            sampler: PixelSampler::new(view_pixels, index_count, importance, order, params.seed),
             state: SupervisionState {
                 cache,
                 exposures: (params.exposure == Exposure::On).then(|| Exposures::new(views.len())),
@@ -73,11 +75,11 @@ struct Assembly<'a> {
     /// Number of pixels of all LR photographs.
     lr_pixels: u64,
     views: Vec<TrainingView>,
-    /// Pixel numbers of each view.
-    numbers: Vec<PixelNumbers>,
-    /// Total number of pixel numbers.
-    count: u64,
-    /// Numbers of pixels with detail.
+    /// Size and first pixel index of each view.
+    view_pixels: Vec<ViewPixels>,
+    /// Total number of pixel indices.
+    index_count: u64,
+    /// Indices of pixels with detail.
     detailed: PixelSet,
     cache: Option<HrCache>,
     /// Enlargement and kernel of each LR size.
@@ -100,8 +102,8 @@ impl<'a> Assembly<'a> {
             lr_views: photographs.images.len(),
             lr_pixels: photographs.images.iter().map(|image| image.pixels() as u64).sum(),
             views: Vec::new(),
-            numbers: Vec::new(),
-            count: 0,
+            view_pixels: Vec::new(),
+            index_count: 0,
             detailed: PixelSet::default(),
             cache: options.needs_cache(lr_sizes).then(|| HrCache::new(supersample)),
             kernels: BTreeMap::new(),
@@ -121,7 +123,7 @@ impl<'a> Assembly<'a> {
             });
             cache.add(&enlarge.apply(&image), kernel.clone(), &mut self.memory)?;
         }
-        self.number_pixels(&photograph, &image, 1);
+        self.index_pixels(&photograph, &image, 1);
         self.views.push(TrainingView { image: photograph, hr: None, rays: camera.rays() });
         Ok(())
     }
@@ -133,13 +135,13 @@ impl<'a> Assembly<'a> {
         let blocks = PackedPhotograph::new(&masked.into(), &mut self.memory)?;
         let image_blocks = self.lr_views as u64 * blocks.pixels() as u64;
         let draws = (REFERENCE_DRAWS * self.lr_pixels / image_blocks).max(1);
-        self.number_pixels(&blocks, &image, draws);
+        self.index_pixels(&blocks, &image, draws);
         self.views.push(TrainingView { image: blocks, hr: Some(reference), rays: camera.rays() });
         Ok(())
     }
 
-    /// Gives each pixel of a view `draws` numbers. `unmasked` has the colours of all pixels.
-    fn number_pixels(&mut self, image: &PackedPhotograph, unmasked: &Image, draws: u64) {
+    /// Gives each pixel of a view `draws` indices. `unmasked` has the colours of all pixels.
+    fn index_pixels(&mut self, image: &PackedPhotograph, unmasked: &Image, draws: u64) {
         if self.options.params.pixel_importance > 1.0 {
             let mut detailed = detailed_pixels(unmasked);
             for (pixel, is_detailed) in detailed.iter_mut().enumerate() {
@@ -150,8 +152,8 @@ impl<'a> Assembly<'a> {
             }
         }
         let (width, height) = image.size();
-        self.numbers.push(PixelNumbers { width, height, start: self.count });
-        self.count += draws * image.pixels() as u64;
+        self.view_pixels.push(ViewPixels { width, height, start: self.index_count });
+        self.index_count += draws * image.pixels() as u64;
     }
 }
 

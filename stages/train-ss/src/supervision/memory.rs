@@ -9,9 +9,10 @@ use super::options::SupersamplingOptions;
 use crate::params::{Resolved, ResolvedField};
 use crate::photographs::PixelMemory;
 
-/// Bytes of the program itself.
+/// Bytes of the program, the samples of a step and a checkpoint's file.
 const PROGRAM_BYTES: u64 = program_bytes(cfg!(feature = "torch"));
-/// Minimum bytes of the paper's MLPs; libtorch's buffers of a step aren't known in advance.
+/// Minimum bytes of the paper's MLPs, chosen by hand: libtorch's buffers of a step aren't known in
+/// advance.
 const MIN_MLP_BYTES: u64 = 500_000_000;
 
 /// Returns the memory of training with HR `references`, with or without checkpoints.
@@ -40,8 +41,8 @@ pub(crate) fn training_memory(
     memory
 }
 
-/// Creates the storage of pixels for the given free memory, with a file in `folder`. Fails if less
-/// is free than the minimum.
+/// Creates the storage of pixels for the given free memory, with a file in `folder`. Fails if free
+/// memory is below the minimum; `None` means unlimited.
 pub(crate) fn pixel_memory(
     need: &TrainingMemory,
     free: Option<u64>,
@@ -52,11 +53,12 @@ pub(crate) fn pixel_memory(
     Ok(PixelMemory::new(TrainingMemory::MAX_PIXEL_BYTES.min(left), folder))
 }
 
-/// Describes the need with at most `budget` bytes of pixels in memory.
+/// Describes the memory, of which pixels may use `budget` bytes.
 pub(crate) fn memory_text(need: &TrainingMemory, budget: u64) -> String {
     let in_memory = need.pixels.min(budget);
     let mut text = format!(
-        "memory: about {}, of which {} for the field, {} for pixels, the rest for the program",
+        "memory: about {}, of which {} for the field, {} for pixels, the rest for the program, \
+        cameras and reading",
         format_size(need.minimum(PROGRAM_BYTES) + in_memory),
         format_size(need.field),
         format_size(in_memory)
@@ -139,7 +141,7 @@ mod tests {
         let need = TrainingMemory {
             field: 300_000_000,
             pixels: 5_000_000_000,
-            poses: 0,
+            pose_images: 0,
             reading: 100_000_000,
         };
         let minimum = PROGRAM_BYTES + 300_000_000;
@@ -154,7 +156,7 @@ mod tests {
             memory_text(&need, MAX_PIXEL_BYTES),
             format!(
                 "memory: about {total}, of which 300.0 MB for the field, 4.0 GB for pixels, the \
-                rest for the program; 1.0 GB of pixels in a file"
+                rest for the program, cameras and reading; 1.0 GB of pixels in a file"
             )
         );
         let total = format_size(minimum + 2_000_000);
@@ -162,7 +164,7 @@ mod tests {
             memory_text(&TrainingMemory { pixels: 2_000_000, ..need }, MAX_PIXEL_BYTES),
             format!(
                 "memory: about {total}, of which 300.0 MB for the field, 2.0 MB for pixels, the \
-                rest for the program"
+                rest for the program, cameras and reading"
             )
         );
     }

@@ -662,7 +662,7 @@ mod tests {
                 Some(photograph_of_size(&camera, "a", width, height)),
                 &options(kind, 2.0),
             );
-            assert_eq!(joined.sampler.count(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
+            assert_eq!(joined.sampler.index_count(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
             let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
             let mut has_ray = [false; 72];
             for bundle in 0..800 {
@@ -723,7 +723,7 @@ mod tests {
             Some(photograph_of_size(&camera, "a", 20, 16)),
             &options(Supervision::Kernel, 2.0),
         );
-        assert_eq!(larger.sampler.count(), 20 + 80);
+        assert_eq!(larger.sampler.index_count(), 20 + 80);
         let mut masked = truth;
         masked.data[..3].fill(f32::NAN);
         let means = block_means(&masked, [2, 2]);

@@ -4,14 +4,14 @@ use rayon::prelude::*;
 
 use crate::photographs::PixelSet;
 
-/// Sampler of the pixel that a bundle trains on. Pixels are numbered over all views in order; a
-/// pixel of an HR reference has several numbers, so that it is drawn more often.
+/// Sampler of the pixel that a bundle trains on. Pixels are indexed over all views in order; a
+/// pixel of an HR reference has several indices, so that it is drawn more often.
 pub(crate) struct PixelSampler {
-    views: Vec<PixelNumbers>,
-    /// Total number of pixel numbers.
-    count: u64,
+    views: Vec<ViewPixels>,
+    /// Total number of pixel indices.
+    index_count: u64,
     importance: Importance,
-    /// True if each pixel number is drawn once per epoch.
+    /// True if each pixel index is drawn once per epoch.
     pub(crate) in_epochs: bool,
     /// Number of bundles at the start that come from the middle half of each image's width and
     /// height.
@@ -19,12 +19,12 @@ pub(crate) struct PixelSampler {
     seed: u64,
 }
 
-/// Range of a view's pixel numbers.
+/// Size and first pixel index of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct PixelNumbers {
+pub(crate) struct ViewPixels {
     pub(crate) width: usize,
     pub(crate) height: usize,
-    /// Number of pixel numbers of the previous views.
+    /// Number of pixel indices of the previous views.
     pub(crate) start: u64,
 }
 
@@ -34,38 +34,39 @@ const PIXEL_STREAM: u64 = 100;
 /// First of the four RNG streams of an epoch's permutation.
 const EPOCH_STREAM: u64 = 110;
 
-/// Maximum number of draws until a pixel counts; the last draw is used anyway and has no residual.
+/// Maximum number of draws until a pixel is valid, chosen by hand. The last draw is used unchecked;
+/// an invalid pixel has no residual.
 const MAX_DRAWS: usize = 64;
 
 impl PixelSampler {
-    /// Creates a sampler of views with `count` pixel numbers in total.
+    /// Creates a sampler of views with `index_count` pixel indices in total.
     pub(crate) fn new(
-        views: Vec<PixelNumbers>,
-        count: u64,
+        views: Vec<ViewPixels>,
+        index_count: u64,
         importance: Importance,
         (in_epochs, precrop_bundles): (bool, u64),
         seed: u64,
     ) -> Self {
-        Self { views, count, importance, in_epochs, precrop_bundles, seed }
+        Self { views, index_count, importance, in_epochs, precrop_bundles, seed }
     }
 
-    /// Returns the view and pixel that a bundle trains on. `counts` returns whether a view's pixel
-    /// counts.
+    /// Returns the view and pixel that a bundle trains on. `is_valid` returns whether a view's
+    /// pixel is unmasked; epochs ignore `is_valid`, since they contain all pixels.
     pub(crate) fn draw(
         &self,
         bundle: u64,
-        counts: impl Fn(usize, usize) -> bool,
+        is_valid: impl Fn(usize, usize) -> bool,
     ) -> (usize, usize) {
         let mut rng = CounterRng::new(self.seed, PIXEL_STREAM, bundle);
         let is_precrop = bundle < self.precrop_bundles;
         if self.in_epochs && !is_precrop {
             let bundle = bundle - self.precrop_bundles;
-            let (epoch, index) = (bundle / self.count, bundle % self.count);
-            return self.pixel(permuted(self.seed, epoch, index, self.count));
+            let (epoch, index) = (bundle / self.index_count, bundle % self.index_count);
+            return self.pixel(permuted(self.seed, epoch, index, self.index_count));
         }
         let mut drawn = self.draw_once(is_precrop, &mut rng);
         for _ in 1..MAX_DRAWS {
-            if counts(drawn.0, drawn.1) {
+            if is_valid(drawn.0, drawn.1) {
                 break;
             }
             drawn = self.draw_once(is_precrop, &mut rng);
@@ -73,23 +74,24 @@ impl PixelSampler {
         drawn
     }
 
-    /// Draws a view and a pixel; with `is_precrop`, from the middle half of its width and height.
+    /// Draws a view and a pixel. With `is_precrop`, importance chooses only the view, and the pixel
+    /// is uniform in the middle half of the view's width and height.
     fn draw_once(&self, is_precrop: bool, rng: &mut CounterRng) -> (usize, usize) {
-        let (view, pixel) = self.pixel(self.importance.draw(self.count, rng));
+        let (view, pixel) = self.pixel(self.importance.draw(self.index_count, rng));
         if !is_precrop {
             return (view, pixel);
         }
-        let PixelNumbers { width, height, .. } = self.views[view];
+        let ViewPixels { width, height, .. } = self.views[view];
         let [x, y] = [width, height]
             .map(|length| length / 4 + rng.below((length as u64 / 2).max(1)) as usize);
         (view, y * width + x)
     }
 
-    /// Returns the view and pixel of a pixel number.
-    fn pixel(&self, number: u64) -> (usize, usize) {
-        let view = self.views.partition_point(|view| view.start <= number) - 1;
-        let PixelNumbers { width, height, start } = self.views[view];
-        (view, (number - start) as usize % (width * height))
+    /// Returns the view and pixel of a pixel index.
+    fn pixel(&self, index: u64) -> (usize, usize) {
+        let view = self.views.partition_point(|view| view.start <= index) - 1;
+        let ViewPixels { width, height, start } = self.views[view];
+        (view, (index - start) as usize % (width * height))
     }
 
     /// Returns the weight of the loss of a bundle that trains on a pixel of a view.
@@ -101,10 +103,10 @@ impl PixelSampler {
         }
     }
 
-    /// Returns the total number of pixel numbers.
+    /// Returns the total number of pixel indices.
     #[cfg(test)]
-    pub(crate) fn count(&self) -> u64 {
-        self.count
+    pub(crate) fn index_count(&self) -> u64 {
+        self.index_count
     }
 }
 
@@ -112,7 +114,7 @@ impl PixelSampler {
 /// each pixel's loss is multiplied by the ratio of the uniform to the actual draw rate, so that the
 /// expected loss and gradient are those of uniform draws (design note 010).
 pub(crate) struct Importance {
-    /// Numbers of the pixels with detail.
+    /// Indices of the pixels with detail.
     detailed: PixelSet,
     /// Fraction of the draws that are uniform over all pixels; the others are uniform over detailed
     /// pixels.
@@ -123,8 +125,8 @@ pub(crate) struct Importance {
 
 impl Importance {
     /// Creates a sampler that draws detailed pixels `ratio` times as often as flat ones.
-    pub(crate) fn new(ratio: f64, count: u64, detailed: PixelSet) -> Self {
-        let detailed_share = detailed.len() as f64 / count.max(1) as f64;
+    pub(crate) fn new(ratio: f64, index_count: u64, detailed: PixelSet) -> Self {
+        let detailed_share = detailed.len() as f64 / index_count.max(1) as f64;
         if ratio <= 1.0 || detailed_share <= 0.0 {
             return Self { detailed, uniform_share: 1.0, flat_weight: 1.0, detailed_weight: 1.0 };
         }
@@ -137,18 +139,24 @@ impl Importance {
         }
     }
 
-    /// Draws a pixel number below `count`.
-    pub(crate) fn draw(&self, count: u64, rng: &mut CounterRng) -> u64 {
-        if self.uniform_share == 1.0 || rng.uniform() < self.uniform_share {
-            return rng.below(count);
+    /// True if all draws are uniform, even if a few pixels have detail: a share just below 1 is
+    /// rounded to 1.
+    fn is_uniform(&self) -> bool {
+        self.uniform_share >= 1.0
+    }
+
+    /// Draws a pixel index below `index_count`.
+    pub(crate) fn draw(&self, index_count: u64, rng: &mut CounterRng) -> u64 {
+        if self.is_uniform() || rng.uniform() < self.uniform_share {
+            return rng.below(index_count);
         }
-        self.detailed.nth(rng.below(self.detailed.len())).unwrap_or_default()
+        let n = rng.below(self.detailed.len());
+        self.detailed.nth(n).expect("n is below the number of detailed pixels")
     }
 
     /// Returns the weight of a pixel's loss.
-    pub(crate) fn weight(&self, number: u64) -> f32 {
-        let is_uniform = self.uniform_share >= 1.0;
-        if !is_uniform && self.detailed.contains(number) {
+    pub(crate) fn weight(&self, index: u64) -> f32 {
+        if !self.is_uniform() && self.detailed.contains(index) {
             self.detailed_weight
         } else {
             self.flat_weight
@@ -156,7 +164,7 @@ impl Importance {
     }
 }
 
-/// Maximum range of a channel over 3×3 pixels that count as flat (design note 010).
+/// Maximum range of a channel over the 3×3 pixels around a flat pixel (design note 010).
 const MAX_FLAT_RANGE: f32 = 8.0 / 255.0;
 
 /// Returns for every pixel whether a channel varies around it.
@@ -253,7 +261,7 @@ mod tests {
     /// Bundles of the precrop are drawn from the middle half, and never from masked pixels there.
     #[test]
     fn precrop_draws_unmasked_pixels_of_the_middle() {
-        let view = PixelNumbers { width: 8, height: 8, start: 0 };
+        let view = ViewPixels { width: 8, height: 8, start: 0 };
         let importance = Importance::new(1.0, 64, PixelSet::default());
         let sampler = PixelSampler::new(vec![view], 64, importance, (true, 1000), 3);
         for bundle in 0..1000 {

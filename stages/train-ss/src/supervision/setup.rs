@@ -16,16 +16,16 @@ use crate::photographs::{NO_SPACE, PackedPhotograph, Photographs, check_referenc
 pub(crate) fn alpha_background_error(parameter: &str) -> String {
     let problem = match parameter {
         "supervision" => {
-            "kernel cannot be used with prep.background alpha; choose average, or \
-            prep.background white or opaque"
+            "kernel cannot be used with prep.background alpha; choose average, or a \
+            prep.background other than alpha"
         }
         "exposure" => {
-            "exposure cannot be estimated with prep.background alpha; choose prep.background \
-            white or opaque"
+            "exposure cannot be estimated with prep.background alpha; choose a prep.background \
+            other than alpha"
         }
         _ => {
-            "with prep.background alpha, renders cannot be compared with photographs; choose \
-            prep.background white or opaque"
+            "with prep.background alpha, renders cannot be compared with photographs; choose a \
+            prep.background other than alpha"
         }
     };
     format!("parameter {parameter}: {problem}")
@@ -35,16 +35,16 @@ pub(crate) fn alpha_background_error(parameter: &str) -> String {
 /// beyond the memory budget go into a file in `folder`. `log` reports the memory need, and
 /// references that are corrected or dropped.
 pub fn set_up_supervision(
-    input: &GivenInput,
+    scene: &GivenInput,
     params: &Resolved,
-    references: Option<&GivenInput>,
+    references_input: Option<&GivenInput>,
     folder: &Path,
     has_checkpoints: bool,
     log: &dyn Fn(String),
 ) -> anyhow::Result<Supersampling> {
-    let views = Views::read(input)?;
+    let views = Views::read(scene)?;
     let mut reference_views = Vec::new();
-    if let Some(references) = references.map(Views::read).transpose()? {
+    if let Some(references) = references_input.map(Views::read).transpose()? {
         if references.background != views.background {
             let message = "input references: the background differs from the scene's; create both \
                 in one run of prep";
@@ -53,34 +53,35 @@ pub fn set_up_supervision(
         reference_views = references.views;
         reference_views.truncate(params.max_references);
     }
-    let kernel = kernel(input, params, views.background)?;
+    let kernel = kernel(scene, params, views.background)?;
     let options = SupersamplingOptions { params: params.clone(), filter: kernel.filter() };
     let need = training_memory(&options, &views, &reference_views, has_checkpoints);
     let mut memory = pixel_memory(&need, available_memory()?, folder.to_path_buf())?;
     log(memory_text(&need, memory.left()));
-    let photographs = Photographs::read(input, usize::MAX, &mut memory)?;
+    let photographs = Photographs::read(scene, usize::MAX, &mut memory)?;
     if !photographs.images.iter().any(PackedPhotograph::has_valid_pixels) {
         let message = "scene: masks exclude every pixel of every photograph; a mask's black pixels \
             are excluded, so check whether the masks are inverted";
         return Err(Failure::BadInput(message.to_owned()).into());
     }
-    let references = match references {
+    let reference_photographs = match references_input {
         Some(input) => {
-            let references = Photographs::read(input, params.max_references, &mut memory)?;
-            let checked = check_references(references, &photographs, kernel, &mut memory, log)?;
+            let given = Photographs::read(input, params.max_references, &mut memory)?;
+            let checked = check_references(given, &photographs, kernel, &mut memory, log)?;
             Some(checked.over_background())
         }
         None => None,
     };
-    Supersampling::new(photographs.over_background(), references, &options, memory)
+    Supersampling::new(photographs.over_background(), reference_photographs, &options, memory)
         .context(NO_SPACE)
 }
 
-/// Returns the kernel of the LR images; Lanczos if the scene states none. Fails if parameters
-/// require a kernel or a background that the scene lacks.
-fn kernel(input: &GivenInput, params: &Resolved, background: Background) -> anyhow::Result<Kernel> {
+/// Returns the kernel of the LR images. If the scene states none, only references are compared by
+/// the kernel: by Lanczos, `prep`'s default for downscaled images. Fails if parameters require a kernel
+/// or a background that the scene lacks.
+fn kernel(scene: &GivenInput, params: &Resolved, background: Background) -> anyhow::Result<Kernel> {
     let needs_kernel = params.supervision == Supervision::Kernel;
-    let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
+    let degradation: Option<Degradation> = scene.read_optional_json(DEGRADATION_FILE)?;
     if needs_kernel && degradation.is_none() {
         let message = format!(
             "parameter supervision: kernel needs {DEGRADATION_FILE} in the scene, which states \

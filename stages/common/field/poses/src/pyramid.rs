@@ -35,7 +35,7 @@ impl InformativePixel {
 const MIN_LEVEL_SIDE: usize = 16;
 /// Maximum number of pixels rendered per level, spread evenly over the informative ones; chosen by
 /// hand.
-const MAX_PIXELS: usize = 4096;
+const MAX_LEVEL_PIXELS: usize = 4096;
 /// Minimum gradient of an informative pixel in some channel, per pixel; chosen by hand.
 const MIN_GRADIENT: f32 = 3.0 / 255.0;
 
@@ -75,12 +75,12 @@ impl PyramidLevel {
                 pixels.extend(informative_pixel(image, x, y));
             }
         }
-        let stride = pixels.len().div_ceil(MAX_PIXELS).max(1);
+        let stride = pixels.len().div_ceil(MAX_LEVEL_PIXELS).max(1);
         Self { width, height, pixels: pixels.into_iter().step_by(stride).collect() }
     }
 }
 
-/// Returns a pixel within the border if its neighbourhood is known and has a gradient.
+/// Returns a pixel that is not on the border if its neighbourhood is known and has a gradient.
 fn informative_pixel(image: &Image, x: usize, y: usize) -> Option<InformativePixel> {
     let [centre, left, right, up, down] = [(x, y), (x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)]
         .map(|(x, y)| [0, 1, 2].map(|c| image.data[(y * image.width + x) * 3 + c]));

@@ -22,7 +22,7 @@ pub struct Architecture {
     pub march_steps: u32,
 }
 
-/// Maximum number of cells along an axis.
+/// Maximum number of cells along an axis; chosen by hand.
 const MAX_RESOLUTION: u32 = 4096;
 
 impl Default for Architecture {
@@ -45,7 +45,7 @@ impl Architecture {
         3.0f32.sqrt() / self.march_steps as f32
     }
 
-    /// Fails with the first number that is out of range.
+    /// Fails with the first number that is out of range. The ranges are chosen by hand.
     pub fn check(&self) -> Result<(), OutOfRange> {
         check_ranges(&[
             ("n_levels", self.n_levels, 1, 16),
@@ -61,7 +61,7 @@ impl Architecture {
     /// Returns the approximate number of samples of a ray through the whole cube: a training's
     /// estimate before its first step.
     pub fn samples_per_full_ray(&self) -> f64 {
-        // About 1/√3: the cube's side over its diagonal.
+        // The cube's side is 1/√3 = 0.577 of its diagonal; oblique rays are longer. Chosen by hand.
         f64::from(self.march_steps) * 0.6
     }
 }
@@ -85,25 +85,26 @@ pub struct GivenSizes {
 /// Default number of cells of the finest level for each LR pixel across the field's cube (design
 /// note 006).
 pub const CELLS_PER_PIXEL: f64 = 2.56;
-/// Samples along the diagonal of the unit cube by default, and in NDC, where every ray crosses the
-/// whole cube (design note 008).
+/// Number of samples along the diagonal of the unit cube if the user gives none (design note 008).
 const MARCH_STEPS: f64 = 512.0;
+/// Number of these samples in NDC, where every ray crosses the whole cube (design note 008).
 const MARCH_STEPS_IN_NDC: f64 = 256.0;
-/// Exponents by which these samples decrease with the resolution of a coarser field; in NDC fewer
-/// samples cost little accuracy (design note 048).
+/// Power of a coarser field's resolution to which these samples are proportional (design note 048).
 const MARCH_STEPS_EXPONENT: f64 = 1.0;
+/// Power in NDC, where fewer samples cost little accuracy (design note 048).
 const MARCH_STEPS_EXPONENT_IN_NDC: f64 = 1.5;
-/// Range of the finest level's cells along an axis; chosen by hand.
-const MAX_RESOLUTION_RANGE: (f64, f64) = (32.0, 2048.0);
-/// Range of the base-2 logarithm of a level's entries by rule; chosen by hand.
+/// Range of the finest level's cells along an axis in [`GivenSizes::for_scene`]; chosen by hand.
+const FINEST_RANGE: (f64, f64) = (32.0, 2048.0);
+/// Range of the base-2 logarithm of a level's entries if the user gives none; chosen by hand.
 const LOG2_HASHMAP_RANGE: (f64, f64) = (14.0, 20.0);
 
 impl GivenSizes {
     /// Sets every size for a scene with `pixels_across` LR pixels across the field's cube.
     pub fn for_scene(&self, pixels_across: f64, is_ndc: bool) -> Architecture {
-        let (low, high) = MAX_RESOLUTION_RANGE;
+        let (low, high) = FINEST_RANGE;
         let finest = (self.cells_per_pixel * pixels_across).round().clamp(low, high);
-        // The number of cells at surfaces grows with the square of the resolution.
+        // The number of cells at surfaces grows with the square of the resolution. As by default,
+        // a finest level of 256 cells has 2^17 entries.
         let (low, high) = LOG2_HASHMAP_RANGE;
         let by_finest = (17.0 + 2.0 * (finest / 256.0).log2()).round().clamp(low, high) as u32;
         let (by_space, exponent) = if is_ndc {

@@ -421,7 +421,7 @@ impl Occupancy {
     }
 }
 
-/// Value of [`Occupancy::empty_cube_sizes`] for a cell that isn't empty.
+/// Value of [`Occupancy::empty_cube_log2_sides`] for a cell that isn't empty.
 pub(crate) const OCCUPIED: u32 = 8;
 
 /// Bits of the first 2³ elements of a word's 4³.
@@ -455,17 +455,16 @@ impl Occupancy {
         (from < to).then_some([from, to])
     }
 
-    /// Returns for each cell the size, 0 to 4, of the largest empty cube around it, which has
-    /// 2^size cells per side; [`OCCUPIED`] for a cell that isn't empty. `cells` has one array per
-    /// axis.
+    /// Returns for each cell log2 of the side, 0 to 4, of the largest empty cube around the cell, in
+    /// cells; [`OCCUPIED`] for a cell that isn't empty. `cells` has one array per axis.
     ///
     /// All operations but the loads vectorise.
     #[inline(always)]
-    pub(crate) fn empty_cube_sizes<const N: usize>(&self, cells: &[[u32; N]; 3]) -> [u32; N] {
+    pub(crate) fn empty_cube_log2_sides<const N: usize>(&self, cells: &[[u32; N]; 3]) -> [u32; N] {
         let [xs, ys, zs] = cells;
         let (mut bricks, mut cell_bits) = ([0; N], [0; N]);
         let (mut blocks, mut brick_bits) = ([0; N], [0; N]);
-        let (mut words, mut sizes) = ([[0; N]; 2], [0; N]);
+        let (mut words, mut log2_sides) = ([[0; N]; 2], [0; N]);
         for i in 0..N {
             let cell = [xs[i], ys[i], zs[i]];
             (bricks[i], cell_bits[i]) = word_and_bit_u32(cell, BRICKS);
@@ -475,16 +474,16 @@ impl Occupancy {
             words[0][i] = self.bricks[bricks[i] as usize];
             words[1][i] = self.blocks[blocks[i] as usize];
         }
-        // Without branches, since sizes are unpredictable.
+        // Without branches, since sides are unpredictable.
         for i in 0..N {
             let [cells, bricks] = [words[0][i], words[1][i]];
-            let size = u32::from(cells & EIGHTH << (cell_bits[i] & FIRST_OF_EIGHTH) == 0)
+            let log2_side = u32::from(cells & EIGHTH << (cell_bits[i] & FIRST_OF_EIGHTH) == 0)
                 + u32::from(cells == 0)
                 + u32::from(bricks & EIGHTH << (brick_bits[i] & FIRST_OF_EIGHTH) == 0)
                 + u32::from(bricks == 0);
-            sizes[i] = if cells >> cell_bits[i] & 1 == 1 { OCCUPIED } else { size };
+            log2_sides[i] = if cells >> cell_bits[i] & 1 == 1 { OCCUPIED } else { log2_side };
         }
-        sizes
+        log2_sides
     }
 
     /// Returns whether an occupied cell is thin.
@@ -597,7 +596,7 @@ mod tests {
             let cell = [(); 3].map(|()| rng.below(GRID as u64) as usize);
             let largest =
                 (0..=4).rev().find(|size| is_empty(cell.map(|c| c >> size << size), 1 << size));
-            let [size] = occupancy.empty_cube_sizes(&cell.map(|c| [c as u32]));
+            let [size] = occupancy.empty_cube_log2_sides(&cell.map(|c| [c as u32]));
             assert_eq!(size, largest.unwrap_or(OCCUPIED), "{cell:?}");
             counts[size.min(5) as usize] += 1;
         }

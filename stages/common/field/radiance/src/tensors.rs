@@ -40,8 +40,8 @@ pub enum FieldProblem {
     Unusable(String),
 }
 
-/// Vector to write. Its bytes are created only when it is written, so that memory never holds
-/// copies of two vectors.
+/// Vector to write. Its bytes are created only when they are appended to the file's buffer, so that
+/// at most one vector is copied besides that buffer.
 pub(crate) struct Tensor<'a> {
     data: TensorData<'a>,
     shape: [usize; 1],

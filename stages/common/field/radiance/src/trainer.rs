@@ -22,7 +22,7 @@ use numerics::simd::LANES;
 pub use options::{NETWORK_DECAY, RenderedBundles, Supervisor, TrainingOptions};
 pub use phases::{Phase, PhaseClock, PhaseTimes};
 
-use shard::{Shard, StepWork, Worker};
+use shard::{ShardResult, StepWork, Worker};
 
 /// Result of a training step.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -81,7 +81,7 @@ pub struct Trainer {
     transposed: Aligned,
     state: TrainingState,
     samples_per_ray: f64,
-    shards: Vec<Shard>,
+    shards: Vec<ShardResult>,
     workers: Mutex<Vec<Worker>>,
     times: [PhaseTimes; Phase::ALL.len()],
 }
@@ -214,7 +214,7 @@ impl Trainer {
         // Independent of the number of threads, so that sums have one order.
         let shards = (bundles * supervisor.rays_per_bundle() / RAYS_PER_SHARD)
             .clamp(*SHARDS.start(), *SHARDS.end());
-        self.shards.resize_with(shards, Shard::default);
+        self.shards.resize_with(shards, ShardResult::default);
         let workers = &self.workers;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let mut worker = lock(workers).pop().unwrap_or_default();
@@ -231,7 +231,7 @@ impl Trainer {
         parts.for_each(|(i, sums)| {
             clock.task(|| {
                 for shard in shards {
-                    let part = &shard.network[SUMS_PIECE * i..][..sums.len()];
+                    let part = &shard.network_gradients[SUMS_PIECE * i..][..sums.len()];
                     for (sum, gradient) in sums.iter_mut().zip(part) {
                         *sum += gradient;
                     }
@@ -247,7 +247,7 @@ impl Trainer {
             Some("the loss")
         } else if !self.network_gradients.iter().sum::<f32>().is_finite() {
             Some("the networks' gradient")
-        } else if !self.shards.iter().all(|shard| shard.is_finite) {
+        } else if !self.shards.iter().all(|shard| shard.has_finite_grid_gradients) {
             Some("the grid's gradient")
         } else {
             None

@@ -9,7 +9,8 @@ use serde_json::Value;
 pub const TRAINING_FILE: &str = "training.json";
 
 /// Content of `training.json`: course of training, over all ensemble members in order.
-// Sinks also read logs of other versions, which may have more fields.
+// No serde `deny_unknown_fields`: sinks also read logs of other versions, which may have more
+// fields.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[schemars(deny_unknown_fields)]
 pub struct TrainingLog {

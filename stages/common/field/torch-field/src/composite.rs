@@ -1,5 +1,8 @@
 use tch::{Kind, TchError, Tensor};
 
+/// Length of a ray's last sample, which extends to infinity, as in NeRF's code.
+pub(crate) const INFINITY: f32 = 1e10;
+
 /// Samples of n rays (m each) composited along each ray.
 #[derive(Debug)]
 pub(crate) struct Composite {
@@ -12,8 +15,8 @@ pub(crate) struct Composite {
 }
 
 /// Composites samples at distances `t` (n × m) with `colour` (n × m × 3) and raw density (n × m,
-/// noise already added) over a background (n × 3), in optical depth: the last sample extends to
-/// infinity (Max 1995; Mildenhall et al. 2020, eq. 3).
+/// noise already added) over a background (n × 3). The weights are computed from optical depths;
+/// the last sample extends to infinity (Max 1995; Mildenhall et al. 2020, eq. 3).
 pub(crate) fn composite(
     t: &Tensor,
     colour: &Tensor,
@@ -22,12 +25,12 @@ pub(crate) fn composite(
 ) -> Result<Composite, TchError> {
     let m = t.size()[1];
     let gaps = t.f_narrow(1, 1, m - 1)?.f_sub(&t.f_narrow(1, 0, m - 1)?)?;
-    let last = t.f_narrow(1, 0, 1)?.f_full_like(1e10)?;
+    let last = t.f_narrow(1, 0, 1)?.f_full_like(f64::from(INFINITY))?;
     let tau = raw.f_relu()?.f_mul(&Tensor::f_cat(&[&gaps, &last], 1)?)?;
-    let depth_after = tau.f_narrow(1, 0, m - 1)?.f_cumsum(1, None::<Kind>)?;
-    let zero = depth_after.f_narrow(1, 0, 1)?.f_zeros_like()?;
-    let depth_before = Tensor::f_cat(&[&zero, &depth_after], 1)?;
-    let weights = depth_before.f_neg()?.f_exp()?.f_mul(&tau.f_neg()?.f_expm1()?.f_neg()?)?;
+    let tau_after = tau.f_narrow(1, 0, m - 1)?.f_cumsum(1, None::<Kind>)?;
+    let zero = tau_after.f_narrow(1, 0, 1)?.f_zeros_like()?;
+    let tau_before = Tensor::f_cat(&[&zero, &tau_after], 1)?;
+    let weights = tau_before.f_neg()?.f_exp()?.f_mul(&tau.f_neg()?.f_expm1()?.f_neg()?)?;
     let premultiplied = weights.f_unsqueeze(-1)?.f_mul(colour)?.f_sum_dim_intlist(
         [1i64].as_slice(),
         false,

@@ -7,6 +7,7 @@ use radiance::{PointField, PointSamples, RenderError};
 use scene::{Bounds, Space};
 use tch::{Device, TchError, Tensor, no_grad};
 
+use crate::composite::INFINITY;
 use crate::mlp::Mlp;
 use crate::network::encode;
 use crate::ray_tensors::{matrix, to_host};
@@ -21,9 +22,6 @@ const PROBES_PER_SIDE: usize = 5;
 /// Depth in cube sides of the layer before the end of unbounded rays whose density extends to
 /// infinity; chosen by hand.
 const END_DEPTH: f64 = 1.0 / 128.0;
-
-/// Length of a ray's last sample, as in [`crate::composite`].
-const INFINITY: f32 = 1e10;
 
 /// Magnitude to which raw colours are limited: beyond, eight bits show no difference.
 const MAX_RAW_COLOUR: f64 = 6.0;

@@ -82,7 +82,7 @@ mod tests {
         let frame = &set.frames[0];
         assert_eq!(frame.name, "r_0");
         assert_eq!(frame.camera_to_world[2], [0., 0., 1., 4.]);
-        assert_eq!(frame.stored_intrinsics, scene::Intrinsics::from_angle_x(10, 6, 0.7));
+        assert_eq!(frame.lens_intrinsics, scene::Intrinsics::from_angle_x(10, 6, 0.7));
         // Both splits have a frame r_0.
         let merged = set.without_split();
         assert_eq!([&merged.frames[0].name, &merged.frames[1].name], ["r_0", "test_r_0"]);

@@ -39,8 +39,8 @@ impl Dataset {
         self
     }
 
-    /// Keeps the lenses' distortion; adds a note on the pixels that are masked because their lens
-    /// has no ray for them.
+    /// Adds a note on the pixels that are masked because their lens has no ray for them. For data
+    /// sets that keep their lens distortion.
     #[must_use]
     pub fn with_lens_mask_note(mut self) -> Self {
         let mut known: Vec<(Intrinsics, usize)> = Vec::new();
@@ -75,8 +75,8 @@ impl Dataset {
     pub fn undistorted(mut self) -> Result<Self, DatasetError> {
         let (mut undistorted, mut angles) = (0, Vec::new());
         for frame in self.frames.iter_mut().filter(|f| f.has_distortion()) {
-            let distortion = frame.stored_intrinsics.distortion;
-            let pinhole = frame.stored_intrinsics.pinhole().ok_or_else(|| {
+            let distortion = frame.lens_intrinsics.distortion;
+            let pinhole = frame.lens_intrinsics.pinhole().ok_or_else(|| {
                 let problem = format!("lens distortion {distortion} leaves no pinhole image");
                 let reason = Reason::new(format!("{problem}; are its coefficients right?"));
                 DatasetError::format(&frame.image, reason)
@@ -123,7 +123,7 @@ impl Dataset {
     /// Adds notes on lens distortion, EXIF orientations and differing sizes.
     pub(crate) fn add_image_notes(&mut self) {
         let frames = &self.frames;
-        let fisheye = frames.iter().filter(|f| f.stored_intrinsics.distortion.is_fisheye()).count();
+        let fisheye = frames.iter().filter(|f| f.lens_intrinsics.distortion.is_fisheye()).count();
         let distorted = frames.iter().filter(|f| f.has_distortion()).count() - fisheye;
         let upright = frames.iter().filter(|f| f.turn == Turn::Upright).count();
         let assumed = frames.iter().filter(|f| f.turn == Turn::AssumedStored).count();
@@ -146,7 +146,7 @@ impl Dataset {
         let sizes: BTreeSet<(u32, u32)> = self
             .frames
             .iter()
-            .map(|f| (f.stored_intrinsics.width, f.stored_intrinsics.height))
+            .map(|f| (f.lens_intrinsics.width, f.lens_intrinsics.height))
             .collect();
         if let (Some(first), Some(last), true) = (sizes.first(), sizes.last(), sizes.len() > 1) {
             self.notes.push(format!(

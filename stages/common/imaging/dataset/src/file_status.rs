@@ -29,10 +29,10 @@ pub(crate) enum FileProblem {
         path_text(link),
         path_text(target)
     )]
-    DanglingLink { link: PathBuf, target: PathBuf },
+    LinkToNothing { link: PathBuf, target: PathBuf },
     /// Link that can't be followed, at the path or above it.
     #[error("{} is a symbolic link that cannot be followed: {error}", path_text(link))]
-    BrokenLink { link: PathBuf, error: io::Error },
+    UnfollowableLink { link: PathBuf, error: io::Error },
     #[error("{} is named like editor and system files, which are ignored", path_text(path))]
     IgnoredName { path: PathBuf },
 }
@@ -45,7 +45,7 @@ pub(crate) fn path_text(path: &Path) -> String {
     }
 }
 
-/// Maximum length of a path in bytes (Linux's `PATH_MAX`).
+/// Maximum length of a path in bytes, including a final NUL (Linux's `PATH_MAX`).
 const MAX_PATH_BYTES: usize = 4096;
 
 /// Checks a path; `expected` describes the expected file in messages ("an image").
@@ -55,7 +55,7 @@ pub(crate) fn file_status(path: &Path, expected: &str) -> FileStatus {
         let bytes = path.as_os_str().len();
         FileProblem::Other(format!("{}: path is too long ({bytes} bytes)", shortened(&name)))
     };
-    if path.as_os_str().len() > MAX_PATH_BYTES {
+    if path.as_os_str().len() >= MAX_PATH_BYTES {
         return FileStatus::Unusable(too_long());
     }
     if path.file_name().is_some_and(is_ignored_name) {
@@ -69,12 +69,12 @@ pub(crate) fn file_status(path: &Path, expected: &str) -> FileStatus {
         }
         Err(error) => error,
     };
-    FileStatus::Unusable(match (broken_link(path), error.kind()) {
+    FileStatus::Unusable(match (first_bad_link(path), error.kind()) {
         (Some(link), ErrorKind::NotFound) => {
             let target = fs::read_link(link).unwrap_or_default();
-            FileProblem::DanglingLink { link: link.to_path_buf(), target }
+            FileProblem::LinkToNothing { link: link.to_path_buf(), target }
         }
-        (Some(link), _) => FileProblem::BrokenLink { link: link.to_path_buf(), error },
+        (Some(link), _) => FileProblem::UnfollowableLink { link: link.to_path_buf(), error },
         (None, ErrorKind::InvalidFilename) => FileProblem::Other(format!(
             "{}: a name in the path is too long (usual maximum 255 bytes)",
             shortened(&name)
@@ -87,7 +87,7 @@ pub(crate) fn file_status(path: &Path, expected: &str) -> FileStatus {
 }
 
 /// Finds the first link along a path that can't be followed.
-fn broken_link(path: &Path) -> Option<&Path> {
+fn first_bad_link(path: &Path) -> Option<&Path> {
     let mut ancestors: Vec<&Path> =
         path.ancestors().filter(|a| !a.as_os_str().is_empty()).collect();
     ancestors.reverse();
@@ -116,7 +116,7 @@ pub(crate) fn visible_entries(folder: &Path) -> Vec<PathBuf> {
 pub(crate) fn check_link(path: &Path) -> Result<(), DatasetError> {
     match file_status(path, "a folder") {
         FileStatus::Unusable(
-            problem @ (FileProblem::DanglingLink { .. } | FileProblem::BrokenLink { .. }),
+            problem @ (FileProblem::LinkToNothing { .. } | FileProblem::UnfollowableLink { .. }),
         ) => Err(problem.into()),
         _ => Ok(()),
     }

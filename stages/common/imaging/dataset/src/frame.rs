@@ -36,9 +36,9 @@ pub struct Frame {
     /// Mask of the pixels that count.
     pub mask: Option<MaskFile>,
     /// Path of the true depth (EXR, channels `Z` and `A`), if any.
-    pub depth: Option<PathBuf>,
-    /// Intrinsics of the stored image.
-    pub stored_intrinsics: Intrinsics,
+    pub depth_file: Option<PathBuf>,
+    /// Intrinsics of the image as read, before a resampling to `pinhole`.
+    pub lens_intrinsics: Intrinsics,
     /// Pinhole camera to which the image is resampled, if distortion is removed.
     pub pinhole: Option<Intrinsics>,
     /// Pose `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in
@@ -46,14 +46,14 @@ pub struct Frame {
     pub camera_to_world: Pose,
     /// Smallest and largest depth of observed points along the optical axis, if known. For a
     /// fisheye lens, the points' distances from the camera.
-    pub depths: Option<[f64; 2]>,
+    pub depth_range: Option<[f64; 2]>,
 }
 
 impl Frame {
-    /// Creates a frame without name, mask and depths.
+    /// Creates a frame without name, mask and depth.
     pub(crate) fn new(
         image: PathBuf,
-        (stored_intrinsics, turn): (Intrinsics, Turn),
+        (lens_intrinsics, turn): (Intrinsics, Turn),
         camera_to_world: Pose,
     ) -> Self {
         Self {
@@ -61,17 +61,17 @@ impl Frame {
             image,
             turn,
             mask: None,
-            depth: None,
-            stored_intrinsics,
+            depth_file: None,
+            lens_intrinsics,
             pinhole: None,
             camera_to_world,
-            depths: None,
+            depth_range: None,
         }
     }
 
     /// Returns the intrinsics of [`Frame::camera`].
     pub fn intrinsics(&self) -> Intrinsics {
-        self.pinhole.unwrap_or(self.stored_intrinsics)
+        self.pinhole.unwrap_or(self.lens_intrinsics)
     }
 
     /// Returns the camera of [`Frame::photograph`].
@@ -89,14 +89,14 @@ impl Frame {
     }
 
     pub(crate) fn has_distortion(&self) -> bool {
-        !self.stored_intrinsics.distortion.is_none()
+        !self.lens_intrinsics.distortion.is_none()
     }
 
     /// Fails if the camera is invalid. A uniform scale of the rotation is valid, because
     /// [`Dataset::read`](crate::Dataset::read) removes the scale. Pixels without a ray are valid,
     /// because only some callers need a ray through every pixel.
     pub(crate) fn check(&self) -> Result<(), CameraError> {
-        let distortion = self.stored_intrinsics.distortion;
+        let distortion = self.lens_intrinsics.distortion;
         if !distortion.is_finite() {
             return Err(CameraError::distortion(distortion));
         }
@@ -133,7 +133,7 @@ pub(crate) fn assign_names(
     Ok(())
 }
 
-/// Returns the shortest unique names of images, see [`assign_names`].
+/// Returns unique names of images, see [`assign_names`]: all file names, or all names with folders.
 pub(crate) fn unique_names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
     let mut names = each_name(list, paths, |path| printable_part(path.file_stem()))?;
     for separator in SEPARATORS {

@@ -31,25 +31,25 @@ pub(crate) struct FrameFile {
     transforms: Transforms,
 }
 
-/// Frames of a file, and names of missing files.
+/// Frames of a file, and names of files that can't be read.
 #[derive(Default)]
 pub(crate) struct ReadFrames {
     pub(crate) frames: Vec<Frame>,
     pub(crate) names: FrameNames,
     /// Skipped frames whose image doesn't exist.
-    missing: MissingNames,
-    /// Missing depth images in formats that aren't used anyway.
-    missing_depths: MissingNames,
+    missing: CountedNames,
+    /// Unreadable depth images in formats that aren't used anyway.
+    unread_depths: CountedNames,
 }
 
-/// Number of missing files, and the name of the first.
+/// Number of files, and the name of the first.
 #[derive(Default)]
-struct MissingNames {
+struct CountedNames {
     count: usize,
     first: Option<String>,
 }
 
-impl MissingNames {
+impl CountedNames {
     fn add(&mut self, name: &str) {
         self.count += 1;
         self.first.get_or_insert_with(|| name.to_owned());
@@ -81,12 +81,12 @@ impl ReadFrames {
         ))
     }
 
-    /// Returns the note on missing depth images, if any.
+    /// Returns the note on unreadable depth images, if any.
     pub(crate) fn depth_note(&self) -> Option<String> {
-        let first = self.missing_depths.first.as_ref()?;
-        let count = format_count(self.missing_depths.count, "depth image");
+        let first = self.unread_depths.first.as_ref()?;
+        let count = format_count(self.unread_depths.count, "depth image");
         Some(format!(
-            "{count} (depth_file_path) not found (first: {first}); only EXR depth is used"
+            "{count} (depth_file_path) cannot be read (first: {first}); only EXR depth is used"
         ))
     }
 }
@@ -150,8 +150,8 @@ impl FrameFile {
             let shared = &self.transforms.shared;
             let mut frame = read_frame(image, entry, shared).map_err(frame_error)?;
             frame.mask = find_mask(lookup, entry).map_err(frame_error)?;
-            frame.depth =
-                find_depth(lookup, entry, &mut read.missing_depths).map_err(frame_error)?;
+            frame.depth_file =
+                find_depth(lookup, entry, &mut read.unread_depths).map_err(frame_error)?;
             read.names.add(read.frames.len(), &entry.file_path, file.path);
             read.frames.push(frame);
             labels.push(file.label);
@@ -182,7 +182,7 @@ fn find_mask(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>
 fn find_depth(
     lookup: &mut Lookup,
     entry: &FrameEntry,
-    missing: &mut MissingNames,
+    unread: &mut CountedNames,
 ) -> Result<Option<PathBuf>, Reason> {
     let Some(name) = &entry.depth_file_path else { return Ok(None) };
     match lookup.find(name) {
@@ -190,7 +190,7 @@ fn find_depth(
             Ok(Some(lookup.root().join(file.path)).filter(|path| is_exr(path)))
         }
         Ok(Located::Missing(_) | Located::Unusable(_)) | Err(_) if !is_exr(Path::new(name)) => {
-            missing.add(name);
+            unread.add(name);
             Ok(None)
         }
         Ok(Located::Missing(problem) | Located::Unusable(problem)) => Err(unusable_entry(&problem)),

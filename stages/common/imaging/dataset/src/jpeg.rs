@@ -1,5 +1,5 @@
-//! Finds rows without data in a JPEG (ITU-T T.81). The decoder fills such rows with grey, or
-//! decodes them more coarsely, without an error.
+//! Finds rows without data in a JPEG (ITU-T T.81). The decoder (zune-jpeg) fills such rows with
+//! grey, or decodes them more coarsely, without an error.
 //!
 //! Huffman codes are skipped scan by scan. Like libjpeg, this accepts any bytes after the end
 //! marker (EOI). Unlike Pillow, it accepts a sequential JPEG that lacks only the end marker: no
@@ -8,7 +8,8 @@
 //!
 //! An invalid segment before the first scan is left to the decoder, which reports it; if it
 //! doesn't, the file is refused. The decoder ignores an invalid scan header, and any invalid
-//! segment after the first scan: here these are damage.
+//! segment after the first scan. Here either ends the image data: a sequential JPEG whose rows are
+//! complete by then is accepted.
 
 use std::ops::{Range, RangeInclusive};
 
@@ -29,23 +30,24 @@ pub(crate) const END_MARKER: [u8; 2] = [0xff, EOI];
 const SOS: u8 = 0xda;
 const DRI: u8 = 0xdd;
 
-/// Maximum number of scans, that of the decoder.
+/// Maximum number of scans, zune-jpeg's default.
 const MAX_SCANS: usize = 100;
 /// Minimum number of zeros at the end of a file that can't be image data; chosen by hand.
 const MIN_PADDING_BYTES: usize = 16;
 
-/// Returns whether the decoder knows a marker.
+/// Returns whether zune-jpeg knows a marker.
 fn is_known_marker(marker: u8) -> bool {
     matches!(marker, 0xc0..=0xc2 | DHT | 0xcc | 0xd0..=0xdd | 0xe0..=0xe2 | 0xed | 0xee | 0xfe)
 }
 
 /// Completeness of a JPEG's image data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Extent {
+pub(crate) enum Completeness {
     /// Complete data.
-    Whole,
-    /// No scan is found: the decoder should refuse the file.
-    Unknown,
+    Complete,
+    /// Invalid segment before the first scan, or no frame header: the decoder should refuse the
+    /// file.
+    UnreadableHeader,
     /// Complete rows without an end marker that the decoder reaches. The image data end at offset
     /// `end`.
     Unterminated { end: usize },
@@ -57,13 +59,12 @@ pub(crate) enum Extent {
 }
 
 /// Checks the completeness of a JPEG's image data.
-pub(crate) fn extent(bytes: &[u8]) -> Extent {
+pub(crate) fn check_completeness(bytes: &[u8]) -> Completeness {
     let mut walk = Walk { bytes: without_padding(bytes), ..Walk::default() };
-    let is_terminated = walk.read_to_end();
-    if is_terminated.is_none() && walk.scans == 0 && walk.damaged_scan.is_none() {
-        return Extent::Unknown;
+    if walk.read_to_end().is_none() && walk.scans == 0 && walk.damaged_scan.is_none() {
+        return Completeness::UnreadableHeader;
     }
-    walk.extent(is_terminated == Some(true)).unwrap_or(Extent::Unknown)
+    walk.completeness().unwrap_or(Completeness::UnreadableHeader)
 }
 
 /// Removes zeros at the end, left by an interrupted copy: they would be valid codes.
@@ -114,21 +115,22 @@ struct Walk<'a> {
     damaged_scan: Option<usize>,
     /// Offset of the marker after the last scan, or length of the file.
     end: usize,
+    /// True after the end marker.
+    is_terminated: bool,
 }
 
 impl<'a> Walk<'a> {
-    /// Reads up to the end marker; false if the file ends without one, `None` at an invalid
-    /// segment.
-    fn read_to_end(&mut self) -> Option<bool> {
-        loop {
-            let marker = match self.next_marker() {
-                Some(EOI) => return Some(true),
-                Some(SOI | TEM) => continue,
-                Some(marker) if RESTART_MARKERS.contains(&marker) => continue,
-                Some(marker) => marker,
-                None => return Some(false),
-            };
-            let Some(segment) = self.segment() else { return Some(false) };
+    /// Reads up to the end marker or the end of the file; `None` at an invalid segment.
+    fn read_to_end(&mut self) -> Option<()> {
+        while let Some(marker) = self.next_marker() {
+            if marker == EOI {
+                self.is_terminated = true;
+                break;
+            }
+            if matches!(marker, SOI | TEM) || RESTART_MARKERS.contains(&marker) {
+                continue;
+            }
+            let Some(segment) = self.segment() else { break };
             match marker {
                 DHT => self.read_tables(segment)?,
                 DRI => self.restart_interval = usize::from(u16_at(segment, 0)?),
@@ -144,6 +146,7 @@ impl<'a> Walk<'a> {
                 _ => {}
             }
         }
+        Some(())
     }
 
     /// Finds the next marker; skips other bytes.
@@ -227,16 +230,17 @@ impl<'a> Walk<'a> {
     }
 
     /// Returns the completeness of a file that ends here; `None` without a frame.
-    fn extent(&self, is_terminated: bool) -> Option<Extent> {
+    fn completeness(&self) -> Option<Completeness> {
         let Frame { is_progressive, height, components, .. } = self.frame.as_ref()?;
         let missing = components.iter().map(|c| c.missing.unwrap_or(*height)).max()?;
-        Some(match (missing, is_terminated) {
-            (0, true) => Extent::Whole,
+        Some(match (missing, self.is_terminated) {
+            (0, true) => Completeness::Complete,
             _ if *is_progressive => {
-                Extent::Coarse { scan: self.damaged_scan.unwrap_or(self.scans), height: *height }
+                let scan = self.damaged_scan.unwrap_or(self.scans.max(1));
+                Completeness::Coarse { scan, height: *height }
             }
-            (0, false) => Extent::Unterminated { end: self.end },
-            (rows, _) => Extent::Missing { rows, height: *height },
+            (0, false) => Completeness::Unterminated { end: self.end },
+            (rows, _) => Completeness::Missing { rows, height: *height },
         })
     }
 }
@@ -305,18 +309,20 @@ impl Grid {
     ) -> u32 {
         let all = self.mcu_count();
         let interval = if restart_interval == 0 { all } else { restart_interval };
-        let (mut mcu, mut counted, mut missing) = (0, 0, 0);
+        // Rows of MCUs below `rows_counted` are already counted.
+        let (mut mcu, mut rows_counted, mut missing) = (0, 0, 0);
         while mcu < all {
             let mut end = all.min(mcu + interval);
             while mcu < end && skip(bits, mcu).is_some() {
                 mcu += 1;
             }
+            // Without the next restart marker, the rest of the scan is lost.
             if end < all && !bits.restart() {
                 end = all;
             }
             if mcu < end {
-                let rows = counted.max(mcu / self.columns)..end.div_ceil(self.columns);
-                counted = rows.end;
+                let rows = rows_counted.max(mcu / self.columns)..end.div_ceil(self.columns);
+                rows_counted = rows.end;
                 missing += self.image_rows(rows);
             }
             mcu = end;

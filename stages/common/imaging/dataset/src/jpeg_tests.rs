@@ -59,8 +59,11 @@ fn missing_rows_are_counted() {
         for restart_interval in [0, 4] {
             let bytes = jpeg(SIZE, sampling, false, restart_interval);
             let case = format!("{sampling:?}, restart {restart_interval}");
-            assert_eq!(extent(&bytes), Extent::Whole, "{case}");
-            assert_eq!(extent(&[&bytes, &b"\xff\xd8 more"[..]].concat()), Extent::Whole);
+            assert_eq!(check_completeness(&bytes), Completeness::Complete, "{case}");
+            assert_eq!(
+                check_completeness(&[&bytes, &b"\xff\xd8 more"[..]].concat()),
+                Completeness::Complete
+            );
             let complete = decoded(&bytes).unwrap();
             let scan = bytes.windows(2).position(|w| w == [0xff, SOS]).unwrap();
             let mut previous = ROWS;
@@ -68,9 +71,11 @@ fn missing_rows_are_counted() {
                 let cut = &bytes[..end];
                 let zeros = [cut, &[0; 512]].concat();
                 let terminated = [cut, &END_MARKER].concat();
-                let (found, rows) = match extent(cut) {
-                    missing @ Extent::Missing { rows, height: ROWS } => (missing, rows),
-                    Extent::Unterminated { end: found } if found == end => (Extent::Whole, 0),
+                let (found, rows) = match check_completeness(cut) {
+                    missing @ Completeness::Missing { rows, height: ROWS } => (missing, rows),
+                    Completeness::Unterminated { end: found } if found == end => {
+                        (Completeness::Complete, 0)
+                    }
                     other => panic!("{case}: {other:?} at {end}"),
                 };
                 assert!(
@@ -78,9 +83,9 @@ fn missing_rows_are_counted() {
                     "{case}: {rows} rows missing at {end}, {previous} before"
                 );
                 previous = rows;
-                assert_eq!(extent(&terminated), found, "{case} at {end}");
+                assert_eq!(check_completeness(&terminated), found, "{case} at {end}");
                 if rows > 0 {
-                    assert_eq!(extent(&zeros), found, "{case} at {end}");
+                    assert_eq!(check_completeness(&zeros), found, "{case} at {end}");
                 }
                 // The decoder blends the row above the missing ones with them. After a restart
                 // marker, the decoder may stop earlier.
@@ -94,7 +99,11 @@ fn missing_rows_are_counted() {
             }
             assert!(previous < 20, "{case}: {previous} rows missing near the end");
             let end = bytes.len() - END_MARKER.len();
-            assert_eq!(extent(&bytes[..end]), Extent::Unterminated { end }, "{case}");
+            assert_eq!(
+                check_completeness(&bytes[..end]),
+                Completeness::Unterminated { end },
+                "{case}"
+            );
         }
     }
 }
@@ -109,14 +118,14 @@ fn unknown_markers_end_the_image_data() {
         for (marker, fill) in [(&b"\xff\x46"[..], 0), (b"\xff\xe5", 0), (b"\xff\xff\xff\xf3", 2)] {
             let tail = [marker, &b"\x00\x04ab"[..], &END_MARKER].concat();
             let mut extended = [&bytes[..end], &tail].concat();
-            let found = extent(&extended);
-            assert_eq!(found, Extent::Unterminated { end: end + fill }, "{sampling:?}");
+            let found = check_completeness(&extended);
+            assert_eq!(found, Completeness::Unterminated { end: end + fill }, "{sampling:?}");
             extended.truncate(end + fill);
             extended.extend(END_MARKER);
             assert!(decoded(&extended).unwrap() == complete, "{sampling:?} {marker:?}");
         }
         let known = [&bytes[..end], b"\xff\xe1\x00\x04ab", &END_MARKER].concat();
-        assert_eq!(extent(&known), Extent::Whole);
+        assert_eq!(check_completeness(&known), Completeness::Complete);
         assert!(decoded(&known).unwrap() == complete, "{sampling:?}");
     }
 }
@@ -126,10 +135,13 @@ fn a_truncated_progressive_jpeg_is_coarse() {
     for sampling in SAMPLINGS {
         for restart_interval in [0, 4] {
             let bytes = jpeg(SIZE, sampling, true, restart_interval);
-            assert_eq!(extent(&bytes), Extent::Whole);
+            assert_eq!(check_completeness(&bytes), Completeness::Complete);
             for end in (bytes.len() / 4..bytes.len()).step_by(17) {
-                let found = extent(&bytes[..end]);
-                assert!(matches!(found, Extent::Coarse { height: ROWS, .. }), "{found:?} at {end}");
+                let found = check_completeness(&bytes[..end]);
+                assert!(
+                    matches!(found, Completeness::Coarse { height: ROWS, .. }),
+                    "{found:?} at {end}"
+                );
             }
         }
     }
@@ -144,16 +156,16 @@ fn an_invalid_scan_header_is_damage() {
         let mut unknown = bytes.clone();
         unknown[scan + 5] = 9;
         let expected = if is_progressive {
-            Extent::Coarse { scan: 1, height: ROWS }
+            Completeness::Coarse { scan: 1, height: ROWS }
         } else {
-            Extent::Missing { rows: ROWS, height: ROWS }
+            Completeness::Missing { rows: ROWS, height: ROWS }
         };
-        assert_eq!(extent(&unknown), expected);
+        assert_eq!(check_completeness(&unknown), expected);
         if is_progressive {
             let mut invalid_band = bytes;
             let components = usize::from(invalid_band[scan + 4]);
             invalid_band[scan + 5 + 2 * components] = 34;
-            assert_eq!(extent(&invalid_band), expected);
+            assert_eq!(check_completeness(&invalid_band), expected);
         }
     }
 }
@@ -165,22 +177,22 @@ fn rows_of_a_lost_piece_are_missing() {
     let marker = |n: u8| bytes.windows(2).position(|w| w == [0xff, 0xd0 + n]).unwrap();
     let (from, to) = (marker(2), marker(3));
     let lost = [&bytes[..from + 12], &bytes[to..]].concat();
-    assert_eq!(extent(&lost), Extent::Missing { rows: 8, height: ROWS });
+    assert_eq!(check_completeness(&lost), Completeness::Missing { rows: 8, height: ROWS });
 }
 
 #[test]
-fn any_bytes_have_an_extent() {
+fn any_bytes_are_checked() {
     for sampling in SAMPLINGS {
         let bytes = jpeg((20, 20), sampling, false, 2);
         for offset in 0..bytes.len() {
             for value in [0, 1, 0x11, 0x7f, 0xff] {
                 let mut damaged = bytes.clone();
                 damaged[offset] = value;
-                extent(&damaged);
+                check_completeness(&damaged);
             }
-            extent(&bytes[offset..]);
+            check_completeness(&bytes[offset..]);
         }
     }
-    assert_eq!(extent(b""), Extent::Unknown);
-    assert_eq!(extent(&hidden_jpeg()), Extent::Unknown);
+    assert_eq!(check_completeness(b""), Completeness::UnreadableHeader);
+    assert_eq!(check_completeness(&hidden_jpeg()), Completeness::UnreadableHeader);
 }

@@ -11,8 +11,8 @@
 //! as EXIF requires only if the camera's width and height are those of the turned image. After
 //! [`Dataset::undistorted`], images are read with lens distortion removed.
 //!
-//! Scene units are those of the poses; pixel coordinates start at the stored image's top left
-//! corner, so that the first pixel's centre is (0.5, 0.5). All content of files is checked: sizes
+//! Scene units are those of the poses; pixel coordinates start at the top left corner of the image
+//! as read, so that the first pixel's centre is (0.5, 0.5). All content of files is checked: sizes
 //! before allocations, paths before files are opened.
 //!
 //! ```no_run

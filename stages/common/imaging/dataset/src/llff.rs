@@ -104,7 +104,7 @@ fn read_frame(
     let camera_to_world = pose_of(DMat3::from_cols(right, -down, back), centre);
     let mut frame = Frame::new(image, fitted, camera_to_world);
     frame.name = name.to_owned();
-    frame.depths = Some([near, far]);
+    frame.depth_range = Some([near, far]);
     frame.check()?;
     Ok(frame)
 }
@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(frame.name, "IMG_1");
         assert_eq!(frame.camera_to_world, [[1., 0., 0., 1.], [0., 1., 0., 2.], [0., 0., 1., 3.]]);
         assert_eq!(
-            frame.stored_intrinsics,
+            frame.lens_intrinsics,
             Intrinsics {
                 width: 40,
                 height: 30,
@@ -321,12 +321,12 @@ mod tests {
                 distortion: Default::default()
             }
         );
-        assert_eq!(frame.depths, Some([1.5, 9.0]));
+        assert_eq!(frame.depth_range, Some([1.5, 9.0]));
     }
 
     fn distortion_and_notes(folder: &Path) -> (f64, String) {
         let set = Dataset::read(folder).unwrap();
-        (set.frames[0].stored_intrinsics.distortion.radial[0], set.notes.join("; "))
+        (set.frames[0].lens_intrinsics.distortion.radial[0], set.notes.join("; "))
     }
 
     /// `poses_bounds.npy` has no lens distortion; the COLMAP model next to it has.

@@ -62,10 +62,10 @@ const DYNAMIC_PREFIX: &str = "dynamic_mask_";
 /// Finds the masks of frames that don't name one, and adds notes on all masks.
 pub(crate) fn add_masks(folder: &Path, set: &mut Dataset) -> Result<(), DatasetError> {
     let mut listings = Listings::new(folder);
-    let has_masks_folder = matches!(set.format, Format::Llff | Format::Colmap);
+    let may_have_masks_folder = matches!(set.format, Format::Llff | Format::Colmap);
     for frame in set.frames.iter_mut().filter(|frame| frame.mask.is_none()) {
         let Ok(image) = frame.image.strip_prefix(folder) else { continue };
-        let found = find_mask(&mut listings, image, has_masks_folder);
+        let found = find_mask(&mut listings, image, may_have_masks_folder);
         let found = found.map_err(|reason| DatasetError::format(&frame.image, reason))?;
         frame.mask = found.map(|(path, kind)| MaskFile { path: folder.join(path), kind });
     }
@@ -80,13 +80,13 @@ pub(crate) fn add_masks(folder: &Path, set: &mut Dataset) -> Result<(), DatasetE
 fn find_mask(
     listings: &mut Listings,
     image: &Path,
-    has_masks_folder: bool,
+    may_have_masks_folder: bool,
 ) -> Result<Option<(PathBuf, MaskKind)>, LookupError> {
     let (Some(stem), Some(parent)) = (image.file_stem().and_then(|s| s.to_str()), image.parent())
     else {
         return Ok(None);
     };
-    if has_masks_folder {
+    if may_have_masks_folder {
         let mut names = vec![(format!("{stem}.png"), MaskKind::Named)];
         for extension in IMAGE_EXTENSIONS {
             names.push((format!("{stem}{extension}.png"), MaskKind::NamedWithExtension));
@@ -171,12 +171,12 @@ fn size_notes(folder: &Path, frames: &[Frame]) -> Result<Vec<String>, DatasetErr
         if frame.turn == Turn::Upright && stored.is_sideways() {
             (width, height) = (height, width);
         }
-        let k = frame.stored_intrinsics;
+        let k = frame.lens_intrinsics;
         if (width, height) != (k.width, k.height) {
             let path = path_text(mask.path.strip_prefix(folder).unwrap_or(&mask.path));
             let sizes = format!("{path}: {width}×{height} for {}×{}", k.width, k.height);
-            let is_copy = has_aspect_of(&k, width, height);
-            if is_copy { &mut resized } else { &mut distorted }.push(sizes);
+            let has_same_aspect = has_aspect_of(&k, width, height);
+            if has_same_aspect { &mut resized } else { &mut distorted }.push(sizes);
         }
     }
     let mut notes = Vec::new();
@@ -193,9 +193,8 @@ fn size_notes(folder: &Path, frames: &[Frame]) -> Result<Vec<String>, DatasetErr
 }
 
 /// Returns a folder's images without instant-ngp's masks of these images.
-pub(crate) fn without_dynamic_masks(images: Vec<PathBuf>) -> Vec<PathBuf> {
+pub(crate) fn without_dynamic_masks(mut images: Vec<PathBuf>) -> Vec<PathBuf> {
     let stems: BTreeSet<String> = images.iter().map(|path| lowercase_stem(path)).collect();
-    let mut images = images;
     images.retain(|path| {
         let stem = lowercase_stem(path);
         !stem.strip_prefix(DYNAMIC_PREFIX).is_some_and(|masked| stems.contains(masked))

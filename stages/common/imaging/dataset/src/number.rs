@@ -2,7 +2,8 @@ use std::fmt;
 
 use serde::de::{Deserialize, Deserializer, Error, Unexpected, Visitor};
 
-/// Number in a JSON file, including Python's non-finite numbers after [`quote_python_numbers`].
+/// Number in a JSON file, including Python's non-finite numbers, which [`quote_python_numbers`] has
+/// quoted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Number(pub(crate) f64);
 
@@ -47,11 +48,11 @@ impl Visitor<'_> for NumberOrWord {
 /// Puts quotes around Python's `NaN` and `Infinity` outside strings, so that JSON with them can be
 /// parsed; `None` if there are none.
 pub(crate) fn quote_python_numbers(json: &str) -> Option<String> {
-    let (mut text, mut rest, mut is_string) = (String::with_capacity(json.len() + 64), json, false);
+    let (mut text, mut rest, mut in_string) = (String::with_capacity(json.len() + 64), json, false);
     while let Some(next) = rest.chars().next() {
         let word = WORDS
             .iter()
-            .find(|(word, _)| !is_string && rest.starts_with(word))
+            .find(|(word, _)| !in_string && rest.starts_with(word))
             .map(|(word, _)| *word);
         let taken = match (word, next) {
             (Some(word), _) => {
@@ -60,9 +61,9 @@ pub(crate) fn quote_python_numbers(json: &str) -> Option<String> {
                 continue;
             }
             // An escaped quote doesn't end the string.
-            (None, '\\') if is_string => 1 + rest[1..].chars().next().map_or(0, char::len_utf8),
+            (None, '\\') if in_string => 1 + rest[1..].chars().next().map_or(0, char::len_utf8),
             (None, '"') => {
-                is_string = !is_string;
+                in_string = !in_string;
                 1
             }
             (None, other) => other.len_utf8(),

@@ -12,7 +12,7 @@ use scene::{Intrinsics, undistort_image};
 
 use crate::error::{DatasetError, Reason};
 use crate::frame::{Frame, Turn};
-use crate::jpeg::{END_MARKER, Extent, extent};
+use crate::jpeg::{Completeness, END_MARKER, check_completeness};
 use crate::unsupported::unsupported_error;
 
 /// Extensions of supported images.
@@ -20,8 +20,9 @@ pub(crate) const IMAGE_EXTENSIONS: [&str; 4] = [".png", ".jpg", ".jpeg", ".exr"]
 
 /// True if a file's name is that of a supported image.
 pub fn is_image_name(path: &Path) -> bool {
-    let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-    matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "exr"))
+    path.extension().is_some_and(|extension| {
+        IMAGE_EXTENSIONS.iter().any(|known| extension.eq_ignore_ascii_case(&known[1..]))
+    })
 }
 
 pub(crate) fn is_exr(path: &Path) -> bool {
@@ -36,6 +37,7 @@ fn decoder<R: BufRead + Seek + 'static>(
     let guessed = ImageReader::new(file).with_guessed_format();
     let mut reader = guessed.map_err(PixelError::io(path))?;
     let mut limits = Limits::default();
+    // Bytes of 16-bit RGBA.
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
     let reason = match reader.format() {
@@ -137,16 +139,16 @@ fn read_image(path: &Path, turn_upright: bool) -> Result<(Rgba8, Clipping), Pixe
         return read_exr_photograph(path);
     }
     let mut bytes = fs::read(path).map_err(PixelError::io(path))?;
-    let mut has_image_data = true;
+    let mut is_header_readable = true;
     if image::guess_format(&bytes).is_ok_and(|format| format == ImageFormat::Jpeg) {
-        has_image_data =
+        is_header_readable =
             complete_jpeg(&mut bytes).map_err(|reason| PixelError::format(path, reason))?;
     }
     let mut decoder = decoder(Cursor::new(bytes), path)?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut image = DynamicImage::from_decoder(decoder)
         .map_err(|e| PixelError::format(path, format!("incomplete or damaged image ({e})")))?;
-    if !has_image_data {
+    if !is_header_readable {
         return Err(PixelError::format(path, "damaged JPEG: headers and image data don't match"));
     }
     if turn_upright {
@@ -156,21 +158,21 @@ fn read_image(path: &Path, turn_upright: bool) -> Result<(Rgba8, Clipping), Pixe
 }
 
 /// Fails if rows or scans of a JPEG are missing, which its decoder would replace by grey. Adds a
-/// missing end marker, without which the decoder omits the last rows. Returns false if the file has
-/// no scan at all.
+/// missing end marker, without which the decoder omits the last rows. Returns false if the headers
+/// are unreadable.
 fn complete_jpeg(jpeg: &mut Vec<u8>) -> Result<bool, String> {
-    match extent(jpeg) {
-        Extent::Whole => Ok(true),
-        Extent::Unknown => Ok(false),
-        Extent::Unterminated { end } => {
+    match check_completeness(jpeg) {
+        Completeness::Complete => Ok(true),
+        Completeness::UnreadableHeader => Ok(false),
+        Completeness::Unterminated { end } => {
             jpeg.truncate(end);
             jpeg.extend(END_MARKER);
             Ok(true)
         }
-        Extent::Missing { rows, height } => {
+        Completeness::Missing { rows, height } => {
             Err(format!("cut short or damaged: {rows} of {height} rows are missing"))
         }
-        Extent::Coarse { scan, height } => Err(format!(
+        Completeness::Coarse { scan, height } => Err(format!(
             "cut short or damaged in scan {scan} of a progressive JPEG: detail of all {height} \
             rows is missing"
         )),
@@ -198,7 +200,7 @@ fn read_exr_photograph(path: &Path) -> Result<(Rgba8, Clipping), PixelError> {
 /// Encodes a premultiplied linear colour as straight 8-bit sRGB.
 fn encode_pixel(colour: [f32; 3], alpha: f32) -> [u8; 4] {
     if alpha <= 0.0 {
-        return [0, 0, 0, to_u8(alpha)];
+        return [0; 4];
     }
     let [r, g, b] = colour.map(|v| {
         let straight = (v / alpha).clamp(0.0, 1.0);
@@ -236,7 +238,8 @@ fn exceeds_one(colour: [f32; 3], alpha: f32) -> bool {
 
 /// Bytes of an 8-bit RGBA pixel.
 const RGBA_BYTES: u64 = 4;
-/// Additional bytes per pixel while a JPEG is decoded: coefficients of a progressive one.
+/// Additional bytes per pixel while a progressive JPEG is decoded: coefficients of 3 channels with
+/// 2 bytes each. Also counted for other JPEGs and for PNG, as an upper bound.
 const COEFFICIENT_BYTES: u64 = 6;
 
 /// Returns the peak memory in bytes while an image is read, estimated from the image's header.
@@ -267,7 +270,7 @@ impl Frame {
     /// Reads [`Frame::photograph`], and counts its pixels brighter than 1.
     pub fn photograph_and_clipping(&self) -> Result<(Rgba8, Clipping), DatasetError> {
         let (image, clipping) = read_image(&self.image, self.turn == Turn::Upright)?;
-        let k = self.stored_intrinsics;
+        let k = self.lens_intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
             let reason = format!(
                 "image is {}×{} pixels, its camera {}×{}",
@@ -285,7 +288,7 @@ impl Frame {
         let lens = self.intrinsics().lens_mask();
         let Some(file) = &self.mask else { return Ok(lens) };
         let (image, _) = read_image(&file.path, self.turn == Turn::Upright)?;
-        let k = self.stored_intrinsics;
+        let k = self.lens_intrinsics;
         let resized = resize_nearest(&image, (k.width as usize, k.height as usize));
         let mut mask = Mask::of(&self.without_distortion(resized));
         for (i, counts) in mask.counts.iter_mut().enumerate() {
@@ -298,7 +301,7 @@ impl Frame {
     /// Resamples an image of the stored size to the pinhole camera, if distortion is removed.
     fn without_distortion(&self, image: Rgba8) -> Rgba8 {
         match &self.pinhole {
-            Some(pinhole) => undistort_image(&image, &self.stored_intrinsics, pinhole),
+            Some(pinhole) => undistort_image(&image, &self.lens_intrinsics, pinhole),
             None => image,
         }
     }

@@ -6,6 +6,9 @@ use artifact::{format_count, relative_path};
 use crate::error::Reason;
 use crate::lookup::{Located, Lookup, LookupError};
 
+/// Interval of held-out frames, as in LLFF's code.
+const HOLD_OUT_EVERY: usize = 8;
+
 /// Indices of training and test frames.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Split {
@@ -21,10 +24,11 @@ impl Split {
         Self { train: (0..count).collect(), test: (0..count).collect() }
     }
 
-    /// Holds out every `every`-th frame, starting with the first, for testing, as LLFF does. A
-    /// single frame is used for both training and testing.
-    pub fn hold_out(count: usize, every: usize) -> Self {
-        let (test, train): (Vec<_>, Vec<_>) = (0..count).partition(|i| i % every.max(1) == 0);
+    /// Holds out every eighth frame, starting with the first, for testing, as LLFF does. A single
+    /// frame is used for both training and testing.
+    pub fn hold_out(count: usize) -> Self {
+        let (test, train): (Vec<_>, Vec<_>) =
+            (0..count).partition(|i| i.is_multiple_of(HOLD_OUT_EVERY));
         if train.is_empty() { Self::all(count) } else { Self { train, test } }
     }
 }
@@ -139,10 +143,10 @@ mod tests {
 
     #[test]
     fn every_eighth_is_held_out() {
-        let split = Split::hold_out(20, 8);
+        let split = Split::hold_out(20);
         assert_eq!(split.test, [0, 8, 16]);
         assert_eq!(split.train.len(), 17);
-        assert_eq!(Split::hold_out(1, 8), Split::all(1));
-        assert_eq!(Split::hold_out(0, 8), Split::default());
+        assert_eq!(Split::hold_out(1), Split::all(1));
+        assert_eq!(Split::hold_out(0), Split::default());
     }
 }

@@ -170,7 +170,7 @@ mod tests {
         let head = r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1,
             "p2": 0.01, "camera_model": "OPENCV""#;
         let set = read(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
-        let [first, second] = [0, 1].map(|i| set.frames[i].stored_intrinsics);
+        let [first, second] = [0, 1].map(|i| set.frames[i].lens_intrinsics);
         let distortion = Distortion::brown([0.0; 3], [0.0, 0.01]);
         assert_eq!(
             first,
@@ -203,7 +203,7 @@ mod tests {
         let set =
             read(&frames(r#""fl_x": 200, "cx": 80, "cy": 60, "w": 160, "h": 120"#, "")).unwrap();
         assert_eq!(
-            set.frames[0].stored_intrinsics,
+            set.frames[0].lens_intrinsics,
             Intrinsics {
                 width: 40,
                 height: 30,
@@ -229,7 +229,7 @@ mod tests {
 
     fn lens(head: &str) -> Distortion {
         read(&frames(&format!(r#""fl_x": 50, {head}"#), "")).unwrap().frames[0]
-            .stored_intrinsics
+            .lens_intrinsics
             .distortion
     }
 

@@ -65,9 +65,10 @@ fn warning(format: Format, folder: &Path, files: &[PathBuf]) -> Option<String> {
     let look_like = if files.len() == 1 { "looks like a mask" } else { "look like masks" };
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     let remedy = match format {
-        Format::Blender | Format::Transforms => "name masks in their frames' mask_path",
+        Format::Blender | Format::Transforms => "list masks as mask_path of their frames",
         Format::Llff | Format::Colmap => {
-            "name the mask of NAME.EXT masks/NAME.png or masks/NAME.EXT.png"
+            "the mask of a photograph NAME.EXT must be called masks/NAME.png or \
+            masks/NAME.EXT.png"
         }
     };
     Some(format!(

@@ -19,7 +19,7 @@ fn fern_is_read() {
     assert_eq!((set.format, set.frames.len()), (Format::Llff, 20));
     let frame = &set.frames[0];
     assert_eq!(frame.name, "IMG_4026");
-    let k = frame.stored_intrinsics;
+    let k = frame.lens_intrinsics;
     assert_eq!((k.width, k.height, k.cx, k.cy), (4032, 3024, 2016.0, 1512.0));
     assert!((k.fx - 3260.5).abs() < 1.0, "{}", k.fx);
     // All cameras face about the same direction, and are closer together than the near bound.
@@ -27,7 +27,7 @@ fn fern_is_read() {
     for frame in &set.frames {
         let camera = frame.camera();
         assert!(camera.forward().dot(first.forward()) > 0.9, "{}", frame.name);
-        let [near, far] = frame.depths.unwrap();
+        let [near, far] = frame.depth_range.unwrap();
         assert!(
             (camera.centre() - first.centre()).length() < near && near < far,
             "{} {near} {far}",

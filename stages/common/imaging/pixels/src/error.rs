@@ -64,5 +64,6 @@ impl PixelError {
     }
 }
 
-/// Maximum number of pixels of an image. A header with more is usually damaged or hostile.
+/// Maximum number of pixels of an image, chosen by hand. A header with more is usually damaged or
+/// hostile.
 pub const MAX_PIXELS: usize = 1 << 28;

@@ -35,7 +35,7 @@ impl Mask {
                 "mask is {}×{} pixels, its image {width}×{height}",
                 image.width, image.height
             );
-            return Err(PixelError::Format { path: path.to_path_buf(), reason });
+            return Err(PixelError::format(path, reason));
         }
         Ok(Self::of(&image))
     }
@@ -46,8 +46,8 @@ impl Mask {
         Rgba8::new(self.width, self.height, self.counts.iter().flat_map(pixel).collect())
     }
 
-    /// Resizes the mask: a new pixel counts if all old pixels under it and under the `margin` new
-    /// pixels around it count, which are those that the image's kernel reads.
+    /// Resizes the mask: a new pixel counts if all old pixels under it and its neighbours count.
+    /// `margin` is the distance in new pixels up to which neighbours must count, too.
     #[must_use]
     pub fn resized(&self, (width, height): (usize, usize), margin: usize) -> Self {
         // Rows first, then columns: a wide margin stays cheap.

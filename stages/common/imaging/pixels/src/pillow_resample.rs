@@ -66,13 +66,10 @@ fn sinc(x: f64) -> f64 {
 /// Fractional bits of the integer weights, as in Pillow.
 const PRECISION_BITS: u32 = 32 - 8 - 2;
 
-/// Integer weights of one output sample, for inputs `first..first + weights.len()`.
-struct Taps {
-    first: usize,
-    weights: Vec<i32>,
-}
+/// One half, for rounding.
+const HALF: i32 = 1 << (PRECISION_BITS - 1);
 
-/// Returns the first input and the normalised weights of each output.
+/// Returns the run of inputs of each output: the first input, and normalised weights.
 pub(crate) fn coefficients(input: usize, output: usize, filter: Filter) -> Vec<(usize, Vec<f64>)> {
     let scale = input as f64 / output as f64;
     let stretch = scale.max(1.0);
@@ -97,13 +94,10 @@ pub(crate) fn coefficients(input: usize, output: usize, filter: Filter) -> Vec<(
     runs
 }
 
-fn taps(input: usize, output: usize, filter: Filter) -> Vec<Taps> {
+/// Returns [`coefficients`] as integers.
+fn integer_coefficients(input: usize, output: usize, filter: Filter) -> Vec<(usize, Vec<i32>)> {
     let runs = coefficients(input, output, filter).into_iter();
-    runs.map(|(first, weights)| Taps {
-        first,
-        weights: weights.into_iter().map(fixed_point).collect(),
-    })
-    .collect()
+    runs.map(|(first, weights)| (first, weights.into_iter().map(fixed_point).collect())).collect()
 }
 
 fn fixed_point(weight: f64) -> i32 {
@@ -129,12 +123,12 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
     }
     let mut current = premultiplied(image);
     if width != image.width {
-        let taps = taps(image.width, width, filter);
+        let runs = integer_coefficients(image.width, width, filter);
         let mut data = Vec::with_capacity(width * image.height * 4);
         for row in current.data.chunks_exact(image.width * 4) {
-            for tap in &taps {
-                let mut sum = [1 << (PRECISION_BITS - 1); 4];
-                for (pixel, &w) in row.as_chunks::<4>().0[tap.first..].iter().zip(&tap.weights) {
+            for (first, weights) in &runs {
+                let mut sum = [HALF; 4];
+                for (pixel, &w) in row.as_chunks::<4>().0[*first..].iter().zip(weights) {
                     for c in 0..4 {
                         sum[c] += i32::from(pixel[c]) * w;
                     }
@@ -145,14 +139,14 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
         current = Cow::Owned(Rgba8::new(width, image.height, data));
     }
     if height != image.height {
-        let taps = taps(image.height, height, filter);
+        let runs = integer_coefficients(image.height, height, filter);
         let row_len = width * 4;
         let mut data = Vec::with_capacity(height * row_len);
         let mut sums = vec![0i32; row_len];
-        for tap in &taps {
-            sums.fill(1 << (PRECISION_BITS - 1));
-            for (k, &w) in tap.weights.iter().enumerate() {
-                let row = &current.data[(tap.first + k) * row_len..][..row_len];
+        for (first, weights) in &runs {
+            sums.fill(HALF);
+            for (k, &w) in weights.iter().enumerate() {
+                let row = &current.data[(first + k) * row_len..][..row_len];
                 for (sum, &v) in sums.iter_mut().zip(row) {
                     *sum += i32::from(v) * w;
                 }

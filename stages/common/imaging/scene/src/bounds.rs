@@ -2,7 +2,7 @@ use glam::DVec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::space::{Space, power_of_two_below, rounded, rounded_offset, rounding_step};
+use crate::space::{Space, power_of_two_floor, rounded, rounded_offset, rounding_step};
 
 /// Axis-aligned box around the scene, range of its distances along rays, and the field's space.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -50,7 +50,7 @@ impl Bounds {
     /// Returns a unit of length for the scene: half of the longest side, rounded down to a power of
     /// two so that division by the unit is exact.
     pub fn unit(&self) -> f64 {
-        power_of_two_below(0.5 * self.longest_side()).max(f64::MIN_POSITIVE)
+        power_of_two_floor(0.5 * self.longest_side()).max(f64::MIN_POSITIVE)
     }
 
     /// Returns the bounds of the scene moved by a vector.

@@ -4,7 +4,7 @@ use artifact::format_number;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::projection::{MAX_FISHEYE_ANGLE, Projection, ratio, scaled};
+use crate::projection::{MAX_FISHEYE_ANGLE, Projection, fisheye_jacobian, ratio, scaled};
 
 /// Radial and tangential distortion (Brown 1966), as defined by OpenCV and COLMAP. The undistorted
 /// plane position (x, y) is imaged at (x·r + 2·p1·x·y + p2·(ρ + 2x²), y·r + p1·(ρ + 2y²) +
@@ -114,7 +114,7 @@ impl Distortion {
         if self.projection.is_perspective() {
             return [[a, b], [b, c]];
         }
-        let [d, e, f] = self.projection.jacobian(slopes);
+        let [d, e, f] = fisheye_jacobian(slopes);
         [[a * d + b * e, a * e + b * f], [b * d + c * e, b * e + c * f]]
     }
 
@@ -160,7 +160,7 @@ impl Distortion {
         }
         let radius = libm::hypot(distorted[0], distorted[1]);
         let angle = self.undistorted_angle(radius);
-        let radial = scaled(distorted, if radius > 0.0 { angle / radius } else { 1.0 });
+        let radial = scaled(distorted, ratio(angle, radius));
         if self.tangential == [0.0; 2] {
             radial
         } else {
@@ -168,7 +168,8 @@ impl Distortion {
         }
     }
 
-    /// Solves for the undistorted position by Newton's method.
+    /// Solves for the undistorted position by Newton's method. The maximum number of steps and the
+    /// factor of the tolerance are chosen by hand.
     fn solve_position(&self, distorted: [f64; 2], start: [f64; 2]) -> [f64; 2] {
         const MAX_STEPS: usize = 20;
         let [mut x, mut y] = start;
@@ -187,9 +188,9 @@ impl Distortion {
     }
 
     /// Returns the smallest angle whose distorted radius, without tangential terms, is `radius`, or
-    /// [`MAX_FISHEYE_ANGLE`] if there is none below. Newton's method within a bracket: a step that
-    /// leaves the bracket or is longer than half the last one is replaced by bisection, so the loop
-    /// ends.
+    /// [`MAX_FISHEYE_ANGLE`] if no smaller angle has this radius. Newton's method within a bracket:
+    /// a step that leaves the bracket or is longer than half the previous step is replaced by
+    /// bisection, so the loop ends.
     fn undistorted_angle(&self, radius: f64) -> f64 {
         let mut low = 0.0;
         let mut high = 0.0;
@@ -204,8 +205,8 @@ impl Distortion {
             }
         }
         let mut angle = 0.5 * (low + high);
-        let mut last = high - low;
-        while last > f64::EPSILON * high {
+        let mut previous_step = high - low;
+        while previous_step > f64::EPSILON * high {
             let (value, derivative) = self.distorted_radius(angle);
             if value < radius {
                 low = angle;
@@ -213,9 +214,10 @@ impl Distortion {
                 high = angle;
             }
             let newton = angle - (value - radius) / derivative;
-            let is_good = low <= newton && newton <= high && (newton - angle).abs() <= 0.5 * last;
-            let next = if is_good { newton } else { 0.5 * (low + high) };
-            (angle, last) = (next, (next - angle).abs());
+            let is_newton_safe =
+                (low..=high).contains(&newton) && (newton - angle).abs() <= 0.5 * previous_step;
+            let next = if is_newton_safe { newton } else { 0.5 * (low + high) };
+            (angle, previous_step) = (next, (next - angle).abs());
         }
         angle
     }
@@ -244,12 +246,13 @@ impl Distortion {
     }
 
     /// True if a position has exactly one ray: undoing the distortion succeeds, or a fisheye ray is
-    /// cut, and the distortion doesn't fold back between the centre and the position.
+    /// clamped, and the distortion doesn't fold back between the centre and the position.
     pub(crate) fn is_invertible_at(&self, distorted: [f64; 2]) -> bool {
         let position = self.undistorted_position(distorted);
         let [u, v] = self.distorted_position(position);
         let is_found = (u - distorted[0]).abs().max((v - distorted[1]).abs()) < UNDISTORT_TOLERANCE;
-        // All positions with a cut ray share one path, so the path has more samples.
+        // The paths of clamped rays all end at 89°, so samples of different positions don't
+        // complement each other, and each path has more. Both numbers are chosen by hand.
         let samples = if self.is_fisheye() { 64u32 } else { 16 };
         (is_found || self.is_fisheye() && is_at_limit(position))
             && (0..=samples).all(|i| {

@@ -43,21 +43,16 @@ impl Projection {
             }
         }
     }
+}
 
-    /// Returns the Jacobian of [`Projection::plane_position`] (u, v) at slopes (x, y), a symmetric
-    /// matrix: ∂u/∂x, ∂u/∂y and ∂v/∂y.
-    pub(crate) fn jacobian(self, [x, y]: [f64; 2]) -> [f64; 3] {
-        match self {
-            Self::Perspective => [1.0, 0.0, 1.0],
-            Self::Fisheye => {
-                let slope = libm::hypot(x, y);
-                let across = ratio(libm::atan(slope), slope);
-                let excess = 1.0 / (1.0 + slope * slope) - across;
-                let [nx, ny] = [ratio(x, slope), ratio(y, slope)];
-                [across + excess * nx * nx, excess * nx * ny, across + excess * ny * ny]
-            }
-        }
-    }
+/// Returns the Jacobian of a fisheye lens's [`Projection::plane_position`] (u, v) at slopes (x, y),
+/// a symmetric matrix: ∂u/∂x, ∂u/∂y and ∂v/∂y.
+pub(crate) fn fisheye_jacobian([x, y]: [f64; 2]) -> [f64; 3] {
+    let slope = libm::hypot(x, y);
+    let across = ratio(libm::atan(slope), slope);
+    let excess = 1.0 / (1.0 + slope * slope) - across;
+    let [nx, ny] = [ratio(x, slope), ratio(y, slope)];
+    [across + excess * nx * nx, excess * nx * ny, across + excess * ny * ny]
 }
 
 /// Multiplies both coordinates.

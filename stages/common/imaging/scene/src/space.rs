@@ -21,9 +21,9 @@ pub enum Space {
 }
 
 /// Frustum of a virtual camera between two planes. A point (X, Y, Z) in camera space, Z the depth,
-/// has projective coordinates (X/Z, Y/Z) between `min` and `max` and disparity 1/Z between `1/far`
-/// and `1/near`. Straight lines stay straight. Equal steps along a line in the cube are shorter in
-/// the world near the camera, where images resolve more.
+/// has slopes (X/Z, Y/Z) between `min` and `max` and disparity 1/Z between `1/far` and `1/near`.
+/// Straight lines stay straight. Equal steps along a line in the cube are shorter in the world near
+/// the camera, where images resolve more.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Frustum {
@@ -115,19 +115,19 @@ impl Frustum {
     }
 }
 
-/// Relative size of a rounding step, 2⁻²⁶ (docs/design/004): a quarter of single precision in the
-/// unit cube, and far above the rounding errors of f64, even a million scene sizes from the origin.
+/// Relative size of a rounding step, 2⁻²⁶ (docs/design/004): a quarter of the f32 spacing just below
+/// 1, and far above the rounding errors of f64, even a million scene sizes from the origin.
 const STEP: f64 = 1.0 / 67_108_864.0;
 
 /// Returns the largest power of two not above a positive number; 0 for subnormal numbers.
-pub fn power_of_two_below(value: f64) -> f64 {
+pub fn power_of_two_floor(value: f64) -> f64 {
     const EXPONENT: u64 = 0x7ff0_0000_0000_0000;
     f64::from_bits(value.to_bits() & EXPONENT)
 }
 
 /// Returns the step to which lengths of a magnitude are rounded.
 pub(crate) fn rounding_step(magnitude: f64) -> f64 {
-    STEP * power_of_two_below(magnitude)
+    STEP * power_of_two_floor(magnitude)
 }
 
 /// Returns the nearest multiple of a step; the number itself if the step is 0.

@@ -6,7 +6,7 @@ use std::path::Path;
 use crate::text::printable;
 use crate::type_words::in_words;
 
-/// Error, by the user's next step; each kind has its exit code.
+/// Error that a program exits with. The kind, and so the exit code, tells the user what to change.
 #[derive(Debug, thiserror::Error)]
 pub enum Failure {
     /// Wrong arguments or parameters: exit code 2.
@@ -56,8 +56,8 @@ pub fn exit_code(error: &anyhow::Error) -> u8 {
     error.chain().find_map(|cause| cause.downcast_ref::<Failure>()).map_or(1, Failure::exit_code)
 }
 
-/// Formats an error and its causes on one line, with types in English and control characters
-/// escaped.
+/// Formats an error and its causes on one line, with serde's type names in plain words and control
+/// characters escaped.
 pub fn one_line(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {

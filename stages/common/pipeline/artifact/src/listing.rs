@@ -8,8 +8,8 @@ use std::path::{Component, Path, PathBuf};
 
 use crate::text::shortened;
 
-/// Lists all files below a folder, sorted by name. Follows symbolic links. Fails for a link to one
-/// of its own parents, and for a FIFO, socket or device, since reading one may block forever.
+/// Lists all files below a folder, sorted by name. Follows symbolic links. Fails for a link to a
+/// folder that contains it, and for a FIFO, socket or device, since reading one may block forever.
 pub fn list_files(folder: &Path) -> io::Result<ListedFiles> {
     list_unless(folder, |_| false)
 }
@@ -31,7 +31,8 @@ pub fn list_source_files(folder: &Path) -> io::Result<(ListedFiles, Vec<PathBuf>
     Ok((files, ignored))
 }
 
-/// Lists the files below a folder for which `is_excluded` is false.
+/// Lists the files below a folder for which `is_excluded` is false. Errors of excluded paths, such
+/// as dangling links, are ignored.
 fn list_unless(
     folder: &Path,
     mut is_excluded: impl FnMut(&Path) -> bool,
@@ -47,19 +48,21 @@ fn list_unless(
             continue;
         }
         let entry = entry.map_err(|error| match (error.path(), error.loop_ancestor()) {
-            (Some(link), Some(parent)) => io::Error::other(format!(
-                "{link:?} is a link to its own parent {parent:?}; remove the link"
+            (Some(link), Some(folder)) => io::Error::other(format!(
+                "{link:?} is a link to {folder:?}, a folder that contains it; remove the link"
             )),
             _ => io::Error::from(error),
         })?;
-        if entry.file_type().is_file() {
+        let kind = entry.file_type();
+        if kind.is_file() {
             let relative =
                 entry.path().strip_prefix(folder).map_err(io::Error::other)?.to_path_buf();
             found.push((relative, entry.into_path()));
-        } else if !entry.file_type().is_dir() {
-            let path = entry.path();
+        } else if !kind.is_dir() {
             return Err(io::Error::other(format!(
-                "{path:?} is a FIFO, socket or device, which cannot be hashed; remove it"
+                "{:?} is {}, which cannot be hashed; remove it",
+                entry.path(),
+                file_kind(kind)
             )));
         }
     }
@@ -143,22 +146,24 @@ pub fn file_kind(file_type: FileType) -> &'static str {
     }
 }
 
-/// Error returned for a path that is empty or leaves its folder.
+/// Error returned for a path that is empty, contains NUL or leaves its folder.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{:?} is not a path inside the folder", shortened(.0))]
 pub struct PathError(String);
 
-/// Parses a relative, `/`-separated path from a file that may be hostile. Fails if the path could
-/// leave its folder.
+/// Parses a relative, `/`-separated path from a file that may be hostile. Fails if the path is
+/// empty, contains NUL or could leave its folder.
 pub fn relative_path(text: &str) -> Result<PathBuf, PathError> {
     let path = Path::new(text);
     let stays_inside =
         path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
-    if text.is_empty() || !stays_inside || text.contains('\0') {
+    let inside: PathBuf =
+        path.components().filter(|part| matches!(part, Component::Normal(_))).collect();
+    if inside.as_os_str().is_empty() || !stays_inside || text.contains('\0') {
         // A hostile file may consist of one long path.
         return Err(PathError(text.chars().take(200).collect()));
     }
-    Ok(path.components().filter(|part| matches!(part, Component::Normal(_))).collect())
+    Ok(inside)
 }
 
 #[cfg(test)]
@@ -183,7 +188,10 @@ mod tests {
         let dir = example();
         symlink(dir.path(), dir.path().join("train/loop")).unwrap();
         let message = list_files(dir.path()).unwrap_err().to_string();
-        assert!(message.contains("train/loop") && message.contains("its own parent"), "{message}");
+        assert!(
+            message.contains("train/loop") && message.contains("a folder that contains it"),
+            "{message}"
+        );
     }
 
     /// Dangling links and editors' files are ignored in a user's folder, but not in an artifact.

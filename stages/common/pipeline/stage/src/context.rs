@@ -68,11 +68,15 @@ impl Context {
         write_json(&path, value).with_context(|| format!("cannot write {}", path.display()))
     }
 
+    /// Writes a text file to the output.
+    pub fn write_text(&self, file: &str, text: &str) -> anyhow::Result<()> {
+        let path = self.output_path(file)?;
+        fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
+    }
+
     /// Writes the summary that the runner prints at the end.
     pub fn write_summary(&self, text: &str) -> anyhow::Result<()> {
-        let path = self.output_path(SUMMARY_FILE)?;
-        fs::write(&path, format!("{}\n", text.trim_end()))
-            .with_context(|| format!("cannot write {}", path.display()))
+        self.write_text(SUMMARY_FILE, &format!("{}\n", text.trim_end()))
     }
 
     /// Returns the folder for checkpoints, if given.

@@ -16,6 +16,8 @@
 //! The crate knows neither images nor tensors nor the store. Artifacts and failures are in
 //! `artifact`.
 //!
+//! [`main!`] expands to this example's function `main`, with the code's fingerprint:
+//!
 //! ```no_run
 //! use stage::{Context, Output, Stage, run_stage};
 //!

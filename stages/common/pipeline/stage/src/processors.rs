@@ -1,6 +1,5 @@
 use std::fmt;
 use std::fs;
-use std::path::Path;
 
 /// Environment variables with the number of a Slurm task's or job's processors. Slurm restricts
 /// neither affinity nor quota unless its task plugins do.
@@ -48,44 +47,44 @@ impl fmt::Display for ProcessorLimit {
 /// println!("{} threads: {}", processors.count, processors.limit);
 /// ```
 pub fn processors() -> Processors {
-    // Affinity and quota together.
-    let available = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    let allowed = allowed_processors().unwrap_or(available);
-    let online = online_processors().unwrap_or(allowed);
+    let by_affinity_and_quota =
+        std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    let by_affinity = processors_by_affinity().unwrap_or(by_affinity_and_quota);
+    let online = online_processors().unwrap_or(by_affinity);
     let slurm = SLURM_VARIABLES
         .iter()
         .find_map(|&name| Some((name, std::env::var(name).ok()?.parse().ok().filter(|&n| n > 0)?)));
-    least_limit(online, allowed, available, slurm)
+    least_limit(online, by_affinity, by_affinity_and_quota, slurm)
 }
 
 /// Returns the least of several numbers of processors, with its limit: online ones, those of the
 /// affinity, those of affinity and quota, and those of Slurm.
 fn least_limit(
     online: usize,
-    allowed: usize,
-    available: usize,
+    by_affinity: usize,
+    by_affinity_and_quota: usize,
     slurm: Option<(&'static str, usize)>,
 ) -> Processors {
     let limit = match slurm {
-        Some((variable, count)) if count < available => {
+        Some((variable, count)) if count < by_affinity_and_quota => {
             return Processors { count, limit: ProcessorLimit::Slurm(variable) };
         }
-        _ if available < allowed => ProcessorLimit::Quota,
-        _ if available < online => ProcessorLimit::Affinity,
+        _ if by_affinity_and_quota < by_affinity => ProcessorLimit::Quota,
+        _ if by_affinity_and_quota < online => ProcessorLimit::Affinity,
         _ => ProcessorLimit::Machine,
     };
-    Processors { count: available, limit }
+    Processors { count: by_affinity_and_quota, limit }
 }
 
 /// Returns the number of processors in the CPU affinity of this process.
-fn allowed_processors() -> Option<usize> {
+fn processors_by_affinity() -> Option<usize> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     count_listed(status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:"))?)
 }
 
 /// Returns the number of the machine's processors.
 fn online_processors() -> Option<usize> {
-    count_listed(&fs::read_to_string(Path::new("/sys/devices/system/cpu/online")).ok()?)
+    count_listed(&fs::read_to_string("/sys/devices/system/cpu/online").ok()?)
 }
 
 /// Counts the numbers of a kernel's list, such as `0-3,8`; `None` if malformed.

@@ -27,7 +27,7 @@ use crate::signals::{EndClaim, stop_on_signals};
 use crate::stage::Stage;
 use crate::staging::Staging;
 
-/// Environment variable with the runner's process id, which tells a stage to watch its runner.
+/// Environment variable that is set if a runner reads the stage's stdout.
 pub const RUNNER_VARIABLE: &str = "NERF_SR_RUNNER";
 
 /// Runs a stage as a program: parses the arguments, checks and runs the stage, publishes the

@@ -42,8 +42,9 @@ impl Staging {
 
     /// Renames the folder to its final name.
     pub(crate) fn publish(self, output: &Path) -> anyhow::Result<()> {
-        fs::rename(&self.folder, output)
-            .with_context(|| format!("cannot write {}", output.display()))
+        fs::rename(&self.folder, output).with_context(|| {
+            format!("cannot rename {} to {}", self.folder.display(), output.display())
+        })
     }
 }
 

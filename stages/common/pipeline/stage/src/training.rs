@@ -14,7 +14,7 @@ pub trait Training {
     /// Returns the number of steps taken.
     fn steps(&self) -> u64;
 
-    /// Takes a step. Returns the error before the step, or `None` after the last step.
+    /// Takes a step. Returns the loss before the step, or `None` after the last step.
     fn step(&mut self) -> anyhow::Result<Option<f64>>;
 
     /// Writes a checkpoint, from which the training resumes. The caller makes the write atomic.
@@ -25,24 +25,24 @@ pub trait Training {
 }
 
 impl Context {
-    /// Trains to the end, from the checkpoint of an earlier run if there is one. `format_error`
-    /// formats a mean error for the progress bar.
+    /// Trains to the end, from the checkpoint of an earlier run if there is one. `format_loss`
+    /// formats a mean loss for the progress bar.
     pub fn train(
         &self,
-        steps: u64,
+        total_steps: u64,
         training: &mut impl Training,
-        format_error: impl Fn(f64) -> String,
+        format_loss: impl Fn(f64) -> String,
     ) -> anyhow::Result<()> {
         let checkpoint = self.work().map(|work| work.join("checkpoint.safetensors"));
         if let Some(path) = checkpoint.as_deref().filter(|path| path.exists()) {
             self.log_line(resume(training, path));
         }
-        let progress = self.progress("training", steps);
+        let progress = self.progress("training", total_steps);
         take_steps(
             training,
             checkpoint.as_deref(),
             || self.is_interrupted(),
-            |done, mean| progress.set(done, &format_error(mean)),
+            |done, mean| progress.set(done, &format_loss(mean)),
         )
     }
 }
@@ -56,7 +56,7 @@ fn resume(training: &mut impl Training, checkpoint: &Path) -> String {
 }
 
 /// Takes the remaining steps and writes checkpoints. Writes a last checkpoint and fails if the run
-/// is interrupted. `report` gets the number of steps and the mean error since the last report.
+/// is interrupted. `report` gets the number of steps and the mean loss since the last report.
 fn take_steps(
     training: &mut impl Training,
     checkpoint: Option<&Path>,
@@ -70,8 +70,8 @@ fn take_steps(
         schedule.write_if_due(interrupted(), || {
             checkpoint.map_or(Ok(()), |path| write_checkpoint(training, path))
         })?;
-        let Some(error) = training.step()? else { return Ok(()) };
-        sum += error;
+        let Some(loss) = training.step()? else { return Ok(()) };
+        sum += loss;
         count += 1;
         if count == STEPS_PER_REPORT || last_report.elapsed() > MAX_REPORT_INTERVAL {
             report(training.steps(), sum / count as f64);
@@ -99,7 +99,7 @@ mod tests {
 
     const STEPS: u64 = 120;
 
-    /// Training whose errors are 1, 2, 3, …; its checkpoint is the number of steps as text.
+    /// Training whose losses are 1, 2, 3, …; its checkpoint is the number of steps as text.
     #[derive(Default)]
     struct CountingTraining {
         steps: u64,

@@ -3,10 +3,11 @@
 pub struct TrainingMemory {
     /// Field, optimiser state, and the copy that a checkpoint is written from.
     pub field: u64,
-    /// Packed photographs and cached HR pixels; those beyond `MAX_PIXEL_BYTES` are in a file.
+    /// Packed photographs and cached HR pixels; those beyond [`Self::MAX_PIXEL_BYTES`] are in a
+    /// file.
     pub pixels: u64,
     /// Photographs in the form that pose refinement compares.
-    pub poses: u64,
+    pub pose_images: u64,
     /// Buffers for reading the largest photograph, which are freed before the field is created.
     pub reading: u64,
 }
@@ -25,10 +26,8 @@ pub struct PixelStorage {
     pub refines_poses: bool,
 }
 
-/// Maximum bytes of pixels in memory, so that a stage with many photographs leaves memory to other
-/// programs (design note 038).
-const MAX_PIXEL_BYTES: u64 = 4_000_000_000;
-/// Numbers of 32 bits per parameter of the grid: value, gradient, moments, moving average.
+/// Numbers of 32 bits per parameter of the grid: value, gradient, both moments in one number
+/// (design note 006), moving average.
 const NUMBERS_PER_PARAMETER: u64 = 4;
 /// Numbers per parameter that a checkpoint copies: all but the gradient.
 const COPIED_NUMBERS_PER_PARAMETER: u64 = 3;
@@ -41,20 +40,21 @@ const BYTES_PER_RGB_PIXEL: u64 = 12;
 const BYTES_PER_PYRAMID_PIXEL: u64 = 16 + BYTES_PER_RGB_PIXEL;
 
 impl TrainingMemory {
-    /// Maximum bytes of pixels in memory; further pixels are in a file.
-    pub const MAX_PIXEL_BYTES: u64 = MAX_PIXEL_BYTES;
+    /// Maximum bytes of pixels in memory, so that a stage with many photographs leaves memory to
+    /// other programs (design note 038); further pixels are in a file.
+    pub const MAX_PIXEL_BYTES: u64 = 4_000_000_000;
 
     /// Adds an LR photograph, with the size of its HR image.
     pub fn add_photograph(&mut self, storage: PixelStorage, size: ImageSize, hr_size: ImageSize) {
-        let cached = if storage.has_cache { hr_size.0 * hr_size.1 } else { 0 };
+        let hr_pixels = if storage.has_cache { hr_size.0 * hr_size.1 } else { 0 };
         // Buffers of the image enlarged along one axis (floats) and both (floats and 8 bits).
-        let enlarged = if storage.has_cache {
-            BYTES_PER_RGB_PIXEL * hr_size.0 * size.1 + (BYTES_PER_RGB_PIXEL + 3) * cached
+        let enlarging_bytes = if storage.has_cache {
+            BYTES_PER_RGB_PIXEL * hr_size.0 * size.1 + (BYTES_PER_RGB_PIXEL + 3) * hr_pixels
         } else {
             0
         };
-        self.pixels += 3 * cached;
-        self.add(storage, size, enlarged);
+        self.pixels += 3 * hr_pixels;
+        self.add(storage, size, enlarging_bytes);
     }
 
     /// Adds an HR reference.
@@ -62,32 +62,32 @@ impl TrainingMemory {
         self.add(storage, size, 0);
     }
 
-    fn add(&mut self, storage: PixelStorage, (width, height): ImageSize, enlarged: u64) {
-        let pixels = width * height;
+    fn add(&mut self, storage: PixelStorage, (width, height): ImageSize, enlarging_bytes: u64) {
+        let count = width * height;
         let packed = if storage.is_opaque { 3 } else { 4 };
         // Two bits per pixel: whether the pixel is masked, and whether it has detail.
-        self.pixels += packed * pixels + pixels / 4;
-        let reading = (BYTES_PER_RGBA_PIXEL + BYTES_PER_RGB_PIXEL) * pixels + enlarged;
+        self.pixels += packed * count + count / 4;
+        let reading = (BYTES_PER_RGBA_PIXEL + BYTES_PER_RGB_PIXEL) * count + enlarging_bytes;
         self.reading = self.reading.max(reading);
         if storage.refines_poses {
-            self.poses += BYTES_PER_PYRAMID_PIXEL * pixels;
+            self.pose_images += BYTES_PER_PYRAMID_PIXEL * count;
         }
     }
 
     /// Returns the bytes needed with all pixels in the file; `program` is from [`program_bytes`].
     pub fn minimum(&self, program: u64) -> u64 {
-        program + self.poses + self.field.max(self.reading)
+        program + self.pose_images + self.field.max(self.reading)
     }
 
     /// Returns the bytes needed with unlimited memory; `program` is from [`program_bytes`].
     pub fn total(&self, program: u64) -> u64 {
-        self.minimum(program) + self.pixels.min(MAX_PIXEL_BYTES)
+        self.minimum(program) + self.pixels.min(Self::MAX_PIXEL_BYTES)
     }
 }
 
 /// Returns the bytes that a training needs besides field, poses and pixels, with or without
 /// libtorch: for the program, the samples of a step and a checkpoint's file. Measured with small
-/// scenes, and without libtorch with the demo scene.
+/// scenes, and without libtorch with the demo scene; the command isn't recorded.
 pub const fn program_bytes(has_torch: bool) -> u64 {
     if has_torch { 175_000_000 } else { 60_000_000 }
 }
@@ -114,7 +114,7 @@ mod tests {
                     memory.add_photograph(storage, (2000, 1500), (4000, 3000));
                     assert_eq!(memory.pixels, count * (3_000_000 * bytes + 750_000));
                     let poses = if refines_poses { 3_000_000 * BYTES_PER_PYRAMID_PIXEL } else { 0 };
-                    assert_eq!(memory.poses, count * poses);
+                    assert_eq!(memory.pose_images, count * poses);
                 }
                 let reading = memory.reading;
                 memory.add_reference(storage, (100, 10));
@@ -126,10 +126,10 @@ mod tests {
 
     #[test]
     fn the_larger_of_field_and_reading_counts() {
-        let memory = TrainingMemory { field: 7, pixels: 100, poses: 3, reading: 9 };
+        let memory = TrainingMemory { field: 7, pixels: 100, pose_images: 3, reading: 9 };
         assert_eq!((memory.minimum(10), memory.total(10)), (22, 122));
-        let many = TrainingMemory { pixels: 2 * MAX_PIXEL_BYTES, ..memory };
-        assert_eq!(many.total(10), 22 + MAX_PIXEL_BYTES);
+        let many = TrainingMemory { pixels: 2 * TrainingMemory::MAX_PIXEL_BYTES, ..memory };
+        assert_eq!(many.total(10), 22 + TrainingMemory::MAX_PIXEL_BYTES);
         assert_eq!([false, true].map(|copied| grid_training_bytes(10, copied)), [160, 280]);
     }
 }

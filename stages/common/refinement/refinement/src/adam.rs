@@ -6,8 +6,9 @@ use tch::Tensor;
 use crate::error::RefinementError;
 use crate::refiner::Refiner;
 
-/// Adam (Kingma and Ba 2015) with PyTorch's defaults: β 0.9 and 0.999, ε 1e-8. `nets::Adam`, on
-/// libtorch's tensors, needs ten calls per parameter, a tenth of a step of so small a network.
+/// Adam (Kingma and Ba 2015) with PyTorch's defaults: β 0.9 and 0.999, ε 1e-8. `nets::Adam` makes
+/// about ten libtorch calls per parameter, which take a tenth of a step's time because the network
+/// is small.
 #[derive(Debug)]
 pub(crate) struct Adam {
     /// First and second moments of each parameter.
@@ -17,7 +18,7 @@ pub(crate) struct Adam {
 
 const BETA: [f64; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-8;
-/// Name of the checkpoint's number of updates.
+/// Name of the number of updates in a checkpoint, as in those of `nets::Adam`.
 const UPDATES: &str = "counts";
 /// Prefixes of a parameter's moments in a checkpoint.
 const MOMENTS: [&str; 2] = ["first", "second"];
@@ -39,16 +40,16 @@ impl Adam {
         self.updates += 1;
         let t = i32::try_from(self.updates).unwrap_or(i32::MAX);
         let [beta1, beta2] = BETA.map(|beta| beta as f32);
-        let [rest1, rest2] = BETA.map(|beta| (1.0 - beta) as f32);
+        let [one_minus_beta1, one_minus_beta2] = BETA.map(|beta| (1.0 - beta) as f32);
         let corrections = BETA.map(|beta| 1.0 - beta.powi(t));
         let rate = (rate / corrections[0]) as f32;
-        let root = corrections[1].sqrt() as f32;
+        let sqrt_correction = corrections[1].sqrt() as f32;
         for (i, [first, second]) in self.moments.iter_mut().enumerate() {
             let parameter = refiner.parameters[i].iter_mut().zip(&gradients[i]);
             for ((p, g), (m, v)) in parameter.zip(first.iter_mut().zip(second)) {
-                *m = beta1 * *m + rest1 * g;
-                *v = beta2 * *v + rest2 * g * g;
-                *p -= rate * *m / (v.sqrt() / root + EPSILON);
+                *m = beta1 * *m + one_minus_beta1 * g;
+                *v = beta2 * *v + one_minus_beta2 * g * g;
+                *p -= rate * *m / (v.sqrt() / sqrt_correction + EPSILON);
             }
         }
     }

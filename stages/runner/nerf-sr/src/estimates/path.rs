@@ -1,4 +1,4 @@
-//! Frames along a `camera-path`, before the path exists.
+//! Frames of a `camera-path` stage, before it has run.
 
 use std::path::Path;
 
@@ -20,7 +20,7 @@ struct PathFile {
 }
 
 /// Returns the frames of a path that `camera-path` computes: as large as the scene's HR images,
-/// unless their width is given.
+/// unless parameter `size` gives the frames' width.
 pub(super) fn computed(parameters: &Value, scene: &SceneImages) -> Option<Images> {
     let count = parameters["frames"].as_u64()?;
     Some(frames(count, scene.images("train-cameras")?.largest_size, parameters))

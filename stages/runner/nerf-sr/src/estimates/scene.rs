@@ -4,20 +4,21 @@ use std::path::Path;
 
 use artifact::format_count;
 use dataset::{Dataset, Format, Frame, Split};
+use pixels::DEGRADATION_FILE;
+use scene::VIEWS_FILE;
 use serde_json::Value;
 use workload::preparation_bytes;
 
 use super::work::{Images, SceneKind};
 
-/// Test views of a data set without a split: every eighth (`prep`'s `split: holdout`).
-const HOLDOUT: usize = 8;
 /// Width of the field's cube in NDC, in widths of an LR image, before the frustum is known: that of
 /// `fern`.
 const NDC_WIDTHS: f64 = 1.35;
 /// Width of the field's cube in a contraction, in widths of an LR image, as in `train-ss`.
 const CONTRACTION_WIDTHS: f64 = 2.0;
-/// Bytes per pixel of reading an 8-bit image, as in `dataset`.
-const READING_BYTES: u64 = 14;
+/// Bytes per pixel of reading an RGBA PNG, as in `dataset`: the decoder's pixels, the image's, and
+/// the coefficients of a JPEG, which `dataset` adds for every format.
+const READING_BYTES: u64 = 4 + 4 + 6;
 
 /// Images of a scene, by the folders of the artifact that `prep` creates.
 #[derive(Clone, Debug)]
@@ -61,7 +62,7 @@ impl SceneImages {
             folders: Vec::new(),
         };
         for folder in FOLDERS {
-            let Ok(bytes) = std::fs::read(artifact.join(folder).join("views.json")) else {
+            let Ok(bytes) = std::fs::read(artifact.join(folder).join(VIEWS_FILE)) else {
                 continue;
             };
             let views: Value = serde_json::from_slice(&bytes).ok()?;
@@ -74,9 +75,9 @@ impl SceneImages {
             });
             scene.folders.push((folder, images_of(&sizes.collect::<Option<Vec<_>>>()?)));
         }
-        if let Ok(bytes) = std::fs::read(artifact.join("train").join("degradation.json")) {
+        if let Ok(bytes) = std::fs::read(artifact.join("train").join(DEGRADATION_FILE)) {
             let degradation: Value = serde_json::from_slice(&bytes).ok()?;
-            scene.has_box_kernel = is_box(&degradation["kernel"], false);
+            scene.has_box_kernel = is_mean_kernel(&degradation["kernel"], false);
         }
         Some(scene)
     }
@@ -86,12 +87,14 @@ impl SceneImages {
         let set = Dataset::read(folder).ok()?;
         let all = set.frames.len();
         let split = match (parameters["split"].as_str(), set.split) {
+            // Approximate: `prep` removes the references from these test views.
             (Some("paper"), _) => Split::all(all),
-            (Some("holdout"), _) | (_, None) => Split::hold_out(all, HOLDOUT),
+            (Some("holdout"), _) | (_, None) => Split::hold_out(all),
             (_, Some(split)) => split,
         };
         let background = parameters["background"].as_str();
-        // Only Blender's images are taken as objects; `prep` also examines images with alpha.
+        // Only Blender's images are taken as objects. `prep` would also take images with alpha as
+        // objects; their pixels aren't read here.
         let is_object = set.format == Format::Blender;
         let is_opaque = background.map_or(!is_object, |background| background == "opaque");
         let space = parameters["space"].as_str();
@@ -154,6 +157,8 @@ impl SceneImages {
             let scaled = indices.iter().map(|&i| (sizes[i].0 * factor, sizes[i].1 * factor));
             images_of(&scaled.collect::<Vec<_>>())
         };
+        // `prep` spreads test views and references over all views; which views are taken matters
+        // only if their sizes differ.
         let test: Vec<usize> = split.test.iter().copied().take(max_test).collect();
         let references = number("hr_references").filter(|_| is_downscaled).unwrap_or(0.0) as usize;
         let references = &split.train[..references.min(split.train.len())];
@@ -169,7 +174,7 @@ impl SceneImages {
         Self {
             kind: *kind,
             widths_across: *widths_across,
-            has_box_kernel: is_box(&parameters["kernel"], !is_downscaled),
+            has_box_kernel: is_mean_kernel(&parameters["kernel"], !is_downscaled),
             photographs: images(&read, 1.0),
             preparation_bytes: preparation.max().unwrap_or(0),
             folders: vec![
@@ -240,7 +245,7 @@ fn planned_widths_across(kind: SceneKind, space: Option<&str>) -> f64 {
 }
 
 /// Returns whether a kernel is a mean, or `by_default` if no kernel is given.
-fn is_box(kernel: &Value, by_default: bool) -> bool {
+fn is_mean_kernel(kernel: &Value, by_default: bool) -> bool {
     kernel.as_str().map_or(by_default, |kernel| kernel != "lanczos" && kernel != "bicubic")
 }
 
@@ -303,7 +308,7 @@ mod tests {
             kind: SceneKind::Unbounded,
             widths_across: 2.0,
             sizes: vec![(640.0, 480.0); 9],
-            split: Split::hold_out(9, HOLDOUT),
+            split: Split::hold_out(9),
             is_benchmark: false,
         };
         let scene = SceneImages::from_plan(&planned, &json!({"scale": 2}), |_| 7);
@@ -332,7 +337,7 @@ mod tests {
             let views = json!({
                 "background": "opaque", "bounds": {"space": space}, "views": [view, view],
             });
-            std::fs::write(train.join("views.json"), views.to_string()).unwrap();
+            std::fs::write(train.join(VIEWS_FILE), views.to_string()).unwrap();
             SceneImages::of_artifact(folder.path()).unwrap()
         };
         let scene = scene_in(json!("contraction"));
@@ -341,7 +346,7 @@ mod tests {
         assert_eq!(scene.images("train"), Some(images));
         let scene = scene_in(json!({"ndc": {"min": [-0.5, -0.25], "max": [0.5, 0.25]}}));
         assert_eq!((scene.kind, scene.widths_across), (SceneKind::Frustum, 1.5));
-        std::fs::write(train.join("views.json"), "{").unwrap();
+        std::fs::write(train.join(VIEWS_FILE), "{").unwrap();
         assert!(SceneImages::of_artifact(folder.path()).is_none());
     }
 }

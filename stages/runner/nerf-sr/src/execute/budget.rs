@@ -8,9 +8,9 @@ use serde_json::{Map, Value};
 use stage::{ProcessorLimit, Processors, machine_memory, processors};
 use store::Record;
 
-/// Maximum number of threads or stages per core. A larger number would only cost memory and time;
-/// chosen by hand.
-const MAX_THREADS_PER_CORE: usize = 4;
+/// Maximum number of threads, and of stages, per core. A larger number would only cost memory and
+/// time; chosen by hand.
+const MAX_PER_CORE: usize = 4;
 /// Maximum number of stages at once without `--jobs`; chosen by hand.
 const DEFAULT_MAX_STAGES: usize = 4;
 
@@ -36,6 +36,7 @@ impl Demand {
         let measured =
             records.iter().filter(|record| record.peak_memory.is_some() && record.stage == stage);
         let Some(record) = nearest_record(key_parts, measured) else { return DEFAULT_DEMAND };
+        // Short stages may have measured 0 seconds; the minimum was chosen by hand.
         let seconds = record.seconds.max(1e-3);
         let cores = record.processor_seconds.map_or(1, |busy| (busy / seconds).round() as usize);
         Self { cores: cores.max(1), memory: record.peak_memory.unwrap_or(0) }
@@ -47,12 +48,12 @@ impl Demand {
 pub(crate) struct Budget {
     /// Maximum number of stages.
     pub(crate) stages: usize,
-    /// Number of cores of all stages, and number of threads of each stage: the operating system
+    /// Cores of all stages together; also each stage's number of threads. The operating system
     /// divides the cores among the stages, and a stage that runs alone uses all cores.
-    pub(crate) threads: usize,
+    pub(crate) cores: usize,
     /// Memory in bytes.
     pub(crate) memory: u64,
-    /// Limit that makes `threads` less than the machine's number of processors, such as a cgroup;
+    /// Limit that makes `cores` less than the machine's number of processors, such as a cgroup;
     /// `None` if there is no such limit, or with `--threads`.
     pub(crate) limit: Option<ProcessorLimit>,
 }
@@ -70,7 +71,7 @@ impl Budget {
         let Processors { count: cores, limit } = processors();
         Ok(Self {
             stages: capped("--jobs", jobs.unwrap_or(cores.min(DEFAULT_MAX_STAGES)), cores),
-            threads: capped("--threads", threads.unwrap_or(cores), cores),
+            cores: capped("--threads", threads.unwrap_or(cores), cores),
             memory: memory.or_else(machine_memory).unwrap_or(u64::MAX),
             limit: Some(limit)
                 .filter(|&limit| threads.is_none() && limit != ProcessorLimit::Machine),
@@ -80,21 +81,21 @@ impl Budget {
     /// Returns the line that names a limit below the machine's number of processors.
     pub(crate) fn limit_line(&self) -> Option<String> {
         let limit = self.limit?;
-        Some(format!("nerf-sr: {}: {limit}", format_count(self.threads, "thread")))
+        Some(format!("nerf-sr: {}: {limit}", format_count(self.cores, "thread")))
     }
 
     /// Decides whether a stage may start next to the running ones: a slot, a core and its memory
     /// must be free. One free core is enough for a stage of several threads.
     pub(crate) fn admission(&self, running: &BTreeMap<usize, Demand>, demand: Demand) -> Admission {
-        let (needed, limit) = (format_size(demand.memory), format_size(self.memory));
+        let (needed, memory_limit) = (format_size(demand.memory), format_size(self.memory));
         if demand.memory > self.memory {
             return Admission::TooLarge(format!(
                 "needs {needed} of memory, as in its most similar earlier run, but the limit is \
-                {limit}; change the limit with --memory"
+                {memory_limit}; change the limit with --memory"
             ));
         }
-        let cores: usize = running.values().map(|demand| demand.cores).sum();
-        if running.len() >= self.stages || cores >= self.threads {
+        let busy: usize = running.values().map(|demand| demand.cores).sum();
+        if running.len() >= self.stages || busy >= self.cores {
             return Admission::Wait;
         }
         let used: u64 = running.values().map(|demand| demand.memory).sum();
@@ -103,8 +104,8 @@ impl Budget {
             return Admission::Start;
         }
         Admission::WaitForMemory(format!(
-            "needs {needed} of memory, as in its most similar earlier run, but {} of {limit} are \
-            free",
+            "needs {needed} of memory, as in its most similar earlier run, but {} of \
+            {memory_limit} are free",
             format_size(free)
         ))
     }
@@ -112,7 +113,7 @@ impl Budget {
 
 /// Caps the number given by an option, and reports this.
 fn capped(option: &str, given: usize, cores: usize) -> usize {
-    let max = cores.saturating_mul(MAX_THREADS_PER_CORE);
+    let max = cores.saturating_mul(MAX_PER_CORE);
     if given > max {
         report_line!(
             "nerf-sr: {option} {given} is more than {} can use; using {max}, with the same results",
@@ -140,7 +141,7 @@ mod tests {
     use serde_json::json;
 
     const GB: u64 = 1_000_000_000;
-    const BUDGET: Budget = Budget { stages: 3, threads: 4, memory: 8 * GB, limit: None };
+    const BUDGET: Budget = Budget { stages: 3, cores: 4, memory: 8 * GB, limit: None };
 
     fn demand(cores: usize, gb: u64) -> Demand {
         Demand { cores, memory: gb * GB }

@@ -41,7 +41,7 @@ impl Executor for Local {
         let plan = run.plan;
         let free = available_memory()?.into_iter().chain([self.budget.memory]).min();
         check_memory(plan, run.estimates, free)?;
-        if let Some(text) = run_text(plan, run.estimates, self.budget.threads) {
+        if let Some(text) = run_text(plan, run.estimates, self.budget.cores) {
             report_text(&format!("nerf-sr: {text}"));
         }
         let outcome = run_nodes(run, self);
@@ -90,7 +90,7 @@ impl Local {
         };
         let mut has_written = false;
         for sink in sinks {
-            let result = run_sink(run, sink, self.budget.threads, &progress);
+            let result = run_sink(run, sink, self.budget.cores, &progress);
             if run.stop.load(Ordering::Relaxed) {
                 return Err(Failure::Interrupted.into());
             }
@@ -200,7 +200,7 @@ impl<'a> Schedule<'a> {
             .parents()
             .filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?)))
             .collect();
-        let threads = self.options.budget.threads;
+        let threads = self.options.budget.cores;
         let (run, display) = (self.run, self.display);
         let estimate = run.estimates.get(index).copied();
         NodeJob { run, node, parents, threads, display, estimate, watch: None }

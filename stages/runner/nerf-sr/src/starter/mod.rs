@@ -265,7 +265,7 @@ fn read_failure(folder: &Path, error: &DatasetError) -> Failure {
         "{}: {}, but no cameras; estimate them with COLMAP: {}",
         folder.display(),
         images.summary(),
-        images.colmap_command(folder)
+        images.colmap_instructions(folder)
     ))
 }
 

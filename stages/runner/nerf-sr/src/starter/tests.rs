@@ -9,11 +9,11 @@ fn set(format: Format, sizes: &[(u32, u32)]) -> Dataset {
         image: PathBuf::new(),
         turn: Turn::Stored,
         mask: None,
-        depth: None,
-        stored_intrinsics: Intrinsics::from_angle_x(width, height, 0.7),
+        depth_file: None,
+        lens_intrinsics: Intrinsics::from_angle_x(width, height, 0.7),
         pinhole: None,
         camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]],
-        depths: None,
+        depth_range: None,
     });
     Dataset { format, frames: frames.collect(), split: None, notes: Vec::new() }
 }

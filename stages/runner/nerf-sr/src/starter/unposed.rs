@@ -32,8 +32,8 @@ impl UnposedImages {
         }
     }
 
-    /// Returns the commands that estimate cameras.
-    pub(crate) fn colmap_command(&self, folder: &Path) -> String {
+    /// Returns the instructions for estimating cameras with COLMAP.
+    pub(crate) fn colmap_instructions(&self, folder: &Path) -> String {
         let folder = folder.display().to_string().replace('\'', r"'\''");
         let moved = if self.in_subfolder {
             String::new()

@@ -3,7 +3,7 @@ use std::time::Duration;
 
 use crate::garbage::{Collection, Policy, Root};
 use anyhow::Context as _;
-use artifact::{Failure, format_duration, print_line, report_line};
+use artifact::{Failure, format_duration, format_size, print_line, report_line};
 use planning::{PlanError, Request};
 use serde_json::json;
 use stage::stop_on_signals;
@@ -68,12 +68,11 @@ impl GcOutput {
         for decision in collection.decisions() {
             print_line!("{decision}");
         }
-        let deleted = deleted as f64 / 1e6;
-        let kept = kept as f64 / 1e6;
+        let [deleted, kept] = [deleted, kept].map(format_size);
         if self.dry_run {
-            print_line!("{deleted:.1} MB would be deleted, {kept:.1} MB would be kept");
+            print_line!("{deleted} would be deleted, {kept} would be kept");
         } else {
-            print_line!("{deleted:.1} MB deleted, {kept:.1} MB kept");
+            print_line!("{deleted} deleted, {kept} kept");
         }
         Ok(ExitCode::SUCCESS)
     }

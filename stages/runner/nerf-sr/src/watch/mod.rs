@@ -159,8 +159,7 @@ impl Look<'_> {
         let rendering = self.call_link(render, "render", &field, &views)?;
         let scoring = self.call_link(score, "score", &views, &scores)?;
         Ok(Some(LookResult {
-            // Same path as `scene::preview_file`: the runner doesn't link that crate.
-            picture: views.join(format!("previews/{}.png", self.view.name)),
+            picture: views.join(scene::preview_file(&self.view.name)),
             field: read_summary(&field)?,
             scores: read_summary(&scores)?,
             processor: reading + rendering + scoring,

@@ -2,12 +2,10 @@ use std::io;
 use std::path::Path;
 
 use artifact::MANIFEST_FILE;
+use scene::VIEWS_FILE;
 use serde_json::Value;
 
 use super::chain::Chain;
-
-/// File that lists a folder's views. The runner doesn't link the crate `scene`, which defines it.
-const VIEWS_FILE: &str = "views.json";
 
 /// The watched view.
 pub(super) struct WatchedView {

@@ -16,7 +16,7 @@ impl RayKind for Curved {
     fn crossing(_: &Occupancy, ray: &NormalizedRay, _: &[f32; 3]) -> Option<[f32; 2]> {
         match ray.map {
             RayMap::Contracted { .. } => Some([ray.enter, ray.leave]),
-            // Rays that miss the cube have this map, too.
+            // Among curved rays, only those that miss the cube have this map.
             RayMap::Straight { .. } => {
                 debug_assert!(ray.enter >= ray.leave);
                 None
@@ -43,7 +43,7 @@ impl RayKind for Curved {
     fn exits(
         rays: &LaneRays,
         lane_positions: &LanePositions,
-        sizes: &[u32; LANES],
+        log2_sides: &[u32; LANES],
     ) -> [f32; LANES] {
         let (mut xs, mut ys, mut zs) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
         for i in 0..LANES {
@@ -54,13 +54,13 @@ impl RayKind for Curved {
         let velocities = [xs, ys, zs];
         let mut exits = [0.0; LANES];
         for i in 0..LANES {
-            let cube = EmptyCube::around(lane_of(&lane_positions.cells, i), sizes[i]);
+            let cube = EmptyCube::around(lane_of(&lane_positions.cells, i), log2_sides[i]);
             let inside =
                 cube.time_inside(&lane_of(&lane_positions.positions, i), &lane_of(&velocities, i));
-            // In a cube of one cell, half a cell is ahead of a ray on average. This is about one
-            // step, by which every ray advances anyway.
+            // For a cube of one cell, t itself, a valid bound: the ray advances by a step anyway,
+            // and half a cell, the mean distance ahead, is about one step (at 512 `march_steps`).
             exits[i] =
-                if sizes[i] == 0 { lane_positions.t[i] } else { inside + lane_positions.t[i] };
+                if log2_sides[i] == 0 { lane_positions.t[i] } else { inside + lane_positions.t[i] };
         }
         exits
     }
@@ -87,8 +87,8 @@ impl EmptyCube {
         Self { low: cell.map(|c| c >> log2_side << log2_side), side: 1 << log2_side }
     }
 
-    /// Returns a lower bound of the time, in units of t, that a ray stays inside, from its position
-    /// and velocity, [`MAX_SPEED`] and [`MAX_ACCELERATION`].
+    /// Returns a lower bound, in units of t, of the time until a ray leaves the cube. The bound
+    /// follows from the ray's position and velocity, [`MAX_SPEED`] and [`MAX_ACCELERATION`].
     #[inline(always)]
     pub(super) fn time_inside(&self, position: &[f32; 3], velocity: &[f32; 3]) -> f32 {
         let (mut nearest_face, mut min_time) = (f32::INFINITY, f32::INFINITY);

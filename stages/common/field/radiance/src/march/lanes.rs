@@ -21,14 +21,17 @@ pub(super) trait RayKind {
     fn positions(rays: &LaneRays, t: &[f32; LANES]) -> [[f32; LANES]; 3];
 
     /// Returns for each ray a t that is not beyond the ray's exit from the empty cube around the
-    /// ray's position. The cube has 2^size cells per side.
-    fn exits(rays: &LaneRays, lane_positions: &LanePositions, sizes: &[u32; LANES])
-    -> [f32; LANES];
+    /// ray's position. The cube has 2^`log2_sides` cells per side.
+    fn exits(
+        rays: &LaneRays,
+        lane_positions: &LanePositions,
+        log2_sides: &[u32; LANES],
+    ) -> [f32; LANES];
 }
 
-/// Mask of the exponent of an empty cube's side, at most 7: shifts known to be below 32 vectorise
+/// Mask of the logarithm of an empty cube's side, at most 7: shifts known to be below 32 vectorise
 /// without a check.
-const SIZE_MASK: u32 = 0b111;
+const LOG2_SIDE_MASK: u32 = 0b111;
 
 /// The rays of all lanes.
 pub(super) struct LaneRays {
@@ -199,13 +202,14 @@ impl<'a> RayLanes<'a> {
         let [x, y, z] = &positions;
         let cells = [cells_along(x), cells_along(y), cells_along(z)];
         let lane_positions = LanePositions { t, positions, cells };
-        let sizes = occupancy.empty_cube_sizes(&lane_positions.cells);
+        let log2_sides = occupancy.empty_cube_log2_sides(&lane_positions.cells);
         // Exits of occupied cells aren't used.
-        let exits = K::exits(&self.rays, &lane_positions, &sizes.map(|size| size & SIZE_MASK));
+        let masked = log2_sides.map(|log2_side| log2_side & LOG2_SIDE_MASK);
+        let exits = K::exits(&self.rays, &lane_positions, &masked);
         let mut stops = 0;
         for i in 0..LANES {
             let exit_step = ceil_steps((exits[i] - enter[i]).mul_add(1.0 / step, -offset[i]));
-            let stop = (lane_positions.t[i] >= self.until[i]) | (sizes[i] == OCCUPIED);
+            let stop = (lane_positions.t[i] >= self.until[i]) | (log2_sides[i] == OCCUPIED);
             self.k[i] = if stop { self.k[i] } else { exit_step.max(self.k[i] + 1) };
             stops |= u32::from(stop) << i;
         }

@@ -4,7 +4,7 @@ use crate::occupancy::Occupancy;
 use crate::ray::NormalizedRay;
 use crate::spec::Strides;
 
-/// Value that replaces the number of a ray's next step after the ray has left the cube.
+/// Value that replaces the number of the next step of a ray without further samples.
 pub(crate) const DONE: u32 = u32::MAX;
 
 /// Rays to march, and their sampling.
@@ -38,9 +38,9 @@ pub(crate) struct MarchedSamples {
 /// Samples of rays that march in parallel lanes, before they are sorted by ray.
 #[derive(Debug, Default)]
 pub(super) struct SampleSlots {
-    /// Maximum number of samples per ray.
+    /// Maximum number of samples per ray in this round.
     max_samples: usize,
-    /// Number of samples of each active ray so far.
+    /// Number of samples of each active ray in this round.
     pub(super) counts: Vec<usize>,
     /// t and length of each sample: `max_samples` slots per ray.
     samples: Vec<[f32; 2]>,

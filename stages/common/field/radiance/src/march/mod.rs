@@ -18,8 +18,8 @@ kernel! {
     /// Finds at most `max_samples` more samples of each of the `active` rays, all of one scene.
     /// Step k of a ray is at t = enter + (k + offset)·step and has a sample if its cell is
     /// occupied. With double [`Strides`](crate::spec::Strides) only even-numbered steps have a
-    /// sample, which covers two steps and lies at their middle. `next` has each ray's k, from 0 to
-    /// [`DONE`].
+    /// sample, which covers two steps and lies at their middle. `next[r]` is the next step k of ray
+    /// r: 0 at first, [`DONE`] if the ray has no further samples.
     pub(crate) fn march<L>(march: &March<'_>, max_samples: usize, active: &[u32], next: &mut [u32],
         samples: &mut MarchedSamples) {
         // A scene has rays of one kind, but a ray that misses the cube has a straight one's map.

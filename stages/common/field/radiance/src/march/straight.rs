@@ -36,12 +36,12 @@ impl RayKind for Straight {
     fn exits(
         rays: &LaneRays,
         lane_positions: &LanePositions,
-        sizes: &[u32; LANES],
+        log2_sides: &[u32; LANES],
     ) -> [f32; LANES] {
         let mut exits = [f32::INFINITY; LANES];
-        leave_along(0, rays, lane_positions, sizes, &mut exits);
-        leave_along(1, rays, lane_positions, sizes, &mut exits);
-        leave_along(2, rays, lane_positions, sizes, &mut exits);
+        leave_along(0, rays, lane_positions, log2_sides, &mut exits);
+        leave_along(1, rays, lane_positions, log2_sides, &mut exits);
+        leave_along(2, rays, lane_positions, log2_sides, &mut exits);
         exits
     }
 }
@@ -62,14 +62,15 @@ fn leave_along(
     axis: usize,
     rays: &LaneRays,
     lane_positions: &LanePositions,
-    sizes: &[u32; LANES],
+    log2_sides: &[u32; LANES],
     exits: &mut [f32; LANES],
 ) {
     let (origin, direction) = (&rays.origin[axis], &rays.direction[axis]);
     let (inverse, cells) = (&rays.inverse[axis], &lane_positions.cells[axis]);
     for i in 0..LANES {
-        let side = if direction[i] > 0.0 { 1 << sizes[i] } else { 0 };
-        let face = ((cells[i] >> sizes[i] << sizes[i]) + side) as i32 as f32 / GRID as f32;
+        let side = if direction[i] > 0.0 { 1 << log2_sides[i] } else { 0 };
+        let face =
+            ((cells[i] >> log2_sides[i] << log2_sides[i]) + side) as i32 as f32 / GRID as f32;
         let until = (face - origin[i]) * inverse[i];
         exits[i] = if direction[i] != 0.0 && until < exits[i] { until } else { exits[i] };
     }

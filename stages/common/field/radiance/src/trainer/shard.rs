@@ -23,18 +23,17 @@ pub(super) struct StepWork<'a, S> {
     pub(super) bundles: usize,
 }
 
-/// Results of a shard.
+/// Result of a shard; buffers are reused.
 #[derive(Default)]
-pub(super) struct Shard {
+pub(super) struct ShardResult {
     pub(super) colours: Vec<[f32; 3]>,
     pub(super) features: FeatureGradients,
-    pub(super) network: Vec<f32>,
+    pub(super) network_gradients: Vec<f32>,
     pub(super) loss: f64,
     pub(super) samples: usize,
     /// Densities and cells of samples that stop light.
     pub(super) hits: Vec<CellHit>,
-    /// False if a gradient of the grid isn't finite.
-    pub(super) is_finite: bool,
+    pub(super) has_finite_grid_gradients: bool,
 }
 
 /// Buffers of one thread.
@@ -49,7 +48,7 @@ pub(super) struct Worker {
     gradients: Vec<[f32; 3]>,
 }
 
-impl Shard {
+impl ShardResult {
     /// Runs the forward and backward pass of a range of the step's bundles.
     pub(super) fn run(
         &mut self,
@@ -60,19 +59,19 @@ impl Shard {
         self.colours.clear();
         self.features.clear();
         self.hits.clear();
-        self.network.resize(work.field.network.len(), 0.0);
-        self.network.fill(0.0);
+        self.network_gradients.resize(work.field.network.len(), 0.0);
+        self.network_gradients.fill(0.0);
         (self.loss, self.samples) = (0.0, 0);
         let chunk_bundles = (CHUNK_RAYS / work.supervisor.rays_per_bundle()).max(1);
         let mut next = range.start;
         while next < range.end {
-            let here = next..(next + chunk_bundles).min(range.end);
-            next = here.end;
-            self.run_chunk(worker, work, here);
+            let bundles = next..(next + chunk_bundles).min(range.end);
+            next = bundles.end;
+            self.run_chunk(worker, work, bundles);
         }
         arrange_in_rows(&self.features.positions, &mut self.features.rows);
         let gradients = self.features.levels.iter().flatten().flatten();
-        self.is_finite = gradients.fold(true, |all, g| all & g.is_finite());
+        self.has_finite_grid_gradients = gradients.fold(true, |all, g| all & g.is_finite());
     }
 
     /// Runs the forward and backward pass of a chunk's bundles.
@@ -80,15 +79,15 @@ impl Shard {
         &mut self,
         worker: &mut Worker,
         work: &StepWork<'_, impl Supervisor>,
-        here: Range<usize>,
+        bundles: Range<usize>,
     ) {
         let StepWork { field, supervisor, options, .. } = *work;
         let rays_per_bundle = supervisor.rays_per_bundle();
-        let rays = here.len() * rays_per_bundle;
-        worker.rays.resize(rays, Ray::default());
-        worker.colours.resize(rays, [0.0; 3]);
-        worker.gradients.resize(rays, [0.0; 3]);
-        let first_bundle = work.first_bundle + here.start as u64;
+        let ray_count = bundles.len() * rays_per_bundle;
+        worker.rays.resize(ray_count, Ray::default());
+        worker.colours.resize(ray_count, [0.0; 3]);
+        worker.gradients.resize(ray_count, [0.0; 3]);
+        let first_bundle = work.first_bundle + bundles.start as u64;
         for (i, rays) in worker.rays.chunks_exact_mut(rays_per_bundle).enumerate() {
             supervisor.sample_rays(first_bundle + i as u64, rays);
         }
@@ -96,9 +95,9 @@ impl Shard {
         worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
         worker.backgrounds.clear();
         worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
-        let first_ray = work.first_ray + (here.start * rays_per_bundle) as u64;
+        let first_ray = work.first_ray + (bundles.start * rays_per_bundle) as u64;
         worker.offsets.clear();
-        worker.offsets.extend((0..rays as u64).map(|r| options.offset(first_ray + r)));
+        worker.offsets.extend((0..ray_count as u64).map(|r| options.offset(first_ray + r)));
         worker.chunk.forward(field, &worker.clipped, &worker.offsets, work.strides);
         self.samples += worker.chunk.samples();
         worker.chunk.list_hits(field.march_step(), &mut self.hits);
@@ -121,7 +120,8 @@ impl Shard {
             backgrounds: &worker.backgrounds,
             regularisers: options.regularisers.per_ray(scale, rays_per_bundle),
         };
-        let mut network = NetworkGradients { transposed: work.transposed, sums: &mut self.network };
+        let mut network =
+            NetworkGradients { transposed: work.transposed, sums: &mut self.network_gradients };
         worker.chunk.backward(
             field,
             upstream,

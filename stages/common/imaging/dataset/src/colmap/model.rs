@@ -219,7 +219,7 @@ impl Model {
             .map_err(|reason| Reason::new(format!("{reason} (camera {id})")))?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
         let mut frame = Frame::new(file, fitted, camera_to_world);
-        frame.depths = depth_range(image, camera, &self.points);
+        frame.depth_range = depth_range(image, camera, &self.points);
         frame.check()?;
         Ok(frame)
     }

@@ -106,7 +106,7 @@ fn binary_and_text_models_are_equal() {
     // The files have half the model's image size. Image 7's camera looks along +z, so that
     // (0, 0, 1) has depth 1 + 3; image 3's camera is rotated by 180° about z.
     assert_eq!(
-        b.stored_intrinsics,
+        b.lens_intrinsics,
         Intrinsics {
             width: 40,
             height: 30,
@@ -117,13 +117,10 @@ fn binary_and_text_models_are_equal() {
             distortion: Distortion::brown([-0.1, 0.0, 0.0], [0.0; 2])
         }
     );
-    assert_eq!(b.depths, Some([4.0, 5.0]));
+    assert_eq!(b.depth_range, Some([4.0, 5.0]));
     assert_eq!(b.camera_to_world, [[1., 0., 0., 0.], [0., -1., 0., 0.], [0., 0., -1., -3.]]);
-    assert_eq!(
-        a.stored_intrinsics.distortion,
-        Distortion::brown([0.1, 0.01, 0.0], [0.001, -0.002])
-    );
-    assert_eq!(a.depths, None);
+    assert_eq!(a.lens_intrinsics.distortion, Distortion::brown([0.1, 0.01, 0.0], [0.001, -0.002]));
+    assert_eq!(a.depth_range, None);
     assert!(
         (a.camera_to_world[0][3] - 1.0).abs() < 1e-12
             && (a.camera_to_world[2][3] + 3.0).abs() < 1e-12
@@ -132,7 +129,10 @@ fn binary_and_text_models_are_equal() {
 
 fn read_frames(dir: &Path) -> Vec<(String, Intrinsics, scene::Pose, Option<[f64; 2]>)> {
     let frames = Dataset::read(dir).unwrap().frames;
-    frames.into_iter().map(|f| (f.name, f.stored_intrinsics, f.camera_to_world, f.depths)).collect()
+    frames
+        .into_iter()
+        .map(|f| (f.name, f.lens_intrinsics, f.camera_to_world, f.depth_range))
+        .collect()
 }
 
 /// Editors on Windows write a byte order mark and CRLF line ends.
@@ -271,7 +271,7 @@ fn unknown_model_numbers_are_named() {
     // SIMPLE_RADIAL_FISHEYE has as many parameters as SIMPLE_RADIAL.
     let set = read_binaries(&with_model_number(8)).unwrap();
     assert_eq!(
-        set.frames[1].stored_intrinsics.distortion,
+        set.frames[1].lens_intrinsics.distortion,
         Distortion::fisheye([-0.1, 0.0, 0.0, 0.0])
     );
     assert!(

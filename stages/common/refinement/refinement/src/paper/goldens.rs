@@ -27,8 +27,7 @@ fn network_and_loss_agree_with_pytorch() {
     let tensor_4d = |name: &str| file.tensor(name, &file.shape::<4>(name).unwrap()).unwrap();
     let read_network = || PaperRefiner::read(&golden_path(), 4).unwrap();
     let (rendered, truth) = (tensor_4d("golden.rendered"), tensor_4d("golden.truth"));
-    let references =
-        file.tensor("golden.references", &file.shape::<4>("golden.references").unwrap()).unwrap();
+    let references = tensor_4d("golden.references");
 
     let network = read_network();
     let features = tch::no_grad(|| network.encode(&rendered, false)).unwrap();

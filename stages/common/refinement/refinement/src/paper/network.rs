@@ -5,7 +5,7 @@ use nets::Weights;
 use numerics::CounterRng;
 use tch::{TchError, Tensor};
 
-/// The published network, of any width.
+/// NeRF-SR's refinement network, of any width.
 #[derive(Debug)]
 pub struct PaperRefiner {
     encoder: Vec<ConvLayer>,
@@ -35,6 +35,8 @@ const ENCODER: [LayerSpec; 7] = [
     (Some(4), Some(4), 1, true),
     (Some(4), Some(4), 2, true),
 ];
+/// Three layers per size, coarsest first. The first one takes the previous size's output, the view's
+/// features, and their maximum over references: 4 + 4, 4 + 4 + 4, 2 + 2 + 2, 1 + 1 + 1 widths.
 const DECODER: [LayerSpec; 12] = [
     (Some(8), Some(4), 1, true),
     (Some(4), Some(4), 1, true),
@@ -59,7 +61,7 @@ pub(crate) const PATCH_MULTIPLE: usize = 8;
 /// PyTorch's defaults for batch normalisation.
 const MOMENTUM: f64 = 0.1;
 const EPSILON: f64 = 1e-5;
-/// Maximum width of a network that is read from a file.
+/// Maximum width of a network that is read from a file; chosen by hand.
 const MAX_WIDTH: u32 = 1024;
 /// Stream of random numbers for the initial weights.
 const WEIGHTS_STREAM: u64 = 320;
@@ -94,7 +96,7 @@ impl PaperRefiner {
     pub fn read(path: &Path, width: u32) -> Result<Self, RefinementError> {
         // Checked before anything of this size is allocated.
         if !(1..=MAX_WIDTH).contains(&width) {
-            let problem = format!("unsupported network: {width} channels, 0 blocks");
+            let problem = format!("unsupported network: {width} channels");
             return Err(RefinementError::Unusable(problem));
         }
         let weights = Weights::read(path)?;
@@ -176,13 +178,14 @@ impl PaperRefiner {
         let own = self.encode(rendered, training)?;
         let theirs = self.encode(references, training)?;
         let mut x = None::<Tensor>;
-        // Three layers per size, coarsest first; the last layer's outputs are colours.
+        // The last layer's outputs are colours.
         for (size, layers) in self.decoder.chunks_exact(3).enumerate() {
             let tap = TAPS.len() - 1 - size;
             let features = [own[tap].shallow_clone(), max_over_references(&theirs[tap], count)?];
             let mut y = Tensor::f_cat(&x.into_iter().chain(features).collect::<Vec<_>>(), 1)?;
             for (i, layer) in layers.iter().enumerate() {
                 let is_last = tap == 0 && i == 2;
+                // The next size has twice as many rows and columns: nearest neighbour.
                 if i == 2 && !is_last {
                     y = y
                         .f_repeat_interleave_self_int(2, 2, None)?
@@ -193,7 +196,7 @@ impl PaperRefiner {
             }
             x = Some(y);
         }
-        x.ok_or_else(|| TchError::Shape("a decoder without layers".to_owned()))
+        Ok(x.expect("the decoder has layers"))
     }
 }
 

@@ -45,12 +45,13 @@ impl PaperRefiner {
             let reason = format!("reference of fewer than {PATCH_PIXELS}×{PATCH_PIXELS} pixels");
             return Err(RefinementError::view(&small.rendered.camera.name, reason));
         }
-        let corners: Vec<(Corner, Self)> = patch_starts(view.height)
+        // Tensors aren't `Sync`, so each task takes handles of its own.
+        let tasks: Vec<(Corner, Self)> = patch_starts(view.height)
             .into_iter()
             .flat_map(|y| patch_starts(view.width).into_iter().map(move |x| (x, y)))
             .map(|corner| (corner, self.shallow_clone()))
             .collect();
-        let patches = corners
+        let patches = tasks
             .into_par_iter()
             .map(|(corner, network)| network.redraw(rendered, corner, references, max_references))
             .collect::<Result<Vec<_>, _>>()?;
@@ -65,17 +66,18 @@ impl PaperRefiner {
         references: &[&KnownView],
         max_references: usize,
     ) -> Result<(Corner, Vec<f32>), TchError> {
-        let own = patch(&rendered.view, corner);
-        let mut matching: Vec<Vec<f32>> =
+        let samples = patch(&rendered.view, corner);
+        let mut reference_samples: Vec<Vec<f32>> =
             matching_patches(rendered, references, corner, max_references)
                 .into_iter()
                 .map(|(r, corner)| patch(&references[r].truth, corner))
                 .collect();
-        if matching.is_empty() {
-            matching.push(own.clone());
+        if reference_samples.is_empty() {
+            reference_samples.push(samples.clone());
         }
-        let own = patch_tensor(&own, 1, PATCH_PIXELS)?;
-        let matching = patch_tensor(&matching.concat(), matching.len(), PATCH_PIXELS)?;
+        let own = patch_tensor(&samples, 1, PATCH_PIXELS)?;
+        let count = reference_samples.len();
+        let matching = patch_tensor(&reference_samples.concat(), count, PATCH_PIXELS)?;
         let redrawn = no_grad(|| self.forward(&own, &matching, false))?;
         let redrawn = redrawn.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
         Ok((corner, Vec::<f32>::try_from(&redrawn)?))
@@ -142,8 +144,7 @@ fn matching_patches(
 /// Returns the start of a patch along an axis of a reference, so that the patch's pixel `offset` is
 /// the one that contains `position`. The patch is clamped to the reference of `size` pixels.
 fn matching_start(position: f32, offset: usize, size: usize) -> usize {
-    ((position - 0.5).round() as isize - offset as isize).clamp(0, (size - PATCH_PIXELS) as isize)
-        as usize
+    (position.floor() as isize - offset as isize).clamp(0, (size - PATCH_PIXELS) as isize) as usize
 }
 
 /// Blends patches in -1..1 to an image in 0..1, weighted by distance from the patch's border.

@@ -62,16 +62,16 @@ impl Perspective {
             }
             let weight = (1.0 - (u - column).abs()) * (1.0 - (v - row).abs());
             let start = (row as usize * image.width + column as usize) * image.channels;
-            for c in 0..3 {
-                colour[c] += weight as f32 * image.data[start + c];
+            for channel in 0..3 {
+                colour[channel] += weight as f32 * image.data[start + channel];
             }
         }
         colour
     }
 }
 
-/// Solves for the perspective that maps four points to four others; `None` if three of them are
-/// collinear.
+/// Solves for the perspective that maps four points to four others; `None` if the equations are
+/// singular, as with three collinear points in `from`.
 fn homography(from: [(f64, f64); 4], to: [(f64, f64); 4]) -> Option<[f64; 8]> {
     // Two rows per point; the ninth column is the right-hand side.
     let mut rows = Vec::with_capacity(8);
@@ -84,6 +84,7 @@ fn homography(from: [(f64, f64); 4], to: [(f64, f64); 4]) -> Option<[f64; 8]> {
             (column..8).max_by(|&a, &b| rows[a][column].abs().total_cmp(&rows[b][column].abs()))?;
         rows.swap(column, pivot);
         let divisor: f64 = rows[column][column];
+        // Zero up to rounding; chosen by hand.
         if divisor.abs() < 1e-12 {
             return None;
         }
