@@ -13,7 +13,7 @@ endif
 export LD_LIBRARY_PATH := $(LIBTORCH_DIR)/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 
 NERF_SR := target/release/nerf-sr
-# Folder with real scenes and network weights, read by the targets that measure.
+# Folder with published scenes and network weights, read by the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
 .PHONY: help demo build-demo build remote install dist check-dist setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff parts seeds stability bench bench-runner compare-engines fuzz clean reference goldens
@@ -125,7 +125,7 @@ chosen = $(if $(SCENES),--scene $(call list,$(SCENES))) $(if $(PROTOCOLS),--prot
 experiment = $(NERF_SR) run $(1) -j 1 --out out/$(1) $(chosen) $(2) && mkdir -p $(dir $(or $(OUT),out/$(1).json)) && \
   cp out/$(1)/$(1)/rows.json $(or $(OUT),out/$(1).json)
 QUALITY := quality$(if $(ENLARGED),-enlarged,$(if $(REFINED),-refined))
-quality: build ## Score the protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" REFINED=1 SET="seed=1" OUT=FILE
+quality: build ## Score the protocols on published scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" REFINED=1 SET="seed=1" OUT=FILE
 	@$(call experiment,$(QUALITY),$(if $(SUPERVISION),-p train-ss.supervision=$(call list,$(SUPERVISION))))
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr

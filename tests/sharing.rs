@@ -162,7 +162,7 @@ fn gc_deletes_another_point_unless_it_is_pinned() {
     project.ok(&[&["pin", "boxes"][..], &point].concat());
     project.ok(&["gc", "--keep-days", "0"]);
     assert_eq!(project.store_listing(), full_listing);
-    project.run(&["unpin", "box"]).fails(2, &["no pin \"box\"; pins: boxes"]);
+    project.run(&["unpin", "box"]).fails(2, &["no pin \"box\"; known: boxes"]);
     project.run(&["pin", "../x"]).fails(2, &["invalid pin name"]);
     project.run(&["pin", "new", "-p", "kernel=bicubic"]).fails(2, &["has no artifact to pin yet"]);
     project.ok(&["unpin", "boxes"]);

@@ -138,7 +138,7 @@ fn a_damaged_pin_stops_gc_until_it_is_removed() {
             .fails(1, &["nothing was deleted", "pins/mine.jsonl", "`nerf-sr unpin mine`"]);
         assert_eq!(project.store_listing(), before, "{text:?}");
     }
-    project.run(&["unpin", "yours"]).fails(2, &["no pin \"yours\"; pins: mine"]);
+    project.run(&["unpin", "yours"]).fails(2, &["no pin \"yours\"; known: mine"]);
     project.ok(&["unpin", "mine"]);
     project.ok(&["gc", "--keep-days", "0"]);
     assert!(project.store_listing().is_empty());

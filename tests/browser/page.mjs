@@ -19,8 +19,8 @@ async function look(browser, size) {
   const expect = (isRight, words) => isRight || problems.push(words);
   const found = { size, problems, summary: await page.locator(".summary dd").allTextContents() };
   found.title = await page.locator("h1").textContent();
-  if (await page.locator("#viewer").isVisible()) {
-    const top = (await page.locator("#stage .pane").boundingBox()).y;
+  if (await page.locator("#comparison").isVisible()) {
+    const top = (await page.locator("#panes .pane").boundingBox()).y;
     const hasNotices = (await page.locator(".notice").count()) > 0;
     expect(hasNotices || top < 0.55 * size.height, `the first picture begins at ${top} of ${size.height} pixels`);
     await thumbnails(page, expect);
@@ -60,10 +60,10 @@ const readNumbers = (page) =>
 const options = (page, id) => page.locator(`#${id} option`).evaluateAll((all) => all.map((option) => option.value));
 /** Returns the first six and last six values, because a page can have a hundred methods. */
 const ends = (all) => [...all.slice(0, 6), ...all.slice(-6)].filter((value, i, some) => some.indexOf(value) === i);
-const sources = (page) => page.locator("#stage img").evaluateAll((all) => all.map((image) => image.src));
+const sources = (page) => page.locator("#panes img").evaluateAll((all) => all.map((image) => image.src));
 const division = (page) =>
   page
-    .locator("#stage .half")
+    .locator("#panes .half")
     .nth(1)
     .evaluate((half) => half.style.clipPath);
 
@@ -72,7 +72,7 @@ async function compare(page, expect) {
   const before = await division(page);
   await page.locator("#split").press("Home");
   const home = await division(page);
-  const pane = page.locator("#stage .pane");
+  const pane = page.locator("#panes .pane");
   await pane.hover({ position: { x: 60, y: 60 } });
   await page.mouse.down();
   await page.mouse.move((await pane.boundingBox()).x + 100, 300, { steps: 4 });
@@ -90,7 +90,7 @@ async function compare(page, expect) {
       Object.assign(numbers[name], await readNumbers(page));
     }
     expect(seen.size > 2, `${name} has ${seen.size} pictures`);
-    const isBroken = await page.locator("#stage img").evaluateAll(async (all) => {
+    const isBroken = await page.locator("#panes img").evaluateAll(async (all) => {
       await Promise.all(all.map((image) => image.decode().catch(() => {})));
       return all.some((image) => !image.naturalWidth);
     });
@@ -114,12 +114,12 @@ async function thumbnails(page, expect) {
 /** Checks that the page's address shows the same view and zoom again. */
 async function link(browser, page, size, expect) {
   await page.locator("#view").selectOption({ index: (await options(page, "view")).length - 1 });
-  await page.locator("#stage").press("+");
+  await page.locator("#panes").press("+");
   const state = (one) =>
     one.evaluate(() => [
       document.getElementById("view").value,
       document.getElementById("zoom").textContent,
-      document.querySelector("#stage .tag.right").textContent,
+      document.querySelector("#panes .tag.right").textContent,
     ]);
   const before = await state(page);
   const { page: other } = await open(browser, PAGE, size);
@@ -207,12 +207,12 @@ async function plots(page, expect) {
 async function zoom(page, expect) {
   const transform = () =>
     page
-      .locator("#stage img")
+      .locator("#panes img")
       .first()
       .evaluate((image) => image.style.transform);
   const fit = await transform();
-  await page.locator("#stage").press("+");
-  await page.locator("#stage").press("ArrowRight");
+  await page.locator("#panes").press("+");
+  await page.locator("#panes").press("ArrowRight");
   const near = await transform();
   await page.locator("#next").click();
   expect(near !== fit && (await transform()) === near, `zoom: ${fit}, ${near}, ${await transform()}`);
@@ -222,11 +222,11 @@ async function zoom(page, expect) {
 
 async function arrange(page, expect) {
   await page.locator("#grid-mode").click();
-  expect((await page.locator("#stage .pane").count()) > 1, "the grid has fewer than two panes");
+  expect((await page.locator("#panes .pane").count()) > 1, "the grid has fewer than two panes");
   await marked(page, expect, "#grid-mode", "#slider-mode");
   await page.locator("#slider-mode").click();
   await marked(page, expect, "#slider-mode", "#grid-mode");
-  expect((await page.locator("#stage .pane").count()) === 1, "the slider has more than one pane");
+  expect((await page.locator("#panes .pane").count()) === 1, "the slider has more than one pane");
 }
 
 /** Checks that the button of the active mode stands out, and that neither button looks disabled. */

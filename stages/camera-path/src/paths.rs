@@ -57,6 +57,7 @@ fn depth_range(bounds: &Bounds) -> (f64, f64) {
         Space::Ndc(frustum) => (frustum.near, frustum.far),
         _ => (bounds.near, bounds.far),
     };
+    // The limit is chosen by hand.
     (near.max(1e-3 * far), far)
 }
 

@@ -3,6 +3,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use numerics::CounterRng;
 use pixels::Rgba8;
+use scene::pose_of;
 
 use crate::params::Params;
 
@@ -38,7 +39,7 @@ pub(crate) fn with_error(pose: &[[f64; 4]; 4], params: &Params, i: u32) -> [[f64
     let error = DQuat::from_scaled_axis(params.pose_error.to_radians() * rotation);
     let column = |k: usize| DVec3::new(pose[0][k], pose[1][k], pose[2][k]);
     let axes = DMat3::from_cols(column(0), column(1), column(2)) * DMat3::from_quat(error);
-    crate::camera_to_world(axes, column(3))
+    crate::camera_to_world(pose_of(axes, column(3)))
 }
 
 #[cfg(test)]

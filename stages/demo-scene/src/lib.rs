@@ -22,6 +22,7 @@ mod world;
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
+use scene::{Pose, looking_at, pose_of};
 use stage::{Context, Output, Stage};
 
 use camera::ViewCamera;
@@ -110,7 +111,8 @@ fn check_memory(context: &Context, splits: &[(&str, u32, ViewCamera)]) -> anyhow
 ///
 /// Around: training views are evenly spread over the upper hemisphere and slightly below it, test
 /// views are on a wavy circle between them. Forward: training views fill a square evenly (a
-/// golden-ratio sequence), test views are on a circle in this square.
+/// golden-ratio sequence), test views are on a circle in this square. Heights and radii are chosen
+/// by hand.
 fn camera_pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     use std::f64::consts::{PI, TAU};
     let fraction = (f64::from(i) + 0.5) / f64::from(count);
@@ -122,27 +124,21 @@ fn camera_pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4]
         };
         // Cameras look along +y.
         let axes = DMat3::from_cols(DVec3::X, DVec3::Z, -DVec3::Y);
-        return camera_to_world(axes, DVec3::new(u, -CAMERA_DISTANCE, 0.3 + v));
+        return camera_to_world(pose_of(axes, DVec3::new(u, -CAMERA_DISTANCE, 0.3 + v)));
     }
     let (azimuth, height) = if split == "train" {
-        // Azimuths by the golden angle; heights from just below the horizon to almost straight
-        // above.
+        // Azimuths by the golden angle; heights from just below the horizon to 72° above it.
         (f64::from(i) * PI * (3.0 - 5.0f64.sqrt()), -0.08 + 1.03 * fraction)
     } else {
         (TAU * fraction, 0.42 + 0.28 * libm::sin(3.0 * TAU * fraction))
     };
     let radius = (1.0 - height * height).sqrt();
     let direction = DVec3::new(radius * libm::cos(azimuth), radius * libm::sin(azimuth), height);
-    let centre = CAMERA_DISTANCE * direction;
-    let back = centre.normalize();
-    let right = DVec3::Z.cross(back).normalize();
-    camera_to_world(DMat3::from_cols(right, back.cross(right), back), centre)
+    camera_to_world(looking_at(CAMERA_DISTANCE * direction, DVec3::ZERO, DVec3::Z))
 }
 
-/// Returns the 4 × 4 matrix of a camera with the given axes and centre.
-fn camera_to_world(axes: DMat3, centre: DVec3) -> [[f64; 4]; 4] {
-    let DMat3 { x_axis, y_axis, z_axis } = axes;
-    let [x, y, z] = [0, 1, 2].map(|k| [x_axis[k], y_axis[k], z_axis[k], centre[k]]);
+/// Returns the 4 × 4 matrix of a pose.
+fn camera_to_world([x, y, z]: Pose) -> [[f64; 4]; 4] {
     [x, y, z, [0.0, 0.0, 0.0, 1.0]]
 }
 

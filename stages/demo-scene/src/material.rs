@@ -31,7 +31,8 @@ pub(crate) struct Reflectance {
     pub(crate) mirror: f64,
 }
 
-/// Hashes a lattice cell to [0, 1).
+/// Hashes a lattice cell to [0, 1). In two dimensions, `z` numbers a pattern or a face. The
+/// multipliers are 2⁶⁴ over the golden ratio, two primes of xxHash and that of degski64.
 fn hash(x: i64, y: i64, z: i64, seed: u32) -> f64 {
     let mut h = (x as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
         ^ (y as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F)
@@ -88,9 +89,9 @@ fn tiles(p: DVec3, normal: DVec3, seed: u32) -> DVec3 {
     }
     let ring = cell(radius * 14.0);
     let tile_count = (2 * ring + 7) as f64;
-    let angle = libm::atan2(p.y, p.x) / std::f64::consts::TAU + 0.5;
-    let tile = cell(angle * tile_count);
-    let is_joint = (radius * 14.0).fract().min((angle * tile_count).fract()) < 0.08;
+    let turn = libm::atan2(p.y, p.x) / std::f64::consts::TAU + 0.5;
+    let tile = cell(turn * tile_count);
+    let is_joint = (radius * 14.0).fract().min((turn * tile_count).fract()) < 0.08;
     let tone = hash(ring, tile, 2, seed);
     let light = if (ring + tile) % 2 == 0 { 0.62 } else { 0.16 };
     let tint =
@@ -108,6 +109,7 @@ fn printed_crate(p: DVec3, normal: DVec3, seed: u32) -> DVec3 {
     } else {
         (p.x, p.y)
     };
+    // Number of the face: -2, 0 or 1 by each coordinate of its normal.
     let face = cell(normal.x * 1.5) * 9 + cell(normal.y * 1.5) * 3 + cell(normal.z * 1.5);
     if u.abs().max(v.abs()) > 0.88 {
         return DVec3::new(0.45, 0.30, 0.10);
@@ -134,8 +136,8 @@ fn stripes(p: DVec3) -> DVec3 {
 /// Returns the albedo of a sign: rows of ink marks.
 fn marks(p: DVec3, seed: u32) -> DVec3 {
     let line = cell(p.z * 6.0);
-    let gap = (p.z * 6.0).rem_euclid(1.0);
+    let height = (p.z * 6.0).rem_euclid(1.0);
     let is_mark = hash(cell(p.x * 16.0), line, 11, seed) < 0.6;
-    let is_ink = (0.25..0.8).contains(&gap) && is_mark && p.x.abs() < 0.92 && p.z.abs() < 0.95;
+    let is_ink = (0.25..0.8).contains(&height) && is_mark && p.x.abs() < 0.92 && p.z.abs() < 0.95;
     if is_ink { DVec3::new(0.55, 0.05, 0.10) } else { DVec3::new(0.80, 0.80, 0.74) }
 }

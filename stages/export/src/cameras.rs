@@ -2,7 +2,7 @@ use std::fmt::Write as _;
 
 use glam::{DMat3, DQuat, DVec3};
 use scene::{Camera, Distortion, Intrinsics};
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
 use crate::ply::colour_bytes;
 use crate::surfel::Surfel;
@@ -16,22 +16,22 @@ pub(crate) fn transforms_json(cameras: &[Camera], points: Option<&str>) -> Value
     let shared = shared_intrinsics(cameras);
     let frames: Value =
         cameras.iter().map(|camera| frame_entry(camera, shared.is_some())).collect();
-    let mut file = shared.map(lens_entries).unwrap_or_default();
-    file.insert("frames".to_owned(), frames);
+    let mut file = shared.map_or_else(|| json!({}), lens_entries);
+    file["frames"] = frames;
     if let Some(points) = points {
-        file.insert("ply_file_path".to_owned(), json!(points));
+        file["ply_file_path"] = json!(points);
     }
-    Value::Object(file)
+    file
 }
 
 /// Returns the entry of a camera.
 fn frame_entry(camera: &Camera, has_shared_lens: bool) -> Value {
-    let mut entry = if has_shared_lens { Map::new() } else { lens_entries(&camera.intrinsics) };
+    let mut entry = if has_shared_lens { json!({}) } else { lens_entries(&camera.intrinsics) };
     let mut matrix = camera.camera_to_world.to_vec();
     matrix.push([0.0, 0.0, 0.0, 1.0]);
-    entry.insert("file_path".to_owned(), json!(format!("images/{}.png", camera.name)));
-    entry.insert("transform_matrix".to_owned(), json!(matrix));
-    Value::Object(entry)
+    entry["file_path"] = json!(format!("images/{}.png", camera.name));
+    entry["transform_matrix"] = json!(matrix);
+    entry
 }
 
 /// Returns the intrinsics of all cameras if they are equal.
@@ -40,27 +40,26 @@ fn shared_intrinsics(cameras: &[Camera]) -> Option<&Intrinsics> {
     cameras.iter().all(|camera| camera.intrinsics == *first).then_some(first)
 }
 
-/// Returns the entries for intrinsics.
-fn lens_entries(k: &Intrinsics) -> Map<String, Value> {
+/// Returns an object with the entries for intrinsics.
+fn lens_entries(k: &Intrinsics) -> Value {
     let ([k1, k2, k3, k4], [p1, p2]) = (k.distortion.radial, k.distortion.tangential);
-    let mut entry = json!({
-        "camera_model": if k.distortion.is_none() { "PINHOLE" } else { "OPENCV" },
-        "camera_angle_x": 2.0 * (0.5 * f64::from(k.width) / k.fx).atan(),
-        "camera_angle_y": 2.0 * (0.5 * f64::from(k.height) / k.fy).atan(),
+    let mut entries = json!({
         "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": k.width, "h": k.height,
         "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2,
     });
     if k4 != 0.0 || k.distortion.is_fisheye() {
-        entry["k4"] = json!(k4);
+        entries["k4"] = json!(k4);
     }
-    let Value::Object(mut entry) = entry else { return Map::new() };
     if k.distortion.is_fisheye() {
-        entry.insert("camera_model".to_owned(), json!("OPENCV_FISHEYE"));
-        entry.insert("is_fisheye".to_owned(), json!(true));
-        // These angles are those of a pinhole camera.
-        entry.retain(|key, _| !key.starts_with("camera_angle"));
+        entries["camera_model"] = json!("OPENCV_FISHEYE");
+        entries["is_fisheye"] = json!(true);
+        return entries;
     }
-    entry
+    entries["camera_model"] = json!(if k.distortion.is_none() { "PINHOLE" } else { "OPENCV" });
+    // Angles describe a pinhole camera only.
+    entries["camera_angle_x"] = json!(2.0 * (0.5 * f64::from(k.width) / k.fx).atan());
+    entries["camera_angle_y"] = json!(2.0 * (0.5 * f64::from(k.height) / k.fy).atan());
+    entries
 }
 
 /// Format of exported cameras.
@@ -75,14 +74,14 @@ pub(crate) enum CameraFormat {
 impl CameraFormat {
     /// Returns why the format can't describe the cameras' lenses, or `None` if it can.
     pub(crate) fn lens_problem(self, cameras: &[Camera]) -> Option<&'static str> {
-        let is_any =
-            |has: fn(&Distortion) -> bool| cameras.iter().any(|c| has(&c.intrinsics.distortion));
+        let has_lens =
+            |is: fn(&Distortion) -> bool| cameras.iter().any(|c| is(&c.intrinsics.distortion));
         match self {
-            Self::Transforms if is_any(|lens| lens.denominator != [0.0; 3]) => Some(
+            Self::Transforms if has_lens(|lens| lens.denominator != [0.0; 3]) => Some(
                 "transforms.json is not written: its readers don't support the rational terms of \
                 a lens, OpenCV's k4 to k6",
             ),
-            Self::Colmap if is_any(|lens| lens.radial[3] != 0.0 && !lens.is_fisheye()) => Some(
+            Self::Colmap if has_lens(|lens| lens.radial[3] != 0.0 && !lens.is_fisheye()) => Some(
                 "colmap/ is not written: COLMAP doesn't support the fourth radial term of a \
                 perspective lens",
             ),
@@ -92,7 +91,7 @@ impl CameraFormat {
 }
 
 /// Returns a COLMAP model as text files: names and contents. Poses are world to camera with axes
-/// right, down, forward. Points have no track; `offset` is added to their positions.
+/// right, down, forward. Points have no track. Surfels are relative to `offset`, cameras aren't.
 pub(crate) fn colmap_files(
     cameras: &[Camera],
     surfels: &[Surfel],
@@ -110,11 +109,11 @@ pub(crate) fn colmap_files(
         let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
         let _ = writeln!(images, "{} {pose} {} {}.png\n", i + 1, lens + 1, camera.name);
     }
-    let mut cameras = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
+    let mut lens_text = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
     for (i, k) in lenses.iter().enumerate() {
         let (model, parameters) = colmap_model(k);
         let parameters = parameters.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
-        let _ = writeln!(cameras, "{} {model} {} {} {parameters}", i + 1, k.width, k.height);
+        let _ = writeln!(lens_text, "{} {model} {} {} {parameters}", i + 1, k.width, k.height);
     }
     let mut points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n".to_owned();
     let step = surfels.len().div_ceil(MAX_POINTS).max(1);
@@ -123,7 +122,7 @@ pub(crate) fn colmap_files(
         let [r, g, b] = colour_bytes(surfel.colour);
         let _ = writeln!(points, "{} {x} {y} {z} {r} {g} {b} 0", i + 1);
     }
-    [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)]
+    [("cameras.txt", lens_text), ("images.txt", images), ("points3D.txt", points)]
 }
 
 /// Returns a point's world coordinates as text: in double precision if there is an offset, because

@@ -16,6 +16,11 @@ const VERTICES: u32 = 34962;
 /// glTF's code of the buffer target for indices (`ELEMENT_ARRAY_BUFFER`).
 const INDICES: u32 = 34963;
 
+/// Version of the file's header.
+const VERSION: u32 = 2;
+/// Number of bytes of the file's header (12) and of its two chunks' headers (8 each).
+const HEADER_BYTES: usize = 28;
+
 /// Writes a mesh as binary glTF 2.0, unlit, since the colours include the scene's light. The
 /// vertices' `colours`, display-encoded sRGB, are converted to glTF's linear colours.
 pub(crate) fn write(
@@ -35,7 +40,7 @@ pub(crate) fn write(
     }
     let length = buffer_length(mesh);
     file.write_all(b"glTF")?;
-    write_words(file, &[2, (28 + text.len() + length) as u32, text.len() as u32])?;
+    write_words(file, &[VERSION, (HEADER_BYTES + text.len() + length) as u32, text.len() as u32])?;
     file.write_all(b"JSON")?;
     file.write_all(text.as_bytes())?;
     write_words(file, &[length as u32])?;

@@ -72,8 +72,7 @@ pub(crate) fn scene_bounds(
     }
     let (training, others) = (moved(training, -origin), moved(others, -origin));
     let bounds = bounds_near_origin(&training, &others, is_unbounded, kind)?;
-    // Rounded as in `train-ss`, and before the shift: large coordinates have fewer digits after the
-    // point.
+    // `train-ss` rounds bounds in any case. These are rounded before the shift, which loses digits.
     let anchor = training.first().map_or(DVec3::ZERO, |(camera, _)| camera.centre());
     Ok(bounds.rounded(anchor).moved(origin))
 }
@@ -82,8 +81,8 @@ fn moved(views: &[CameraDepths], offset: DVec3) -> Vec<CameraDepths> {
     views.iter().map(|(camera, depths)| (camera.moved(offset), *depths)).collect()
 }
 
-/// Step of [`near_point`], relative to the scene's extent (docs/design/004). Within half a step of
-/// the origin, f64 represents at least ten digits of the extent.
+/// Step of [`near_point`], relative to the scene's extent (docs/design/004). A scene within half a
+/// step of the origin isn't moved: f64 has at least ten digits of its extent there.
 const NEAR_POINT_STEP: f64 = 1024.0;
 
 /// Returns a point near the cameras, a multiple of a step much larger than the scene's known
@@ -138,7 +137,7 @@ fn ndc_bounds(
         all.push((camera.clone(), depths.or(guessed)));
     }
     let space = Space::Ndc(frustum(&all)?);
-    Ok(Bounds { space, ..frusta_bounds(&all).ok_or(SpaceError::NoDepths)? })
+    Ok(Bounds { space, ..frusta_bounds(&all).ok_or(SpaceError::NotForward)? })
 }
 
 /// Guessed nearest and farthest depth, relative to the distance of the cameras' focus
@@ -152,10 +151,10 @@ const GUESSED_DEPTH_FACTORS: [f64; 2] = [0.25, 50.0];
 fn guess_depths(views: &[CameraDepths]) -> Option<[f64; 2]> {
     let cameras: Vec<&Camera> = views.iter().map(|(camera, _)| camera).collect();
     let forward = common_direction(cameras.iter().copied())?;
-    let mean = cameras.iter().map(|c| c.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
-    let extent = 2.0 * cameras.iter().map(|c| (c.centre() - mean).length()).fold(0.0, f64::max);
+    let centre = mean(views, Camera::centre);
+    let extent = 2.0 * cameras.iter().map(|c| (c.centre() - centre).length()).fold(0.0, f64::max);
     let focus = crossing_point(&cameras, MIN_FOCUS_DETERMINANT)
-        .map(|point| (point - mean).dot(forward))
+        .map(|point| (point - centre).dot(forward))
         .filter(|distance| *distance > extent);
     let distance = focus.unwrap_or(4.0 * extent);
     (distance > 0.0).then(|| GUESSED_DEPTH_FACTORS.map(|factor| factor * distance))
@@ -176,8 +175,9 @@ fn frustum(views: &[CameraDepths]) -> Result<Frustum, SpaceError> {
     };
     for (camera, depths) in views {
         let [nearest, farthest] = depths.ok_or(SpaceError::NoDepths)?;
-        // Known depths are those of matched points; surfaces may be twice as far.
-        for corner in border_points(camera, [0.9 * nearest, 2.0 * farthest]) {
+        // Known depths are those of matched points, but surfaces may be nearer or much farther. The
+        // factors are chosen by hand.
+        for corner in extreme_points(camera, [0.9 * nearest, 2.0 * farthest]) {
             let p = frustum.to_camera(corner);
             if p.z <= 0.0 {
                 return Err(SpaceError::NotForward);
@@ -199,7 +199,7 @@ fn mean(views: &[CameraDepths], vector: fn(&Camera) -> DVec3) -> DVec3 {
 
 /// True if most views have known depths far outside the box.
 fn reaches_beyond(bounds: &Bounds, views: &[CameraDepths]) -> bool {
-    let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
+    let centre = bounds.middle();
     let reach = MIN_CONTRACTION_DISTANCE * 0.5 * bounds.longest_side();
     let far = views.iter().filter(|(camera, depths)| {
         depths.is_some_and(|[_, farthest]| farthest > (camera.centre() - centre).length() + reach)
@@ -207,11 +207,11 @@ fn reaches_beyond(bounds: &Bounds, views: &[CameraDepths]) -> bool {
     2 * far.count() > views.len()
 }
 
-/// Extends a box to the contraction, with near and far wide enough for all known depths. If most
-/// cameras face away from the box's centre, the box reaches twice as far as the cameras, so that it
-/// contains what is near them (docs/design/035).
+/// Extends a box to the contraction, with near and far wide enough for all known depths, by factors
+/// chosen by hand. If most cameras face away from the box's centre, the box reaches twice as far as
+/// the cameras, so that it contains what is near them (docs/design/035).
 fn contracted_bounds(boxed: Bounds, views: &[CameraDepths]) -> Bounds {
-    let centre = 0.5 * (DVec3::from(boxed.min) + DVec3::from(boxed.max));
+    let centre = boxed.middle();
     let outward = views.iter().filter(|(c, _)| c.forward().dot(c.centre() - centre) > 0.0);
     let faces_outward = 2 * outward.count() > views.len();
     let camera_distance =
@@ -233,9 +233,9 @@ fn contracted_bounds(boxed: Bounds, views: &[CameraDepths]) -> Bounds {
 /// Number of cells along each side of the sampling grid over a fisheye image; chosen by hand.
 const FISHEYE_GRID_CELLS: u32 = 16;
 
-/// Returns points on the border of a camera's view between two depths. A fisheye view is a part of
-/// a spherical shell, so that its extreme points may be anywhere in the image.
-fn border_points(camera: &Camera, depths: [f64; 2]) -> Vec<DVec3> {
+/// Returns points that bound a camera's view between two depths. For a fisheye lens, the depths are
+/// distances along rays, and extreme points may be anywhere in the image.
+fn extreme_points(camera: &Camera, depths: [f64; 2]) -> Vec<DVec3> {
     let k = &camera.intrinsics;
     let mut points = Vec::new();
     if !k.distortion.is_fisheye() {
@@ -321,26 +321,26 @@ fn half_width(camera: &Camera, point: DVec3) -> f64 {
 /// enough: the determinant of the mean projection is 0 for parallel axes and 8/27 for axes from all
 /// sides.
 fn crossing_point(cameras: &[&Camera], min_determinant: f64) -> Option<DVec3> {
-    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    let (mut matrix, mut rhs) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
         let d = camera.forward();
         let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
-        normal += across;
-        right += across * camera.centre();
+        matrix += across;
+        rhs += across * camera.centre();
     }
-    let mean = normal * (1.0 / cameras.len().max(1) as f64);
-    (mean.determinant() > min_determinant).then(|| normal.inverse() * right)
+    let mean_matrix = matrix * (1.0 / cameras.len().max(1) as f64);
+    (mean_matrix.determinant() > min_determinant).then(|| matrix.inverse() * rhs)
 }
 
 /// Returns a box around all views between their depths, with a margin of a tenth. `None` if a
-/// view's depths are unknown.
+/// view's depths are unknown, or the box is invalid.
 fn frusta_bounds(views: &[CameraDepths]) -> Option<Bounds> {
     let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
     for (camera, depths) in views {
         let [nearest, farthest] = (*depths)?;
         near = near.min(0.9 * nearest);
-        for corner in border_points(camera, [0.9 * nearest, 1.1 * farthest]) {
+        for corner in extreme_points(camera, [0.9 * nearest, 1.1 * farthest]) {
             (min, max) = (min.min(corner), max.max(corner));
             far = far.max((corner - camera.centre()).length());
         }
@@ -358,7 +358,7 @@ fn with_ray_range(bounds: Bounds, cameras: &[&Camera]) -> Bounds {
         near = near.min((c - c.clamp(min, max)).length());
         far = far.max((c - min).abs().max((c - max).abs()).length());
     }
-    // Cameras inside the box skip a sliver: no surface is on the lens.
+    // Cameras inside the box skip a sliver, chosen by hand: no surface is on the lens.
     Bounds { near: near.max(1e-3 * far), far, ..bounds }
 }
 
@@ -475,7 +475,7 @@ mod tests {
                 "{frustum:?}"
             );
             for camera in &row {
-                for corner in border_points(camera, [2.0 * scale, 15.0 * scale]) {
+                for corner in extreme_points(camera, [2.0 * scale, 15.0 * scale]) {
                     let p = frustum.to_cube(frustum.to_camera(corner)).to_array();
                     assert!(p.iter().all(|x| (-1e-9..=1.0 + 1e-9).contains(x)), "{p:?}");
                 }

@@ -6,10 +6,10 @@ use pixels::Rgba8;
 
 /// Side of a block whose spectrum is measured, in pixels.
 const BLOCK_SIDE: usize = 32;
-/// Maximum number of blocks of an image; chosen by hand.
+/// Maximum number of measured blocks of an image; chosen by hand.
 const MAX_BLOCKS: usize = 256;
-/// Divisor of the number of blocks: one in four is measured. These are the blocks of largest
-/// variance, since smooth areas have no detail.
+/// Divisor of the number of blocks: of the quarter of largest variance, at most [`MAX_BLOCKS`] are
+/// measured, evenly spaced. Smooth areas have no detail.
 const MEASURED_DIVISOR: usize = 4;
 /// Frequencies that fix the expected spectrum.
 const REFERENCE_FREQUENCIES: [usize; 2] = [2, 3];
@@ -70,7 +70,7 @@ impl Spectrum {
         let flattened_power = |k: usize| self.power[k] * (k * k) as f64;
         let expected = REFERENCE_FREQUENCIES.map(flattened_power).iter().sum::<f64>()
             / REFERENCE_FREQUENCIES.len() as f64;
-        if expected.is_nan() || expected <= MIN_POWER {
+        if expected <= MIN_POWER {
             return None;
         }
         // Geometric mean over neighbouring frequencies.

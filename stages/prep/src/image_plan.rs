@@ -41,7 +41,7 @@ impl ImagePlan {
         if kernel == Kernel::Average {
             for &i in split.train.iter().chain(&split.test) {
                 let sizes = plan.sizes_of(&set.frames[i].intrinsics());
-                if !sizes.is_integer() {
+                if !sizes.has_integer_scale() {
                     let Sizes { lr, hr } = sizes;
                     bail_usage!(
                         "parameter kernel: average requires an integer scale, found {}×{} → \

@@ -101,7 +101,9 @@ impl Stage for Prep {
             notes.push(format!("lr_width {lr_width} has no effect with lr_source photographs"));
         }
         if params.hr_references > Params::default().hr_references && !images.has_truth {
-            notes.push("hr_references has no effect with lr_source photographs".to_owned());
+            let note = "hr_references gives no references with lr_source photographs; it only \
+                removes test views of split paper";
+            notes.push(note.to_owned());
         }
         notes.extend(warnings);
         for note in &notes {

@@ -35,18 +35,18 @@ pub struct Params {
     /// undistortion or letterboxing, otherwise `opaque`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub background: Option<Background>,
-    /// Distance along rays at which the scene starts. With `space: ndc` and known depths, it can
-    /// only shorten rays. Default: derived from the cameras.
+    /// Distance along rays at which the scene starts. With `space: ndc` and known depths, a value
+    /// below the derived one has no effect. Default: derived from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub near: Option<f64>,
-    /// Distance along rays at which the scene ends. With `space: ndc` and known depths, it can only
-    /// shorten rays. Default: derived from the cameras.
+    /// Distance along rays at which the scene ends. With `space: ndc` and known depths, a value
+    /// above the derived one has no effect. Default: derived from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub far: Option<f64>,
-    /// Space of the field's unit cube. Default: `ndc` if all cameras face one direction, and either
-    /// depths are known or the background is `opaque`. Otherwise `contraction` if depths are
-    /// unknown and the background is `opaque`, or if known points are far outside the region that
-    /// the cameras face. Otherwise `box`.
+    /// Space of the field's unit cube. Default: the first of these whose condition is true. `ndc`:
+    /// all cameras face one direction, and depths are known or the background is `opaque`.
+    /// `contraction`: depths are unknown and the background is `opaque`, or known points are far
+    /// outside the region that the cameras face. `box`: in all other cases.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub space: Option<SpaceKind>,
     /// Split into training and test views. `given`: the data set's own. `holdout`: every eighth

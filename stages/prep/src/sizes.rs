@@ -11,7 +11,7 @@ pub(crate) struct Sizes {
 
 impl Sizes {
     /// True if the HR size is an integer multiple of the LR size along both axes.
-    pub(crate) fn is_integer(&self) -> bool {
+    pub(crate) fn has_integer_scale(&self) -> bool {
         self.hr.0.is_multiple_of(self.lr.0) && self.hr.1.is_multiple_of(self.lr.1)
     }
 }
@@ -19,35 +19,36 @@ impl Sizes {
 /// Returns LR and HR size from `lr_width` and `scale`; heights follow the native aspect ratio.
 pub(crate) fn downscaled_sizes(
     native: (u32, u32),
-    lr: Option<u32>,
+    lr_width: Option<u32>,
     scale: f64,
 ) -> Result<Sizes, Failure> {
-    let (lr, hr) = match lr {
-        Some(lr) => (lr, scaled_by(lr, scale)),
+    let (lr_width, hr_width) = match lr_width {
+        Some(lr_width) => (lr_width, scaled_by(lr_width, scale)),
         None => (scaled_by(native.0, 1.0 / scale), native.0),
     };
-    if lr == 0 {
+    if lr_width == 0 {
         bail_usage!(
-            "parameters: scale = {scale} reduces a width of {hr} pixels to 0; choose a smaller \
-            scale"
+            "parameters: scale = {scale} reduces a width of {hr_width} pixels to 0; choose a \
+            smaller scale"
         );
     }
-    if scale > 1.0 && lr == hr {
+    if scale > 1.0 && lr_width == hr_width {
         bail_usage!(
-            "parameters: scale = {scale} gives LR and HR images the same width of {hr} pixels; \
-            give larger images, or choose scale = 1"
+            "parameters: scale = {scale} gives LR and HR images the same width of {hr_width} \
+            pixels; choose scale = 1, or a larger lr_width or scale"
         );
     }
-    if hr > native.0 {
+    if hr_width > native.0 {
         bail_usage!(
-            "parameters: lr_width = {lr} and scale = {scale} give HR images of {hr} pixels, but \
-            the data set's images are {} pixels wide; choose a smaller lr_width or scale",
+            "parameters: lr_width = {lr_width} and scale = {scale} give HR images of {hr_width} \
+            pixels, but the data set's images are {} pixels wide; choose a smaller lr_width or \
+            scale",
             native.0
         );
     }
-    let (lr_height, hr_height) =
-        (scaled_length(native.1, native.0, lr), scaled_length(native.1, native.0, hr));
-    Ok(Sizes { lr: (lr, lr_height), hr: (hr, hr_height) })
+    let [lr, hr] =
+        [lr_width, hr_width].map(|width| (width, scaled_length(native.1, native.0, width)));
+    Ok(Sizes { lr, hr })
 }
 
 fn scaled_by(length: u32, scale: f64) -> u32 {
@@ -78,7 +79,7 @@ mod tests {
         ] {
             assert_eq!(downscaled_sizes(native, lr, scale).unwrap(), expected);
         }
-        assert!(!downscaled_sizes((504, 378), None, 4.0).unwrap().is_integer());
+        assert!(!downscaled_sizes((504, 378), None, 4.0).unwrap().has_integer_scale());
         assert_eq!(enlarged_sizes((90, 61), 1.5), Sizes { lr: (90, 61), hr: (135, 92) });
     }
 

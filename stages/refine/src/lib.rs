@@ -158,7 +158,7 @@ fn refine_all(
         consistent: 0,
         averaged: 0,
         residual_weight: job.application.residual_weight,
-        is_reference_based: job.network.warp_options().is_some(),
+        has_reference_statistics: job.network.warp_options().is_some(),
         statistics: vec![ReferenceStatistics::default(); references.len()],
     };
     let progress = job.context.progress("refining", views.views.len() as u64);

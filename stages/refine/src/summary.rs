@@ -12,7 +12,7 @@ pub(crate) struct Summary {
     /// Fraction of the predicted residual that was added.
     pub(crate) residual_weight: f32,
     /// True if the network reports statistics of references.
-    pub(crate) is_reference_based: bool,
+    pub(crate) has_reference_statistics: bool,
     /// Statistics of each reference, summed over the views.
     pub(crate) statistics: Vec<ReferenceStatistics>,
 }
@@ -41,7 +41,7 @@ impl Summary {
             return String::new();
         }
         let references = format_count(self.statistics.len(), "reference");
-        if !self.is_reference_based {
+        if !self.has_reference_statistics {
             return format!(" by {references}");
         }
         let mut all = ReferenceStatistics::default();
@@ -66,7 +66,7 @@ mod tests {
             consistent: 0,
             averaged: 0,
             residual_weight: 0.8,
-            is_reference_based: false,
+            has_reference_statistics: false,
             statistics: Vec::new(),
         };
         assert_eq!(plain.text(), "1 view, residual weight 0.80");
@@ -75,7 +75,7 @@ mod tests {
             views: 3,
             consistent: 2,
             averaged: 1,
-            is_reference_based: true,
+            has_reference_statistics: true,
             statistics: vec![visible, ReferenceStatistics::default()],
             ..plain
         };

@@ -13,12 +13,12 @@ use crate::gather::{Report, Row};
 pub(crate) struct Layer<'a> {
     pub(crate) label: String,
     pub(crate) group: Group,
-    /// Index of the data set in the report.
+    /// Index of the data set in [`Report::scenes`].
     pub(crate) scene: usize,
     /// Indices of the rows that made the pictures: several if their pictures are equal, none for
     /// observations.
     pub(crate) rows: Vec<usize>,
-    /// Identity of the pictures: equal if all of them are equal.
+    /// Identity of the pictures: two layers whose pictures are all equal have the same one.
     identity: String,
     source: Source<'a>,
 }
@@ -238,8 +238,8 @@ fn merge_equal(layers: Vec<Layer<'_>>) -> Vec<Layer<'_>> {
     different
 }
 
-/// Labels observations by kind, and by result if the data set has several of the kind: "Ground truth"
-/// or "Ground truth of RESULT". Their labels must be the results' names.
+/// Labels observations by kind, and by result if the data set has several of the kind: "Ground
+/// truth" or "Ground truth of RESULT". Before the call, each label is the result's name.
 fn name_observations(layers: &mut [Layer<'_>]) {
     let kinds: Vec<(usize, Group)> =
         layers.iter().map(|layer| (layer.scene, layer.group.clone())).collect();
@@ -341,8 +341,7 @@ fn scored_on(report: &Report<'_>, truth: &Path) -> String {
     let labels: Vec<&str> = rows.map(|row| row.label.as_str()).collect();
     match labels.as_slice() {
         [one] => (*one).to_owned(),
-        [first, ..] => format!("{first} and {} more", labels.len() - 1),
-        [] => String::new(),
+        _ => format!("{} and {} more", labels[0], labels.len() - 1),
     }
 }
 

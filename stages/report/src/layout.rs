@@ -43,6 +43,7 @@ impl Item {
     }
 
     fn half_width(&self) -> f64 {
+        // A lane is a line: 1 keeps its stroke within the drawing. Chosen by hand.
         if self.is_lane { 1.0 } else { WIDTH / 2.0 }
     }
 }

@@ -9,10 +9,10 @@
 //!   byte budget. `scale`: colour scales of error and depth maps.
 //! * `data`: input of the page's script, as JSON.
 //! * `heading`: facts in the heading. `unscored`: views of a failed run.
-//! * `page`: the page's frame. `tables`, `viewer`, `pipeline`, `commands`: its parts. `layout`:
+//! * `page`: the page's frame. `tables`, `comparison`, `pipeline`, `commands`: its parts. `layout`:
 //!   drawing of the pipeline's graph.
-//! * `page.css`; `chart.js`: charts as SVG; `viewer.js`: the comparison; `plots.js`: choice of
-//!   plots; `page.js`: entry point.
+//! * `page.css`; `chart.js`: charts as SVG; `comparison.js`: comparison of pictures; `plots.js`:
+//!   choice of plots; `page.js`: entry point.
 //! * [`ResultRow`]: a row of `results.json`, the page's figures for scripts.
 //!
 //! ```
@@ -24,6 +24,7 @@
 //! ```
 
 mod commands;
+mod comparison;
 mod data;
 mod gather;
 mod heading;
@@ -36,7 +37,6 @@ mod results;
 mod scale;
 mod tables;
 mod unscored;
-mod viewer;
 
 use artifact::{Failure, RunRecord, format_count, format_size};
 use stage::{Context, Input, Output, Stage};

@@ -52,13 +52,13 @@ function startPage() {
   const data = JSON.parse(text);
   let plots = null;
   const rowsOf = ({ left, right }) => [left, right].map((layer) => data.layers[layer]?.rows[0] ?? -1);
-  const viewer = data.pictures.length ? new Viewer(data, (state) => plots?.choose(rowsOf(state))) : null;
+  const comparison = data.pictures.length ? new Comparison(data, (state) => plots?.choose(rowsOf(state))) : null;
   if (!data.rows.length) return;
   plots = new Plots(data, (view) => {
-    viewer?.show({ view });
+    comparison?.show({ view });
     document.getElementById("compare").scrollIntoView({ block: "start" });
   });
-  if (viewer) plots.choose(rowsOf(viewer.state));
+  if (comparison) plots.choose(rowsOf(comparison.state));
 }
 
 startPage();

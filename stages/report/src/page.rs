@@ -2,19 +2,19 @@ use artifact::{RunRecord, format_count, format_utc};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use crate::commands::{commands, file_name};
+use crate::comparison::{comparison, plots};
 use crate::data::Data;
 use crate::gather::Report;
 use crate::heading::facts;
 use crate::pipeline::pipeline;
 use crate::results::warnings_by_node;
 use crate::tables::{conventions, scores, summary, view_figures};
-use crate::viewer::{plots, viewer};
 
 const STYLE: &str = include_str!("page.css");
 /// Scripts in the order of their dependencies.
 const SCRIPTS: [&str; 4] = [
     include_str!("chart.js"),
-    include_str!("viewer.js"),
+    include_str!("comparison.js"),
     include_str!("plots.js"),
     include_str!("page.js"),
 ];
@@ -45,7 +45,7 @@ pub(crate) fn page(report: &Report<'_>, data: Option<&Data>) -> anyhow::Result<M
                 main id="content" {
                     (notices(report))
                     (summary(report))
-                    @if has_pictures { (viewer(data)) }
+                    @if has_pictures { (comparison(data)) }
                     (scores(report))
                     (plots(report))
                     (view_figures(report))

@@ -1,3 +1,5 @@
+use std::collections::BTreeMap;
+
 use artifact::format_duration;
 use maud::{Markup, html};
 use metrics::ScoreFormat;
@@ -97,15 +99,14 @@ fn figure_head(report: &Report<'_>, figure: &ScoreFormat) -> Markup {
     }
 }
 
-/// Returns the name of a figure's metric and its definition.
+/// Returns the name of a figure's metric and its definition; `None` if no result has the figure.
 pub(crate) fn definition<'a>(
     report: &'a Report<'_>,
     figure: &ScoreFormat,
 ) -> Option<(&'a str, &'a str)> {
     let metric = figure.path.split('/').next().unwrap_or_default();
     // A result without this figure may state why it isn't measured.
-    let measured = report.rows.iter().find(|row| row.mean(figure).is_some());
-    let row = measured.or(report.rows.first())?;
+    let row = report.rows.iter().find(|row| row.mean(figure).is_some())?;
     let conventions = row.metrics.conventions().as_object()?;
     // Networks of LPIPS share a definition.
     let (name, text) =
@@ -208,19 +209,30 @@ pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
 
 /// Definitions of the figures, as stated by the metrics.
 pub(crate) fn conventions(report: &Report<'_>) -> Markup {
-    let Some(row) = report.rows.first() else { return html! {} };
-    let conventions = row.metrics.conventions().as_object();
+    let definitions = definitions(report);
     html! {
-        @if let Some(conventions) = conventions {
+        @if !definitions.is_empty() {
             details class="more" {
                 summary { "Definitions of the figures" }
                 dl class="facts" {
-                    @for (name, text) in conventions {
+                    @for (name, text) in &definitions {
                         dt id={ "definition-" (name) } { (name.replace('_', " ")) }
-                        dd { (text.as_str().unwrap_or_default()) }
+                        dd { (text) }
                     }
                 }
             }
         }
     }
+}
+
+/// Returns the definitions by name: of measured figures as [`definition`], of others as stated by
+/// the first result.
+fn definitions<'a>(report: &'a Report<'_>) -> BTreeMap<&'a str, &'a str> {
+    let mut all = BTreeMap::new();
+    let stated = report.rows.iter().filter_map(|row| row.metrics.conventions().as_object());
+    for (name, text) in stated.flatten() {
+        all.entry(name.as_str()).or_insert(text.as_str().unwrap_or_default());
+    }
+    all.extend(report.figures.iter().filter_map(|figure| definition(report, figure)));
+    all
 }

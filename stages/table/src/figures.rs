@@ -8,21 +8,21 @@ use metrics::{AnyMetrics, ScoreFormat};
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Figures(BTreeMap<String, ScoreFormat>);
 
-/// Values that the table adds to those of metrics: name, title, digits, and true if higher values
-/// are better.
-const ADDED: [(&str, &str, usize, bool); 12] = [
-    ("least_gain", "least gain", 2, true),
-    ("near_psnr", "near psnr", 2, true),
-    ("gain", "gain", 2, true),
-    ("rendered_psnr", "rendered psnr", 2, true),
-    ("refined_psnr", "refined psnr", 2, true),
-    ("samples_per_ray", "samples per ray", 1, false),
-    ("rays_per_s", "rays/s", 0, true),
-    ("views", "views", 0, true),
-    ("near_views", "near views", 0, true),
-    ("seconds_per_view", "seconds per view", 1, false),
-    ("peak_mb", "peak memory, MB", 0, false),
-    ("field_mb", "field, MB", 1, false),
+/// Values that the table adds to those of metrics: name, title, digits, and whether higher values
+/// are better; `None` if no value is better than another.
+const ADDED: [(&str, &str, usize, Option<bool>); 12] = [
+    ("least_gain", "least gain", 2, Some(true)),
+    ("near_psnr", "near psnr", 2, Some(true)),
+    ("gain", "gain", 2, Some(true)),
+    ("rendered_psnr", "rendered psnr", 2, Some(true)),
+    ("refined_psnr", "refined psnr", 2, Some(true)),
+    ("samples_per_ray", "samples per ray", 1, Some(false)),
+    ("rays_per_s", "rays/s", 0, Some(true)),
+    ("views", "views", 0, None),
+    ("near_views", "near views", 0, None),
+    ("seconds_per_view", "seconds per view", 1, Some(false)),
+    ("peak_mb", "peak memory, MB", 0, Some(false)),
+    ("field_mb", "field, MB", 1, Some(false)),
 ];
 
 impl Figures {
@@ -38,13 +38,13 @@ impl Figures {
     pub(crate) fn lower_is_better(&self, name: &str) -> bool {
         match self.0.get(name) {
             Some(figure) => figure.higher_is_better == Some(false),
-            None => !added(name).is_some_and(|(.., higher_is_better)| higher_is_better),
+            None => added(name).is_none_or(|(.., is_better)| is_better == Some(false)),
         }
     }
 
     /// True if no value of the column is better than another: numbers of views.
     pub(crate) fn has_no_best(name: &str) -> bool {
-        ["views", "near_views"].contains(&name)
+        added(name).is_some_and(|(.., is_better)| is_better.is_none())
     }
 
     /// Formats a value with its digits and unit.
@@ -55,6 +55,7 @@ impl Figures {
         match (name, added(name)) {
             ("rays_per_s", _) => format!("{:.0} k", value / 1e3),
             (_, Some((_, digits, _))) => format!("{value:.digits$}"),
+            // Minutes from 120 s on; chosen by hand.
             _ if is_time(name) && value >= 120.0 => format!("{:.1} min", value / 60.0),
             _ if is_time(name) => format!("{value:.1} s"),
             _ if value.fract() == 0.0 => format!("{value:.0}"),
@@ -84,7 +85,7 @@ impl Figures {
     }
 }
 
-fn added(name: &str) -> Option<(&'static str, usize, bool)> {
+fn added(name: &str) -> Option<(&'static str, usize, Option<bool>)> {
     let found = ADDED.iter().find(|(added, ..)| *added == name)?;
     Some((found.1, found.2, found.3))
 }

@@ -72,7 +72,7 @@ impl Layout<'_> {
         head
     }
 
-    /// Returns the names of the values that make the front; `None` without a front.
+    /// Returns the names of the Pareto front's values; `None` without a front.
     fn axes(&self) -> Option<Axes<'_>> {
         let score = self.params.compared_value();
         Some(Axes {
@@ -82,7 +82,7 @@ impl Layout<'_> {
         })
     }
 
-    /// Returns the lines that have both values of the front, named by their keys.
+    /// Returns the lines that have both values of the Pareto front, named by their keys.
     fn points(&self, rows: &[Row], axes: &Axes<'_>) -> Vec<Point> {
         let point = |keys: Vec<String>| {
             let line = select(rows, &self.keys, &keys);
@@ -92,7 +92,7 @@ impl Layout<'_> {
         distinct(rows, &self.keys).into_iter().filter_map(point).collect()
     }
 
-    /// Returns the names of the lines on the front.
+    /// Returns the names of the lines on the Pareto front.
     fn front(&self, rows: &[Row]) -> Vec<String> {
         let Some(axes) = self.axes() else { return Vec::new() };
         let points = self.points(rows, &axes);
@@ -194,8 +194,9 @@ impl Layout<'_> {
         }
     }
 
-    /// True if an extra row belongs to some results. Each of the row's keys that identify lines or
-    /// columns has the value of some result; each other key has the value that all results share.
+    /// Returns whether an extra row belongs to the table of some results. A key that identifies
+    /// lines or columns must have a value that occurs in the results; any other key must have the
+    /// one value that all results have.
     fn matches(&self, extra: &Row, rows: &[Row]) -> bool {
         extra.iter().filter(|(name, value)| self.is_key(name, value)).all(|(name, value)| {
             let theirs = distinct(rows, std::slice::from_ref(name)).concat();
@@ -206,7 +207,7 @@ impl Layout<'_> {
 
     /// True if an entry of a row is a key that results may share.
     fn is_key(&self, name: &str, value: &Value) -> bool {
-        value.is_string() && name != "method" && name != GROUP
+        value.is_string() && name != "method" && name != GROUP && !PROVENANCE.contains(&name)
     }
 }
 

@@ -60,6 +60,7 @@ pub(crate) fn document(
     if is_by_seed {
         text += &spread(rows, figures, params.compared_value()).unwrap_or_default();
     }
+    // Points with a reason were excluded on purpose.
     let failed: Vec<&FailedPoint> = failed.iter().filter(|point| point.reason.is_none()).collect();
     if !failed.is_empty() {
         text += "\nFailed, or waiting for a failed stage:\n\n";
@@ -121,22 +122,28 @@ fn check_front(params: &Params, rows: &[Row]) -> Result<(), Failure> {
     }
     let names = rows.iter().flatten().filter(|(_, value)| value.is_number());
     let known = artifact::known_names(front, names.map(|(name, _)| name.as_str()));
-    Err(Failure::Usage(format!("parameter front: no result has a value {front:?}; {known}")))
+    bail_usage!("parameter front: no result has a value {front:?}; {known}");
 }
 
-/// Returns the value that others are compared with.
+/// Returns the value that others are compared with. Fails if the named results don't have it.
 fn reference(params: &Params, rows: &[Row]) -> Result<Option<f64>, Failure> {
     if params.relative_to.is_empty() || rows.is_empty() {
         return Ok(None);
     }
     let (keys, values): (Vec<String>, Vec<String>) = params.relative_to.clone().into_iter().unzip();
-    match mean(&select(rows, &keys, &values), params.compared_value()) {
-        Some(value) => Ok(Some(value)),
-        None => Err(Failure::Usage(format!(
-            "parameter relative_to: no result has {:?}",
-            params.relative_to
-        ))),
+    let selected = select(rows, &keys, &values);
+    let name = params.compared_value();
+    let value = mean(&selected, name);
+    if value.is_none() {
+        let named: Vec<String> =
+            params.relative_to.iter().map(|(key, value)| format!("{key} = {value}")).collect();
+        let named = named.join(", ");
+        if selected.is_empty() {
+            bail_usage!("parameter relative_to: no result has {named}");
+        }
+        bail_usage!("parameter relative_to: no result with {named} has a value {name:?}");
     }
+    Ok(value)
 }
 
 /// Returns the table of differences between methods in each column; empty if there are none.

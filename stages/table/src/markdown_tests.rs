@@ -125,7 +125,7 @@ fn keys_that_no_result_has_are_refused() {
         (
             vec![],
             vec![("variant", "nothing")],
-            "parameter relative_to: no result has {\"variant\": \"nothing\"}",
+            "parameter relative_to: no result has variant = nothing",
         ),
     ] {
         let params = Params {

@@ -16,12 +16,13 @@ pub(crate) struct Examples<T = KnownView> {
 }
 
 impl<T: Clone> Examples<T> {
-    /// Leaves out the middle one of each eight views; a single view is used for both.
+    /// Leaves out the fifth of each eight views, or the last of fewer than five; a single view is
+    /// used for both.
     fn split(all: Vec<T>) -> Self {
         if all.len() == 1 {
             return Self { training: all.clone(), left_out: all };
         }
-        let middle = (HOLD_OUT_EVERY / 2).min(all.len().saturating_sub(1));
+        let middle = (HOLD_OUT_EVERY / 2).min(all.len() - 1);
         let mut examples = Self { training: Vec::new(), left_out: Vec::new() };
         for (i, example) in all.into_iter().enumerate() {
             let is_left_out = i % HOLD_OUT_EVERY == middle;
@@ -101,7 +102,7 @@ pub(crate) fn lr_photographs(context: &Context) -> Result<Option<LrObservations<
         return Ok(None);
     };
     let photographs = LrObservations::read(photographs)?;
-    if !photographs.cover(&Views::read(cameras)?) {
+    if !photographs.covers(&Views::read(cameras)?) {
         return Ok(None);
     }
     context.log_line(

@@ -205,7 +205,7 @@ fn hr_camera<'a>(view: &View, cameras: &'a Views) -> Result<&'a Camera, Failure>
     })
 }
 
-/// Reads the method's network once for each thread; `None` for `bicubic`.
+/// Reads the method's network once for each thread; one `None` for each thread with `bicubic`.
 fn read_networks(
     context: &Context,
     params: &Params,
@@ -214,13 +214,13 @@ fn read_networks(
     let scale = pairs.first().map_or(1.0, |(view, camera)| {
         f64::from(camera.intrinsics.width) / f64::from(view.camera.intrinsics.width)
     });
-    let scale = scale.round();
+    let nearest = scale.round();
     let (default, read): (String, NetworkReader) = match params.method {
         Method::Bicubic => return Ok((0..context.threads).map(|_| None).collect()),
-        Method::Imdn => (format!("imdn_x{scale}.safetensors"), |weights| {
+        Method::Imdn => (format!("imdn_x{nearest}.safetensors"), |weights| {
             Ok(Box::new(imdn::Imdn::read(weights)?))
         }),
-        Method::Swinir => (format!("swinir_x{scale}.safetensors"), |weights| {
+        Method::Swinir => (format!("swinir_x{nearest}.safetensors"), |weights| {
             Ok(Box::new(swinir::SwinIr::read(weights)?))
         }),
         Method::Liif => {
@@ -232,11 +232,11 @@ fn read_networks(
     let networks =
         (0..context.threads).map(|_| read(&weights).map(Some)).collect::<Result<Vec<_>, _>>();
     let networks = networks.bad_input("input weights")?;
-    let scale = networks.first().and_then(|n| n.as_ref()?.scale());
+    let network_scale = networks.first().and_then(|n| n.as_ref()?.scale());
     for (view, camera) in pairs {
         let [lr, hr] = [&view.camera, *camera]
             .map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
-        check_scale(scale, lr, hr)
+        check_scale(network_scale, lr, hr)
             .map_err(|e| Failure::BadInput(format!("view {}: {file} {e}", camera.name)))?;
     }
     Ok(networks)

@@ -154,7 +154,7 @@ fn scene_name(run: &RunRecord) -> String {
     name.unwrap_or("scene").to_owned()
 }
 
-/// Returns the width of a recorded film in pixels: that of the scene's HR images, if known.
+/// Returns the width of a recorded video in pixels: that of the scene's HR images, if known.
 fn film_width(folder: &Path, cameras: &[&Camera]) -> anyhow::Result<u32> {
     let input = GivenInput::open("scene", folder)?;
     let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
@@ -172,9 +172,10 @@ fn bake(context: &Context, baker: &Baker<'_>) -> anyhow::Result<Volume> {
     Ok(baker.volume(&shape, &progress)?)
 }
 
-/// Returns the bounds of the page's rays. A viewer may be nearer than the cameras were and, where
-/// the space's border limits rays, farther.
+/// Returns the bounds of the page's rays. A viewer may be nearer than the cameras were. In a box and
+/// NDC, the cube ends the rays, so `far` needs no limit.
 fn page_bounds(bounds: &Bounds) -> Bounds {
+    // JSON has no infinity.
     let far = if bounds.space == Space::Contraction { bounds.far } else { 1e30 };
     Bounds { near: 0.0, far, ..*bounds }
 }
@@ -236,7 +237,7 @@ fn shrunk(image: Rgba8, max_width: usize) -> Rgba8 {
     if factor < 2 {
         return image;
     }
-    let [width, height] = [image.width, image.height].map(|size| size.div_ceil(factor).max(1));
+    let [width, height] = [image.width, image.height].map(|size| size.div_ceil(factor));
     resize_pillow(&image, width, height, Filter::Box)
 }
 

@@ -27,7 +27,7 @@ pub(crate) fn centre_and_size(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) 
     let median = [0, 1, 2].map(|axis| quantile(positions.iter().map(|p| p[axis]).collect(), 0.5));
     let centre = to_world(bounds, DVec3::from(median));
     let distances = positions.iter().map(|&p| to_world(bounds, p).distance(centre)).collect();
-    // Half of a frustum's voxels may lie in the far background.
+    // Half of a frustum's voxels may lie in the far background. Both fractions are chosen by hand.
     let fraction = if matches!(bounds.space, Space::Ndc(_)) { 0.5 } else { 0.9 };
     (centre, (2.0 * quantile(distances, fraction)).max(f64::MIN_POSITIVE))
 }
@@ -37,7 +37,7 @@ const FRUSTUM_SHARE: f64 = 0.4;
 /// Maximum depth of a drawn frustum over the scene's size; chosen by hand.
 const MAX_FRUSTUM_SHARE: f64 = 0.06;
 
-/// Returns the depth at which frusta are drawn, in scene units: small enough that they are apart.
+/// Returns the depth of the drawn frusta in scene units: so small that most don't overlap.
 pub(crate) fn frustum_depth(cameras: &[&Camera], size: f64) -> f64 {
     let centres: Vec<DVec3> = cameras.iter().map(|camera| camera.centre()).collect();
     let mut spacings = Vec::with_capacity(centres.len());
@@ -66,11 +66,12 @@ pub(crate) fn up_direction(cameras: &[&Camera]) -> DVec3 {
     let mut order = [0, 1, 2];
     order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
     let [least, second, most] = order.map(|i| eigen.eigenvalues[i]);
+    // Both limits are chosen by hand.
     if second < 0.1 * most || least > 0.3 * second {
         return mean;
     }
-    let across = DVec3::from([0, 1, 2].map(|i| eigen.eigenvectors[(i, order[0])]));
-    if across.dot(mean) < 0.0 { -across } else { across }
+    let up = DVec3::from([0, 1, 2].map(|i| eigen.eigenvectors[(i, order[0])]));
+    if up.dot(mean) < 0.0 { -up } else { up }
 }
 
 /// Returns the index of the initial camera: one that looks from slightly above; of cameras that

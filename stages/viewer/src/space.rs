@@ -1,15 +1,14 @@
 //! Maps between the world and a field's unit cube, and steps of rays through the cube.
 
 use glam::DVec3;
-use radiance::{NormalizedRay, RayMap};
+use radiance::{MAX_SPEED, NormalizedRay, RayMap};
 use scene::{Bounds, Space};
 
-/// Maximum speed of a contracted ray in cube sides per unit of t, as in `radiance`.
-const MAX_SPEED: f32 = 2.0;
-/// Lower limit of the speed that a step assumes for a contracted ray. Only rays near the border are
-/// slower.
+/// Minimum speed that [`step_along`] assumes for a contracted ray; chosen by hand. Only rays near
+/// the border are slower.
 const MIN_SPEED: f32 = 1.0 / 64.0;
-/// Maximum distance from the middle of a contracted space in ball radii, 2 at infinity.
+/// Maximum distance from the middle of a contracted space in ball radii, 2 at infinity; chosen by
+/// hand.
 const MAX_CONTRACTED_RADIUS: f64 = 2.0 - 1e-6;
 
 /// Converts a position in the unit cube to a world point. Positions beyond the border of a
@@ -38,9 +37,8 @@ pub(crate) fn is_reachable(bounds: &Bounds, low: [f32; 3], high: [f32; 3]) -> bo
             (0..3).all(|i| f64::from(low[i]) <= extent[i])
         }
         Space::Ndc(frustum) => {
-            let [width, height] = [0, 1].map(|i| frustum.max[i] - frustum.min[i]);
-            let side = width.max(height);
-            f64::from(low[0]) <= width / side && f64::from(low[1]) <= height / side
+            let extent = |i: usize| (frustum.max[i] - frustum.min[i]) / frustum.cube_side();
+            (0..2).all(|i| f64::from(low[i]) <= extent(i))
         }
         Space::Contraction => {
             let nearest: [f32; 3] = std::array::from_fn(|i| 0.5f32.max(low[i]).min(high[i]) - 0.5);

@@ -49,7 +49,8 @@ pub fn psnr(render: &Image, truth: &Image) -> f64 {
     psnr_of(sum / render.data.len() as f64)
 }
 
-/// Returns the [`psnr`] over the fraction of pixels that count; the other pixels must be equal.
+/// Returns the [`psnr`] of the pixels that count; all other pixels must be equal. `counted_share`
+/// is the fraction that counts. Below 1, images that are equal everywhere have less than 100 dB.
 fn masked_psnr(render: &Image, truth: &Image, counted_share: f64) -> f64 {
     psnr(render, truth) + 10.0 * counted_share.log10()
 }
@@ -68,7 +69,7 @@ impl Metric for PsnrMetric {
 
     fn convention(&self, scene: &ScoredScene<'_>) -> String {
         let is_masked = scene.truth.views.iter().any(|view| view.mask.is_some());
-        let masked = if is_masked { "; of the pixels that masks leave" } else { "" };
+        let masked = if is_masked { "; only pixels that no mask excludes" } else { "" };
         format!(
             "-10 log10 of the mean squared error over pixels and channels in [0, 1]; prediction in \
             half precision, clamped; mean of per-view values{masked}"
@@ -174,8 +175,8 @@ impl Metric for WarpMetric {
 
     fn figures(&self) -> Vec<ScoreFormat> {
         vec![
-            ScoreFormat::new("warp/psnr", "PSNR of neighbours by depth ↑ dB", 2, true),
-            ScoreFormat::new("warp/seen", "share that neighbours see ↑", 4, true),
+            ScoreFormat::new("warp/psnr", "PSNR of warped neighbour ↑ dB", 2, true),
+            ScoreFormat::new("warp/seen", "share of pixels visible in the neighbour ↑", 4, true),
         ]
     }
 
@@ -188,7 +189,7 @@ impl Metric for WarpMetric {
     }
 
     fn picture_title(&self) -> Option<&'static str> {
-        Some("Neighbours by depth (red: not seen)")
+        Some("Warped neighbour (red: not visible there)")
     }
 
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {

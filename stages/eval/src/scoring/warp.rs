@@ -32,24 +32,23 @@ fn squared_distance(camera: &Camera, view: &View) -> f64 {
 }
 
 /// True if two cameras are near enough for a comparison of their views, by
-/// [`MAX_DISTANCE_PER_DEPTH`]. `depth` is the depth image of the first camera.
-fn are_near(camera: &Camera, other: &Camera, depth: &ExrImage) -> bool {
-    let (Some(z), Some(opacity)) = (depth.channel("Z"), depth.channel("A")) else { return false };
-    let mut depths: Vec<f32> =
-        z.iter().zip(opacity).filter(|(_, a)| **a >= 0.5).map(|(z, _)| *z).collect();
+/// [`MAX_DISTANCE_PER_DEPTH`]. `map` has the depths of the first camera.
+fn are_near(camera: &Camera, other: &Camera, map: DepthMap<'_>) -> bool {
+    let surfaces = (0..map.depth.len()).filter(|pixel| map.has_surface(*pixel));
+    let mut depths: Vec<f32> = surfaces.map(|pixel| map.depth[pixel]).collect();
     depths.sort_by(f32::total_cmp);
     let Some(median) = depths.get(depths.len() / 2) else { return false };
     let distance = (other.centre() - camera.centre()).length();
     distance <= MAX_DISTANCE_PER_DEPTH * f64::from(*median)
 }
 
-/// Reads depth and opacity of a rendered view; `None` if missing or of another size.
+/// Reads a rendered view's depth image; `None` if it is missing or has another size.
 fn read_depth_image(input: &GivenInput, view: &View) -> anyhow::Result<Option<ExrImage>> {
     let Some(depth) = &view.depth else { return Ok(None) };
     let image = read_depth(&input.path(depth), &view.camera.name)?;
     let k = &view.camera.intrinsics;
     let has_size = (image.width, image.height) == (k.width as usize, k.height as usize);
-    Ok((has_size && DepthMap::of(&image).is_some()).then_some(image))
+    Ok(has_size.then_some(image))
 }
 
 /// View with its true image; images have the size of the camera's.
@@ -65,7 +64,8 @@ struct TrueView<'a> {
 const CUBIC_MARGIN: usize = 2;
 
 /// Warps the neighbour's image to a view by both depths, and scores the result. In the picture,
-/// pixels that are masked or aren't visible from the neighbour are red. `None` if no pixel remains.
+/// pixels that are masked or aren't visible from the neighbour are red. `None` if a depth image
+/// lacks a channel, or no pixel remains.
 fn warp(view: &TrueView<'_>, neighbour: &TrueView<'_>) -> Option<(WarpScore, Rgba8)> {
     const INVISIBLE_COLOUR: [u8; 4] = [120, 20, 30, 255];
     let (truth, other_truth) = (view.truth, neighbour.truth);
@@ -79,6 +79,7 @@ fn warp(view: &TrueView<'_>, neighbour: &TrueView<'_>) -> Option<(WarpScore, Rgb
         }
     }
     let size = (other_truth.width, other_truth.height);
+    // The mask has this size already; resizing only widens it by the margin.
     if let Some(mask) = neighbour.mask.as_ref().map(|mask| mask.resized(size, CUBIC_MARGIN)) {
         for position in &mut positions {
             *position = position.filter(|&[x, y]| {
@@ -114,16 +115,16 @@ fn warp(view: &TrueView<'_>, neighbour: &TrueView<'_>) -> Option<(WarpScore, Rgb
 /// Scores a view against its nearest neighbour's true image, warped by the rendered depths. `None`
 /// if an image or depth is missing, the neighbour is too far away, or the neighbour shows no pixel
 /// of the view.
-pub(super) fn score_view(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
-    let (scene, own_camera) = (view.scene, &view.view.camera);
-    let Some(truth) = &view.truth else { return Ok(None) };
+pub(super) fn score_view(scored: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
+    let (scene, own_camera) = (scored.scene, &scored.view.camera);
+    let Some(truth) = &scored.truth else { return Ok(None) };
     let Some(other) = neighbour(own_camera, &scene.views.views) else { return Ok(None) };
     let other_truth = scene.truth.views.iter().find(|v| v.camera.name == other.camera.name);
     let Some((other_view, file)) = other_truth.and_then(|v| Some((v, v.image.as_ref()?))) else {
         return Ok(None);
     };
-    let Some(depth) = read_depth_image(scene.views_input, view.view)? else { return Ok(None) };
-    if !are_near(own_camera, &other.camera, &depth) {
+    let Some(depth) = read_depth_image(scene.views_input, scored.view)? else { return Ok(None) };
+    if DepthMap::of(&depth).is_none_or(|map| !are_near(own_camera, &other.camera, map)) {
         return Ok(None);
     }
     let Some(other_depth) = read_depth_image(scene.views_input, other)? else { return Ok(None) };
@@ -131,15 +132,15 @@ pub(super) fn score_view(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpSc
     if (image.width, image.height) != (other_depth.width, other_depth.height) {
         return Ok(None);
     }
-    let read_mask = |view: &View, image: &Image| {
-        let mask = view.read_mask(scene.truth_input, (image.width, image.height));
-        mask.bad_input(format!("view {}", view.camera.name))
+    let read_mask = |true_view: &View, image: &Image| {
+        let mask = true_view.read_mask(scene.truth_input, (image.width, image.height));
+        mask.bad_input(format!("view {}", true_view.camera.name))
     };
     let view = TrueView {
         camera: own_camera,
         depth: &depth,
         truth,
-        mask: read_mask(view.true_view, truth)?,
+        mask: read_mask(scored.true_view, truth)?,
     };
     let neighbour = TrueView {
         camera: &other.camera,
@@ -226,7 +227,9 @@ mod tests {
         for (angle, is_compared) in [(10.0_f64, true), (30.0, false)] {
             let baseline = 2.0 * 2.0 * (angle / 2.0).to_radians().tan();
             let (a, b) = (camera("a", 0.0), camera("b", baseline));
-            assert_eq!(are_near(&a, &b, &depth_image(2.0)), is_compared, "{angle}");
+            let image = depth_image(2.0);
+            let map = DepthMap::of(&image).unwrap();
+            assert_eq!(are_near(&a, &b, map), is_compared, "{angle}");
         }
     }
 

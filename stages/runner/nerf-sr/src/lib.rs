@@ -75,7 +75,7 @@ fn plan_exit_code(error: &PlanError) -> u8 {
     match error {
         PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
         PlanError::Store(_) => 1,
-        PlanError::Source { .. } | PlanError::Artifact(_) => 3,
-        PlanError::Interrupted => 130,
+        PlanError::Source { .. } | PlanError::Artifact(_) => StageFailure::BAD_INPUT,
+        PlanError::Interrupted => StageFailure::INTERRUPTED,
     }
 }

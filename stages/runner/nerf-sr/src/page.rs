@@ -60,20 +60,22 @@ pub(crate) fn check_ownership(target: &Path, kind: &str) -> anyhow::Result<()> {
     let files = list_files(target)?;
     // The mark decides whether the page is archived, so it must be readable.
     PageMark::read(target).map_err(|e| unreadable(&target.join(MARK_FILE), &e))?;
-    let manifest = Manifest::read(target).ok().filter(|manifest| manifest.kind == kind);
-    let listed = manifest.as_ref().map_or(&[][..], |manifest| manifest.files.as_slice());
-    let is_foreign = |file: &Path| {
-        file != Path::new(MANIFEST_FILE)
-            && file != Path::new(MARK_FILE)
-            && listed.iter().all(|entry| Path::new(&entry.path) != file)
-    };
-    let foreign = files.iter().map(|(file, _)| file.as_path()).find(|file| is_foreign(file));
+    let manifest = Manifest::read(target).ok();
+    if let Some(manifest) = manifest.as_ref().filter(|manifest| manifest.kind != kind) {
+        bail!("{} contains an artifact of kind {}, not {kind}", target.display(), manifest.kind);
+    }
+    let listed = manifest.iter().flat_map(|manifest| &manifest.files);
+    let mut own: BTreeSet<&Path> = listed.map(|entry| Path::new(&entry.path)).collect();
+    own.extend([Path::new(MANIFEST_FILE), Path::new(MARK_FILE)]);
+    let foreign = files.iter().map(|(file, _)| file.as_path()).find(|file| !own.contains(file));
     let Some(manifest) = manifest.as_ref().filter(|_| foreign.is_none()) else {
         let foreign = target.join(foreign.unwrap_or(Path::new("")));
         bail!("{} was not written by nerf-sr", foreign.display());
     };
+    // One by one, since a missing file must not hide a changed one.
     for entry in &manifest.files {
-        let single = Manifest { files: vec![entry.clone()], ..manifest.clone() };
+        let files = vec![entry.clone()];
+        let single = Manifest { kind: kind.to_owned(), schema: manifest.schema, files };
         match single.check_contents(target) {
             // A page that lost a file still belongs to nerf-sr.
             Ok(()) | Err(Damage::Missing { .. }) => {}

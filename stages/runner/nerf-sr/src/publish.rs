@@ -111,17 +111,18 @@ impl Publishing<'_> {
     /// Replaces the target's page by a copy of `output`. Returns the new path of the old page if
     /// that was archived.
     fn replace(&self, output: &Path) -> Result<Option<PathBuf>, StageFailure> {
-        let (scrap, swap) = (self.hidden("scrap"), self.hidden("new"));
+        let (scrap, staged) = (self.hidden("scrap"), self.hidden("new"));
         remove_folder(&scrap)
             .and_then(|()| copy_folder(output, &scrap))
-            .and_then(|()| fs::rename(&scrap, &swap))
+            .and_then(|()| fs::rename(&scrap, &staged))
             .map_err(|e| StageFailure::at(&scrap, &e))?;
-        if let Err(refused) = self.exchange(&swap) {
-            self.delete(&swap).ok();
+        if let Err(refused) = self.exchange(&staged) {
+            self.delete(&staged).ok();
             return Err(refused);
         }
-        // Now `swap` is the old page, or doesn't exist.
-        self.archive_or_delete(&swap, &self.mark).map_err(|e| StageFailure::at(&swap, &e))
+        // After the exchange the old page is there, if one existed.
+        let replaced = staged;
+        self.archive_or_delete(&replaced, &self.mark).map_err(|e| StageFailure::at(&replaced, &e))
     }
 
     /// Exchanges a page and the target's page. If the target doesn't exist, the page is moved.

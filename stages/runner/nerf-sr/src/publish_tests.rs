@@ -265,7 +265,7 @@ fn foreign_files_are_not_replaced() {
         ("index.html was not written by nerf-sr", |t| {
             fs::write(t.join(MANIFEST_FILE), "{}").unwrap();
         }),
-        ("index.html was not written by nerf-sr", |t| {
+        ("report contains an artifact of kind scene, not ", |t| {
             let manifest = Manifest { kind: "scene".into(), ..Manifest::read(t).unwrap() };
             write_json(&t.join(MANIFEST_FILE), &manifest).unwrap();
         }),

@@ -42,15 +42,16 @@ impl<'a> ConfirmedProgram<'a> {
 }
 
 fn confirmation_failure(problem: &ConfirmError) -> StageFailure {
-    let code = if matches!(problem, ConfirmError::Interrupted) { 130 } else { 2 };
+    let is_interrupted = matches!(problem, ConfirmError::Interrupted);
+    let code = if is_interrupted { StageFailure::INTERRUPTED } else { 2 };
     StageFailure { code, message: problem.to_string() }
 }
 
 /// Returns the failure of a stage whose inputs can't be used.
 pub(crate) fn input_failure(problem: &PlanError) -> StageFailure {
     let code = match problem {
-        PlanError::Source { .. } | PlanError::Artifact(_) => 3,
-        PlanError::Interrupted => 130,
+        PlanError::Source { .. } | PlanError::Artifact(_) => StageFailure::BAD_INPUT,
+        PlanError::Interrupted => StageFailure::INTERRUPTED,
         PlanError::Pipeline(_) | PlanError::Store(_) | PlanError::Usage(_) => 1,
     };
     StageFailure { code, message: problem.to_string() }
@@ -105,7 +106,7 @@ impl<'a> Inputs<'a> {
                     run again",
                     folder.display()
                 );
-                return Err(StageFailure { code: 3, message });
+                return Err(StageFailure { code: StageFailure::BAD_INPUT, message });
             }
         }
         self.artifacts.iter().try_for_each(StoredInput::check).map_err(|e| damage_failure(&e))
@@ -136,7 +137,7 @@ impl<'a> Inputs<'a> {
 }
 
 fn damage_failure(damage: &Damage) -> StageFailure {
-    StageFailure { code: 3, message: damage.to_string() }
+    StageFailure { code: StageFailure::BAD_INPUT, message: damage.to_string() }
 }
 
 /// An input from the store.

@@ -30,7 +30,7 @@ pub(crate) fn wait_for_lock<T>(
             Locked::HeldBy(holder) => {
                 if stop.load(Ordering::Relaxed) {
                     let message = "interrupted while waiting for a lock".to_owned();
-                    return Err(StageFailure { code: 130, message });
+                    return Err(StageFailure { code: StageFailure::INTERRUPTED, message });
                 }
                 if begin.elapsed() >= next_notice {
                     report(holder.as_ref(), begin.elapsed());

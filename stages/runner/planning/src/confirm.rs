@@ -39,6 +39,7 @@ impl StageProgram {
     }
 
     /// Checks before a stage's start that the program is the planned one. Returns the file's stamp.
+    /// Programs that this one calls are checked after the stage's end.
     pub fn confirm(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<Stamp, ConfirmError> {
         let now = self.stamp_now()?;
         if self.stamp == Some(now) {
@@ -51,8 +52,9 @@ impl StageProgram {
         Ok(now)
     }
 
-    /// Checks after a stage's end that the program was the planned one since the `start`. Programs
-    /// outside the runner's folder are always described again: they may call other programs.
+    /// Checks after a stage's end that the program was the planned one since the stage's start;
+    /// `start` is the file's stamp at that time. Programs outside the runner's folder are always
+    /// described again: they may call other programs.
     pub fn confirm_since(
         &self,
         start: &Stamp,
@@ -86,8 +88,8 @@ impl StageProgram {
     fn check_code(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<(), ConfirmError> {
         let path = &self.path;
         let mut descriptions = describe_all(std::slice::from_ref(path), stop)?;
-        let description = descriptions.remove(path).ok_or(ConfirmError::Interrupted)?;
-        if description?.code == self.description.code {
+        let description = descriptions.remove(path).expect("all given programs are described")?;
+        if description.code == self.description.code {
             return Ok(());
         }
         // The cache knows a wrapper script by its own file, which may be unchanged.

@@ -60,10 +60,10 @@ impl Plan {
     ) -> Result<Vec<State>, PlanError> {
         let mut states: Vec<State> = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {
-            let on: BTreeSet<usize> =
+            let unfinished_parents: BTreeSet<usize> =
                 node.parents().filter(|&p| !matches!(states[p], State::Cached(_))).collect();
-            if !on.is_empty() {
-                states.push(State::Waits { on: on.into_iter().collect() });
+            if !unfinished_parents.is_empty() {
+                states.push(State::Waits { on: unfinished_parents.into_iter().collect() });
                 continue;
             }
             let inputs = hash_inputs(node, store, stop, |index| cached_output(&states[index]))?;

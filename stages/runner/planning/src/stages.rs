@@ -29,8 +29,8 @@ pub struct StageProgram {
     pub description: Description,
     /// Schema of the parameters.
     pub schema: Schema,
-    /// Stamp of the executable from before it was described; `None` in a plan that was read from a
-    /// file.
+    /// Stamp of the executable from before it was described; `None` if the description was given,
+    /// not read from the executable.
     pub(crate) stamp: Option<Stamp>,
 }
 

@@ -10,10 +10,11 @@ use crate::file::Part;
 use crate::pipeline::{Pipeline, TARGET_FOLDERS};
 use crate::request::PlanError;
 
-/// Returns a pipeline that contains all targets, and the targets' blocks. A target NAME is searched
-/// in this order: the block NAME of pipeline.yaml; the file NAME.yaml in [`TARGET_FOLDERS`], which
-/// stands for its block NAME or, without one, for its default blocks; the block NAME of any other
-/// file there.
+/// Returns a pipeline that contains all targets, and the targets' blocks. A target NAME is the
+/// first of these:
+/// 1. the block NAME of pipeline.yaml;
+/// 2. the block NAME of NAME.yaml in [`TARGET_FOLDERS`] or, without one, its default blocks;
+/// 3. the block NAME of another file there.
 pub fn find_targets(
     pipeline: &Pipeline,
     targets: &[String],
@@ -26,23 +27,22 @@ pub fn find_targets(
         } else {
             find_in_folders(pipeline, target)?
         };
+        let cannot_combine = |reason: &str| {
+            PlanError::Usage(format!(
+                "{target} can't be combined with {}: {reason}; run {target} alone",
+                blocks.join(", ")
+            ))
+        };
         joined = Some(match joined {
             None => found,
             Some(joined)
                 if joined.quality.unwrap_or_default() != found.quality.unwrap_or_default() =>
             {
-                return Err(PlanError::Usage(format!(
-                    "{target} can't be combined with {}: their files set different qualities; run \
-                    {target} alone",
-                    blocks.join(", ")
-                )));
+                return Err(cannot_combine("their files set different qualities"));
             }
-            Some(joined) => joined.joined(found).map_err(|problem| {
-                PlanError::Usage(format!(
-                    "{target} can't be combined with {}: {problem}; run {target} alone",
-                    blocks.join(", ")
-                ))
-            })?,
+            Some(joined) => {
+                joined.joined(found).map_err(|problem| cannot_combine(&problem.to_string()))?
+            }
         });
         blocks.extend(target_blocks);
     }

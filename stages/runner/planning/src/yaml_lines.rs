@@ -26,6 +26,7 @@ pub(crate) struct DecodeError {
 
 /// Returns the text of a UTF-8 file without its byte order mark.
 pub(crate) fn decode(bytes: &[u8]) -> Result<&str, DecodeError> {
+    // Without a byte order mark, the first character, an ASCII one, has a zero byte.
     let is_utf16 = bytes.starts_with(&[0xff, 0xfe])
         || bytes.starts_with(&[0xfe, 0xff])
         || bytes.iter().take(2).any(|b| *b == 0);
@@ -83,7 +84,7 @@ pub(crate) fn find_non_finite(value: &Value) -> Option<Vec<String>> {
 }
 
 /// Message of the error with which a visitor ends a search: serde_yaml knows lines only for errors,
-/// so a visitor reports the wanted key as one.
+/// so a visitor reports the wanted key as an error.
 const FOUND: &str = "key found";
 
 /// Returns the line at which a search reported its key.
@@ -125,7 +126,7 @@ impl<'de> Visitor<'de> for Search<'_> {
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
-        let Some((first, rest)) = self.0.split_first() else { return Ok(()) };
+        let (first, rest) = self.0.split_first().expect("a searched path has a key");
         while let Some(is_match) = map.next_key_seed(KeyCheck(|key: &str| {
             if key == *first && rest.is_empty() { None } else { Some(key == *first) }
         }))? {

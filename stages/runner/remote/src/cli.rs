@@ -59,7 +59,7 @@ enum Verb {
     },
     /// Write one artifact with its history to a file
     Export {
-        /// Hash of an artifact or key of an action, or the beginning of it
+        /// Hash of an artifact or key of an action, or the beginning of either
         what: String,
         /// Path of the tar file to create
         file: PathBuf,
@@ -144,6 +144,11 @@ fn open_existing(folder: &Path) -> anyhow::Result<Store> {
     Ok(Store::open(folder)?)
 }
 
+/// Interval between two checks for a signal; chosen by hand.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
+/// Time after a signal in which transfers stop by themselves; chosen by hand.
+const GRACE_TIME: Duration = Duration::from_secs(2);
+
 /// Runs transfers on as many threads as concurrent files, since they block on files.
 fn block_on(
     stop: &Arc<AtomicBool>,
@@ -159,18 +164,18 @@ fn block_on(
             () = wait_for_signal(stop) => Err(Failure::Interrupted.into()),
         }
     });
-    // Connections to an unresponsive server must not delay the end.
+    // Connections to an unresponsive server must not delay the end; the second is chosen by hand.
     runtime.shutdown_timeout(Duration::from_secs(1));
     result
 }
 
-/// Waits for a signal, and gives transfers time to stop by themselves, which they can't while a
-/// server is unresponsive.
+/// Returns [`GRACE_TIME`] after a signal: transfers stop by themselves by then, unless a server is
+/// unresponsive.
 async fn wait_for_signal(stop: &AtomicBool) {
     while !stop.load(Ordering::Relaxed) {
-        tokio::time::sleep(Duration::from_millis(100)).await;
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
-    tokio::time::sleep(Duration::from_secs(2)).await;
+    tokio::time::sleep(GRACE_TIME).await;
 }
 
 #[cfg(test)]

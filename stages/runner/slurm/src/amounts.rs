@@ -34,9 +34,9 @@ impl Memory {
 
     fn parse(text: &str) -> Option<Self> {
         let (count, letter) = split_unit(text)?;
-        let (_, unit) = MEMORY_UNITS.iter().find(|(unit, _)| *unit == letter)?;
+        let (_, factor) = MEMORY_UNITS.iter().find(|(unit, _)| *unit == letter)?;
         // Slurm reads `--mem=0` as all memory of a node.
-        count.checked_mul(*unit).filter(|&mib| mib > 0).map(|mib| Self { mib })
+        count.checked_mul(*factor).filter(|&mib| mib > 0).map(|mib| Self { mib })
     }
 }
 
@@ -52,8 +52,8 @@ impl Period {
         for piece in text.split_inclusive(|c: char| !c.is_ascii_digit()) {
             let (count, letter) = split_unit(piece)?;
             // The iterator only advances: each unit occurs at most once, larger units first.
-            let (_, unit) = units.find(|(unit, _)| *unit == letter)?;
-            seconds = seconds.checked_add(count.checked_mul(*unit)?)?;
+            let (_, factor) = units.find(|(unit, _)| *unit == letter)?;
+            seconds = seconds.checked_add(count.checked_mul(*factor)?)?;
         }
         (seconds > 0).then_some(Self { seconds })
     }
@@ -89,22 +89,22 @@ impl FromStr for Period {
 
 impl Display for Memory {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let (name, unit) = MEMORY_UNITS
-            .iter()
-            .find(|(_, unit)| self.mib.is_multiple_of(*unit))
-            .unwrap_or(&('M', 1));
-        write!(f, "{}{name}", self.mib / unit)
+        let (unit, factor) = MEMORY_UNITS
+            .into_iter()
+            .find(|(_, factor)| self.mib.is_multiple_of(*factor))
+            .expect("all numbers are multiples of 1");
+        write!(f, "{}{unit}", self.mib / factor)
     }
 }
 
 impl Display for Period {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let mut left = self.seconds;
-        for (name, unit) in PERIOD_UNITS.iter().filter(|(_, unit)| self.seconds >= *unit) {
-            if left >= *unit {
-                write!(f, "{}{name}", left / unit)?;
+        for (unit, factor) in PERIOD_UNITS {
+            if left >= factor {
+                write!(f, "{}{unit}", left / factor)?;
             }
-            left %= unit;
+            left %= factor;
         }
         Ok(())
     }

@@ -19,8 +19,8 @@ pub struct Arrival {
 
 impl Store {
     /// Checks an artifact from another store, its files against the manifest and the manifest
-    /// against the identity, and makes it durable. All slow work is done here, so that
-    /// [`Store::import_object`] is fast.
+    /// against the identity, and makes it durable. Then [`Store::import_object`] is fast, unless it
+    /// replaces a damaged object, which it hashes again.
     pub fn check_arrival(&self, folder: &Path, identity: &str) -> Result<Arrival, StoreError> {
         let manifest = Manifest::read(folder)?;
         if manifest.identity() != identity {
@@ -35,7 +35,7 @@ impl Store {
 
     /// Moves a checked object into place, unless the store has a complete one.
     pub fn import_object(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
-        // An object that another process has stored meanwhile must not vanish even for a moment.
+        // An object that another process has stored meanwhile isn't hashed again.
         let is_stored = !arrival.replaces && self.is_complete(&arrival.identity)?;
         self.install_object(&arrival.folder, &arrival.identity, is_stored)
     }

@@ -170,6 +170,7 @@ pub(crate) const EXTENSION: &str = ".jsonl";
 #[derive(Debug)]
 pub struct RunFile {
     pub(crate) id: String,
+    pub(crate) path: PathBuf,
     /// `None` for a store on a read-only file system, where no garbage is collected.
     pub(crate) file: Option<File>,
 }
@@ -198,9 +199,8 @@ impl RunFile {
 
     pub(crate) fn write(&self, line: &RunLine) -> Result<(), StoreError> {
         let Some(mut file) = self.file.as_ref() else { return Ok(()) };
-        let path = Path::new(&self.id);
         // One write per line, since threads of a run share the file.
-        with_path(path, file.write_all(line.text(path)?.as_bytes()))
+        with_path(&self.path, file.write_all(line.text(&self.path)?.as_bytes()))
     }
 }
 

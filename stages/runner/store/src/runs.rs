@@ -29,11 +29,11 @@ impl Store {
             match opened {
                 Ok(file) => {
                     file.lock().map_err(|source| lock_error(&path, source))?;
-                    return Ok(RunFile { id, file: Some(file) });
+                    return Ok(RunFile { id, path, file: Some(file) });
                 }
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => {
-                    return Ok(RunFile { id, file: None });
+                    return Ok(RunFile { id, path, file: None });
                 }
                 Err(source) => return Err(StoreError::Io { path, source }),
             }

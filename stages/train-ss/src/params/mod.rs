@@ -27,7 +27,7 @@ pub struct Params {
     pub supersample: f64,
     /// Fraction of the rays that are cast before each LR pixel gets all of its sub-pixel rays: 1
     /// per side at first, then 2, 4 and so on, up to `supersample`. Default: 0.3, or 0 with
-    /// `field: mlp` and in fine-tuning (input `init`).
+    /// `field: mlp`. A fine-tuning (input `init`) ignores this parameter and uses 0.
     #[schemars(range(min = 0.0, max = 1.0))]
     #[schemars(extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub supersample_warmup: Option<f64>,
@@ -222,7 +222,8 @@ impl Default for GridParams {
 #[serde(default, deny_unknown_fields)]
 pub struct MlpParams {
     /// Number of steps at the start that draw pixels only from the middle half of each image's
-    /// width and height. Default: 0 in NDC, otherwise 1000.
+    /// width and height. Default: 0 in NDC, otherwise 1000. A fine-tuning (input `init`) ignores
+    /// this parameter and uses 0.
     #[schemars(extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub precrop_steps: Option<u32>,
     /// Samples of the coarse MLP along a ray.

@@ -19,7 +19,7 @@ const PRECROP_STEPS: u32 = 1000;
 /// NDC (NeRF-SR).
 const DENSITY_NOISE_STD_IN_NDC: f64 = 1.0;
 /// Fraction of a grid's rays that are cast before each LR pixel gets all of its sub-pixel rays
-/// (design note 008).
+/// (design note 007).
 const SUPERSAMPLE_WARMUP: f64 = 0.3;
 /// Weight of the distortion loss with an opaque background in NDC (design note 012).
 const DISTORTION_IN_NDC: f64 = 0.004;
@@ -28,18 +28,19 @@ const DISTORTION_IN_CONTRACTION: f64 = 0.002;
 /// Weight of the floater loss with a background of one colour (design note 013).
 const FLOATER_LOSS: f64 = 0.001;
 impl Params {
-    /// Sets every default for a scene.
+    /// Sets every default for a scene. A fine-tuning ignores `supersample_warmup` and
+    /// `precrop_steps`.
     pub fn resolve(&self, scene: &SceneFacts) -> Resolved {
-        let epoch = scene.lr_pixels * whole_supersample(self.supersample).pow(2);
-        let mut defaults = match &self.field {
-            FieldParams::Grid(grid) => grid.training_defaults(self.rays, scene),
-            FieldParams::Mlp(mlp) => mlp.training_defaults(self.rays, scene, epoch),
+        let rays_per_epoch = scene.lr_pixels * whole_supersample(self.supersample).pow(2);
+        let mut settings = match &self.field {
+            FieldParams::Grid(grid) => grid.training_settings(self.rays, scene),
+            FieldParams::Mlp(mlp) => mlp.training_settings(self.rays, scene, rays_per_epoch),
         };
-        defaults.supersample_warmup =
-            self.supersample_warmup.unwrap_or(defaults.supersample_warmup);
+        settings.supersample_warmup =
+            self.supersample_warmup.unwrap_or(settings.supersample_warmup);
         if scene.is_fine_tuning {
             // The initial field already has the scene's rough shape.
-            (defaults.supersample_warmup, defaults.precrop_steps) = (0.0, 0);
+            (settings.supersample_warmup, settings.precrop_steps) = (0.0, 0);
         }
         let is_grid = matches!(self.field, FieldParams::Grid(_));
         let supervision = if is_grid && scene.has_kernel && scene.background != Background::Alpha {
@@ -57,19 +58,19 @@ impl Params {
         Resolved {
             field: self.field.resolve(scene),
             supersample: self.supersample,
-            supersample_warmup: defaults.supersample_warmup,
+            supersample_warmup: settings.supersample_warmup,
             supervision: self.supervision.unwrap_or(supervision),
             exposure: self.exposure.map_or(exposure, Exposure::from),
             pose_refinement: self.pose_refinement,
             silhouettes: self.silhouettes && is_grid,
             in_epochs: !is_grid,
-            pixel_importance: defaults.pixel_importance,
-            precrop_steps: defaults.precrop_steps,
+            pixel_importance: settings.pixel_importance,
+            precrop_steps: settings.precrop_steps,
             ensemble: self.ensemble,
-            rays: defaults.rays,
-            max_rays_per_step: self.max_rays_per_step.unwrap_or(defaults.max_rays_per_step),
-            learning_rate: self.learning_rate.unwrap_or(defaults.learning_rate),
-            epoch,
+            rays: settings.rays,
+            max_rays_per_step: self.max_rays_per_step.unwrap_or(settings.max_rays_per_step),
+            learning_rate: self.learning_rate.unwrap_or(settings.learning_rate),
+            rays_per_epoch,
             max_references: self.max_references.map_or(usize::MAX, |count| count as usize),
             combine: self.combine.unwrap_or(combine),
             seed: self.seed,
@@ -77,8 +78,8 @@ impl Params {
     }
 }
 
-/// Parameters of a training that follow from the kind of field.
-struct FieldDefaults {
+/// Settings of a training that depend on the kind of field: given values or defaults.
+struct FieldSettings {
     rays: u64,
     max_rays_per_step: u32,
     learning_rate: f64,
@@ -88,7 +89,7 @@ struct FieldDefaults {
 }
 
 impl GridParams {
-    fn training_defaults(&self, rays: Option<u64>, scene: &SceneFacts) -> FieldDefaults {
+    fn training_settings(&self, rays: Option<u64>, scene: &SceneFacts) -> FieldSettings {
         let budget = RayBudget {
             rays,
             rays_per_pixel: self.rays_per_pixel,
@@ -96,7 +97,7 @@ impl GridParams {
             max_rays: self.max_rays,
         };
         let is_opaque = scene.background == Background::Opaque;
-        FieldDefaults {
+        FieldSettings {
             rays: budget.total(scene.lr_pixels, is_opaque, scene.is_fine_tuning),
             // Design note 007.
             max_rays_per_step: 8_192,
@@ -136,16 +137,16 @@ impl GridParams {
 }
 
 impl MlpParams {
-    fn training_defaults(
+    fn training_settings(
         &self,
         rays: Option<u64>,
         scene: &SceneFacts,
-        epoch: u64,
-    ) -> FieldDefaults {
+        rays_per_epoch: u64,
+    ) -> FieldSettings {
         let (epochs, precrop_steps) =
             if scene.is_ndc() { (EPOCHS_IN_NDC, 0) } else { (EPOCHS, PRECROP_STEPS) };
-        FieldDefaults {
-            rays: rays.unwrap_or(epochs * epoch),
+        FieldSettings {
+            rays: rays.unwrap_or(epochs * rays_per_epoch),
             // As in the paper's code.
             max_rays_per_step: 2_048,
             learning_rate: 5e-4,

@@ -50,7 +50,7 @@ pub struct Resolved {
     /// Highest learning rate.
     pub learning_rate: f64,
     /// Number of rays in an epoch: one through every sub-pixel of every view.
-    pub epoch: u64,
+    pub rays_per_epoch: u64,
     /// Maximum number of HR references.
     pub max_references: usize,
     /// Combination of the initial with the fine-tuned field.
@@ -161,8 +161,7 @@ impl Resolved {
     }
 
     /// Returns the number of bundles (the rays of one LR pixel) in the first `precrop_steps` steps,
-    /// which are drawn from the
-    /// middle of the images.
+    /// which are drawn from the middle of the images.
     pub fn precrop_bundles(&self) -> u64 {
         let batch = u64::from(self.max_rays_per_step);
         let supersample = whole_supersample(self.supersample);
@@ -213,7 +212,7 @@ impl Resolved {
             max_rays_per_step: self.max_rays_per_step as usize,
             learning_rate: self.learning_rate,
             learning_rate_decay: MLP_LEARNING_RATE_DECAY,
-            epochs: self.rays.div_ceil(self.epoch.max(1)),
+            epochs: self.rays.div_ceil(self.rays_per_epoch.max(1)),
             density_noise_std,
             seed: self.seed,
         }

@@ -21,6 +21,7 @@ pub(crate) struct Curve {
     loss: f64,
     /// Number of steps since the last point.
     steps: u64,
+    /// Number of samples of the whole training.
     samples: u64,
 }
 
@@ -57,8 +58,9 @@ impl Curve {
     }
 }
 
-/// Checkpoints in the work folder: `curve-STEP.json` and `kept-STEP.bin`, the supervision's state,
-/// then `checkpoint.safetensors`, whose step decides which of these files belong to it.
+/// Checkpoints in the work folder. A checkpoint has three files, written in this order:
+/// `curve-STEP.json`; `kept-STEP.bin`, the supervision's state; `checkpoint.safetensors`. The step
+/// in the last one decides which of the others belong to it.
 pub(crate) struct Checkpoints {
     folder: Option<PathBuf>,
     schedule: CheckpointSchedule,

@@ -16,9 +16,9 @@ pub(crate) struct InitField<'a> {
 impl<'a> InitField<'a> {
     /// Reads the initial field's description and fails if it differs from `file`, the description
     /// of the field to train. Older versions neither rounded bounds nor scaled positions. So that
-    /// their fields can still be trained, the initial field's bounds replace those of `file` if
-    /// they are equal after rounding around `anchor`, the first camera's centre, and its
-    /// `scaled_positions` replaces that of `file`.
+    /// their fields can still be trained, `file` takes the initial field's `scaled_positions`.
+    /// `file` also takes the initial bounds if these, rounded around `anchor` (the first camera's
+    /// centre), equal its own.
     pub(crate) fn read(
         input: &'a GivenInput,
         file: &mut FieldFile,

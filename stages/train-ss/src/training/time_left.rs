@@ -4,9 +4,10 @@ use radiance::StepReport;
 
 use crate::params::{Resolved, ResolvedField};
 
-/// Relative cost of a ray of a grid field at each step, 1 late in the training. Until the occupancy
-/// grid has found the empty space, rays have many samples, and small steps share their fixed costs
-/// among few rays. Processor time per ray of lego 100×2 and fern 252×2 (design note 048).
+/// Relative cost of a ray of a grid field at each step; a late ray, at the end of the training,
+/// costs 1. Until the occupancy grid has found the empty space, rays have many samples, and small
+/// steps share their fixed costs among few rays. Processor time per ray of lego 100×2 and fern
+/// 252×2 (design note 048).
 const COURSE: [(f64, f64); 9] = [
     (0.0, 14.0),
     (48.0, 9.0),
@@ -20,7 +21,7 @@ const COURSE: [(f64, f64); 9] = [
 ];
 /// Minimum number of steps over which the current pace is averaged; chosen by hand.
 const MIN_WINDOW_STEPS: f64 = 32.0;
-/// Number of steps taken for each step of the averaging window; chosen by hand.
+/// Number of steps taken over those in the averaging window; chosen by hand.
 const STEPS_PER_WINDOW_STEP: f64 = 8.0;
 /// Number of parts of growing size in which the remaining rays are predicted; chosen by hand.
 const PARTS: u32 = 64;
@@ -73,7 +74,7 @@ impl TimeLeft {
 
     fn add_seconds(&mut self, rays: usize, seconds: f64) {
         self.steps += 1.0;
-        let kept = 1.0 - 1.0 / (self.steps / STEPS_PER_WINDOW_STEP).max(MIN_WINDOW_STEPS);
+        let kept = 1.0 - 1.0 / self.window();
         self.seconds = kept * self.seconds + seconds;
         self.rays = kept * self.rays + rays as f64;
     }
@@ -87,7 +88,7 @@ impl TimeLeft {
         // The recent steps' average is the pace of half a window ago, which matters at first.
         let before = (step as f64 - MIN_WINDOW_STEPS / 2.0).max(0.0);
         let cost = self.cost(before);
-        let late_rays_per_step = (cost * self.rays / self.window()).max(1.0);
+        let late_rays_per_step = (cost * self.rays / self.window().min(self.steps)).max(1.0);
         let own = self.late_rays(step as f64, rays.remaining as f64, late_rays_per_step);
         let each = self.late_rays(0.0, rays.total as f64, late_rays_per_step);
         let others = rays.further as f64 / rays.total.max(1) as f64 * each;
@@ -108,20 +109,20 @@ impl TimeLeft {
         sum
     }
 
-    /// Returns the number of steps in the averaging window.
+    /// Returns the number of steps in the averaging window, even if fewer were taken.
     fn window(&self) -> f64 {
-        (self.steps / STEPS_PER_WINDOW_STEP).max(MIN_WINDOW_STEPS).min(self.steps)
+        (self.steps / STEPS_PER_WINDOW_STEP).max(MIN_WINDOW_STEPS)
     }
 
-    /// Returns the cost of a ray at a step over that late in the training.
+    /// Returns the cost of a ray at a step, relative to a late ray.
     fn cost(&self, step: f64) -> f64 {
         if !self.has_course {
             return 1.0;
         }
         let after = COURSE.iter().position(|(end, _)| *end > step).unwrap_or(COURSE.len());
-        let Some(&(end, next)) = COURSE.get(after) else { return 1.0 };
-        let (start, now) = COURSE[after - 1];
-        now + (next - now) * (step - start) / (end - start)
+        let Some(&(end, end_cost)) = COURSE.get(after) else { return 1.0 };
+        let (start, start_cost) = COURSE[after - 1];
+        start_cost + (end_cost - start_cost) * (step - start) / (end - start)
     }
 }
 

@@ -17,10 +17,11 @@ pub(crate) struct AdamStep {
 }
 
 impl AdamStep {
-    /// Creates the constants of Adam's (Kingma and Ba 2015) step 1, 2, …, with both bias
-    /// corrections folded into the rate.
+    /// Creates the constants of Adam (Kingma and Ba 2015), with both bias corrections folded into
+    /// the rate. `step` counts from 1.
     pub(crate) fn new(step: u64, rate: f64, decay: f32) -> Self {
         let [beta1, beta2] = ADAM_BETA;
+        // Far beyond this limit, which is chosen by hand, both corrections are 1.
         let t = step.min(100_000) as i32;
         let corrected = rate * (1.0 - beta2.powi(t)).sqrt() / (1.0 - beta1.powi(t));
         Self {
@@ -97,8 +98,8 @@ kernel! {
     }
 }
 
-/// Gradients of one half of each of some bricks, and a mark for each brick: not 0 if its half has a
-/// gradient. Half h of brick b is block 2·b + h of the weights.
+/// For some bricks: the gradients of one half of each brick, and one mark per brick. A mark is 0 if
+/// the half has no gradient. Half h of brick b is block 2·b + h of the weights.
 pub(crate) type HalfPiece<'a> = (&'a mut [f32], &'a mut [u8]);
 
 kernel! {
@@ -122,9 +123,9 @@ kernel! {
                 L::prefetch(&halves[ahead % 2].0[ahead / 2 * LANES..]);
                 L::prefetch(&moments[ahead]);
                 let block = list[at];
-                let sums = &mut halves[block % 2].0.as_chunks_mut::<LANES>().0[block / 2];
-                update_block(step, sums, &mut weights[block], &mut moments[block]);
-                *sums = [0.0; LANES];
+                let gradients = &mut halves[block % 2].0.as_chunks_mut::<LANES>().0[block / 2];
+                update_block(step, gradients, &mut weights[block], &mut moments[block]);
+                *gradients = [0.0; LANES];
             }
         }
     }

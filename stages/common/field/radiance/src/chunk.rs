@@ -91,7 +91,7 @@ impl BackwardBuffers {
         self.chosen.clear();
         self.rounds.clear();
         for (round, range) in rounds_of(&samples.rounds, count) {
-            self.rounds.push(Round { first: self.chosen.len(), ..*round });
+            self.rounds.push(Round { first_selected: self.chosen.len(), ..*round });
             for k in range {
                 let mut gradient = self.gradients[k];
                 if self.lengths[k] < limit {

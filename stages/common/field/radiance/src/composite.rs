@@ -28,16 +28,17 @@ kernel! {
 }
 
 kernel! {
-    /// Computes the gradient of a loss by each sample's optical depth, along one ray.
+    /// Computes the gradient of a loss with respect to each sample's optical depth, along one ray.
     ///
-    /// With C = Σ w c + T_end·b and g = dL/dC: dL/dτ_i = T_{i+1}·(g·c_i) - Σ_{j>i} w_j·(g·c_j) -
-    /// T_end·(g·b).
-    pub(crate) fn optical_depth_gradients<L>(shade: &[f32], transmittance: &[f32], weight: &[f32],
-        behind: f32, gradient: &mut [f32]) {
+    /// With C = Σ w c + T_end·b, g = dL/dC and `by_weight` s_i = dL/dw_i, which is g·c_i without
+    /// regularisers: dL/dτ_i = T_{i+1}·s_i - Σ_{j>i} w_j·s_j - T_end·(g·b). Here T_{i+1} is
+    /// T_i - w_i, and `behind` is T_end·(g·b).
+    pub(crate) fn optical_depth_gradients<L>(by_weight: &[f32], transmittance: &[f32],
+        weight: &[f32], behind: f32, gradient: &mut [f32]) {
         let mut suffix = behind;
-        for i in (0..shade.len()).rev() {
-            gradient[i] = (transmittance[i] - weight[i]).mul_add(shade[i], -suffix);
-            suffix = weight[i].mul_add(shade[i], suffix);
+        for i in (0..by_weight.len()).rev() {
+            gradient[i] = (transmittance[i] - weight[i]).mul_add(by_weight[i], -suffix);
+            suffix = weight[i].mul_add(by_weight[i], suffix);
         }
     }
 }

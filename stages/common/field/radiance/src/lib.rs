@@ -73,7 +73,7 @@ pub use math::spherical_harmonics;
 pub use occupancy::{CellHit, Occupancy};
 pub use passes::Passes;
 pub use points::{PointField, PointSample, PointSamples};
-pub use ray::{NormalizedRay, Ray, RayMap, clip};
+pub use ray::{MAX_SPEED, NormalizedRay, Ray, RayMap, clip};
 pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};
 pub use spec::Strides;

@@ -1,18 +1,18 @@
 //! Matrix kernels of the small networks. Activations are rows of `n` samples (a multiple of 16);
 //! weights are stored by input (`w[i·outputs + j]`). There are no biases; the view network
-//! has a constant input, the first spherical harmonic.
+//! has a constant input, the first spherical harmonic. Sizes of tiles are chosen by hand.
 
 use crate::spec::{DENSITY_OUTPUTS, VIEW_INPUTS};
 use numerics::kernel;
 use numerics::simd::{LANES, Lanes, Quad as _};
 
 #[inline(always)]
-fn row<L: Lanes>(from: &[f32], at: usize) -> L {
+fn load_vector<L: Lanes>(from: &[f32], at: usize) -> L {
     L::load(from[at..at + LANES].try_into().expect("a row has whole vectors"))
 }
 
 #[inline(always)]
-fn put<L: Lanes>(value: L, to: &mut [f32], at: usize) {
+fn store_vector<L: Lanes>(value: L, to: &mut [f32], at: usize) {
     value.store((&mut to[at..at + LANES]).try_into().expect("a row has whole vectors"));
 }
 
@@ -58,7 +58,7 @@ fn tile<L: Lanes, const TO: usize, const TV: usize>(
     let Product { matrix: Matrix { weights: w, inputs, outputs }, x, n, after } = *product;
     let mut acc = [[L::splat(0.0); TV]; TO];
     for i in 0..inputs {
-        let xs: [L; TV] = std::array::from_fn(|v| row(x, i * n + s + v * LANES));
+        let xs: [L; TV] = std::array::from_fn(|v| load_vector(x, i * n + s + v * LANES));
         let ws: &[f32; TO] =
             w[i * outputs + j..i * outputs + j + TO].try_into().expect("a tile of weights");
         for o in 0..TO {
@@ -74,9 +74,9 @@ fn tile<L: Lanes, const TO: usize, const TV: usize>(
             let sum = match after {
                 After::Linear => acc[o][v],
                 After::Relu => acc[o][v].positive(),
-                After::Gate(gate) => acc[o][v].where_positive(row(gate, at)),
+                After::Gate(gate) => acc[o][v].where_positive(load_vector(gate, at)),
             };
-            put(sum, y, at);
+            store_vector(sum, y, at);
         }
     }
 }
@@ -123,6 +123,7 @@ kernel! {
     }
 }
 
+/// Adds the weights' gradients of inputs i to i + TI and outputs j to j + TJ.
 #[inline(always)]
 fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(
     x: &[f32],
@@ -135,9 +136,9 @@ fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(
     let mut acc = [[L::splat(0.0); TJ]; TI];
     let mut s = 0;
     while s < n {
-        let xs: [L; TI] = std::array::from_fn(|k| row(x, (i + k) * n + s));
+        let xs: [L; TI] = std::array::from_fn(|k| load_vector(x, (i + k) * n + s));
         for l in 0..TJ {
-            let d: L = row(dy, (j + l) * n + s);
+            let d: L = load_vector(dy, (j + l) * n + s);
             for k in 0..TI {
                 acc[k][l] = xs[k].mul_add(d, acc[k][l]);
             }
@@ -157,21 +158,22 @@ fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(
     }
 }
 
+/// Adds the weights' gradients of inputs i to i + TI and all outputs.
 #[inline(always)]
 fn outer_row<L: Lanes, const TI: usize, const TJ: usize>(
     x: &[f32],
     dy: &[f32],
     gradient: &mut [f32],
-    shape: (usize, usize),
+    (outputs, n): (usize, usize),
     i: usize,
 ) {
     let mut j = 0;
-    while j + TJ <= shape.0 {
-        outer_tile::<L, TI, TJ>(x, dy, gradient, shape, i, j);
+    while j + TJ <= outputs {
+        outer_tile::<L, TI, TJ>(x, dy, gradient, (outputs, n), i, j);
         j += TJ;
     }
-    while j < shape.0 {
-        outer_tile::<L, TI, 1>(x, dy, gradient, shape, i, j);
+    while j < outputs {
+        outer_tile::<L, TI, 1>(x, dy, gradient, (outputs, n), i, j);
         j += 1;
     }
 }

@@ -21,7 +21,7 @@ pub struct PointSample {
     pub density: f32,
     /// Red, green and blue before the sigmoid, without the view-dependent part.
     pub raw_colour: [f32; 3],
-    /// Inputs of the view network.
+    /// View features: inputs of the view network, in addition to the direction.
     pub view_features: [f32; VIEW_FEATURES],
 }
 
@@ -32,7 +32,8 @@ pub struct PointSamples {
     pub densities: Vec<f32>,
     /// Red, green and blue of each point before the sigmoid, without the view-dependent part.
     pub raw_colours: Vec<[f32; 3]>,
-    /// Inputs of [`PointField::view_colours`], a row of equal length for each point.
+    /// View features, a row of equal length for each point; [`PointField::view_colours`] takes
+    /// them with directions.
     pub view_features: Vec<f32>,
 }
 
@@ -41,7 +42,8 @@ pub struct PointSamples {
 /// # Errors
 /// All methods return [`RenderError::Backend`] if a library fails.
 pub trait PointField: Sync {
-    /// Returns whether a density of at least `min_density` is possible between two corners.
+    /// Returns whether a density of at least `min_density` is possible between two corners. A field
+    /// that can only be probed may miss a thin surface.
     fn may_have_density(
         &self,
         low: [f32; 3],
@@ -55,8 +57,8 @@ pub trait PointField: Sync {
     /// Evaluates density, raw colour and view features.
     fn samples(&self, points: &[[f32; 3]]) -> Result<PointSamples, RenderError>;
 
-    /// Computes the view-dependent part of raw colours for rows of view features, each in some unit
-    /// directions of the world.
+    /// Computes the view-dependent part of raw colours for each row of `features`, in the unit
+    /// directions of the world at the same index.
     fn view_colours(
         &self,
         features: &[f32],
@@ -94,7 +96,7 @@ impl PointField for Field {
         directions: &[Vec<[f32; 3]>],
     ) -> Result<Vec<Vec<[f32; 3]>>, RenderError> {
         let rows = features.as_chunks().0.iter().zip(directions);
-        Ok(rows.map(|(row, directions)| Self::view_colours(self, row, directions)).collect())
+        Ok(rows.map(|(row, directions)| self.view_colours_of(row, directions)).collect())
     }
 }
 
@@ -141,7 +143,7 @@ impl Field {
 
     /// Computes, in this thread, the view-dependent part of raw colours for composited view
     /// features and each of `directions`, which have unit length.
-    pub fn view_colours(
+    pub fn view_colours_of(
         &self,
         features: &[f32; VIEW_FEATURES],
         directions: &[[f32; 3]],
@@ -208,7 +210,7 @@ mod tests {
         for (sample, weight) in samples.iter().zip(&weights) {
             features.iter_mut().zip(&sample.view_features).for_each(|(sum, f)| *sum += weight * f);
         }
-        let view_colour = field.view_colours(&features, &[clipped.view, [0.0, 1.0, 0.0]]);
+        let view_colour = field.view_colours_of(&features, &[clipped.view, [0.0, 1.0, 0.0]]);
         let colour: [f32; 3] = std::array::from_fn(|c| {
             let weighted = samples.iter().zip(&weights);
             weighted

@@ -87,7 +87,7 @@ impl Default for RayMap {
 
 /// Maximum speed of a contracted ray in cube sides per unit of t, approached by rays that pass far
 /// from the centre.
-pub(crate) const MAX_SPEED: f32 = 2.0;
+pub const MAX_SPEED: f32 = 2.0;
 
 /// Maximum change of a contracted ray's velocity per unit of t, reached just outside the ball by a
 /// ray through the centre.
@@ -133,7 +133,7 @@ pub(crate) fn contracted_velocity(
 ) -> [f32; 3] {
     let e = exp(4.0 * t);
     let half = 0.5 * radii;
-    // A quarter of the derivative of `along`: the cube is four radii wide.
+    // `speed` is a quarter of the derivative of `along`, since the cube is four radii wide.
     let (along, speed) = (half * (e - 1.0 / e), half * (e + 1.0 / e));
     let (u, length) = uncontracted_point(origin, direction, along);
     // The contraction is h(r)·u with h = (2 - 1/r) / r, and dr/d(along) = along / r.
@@ -182,7 +182,7 @@ impl NormalizedRay {
 
     /// Creates a ray that misses the cube.
     fn miss(ray: &Ray) -> Self {
-        Self { enter: 0.0, leave: 0.0, view: ray.view_direction(), ..Self::default() }
+        Self { view: ray.view_direction(), ..Self::default() }
     }
 }
 
@@ -233,7 +233,7 @@ fn clip_to_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<Norma
 }
 
 /// Clips a ray to the frustum, beyond `near`. The range's far end isn't needed: the frustum's far
-/// plane is behind the whole scene.
+/// plane takes its place.
 fn clip_to_frustum(
     frustum: &Frustum,
     near: f64,
@@ -255,8 +255,9 @@ fn clip_to_frustum(
     if !length.is_finite() || length <= 0.0 {
         return None;
     }
-    // With x = distance - enter, t is a projective function of x: t = c·x / (Z + x·dZ). c follows
-    // from t = length at the far end.
+    // With x = distance - enter, t is a projective function of x: t = c·x / (from.z + x·d.z).
+    // Solved for x: x = t·(from.z / c) / (1 - t·(d.z / c)). c follows from t = length at the far
+    // end.
     let c = length * to.z / (leave - enter);
     Some(NormalizedRay {
         origin: start.as_vec3().to_array(),

@@ -1,6 +1,6 @@
 //! Regularisers: losses on a ray other than the error of its colour. Each has a weight and a
-//! function that adds the loss's gradient to the ray's gradients. `torch-field` computes the losses
-//! for autograd. The distortion loss is checked in f64 here, the floater loss in `reference.rs`.
+//! function that adds the loss's gradient by each sample's weight. `torch-field` computes the
+//! losses for autograd. The distortion loss is checked in f64 here, the floater loss in `reference.rs`.
 
 use crate::spec::MAX_FLOATER_COLOUR_DISTANCE;
 
@@ -32,15 +32,6 @@ pub(crate) struct ShadedRay<'a> {
     pub(crate) background: [f32; 3],
 }
 
-/// Gradients of a ray's loss.
-#[derive(Debug)]
-pub(crate) struct LossGradients<'a> {
-    /// Gradient with respect to each sample's weight.
-    pub(crate) by_weight: &'a mut [f32],
-    /// T times the gradient with respect to the ray's transmittance T.
-    pub(crate) behind: f32,
-}
-
 impl Regularisers {
     /// Returns the weights for one ray, if each bundle of `bundle` rays has weight `scale`.
     pub(crate) fn per_ray(&self, scale: f32, bundle: usize) -> Self {
@@ -50,16 +41,16 @@ impl Regularisers {
         }
     }
 
-    /// Adds the losses' gradients to those of a ray. `self` has the weights for one ray.
+    /// Adds the losses' gradients by each sample's weight. `self` has the weights for one ray.
     #[inline]
-    pub(crate) fn add_gradients(&self, ray: &ShadedRay<'_>, gradients: &mut LossGradients<'_>) {
+    pub(crate) fn add_gradients(&self, ray: &ShadedRay<'_>, by_weight: &mut [f32]) {
         let Self { distortion, floater_loss } = *self;
         let floater = floater_loss * ray.transmittance;
         if floater > 0.0 {
-            add_floater_gradients(ray, floater, gradients.by_weight);
+            add_floater_gradients(ray, floater, by_weight);
         }
         if distortion > 0.0 {
-            add_distortion_gradients(ray, distortion, gradients.by_weight);
+            add_distortion_gradients(ray, distortion, by_weight);
         }
     }
 }
@@ -93,17 +84,19 @@ fn add_floater_gradients(ray: &ShadedRay<'_>, factor: f32, by_weight: &mut [f32]
 }
 
 /// Adds the gradient by each weight of the distortion loss, times `factor`. The loss Σ_ij
-/// w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i² concentrates a ray's weights.
+/// w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i² concentrates a ray's weights. Unlike in eq. 15, a sample
+/// of a double stride counts as one step long, too.
 #[inline]
 fn add_distortion_gradients(ray: &ShadedRay<'_>, factor: f32, by_weight: &mut [f32]) {
     let ShadedRay { t, weight, step, .. } = *ray;
     let total: f32 = weight.iter().sum();
-    // Distances from the mean don't cancel.
+    // Large t would cancel in the sums, so t is measured from the weighted mean.
     let mean = weight.iter().zip(t).map(|(w, t)| w * t).sum::<f32>() / total.max(f32::MIN_POSITIVE);
     let (mut before, mut moment) = (0.0, 0.0);
     for ((by_weight, &w), &t) in by_weight.iter_mut().zip(weight).zip(t) {
         let t = t - mean;
-        // Σ_j w_j·|t - t_j|: samples before with +, samples behind with -. All moments sum to 0.
+        // Σ_j w_j·|t - t_j|: samples before with +, samples behind with -. The ray's moments sum to
+        // 0, so those behind sum to -(moment + w·t).
         let spread = t * (2.0 * before + w - total) - (2.0 * moment + w * t);
         *by_weight += 2.0 * factor * (spread + step * w / 3.0);
         before += w;
@@ -142,10 +135,8 @@ mod tests {
                 background: [0.0; 3],
             };
             let mut by_weight = vec![0.0; t.len()];
-            let mut gradients = LossGradients { by_weight: &mut by_weight, behind: 0.0 };
             let regularisers = Regularisers { distortion: factor, ..Regularisers::default() };
-            regularisers.add_gradients(&ray, &mut gradients);
-            prop_assert_eq!(gradients.behind, 0.0);
+            regularisers.add_gradients(&ray, &mut by_weight);
             // Distances are differences of f32 depths: their error is a few parts in 10^7 of the
             // depth.
             let total_weight: f32 = weight.iter().sum();

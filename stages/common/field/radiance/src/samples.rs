@@ -15,7 +15,7 @@ use crate::spec::{
 };
 use numerics::simd::LANES;
 
-/// Sums over one ray's samples. Marching starts from a transmittance of 1.
+/// Sums over one ray's samples. Before marching, the caller sets `transmittance` to 1.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RaySum {
     pub(crate) colour: [f32; 3],
@@ -35,18 +35,18 @@ const RENDERING_ROUND: usize = 8;
 /// Samples that were marched together, padded to whole vectors.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Round {
-    /// Index of the first sample; a buffer with k rows per round has this round at k·start.
-    pub(crate) start: usize,
+    /// Index of the first sample; a buffer with k rows per round has this round at k·first_sample.
+    pub(crate) first_sample: usize,
     /// Number of samples with padding: the length of a row.
     pub(crate) n: usize,
     /// Index of the round's first sample in a list of selected samples.
-    pub(crate) first: usize,
+    pub(crate) first_selected: usize,
 }
 
 impl Round {
     /// Returns the range of the round's `rows` rows in a buffer.
     fn range(self, rows: usize) -> std::ops::Range<usize> {
-        rows * self.start..rows * (self.start + self.n)
+        rows * self.first_sample..rows * (self.first_sample + self.n)
     }
 }
 
@@ -88,7 +88,7 @@ impl DensityRows {
     /// Runs the network at `n` positions (three rows) and returns its outputs, one row each.
     pub(crate) fn outputs_at(&mut self, field: &Field, positions: &[f32], n: usize) -> &[f32] {
         self.positions.grow(3 * n).copy_from_slice(positions);
-        self.run(field, Round { start: 0, n, first: 0 });
+        self.run(field, Round { first_sample: 0, n, first_selected: 0 });
         &self.outputs[..DENSITY_OUTPUTS * n]
     }
 
@@ -176,36 +176,36 @@ impl Samples {
     }
 
     /// Finds the next samples of every active ray, and copies their positions to the network's
-    /// rows. Before this round `counted` samples count.
-    fn take_samples(&mut self, rays: &March<'_>, counted: usize) -> Round {
+    /// rows. `first_selected` is the number of counted samples of earlier rounds.
+    fn take_samples(&mut self, rays: &March<'_>, first_selected: usize) -> Round {
         let max_samples = match rays.strides {
             Strides::Single => RENDERING_ROUND,
             Strides::ByCell | Strides::Double => {
                 TRAINING_ROUND_SAMPLES[self.rounds.len().min(TRAINING_ROUND_SAMPLES.len() - 1)]
             }
         };
-        let start = self.marched.t.len();
+        let first_sample = self.marched.t.len();
         self.marched.starts.clear();
         march(rays, max_samples, &self.active, &mut self.next, &mut self.marched);
-        let count = self.marched.t.len() - start;
+        let count = self.marched.t.len() - first_sample;
         let n = count.next_multiple_of(LANES);
         self.count += count;
-        self.marched.t.resize(start + n, 0.0);
-        self.marched.lengths.resize(start + n, 0.0);
-        self.marched.positions.resize(start + n, [0.0; 3]);
+        self.marched.t.resize(first_sample + n, 0.0);
+        self.marched.lengths.resize(first_sample + n, 0.0);
+        self.marched.positions.resize(first_sample + n, [0.0; 3]);
         self.rows.positions.grow(3 * n);
         for (axis, row) in self.rows.positions[..3 * n].chunks_exact_mut(n.max(1)).enumerate() {
-            for (value, p) in row.iter_mut().zip(&self.marched.positions[start..]) {
+            for (value, p) in row.iter_mut().zip(&self.marched.positions[first_sample..]) {
                 *value = p[axis];
             }
         }
-        Round { start, n, first: counted }
+        Round { first_sample, n, first_selected }
     }
 
     /// Computes each sample's optical depth, transmittance and weight from the network's outputs,
     /// and the rays' median t. `step` is the length of one step in cube sides.
     fn compute_weights(&mut self, round: Round, step: f32, sums: &mut [RaySum]) {
-        let Round { start, n, .. } = round;
+        let Round { first_sample: start, n, .. } = round;
         for buffer in [&mut self.tau, &mut self.before, &mut self.transmittance, &mut self.weight] {
             buffer.grow(start + n);
         }
@@ -278,7 +278,8 @@ pub(crate) struct Counted {
     ray_starts: Vec<usize>,
     /// Rays with at least one sample that counts.
     pub(crate) rays: Vec<u32>,
-    /// Outputs of the density network per sample; in place of the raw density its slope dτ/d(raw).
+    /// Outputs of the density network per sample. The first one, the raw density, is replaced by
+    /// dτ/d(raw).
     pub(crate) outputs: Vec<[f32; DENSITY_OUTPUTS]>,
 }
 
@@ -321,10 +322,9 @@ impl Counted {
 
         self.outputs.clear();
         for (round, range) in rounds_of(&samples.rounds, self.sample.len()) {
-            let rows =
-                &samples.rows.outputs[DENSITY_OUTPUTS * round.start..][..DENSITY_OUTPUTS * round.n];
+            let rows = &samples.rows.outputs[round.range(DENSITY_OUTPUTS)];
             for &i in &self.sample[range] {
-                let column = i as usize - round.start;
+                let column = i as usize - round.first_sample;
                 let mut outputs: [f32; DENSITY_OUTPUTS] =
                     std::array::from_fn(|o| rows[o * round.n + column]);
                 outputs[0] = samples.optical_depth_slope(i as usize, outputs[0]);
@@ -339,12 +339,12 @@ pub(crate) fn rounds_of(
     rounds: &[Round],
     count: usize,
 ) -> impl Iterator<Item = (&Round, std::ops::Range<usize>)> {
-    let ends = rounds.iter().skip(1).map(|r| r.first).chain([count]);
-    rounds.iter().zip(ends).map(|(round, end)| (round, round.first..end))
+    let ends = rounds.iter().skip(1).map(|r| r.first_selected).chain([count]);
+    rounds.iter().zip(ends).map(|(round, end)| (round, round.first_selected..end))
 }
 
-/// Copies the columns of selected samples from the rounds, whose `rows` rows are in `from`, to rows
-/// of length `m`, padded with 0.
+/// Copies the columns of the samples in `list` to `to`. `from` has `rows` rows for each round; rows
+/// of `to` have length `m`, padded with 0.
 pub(crate) fn gather(
     rounds: &[Round],
     list: &[u32],
@@ -355,9 +355,9 @@ pub(crate) fn gather(
 ) {
     for (round, range) in rounds_of(rounds, list.len()) {
         for (row, target) in to.chunks_exact_mut(m.max(1)).enumerate() {
-            let source = &from[rows * round.start + row * round.n..][..round.n];
+            let source = &from[rows * round.first_sample + row * round.n..][..round.n];
             for (value, &i) in target[range.clone()].iter_mut().zip(&list[range.clone()]) {
-                *value = source[i as usize - round.start];
+                *value = source[i as usize - round.first_sample];
             }
         }
     }

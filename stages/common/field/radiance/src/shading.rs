@@ -10,7 +10,7 @@ use crate::math::spherical_harmonics;
 use crate::mlp::Layers;
 use crate::mlp::{After, Layer, add_outer, multiply};
 use crate::ray::NormalizedRay;
-use crate::regularisers::{LossGradients, Regularisers, ShadedRay};
+use crate::regularisers::{Regularisers, ShadedRay};
 use crate::samples::{Counted, RaySum, Samples};
 use crate::spec::{DENSITY_OUTPUTS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES, VIEW_INPUTS};
 use numerics::kernel;
@@ -330,16 +330,14 @@ impl Shading {
             gradients_along(samples, counted, colour, &ray_gradient, along, gradients);
             let (t, weight) = (&along.t[..len], &along.weight[..len]);
             let ray = ShadedRay { t, weight, step, channels, indices, transmittance, background };
-            let mut loss = LossGradients {
-                by_weight: &mut along.by_weight[..len],
-                behind: transmittance * (0..3).map(|c| g[c] * background[c]).sum::<f32>(),
-            };
-            upstream.regularisers.add_gradients(&ray, &mut loss);
+            let by_weight = &mut along.by_weight[..len];
+            upstream.regularisers.add_gradients(&ray, by_weight);
+            let behind = transmittance * (0..3).map(|c| g[c] * background[c]).sum::<f32>();
             optical_depth_gradients(
-                loss.by_weight,
+                by_weight,
                 &along.transmittance[..len],
                 weight,
-                loss.behind,
+                behind,
                 &mut along.by_depth[..len],
             );
             for (&k, &by_depth) in indices.iter().zip(&*along.by_depth) {

@@ -1,7 +1,7 @@
 use tch::{Kind, TchError, Tensor};
 
 /// Length of a ray's last sample, which extends to infinity, as in NeRF's code.
-pub(crate) const INFINITY: f32 = 1e10;
+pub(crate) const LAST_STEP: f32 = 1e10;
 
 /// Samples of n rays (m each) composited along each ray.
 #[derive(Debug)]
@@ -25,7 +25,7 @@ pub(crate) fn composite(
 ) -> Result<Composite, TchError> {
     let m = t.size()[1];
     let gaps = t.f_narrow(1, 1, m - 1)?.f_sub(&t.f_narrow(1, 0, m - 1)?)?;
-    let last = t.f_narrow(1, 0, 1)?.f_full_like(f64::from(INFINITY))?;
+    let last = t.f_narrow(1, 0, 1)?.f_full_like(f64::from(LAST_STEP))?;
     let tau = raw.f_relu()?.f_mul(&Tensor::f_cat(&[&gaps, &last], 1)?)?;
     let tau_after = tau.f_narrow(1, 0, m - 1)?.f_cumsum(1, None::<Kind>)?;
     let zero = tau_after.f_narrow(1, 0, 1)?.f_zeros_like()?;

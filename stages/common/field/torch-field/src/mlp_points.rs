@@ -4,10 +4,10 @@ use std::sync::{Mutex, PoisonError};
 
 use glam::DVec3;
 use radiance::{PointField, PointSamples, RenderError};
-use scene::{Bounds, Space};
+use scene::Space;
 use tch::{Device, TchError, Tensor, no_grad};
 
-use crate::composite::INFINITY;
+use crate::composite::LAST_STEP;
 use crate::mlp::Mlp;
 use crate::network::encode;
 use crate::ray_tensors::{matrix, to_host};
@@ -16,18 +16,19 @@ use crate::ray_tensors::{matrix, to_host};
 const POINTS_PER_PASS: usize = 1024;
 
 /// Probes along each side of a box that [`PointField::may_have_density`] evaluates, corners
-/// included: at every other voxel of a brick of the viewer. Chosen by hand.
+/// included: at every other voxel of a brick of the viewer. A surface between the probes is missed.
+/// Chosen by hand.
 const PROBES_PER_SIDE: usize = 5;
 
-/// Depth in cube sides of the layer before the end of unbounded rays whose density extends to
+/// Thickness, in cube sides, of an unbounded space's outermost layer, whose density extends to
 /// infinity; chosen by hand.
-const END_DEPTH: f64 = 1.0 / 128.0;
+const END_LAYER: f64 = 1.0 / 128.0;
 
-/// Magnitude to which raw colours are limited: beyond, eight bits show no difference.
+/// Magnitude to which raw colours are limited: beyond, eight bits differ by at most one level.
 const MAX_RAW_COLOUR: f64 = 6.0;
 
 /// The paper's field at points: its fine network on the CPU. View features are those of the
-/// network's colour branch, so that raw colours have no part that is independent of the direction.
+/// network's colour branch. All colour depends on the direction, so raw colours are 0.
 pub struct MlpPoints {
     /// The field. A tensor may be used by one thread at a time, so each call takes handles of its
     /// own.
@@ -115,10 +116,8 @@ impl Mlp {
         if self.bounds.space != Space::Box {
             return point.map(|c| 2.0 * c - 1.0);
         }
-        let Bounds { min, .. } = self.bounds;
-        let world =
-            DVec3::from(min) + self.bounds.longest_side() * DVec3::from(point.map(f64::from));
-        self.frame().position_of(world)
+        let offset = self.bounds.longest_side() * DVec3::from(point.map(f64::from));
+        self.frame().position_of(DVec3::from(self.bounds.min) + offset)
     }
 
     /// Returns densities per unit of a ray's t from the trunk's outputs. In a box this unit is the
@@ -132,7 +131,7 @@ impl Mlp {
         let mut densities = to_host(&densities)?;
         for (density, &point) in densities.iter_mut().zip(points) {
             if self.is_at_end(point) {
-                *density *= INFINITY;
+                *density *= LAST_STEP;
             }
         }
         Ok(densities)
@@ -144,11 +143,12 @@ impl Mlp {
         let point = DVec3::from(point.map(f64::from));
         match self.bounds.space {
             Space::Box => false,
-            Space::Ndc(_) => point.z > 1.0 - END_DEPTH,
+            Space::Ndc(_) => point.z > 1.0 - END_LAYER,
             Space::Contraction => {
                 let radius = 0.5 * self.bounds.longest_side();
+                // Contracted distance of points at distance `far` (`Bounds::to_cube`).
                 let end = 0.25 * (2.0 - radius / self.bounds.far.max(radius));
-                point.distance(DVec3::splat(0.5)) > end - END_DEPTH
+                point.distance(DVec3::splat(0.5)) > end - END_LAYER
             }
         }
     }
@@ -185,7 +185,7 @@ impl Mlp {
 #[cfg(test)]
 mod tests {
     use radiance::{Ray, clip};
-    use scene::Frustum;
+    use scene::{Bounds, Frustum};
     use tch::Kind;
 
     use super::*;

@@ -51,7 +51,7 @@ fn shard_count(rays: usize) -> usize {
 }
 
 /// Number of samples that pass through the fine network together: few enough that activations stay
-/// in the cache, enough to outweigh the overhead of a call (design note 022).
+/// in the cache, enough to outweigh the overhead of a call; chosen by hand.
 const CHUNK_SAMPLES: usize = 4096;
 /// Number of consecutive stuck steps that count as a collapse (design note 022).
 const MAX_STUCK_STEPS: u64 = 200;
@@ -163,7 +163,7 @@ impl MlpTrainer {
         let rays = step.rays();
         let pieces = self.run_step(&*supervisor, step)?;
         self.state.count(bundles, rays_per_bundle);
-        let Some(sum) = sum_in_order(pieces.into_iter().map(Ok))? else { return Ok(None) };
+        let sum = sum_in_order(pieces.into_iter().map(Ok))?.expect("a step has a bundle");
         let loss = sum.loss / bundles as f64;
         let skipped = !loss.is_finite() || !nets::all_finite(&sum.gradients)?;
         if skipped {

@@ -5,8 +5,8 @@ use tch::{Kind, TchError, Tensor};
 use crate::grid::GridForward;
 
 /// Adds the regularisers' losses to `surrogate`, a scalar whose gradient is that of the step's mean
-/// loss. `forward` has a part of the step's rays, which are `rays` in all; `march_step` is the
-/// distance between samples, in sides of the unit cube.
+/// loss. `forward` has some of the step's rays, `rays` is the number of all; `march_step` is the
+/// length of a step in t.
 pub(crate) fn add_regularisers(
     mut surrogate: Tensor,
     regularisers: &Regularisers,
@@ -30,7 +30,8 @@ pub(crate) fn add_regularisers(
 }
 
 /// Computes the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), summed over
-/// the rays of `forward`: Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i².
+/// the rays of `forward`: Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i². Unlike in eq. 15, a sample of
+/// a double stride counts as one step long, too.
 fn distortion_sum(forward: &GridForward, step: f64) -> Result<Tensor, TchError> {
     let weights = forward.weights.f_mul(&forward.counted)?;
     let moments = weights.f_mul(&forward.t)?;
@@ -42,8 +43,8 @@ fn distortion_sum(forward: &GridForward, step: f64) -> Result<Tensor, TchError> 
 }
 
 /// Computes the floater loss, summed over the rays of `forward`:
-/// T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊ with a ray's transmittance T, background b and [`MAX_FLOATER_COLOUR_DISTANCE`] as reach. No
-/// gradients go through the colours c or T.
+/// T·Σ_i w_i·(1 - |c_i - b|² / d²)₊ with a ray's transmittance T, its background b and the distance
+/// d = [`MAX_FLOATER_COLOUR_DISTANCE`]. No gradients go through the colours c or T.
 fn floater_sum(forward: &GridForward, backgrounds: &Tensor) -> Result<Tensor, TchError> {
     let background = backgrounds.f_index_select(0, &forward.shaded_ray)?;
     let squared = forward

@@ -16,8 +16,12 @@ pub struct DatasetError(#[from] Problem);
 /// a file's text unescaped.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Problem {
-    #[error("{}: no data set; {}", path_text(path), hint(nearby.as_ref()))]
-    Unrecognised { path: PathBuf, nearby: Option<String> },
+    #[error("{}: no data set; {}", path_text(path), hint(finding.as_ref()))]
+    Unrecognised {
+        path: PathBuf,
+        /// What was found instead, with the remedy.
+        finding: Option<String>,
+    },
     #[error("{}: {source}", path_text(path))]
     Io { path: PathBuf, source: io::Error },
     #[error("{0}")]
@@ -36,9 +40,9 @@ pub(crate) enum Problem {
 }
 
 /// Returns what was found instead of a data set, or what was expected.
-fn hint(nearby: Option<&String>) -> String {
-    match nearby {
-        Some(nearby) => printable(nearby).into_owned(),
+fn hint(finding: Option<&String>) -> String {
+    match finding {
+        Some(finding) => printable(finding).into_owned(),
         None => format!("expected {}", expected_files()),
     }
 }
@@ -58,7 +62,7 @@ impl From<FileProblem> for DatasetError {
 impl DatasetError {
     /// True if the folder contains neither a data set nor a sign of one.
     pub fn is_unrecognised(&self) -> bool {
-        matches!(self.0, Problem::Unrecognised { nearby: None, .. })
+        matches!(self.0, Problem::Unrecognised { finding: None, .. })
     }
 
     pub(crate) fn io(path: &Path, source: io::Error) -> Self {
@@ -102,7 +106,7 @@ impl Reason {
         Self(format!("{name} is {value}; an image has 1 to {} pixels per side", u32::MAX))
     }
 
-    /// Returns the reason why a file is invalid of whose images none exists. `folder` is the folder
+    /// Returns the reason for a file none of whose images exists. `folder` is the folder
     /// in which all were expected, if there is a single one.
     pub(crate) fn images_missing(count: usize, folder: Option<&Path>, first: &str) -> Self {
         let folder = folder.map(|folder| format!(" in {}", path_text(folder))).unwrap_or_default();

@@ -20,15 +20,17 @@ pub enum Format {
 struct Description {
     /// Name in artifacts.
     name: &'static str,
-    /// Name in the log, with the file that identifies the format.
+    /// Name for the log, with the file that identifies the format.
     title: &'static str,
-    /// File that identifies the format, for the message about a folder without a data set.
+    /// File that identifies the format, with the format's name, for the message about a folder
+    /// without a data set.
     sign: &'static str,
     is_benchmark: bool,
 }
 
 impl Format {
-    /// All formats, the most explicit first: a folder often contains the source of its poses, too.
+    /// All formats in order of recognition: next to `transforms.json` is often the COLMAP model from
+    /// which it was made.
     pub(crate) const ALL: [Self; 4] = [Self::Blender, Self::Transforms, Self::Llff, Self::Colmap];
 
     /// Returns the format's name with the file that identifies it: `COLMAP (sparse)`.

@@ -81,7 +81,7 @@ impl Dataset {
 fn recognise_format(folder: &Path) -> Result<Format, DatasetError> {
     let format = find_format(folder)?.ok_or_else(|| Problem::Unrecognised {
         path: folder.to_path_buf(),
-        nearby: find_nearby(folder),
+        finding: find_nearby(folder),
     })?;
     Ok(format)
 }

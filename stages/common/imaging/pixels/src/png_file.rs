@@ -13,6 +13,7 @@ pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
     let damaged = |e| PixelError::format(path, format!("not a complete PNG ({e})"));
     let mut reader = image::ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
+    // 16-bit RGBA has eight bytes per pixel.
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
     let decoder = reader.into_decoder().map_err(damaged)?;

@@ -72,7 +72,7 @@ impl Frustum {
     }
 
     /// Returns the side of the cube in slopes: the width of the wider range.
-    fn cube_side(&self) -> f64 {
+    pub fn cube_side(&self) -> f64 {
         (self.max[0] - self.min[0]).max(self.max[1] - self.min[1])
     }
 

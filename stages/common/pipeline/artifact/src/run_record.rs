@@ -27,7 +27,8 @@ pub struct RunRecord {
     /// Nodes that the sink should display but that have no artifact; only for partial sinks.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub failed: Vec<FailedPoint>,
-    /// Unfinished ancestors of the failed nodes and these nodes; parents precede children.
+    /// Unfinished nodes that the sink should display, and their unfinished ancestors; parents
+    /// precede children.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub unfinished: Vec<UnfinishedNode>,
 }
@@ -44,7 +45,7 @@ pub struct UnfinishedNode {
     pub kind: String,
     /// All parameters.
     pub parameters: Map<String, Value>,
-    /// Indices of the required nodes: in [`RunRecord::nodes`], followed by
+    /// Indices of the required nodes in a list of all [`RunRecord::nodes`], then all
     /// [`RunRecord::unfinished`].
     pub needs: Vec<usize>,
     /// Message of the failure; `None` if the node didn't run.

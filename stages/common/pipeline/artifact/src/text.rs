@@ -172,7 +172,8 @@ pub fn format_duration(seconds: f64) -> String {
 /// Formats a time, given in seconds since 1970, as `2026-11-24 23:23:05 UTC`.
 pub fn format_utc(unix: u64) -> String {
     let seconds = unix % 86_400;
-    // Days since 1 March 0000. Years that begin in March end with the leap day.
+    // Howard Hinnant's algorithm `civil_from_days`: days since 1 March 0000, in eras of 400 years.
+    // Years that begin in March end with the leap day.
     let days = unix / 86_400 + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
     let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;

@@ -1,10 +1,11 @@
 use serde::Deserialize;
 
 /// Rays per LR pixel of an opaque scene, whose rays all hit a surface, over those of other scenes.
-/// The protocols for photographs and for objects (`experiments/common.yaml`) have this ratio.
-const OPAQUE_RAYS: f64 = 0.6;
-/// Rays of a fine-tuning over those of the initial field (`experiments/common.yaml`).
-const FINE_TUNING_RAYS: f64 = 0.5;
+/// The protocols 252x2 and 100x2 (`experiments/common.yaml`) have about this ratio.
+const OPAQUE_RAY_FACTOR: f64 = 0.6;
+/// Rays of a fine-tuning over those of the initial field, as in the protocols with an LR width
+/// (`experiments/common.yaml`).
+const FINE_TUNING_RAY_FACTOR: f64 = 0.5;
 
 /// Parameters from which the rays of a training follow. Deserialised from the parameters of
 /// `train-ss`.
@@ -14,9 +15,9 @@ pub struct RayBudget {
     pub rays: Option<u64>,
     /// Rays for each LR pixel of all views.
     pub rays_per_pixel: f64,
-    /// Minimum number of rays.
+    /// Minimum number of rays, which a fine-tuning halves.
     pub min_rays: u64,
-    /// Maximum number of rays, even below the minimum.
+    /// Maximum number of rays; overrides a larger minimum. A fine-tuning halves it.
     pub max_rays: u64,
 }
 
@@ -33,10 +34,10 @@ impl RayBudget {
         if let Some(rays) = self.rays {
             return rays;
         }
-        let opaque = if is_opaque { OPAQUE_RAYS } else { 1.0 };
+        let opaque = if is_opaque { OPAQUE_RAY_FACTOR } else { 1.0 };
         let rays = opaque * self.rays_per_pixel * lr_pixels as f64;
         let rays = rays.max(self.min_rays as f64).min(self.max_rays as f64);
-        let part = if is_fine_tuning { FINE_TUNING_RAYS } else { 1.0 };
+        let part = if is_fine_tuning { FINE_TUNING_RAY_FACTOR } else { 1.0 };
         (part * rays).round().max(1.0) as u64
     }
 }

@@ -137,7 +137,8 @@ fn serialized(
         let dtype = match tensor.kind() {
             Kind::Int64 => Dtype::I64,
             Kind::Uint8 => Dtype::U8,
-            _ => Dtype::F32,
+            Kind::Float => Dtype::F32,
+            other => return Err(format!("tensor {name}: cannot write {other:?}").into()),
         };
         let flat = tensor.f_detach()?.f_to_device(Device::Cpu)?.f_contiguous()?;
         let mut data = vec![0u8; flat.numel() * flat.kind().elt_size_in_bytes()];

@@ -22,9 +22,12 @@ impl<'a> LrObservations<'a> {
         Ok(Self { input, views: Views::read(input)?, filter: degradation.kernel.filter() })
     }
 
-    /// Returns whether each of the cameras has a photograph.
-    pub fn cover(&self, cameras: &Views) -> bool {
-        cameras.views.iter().all(|view| self.views.taken_by(&view.camera).is_some())
+    /// Returns whether the camera of each view has a photograph.
+    pub fn covers(&self, views: &Views) -> bool {
+        views
+            .views
+            .iter()
+            .all(|view| self.views.taken_by(&view.camera).is_some_and(|own| own.image.is_some()))
     }
 
     /// Reads the LR photograph of a camera, composited on the background. The photograph has the
@@ -70,11 +73,12 @@ impl<'a> LrObservations<'a> {
             let zeros = Image { data: vec![0.0; residual.data.len()], ..residual.clone() };
             mask.fill(&mut residual, &zeros);
         }
-        let scale =
+        // K⁺ = s·Pᵀ along each axis (`AxisTaps::inverse`), with the scales s of both axes.
+        let pixels_per_lr_pixel =
             (refined.width * refined.height) as f32 / (photograph.width * photograph.height) as f32;
         let mut projected = kernel.inverse(INVERSE_RADIUS_LR_PIXELS).adjoint(&residual);
-        for (m, r) in projected.data.iter_mut().zip(&refined.data) {
-            *m = (scale * *m + r).clamp(0.0, 1.0);
+        for (projected, refined) in projected.data.iter_mut().zip(&refined.data) {
+            *projected = (pixels_per_lr_pixel * *projected + refined).clamp(0.0, 1.0);
         }
         projected
     }

@@ -9,14 +9,16 @@ use numerics::kernel;
 use numerics::simd::{LANES, Lanes};
 
 /// Outputs along each side of a tile.
-const OUTPUTS: usize = 4;
+const TILE_OUTPUTS: usize = 4;
 /// Inputs along each side of a tile.
-const INPUTS: usize = 6;
+const TILE_INPUTS: usize = 6;
 /// Products per tile and pair of channels.
-const POINTS: usize = INPUTS * INPUTS;
-/// Number of tiles that are transformed together: their products fit in the second cache.
+const POINTS: usize = TILE_INPUTS * TILE_INPUTS;
+/// Number of tiles that are transformed together: their products fit in the level-2 cache; chosen
+/// by hand.
 const BLOCK: usize = 32;
-/// Number of tiles whose sums are in registers at once; divides [`BLOCK`].
+/// Rows of a product that are in registers at once; half as many in narrow SIMD families. Divides
+/// [`BLOCK`] and [`LANES`]; chosen by hand.
 const ROWS: usize = 8;
 
 /// Sixteen numbers in one cache line.
@@ -61,8 +63,7 @@ impl Maps {
         let pixels = self.data.chunks_exact_mut(self.depth);
         for (pixel, sample) in pixels.zip(samples.chunks_exact(channels)) {
             for (vector, values) in pixel.iter_mut().zip(sample.chunks(LANES)) {
-                vector.0[..values.len()].copy_from_slice(values);
-                vector.0[values.len()..].fill(0.0);
+                *vector = padded(values);
             }
         }
     }
@@ -110,7 +111,7 @@ impl Maps {
 
 /// Returns a + factor · b.
 #[inline(always)]
-fn sum<L: Lanes>(a: L, factor: f32, b: L) -> L {
+fn add_scaled<L: Lanes>(a: L, factor: f32, b: L) -> L {
     b.mul_add(L::splat(factor), a)
 }
 
@@ -118,8 +119,8 @@ fn sum<L: Lanes>(a: L, factor: f32, b: L) -> L {
 #[derive(Debug)]
 pub(crate) struct Convolution {
     /// Numbers of vectors of inputs and of outputs.
-    inputs: usize,
-    outputs: usize,
+    input_vectors: usize,
+    output_vectors: usize,
     /// G g Gᵀ: points × inputs × outputs.
     forward: Vec<Vector>,
     /// G g Gᵀ: points × outputs × inputs.
@@ -128,7 +129,7 @@ pub(crate) struct Convolution {
 }
 
 /// G: transform of kernels.
-const G: [[f32; 3]; INPUTS] = [
+const G: [[f32; 3]; TILE_INPUTS] = [
     [0.25, 0.0, 0.0],
     [-1.0 / 6.0, -1.0 / 6.0, -1.0 / 6.0],
     [-1.0 / 6.0, 1.0 / 6.0, -1.0 / 6.0],
@@ -141,20 +142,21 @@ impl Convolution {
     /// Transforms kernels, outputs × rows × columns × inputs, with a bias per output.
     pub(crate) fn new(kernels: &[f32], bias: &[f32]) -> Self {
         let channels = kernels.len() / (9 * bias.len());
-        let (inputs, outputs) = (channels.div_ceil(LANES), bias.len().div_ceil(LANES));
-        let size = POINTS * inputs * outputs * LANES;
+        let (input_vectors, output_vectors) =
+            (channels.div_ceil(LANES), bias.len().div_ceil(LANES));
+        let size = POINTS * input_vectors * output_vectors * LANES;
         let mut layer = Self {
-            inputs,
-            outputs,
+            input_vectors,
+            output_vectors,
             forward: vec![Vector::default(); size],
             backward: vec![Vector::default(); size],
             bias: bias.chunks(LANES).map(padded).collect(),
         };
-        let mut rows = vec![0.0; 3 * INPUTS * channels];
+        let mut rows = vec![0.0; 3 * TILE_INPUTS * channels];
         for (output, kernel) in kernels.chunks_exact(9 * channels).enumerate() {
             transform_rows(kernel, channels, &mut rows);
             for point in 0..POINTS {
-                let row = &rows[point / INPUTS * 3 * channels..][..3 * channels];
+                let row = &rows[point / TILE_INPUTS * 3 * channels..][..3 * channels];
                 layer.set_point(point, output, row, channels);
             }
         }
@@ -163,15 +165,15 @@ impl Convolution {
 
     /// Transforms an output's kernels along columns, for one point, from `row`: 3 × `channels`.
     fn set_point(&mut self, point: usize, output: usize, row: &[f32], channels: usize) {
-        let g = G[point % INPUTS];
-        let start = (point * self.outputs * LANES + output) * self.inputs;
+        let g = G[point % TILE_INPUTS];
+        let start = (point * self.output_vectors * LANES + output) * self.input_vectors;
         for channel in 0..channels {
             let value = g[0] * row[channel]
                 + g[1] * row[channels + channel]
                 + g[2] * row[2 * channels + channel];
             self.backward[start + channel / LANES].0[channel % LANES] = value;
-            let input = point * self.inputs * LANES + channel;
-            self.forward[input * self.outputs + output / LANES].0[output % LANES] = value;
+            let input = point * self.input_vectors * LANES + channel;
+            self.forward[input * self.output_vectors + output / LANES].0[output % LANES] = value;
         }
     }
 }
@@ -208,7 +210,7 @@ impl LayerGradients {
         self.transformed.clear();
         self.transformed.resize(layer.forward.len(), Vector::default());
         self.bias.clear();
-        self.bias.resize(layer.outputs, Vector::default());
+        self.bias.resize(layer.output_vectors, Vector::default());
     }
 
     /// Adds other gradients of the same layer.
@@ -248,9 +250,9 @@ impl LayerGradients {
     /// Returns the gradients of a kernel's nine taps for an input and sixteen outputs, whose
     /// vectors are at `offset` of each point's `size`.
     fn taps(&self, size: usize, offset: usize) -> [Vector; 9] {
-        let mut rows = [[Vector::default(); INPUTS]; 3];
+        let mut rows = [[Vector::default(); TILE_INPUTS]; 3];
         for point in 0..POINTS {
-            let (i, j) = (point / INPUTS, point % INPUTS);
+            let (i, j) = (point / TILE_INPUTS, point % TILE_INPUTS);
             let vector = &self.transformed[point * size + offset];
             for y in 0..3 {
                 for lane in 0..LANES {
@@ -260,7 +262,7 @@ impl LayerGradients {
         }
         let mut taps = [Vector::default(); 9];
         for (tap, sum) in taps.iter_mut().enumerate() {
-            for j in 0..INPUTS {
+            for j in 0..TILE_INPUTS {
                 for lane in 0..LANES {
                     sum.0[lane] += rows[tap / 3][j].0[lane] * G[j][tap % 3];
                 }
@@ -270,7 +272,7 @@ impl LayerGradients {
     }
 }
 
-/// Rows of the tiles of a block, one for each tile and point.
+/// One row for each tile and point of a block.
 #[derive(Clone, Debug, Default)]
 struct BlockRows {
     /// Number of vectors per row.
@@ -305,11 +307,11 @@ impl BlockRows {
 
     /// Returns a tile's values of all points.
     #[inline(always)]
-    fn load_tile<L: Lanes>(&self, tile: usize, vector: usize) -> [[L; INPUTS]; INPUTS] {
-        let mut values = [[L::splat(0.0); INPUTS]; INPUTS];
-        for i in 0..INPUTS {
-            for j in 0..INPUTS {
-                let start = (i * INPUTS + j) * self.stride() + tile * self.depth;
+    fn load_tile<L: Lanes>(&self, tile: usize, vector: usize) -> [[L; TILE_INPUTS]; TILE_INPUTS] {
+        let mut values = [[L::splat(0.0); TILE_INPUTS]; TILE_INPUTS];
+        for i in 0..TILE_INPUTS {
+            for j in 0..TILE_INPUTS {
+                let start = (i * TILE_INPUTS + j) * self.stride() + tile * self.depth;
                 values[i][j] = load(&self.data[start + vector]);
             }
         }
@@ -317,10 +319,15 @@ impl BlockRows {
     }
 
     #[inline(always)]
-    fn store_tile<L: Lanes>(&mut self, tile: usize, vector: usize, values: &[[L; INPUTS]; INPUTS]) {
-        for i in 0..INPUTS {
-            for j in 0..INPUTS {
-                let start = (i * INPUTS + j) * self.stride() + tile * self.depth;
+    fn store_tile<L: Lanes>(
+        &mut self,
+        tile: usize,
+        vector: usize,
+        values: &[[L; TILE_INPUTS]; TILE_INPUTS],
+    ) {
+        for i in 0..TILE_INPUTS {
+            for j in 0..TILE_INPUTS {
+                let start = (i * TILE_INPUTS + j) * self.stride() + tile * self.depth;
                 values[i][j].store(&mut self.data[start + vector].0);
             }
         }
@@ -349,7 +356,7 @@ pub(crate) enum After<'a> {
     Add(&'a Maps),
 }
 
-/// Applies a 3×3 transform along columns, then along rows.
+/// Applies a transform of `$from` to `$to` numbers to each column of a tile, then to each row.
 macro_rules! both_axes {
     ($tile:expr, $transform:ident, $from:expr, $to:expr) => {{
         let tile = $tile;
@@ -374,59 +381,59 @@ macro_rules! both_axes {
 
 /// Returns Bᵀ d.
 #[inline(always)]
-fn input_transform<L: Lanes>(d: [L; INPUTS]) -> [L; INPUTS] {
-    let (even, odd) = (sum(d[4], -4.0, d[2]), sum(d[3], -4.0, d[1]));
-    let (near, far) = (sum(d[4], -1.0, d[2]), sum(d[3], -1.0, d[1]));
+fn input_transform<L: Lanes>(d: [L; TILE_INPUTS]) -> [L; TILE_INPUTS] {
+    let (even, odd) = (add_scaled(d[4], -4.0, d[2]), add_scaled(d[3], -4.0, d[1]));
+    let (near, far) = (add_scaled(d[4], -1.0, d[2]), add_scaled(d[3], -1.0, d[1]));
     [
-        sum(sum(d[4], -5.0, d[2]), 4.0, d[0]),
-        sum(even, 1.0, odd),
-        sum(even, -1.0, odd),
-        sum(near, 2.0, far),
-        sum(near, -2.0, far),
-        sum(sum(d[5], -5.0, d[3]), 4.0, d[1]),
+        add_scaled(add_scaled(d[4], -5.0, d[2]), 4.0, d[0]),
+        add_scaled(even, 1.0, odd),
+        add_scaled(even, -1.0, odd),
+        add_scaled(near, 2.0, far),
+        add_scaled(near, -2.0, far),
+        add_scaled(add_scaled(d[5], -5.0, d[3]), 4.0, d[1]),
     ]
 }
 
 /// Returns B t.
 #[inline(always)]
-fn input_adjoint<L: Lanes>(t: [L; INPUTS]) -> [L; INPUTS] {
-    let (sum12, sum34) = (sum(t[1], 1.0, t[2]), sum(t[3], 1.0, t[4]));
-    let (minus12, minus34) = (sum(t[1], -1.0, t[2]), sum(t[3], -1.0, t[4]));
+fn input_adjoint<L: Lanes>(t: [L; TILE_INPUTS]) -> [L; TILE_INPUTS] {
+    let (sum12, sum34) = (add_scaled(t[1], 1.0, t[2]), add_scaled(t[3], 1.0, t[4]));
+    let (minus12, minus34) = (add_scaled(t[1], -1.0, t[2]), add_scaled(t[3], -1.0, t[4]));
     let zero = L::splat(0.0);
     [
-        sum(zero, 4.0, t[0]),
-        sum(sum(sum(zero, -4.0, minus12), -2.0, minus34), 4.0, t[5]),
-        sum(sum(sum(zero, -5.0, t[0]), -4.0, sum12), -1.0, sum34),
-        sum(sum(minus12, 2.0, minus34), -5.0, t[5]),
-        sum(sum(t[0], 1.0, sum12), 1.0, sum34),
+        add_scaled(zero, 4.0, t[0]),
+        add_scaled(add_scaled(add_scaled(zero, -4.0, minus12), -2.0, minus34), 4.0, t[5]),
+        add_scaled(add_scaled(add_scaled(zero, -5.0, t[0]), -4.0, sum12), -1.0, sum34),
+        add_scaled(add_scaled(minus12, 2.0, minus34), -5.0, t[5]),
+        add_scaled(add_scaled(t[0], 1.0, sum12), 1.0, sum34),
         t[5],
     ]
 }
 
 /// Returns Aᵀ m.
 #[inline(always)]
-fn output_transform<L: Lanes>(m: [L; INPUTS]) -> [L; OUTPUTS] {
-    let (sum12, sum34) = (sum(m[1], 1.0, m[2]), sum(m[3], 1.0, m[4]));
-    let (minus12, minus34) = (sum(m[1], -1.0, m[2]), sum(m[3], -1.0, m[4]));
+fn output_transform<L: Lanes>(m: [L; TILE_INPUTS]) -> [L; TILE_OUTPUTS] {
+    let (sum12, sum34) = (add_scaled(m[1], 1.0, m[2]), add_scaled(m[3], 1.0, m[4]));
+    let (minus12, minus34) = (add_scaled(m[1], -1.0, m[2]), add_scaled(m[3], -1.0, m[4]));
     [
-        sum(sum(m[0], 1.0, sum12), 1.0, sum34),
-        sum(minus12, 2.0, minus34),
-        sum(sum12, 4.0, sum34),
-        sum(sum(minus12, 8.0, minus34), 1.0, m[5]),
+        add_scaled(add_scaled(m[0], 1.0, sum12), 1.0, sum34),
+        add_scaled(minus12, 2.0, minus34),
+        add_scaled(sum12, 4.0, sum34),
+        add_scaled(add_scaled(minus12, 8.0, minus34), 1.0, m[5]),
     ]
 }
 
 /// Returns A y.
 #[inline(always)]
-fn output_adjoint<L: Lanes>(y: [L; OUTPUTS]) -> [L; INPUTS] {
-    let (even, odd) = (sum(y[0], 1.0, y[2]), sum(y[1], 1.0, y[3]));
-    let (even4, odd4) = (sum(y[0], 4.0, y[2]), sum(y[1], 4.0, y[3]));
+fn output_adjoint<L: Lanes>(y: [L; TILE_OUTPUTS]) -> [L; TILE_INPUTS] {
+    let (even, odd) = (add_scaled(y[0], 1.0, y[2]), add_scaled(y[1], 1.0, y[3]));
+    let (even4, odd4) = (add_scaled(y[0], 4.0, y[2]), add_scaled(y[1], 4.0, y[3]));
     [
         y[0],
-        sum(even, 1.0, odd),
-        sum(even, -1.0, odd),
-        sum(even4, 2.0, odd4),
-        sum(even4, -2.0, odd4),
+        add_scaled(even, 1.0, odd),
+        add_scaled(even, -1.0, odd),
+        add_scaled(even4, 2.0, odd4),
+        add_scaled(even4, -2.0, odd4),
         y[3],
     ]
 }
@@ -437,13 +444,13 @@ fn transform_inputs<L: Lanes>(x: &Maps, tiles: Tiles, to: &mut BlockRows) {
     for tile in 0..tiles.count {
         let (left, top) = tiles.corner(tile);
         for vector in 0..x.depth {
-            let mut d = [[L::splat(0.0); INPUTS]; INPUTS];
-            for i in 0..INPUTS {
-                for j in 0..INPUTS {
+            let mut d = [[L::splat(0.0); TILE_INPUTS]; TILE_INPUTS];
+            for i in 0..TILE_INPUTS {
+                for j in 0..TILE_INPUTS {
                     d[i][j] = x.load(left + j, top + i, vector);
                 }
             }
-            let t = both_axes!(d, input_transform, INPUTS, INPUTS);
+            let t = both_axes!(d, input_transform, TILE_INPUTS, TILE_INPUTS);
             to.store_tile(tile, vector, &t);
         }
     }
@@ -464,25 +471,26 @@ impl Tiles {
     /// Returns the number of tiles along a row of some output maps, and of all tiles.
     #[inline(always)]
     fn of(maps: &Maps) -> (usize, usize) {
-        let across = maps.width.div_ceil(OUTPUTS);
-        (across, across * maps.height.div_ceil(OUTPUTS))
+        let across = maps.width.div_ceil(TILE_OUTPUTS);
+        (across, across * maps.height.div_ceil(TILE_OUTPUTS))
     }
 
     /// Returns column and row of a tile's first output.
     #[inline(always)]
     fn corner(self, tile: usize) -> (usize, usize) {
         let index = self.first + tile;
-        (index % self.across * OUTPUTS, index / self.across * OUTPUTS)
+        (index % self.across * TILE_OUTPUTS, index / self.across * TILE_OUTPUTS)
     }
 
-    /// Number of tiles, padded to whole register tiles.
+    /// Returns the number of tiles, rounded up to a multiple of [`ROWS`].
     #[inline(always)]
     fn padded(self) -> usize {
         self.count.next_multiple_of(ROWS)
     }
 }
 
-/// Computes for each point rows · matrix, of `rows.depth` × `to.depth` vectors of 16 × 16 numbers.
+/// Multiplies, for each point, the rows by its matrix: `rows.depth` × `to.depth` blocks of 16 × 16
+/// numbers.
 #[inline(always)]
 fn multiply<L: Lanes>(tiles: Tiles, rows: &BlockRows, matrix: &[Vector], to: &mut BlockRows) {
     let (inputs, outputs) = (rows.depth, to.depth);
@@ -646,16 +654,16 @@ fn transform_outputs<L: Lanes>(
         let (left, top) = tiles.corner(tile);
         for vector in 0..y.depth {
             let m = products.load_tile::<L>(tile, vector);
-            let outputs = both_axes!(m, output_transform, INPUTS, OUTPUTS);
+            let outputs = both_axes!(m, output_transform, TILE_INPUTS, TILE_OUTPUTS);
             let bias: L = load(&bias[vector]);
-            for i in 0..OUTPUTS {
-                for j in 0..OUTPUTS {
-                    let value = sum(outputs[i][j], 1.0, bias);
+            for i in 0..TILE_OUTPUTS {
+                for j in 0..TILE_OUTPUTS {
+                    let value = add_scaled(outputs[i][j], 1.0, bias);
                     let value = match after {
                         After::Linear => value,
                         After::Relu => value.positive(),
                         After::Add(maps) => {
-                            sum(value, 1.0, maps.load(left + j + 2, top + i + 2, vector))
+                            add_scaled(value, 1.0, maps.load(left + j + 2, top + i + 2, vector))
                         }
                     };
                     y.store(left + j, top + i, vector, value);
@@ -665,8 +673,8 @@ fn transform_outputs<L: Lanes>(
     }
 }
 
-/// Writes the transformed gradients of a block's outputs, A dy Aᵀ, and adds them to the biases'.
-/// With a gate, gradients of outputs that aren't above 0 are 0.
+/// Writes A dy Aᵀ for each tile of a block, and adds dy to the gradients of the biases. With a
+/// gate, gradients of outputs that aren't above 0 are 0.
 #[inline(always)]
 fn transform_gradients<L: Lanes>(
     dy: &Maps,
@@ -678,21 +686,21 @@ fn transform_gradients<L: Lanes>(
     for tile in 0..tiles.count {
         let (left, top) = tiles.corner(tile);
         for vector in 0..dy.depth {
-            let mut y = [[L::splat(0.0); OUTPUTS]; OUTPUTS];
+            let mut y = [[L::splat(0.0); TILE_OUTPUTS]; TILE_OUTPUTS];
             let mut total: L = load(&bias[vector]);
-            for i in 0..OUTPUTS {
-                for j in 0..OUTPUTS {
+            for i in 0..TILE_OUTPUTS {
+                for j in 0..TILE_OUTPUTS {
                     let (column, row) = (left + j, top + i);
                     let mut value: L = dy.load(column, row, vector);
                     if let Some(gate) = gate {
                         value = value.where_positive(gate.load(column, row, vector));
                     }
-                    total = sum(total, 1.0, value);
+                    total = add_scaled(total, 1.0, value);
                     y[i][j] = value;
                 }
             }
             total.store(&mut bias[vector].0);
-            let m = both_axes!(y, output_adjoint, OUTPUTS, INPUTS);
+            let m = both_axes!(y, output_adjoint, TILE_OUTPUTS, TILE_INPUTS);
             to.store_tile(tile, vector, &m);
         }
     }
@@ -705,11 +713,11 @@ fn add_input_gradients<L: Lanes>(products: &BlockRows, tiles: Tiles, dx: &mut Ma
         let (left, top) = tiles.corner(tile);
         for vector in 0..dx.depth {
             let t = products.load_tile::<L>(tile, vector);
-            let d = both_axes!(t, input_adjoint, INPUTS, INPUTS);
-            for i in 0..INPUTS {
-                for j in 0..INPUTS {
+            let d = both_axes!(t, input_adjoint, TILE_INPUTS, TILE_INPUTS);
+            for i in 0..TILE_INPUTS {
+                for j in 0..TILE_INPUTS {
                     let before: L = dx.load(left + j, top + i, vector);
-                    dx.store(left + j, top + i, vector, sum(before, 1.0, d[i][j]));
+                    dx.store(left + j, top + i, vector, add_scaled(before, 1.0, d[i][j]));
                 }
             }
         }
@@ -720,10 +728,10 @@ kernel! {
     /// Convolves `x`; `y` becomes two pixels narrower and lower.
     pub(crate) fn convolve<L>(layer: &Convolution, x: &Maps, after: After<'_>, y: &mut Maps,
         scratch: &mut Scratch) {
-        y.resize(x.width - 2, x.height - 2, layer.outputs);
+        y.resize(x.width - 2, x.height - 2, layer.output_vectors);
         let Scratch { inputs, products, .. } = scratch;
-        inputs.resize(layer.inputs);
-        products.resize(layer.outputs);
+        inputs.resize(layer.input_vectors);
+        products.resize(layer.output_vectors);
         let (across, count) = Tiles::of(y);
         let mut first = 0;
         while first < count {
@@ -742,9 +750,9 @@ kernel! {
     pub(crate) fn convolve_back<L>(layer: &Convolution, x: &Maps, dy: &Maps, gate: Option<&Maps>,
         gradients: &mut LayerGradients, dx: Option<&mut Maps>, scratch: &mut Scratch) {
         let Scratch { inputs, products, gradients: transformed } = scratch;
-        inputs.resize(layer.inputs);
-        products.resize(layer.inputs);
-        transformed.resize(layer.outputs);
+        inputs.resize(layer.input_vectors);
+        products.resize(layer.input_vectors);
+        transformed.resize(layer.output_vectors);
         let (across, count) = Tiles::of(dy);
         let mut dx = dx;
         let mut first = 0;

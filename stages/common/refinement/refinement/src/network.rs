@@ -12,8 +12,8 @@ pub(crate) struct Layers(pub(crate) Vec<Convolution>);
 pub(crate) struct Pass {
     /// Input of each layer, and the output of the last.
     maps: Vec<Maps>,
-    /// Gradients of a layer's outputs, of its inputs, and of a residual block's outputs.
-    slopes: [Maps; 3],
+    /// Gradients by a layer's output, by its input, and by a residual block's output.
+    gradient_maps: [Maps; 3],
     /// Sums of the gradients of all backward passes since [`Pass::reset`].
     pub(crate) gradients: Vec<LayerGradients>,
     scratch: Scratch,
@@ -32,11 +32,14 @@ impl Pass {
         let last = layers.0.len() - 1;
         for (i, layer) in layers.0.iter().enumerate() {
             let (before, after) = self.maps.split_at_mut(i + 1);
-            // Odd layers begin a residual block, even ones but the first end it.
-            let step = match i {
-                _ if i == 0 || i == last => After::Linear,
-                _ if i % 2 == 1 => After::Relu,
-                _ => After::Add(&before[i - 1]),
+            // Between the first and the last layer, odd ones begin a residual block and even ones
+            // end it.
+            let step = if i == 0 || i == last {
+                After::Linear
+            } else if i % 2 == 1 {
+                After::Relu
+            } else {
+                After::Add(&before[i - 1])
             };
             convolve(layer, &before[i], step, &mut after[0], &mut self.scratch);
         }
@@ -53,26 +56,26 @@ impl Pass {
 
     /// Adds the gradients of the last forward pass, from those of its output's samples.
     pub(crate) fn backward(&mut self, layers: &Layers, output_gradients: &[f32]) {
-        let Self { maps, slopes: [slope, below, block], gradients, scratch } = self;
+        let Self { maps, gradient_maps: [output, input, block], gradients, scratch } = self;
         let last = layers.0.len() - 1;
-        let output = &maps[last + 1];
-        slope.fill(output.width, output.height, output_gradients);
+        let result = &maps[last + 1];
+        output.fill(result.width, result.height, output_gradients);
         for i in (0..=last).rev() {
             let (layer, x, gradients) = (&layers.0[i], &maps[i], &mut gradients[i]);
             if i == 0 {
-                convolve_back(layer, x, slope, None, gradients, None, scratch);
+                convolve_back(layer, x, output, None, gradients, None, scratch);
                 return;
             }
-            below.reset_like(x);
+            input.reset_like(x);
             let begins_block = i < last && i % 2 == 1;
             let gate = begins_block.then_some(&maps[i + 1]);
-            convolve_back(layer, x, slope, gate, gradients, Some(below), scratch);
+            convolve_back(layer, x, output, gate, gradients, Some(input), scratch);
             if begins_block {
-                below.add_to_middle(block);
+                input.add_to_middle(block);
             } else if i < last {
-                std::mem::swap(block, slope);
+                std::mem::swap(block, output);
             }
-            std::mem::swap(slope, below);
+            std::mem::swap(output, input);
         }
     }
 }

@@ -81,11 +81,12 @@ pub struct ConditionedView {
     pub statistics: Vec<ReferenceStatistics>,
 }
 
-/// Length of the mean RGB difference around a pixel that quarters the confidence (design note 018).
-const QUARTERING_DIFFERENCE: f32 = 0.1;
-/// Second difference of neighbouring warped positions that halves the confidence, in pixels of the
-/// reference; chosen by hand.
-const HALVING_SECOND_DIFFERENCE: f32 = 1.0;
+/// Length of the mean RGB difference around a pixel at which confidence is a quarter of visibility
+/// (design note 018).
+const DIFFERENCE_AT_QUARTER_CONFIDENCE: f32 = 0.1;
+/// Length of the second difference of warped positions at which confidence is half as large, in
+/// pixels of the reference; chosen by hand.
+const SECOND_DIFFERENCE_AT_HALF_CONFIDENCE: f32 = 1.0;
 /// Number of rows of a view that are warped together, so that memory doesn't grow with the view.
 const BAND_ROWS: usize = 32;
 
@@ -158,8 +159,9 @@ fn warp(
     options: WarpOptions,
 ) -> Vec<WarpedPixel> {
     let (width, height) = (rendered.view.width, rendered.view.height);
-    let near = rows.start.saturating_sub(COMPARED_RADIUS)..(rows.end + COMPARED_RADIUS).min(height);
-    let warped = warp_by_depth(rendered, reference, near.clone(), options.occlusion);
+    let first_row = rows.start.saturating_sub(COMPARED_RADIUS);
+    let rows_with_margin = first_row..(rows.end + COMPARED_RADIUS).min(height);
+    let warped = warp_by_depth(rendered, reference, rows_with_margin, options.occlusion);
     let terms = warped.iter().map(|pixel| {
         let [r, g, b] = pixel.difference.map(f64::from);
         if pixel.confidence > 0.0 { [r, g, b, 1.0] } else { [0.0; 4] }
@@ -167,14 +169,14 @@ fn warp(
     let sums = Sums::new(width, &terms.collect::<Vec<_>>());
     let mut pixels = Vec::with_capacity(width * rows.len());
     let positions = WarpedPositions { warped: &warped, width };
-    for y in rows.start - near.start..rows.end - near.start {
+    for y in rows.start - first_row..rows.end - first_row {
         for x in 0..width {
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
-                let difference = mean_difference(&sums, x, y) / QUARTERING_DIFFERENCE;
+                let difference = mean_difference(&sums, x, y) / DIFFERENCE_AT_QUARTER_CONFIDENCE;
                 let squared = positions.squared_second_differences(x, y);
                 own.confidence *= (1.0 + difference * difference).powi(-2)
-                    / (1.0 + squared / HALVING_SECOND_DIFFERENCE.powi(2));
+                    / (1.0 + squared / SECOND_DIFFERENCE_AT_HALF_CONFIDENCE.powi(2));
             }
             pixels.push(own);
         }

@@ -9,12 +9,11 @@ use numerics::SpeedTest;
 /// Seconds of a piece of work on the reference machine: two cores with AVX-512.
 const REFERENCE_SECONDS: f64 = 0.42e-3;
 /// Number of measurements, of which the fastest counts: others may have been interrupted by other
-/// programs. All together take a hundredth of a second.
+/// programs. All together take a hundredth of a second. Chosen by hand.
 const MEASUREMENTS: u32 = 24;
 
-/// Returns the time that this machine takes for a piece of work, over that of the reference
-/// machine.
-/// The first call measures it.
+/// Returns this machine's time for the work of [`SpeedTest`] over the reference machine's time. The
+/// first call measures the machine.
 pub(crate) fn slowness() -> f64 {
     static SLOWNESS: OnceLock<f64> = OnceLock::new();
     *SLOWNESS.get_or_init(measure)

@@ -1,6 +1,6 @@
-//! Properties of a node's inputs, on which its cost depends.
+//! Facts on which a node's cost depends.
 
-use radiance::GivenSizes;
+use radiance::{Architecture, GivenSizes};
 use serde::Deserialize as _;
 use serde_json::Value;
 
@@ -49,7 +49,7 @@ impl Images {
     }
 }
 
-/// Properties of a stage's inputs, on which its cost depends.
+/// Facts on which a stage's cost depends: its inputs, parameters, program and machine.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Work {
     pub(crate) kind: SceneKind,
@@ -89,19 +89,23 @@ impl Work {
         Some(Self { kind, images, threads, ..Self::default() })
     }
 
-    /// Returns the fraction of the wanted cells per LR pixel, by area, that the limited field has.
-    pub(crate) fn resolved_part(&self, training: &Value) -> Option<f64> {
+    /// Returns the architecture of a grid that is trained with some parameters.
+    fn architecture(&self, training: &Value) -> Option<Architecture> {
         let sizes = GivenSizes::deserialize(training).ok()?;
-        let architecture = sizes.for_scene(self.pixels_across, self.kind == SceneKind::Frustum);
-        let wanted = radiance::CELLS_PER_PIXEL * self.pixels_across.max(1.0);
-        Some((f64::from(architecture.max_resolution) / wanted).powi(2).min(1.0))
+        Some(sizes.for_scene(self.pixels_across, self.kind == SceneKind::Frustum))
+    }
+
+    /// Returns the number of a field's cells per LR pixel, by area, over the default number. The
+    /// ratio is at most 1; parameters and the maximum resolution can make it smaller.
+    pub(crate) fn resolved_part(&self, training: &Value) -> Option<f64> {
+        let default = radiance::CELLS_PER_PIXEL * self.pixels_across.max(1.0);
+        let resolution = f64::from(self.architecture(training)?.max_resolution);
+        Some((resolution / default).powi(2).min(1.0))
     }
 
     /// Returns the number of floats of a grid that is trained with some parameters.
     pub(crate) fn grid_floats(&self, training: &Value) -> Option<u64> {
-        let sizes = GivenSizes::deserialize(training).ok()?;
-        let is_ndc = self.kind == SceneKind::Frustum;
-        let architecture = sizes.for_scene(self.pixels_across, is_ndc);
+        let architecture = self.architecture(training)?;
         // A plan may contain sizes that the stage will refuse.
         architecture.check().ok()?;
         Some(architecture.grid_len() as u64)

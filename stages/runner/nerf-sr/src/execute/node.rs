@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use artifact::{format_duration, hash_json, unix_time};
 use planning::stage_call::{Call, Display, StageDisplay, StageFailure, Usage, read_summary};
-use planning::{HashedInputs, Node, Origin, hash_inputs};
+use planning::{HashedInputs, Node, Origin, hash_inputs, short_hash};
 use serde_json::{Map, Value};
 use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
 
@@ -20,6 +20,7 @@ use crate::watch::{Chain, Watch, Watching};
 
 /// Action of a node that isn't cached.
 pub(crate) struct PendingAction {
+    key: String,
     pub(super) key_parts: Map<String, Value>,
     inputs: HashedInputs,
 }
@@ -49,7 +50,7 @@ impl NodeJob<'_> {
     pub(crate) fn find_or_run(&self) -> Result<Record, StageFailure> {
         match self.look_up()? {
             Lookup::Cached(record) => Ok(record),
-            Lookup::Pending(action) => self.carry_out(action).map(|(record, _)| record),
+            Lookup::Pending(pending) => self.carry_out(pending).map(|(record, _)| record),
         }
     }
 
@@ -66,15 +67,14 @@ impl NodeJob<'_> {
         self.run.file.record_action(&entered, &self.node.stage, &key).map_err(failure)?;
         Ok(match self.run.store.hit(&key).map_err(failure)? {
             Some(record) => Lookup::Cached(record),
-            None => Lookup::Pending(PendingAction { key_parts, inputs }),
+            None => Lookup::Pending(PendingAction { key, key_parts, inputs }),
         })
     }
 
     /// Runs the node unless another runner has done so meanwhile. Returns the record and whether
     /// the stage ran.
-    pub(crate) fn carry_out(&self, action: PendingAction) -> Result<(Record, bool), StageFailure> {
-        let PendingAction { key_parts, inputs } = action;
-        let key = hash_json(&key_parts);
+    pub(crate) fn carry_out(&self, pending: PendingAction) -> Result<(Record, bool), StageFailure> {
+        let PendingAction { key, key_parts, inputs } = pending;
         let lock = wait_for_lock(
             self.run.stop,
             &|holder, waited| self.report_waiting(holder, waited),
@@ -152,7 +152,7 @@ impl NodeJob<'_> {
         self.report(&format!(
             "done in {}, artifact {}{}",
             format_duration(record.seconds),
-            &record.output[..10],
+            short_hash(&record.output),
             estimate.map_or_else(String::new, |text| format!(" ({text})"))
         ));
         Ok(record)

@@ -130,12 +130,13 @@ fn choose(all: &[QualityCosts], limits: Limits, processors: usize) -> &QualityCo
     if let Some(costs) = all.iter().rfind(|costs| fits_time(costs) && fits_memory(costs)) {
         return costs;
     }
+    let name = fastest.quality.name();
     if let Some(minutes) = minutes.filter(|_| !fits_time(fastest)) {
-        print_line!("no quality fits into {minutes} minutes; the fastest is draft");
+        print_line!("no quality fits into {minutes} minutes; the fastest is {name}");
     }
     if let Some(memory) = memory.filter(|_| !fits_memory(fastest)) {
         let need = format_size(fastest.min_memory);
-        print_line!("no quality fits into {memory} of memory; draft needs {need}");
+        print_line!("no quality fits into {memory} of memory; {name} needs {need}");
     }
     fastest
 }
@@ -177,8 +178,8 @@ fn costs(session: &Session, request: &Request, quality: Quality) -> anyhow::Resu
     Ok(costs)
 }
 
-/// Returns the additional cost of refining the views of a plan; `None` if the pipeline has no such
-/// target, or if the request names targets.
+/// Returns the additional cost of refining the views of a plan; `None` if the request names
+/// targets, or if the target that refines can't be planned, as in a pipeline without it.
 fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Cost> {
     if !request.targets.is_empty() {
         return None;
@@ -189,9 +190,10 @@ fn refining_cost(session: &Session, request: &Request, plan: &Plan) -> Option<Co
     let estimates = Estimates::new(&refined, &refined_states, &session.store);
     let mut cost = Cost::default();
     for (index, estimate) in estimates.iter() {
-        let own = &refined.nodes[index];
-        let is_own = |node: &Node| (&node.stage, &node.point) == (&own.stage, &own.point);
-        if !plan.nodes.iter().any(is_own) {
+        let refined_node = &refined.nodes[index];
+        let is_same =
+            |node: &Node| (&node.stage, &node.point) == (&refined_node.stage, &refined_node.point);
+        if !plan.nodes.iter().any(is_same) {
             cost.add(estimate.processor_seconds, estimate.memory);
         }
     }

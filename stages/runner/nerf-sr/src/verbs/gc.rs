@@ -4,6 +4,7 @@ use std::time::Duration;
 use crate::garbage::{Collection, Policy, Root};
 use anyhow::Context as _;
 use artifact::{Failure, format_duration, format_size, print_line, report_line};
+use planning::stage_call::StageFailure;
 use planning::{PlanError, Request};
 use serde_json::json;
 use stage::stop_on_signals;
@@ -28,7 +29,9 @@ pub(crate) fn gc(
     let closed = match wait_for_lock(&stop, &|_, waited| report_wait(waited), || store.try_close())
     {
         Ok(closed) => closed,
-        Err(failure) if failure.code == 130 => return Err(Failure::Interrupted.into()),
+        Err(failure) if failure.code == StageFailure::INTERRUPTED => {
+            return Err(Failure::Interrupted.into());
+        }
         Err(failure) => return Err(failure.into()),
     };
     let collection = Collection::new(store, root, policy).context(UNREADABLE)?;

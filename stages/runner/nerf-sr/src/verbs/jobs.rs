@@ -62,7 +62,7 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     });
     let Err(failure) = result else { return Ok(ExitCode::SUCCESS) };
     report_text(&format!("nerf-sr: {}", failure.message));
-    if is_time_up.load(Ordering::Relaxed) && failure.code == 130 {
+    if is_time_up.load(Ordering::Relaxed) && failure.code == StageFailure::INTERRUPTED {
         requeue(&plan, &store)?;
     }
     Ok(ExitCode::from(failure.code))
@@ -138,5 +138,5 @@ fn check_parents(
         "{label} needs {parent}, which has no artifact: its job failed, was cancelled, or is \
         unknown to Slurm; run again"
     );
-    Err(StageFailure { code: 3, message })
+    Err(StageFailure { code: StageFailure::BAD_INPUT, message })
 }

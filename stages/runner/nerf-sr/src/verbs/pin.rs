@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::{format_count, print_line};
+use artifact::{format_count, known_names, print_line};
 use planning::{PlanError, Request, State};
 
 use crate::session::{Session, command_line};
@@ -36,11 +36,7 @@ pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let pins = session.store.pin_names()?;
-    let known = if pins.is_empty() {
-        "there are no pins".to_owned()
-    } else {
-        format!("pins: {}", pins.join(", "))
-    };
+    let known = known_names(name, pins.iter().map(String::as_str));
     Err(PlanError::Usage(format!("no pin {name:?}; {known}")).into())
 }
 

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use artifact::{format_count, format_duration, format_size, hash_json, print_line};
-use planning::{Plan, Request, State};
+use planning::{Plan, Request, State, short_hash};
 
 use store::Record;
 
@@ -123,7 +123,7 @@ fn cached_detail(session: &Session, record: &Record) -> String {
     let size = session.store.manifest(&record.output).map_or(0, |manifest| manifest.size());
     format!(
         "{}  {:>9}  {:>9}  {}",
-        &record.output[..10],
+        short_hash(&record.output),
         format_size(size),
         format_duration(record.seconds),
         age_text(record)

@@ -265,8 +265,8 @@ impl<'a> OutputReader<'a> {
         }
     }
 
-    /// Runs every few milliseconds until the stage ends: forwards a line that is no reason of a
-    /// failure, since the stage still runs.
+    /// Runs every few milliseconds until the stage ends: forwards the held line after
+    /// [`MAX_HOLD_TIME`], unless it begins like the reason of a failure.
     fn tick(&self) {
         self.release(|line| {
             line.since.elapsed() >= MAX_HOLD_TIME && !line.text.starts_with(&self.failure_prefix)
@@ -326,24 +326,25 @@ fn wait(
     tick: &dyn Fn(),
     are_closed: &dyn Fn() -> bool,
 ) -> std::io::Result<(ResUse, u64)> {
-    // Linux counts the runner's memory as the stage's, since a new process shares it until it runs
-    // the program: a smaller peak is known only while the stage runs.
+    // `maxrss` includes the runner's memory, which a new process shares until it runs the program:
+    // a stage's smaller peak must be read while the stage runs.
     let runner_peak = peak_memory("self");
     let mut stage_peak = None;
-    let mut is_stopped = false;
+    let mut was_terminated = false;
     while !group.has_exited()? {
+        // An unknown peak, `None`, is less than any other.
         if stage_peak <= runner_peak {
             stage_peak = group.peak_memory().or(stage_peak);
         }
-        if stop.load(Ordering::Relaxed) && !is_stopped {
+        if stop.load(Ordering::Relaxed) && !was_terminated {
             group.terminate();
-            is_stopped = true;
+            was_terminated = true;
         }
         tick();
         std::thread::sleep(POLL_INTERVAL);
     }
     let exited = Instant::now();
-    while is_stopped && !are_closed() && exited.elapsed() < MAX_CHECKPOINT_TIME {
+    while was_terminated && !are_closed() && exited.elapsed() < MAX_CHECKPOINT_TIME {
         tick();
         std::thread::sleep(POLL_INTERVAL);
     }

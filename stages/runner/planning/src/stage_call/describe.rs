@@ -18,9 +18,9 @@ use crate::stage_call::group::Group;
 const MAX_DESCRIBE_TIME: Duration = Duration::from_secs(120);
 /// Time after which the wait for descriptions is reported, chosen by hand.
 const NOTICE_AFTER: Duration = Duration::from_secs(1);
-/// Maximum size of a program's output; descriptions have some kilobytes.
+/// Maximum size of a program's output, chosen by hand; descriptions have some kilobytes.
 const MAX_OUTPUT_BYTES: u64 = 1 << 24;
-/// Interval between two checks whether a program has ended.
+/// Interval between two checks whether a program has ended; chosen by hand.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Error returned when `describe` was interrupted.
@@ -69,7 +69,8 @@ pub fn describe_all(
             match receiver.recv_timeout(timeout) {
                 Ok((path, description)) => _ = descriptions.insert(path, description),
                 Err(mpsc::RecvTimeoutError::Timeout) => {
-                    artifact::report_line!("reading the stages' descriptions (once per build)");
+                    let text = "reading the stages' descriptions (once per program version)";
+                    artifact::report_line!("{text}");
                     timeout = Duration::MAX;
                 }
                 Err(mpsc::RecvTimeoutError::Disconnected) => break,
@@ -93,6 +94,7 @@ fn describe(
     let Some(Output { status, stdout, stderr }) = run_describe(path, limit, stop)
         .map_err(|problem| ProgramError(format!("{call}: {problem}")))?
     else {
+        // After an interruption, `describe_all` discards this error.
         return Err(ProgramError(format!(
             "{call} didn't finish within {limit:?}; check what it waits for, or set `run:` to \
             another program"

@@ -18,6 +18,11 @@ pub struct StageFailure {
 }
 
 impl StageFailure {
+    /// Exit code for an input folder or artifact that can't be used.
+    pub const BAD_INPUT: u8 = 3;
+    /// Exit code of an interruption.
+    pub const INTERRUPTED: u8 = 130;
+
     /// Creates the failure for a file that can't be read or written.
     pub fn at(path: &Path, error: &std::io::Error) -> Self {
         Self { code: 1, message: format!("{}: {error}", path.display()) }
@@ -52,7 +57,8 @@ impl Exit {
     /// stage may print before its messages.
     pub(crate) fn failure(&self, name: &str) -> StageFailure {
         if self.was_stopped && self.status.signal().is_some() {
-            return StageFailure { code: 130, message: "interrupted".to_owned() };
+            let message = "interrupted".to_owned();
+            return StageFailure { code: StageFailure::INTERRUPTED, message };
         }
         let code = self.status.code().and_then(|code| u8::try_from(code).ok()).unwrap_or(1);
         StageFailure { code, message: self.reason(name) }

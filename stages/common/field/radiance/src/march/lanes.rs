@@ -58,9 +58,9 @@ pub(super) struct LanePositions {
 }
 
 /// State of the rays that march in lanes.
-struct RayLanes<'a> {
+struct Marching<'a> {
     march: &'a March<'a>,
-    /// Maximum number of samples per ray.
+    /// Maximum number of samples per ray in this round.
     max_samples: usize,
     /// Rays to march.
     active: &'a [u32],
@@ -71,8 +71,8 @@ struct RayLanes<'a> {
     /// Index in `active` of each lane's ray.
     active_index: [usize; LANES],
     rays: LaneRays,
-    /// End of each lane's range of t.
-    until: [f32; LANES],
+    /// End of the range of t in which each lane's ray may cross occupied cells.
+    occupied_until: [f32; LANES],
     /// Number of each lane's next step.
     k: [u32; LANES],
 }
@@ -87,7 +87,7 @@ pub(super) fn march<K: RayKind>(
     samples: &mut MarchedSamples,
 ) {
     samples.slots.begin(active.len(), max_samples);
-    let mut lanes = RayLanes::new(march, max_samples, active);
+    let mut lanes = Marching::new(march, max_samples, active);
     for lane in 0..LANES {
         lanes.assign_ray::<K>(lane, next);
     }
@@ -97,7 +97,7 @@ pub(super) fn march<K: RayKind>(
             let lane = stops.trailing_zeros() as usize;
             stops &= stops - 1;
             let r = active[lanes.active_index[lane]] as usize;
-            if lane_positions.t[lane] >= lanes.until[lane] {
+            if lane_positions.t[lane] >= lanes.occupied_until[lane] {
                 next[r] = DONE;
             } else if lanes.take_sample(lane, &lane_positions, samples) {
                 continue;
@@ -149,7 +149,7 @@ impl LaneRays {
     }
 }
 
-impl<'a> RayLanes<'a> {
+impl<'a> Marching<'a> {
     #[inline(always)]
     fn new(march: &'a March<'a>, max_samples: usize, active: &'a [u32]) -> Self {
         Self {
@@ -160,7 +160,7 @@ impl<'a> RayLanes<'a> {
             busy_lanes: 0,
             active_index: [0; LANES],
             rays: LaneRays::new(),
-            until: [0.0; LANES],
+            occupied_until: [0.0; LANES],
             k: [0; LANES],
         }
     }
@@ -178,7 +178,7 @@ impl<'a> RayLanes<'a> {
                 continue;
             };
             self.rays.set(lane, ray, inverse, offset);
-            self.until[lane] = until;
+            self.occupied_until[lane] = until;
             let first = ceil_steps((from - ray.enter).mul_add(1.0 / self.march.step, -offset));
             self.k[lane] = first.max(next[r as usize]);
             self.active_index[lane] = self.next_active - 1;
@@ -209,7 +209,8 @@ impl<'a> RayLanes<'a> {
         let mut stops = 0;
         for i in 0..LANES {
             let exit_step = ceil_steps((exits[i] - enter[i]).mul_add(1.0 / step, -offset[i]));
-            let stop = (lane_positions.t[i] >= self.until[i]) | (log2_sides[i] == OCCUPIED);
+            let stop =
+                (lane_positions.t[i] >= self.occupied_until[i]) | (log2_sides[i] == OCCUPIED);
             self.k[i] = if stop { self.k[i] } else { exit_step.max(self.k[i] + 1) };
             stops |= u32::from(stop) << i;
         }
@@ -218,7 +219,7 @@ impl<'a> RayLanes<'a> {
 
     /// Stores the sample of a lane's current step and advances the ray by a step. With double
     /// strides, only even-numbered steps have a sample. Returns whether the ray may have more
-    /// samples.
+    /// samples in this round.
     #[inline(always)]
     fn take_sample(
         &mut self,
@@ -254,7 +255,7 @@ fn cells_along(positions: &[f32; LANES]) -> [u32; LANES] {
     cells
 }
 
-/// Maximum step number, far above that of any ray.
+/// Maximum step number: the largest number that [`floor`] takes.
 const MAX_STEPS: f32 = 4_194_304.0;
 
 /// Rounds a number of steps up; 0 for NaN.

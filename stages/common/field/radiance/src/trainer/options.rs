@@ -28,7 +28,7 @@ pub const NETWORK_DECAY: f32 = 1e-6;
 pub struct TrainingOptions {
     /// Number of rays of the whole training run.
     pub rays: u64,
-    /// Maximum number of rays per step.
+    /// Maximum number of rays per step; at least 256 are used.
     pub max_rays_per_step: usize,
     /// Target number of samples of the first step; the last step has 8/3 times as many. While space
     /// is full of semi-transparent density, steps have fewer rays.
@@ -59,6 +59,7 @@ impl TrainingOptions {
     /// per ray.
     pub fn rays_of_step(&self, state: &TrainingState, samples_per_ray: f64) -> usize {
         let growth = libm::pow(STEP_GROWTH, state.progress(self.rays));
+        // Rays may have no samples; the limit is chosen by hand.
         let rays = self.samples_per_step as f64 * growth / samples_per_ray.max(0.1);
         (rays as usize).clamp(MIN_RAYS_PER_STEP, self.max_rays_per_step.max(MIN_RAYS_PER_STEP))
     }
@@ -74,6 +75,7 @@ impl TrainingOptions {
     /// Returns the fraction of a step by which a ray's samples are shifted. `ray` counts from 0
     /// over the whole training.
     pub fn offset(&self, ray: u64) -> f32 {
+        // Streams 1 to 3 belong to the field's initialisation and the occupancy grid.
         uniform(self.seed, 4, ray)
     }
 

@@ -40,9 +40,9 @@ impl Phase {
 pub struct PhaseTimes {
     /// Time from the phase's start to its end.
     pub elapsed: f64,
-    /// Processing time of all tasks.
+    /// Sum of the tasks' durations.
     pub in_tasks: f64,
-    /// Processing time of each step's longest task.
+    /// Sum of the duration of each step's longest task.
     pub in_longest_tasks: f64,
     /// Number of tasks.
     pub tasks: u64,

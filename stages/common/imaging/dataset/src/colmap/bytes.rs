@@ -33,7 +33,7 @@ impl<'a> Bytes<'a> {
     }
 
     fn array<const N: usize>(&mut self, what: &str) -> Result<[u8; N], DatasetError> {
-        Ok(self.take(N, what)?.try_into().unwrap_or([0; N]))
+        Ok(*self.take(N, what)?.first_chunk().expect("`take` returns N bytes"))
     }
 
     pub(super) fn u32(&mut self, what: &str) -> Result<u32, DatasetError> {
@@ -60,7 +60,7 @@ impl<'a> Bytes<'a> {
     /// of the file.
     pub(super) fn count(&mut self, size: usize, what: &str) -> Result<usize, DatasetError> {
         let count = self.u64(what)?;
-        if count > (self.rest.len() / size.max(1)) as u64 {
+        if count > (self.rest.len() / size) as u64 {
             let left = self.rest.len();
             let problem = format!("{count} {what} don't fit into the remaining {left} bytes");
             return Err(self.error(format!("{problem}; copy the file again")));

@@ -11,24 +11,24 @@ pub(super) struct CameraModel {
     /// Name in text files.
     name: &'static str,
     /// Number of parameters.
-    pub(super) parameters: usize,
+    pub(super) parameter_count: usize,
 }
 
 /// Known models. COLMAP 4 has more, which are reported as unknown.
 const MODELS: [CameraModel; 13] = [
-    CameraModel { number: 0, name: "SIMPLE_PINHOLE", parameters: 3 },
-    CameraModel { number: 1, name: "PINHOLE", parameters: 4 },
-    CameraModel { number: 2, name: "SIMPLE_RADIAL", parameters: 4 },
-    CameraModel { number: 3, name: "RADIAL", parameters: 5 },
-    CameraModel { number: 4, name: "OPENCV", parameters: 8 },
-    CameraModel { number: 5, name: "OPENCV_FISHEYE", parameters: 8 },
-    CameraModel { number: 6, name: "FULL_OPENCV", parameters: 12 },
-    CameraModel { number: 7, name: "FOV", parameters: 5 },
-    CameraModel { number: 8, name: "SIMPLE_RADIAL_FISHEYE", parameters: 4 },
-    CameraModel { number: 9, name: "RADIAL_FISHEYE", parameters: 5 },
-    CameraModel { number: 10, name: "THIN_PRISM_FISHEYE", parameters: 12 },
-    CameraModel { number: 14, name: "SIMPLE_FISHEYE", parameters: 3 },
-    CameraModel { number: 15, name: "FISHEYE", parameters: 4 },
+    CameraModel { number: 0, name: "SIMPLE_PINHOLE", parameter_count: 3 },
+    CameraModel { number: 1, name: "PINHOLE", parameter_count: 4 },
+    CameraModel { number: 2, name: "SIMPLE_RADIAL", parameter_count: 4 },
+    CameraModel { number: 3, name: "RADIAL", parameter_count: 5 },
+    CameraModel { number: 4, name: "OPENCV", parameter_count: 8 },
+    CameraModel { number: 5, name: "OPENCV_FISHEYE", parameter_count: 8 },
+    CameraModel { number: 6, name: "FULL_OPENCV", parameter_count: 12 },
+    CameraModel { number: 7, name: "FOV", parameter_count: 5 },
+    CameraModel { number: 8, name: "SIMPLE_RADIAL_FISHEYE", parameter_count: 4 },
+    CameraModel { number: 9, name: "RADIAL_FISHEYE", parameter_count: 5 },
+    CameraModel { number: 10, name: "THIN_PRISM_FISHEYE", parameter_count: 12 },
+    CameraModel { number: 14, name: "SIMPLE_FISHEYE", parameter_count: 3 },
+    CameraModel { number: 15, name: "FISHEYE", parameter_count: 4 },
 ];
 
 /// Remedy for a camera model that isn't supported.
@@ -57,9 +57,9 @@ impl CameraModel {
         let (Some(columns), Some(rows)) = (columns, rows) else {
             return Err(Reason::new(format!("image size {width}×{height} is invalid")));
         };
-        if parameters.len() != self.parameters {
-            let Self { name, parameters: expected, .. } = self;
-            let found = parameters.len();
+        let found = parameters.len();
+        if found != self.parameter_count {
+            let Self { name, parameter_count: expected, .. } = self;
             return Err(Reason::new(format!("{name} has {expected} parameters, not {found}")));
         }
         let ([fx, fy, cx, cy], distortion) = self.lens(parameters)?;

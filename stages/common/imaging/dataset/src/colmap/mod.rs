@@ -138,7 +138,7 @@ fn read_largest_model<'a>(
         }
     }
     let (path, model) = largest
-        .ok_or_else(|| Problem::Unrecognised { path: folder.to_path_buf(), nearby: None })?;
+        .ok_or_else(|| Problem::Unrecognised { path: folder.to_path_buf(), finding: None })?;
     let photographs = format_count(model.images.len(), "photograph");
     let name = path.strip_prefix(folder).unwrap_or(path).display();
     let mut notes = vec![format!("COLMAP: {photographs} from {name}")];

@@ -91,7 +91,7 @@ impl Model {
                 let problem = format!("camera {id} has unknown model {model}");
                 return Err(bytes.error(format!("{problem} (from a newer COLMAP?); {UNDISTORT}")));
             };
-            let parameters = (0..model.parameters)
+            let parameters = (0..model.parameter_count)
                 .map(|_| bytes.f64("a camera"))
                 .collect::<Result<Vec<_>, _>>()?;
             let intrinsics = model

@@ -3,7 +3,7 @@ use serde_json::{Map, Value, json};
 
 use crate::contract::error::ContractError;
 use crate::contract::tagged::Tag;
-use crate::contract::validator::{Misfit, Validator};
+use crate::contract::validator::{Validator, Violation};
 use crate::contract::values::Reader;
 
 /// Compiled parameter schema of a stage, from which runner and stage take defaults and checks.
@@ -96,8 +96,8 @@ impl Schema {
             }
         }
         let resolved = Value::Object(resolved);
-        for misfit in variant.validator.misfits(&resolved) {
-            problems.push(variant.problem(misfit));
+        for violation in variant.validator.violations(&resolved) {
+            problems.push(variant.problem(violation));
         }
         if problems.is_empty() { Ok(resolved) } else { Err(problems) }
     }
@@ -184,11 +184,11 @@ impl VariantSchema {
         }
     }
 
-    fn problem(&self, misfit: Misfit) -> ParameterProblem {
-        let name = misfit.path.trim_start_matches('/').to_owned();
+    fn problem(&self, violation: Violation) -> ParameterProblem {
+        let name = violation.path.trim_start_matches('/').to_owned();
         let problem = match self.choices(&name) {
-            Some(choices) => not_one_of_message(&misfit.value, &choices),
-            None => misfit.problem,
+            Some(choices) => not_one_of_message(&violation.value, &choices),
+            None => violation.problem,
         };
         ParameterProblem { name: if name.is_empty() { "(all)".to_owned() } else { name }, problem }
     }

@@ -22,7 +22,8 @@ pub struct Rule {
     /// Inputs that are required if the rule applies.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<String>,
-    /// Parameters with JSON Schemas that their values must match if the rule applies.
+    /// Parameters, named as in `when`, with JSON Schemas that their values must match if the rule
+    /// applies. An unknown value satisfies the rule.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub must: BTreeMap<String, Value>,
     /// Alternative lists of files by input: if the rule applies, the input's folder must contain
@@ -139,7 +140,8 @@ impl Rule {
     }
 }
 
-/// Returns whether a parameter's value matches a schema; `None` if the value is unknown.
+/// Returns whether a parameter's value matches a schema; `None` if the value is unknown or the
+/// schema invalid. [`Rule::check`] refuses invalid schemas.
 fn value_matches(
     (name, schema): (&String, &Value),
     parameters: &Value,

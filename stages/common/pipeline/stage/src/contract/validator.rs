@@ -44,7 +44,7 @@ pub(crate) struct Validator {
 
 /// Value that violates the schema.
 #[derive(Debug, PartialEq)]
-pub(crate) struct Misfit {
+pub(crate) struct Violation {
     /// Keys and indices from the checked value to the invalid one, each after a `/`.
     pub(crate) path: String,
     /// Invalid value.
@@ -62,11 +62,11 @@ impl Validator {
 
     /// Returns whether a value is valid.
     pub(crate) fn is_valid(&self, value: &Value) -> bool {
-        self.misfits(value).is_empty()
+        self.violations(value).is_empty()
     }
 
     /// Finds all violations of the schema.
-    pub(crate) fn misfits(&self, value: &Value) -> Vec<Misfit> {
+    pub(crate) fn violations(&self, value: &Value) -> Vec<Violation> {
         let mut check = Check { root: &self.root, path: Vec::new(), found: Vec::new() };
         check.check_value(&self.root, value, 0);
         check.found
@@ -133,13 +133,13 @@ struct Check<'a> {
     root: &'a Value,
     /// Keys and indices from the outermost value to the current one.
     path: Vec<String>,
-    found: Vec<Misfit>,
+    found: Vec<Violation>,
 }
 
 impl<'a> Check<'a> {
     fn report(&mut self, value: &Value, problem: String) {
         let path = self.path.iter().map(|part| format!("/{part}")).collect();
-        self.found.push(Misfit { path, value: value.clone(), problem });
+        self.found.push(Violation { path, value: value.clone(), problem });
     }
 
     /// Checks the current value against a schema.
@@ -371,7 +371,8 @@ fn compare(a: &Number, b: &Number) -> Option<Ordering> {
 }
 
 fn is_multiple(number: &Number, step: &Number) -> bool {
-    /// Tolerance of the ratio: decimal fractions are rounded, yet 0.3 is a multiple of 0.1.
+    /// Tolerance of the ratio: decimal fractions are rounded, yet 0.3 is a multiple of 0.1. Chosen
+    /// by hand.
     const ROUNDING: f64 = 1e-9;
     match (exact_integer(number), exact_integer(step)) {
         (Some(number), Some(step)) => number.checked_rem(step) == Some(0),

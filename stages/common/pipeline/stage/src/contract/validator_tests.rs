@@ -99,7 +99,7 @@ fn values_fit_schemas_or_are_refused() {
         let validator = Validator::new(&schema).unwrap();
         assert!(validator.is_valid(&valid), "{schema} {valid}");
         let problems: Vec<String> =
-            validator.misfits(&invalid).into_iter().map(|misfit| misfit.problem).collect();
+            validator.violations(&invalid).into_iter().map(|violation| violation.problem).collect();
         assert!(
             expected.is_empty() || (problems.len() == 1 && problems[0].contains(expected)),
             "{schema} {invalid}: {problems:?}"
@@ -108,10 +108,10 @@ fn values_fit_schemas_or_are_refused() {
 }
 
 #[test]
-fn a_misfit_contains_the_path_of_its_value() {
+fn a_violation_contains_the_path_of_its_value() {
     let schema = json!({"properties": {"a": {"items": {"type": "null"}}}});
-    let misfits = Validator::new(&schema).unwrap().misfits(&json!({"a": [null, 2]}));
-    let [Misfit { path, value, .. }] = &misfits[..] else { panic!("{misfits:?}") };
+    let violations = Validator::new(&schema).unwrap().violations(&json!({"a": [null, 2]}));
+    let [Violation { path, value, .. }] = &violations[..] else { panic!("{violations:?}") };
     assert_eq!((path.as_str(), value), ("/a/1", &json!(2)));
 }
 

@@ -27,8 +27,8 @@ pub struct PaperTrainingOptions {
     pub seed: u64,
 }
 
-/// Trains a [`PaperRefiner`] on references and their rendered views. An example is a patch of both,
-/// warped by one of 200 random perspectives. Its reference patches come from a window of fixed size
+/// Trains a [`PaperRefiner`] on references and their rendered views. A patch is cut from both after
+/// a warp by one of 200 random perspectives. Its reference patches come from a window of fixed size
 /// around the patch in the unwarped reference. The reported loss is the mean absolute error of
 /// colours in -1..1.
 pub struct PaperTrainer {
@@ -78,8 +78,8 @@ impl Training for PaperTrainer {
         for i in 0..batch_size as u64 {
             let number = self.steps() * batch_size as u64 + i;
             let mut rng = CounterRng::new(seed, PATCHES, number);
-            let example = rng.below(examples.len() as u64);
-            TrainingPatch::draw(&examples[example as usize], example, &self.options, &mut rng)
+            let index = rng.below(examples.len() as u64);
+            TrainingPatch::draw(&examples[index as usize], index, &self.options, &mut rng)
                 .append(&mut samples);
         }
         let BatchSamples { rendered, truth, references: reference_samples } = samples;
@@ -163,6 +163,7 @@ impl<'a> TrainingPatch<'a> {
         let size = options.patch_size;
         let [left, top, right, bottom] = warp.filled;
         let (right, bottom) = (right.saturating_sub(size), bottom.saturating_sub(size));
+        // A patch that is larger than the warped content also covers black pixels around it.
         let corner =
             (draw_between(left.min(right), right, rng), draw_between(top.min(bottom), bottom, rng));
         let (right, bottom) = (width.saturating_sub(size), height.saturating_sub(size));
@@ -199,9 +200,9 @@ impl<'a> TrainingPatch<'a> {
     }
 }
 
-/// Draws an integer from `low` to `high`, both included.
+/// Draws an integer from `low` to `high`, both included; `low` is at most `high`.
 fn draw_between(low: usize, high: usize, rng: &mut CounterRng) -> usize {
-    low + rng.below((high.max(low) - low + 1) as u64) as usize
+    low + rng.below((high - low + 1) as u64) as usize
 }
 
 /// Draws the start of a reference patch near `start`, at most `last`.

@@ -12,12 +12,12 @@ const STATIC_VIEWS: usize = 4;
 const STATIC_PICTURES: usize = 6;
 
 /// Section with the comparison of pictures, filled in by a script.
-pub(crate) fn viewer(data: Option<&Data>) -> Markup {
+pub(crate) fn comparison(data: Option<&Data>) -> Markup {
     html! {
         section id="compare" aria-labelledby="compare-heading" {
             h2 id="compare-heading" { "Compare" }
             noscript { (static_pictures(data)) }
-            div id="viewer" hidden {
+            div id="comparison" hidden {
                 div class="controls over" {
                     div class="field" {
                         label for="view" { "View" }
@@ -35,7 +35,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                         button type="button" id="grid-mode" aria-pressed="false" { "Side by side" }
                     }
                 }
-                div id="stage" tabindex="0" role="group" aria-describedby="stage-help" {}
+                div id="panes" tabindex="0" role="group" aria-describedby="panes-help" {}
                 div id="thumbnails" role="group" aria-label="Views" {}
                 div class="controls under" {
                     label class="split" { span { "Divide" }
@@ -53,7 +53,7 @@ pub(crate) fn viewer(data: Option<&Data>) -> Markup {
                         button type="button" id="link" { "Copy link" }
                     }
                 }
-                p id="stage-help" class="note" {
+                p id="panes-help" class="note" {
                     "Drag to move the divider, or to pan a zoomed view. Ctrl and wheel, pinch, + "
                     "and − zoom. 0 fits the view; 1 or a double click shows one image pixel per "
                     "screen pixel. N and P change the view."
@@ -99,7 +99,7 @@ pub(crate) fn plots(report: &Report<'_>) -> Markup {
             h2 id="plots-heading" { "Plots" }
             div class="controls" {
                 div class="field" { label for="figure" { "Figure" } select id="figure" {} }
-                div class="field axis" {
+                div class="field" {
                     label for="axis" { "Swept parameter" }
                     select id="axis" {}
                 }

@@ -10,7 +10,7 @@ const MAX_ZOOM = 40;
 /** Time after the last change until the address is written: browsers ignore more than some 20 writes a second. */
 const LINK_DELAY_MS = 250;
 
-class Viewer {
+class Comparison {
   constructor(data, changed) {
     this.data = data;
     this.changed = changed;
@@ -30,8 +30,8 @@ class Viewer {
       split: 0.5,
     };
     this.part = (id) => document.getElementById(id);
-    this.stage = this.part("stage");
-    this.part("viewer").hidden = false;
+    this.container = this.part("panes");
+    this.part("comparison").hidden = false;
     this.fillViews();
     this.fillThumbnails();
     this.listen();
@@ -126,7 +126,7 @@ class Viewer {
     const { state } = this;
     this.part("view").value = state.view;
     for (const side of ["left", "right"]) this.part(side).value = state[side];
-    this.part("viewer").classList.toggle("grid", state.grid);
+    this.part("comparison").classList.toggle("grid", state.grid);
     this.part("slider-mode").setAttribute("aria-pressed", String(!state.grid));
     this.part("grid-mode").setAttribute("aria-pressed", String(state.grid));
     if (state.grid) this.buildGrid();
@@ -229,9 +229,12 @@ class Viewer {
     element("span", { class: "tag left" }, pane, this.name(this.data.layers[left]));
     element("span", { class: "tag right" }, pane, this.name(this.data.layers[right]));
     this.panes = [{ pane, windows }];
-    this.stage.replaceChildren(pane);
+    this.container.replaceChildren(pane);
     const [one, other] = [left, right].map((layer) => this.name(this.data.layers[layer]));
-    this.stage.setAttribute("aria-label", `View ${this.data.views[this.state.view].name}: left ${one}, right ${other}`);
+    this.container.setAttribute(
+      "aria-label",
+      `View ${this.data.views[this.state.view].name}: left ${one}, right ${other}`,
+    );
   }
 
   buildGrid() {
@@ -265,8 +268,8 @@ class Viewer {
           `${some.length} of ${all.length} pictures; the sliders show all of them.`,
         ),
       );
-    this.stage.replaceChildren(...figures);
-    this.stage.setAttribute(
+    this.container.replaceChildren(...figures);
+    this.container.setAttribute(
       "aria-label",
       `View ${this.data.views[this.state.view].name}: ${some.length} pictures side by side`,
     );
@@ -295,7 +298,7 @@ class Viewer {
     this.part("split").value = 100 * state.split;
     const per = (first.pane.clientWidth * state.zoom) / first.windows[0].picture.width;
     this.part("zoom").textContent = `${Math.round(100 * per)} %`;
-    this.stage.classList.toggle("zoomed", state.zoom > 1);
+    this.container.classList.toggle("zoomed", state.zoom > 1);
     this.keepLink();
   }
 
@@ -405,14 +408,14 @@ class Viewer {
       link: () => this.copyLink(),
     };
     for (const [id, act] of Object.entries(clicks)) this.part(id).addEventListener("click", act);
-    this.stage.addEventListener("keydown", (event) => this.key(event));
-    this.stage.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
-    this.stage.addEventListener("dblclick", () => (this.state.zoom === 1 ? this.showOneToOne() : this.fit()));
-    this.stage.addEventListener("pointerdown", (event) => this.press(event));
-    this.stage.addEventListener("pointermove", (event) => this.drag(event));
+    this.container.addEventListener("keydown", (event) => this.key(event));
+    this.container.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    this.container.addEventListener("dblclick", () => (this.state.zoom === 1 ? this.showOneToOne() : this.fit()));
+    this.container.addEventListener("pointerdown", (event) => this.press(event));
+    this.container.addEventListener("pointermove", (event) => this.drag(event));
     for (const name of ["pointerup", "pointercancel"])
-      this.stage.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
-    new ResizeObserver(() => this.place()).observe(this.stage);
+      this.container.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
+    new ResizeObserver(() => this.place()).observe(this.container);
   }
 
   move(change) {
@@ -454,9 +457,9 @@ class Viewer {
     return { box, at: [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height] };
   }
 
-  /** The wheel zooms with Ctrl (a trackpad's pinch sets it), or after the stage has got the focus. */
+  /** The wheel zooms with Ctrl (a trackpad's pinch sets it), or after the panes have got the focus. */
   wheel(event) {
-    if (!event.ctrlKey && !event.metaKey && document.activeElement !== this.stage) return;
+    if (!event.ctrlKey && !event.metaKey && document.activeElement !== this.container) return;
     event.preventDefault();
     this.zoomBy(Math.exp(-event.deltaY * (event.ctrlKey ? 0.01 : 0.002)), this.under(event).at);
   }
@@ -467,7 +470,7 @@ class Viewer {
     const isNear = Math.abs(at[0] - this.state.split) * box.width < GRIP;
     this.pulls = !this.state.grid && (isNear || this.state.zoom <= 1);
     this.pointers.set(event.pointerId, event);
-    this.stage.setPointerCapture(event.pointerId);
+    this.container.setPointerCapture(event.pointerId);
     if (this.pulls && this.pointers.size === 1) this.move({ split: Math.min(Math.max(at[0], 0), 1) });
   }
 
