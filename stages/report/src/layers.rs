@@ -341,7 +341,8 @@ fn scored_on(report: &Report<'_>, truth: &Path) -> String {
     let labels: Vec<&str> = rows.map(|row| row.label.as_str()).collect();
     match labels.as_slice() {
         [one] => (*one).to_owned(),
-        _ => format!("{} and {} more", labels[0], labels.len() - 1),
+        [first, others @ ..] => format!("{first} and {} more", others.len()),
+        [] => String::new(),
     }
 }
 
