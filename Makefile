@@ -116,7 +116,6 @@ sweep: build ## Run all combinations: make sweep KERNEL="lanczos average" SCALE=
 # Experiments are the files of experiments/. A variable that is set overrides the file's list.
 SCENES ?=
 PROTOCOLS ?=
-SUPERVISION ?=
 # Repeats an option for each value: $(call each,-p ,$(SET)) is -p A=1 -p B=2.
 each = $(foreach value,$(2),$(1)$(value))
 chosen = $(if $(SCENES),--scene $(call list,$(SCENES))) $(if $(PROTOCOLS),--protocol $(call list,$(PROTOCOLS))) --data $(or $(HELD_OUT),$(DATA)) \
@@ -126,7 +125,7 @@ experiment = $(NERF_SR) run $(1) -j 1 --out out/$(1) $(chosen) $(2) && mkdir -p 
   cp out/$(1)/$(1)/rows.json $(or $(OUT),out/$(1).json)
 QUALITY := quality$(if $(ENLARGED),-enlarged,$(if $(REFINED),-refined))
 quality: build ## Score the protocols on published scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" REFINED=1 SET="seed=1" OUT=FILE
-	@$(call experiment,$(QUALITY),$(if $(SUPERVISION),-p train-ss.supervision=$(call list,$(SUPERVISION))))
+	@$(call experiment,$(QUALITY))
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr
 TABLES := paper-table paper-metrics paper-times

@@ -34,18 +34,16 @@ fn column(rows: &[Value], key: &str) -> Vec<String> {
     rows.iter().map(|row| row[key].as_str().unwrap_or_default().to_owned()).collect()
 }
 
-/// A run covers all combinations of scenes and supervision, with all metrics; a second run starts
-/// nothing.
+/// A run covers every scene, with all metrics; a second run starts nothing.
 #[test]
-fn quality_runs_each_scene_with_each_supervision() {
+fn quality_runs_each_scene() {
     let project = project();
     let quality = [&["run", "quality", "--scene", "demo,other"][..], &SMALL].concat();
     project.ok(&quality);
     let text = table(&project, "quality");
-    assert!(text.contains("| 24x2 | rendered | kernel | other |"), "{text}");
+    assert!(text.contains("| 24x2 | rendered | other |"), "{text}");
     let results = rows(&project, "quality");
-    assert_eq!(column(&results, "scene"), ["demo", "demo", "other", "other"]);
-    assert_eq!(column(&results, "supervision"), ["average", "kernel", "average", "kernel"]);
+    assert_eq!(column(&results, "scene"), ["demo", "other"]);
     for row in &results {
         for name in
             ["psnr", "ssim", "train_s", "render_s", "rays_per_s", "samples_per_ray", "views"]
@@ -60,15 +58,13 @@ fn quality_runs_each_scene_with_each_supervision() {
         );
     }
     // Both names refer to one scene, so results are equal.
-    assert_eq!(
-        (&results[0]["psnr"], &results[1]["psnr"]),
-        (&results[2]["psnr"], &results[3]["psnr"])
-    );
+    assert_eq!(results[0]["psnr"], results[1]["psnr"]);
     let csv = std::fs::read_to_string(project.path("out/quality/rows.csv")).unwrap();
-    assert_eq!(csv.lines().count(), 5);
-    assert!(table(&project, "quality").starts_with(
-        "# Quality by protocol\n\n| protocol | method | supervision | scene | PSNR |"
-    ));
+    assert_eq!(csv.lines().count(), 3);
+    assert!(
+        table(&project, "quality")
+            .starts_with("# Quality by protocol\n\n| protocol | method | scene | PSNR |")
+    );
     let again = project.ok(&quality);
     assert!(again.contains("nothing to run") && again.contains("quality (up to date)"), "{again}");
     assert_eq!(rows(&project, "quality"), results);
@@ -183,12 +179,7 @@ fn refined_views_are_compared_with_rendered_ones() {
         );
         assert_eq!(row["least_gain"].is_null(), row["method"] == "ss", "{row}");
     }
-    project.ok(&[
-        &["run", "quality-refined", "--scene", "other", "-p", "supervision=kernel"][..],
-        &SMALL,
-        &budgets,
-    ]
-    .concat());
+    project.ok(&[&["run", "quality-refined", "--scene", "other"][..], &SMALL, &budgets].concat());
     assert_eq!(column(&rows(&project, "quality-refined"), "method"), ["rendered", "refined"]);
     let arguments = [
         "--scene",

@@ -11,7 +11,7 @@ use std::process::Command;
 use common::{Project, data, root};
 
 /// Columns that identify a row.
-const KEY_COLUMNS: [&str; 6] = ["protocol", "method", "supervision", "scene", "has seen", "gain"];
+const KEY_COLUMNS: [&str; 5] = ["protocol", "method", "scene", "has seen", "gain"];
 /// The documents' protocols, for images of 48 pixels.
 const SMALL_PROTOCOLS: &str = "  presets:
     100x2: {lr_width: 24, prep.scale: 2}
