@@ -99,6 +99,9 @@ def main():
             print(f"example-eval: {preview} not found; render the cameras of the ground truth", file=sys.stderr)
             return 3
         found, expected = read_png(preview), read_png(inputs["truth"] / view["image"])
+        if len(found) != len(expected):
+            print(f"example-eval: {preview} and the ground truth differ in size", file=sys.stderr)
+            return 3
         scores[name] = sum((a - b) ** 2 for a, b in zip(found, expected)) / len(found) / params["peak"] ** 2
     output.mkdir()
     mean = sum(scores.values()) / len(scores)

@@ -92,7 +92,7 @@ def importance(edges, weights, u):
     return first + (u - low) / width * (last - first)
 
 
-def look(network, origin, direction, t, background, noise):
+def render(network, origin, direction, t, background, noise):
     n, m = t.shape
     position = origin[:, None] + t[..., None] * direction[:, None]
     colour, raw = network(position.reshape(-1, 3), direction[:, None].expand(n, m, 3).reshape(-1, 3))
@@ -123,10 +123,10 @@ parameters = coarse.ordered() + fine.ordered()
 optimiser = torch.optim.Adam(parameters, lr=5e-4)
 for step in range(3):
     t = stratify(even, u_coarse)
-    coarse_colour, coarse_weights = look(coarse, origin, direction, t, background, noise_coarse)
+    coarse_colour, coarse_weights = render(coarse, origin, direction, t, background, noise_coarse)
     more = importance((t[:, 1:] + t[:, :-1]) / 2, coarse_weights[:, 1:-1].detach(), u_fine)
     both = torch.sort(torch.cat([t, more], 1), 1).values
-    fine_colour, fine_weights = look(fine, origin, direction, both, background, noise_fine)
+    fine_colour, fine_weights = render(fine, origin, direction, both, background, noise_fine)
     loss = sum(((c.reshape(-1, 4, 3).mean(1) - target) ** 2).mean() for c in (coarse_colour, fine_colour))
     optimiser.zero_grad()
     loss.backward()
@@ -134,7 +134,7 @@ for step in range(3):
         out |= {"stratified": t, "importance": more, "coarse.weights": coarse_weights, "fine.weights": fine_weights}
         out |= {"coarse.colour": coarse_colour, "fine.colour": fine_colour, "loss": loss.reshape(1)}
         out["gradient"] = torch.cat([p.grad.reshape(-1) for p in parameters])
-        # Sample positions of the same rays in rendering, without random draws.
+        # Positions from the same weights with evenly spaced draws, as in rendering.
         edges = (even[:, 1:] + even[:, :-1]) / 2
         out["importance.even"] = importance(edges, coarse_weights[:, 1:-1], torch.linspace(0, 1, m, dtype=torch.float64).expand(n, m))
     optimiser.step()
@@ -145,7 +145,8 @@ path.parent.mkdir(parents=True, exist_ok=True)
 save_file({name: x.detach().contiguous() for name, x in out.items()}, path, {"torch": torch.__version__.split("+")[0]})
 print(path, path.stat().st_size)
 
-# Small checkpoints in the reference implementation's layout, for scripts/convert-checkpoint.py: tensor k contains k, k + 1/8, k + 2/8 …
+# Small checkpoints in the reference implementation's layout, for scripts/convert-checkpoint.py: weights of layer k are k, k + 1/8,
+# k + 2/8 …, its biases -k, -k - 1/8 …
 # The coarse one has names of a multi-GPU checkpoint, the fine one has half precision and a transposed tensor.
 names = [f"xyz_encoding_{i + 1}.0" for i in range(6)] + ["sigma", "xyz_encoding_final", "dir_encoding.0", "rgb.0"]
 position, direction, width = 15, 9, 8

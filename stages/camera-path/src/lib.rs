@@ -48,8 +48,8 @@ impl Default for Params {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Kind {
-    /// Spiral around the mean camera, up to as wide as the positions of most cameras, for
-    /// forward-facing photographs. Its frames stay where the cameras looked.
+    /// Spiral around the cameras' mean position, at most as wide as the positions of most cameras,
+    /// for forward-facing photographs. Its frames show almost only what the cameras observed.
     Spiral,
     /// Circle around the middle of the scene's box, at the cameras' mean distance and height, or
     /// the arc along which cameras are.
@@ -124,7 +124,7 @@ fn computed_path(
     params: &Params,
 ) -> Result<(PathFile, String), Failure> {
     let mut template = scene.views[0].camera.clone();
-    // Frames have no lens distortion.
+    // Frames have no lens distortion, unless no pinhole camera fits into the lens's view.
     template.intrinsics = template.intrinsics.pinhole().unwrap_or(template.intrinsics);
     let degradation: Option<Degradation> = input.read_optional_json(DEGRADATION_FILE)?;
     let hr_width = degradation.map(|degradation| degradation.hr[0]);

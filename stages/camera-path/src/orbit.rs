@@ -7,10 +7,10 @@ use scene::{Bounds, Camera, Pose, looking_at};
 
 use crate::paths::mean;
 
-/// Minimum angle without cameras that an orbit leaves out, in radians, and its minimum over the
-/// median angle between neighbouring cameras, so that few cameras all around give a circle. Both
-/// are chosen by hand.
+/// Minimum angle without cameras that an orbit leaves out, in radians; chosen by hand.
 const MIN_GAP: f64 = TAU / 8.0;
+/// Minimum ratio of this angle to the median angle between neighbouring cameras, so that few
+/// cameras all around give a circle. Chosen by hand.
 const MIN_GAP_OVER_MEDIAN: f64 = 3.0;
 /// Minimum distance of a camera from the axis over the orbit's radius: nearer cameras look down,
 /// and their angles around the axis mean little. Chosen by hand.
@@ -65,6 +65,7 @@ impl Orbit {
     /// Returns the pose at a fraction of the path.
     pub(crate) fn pose(&self, fraction: f64) -> Pose {
         let turn = TAU * fraction;
+        // An arc is travelled there and back, so that the film loops.
         let angle = self.half_arc.map_or(turn, |half_arc| half_arc * turn.sin());
         let rotation = DQuat::from_axis_angle(self.up, angle);
         let offset = rotation * self.first * self.radius + self.height * self.up;
@@ -72,8 +73,8 @@ impl Orbit {
     }
 }
 
-/// Returns the direction to which the x axes of level cameras are perpendicular: the mean of the
-/// cameras' own up directions, which lean to the middle, with the parts along the axes removed.
+/// Returns the direction most perpendicular to the cameras' x axes, by power iteration from the
+/// mean of their y axes, which lean to the middle.
 fn up_direction(cameras: &[Camera]) -> DVec3 {
     let mut up = mean(cameras, |c| c.rotation().y_axis).normalize_or(DVec3::Z);
     for _ in 0..UP_STEPS {

@@ -40,12 +40,12 @@ impl ViewCamera {
         let Some(degrees) = params.training_angle() else { return test };
         let half_angle = 0.5 * degrees.to_radians();
         let distortion = Distortion::fisheye(FISHEYE_COEFFICIENTS);
-        let half_width = match params.projection {
+        let half_shorter_side = match params.projection {
             Projection::Perspective => libm::tan(half_angle),
             Projection::Fisheye => distortion.distort([libm::tan(half_angle), 0.0])[0],
         };
-        let scale = half_width / libm::tan(0.5 * CAMERA_ANGLE);
-        let sides = test.sides.map(|side| (f64::from(side) * scale).round().max(1.0) as u32);
+        let enlargement = half_shorter_side / libm::tan(0.5 * CAMERA_ANGLE);
+        let sides = test.sides.map(|side| (f64::from(side) * enlargement).round().max(1.0) as u32);
         let [width, height] = sides;
         let [cx, cy] = sides.map(|side| 0.5 * f64::from(side));
         match params.projection {

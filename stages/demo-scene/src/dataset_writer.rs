@@ -1,7 +1,7 @@
-//! Files of a data set in both formats.
+//! Files of a data set in Blender's format, or with one `transforms.json`.
 
 use std::fs::File;
-use std::io::BufWriter;
+use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
 use anyhow::Context as _;
@@ -58,8 +58,8 @@ pub(crate) struct DatasetWriter {
     form: Form,
     /// Camera of the test views, and of all frames without a camera of their own.
     shared: ViewCamera,
-    /// True if training views have another camera.
-    is_mixed: bool,
+    /// True if training views have a camera of their own.
+    has_training_camera: bool,
     /// Frames of `transforms.json`.
     frames: Vec<Value>,
     /// Key and image names of each split in `transforms.json`.
@@ -72,7 +72,7 @@ impl DatasetWriter {
         Self {
             form: params.form,
             shared: ViewCamera::of_test(params),
-            is_mixed: params.training_angle().is_some(),
+            has_training_camera: params.training_angle().is_some(),
             frames: Vec::new(),
             splits: Vec::new(),
         }
@@ -87,7 +87,7 @@ impl DatasetWriter {
         poses: &[[[f64; 4]; 4]],
     ) -> anyhow::Result<()> {
         if self.form == Form::Transforms {
-            let has_own_camera = self.is_mixed && split == "train";
+            let has_own_camera = self.has_training_camera && split == "train";
             let own = if has_own_camera { camera.transforms_entries() } else { json!({}) };
             let mut names = Vec::with_capacity(poses.len());
             for (number, pose) in poses.iter().enumerate() {
@@ -134,13 +134,11 @@ impl DatasetWriter {
 /// Writes an image, composited on white, as JPEG.
 fn write_jpeg(path: &Path, image: &Rgba8) -> anyhow::Result<()> {
     let rgb: Vec<u8> = image.data.chunks_exact(4).flat_map(over_white).collect();
-    let encoder = JpegEncoder::new_with_quality(BufWriter::new(File::create(path)?), JPEG_QUALITY);
-    Ok(encoder.write_image(
-        &rgb,
-        image.width as u32,
-        image.height as u32,
-        ExtendedColorType::Rgb8,
-    )?)
+    let (width, height) = (image.width as u32, image.height as u32);
+    let mut file = BufWriter::new(File::create(path)?);
+    let encoder = JpegEncoder::new_with_quality(&mut file, JPEG_QUALITY);
+    encoder.write_image(&rgb, width, height, ExtendedColorType::Rgb8)?;
+    Ok(file.flush()?)
 }
 
 /// Composites an RGBA pixel on white.

@@ -52,7 +52,7 @@ fn cell(x: f64) -> i64 {
 }
 
 /// Returns a material's reflectance at a point with a normal, both in the shape's own space
-/// (centred, each coordinate about -1 to 1).
+/// (centred; about -1 to 1, except on rods).
 pub(crate) fn reflectance(material: Material, p: DVec3, normal: DVec3, seed: u32) -> Reflectance {
     match material {
         Material::Tiles => matt(tiles(p, normal, seed)),

@@ -55,7 +55,7 @@ impl PosedView<'_> {
     /// Returns a pixel's display-encoded colour and its alpha.
     fn pixel_colour(&self, column: u32, row: u32, samples: u32) -> [u8; 4] {
         let mut light = DVec3::ZERO;
-        let mut hits = 0u32;
+        let mut opaque_rays = 0u32;
         for b in 0..samples {
             for a in 0..samples {
                 let position = [
@@ -68,13 +68,13 @@ impl PosedView<'_> {
                 };
                 if let Some(radiance) = radiance {
                     light += radiance;
-                    hits += 1;
+                    opaque_rays += 1;
                 }
             }
         }
-        let mean = if hits == 0 { DVec3::ZERO } else { light / f64::from(hits) };
+        let mean = if opaque_rays == 0 { DVec3::ZERO } else { light / f64::from(opaque_rays) };
         let [r, g, b] = mean.to_array().map(|v| (srgb_from_linear(v) * 255.0 + 0.5) as u8);
-        let alpha = f64::from(hits) / f64::from(samples * samples);
+        let alpha = f64::from(opaque_rays) / f64::from(samples * samples);
         [r, g, b, (alpha * 255.0 + 0.5) as u8]
     }
 

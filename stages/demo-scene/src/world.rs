@@ -69,14 +69,16 @@ pub(crate) struct Hit {
     pub(crate) t: f64,
     /// Unit normal in world space.
     pub(crate) normal: DVec3,
-    /// Point in the object's own space, each coordinate about -1 to 1: coordinates of textures.
+    /// Point in the object's own space, coordinates of textures: about -1 to 1, except on
+    /// rods.
     pub(crate) local: DVec3,
     /// Normal in the object's own space.
     pub(crate) local_normal: DVec3,
     pub(crate) material: Material,
 }
 
-/// Scene of objects on a round base, inside a ball of radius 1.35 around the origin.
+/// Scene of objects on a round base, inside a ball of radius 1.35 around the origin; a backdrop
+/// reaches farther.
 #[derive(Clone, Debug)]
 pub struct World {
     clusters: Vec<Cluster>,
@@ -273,8 +275,8 @@ impl Cluster {
         let mut radius = 0.0f64;
         for ball in &mut balls {
             radius = radius.max((ball.centre - centre).length() + ball.radius);
-            // An object's ball is enlarged, so that rounding loses no hit. The cluster's ball
-            // isn't: a larger one would change images.
+            // An object's ball is enlarged, so that rounding loses no hit. The cluster's ball may
+            // lose hits at its border; a larger one would change published images.
             ball.radius += MAX_ROUNDING_ERROR;
         }
         Self { ball: BoundingBall { centre, radius }, objects, balls }
@@ -292,9 +294,10 @@ impl BoundingBall {
     }
 }
 
-/// Upper bound of rounding errors of distances in the scene.
+/// Upper bound of rounding errors of distances in the scene; chosen by hand.
 const MAX_ROUNDING_ERROR: f64 = 1e-6;
 /// Minimum distance of an intersection; nearer ones are of the surface that the ray starts on.
+/// Chosen by hand.
 const MIN_DISTANCE: f64 = 1e-6;
 
 /// Solves a·t² + 2·b·t + c = 0.
@@ -305,8 +308,8 @@ fn solve_quadratic(a: f64, b: f64, c: f64) -> Option<(f64, f64)> {
 }
 
 impl Shape {
-    /// Returns the lengths along each axis by which texture coordinates are divided: about half of
-    /// the shape's size.
+    /// Returns the lengths along each axis by which texture coordinates are divided: half of the
+    /// shape's size, but along z a drum's radius. Rods have no texture.
     fn texture_scale(self) -> DVec3 {
         match self {
             Self::Ball(r) => DVec3::splat(r),

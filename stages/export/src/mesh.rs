@@ -43,7 +43,8 @@ impl Mesh {
         single.map(|edges| edges[0]).collect()
     }
 
-    /// Removes small connected components, and vertices without triangles.
+    /// Removes small connected components, and vertices without triangles. Normals must be computed
+    /// afterwards.
     pub(crate) fn remove_small_components(&mut self) {
         let components = self.components();
         let mut sizes = vec![0usize; self.positions.len()];

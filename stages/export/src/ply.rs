@@ -55,7 +55,7 @@ pub(crate) fn write_points(
 }
 
 /// Writes a mesh with normals and 8-bit vertex colours, display-encoded sRGB, for programs that
-/// don't display vertex colours below a material, as those of `mesh.glb` are.
+/// ignore the vertex colours of a mesh with a material, such as `mesh.glb`.
 pub(crate) fn write_mesh(
     file: &mut impl Write,
     mesh: &Mesh,

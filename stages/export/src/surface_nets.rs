@@ -4,7 +4,7 @@ use stage::Progress;
 use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 
-/// Extracts the surface between nodes inside, which have negative values, and the others (naive
+/// Extracts the surface that separates nodes with negative values (inside) from the others (naive
 /// surface nets, Gibson 1998). Each cell that the surface crosses gets a vertex, at the mean of the
 /// crossings with the cell's edges; each crossed edge gets a quad around it. NaN is unknown: the
 /// surface has a hole there.
@@ -107,7 +107,12 @@ impl Cells<'_> {
             node - self.strides[u],
         ];
         let [a, b, c, d] = around.map(|cell| vertices[cell % vertices.len()]);
-        let is_outwards = (self.values[node] < 0.0) != self.lattice.is_mirrored();
-        triangles.extend(if is_outwards { [[a, b, c], [a, c, d]] } else { [[a, c, b], [a, d, c]] });
+        // Normals point outwards, away from negative values; a mirrored lattice reverses them.
+        let faces_along_axis = (self.values[node] < 0.0) != self.lattice.is_mirrored();
+        triangles.extend(if faces_along_axis {
+            [[a, b, c], [a, c, d]]
+        } else {
+            [[a, c, b], [a, d, c]]
+        });
     }
 }

@@ -40,12 +40,14 @@ pub(crate) fn merge(views: &[SurfaceView], bounds: &Bounds, max_surfels: usize) 
                 .filter_map(|group| mean_surfel(views, bounds, edge, group))
                 .collect();
         }
-        // A surface's number of cells falls with the square of their edge.
+        // A surface's number of cells falls with the square of their edge. The margin of 1 % is
+        // chosen by hand.
         edge *= (groups.len() as f64 / max_surfels as f64).sqrt() * 1.01;
     }
 }
 
-/// Returns half of the median width of all surface pixels, relative to the cube's side.
+/// Returns half of the median width of all surface pixels, relative to the cube's side; at least
+/// 1e-6, chosen by hand.
 fn finest_edge(views: &[SurfaceView], bounds: &Bounds) -> f64 {
     let mut widths: Vec<f64> = views
         .par_iter()
@@ -84,7 +86,8 @@ fn collect_samples(views: &[SurfaceView], bounds: &Bounds, edge: f64) -> Vec<Sam
 }
 
 /// Returns a cell's surfel: the mean of the cell's pixels, weighted by pixel density on the surface
-/// and viewing angle. `None` if all pixels are at silhouettes, or if the normals cancel.
+/// and viewing angle, whose cosine counts as at least 0.05, chosen by hand. `None` if all pixels
+/// are at silhouettes, or if the normals cancel.
 fn mean_surfel(
     views: &[SurfaceView],
     bounds: &Bounds,

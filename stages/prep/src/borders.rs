@@ -11,7 +11,7 @@ use crate::strips::Strips;
 
 /// Maximum deviation of a flat colour in 8-bit levels: JPEG noise on a uniform area. A clear sky
 /// varies more from corner to corner (docs/design/035).
-const MAX_NOISE_LEVELS: u8 = 8;
+const MAX_BORDER_NOISE: u8 = 8;
 
 /// Evidence in the images' borders for the scene's background.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -159,8 +159,8 @@ impl Display for Borders {
             ),
             BorderEvidence::Scene => write!(
                 f,
-                "images have no alpha; borders are one flat colour in {flat} of {views}: the \
-                photographs show the scene up to their borders, so background is opaque"
+                "images have no alpha; borders are one flat colour in only {flat} of {views}: \
+                the photographs show the scene up to their borders, so background is opaque"
             ),
         }
     }
@@ -171,7 +171,7 @@ fn colour(image: &Rgba8, pixel: usize) -> [u8; 3] {
 }
 
 fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
-    (0..3).all(|c| colour[c].abs_diff(other[c]) <= MAX_NOISE_LEVELS)
+    (0..3).all(|c| colour[c].abs_diff(other[c]) <= MAX_BORDER_NOISE)
 }
 
 /// Returns the median of each channel; black for an empty list.

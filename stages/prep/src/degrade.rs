@@ -7,8 +7,8 @@ pub(crate) fn extension(kernel: Kernel) -> &'static str {
     if kernel == Kernel::Average { "exr" } else { "png" }
 }
 
-/// Returns the distance in LR pixels up to which neighbours must be unmasked, too, for a pixel to
-/// count. Less than a tenth of the kernel's weight lies beyond (docs/design/005).
+/// Returns the distance, in LR pixels, within which all neighbours of a pixel must be unmasked for
+/// the pixel to count. Less than a tenth of the kernel's weight lies beyond (docs/design/005).
 pub(crate) fn mask_reach(kernel: Kernel) -> usize {
     match kernel {
         Kernel::Lanczos | Kernel::Bicubic => 1,
@@ -63,7 +63,7 @@ pub(crate) fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, L
         Kernel::Average => {
             let pooled = average_pool(&hr, hr_width / lr_width, hr_height / lr_height);
             let mut floats = pooled.expect("an average is refused for sizes that don't divide");
-            // Mean straight colour times mean alpha, which the paper's code composites.
+            // As the paper's code composites: mean straight colour times mean alpha.
             for [r, g, b, a] in floats.data.as_chunks_mut::<4>().0 {
                 (*r, *g, *b) = (*r * *a, *g * *a, *b * *a);
             }

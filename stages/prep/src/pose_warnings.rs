@@ -11,14 +11,14 @@ pub(crate) const MIN_OUTLIER_RATIO: f64 = 20.0;
 const MIN_CAMERAS: usize = 4;
 /// Maximum offset of a plausible principal point from the image centre, relative to the image side.
 /// For real lenses, it is about 0.01; the threshold is chosen by hand.
-const MAX_CENTRE_OFFSET: f64 = 0.2;
+const MAX_PRINCIPAL_POINT_OFFSET: f64 = 0.2;
 /// Relative error of coordinates after a few operations in double precision.
 const DOUBLE_ERROR: f64 = 8.0 * f64::EPSILON;
 /// Relative error of coordinates that were rounded to single precision.
 const SINGLE_ERROR: f64 = f32::EPSILON as f64;
-/// Maximum rounding error of camera centres, relative to their distance from each other, for a
-/// sharp field: 0.001 is about one pixel.
-const MAX_CENTRE_ERROR: f64 = 1e-3;
+/// Maximum rounding error of camera centres at which a field is sharp, relative to the largest
+/// distance from the first camera: 0.001 is about one pixel.
+const MAX_POSITION_ERROR: f64 = 1e-3;
 
 /// Returns whether several views all have the same pose, so that the poses are unusable.
 pub(crate) fn have_equal_poses(training: &[Camera]) -> bool {
@@ -59,13 +59,13 @@ impl std::fmt::Display for LabelledCamera<'_> {
     }
 }
 
-/// Detects cameras at one position, apart from rounding errors, and cameras whose centres are
+/// Detects cameras whose centres differ by rounding errors only, and cameras whose centres are
 /// rounded too coarsely, such as georeferenced poses in single precision.
 fn unresolved_positions(cameras: &[Camera]) -> Option<String> {
     let [first, others @ ..] = cameras else { return None };
     let distances = others.iter().map(|camera| camera.centre().distance(first.centre()));
     let (extent, error) = (distances.fold(0.0, f64::max), rounding_error(cameras));
-    if others.is_empty() || error < MAX_CENTRE_ERROR * extent {
+    if others.is_empty() || error < MAX_POSITION_ERROR * extent {
         return None;
     }
     let count = cameras.len();
@@ -141,7 +141,7 @@ fn off_centre(all: &[LabelledCamera]) -> Option<String> {
 fn is_off_centre(k: &Intrinsics) -> bool {
     [(k.cx, k.width), (k.cy, k.height)]
         .iter()
-        .any(|(c, side)| (c / f64::from(*side) - 0.5).abs() > MAX_CENTRE_OFFSET)
+        .any(|(c, side)| (c / f64::from(*side) - 0.5).abs() > MAX_PRINCIPAL_POINT_OFFSET)
 }
 
 #[cfg(test)]

@@ -95,8 +95,11 @@ fn bounds(
         }
         frustum.far = frustum.far.min(far);
     }
-    if bounds.near >= bounds.far || !bounds.is_valid() {
+    if !bounds.is_valid() {
         let [near, far] = [bounds.near, bounds.far].map(format_number);
+        if params.near.is_none() {
+            bail_usage!("parameter far: {far} is not greater than near = {near}");
+        }
         bail_usage!("parameter near: {near} is not less than far = {far}");
     }
     Ok(bounds)

@@ -6,7 +6,7 @@ use std::fmt::{self, Display, Formatter};
 use pixels::{Mask, Rgba8};
 
 /// Maximum deviation of a strip's colour in 8-bit levels: JPEG rings next to the photograph.
-const MAX_NOISE_LEVELS: u8 = 16;
+const MAX_STRIP_NOISE: u8 = 16;
 /// Minimum percentage of a line's pixels that have the strip's colour.
 const MIN_FLAT_PERCENT: usize = 95;
 /// Maximum percentage of pixels with the strip's colour in the line next to a strip, and in the
@@ -177,7 +177,7 @@ fn is_flat(line: &[[u8; 3]], colour: [u8; 3]) -> bool {
 }
 
 fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
-    (0..3).all(|c| colour[c].abs_diff(other[c]) <= MAX_NOISE_LEVELS)
+    (0..3).all(|c| colour[c].abs_diff(other[c]) <= MAX_STRIP_NOISE)
 }
 
 #[cfg(test)]

@@ -16,7 +16,7 @@ pub struct SceneSummary {
     pub format: String,
     /// Width and height of the data set's images.
     pub native: [u32; 2],
-    /// Width and height of the HR images.
+    /// HR width and height.
     pub hr: [u32; 2],
     /// Width and height of the LR images.
     pub lr: [u32; 2],
@@ -80,10 +80,14 @@ impl SceneSummary {
         let (train, test) =
             (format_count(self.train, "training view"), format_count(self.test, "test view"));
         let [near, far] = [self.bounds.near, self.bounds.far].map(|end| format_length(end, 2));
-        let kernel = self.kernel;
+        let kernel = format!("{:?}", self.kernel).to_lowercase();
+        let origin = if self.has_truth {
+            format!("from {hr_width}×{hr_height} ({kernel})")
+        } else {
+            format!("(photographs; HR is {hr_width}×{hr_height})")
+        };
         let summary = format!(
-            "{train} at {lr_width}×{lr_height} from {hr_width}×{hr_height} ({kernel:?}), {test}; \
-            rays from {near} to {far}"
+            "{train} at {lr_width}×{lr_height} {origin}, {test}; rays from {near} to {far}"
         );
         with_warnings(&summary, &warnings)
     }

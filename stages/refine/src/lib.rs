@@ -43,7 +43,8 @@ pub struct Params {
     #[schemars(extend("x-default" = "all"))]
     pub max_references: Option<u32>,
     /// Number of rotated and mirrored versions of a view whose residuals are averaged (geometric
-    /// self-ensemble). The running time is proportional to this number.
+    /// self-ensemble). The running time is proportional to this number. The paper's network ignores
+    /// the parameter.
     #[schemars(range(min = 1, max = 8))]
     pub self_ensemble: u32,
 }

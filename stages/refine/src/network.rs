@@ -18,9 +18,11 @@ pub(crate) enum AnyRefiner {
 
 /// Settings for applying a network to every view.
 pub(crate) struct Application {
-    /// Fraction of the predicted residual that is added: the best one in training.
+    /// Fraction of the predicted residual that is added: the best one for the validation views, or
+    /// 1 for the paper's network.
     pub(crate) residual_weight: f32,
-    /// Number of rotated and mirrored versions whose residuals are averaged.
+    /// Number of rotated and mirrored versions whose residuals are averaged; the paper's network
+    /// ignores it.
     pub(crate) self_ensemble: u32,
 }
 

@@ -11,12 +11,13 @@ const MARKS = [
   "M-4.2-4.2L4.2 4.2M4.2-4.2L-4.2 4.2",
   "M0-4.6v9.2M-4.6 0h9.2",
 ];
-/** Maximum number of series with distinct colours and marks; of more series, only chosen ones are distinct. */
+/** Maximum number of series with distinct colours and marks; with more series, only chosen ones have their own. */
 const MAX_COLOURS = MARKS.length;
 const MARGIN = { left: 60, right: 14, top: 12, bottom: 42 };
 const HEIGHT = 270;
-/** Maximum width of a name on an axis, and least distance between two names, in pixels. */
+/** Maximum width of a name on an axis, in pixels. */
 const MAX_NAME_WIDTH = 110;
+/** Minimum distance between two names on an axis, in pixels. */
 const NAME_GAP = 10;
 /** Maximum distance in pixels at which a pointer reads a point. */
 const REACH = 44;
@@ -53,7 +54,8 @@ function roundNumbers(low, high, count, isWhole) {
   return Array.from({ length: last - first + 1 }, (_, i) => (first + i) * step);
 }
 
-function roundPowers(low, high, isWhole) {
+/** Returns 1, 2 and 5 times powers of 10, or only the powers, from `low` to `high`; whole ones if `isWhole`. */
+function roundLogNumbers(low, high, isWhole) {
   const numbers = [];
   for (let power = 10 ** Math.floor(Math.log10(low)); power <= high; power *= 10) {
     numbers.push(...[1, 2, 5].map((factor) => factor * power));
@@ -81,7 +83,7 @@ function fitText(label, text, limit) {
 }
 
 /** Axis: maps values to 0..1, and has round numbers. */
-function axis(values, { log = false, names = null, count = 5 }) {
+function axis(values, { log = false, names = null, count }) {
   if (names) {
     const place = (value) => (names.length < 2 ? 0.5 : 0.04 + (0.92 * value) / (names.length - 1));
     return { place, ticks: names.map((name, value) => ({ value, text: name })) };
@@ -91,8 +93,8 @@ function axis(values, { log = false, names = null, count = 5 }) {
   if (log) {
     [low, high] = [low / 1.15, high * 1.15];
     const place = (value) => Math.log(value / low) / Math.log(high / low);
-    const powers = roundPowers(low, high, isWhole);
-    return { place, ticks: powers.map((value) => ({ value, text: shortNumber(value) })) };
+    const numbers = roundLogNumbers(low, high, isWhole);
+    return { place, ticks: numbers.map((value) => ({ value, text: shortNumber(value) })) };
   }
   const room = (high - low) * 0.06 || Math.abs(high) * 0.05 || 1;
   [low, high] = [low - room, high + room];
@@ -102,8 +104,9 @@ function axis(values, { log = false, names = null, count = 5 }) {
 
 /**
  * Chart in the element `home`. `spec` has: `title`; `x` and `y`, each with `label`, and for x `log` or `names`; `series`,
- * each with `label`, `points` of `x`, `y`, `text` and `key`, and `chosen` if it is highlighted; `lines`; `named` if points
- * are labelled with their series' names where there is room; `front`, points that a dashed line joins; `pick(point)`.
+ * each with `label`, `points` of `x`, `y`, `text` and `key`, and `chosen`: 1 for the left and 2 for the right result,
+ * otherwise undefined; `lines`; `named` if points are labelled with their series' names where there is room; `front`,
+ * points that a dashed line joins; `pick(point)`.
  */
 class Chart {
   constructor(home) {
@@ -308,10 +311,10 @@ class Chart {
 
   step(along, across) {
     const sorted = this.points.slice().sort((a, b) => a.index - b.index || a.order - b.order);
-    const { index, order } = this.current ?? { index: 0, order: along < 0 ? 1 : -1 };
+    if (!this.current) return this.read(sorted[0] ?? null);
+    const { index, order } = this.current;
     const isSingle = this.spec.series.every((series) => series.points.length < 2);
     const to = isSingle ? { index: index + along + across, order: 0 } : { index: index + across, order: order + along };
-    if (!this.current) Object.assign(to, { index: 0, order: 0 });
     const found = sorted.filter((point) => point.index === to.index);
     const point = found[Math.min(Math.max(to.order, 0), found.length - 1)];
     if (point) this.read(point);

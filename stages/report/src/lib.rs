@@ -13,7 +13,7 @@
 //!   drawing of the pipeline's graph.
 //! * `page.css`; `chart.js`: charts as SVG; `comparison.js`: comparison of pictures; `plots.js`:
 //!   choice of plots; `page.js`: entry point.
-//! * [`ResultRow`]: a row of `results.json`, the page's figures for scripts.
+//! * [`ResultRow`]: a row of `results.json`, the page's scores for scripts.
 //!
 //! ```
 //! let params: report::Params = serde_json::from_str(r#"{"views": 8}"#)?;

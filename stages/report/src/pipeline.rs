@@ -20,7 +20,7 @@ struct Block<'a> {
     undone: Vec<&'a UnfinishedNode>,
 }
 
-/// State of a node, the worst first.
+/// State of a node. The first state among a block's nodes colours its box.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum State {
     Failed,
@@ -94,6 +94,7 @@ pub(crate) fn pipeline(run: &RunRecord) -> Markup {
 /// first boxes.
 fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>) {
     let mut blocks: Vec<Block<'_>> = Vec::new();
+    // Block of each node: finished nodes, then unfinished ones.
     let mut block_of: Vec<usize> = Vec::new();
     let names = run.nodes.iter().map(|node| &node.stage);
     for name in names.chain(run.unfinished.iter().map(|node| &node.stage)) {
@@ -107,21 +108,22 @@ fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>
     for input in run.nodes.iter().flat_map(|node| node.inputs.values()) {
         folders.extend(input.folder.as_ref().filter(|folder| !folders.contains(folder)));
     }
-    let first = folders.len();
+    let folder_count = folders.len();
     let mut edges: Vec<(usize, usize)> = Vec::new();
     for (index, node) in run.nodes.iter().enumerate() {
         blocks[block_of[index]].done.push(node);
         for input in node.inputs.values() {
-            let by_node = input.node.map(|parent| first + block_of[parent]);
+            let by_node = input.node.map(|parent| folder_count + block_of[parent]);
             let by_folder = input.folder.as_ref();
             let by_folder = by_folder.and_then(|folder| folders.iter().position(|f| *f == folder));
-            edges.extend(by_node.or(by_folder).map(|from| (from, first + block_of[index])));
+            edges.extend(by_node.or(by_folder).map(|from| (from, folder_count + block_of[index])));
         }
     }
     for (index, node) in run.unfinished.iter().enumerate() {
         let block = block_of[run.nodes.len() + index];
         blocks[block].undone.push(node);
-        edges.extend(node.needs.iter().map(|&needed| (first + block_of[needed], first + block)));
+        let to = folder_count + block;
+        edges.extend(node.needs.iter().map(|&needed| (folder_count + block_of[needed], to)));
     }
     // `draw` needs edges to later boxes. Edges within a block or to an earlier one are left out.
     edges.retain(|(from, to)| from < to);
@@ -165,7 +167,7 @@ fn box_style([x, y]: [f64; 2]) -> String {
 }
 
 impl Block<'_> {
-    /// Counts the nodes in each state, the worst first.
+    /// Counts the nodes in each state, in the states' order.
     fn states(&self) -> impl Iterator<Item = (State, usize)> {
         let mut states: BTreeMap<State, usize> = BTreeMap::new();
         let done = self.done.iter().map(|node| State::of(node));

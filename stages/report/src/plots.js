@@ -1,9 +1,9 @@
 "use strict";
 // Choice of plots: figures of every view, trade-offs, sweeps and trainings.
 
-/** Minimum ratio of the largest to the smallest value for a logarithmic axis. */
+/** Minimum ratio of the largest to the smallest value for a logarithmic axis; chosen by hand. */
 const LOG_RANGE = 10;
-/** Maximum number of labelled points in a plot. */
+/** Maximum number of labelled points in a plot; chosen by hand. */
 const MAX_NAMES = 12;
 
 const isLog = (values) => Math.min(...values) > 0 && Math.max(...values) / Math.min(...values) >= LOG_RANGE;
@@ -12,7 +12,7 @@ function duration(seconds) {
   return seconds < 90 ? `${seconds.toFixed(1)} s` : `${(seconds / 60).toFixed(1)} min`;
 }
 
-/** Returns the points that no other point beats in both coordinates, from the least x. */
+/** Returns the points that are better than all points with a smaller or equal x, from the least x. */
 function frontOf(points, lowerIsBetter) {
   const value = ({ y }) => (lowerIsBetter ? -y : y);
   const sorted = points.toSorted((a, b) => a.x - b.x || value(b) - value(a));
@@ -54,8 +54,8 @@ class Plots {
   }
 
   /** Highlights the results that the comparison shows. */
-  choose(rows) {
-    this.chosen = rows;
+  choose(indices) {
+    this.chosen = indices;
     this.draw();
   }
 
@@ -74,12 +74,12 @@ class Plots {
   }
 
   /** Returns 1 for the left and 2 for the right result, otherwise undefined. */
-  mark(row) {
-    const place = this.chosen.indexOf(row);
+  mark(index) {
+    const place = this.chosen.indexOf(index);
     return place < 0 ? undefined : place + 1;
   }
 
-  /** Formats a figure; its label may end in its unit. */
+  /** Formats a figure. Its label may end in a unit, which follows the number, and in an arrow, which is left out. */
   text(value, figure) {
     const { label, digits } = this.data.figures[figure];
     const words = label.replace(/ ?[↑↓]/, "");

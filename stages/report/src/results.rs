@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use stage::SUMMARY_FILE;
 
-/// Row of `results.json`: the page's figures for scripts, one row per point of the sweep.
+/// Row of `results.json`: scores for scripts, one row for each block that scored views at each
+/// point of the sweep.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ResultRow {
@@ -20,7 +21,7 @@ pub struct ResultRow {
     pub mean: Value,
     /// Number of views.
     pub views: usize,
-    /// All stages that the figures depend on.
+    /// All stages that the scores depend on.
     pub stages: BTreeMap<String, StageResult>,
 }
 

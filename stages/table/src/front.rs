@@ -55,7 +55,8 @@ impl Axes<'_> {
     }
 
     /// Draws the points with a logarithmic cost, as SVG. Filled points are on the front, which a
-    /// line joins. Returns `None` if a cost isn't positive or there are fewer than two points.
+    /// line joins. Returns `None` if a cost isn't positive, a value isn't finite, or there are
+    /// fewer than two points.
     pub(crate) fn picture(&self, points: &[Point], figures: &Figures) -> Option<String> {
         if points.len() < 2 || !points.iter().all(|point| point.cost > 0.0) {
             return None;
@@ -132,6 +133,7 @@ impl Chart {
     fn point(&self, point: &Point, is_on_front: bool, names: &mut Vec<NameBox>) -> String {
         let [x, y] = self.at(point.cost, point.score);
         let fill = if is_on_front { COLOUR } else { "#fff" };
+        // Share of the width, chosen by hand.
         let is_left = x > 0.7 * SIZE.0;
         let (from, anchor) = if is_left { (x - 8.0, "end") } else { (x + 8.0, "start") };
         let width = LETTER_WIDTH * point.name.chars().count() as f64;
@@ -261,7 +263,7 @@ mod tests {
         }
     }
 
-    /// Equal values are in the middle of the picture, not at infinity.
+    /// Equal values are inside the picture, not at infinity.
     #[test]
     fn equal_results_are_drawn() {
         let points = [point("a", 5.0, 20.0), point("b", 5.0, 20.0)];

@@ -228,7 +228,7 @@ fn rays(count: usize) -> Vec<Ray> {
     (0..side * side).map(at).collect()
 }
 
-/// Measures one core in a field of low density, where every sample gets a colour.
+/// Measures one core in a field of low density, where almost every sample gets a colour.
 fn passes(rows: &mut Rows) {
     let bounds = Bounds::cube(1.0, 1.0, 9.0);
     let default = Architecture::default();
@@ -271,6 +271,8 @@ fn passes(rows: &mut Rows) {
         rows.add(format!("forward_backward_ns_per_sample{name}"), both, "ns");
         if name.is_empty() {
             rows.add("coloured_share", 100.0 * coloured as f64 / marched as f64, "%");
+            // Density network only: a multiplication and an addition for each weight, forward once,
+            // backward twice.
             let flops = (3 * 2 * field.density_multiplications()) as f64;
             rows.add("networks_gflops_of_forward_backward", flops / both, "GFLOP/s");
             rows.add(
@@ -370,7 +372,7 @@ fn print_phase_head(unit: &str) {
         format!("ms per {unit}"),
         "tasks",
         "longest task",
-        format!("serial of {unit}")
+        "serial share"
     );
 }
 

@@ -115,7 +115,7 @@ impl Stage for TrainSs {
         if context.from_checkpoint() {
             let init = init.as_ref().map(|init| (init.member(0), params.combine));
             let member = Member::new(context, params.member(0), (file.field, init), 0, 0)?;
-            log.append(member.write_latest_checkpoint(views.bounds)?);
+            log.append(member.write_checkpoint_weights(views.bounds)?);
             return publish(context, &file, &log);
         }
         let first_index = match (&init, params.combine) {

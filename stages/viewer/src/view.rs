@@ -18,23 +18,24 @@ pub(crate) fn fit(
 ) -> ([f32; 3], [f32; COEFFICIENTS]) {
     let scale = 1.0 / colours.len().max(1) as f32;
     let mean: [f32; 3] = std::array::from_fn(|c| scale * colours.iter().map(|v| v[c]).sum::<f32>());
-    let mut normal = SMatrix::<f64, BASIS, BASIS>::identity() * (RIDGE * directions.len() as f64);
-    let mut right = SMatrix::<f64, BASIS, 3>::zeros();
+    let mut gram = SMatrix::<f64, BASIS, BASIS>::identity() * (RIDGE * directions.len() as f64);
+    let mut products = SMatrix::<f64, BASIS, 3>::zeros();
     for (direction, colour) in directions.iter().zip(colours) {
         let basis = SVector::from(spherical_harmonics(*direction).map(f64::from));
-        normal += basis * basis.transpose();
+        gram += basis * basis.transpose();
         let residual = SVector::<f64, 3>::from_fn(|c, _| f64::from(colour[c] - mean[c]));
-        right += basis * residual.transpose();
+        products += basis * residual.transpose();
     }
-    let solution = match normal.cholesky() {
-        Some(cholesky) => cholesky.solve(&right),
+    let solution = match gram.cholesky() {
+        Some(cholesky) => cholesky.solve(&products),
         // Without directions the matrix is 0.
         None => SMatrix::zeros(),
     };
     (mean, std::array::from_fn(|i| solution[(i % BASIS, i / BASIS)] as f32))
 }
 
-/// Principal components of a scene's coefficients, the strongest first.
+/// Principal components of a scene's coefficients about 0, the strongest first. No mean is
+/// subtracted: a voxel without view dependence stays at 0.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Components(Vec<Component>);
 
@@ -47,11 +48,11 @@ struct Component {
     scale: f32,
 }
 
-/// Standard deviations in a component's scale; few values are beyond. Chosen by hand.
-const SCALE_DEVIATIONS: f64 = 4.0;
+/// Root mean squares in a component's scale; few values are beyond. Chosen by hand.
+const SCALE_RMS: f64 = 4.0;
 
 impl Components {
-    /// Finds the `count` strongest components of weighted coefficients.
+    /// Finds the `count` strongest components of voxels' coefficients, weighted by opacity.
     pub(crate) fn of<'a>(
         coefficients: impl Iterator<Item = (&'a [f32; COEFFICIENTS], f32)>,
         count: usize,
@@ -76,10 +77,11 @@ impl Components {
         order.truncate(count);
         let mut components = Vec::new();
         for k in order {
-            let deviation = eigen.eigenvalues[k].max(0.0).sqrt();
+            let rms = eigen.eigenvalues[k].max(0.0).sqrt();
             components.push(Component {
                 axis: std::array::from_fn(|i| eigen.eigenvectors[(i, k)] as f32),
-                scale: (SCALE_DEVIATIONS * deviation).max(1e-6) as f32,
+                // The minimum, chosen by hand, avoids a division by 0.
+                scale: (SCALE_RMS * rms).max(1e-6) as f32,
             });
         }
         Self(components)

@@ -1,17 +1,18 @@
 //! The command line.
 //!
-//! Structs that are flattened into a command, and values of options, have `//` comments. From doc
-//! comments, clap would take the verb's help, or print every verb's help in the long form.
+//! Structs that are flattened into a command, and values of options, have `//` comments. Clap
+//! would take a flattened struct's doc comment as the verb's help. For a doc comment of an option's
+//! value, it would print every verb's help in the long form.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use crate::garbage::Policy;
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::{Memory, Site};
 
 use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
+use crate::garbage::Policy;
 use crate::run_messages::FailureHint;
 use crate::session::Session;
 use crate::verbs::{self, GcOutput, GraphFormat, Limits};
@@ -40,7 +41,7 @@ struct GlobalArgs {
     /// Folder of the artifacts [default: .nerf-sr next to the pipeline file]
     #[arg(long, global = true, value_name = "DIR", env = "NERF_SR_STORE")]
     store: Option<PathBuf>,
-    /// Compute device: cpu or cuda:N
+    /// Compute device: cpu, cuda (the first GPU) or cuda:N
     #[arg(long, global = true, default_value = DEFAULT_DEVICE)]
     device: String,
     /// Executor of stages: this machine, or jobs of a Slurm cluster. With slurm, stages whose
@@ -314,7 +315,7 @@ pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
         Verb::Init { folder } => verbs::init(&folder, &global.pipeline),
         Verb::Plan { plan, json } => verbs::plan(&global.open_session()?, &plan.into(), json),
         Verb::Advise { plan, minutes, memory } => {
-            let arguments = global.arguments_of_log(&plan);
+            let arguments = global.plan_arguments(&plan);
             let limits = Limits { minutes, memory };
             verbs::advise(&global.open_session()?, &plan.into(), limits, &arguments)
         }
@@ -346,7 +347,7 @@ pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
 fn run(global: &GlobalArgs, plan: PlanArgs, options: RunOptions) -> anyhow::Result<ExitCode> {
     let session = global.open_session()?;
     let out = options.out.clone().unwrap_or_else(|| session.pipeline.project_folder().join("out"));
-    let hint = FailureHint::new(global.arguments_of_log(&plan));
+    let hint = FailureHint::new(global.plan_arguments(&plan));
     let executor = new_executor(global.executor, options, hint, &out)?;
     verbs::run(&session, &plan.into(), &out, executor.as_ref())
 }
@@ -358,8 +359,8 @@ impl GlobalArgs {
         Session::open(&self.pipeline, self.store.as_deref(), devices)
     }
 
-    /// Returns the arguments with which `log` finds the stages of a run of this plan.
-    fn arguments_of_log(&self, plan: &PlanArgs) -> Vec<String> {
+    /// Returns the arguments that repeat this plan with another verb, without `--executor`.
+    fn plan_arguments(&self, plan: &PlanArgs) -> Vec<String> {
         let mut arguments = plan.targets.clone();
         for (option, values) in [("-p", &plan.parameters), ("-i", &plan.inputs)] {
             arguments.extend(values.iter().flat_map(|value| [option.to_owned(), value.clone()]));
@@ -397,7 +398,8 @@ fn path_text(path: &Path) -> String {
     path.to_string_lossy().into_owned()
 }
 
-/// Creates the executor of a run. `hint` is printed after a failure; pages are written to `out`.
+/// Creates the executor of a run. `hint` is printed after a failure; watched views are written
+/// below `out`.
 fn new_executor(
     kind: ExecutorKind,
     options: RunOptions,

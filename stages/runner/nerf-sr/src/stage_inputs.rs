@@ -6,9 +6,10 @@ use planning::{Describing, Pipeline, Plan, PlanError, Request, State};
 
 use crate::session::Session;
 
-/// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts. The artifact is
-/// that of the same command line, without the argument and without the stage's own parameters,
-/// which are those of the training that continues.
+/// Replaces stages' names in `-i NAME=STAGE` by the folders of their artifacts; an existing file of
+/// that name has priority. The artifact is that of the same command line, without the argument and
+/// without the stage's own parameters, which are those of the training that continues. Only the
+/// stages' names in earlier arguments have been replaced in that command line.
 pub(crate) fn with_folders(
     pipeline: &Pipeline,
     session: &Session,
@@ -21,7 +22,7 @@ pub(crate) fn with_folders(
         if !pipeline.stages.contains_key(stage) || std::path::Path::new(stage).exists() {
             continue;
         }
-        let folder = folder_of(pipeline, session, request, describing, (index, stage))?;
+        let folder = folder_of(pipeline, session, &resolved, describing, (index, stage))?;
         resolved.inputs[index] = format!("{name}={folder}");
     }
     Ok(resolved)

@@ -45,8 +45,11 @@ impl Pipeline {
     pub fn project_folder(&self) -> PathBuf {
         let folder = self.files[0].folder();
         let is_inside = folder.canonicalize().is_ok_and(|folder| is_target_folder(&folder));
+        if !is_inside || self.files[0].content.extends.is_empty() {
+            return folder.to_path_buf();
+        }
+        // A path such as `.` or a link doesn't end in the folder's name.
         match folder.parent() {
-            _ if !is_inside || self.files[0].content.extends.is_empty() => folder.to_path_buf(),
             Some(parent) if is_target_folder(folder) => Path::new(".").join(parent),
             _ => folder.join(".."),
         }

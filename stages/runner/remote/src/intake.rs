@@ -8,17 +8,18 @@ use std::time::{Duration, Instant};
 use artifact::{Damage, Failure, FileEntry, MANIFEST_FILE, Manifest, relative_path, report_line};
 use store::{Arrival, Entered, Locked, Record, RunFile, Store, is_hash};
 
-/// Maximum size of a record in bytes; usual ones have a few kilobytes.
+/// Maximum size of a record in bytes; usual ones have a few kilobytes. Chosen by hand.
 pub(crate) const MAX_RECORD_BYTES: u64 = 4 << 20;
-/// Maximum size of a manifest in bytes; usual ones have about 150 bytes per file.
+/// Maximum size of a manifest in bytes; usual ones have about 150 bytes per file. Chosen by hand.
 pub(crate) const MAX_MANIFEST_BYTES: u64 = 64 << 20;
 
 /// Maximum number of components of a path. `std::fs::remove_dir_all` opens all folders of a path at
-/// once, and many systems limit a process to 1024 open files.
+/// once, and many systems limit a process to 1024 open files. Chosen by hand.
 const MAX_DEPTH: usize = 100;
 /// Maximum number of characters of a refused path in a message. Chosen by hand.
 const MAX_QUOTED_CHARACTERS: usize = 200;
 /// Maximum length of a path in bytes, which leaves most of the system's 4096 to the folders above.
+/// Chosen by hand.
 const MAX_PATH_BYTES: usize = 1000;
 
 /// Import of artifacts into a store. The store records the import as a run, so that garbage
@@ -127,7 +128,7 @@ pub(crate) fn read_manifest(
         Ok(manifest) if manifest.identity() != identity => {
             "the content has changed (its blake3 differs from the artifact's name)".to_owned()
         }
-        Ok(manifest) => match invalid_file(&manifest) {
+        Ok(manifest) => match manifest_problem(&manifest) {
             Some(problem) => problem,
             None => return Ok(manifest),
         },
@@ -135,8 +136,8 @@ pub(crate) fn read_manifest(
     Err(Failure::BadInput(format!("{name}: {problem}")))
 }
 
-/// Describes the first entry of a manifest that can't be a file of an artifact.
-fn invalid_file(manifest: &Manifest) -> Option<String> {
+/// Describes why a manifest can't be an artifact's: its total size, or its first invalid path.
+fn manifest_problem(manifest: &Manifest) -> Option<String> {
     let mut total: u64 = 0;
     for file in &manifest.files {
         let Some(sum) = total.checked_add(file.size) else {

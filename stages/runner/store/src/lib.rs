@@ -5,7 +5,7 @@
 //! * [`Attempt`], [`CheckedOutput`]: the steps from a stage's output to an object and its record.
 //! * [`Arrival`]: an artifact from another store.
 //! * [`is_hash`]: the form of keys and identities.
-//! * [`KeyLock`]: one OS lock per key. [`Entered`], held by each run, and [`Closed`], held by
+//! * [`KeyLock`]: one OS lock per key. [`Entered`], held briefly by runs, and [`Closed`], held by
 //!   garbage collection, exclude each other.
 //! * [`RunFile`], [`Run`], [`PartialKey`]: the actions that runs and pins need.
 //!

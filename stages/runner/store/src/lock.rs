@@ -51,7 +51,7 @@ pub fn host_name() -> String {
 pub enum Locked<T> {
     /// The lock is acquired.
     Acquired(T),
-    /// Another process holds the lock: this one, if known.
+    /// Another process holds the lock; `None` if the process is unknown.
     HeldBy(Option<Holder>),
 }
 

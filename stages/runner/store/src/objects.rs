@@ -60,8 +60,8 @@ impl Store {
         Ok(manifest)
     }
 
-    /// Rewrites the manifest of an object if its files have the object's identity; returns whether
-    /// they have.
+    /// Rewrites the manifest of an object if its files have the object's identity. Returns whether
+    /// the manifest was rewritten.
     pub(crate) fn repair(&self, identity: &str, kind: &str) -> Result<bool, StoreError> {
         use io::ErrorKind::{NotADirectory, NotFound, Other};
         let object = self.object(identity);
@@ -80,9 +80,10 @@ impl Store {
         Ok(true)
     }
 
-    /// Moves a checked folder into the place of an object. With `is_stored`, the caller found the
-    /// object complete: then nothing moves unless the object has vanished since. Two actions may
-    /// create the same object concurrently: an undamaged object stays, a damaged one is replaced.
+    /// Moves a checked folder to the path of an object. `is_stored`: the caller has found the
+    /// object complete; then the folder is moved only if the object no longer exists. Two actions
+    /// may create the same object concurrently: an undamaged object stays, a damaged one is
+    /// replaced.
     pub(crate) fn install_object(
         &self,
         folder: &Path,

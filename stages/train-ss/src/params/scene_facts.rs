@@ -46,7 +46,10 @@ fn pixels_across(k: Intrinsics, space: Space) -> f64 {
     match space {
         // The view covers about the whole cube.
         Space::Box => f64::from(k.width),
-        Space::Ndc(f) => (f.max[0] - f.min[0]).max(f.max[1] - f.min[1]) * k.fx,
+        Space::Ndc(frustum) => {
+            let [width, height] = [0, 1].map(|axis| frustum.max[axis] - frustum.min[axis]);
+            width.max(height) * k.fx
+        }
         // The view covers about half of the cube; the contracted shell fills the rest.
         Space::Contraction => 2.0 * f64::from(k.width),
     }

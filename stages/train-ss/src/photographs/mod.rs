@@ -39,7 +39,7 @@ impl Photographs {
         let images = views
             .views
             .iter()
-            .map(|view| read(input, view, memory))
+            .map(|view| read_photograph(input, view, memory))
             .collect::<anyhow::Result<_>>()?;
         Ok(Self { views, images })
     }
@@ -78,7 +78,7 @@ impl Photographs {
     }
 }
 
-fn read(
+fn read_photograph(
     input: &GivenInput,
     view: &View,
     memory: &mut PixelMemory,

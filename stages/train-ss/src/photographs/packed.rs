@@ -58,7 +58,7 @@ pub(crate) struct PackedPhotograph {
     pub(crate) height: usize,
     format: SampleFormat,
     bytes: Bytes,
-    /// Valid pixels; `None` if all are valid.
+    /// Unmasked pixels; `None` without a mask.
     mask: Option<PixelSet>,
     /// Grey level of the background; `None` for a transparent background.
     background: Option<f32>,
@@ -93,8 +93,8 @@ impl PackedPhotograph {
         Self { background: Some(background), ..self }
     }
 
-    /// True if the mask contains any valid pixel.
-    pub(crate) fn has_valid_pixels(&self) -> bool {
+    /// True if any pixel isn't masked.
+    pub(crate) fn has_unmasked_pixels(&self) -> bool {
         self.mask.as_ref().is_none_or(|mask| mask.len() > 0)
     }
 
@@ -283,12 +283,12 @@ mod tests {
                 && packed.pixel(1) == [0.5, 0.25, 0.125, 1.0]
         );
         assert_eq!(packed.unpack(), Photograph { image, mask: Some(mask) });
-        assert!(packed.has_valid_pixels());
+        assert!(packed.has_unmasked_pixels());
         let empty_mask = Mask { width: 2, height: 1, counts: vec![false; 2] };
         let grey = Image::new(2, 1, 3, vec![0.5; 6]);
         assert!(
             !packed_photograph(grey, Some(empty_mask), &mut PixelMemory::unlimited())
-                .has_valid_pixels()
+                .has_unmasked_pixels()
         );
     }
 }

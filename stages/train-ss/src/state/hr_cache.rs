@@ -41,7 +41,7 @@ struct CachedView {
 #[derive(Debug)]
 pub(crate) struct KernelOperator {
     operator: Resampling,
-    /// Transposed weights of the pseudo-inverse.
+    /// Weights P of [`Resampling::inverse`]: the pseudo-inverse, transposed and scaled.
     inverse: Resampling,
 }
 
@@ -124,9 +124,9 @@ impl HrCache {
 
     /// Computes the kernel's residuals around an LR pixel, with freshly rendered `colours` in the
     /// pixel's block and cached ones elsewhere, and back-projects them to the block: writes
-    /// P·residual, where P = K⁺ / s², with the pseudo-inverse K⁺ = Kᵀ·(K·Kᵀ)⁻¹. Returns the
-    /// residual of the pixel itself. `residual_of` returns the residual for a channel, a prediction
-    /// and its target.
+    /// Pᵀ·residual, with the P of [`Resampling::inverse`]. But for its ridge and reach, Pᵀ is
+    /// K⁺ / s², with the pseudo-inverse K⁺ = Kᵀ·(K·Kᵀ)⁻¹. Returns the residual of the pixel itself.
+    /// `residual_of` returns the residual for a channel, a prediction and its target.
     pub(crate) fn back_project(
         &self,
         pixel: LrPixel,

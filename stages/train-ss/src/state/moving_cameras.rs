@@ -55,7 +55,7 @@ impl MovingCameras {
     }
 
     /// Optimises the pose of every camera for one round. `exposure` returns, for a view's index,
-    /// the factors per channel from the photograph to the field's colours.
+    /// the factors per channel that convert the photograph's colours to the field's.
     pub(crate) fn step(
         &mut self,
         field: &dyn RayField,

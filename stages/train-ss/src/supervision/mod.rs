@@ -88,7 +88,7 @@ impl Supersampling {
     }
 
     /// Returns the number of LR photographs.
-    fn lr_views(&self) -> usize {
+    fn lr_view_count(&self) -> usize {
         self.views.iter().filter(|view| view.hr.is_none()).count()
     }
 
@@ -158,27 +158,28 @@ impl Supersampling {
     ) -> anyhow::Result<Option<MeanMotion>> {
         let Some(cameras) = &self.state.cameras else { return Ok(None) };
         let motion = cameras
-            .mean_motion(&*field()?, self.lr_views(), self.background.grey_level())
+            .mean_motion(&*field()?, self.lr_view_count(), self.background.grey_level())
             .map_err(fields::rendering_failure)?;
         Ok(Some(motion))
     }
 
     /// Returns the refined cameras of the photographs; empty without pose refinement.
     pub fn refined_cameras(&self) -> &[Camera] {
-        self.state.cameras.as_ref().map_or(&[], |cameras| &cameras.cameras()[..self.lr_views()])
+        let cameras = self.state.cameras.as_ref();
+        cameras.map_or(&[], |cameras| &cameras.cameras()[..self.lr_view_count()])
     }
 
     /// Returns the RGB gain of each photograph relative to the field; empty if exposures aren't
     /// estimated.
     pub fn exposures(&self) -> &[[f32; 3]] {
         let exposures = self.state.exposures.as_ref();
-        exposures.map_or(&[], |exposures| &exposures.gains()[..self.lr_views()])
+        exposures.map_or(&[], |exposures| &exposures.gains()[..self.lr_view_count()])
     }
 
     /// Returns how much the photographs' exposures differ, after the step that ends the
     /// measurement; `None` after any other step.
     pub(crate) fn exposure_difference(&self, progress: f64) -> Option<ExposureDifference> {
-        self.state.measurement.as_ref()?.difference(progress, self.lr_views())
+        self.state.measurement.as_ref()?.difference(progress, self.lr_view_count())
     }
 
     /// Returns the view and pixel that a bundle trains on.
@@ -186,7 +187,7 @@ impl Supersampling {
         self.sampler.draw(bundle, |view, pixel| self.views[view].image.is_valid(pixel))
     }
 
-    /// Returns the view, column and row of a pixel.
+    /// Returns the view, column and row of an LR pixel, or of a reference's block.
     fn position(&self, view: usize, pixel: usize) -> LrPixel {
         let width = self.views[view].image.width;
         LrPixel { view, x: pixel % width, y: pixel / width }
@@ -242,7 +243,7 @@ impl Supersampling {
     }
 }
 
-/// Returns the factors from a view's photograph to the field's colours.
+/// Returns the factors per channel that convert a photograph's colours to the field's.
 fn exposure_correction(exposures: Option<&Exposures>, view: usize) -> [f32; 3] {
     exposures.map_or([1.0; 3], |exposures| exposures.gains()[view].map(f32::recip))
 }

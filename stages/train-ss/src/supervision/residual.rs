@@ -21,8 +21,8 @@ pub(crate) struct LossContext {
     pub(crate) background: [f32; 3],
     /// Weight of the bundle's loss.
     pub(crate) weight: f32,
-    /// True if a sample at 0 or 1 may have been clipped; such a sample is only an upper or lower
-    /// bound.
+    /// True if `loss_of_mean` treats a sample at 0 or 1, which may have been clipped, as an upper
+    /// or lower bound. Photographs must then be composited on the background.
     pub(crate) allows_clipping: bool,
 }
 

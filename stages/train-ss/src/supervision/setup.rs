@@ -59,7 +59,7 @@ pub fn set_up_supervision(
     let mut memory = pixel_memory(&need, available_memory()?, folder.to_path_buf())?;
     log(memory_text(&need, memory.left()));
     let photographs = Photographs::read(scene, usize::MAX, &mut memory)?;
-    if !photographs.images.iter().any(PackedPhotograph::has_valid_pixels) {
+    if !photographs.images.iter().any(PackedPhotograph::has_unmasked_pixels) {
         let message = "scene: masks exclude every pixel of every photograph; a mask's black pixels \
             are excluded, so check whether the masks are inverted";
         return Err(Failure::BadInput(message.to_owned()).into());

@@ -102,8 +102,8 @@ impl<'a> Member<'a> {
         self.train(data)
     }
 
-    /// Writes the weights of the latest checkpoint of any member, and returns its log.
-    pub(crate) fn write_latest_checkpoint(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
+    /// Writes the weights of the latest checkpoint of all members, and returns that member's log.
+    pub(crate) fn write_checkpoint_weights(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
         let work = self.context.work().context("--from-checkpoint needs --work")?;
         let mut trainer = self.new_trainer(bounds, None)?;
         let curve = read_latest(work, &mut *trainer).ok_or_else(|| {

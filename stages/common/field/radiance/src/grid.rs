@@ -58,9 +58,10 @@ pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
             let cells = (f64::from(base_resolution) * ratio.powi(i as i32)).round() as u32;
             let resolution = [cells, cells, cells.min(finest_z)];
             let bricks = resolution.map(|n| (n + 1).div_ceil(2));
-            let vertices = bricks.iter().map(|n| u64::from(*n)).product::<u64>() * BRICK as u64;
-            let hashed = vertices > max_entries;
-            let entries = if hashed { max_entries } else { vertices } as usize;
+            let stored_vertices =
+                bricks.iter().map(|n| u64::from(*n)).product::<u64>() * BRICK as u64;
+            let hashed = stored_vertices > max_entries;
+            let entries = if hashed { max_entries } else { stored_vertices } as usize;
             let level = Level {
                 resolution,
                 entries,
@@ -89,8 +90,8 @@ impl Cells {
             let last = resolution - 1.0;
             for l in 0..LANES {
                 let at = p[axis][l].max(0.0).min(1.0) * resolution;
-                // A position on the far face belongs to the last cell; 0.5 keeps the product
-                // inside.
+                // A position on the far face, where `at` is the resolution, belongs to the last
+                // cell, which contains `last + 0.5`.
                 let (whole, cell) = floor(at.min(last + 0.5));
                 cells.cell[axis][l] = cell;
                 cells.fraction[axis][l] = at - whole;
@@ -147,7 +148,8 @@ impl Corners {
 }
 
 kernel! {
-    /// Interpolates the features of `n` positions (three rows, unit cube) into four rows of `n`.
+    /// Interpolates the features of `n` positions (three rows, unit cube) into four rows of `n`, a
+    /// multiple of sixteen.
     pub(crate) fn encode<L>(level: &Level, table: &[f32], positions: &[f32], features: &mut [f32],
         n: usize) {
         let (table, _) = table.as_chunks::<FEATURES>();
@@ -250,7 +252,7 @@ kernel! {
             for (corner, (index, weight)) in index.iter_mut().zip(&mut weight).enumerate() {
                 let (dx, dy) = (corner as u32 & 1, corner as u32 >> 1);
                 for l in 0..LANES {
-                    // The cell's first or second vertex along z has the half's lowest bit.
+                    // Selects the cell's vertex along z whose lowest bit is `z_bit`.
                     let dz = (cell[2][l] ^ z_bit) & 1;
                     let (x, y, z) = (cell[0][l] + dx, cell[1][l] + dy, cell[2][l] + dz);
                     let brick = brick_index(level, mask, [x >> 1, y >> 1, z >> 1]);

@@ -21,10 +21,11 @@
 //! of each of the ray's samples.
 //!
 //! A step's rays are cut into shards by index. A shard's samples go through encoding, density,
-//! compositing, shading and back in chunks that fit the cache. Gradients of the grid are stored and
-//! then added by two tasks per level. All sums have a fixed order, so results have equal
-//! bits at any thread count. Kernels work on 16 logical lanes on any machine and fuse all
-//! multiply-adds, so AVX-512, AVX2 and portable code give equal bits, too.
+//! compositing, shading and back in chunks that fit the cache. Gradients of the samples'
+//! features are stored until the step's end; then two tasks per level, for even and odd z, add them
+//! to the grid's gradients. All sums have a fixed order, so results have equal bits at any thread
+//! count. Kernels work on 16 logical lanes on any machine and fuse all multiply-adds, so AVX-512,
+//! AVX2 and portable code give equal bits, too.
 //!
 //! Units: rays and depths are in scene units; positions inside the field are in the unit cube.
 //! Colours are display-encoded sRGB.

@@ -27,7 +27,7 @@ use shard::{ShardResult, StepWork, Worker};
 /// Result of a training step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepReport {
-    /// Mean loss of the bundles.
+    /// Mean loss of the bundles; may be NaN or infinite if `skipped`.
     pub loss: f64,
     /// Number of rays cast.
     pub rays: usize,
@@ -78,8 +78,10 @@ pub struct Trainer {
     grid_gradients: Vec<LevelGradients>,
     /// Running average of the weights, created by the first update.
     average: Option<ParameterBuffers>,
+    /// Transposed weights of the networks' layers, for the backward pass.
     transposed: Aligned,
     state: TrainingState,
+    /// Mean number of samples per ray of the last step; before the first, that of a full ray.
     samples_per_ray: f64,
     shards: Vec<ShardResult>,
     workers: Mutex<Vec<Worker>>,
@@ -176,7 +178,7 @@ impl Trainer {
         } else {
             self.phase(Phase::GridGradients, Self::sum_grid_gradients);
             self.phase(Phase::Adam, Self::apply_gradients);
-            self.phase(Phase::Average, Self::update_average);
+            self.phase(Phase::Average, Self::average_weights);
             self.phase(Phase::Records, |trainer, clock| {
                 trainer.record(supervisor, first_bundle, rays_per_bundle, clock);
             });
@@ -224,7 +226,8 @@ impl Trainer {
         });
     }
 
-    /// Sums the networks' gradients over all shards, in the shards' order.
+    /// Sums the networks' gradients over all shards, in the shards' order. The sums are 0 before:
+    /// the previous step has cleared them.
     fn sum_network_gradients(&mut self, clock: &PhaseClock) {
         let shards = &self.shards;
         let parts = self.network_gradients.par_chunks_mut(SUMS_PIECE).enumerate();
@@ -306,7 +309,7 @@ impl Trainer {
 
     /// Updates the average of the weights (Polyak) late in the training, which cancels the steps'
     /// noise (docs/design/007).
-    fn update_average(&mut self, clock: &PhaseClock) {
+    fn average_weights(&mut self, clock: &PhaseClock) {
         if !self.options.is_averaging_step(&self.state) {
             return;
         }

@@ -15,8 +15,8 @@ use crate::step::Step;
 
 /// Trains a [`radiance::Field`] like [`radiance::Trainer`], in libtorch: with equal random numbers,
 /// steps, learning rates and occupancy updates, but without [`TrainingOptions::roulette`], so that
-/// all samples get gradients. On the CPU it runs in one thread and checks that trainer; on CUDA it
-/// is fast (design note 023).
+/// all samples get gradients. On the CPU it runs in one thread, and tests compare that trainer with
+/// it; on CUDA it is fast (design note 023).
 pub struct GridTrainer {
     grid: TorchGrid,
     options: TrainingOptions,
@@ -141,7 +141,7 @@ impl GridTrainer {
         range: Range<usize>,
     ) -> Result<GridPiece, TchError> {
         let rays = step.sample_rays(supervisor, &range);
-        let first = step.first_ray(&range);
+        let first = step.first_ray_of(&range);
         let offsets: Vec<f32> =
             (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
         let offsets = Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?;
@@ -341,6 +341,7 @@ fn lazy_adam(
     gradient: &Tensor,
     [mut first, mut second]: [Tensor; 2],
 ) -> Result<(), TchError> {
+    // The same limit as in `radiance`'s Adam: far beyond it, both corrections are 1.
     let t = t.min(100_000) as i32;
     let rate = learning_rate * (1.0 - ADAM_BETA[1].powi(t)).sqrt() / (1.0 - ADAM_BETA[0].powi(t));
     let touched = gradient.f_ne(0.0)?;
@@ -359,7 +360,7 @@ fn lazy_adam(
     second.f_copy_(&updated)
 }
 
-/// Rounds floats by their `bits` lowest bits.
+/// Rounds floats to multiples of 2^`bits` units in the last place.
 fn round(floats: &Tensor, bits: u32) -> Result<Tensor, TchError> {
     let half = 1 << (bits - 1);
     floats

@@ -202,8 +202,8 @@ impl MlpTrainer {
         Ok(())
     }
 
-    /// Runs the forward and backward pass of a step: on the CPU in parallel shards, on a GPU in as
-    /// few pieces as its memory allows.
+    /// Runs the forward and backward pass of a step: on the CPU in parallel shards, on a GPU in
+    /// pieces that fit its memory.
     fn run_step(
         &self,
         supervisor: &impl Supervisor,
@@ -319,7 +319,7 @@ impl StepContext {
         let draws = SampleDraws::new(
             field,
             self.seed,
-            self.step.first_ray(&range),
+            self.step.first_ray_of(&range),
             rays.len(),
             self.noise_std,
         )?;

@@ -13,8 +13,8 @@ pub(crate) struct RayTensors {
     /// Parameters t at which rays enter and leave the cube (n × 1 each), equal if they miss it.
     pub(crate) enter: Tensor,
     pub(crate) leave: Tensor,
-    /// Coefficients of the map from t to distance (n × 1 each): start, scale, and perspective or
-    /// radii.
+    /// Coefficients of the map from t to distance (n × 1 each): start, scale, and perspective or,
+    /// in a contraction, radii, which positions need, too.
     distance: [Tensor; 3],
     is_contracted: bool,
 }

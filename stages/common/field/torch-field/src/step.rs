@@ -21,7 +21,7 @@ pub(crate) fn learning_rate(highest: f64, decay: f64, epochs: u64, done: f64) ->
     highest * decay.powf(progress)
 }
 
-/// One training step: `bundles` bundles of rays, numbered after those of all earlier steps.
+/// One training step of `bundles` bundles of rays. Bundles are numbered through the training.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Step {
     first_bundle: u64,
@@ -52,7 +52,7 @@ impl Step {
     }
 
     /// Returns the index, over the training run, of the first ray of a range of the step's bundles.
-    pub(crate) fn first_ray(self, range: &Range<usize>) -> u64 {
+    pub(crate) fn first_ray_of(self, range: &Range<usize>) -> u64 {
         self.first_ray + (range.start * self.rays_per_bundle) as u64
     }
 
@@ -103,10 +103,11 @@ impl Step {
             rendered.push(RenderedBundles { first_bundle, colours });
             first_bundle += (colours.len() / self.rays_per_bundle) as u64;
         }
+        // Nobody reads this clock.
         supervisor.record_colours(&rendered, &PhaseClock::start());
     }
 
-    /// Runs the step's bundles in as few pieces as memory allows.
+    /// Runs the step's bundles in pieces, whose size is halved after running out of memory.
     pub(crate) fn run_in_pieces<T>(
         self,
         run: impl FnMut(Range<usize>) -> Result<T, TchError>,

@@ -11,8 +11,8 @@ const MAX_CODE_BITS: u32 = 16;
 pub(crate) struct Table {
     /// Code length and symbol, indexed by the next bits; length 0 for longer codes.
     lookup: Vec<(u8, u8)>,
-    /// End of the codes of each length, extended to 16 bits, and the offset from a code to its
-    /// symbol's index.
+    /// By code length: the first 16 bits after all codes of this length, and the symbol's index
+    /// minus the code.
     ends: [(u32, i32); MAX_CODE_BITS as usize + 1],
     symbols: Vec<u8>,
 }
@@ -140,13 +140,15 @@ impl<'a> Bits<'a> {
         let [dc, ac] = tables;
         let length = match dc {
             Some(dc) => u32::from(self.symbol(dc)?),
+            // A refinement scan has one bit per DC coefficient.
             None => 1,
         };
         self.skip(length)?;
         let Some(ac) = ac else { return Some(()) };
         let mut coefficient = 1;
         while coefficient <= band.last {
-            match self.run(ac)? {
+            match self.run_and_length(ac)? {
+                // ZRL: sixteen zeros.
                 (15, 0) => coefficient += 16,
                 (_, 0) => break,
                 (zeros, length) => {
@@ -163,7 +165,7 @@ impl<'a> Bits<'a> {
     pub(crate) fn skip_band(&mut self, band: Band, table: &Table, known: &mut u64) -> Option<()> {
         let mut coefficient = band.first;
         while self.empty_blocks == 0 && coefficient <= band.last {
-            let (zeros, length) = self.run(table)?;
+            let (zeros, length) = self.run_and_length(table)?;
             if length == 0 && zeros < 15 {
                 self.empty_blocks = (1 << zeros) + self.bits(zeros)?;
                 break;
@@ -229,7 +231,7 @@ impl<'a> Bits<'a> {
     }
 
     /// Reads the number of zeros, and the number of bits of the coefficient after them.
-    fn run(&mut self, table: &Table) -> Option<(u32, u32)> {
+    fn run_and_length(&mut self, table: &Table) -> Option<(u32, u32)> {
         let symbol = self.symbol(table)?;
         Some((u32::from(symbol >> 4), u32::from(symbol & 15)))
     }

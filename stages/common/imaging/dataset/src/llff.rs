@@ -71,7 +71,8 @@ fn colmap_distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Opt
     }
 }
 
-/// True if a photograph's focal length, relative to its width, equals the camera's.
+/// True if a photograph's focal length, relative to its width, equals the camera's to a thousandth;
+/// the tolerance is chosen by hand.
 fn has_focal_length_of(camera: &Intrinsics, row: &[f64; NUMBERS]) -> bool {
     let (width, focal) = (row[9], row[14]);
     (camera.fx * width / (f64::from(camera.width) * focal) - 1.0).abs() < 1e-3
@@ -84,9 +85,9 @@ fn read_frame(
     image: PathBuf,
 ) -> Result<Frame, Reason> {
     let stored: ImageHeader = read_header(&image)?;
-    let [down, right, back, centre, inner] =
+    let [down, right, back, centre, size_and_focal] =
         [0, 1, 2, 3, 4].map(|c| DVec3::new(row[c], row[5 + c], row[10 + c]));
-    let [height, width, focal] = inner.to_array();
+    let [height, width, focal] = size_and_focal.to_array();
     let (width, height) = (side_length(width, "width")?, side_length(height, "height")?);
     let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
     let intrinsics = Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion };
@@ -162,7 +163,8 @@ fn folders_text(folders: &[ImageFolder]) -> String {
 }
 
 /// Finds the folder with one image per pose: `images`, or the first of `images_2`, `images_3` and
-/// so on. Without such a folder, a list may name the images that have poses.
+/// so on, up to 64, chosen by hand. Without such a folder, a list may name the images that have
+/// poses.
 fn find_photographs(folder: &Path, path: &Path, poses: usize) -> Result<Photographs, DatasetError> {
     let mut names = vec!["images".to_owned()];
     names.extend((2..=64).map(|n| format!("images_{n}")));

@@ -54,7 +54,7 @@ pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, Reason> {
 
 /// Returns the reason why an array's shape isn't that of the expected matrix.
 pub(crate) fn shape_reason(shape: &[usize]) -> Reason {
-    Reason::new(format!("unsupported shape {shape:?}; a matrix has rows and columns"))
+    Reason::new(format!("unsupported shape {shape:?}"))
 }
 
 /// Splits a file into the header's text and the data after it.

@@ -115,7 +115,7 @@ impl Image {
         self.data.iter().skip(channel).step_by(self.channels).copied().collect()
     }
 
-    /// Converts to 8-bit RGBA; grey and RGB become opaque.
+    /// Converts to 8-bit RGBA without dividing by alpha; grey and RGB become opaque.
     pub fn to_rgba8(&self) -> Rgba8 {
         let pixels = self.data.chunks_exact(self.channels).flat_map(|p| match p {
             [r, g, b, a] => [to_u8(*r), to_u8(*g), to_u8(*b), to_u8(*a)],

@@ -11,7 +11,7 @@
 //!   `avg`.
 //! * [`Resampling`]: the same resampling as a linear operator in floats, with its adjoint;
 //!   [`Degradation`]: kernel from HR to LR images.
-//! * [`Exposure`]: colour change between two exposures.
+//! * [`Exposure`]: affine change of each colour channel between two exposures.
 //! * [`Mask`]: pixels of an image that count.
 //! * [`sample_cubic`], [`Image::colour_at`]: cubic interpolation.
 //! * [`psnr_of`]: a mean squared error in dB.

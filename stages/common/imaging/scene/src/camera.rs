@@ -171,8 +171,9 @@ impl Camera {
         Self { intrinsics: self.intrinsics.resized(width, height), ..self.clone() }
     }
 
-    /// Fails for an invalid camera: NaN, focal length 0, an empty image, a pose with scale, shear
-    /// or reflection, or a centre beyond [`MAX_CENTRE_DISTANCE`].
+    /// Fails for an invalid camera: a number that isn't finite, an empty image, intrinsics out of
+    /// range, a distortion that isn't invertible, a pose with scale, shear or reflection, or a
+    /// centre beyond [`MAX_CENTRE_DISTANCE`].
     pub fn check(&self) -> Result<(), CameraError> {
         self.check_intrinsics()?;
         let pose = self.camera_to_world.as_flattened();

@@ -5,7 +5,7 @@
 //! * [`GivenInput`]: an input of a stage, checked against its manifest.
 //! * [`canonical_json`]: the only JSON form that is hashed.
 //! * [`RunRecord`]: record of a run, the input of a sink such as `report`.
-//! * [`Failure`]: an error by the user's next step; each kind has its exit code.
+//! * [`Failure`]: an error, classified by the user's next step; each kind has its exit code.
 //! * [`print_line!`], [`report_line!`], [`printable`], [`format_count`]: text of messages.
 //!
 //! Descriptions of stages are in `contract`, the command line of stages is in `stage`. Libraries

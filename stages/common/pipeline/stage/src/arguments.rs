@@ -30,7 +30,7 @@ pub(crate) struct Arguments {
     /// Write the output from the latest checkpoint in --work, without further training
     #[arg(long, requires = "work")]
     pub(crate) from_checkpoint: bool,
-    /// Compute device: cpu or cuda:N
+    /// Compute device: cpu, cuda (the first GPU) or cuda:N
     #[arg(long, default_value = "cpu")]
     pub(crate) device: String,
     // Its help is `threads_help`.

@@ -22,7 +22,7 @@ const MIN_LOGGED_BYTES: u64 = 1_000_000_000;
 pub struct Context {
     /// Number of threads, which is the size of rayon's global pool.
     pub threads: usize,
-    /// Compute device: `cpu` or `cuda:N`.
+    /// Compute device: `cpu`, `cuda` (the first GPU) or `cuda:N`.
     pub device: String,
     pub(crate) inputs: BTreeMap<String, GivenInput>,
     pub(crate) output: PathBuf,
@@ -97,17 +97,18 @@ impl Context {
             .with_hooks(TestHooks::from_environment(&self.interrupted))
     }
 
-    /// Logs one line on stderr, which is also part of the action's log.
+    /// Logs one line on stderr, which is also part of the action's log; with `--progress none`,
+    /// nothing.
     pub fn log_line(&self, text: impl std::fmt::Display) {
         if self.progress != ProgressMode::None {
             report_text(&text.to_string());
         }
     }
 
-    /// Logs the memory that some work needs, in bytes, if at least [`MIN_LOGGED_BYTES`].
+    /// Logs the memory that `work` needs, `need` bytes, if that is at least [`MIN_LOGGED_BYTES`].
     ///
     /// # Errors
-    /// [`Failure::Usage`] with the remedy if less is free.
+    /// [`Failure::Usage`] with `remedy` if less than `need` is free.
     pub fn check_memory(&self, work: &str, need: u64, remedy: &str) -> Result<(), Failure> {
         remaining_memory(work, need, available_memory()?, remedy)?;
         if need >= MIN_LOGGED_BYTES {

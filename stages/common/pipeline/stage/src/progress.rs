@@ -204,7 +204,8 @@ impl Drop for Progress {
     }
 }
 
-/// Pace of work, measured from the first report: steps of an interrupted run don't count.
+/// Pace of work, measured from the first call of [`Pace::start`] or [`Pace::time_left`]: steps of
+/// an interrupted run don't count.
 #[derive(Debug, Default)]
 pub struct Pace {
     first: Option<(Instant, u64)>,
@@ -217,8 +218,9 @@ impl Pace {
         *self.first.get_or_insert_with(|| (Instant::now(), done))
     }
 
-    /// Returns the remaining time as text, such as "4.0 min left": the `estimate` in seconds if there
-    /// is one, otherwise from an even pace; empty until a step has finished since the first call.
+    /// Returns the remaining time as text, such as "4.0 min left": the `estimate` in seconds if
+    /// there is one, otherwise from an even pace; empty until a step has finished since the first
+    /// call.
     pub fn time_left(&mut self, done: u64, total: u64, estimate: Option<f64>) -> String {
         let (start, first) = self.start(done);
         if let Some(seconds) = estimate {

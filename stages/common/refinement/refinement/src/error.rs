@@ -13,7 +13,7 @@ pub enum RefinementError {
     #[error("{0}")]
     Unusable(String),
     /// A step's loss or gradient isn't finite.
-    #[error("step {step}: the gradient is not finite; lower the learning rate")]
+    #[error("step {step}: loss or gradient is not finite; lower the learning rate")]
     NotFinite {
         /// Index of the step.
         step: u64,

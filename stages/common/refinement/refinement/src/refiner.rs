@@ -94,9 +94,9 @@ pub struct Refiner {
 /// Side of a tile in pixels. A tile with its receptive field fits in the cache, and little of the
 /// work is repeated in overlaps (design note 015).
 const TILE_SIDE: usize = 128;
-/// Maximum number of channels of a network that is read from a file.
+/// Maximum number of channels of a network that is read from a file; chosen by hand.
 const MAX_CHANNELS: u32 = 4096;
-/// Maximum number of blocks of a network that is read from a file.
+/// Maximum number of blocks of a network that is read from a file; chosen by hand.
 const MAX_BLOCKS: u32 = 4096;
 /// Stream of random numbers for the initial weights.
 const WEIGHTS_STREAM: u64 = 300;
@@ -205,13 +205,14 @@ impl Refiner {
             .collect();
         let mut data = vec![0.0; width * height * OUTPUTS];
         for (window, residual) in &residuals {
-            for (i, residual) in residual.chunks_exact(OUTPUTS).enumerate() {
+            for (i, pixel_residual) in residual.chunks_exact(OUTPUTS).enumerate() {
                 let column = window.x as usize + i % window.size.0;
                 let row = window.y as usize + i / window.size.0;
                 if column < width && row < height {
                     let index = row * width + column;
                     for c in 0..OUTPUTS {
-                        let colour = view.data[index * inputs + c] + residual_weight * residual[c];
+                        let colour =
+                            view.data[index * inputs + c] + residual_weight * pixel_residual[c];
                         data[index * OUTPUTS + c] = colour.clamp(0.0, 1.0);
                     }
                 }

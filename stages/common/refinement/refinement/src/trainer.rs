@@ -61,6 +61,7 @@ pub struct RefinerTrainer {
 /// Random examples with random references. References are warped once for all patches of a view,
 /// and memory is bounded by the size of the pool (design note 017).
 struct Pool {
+    /// Number of earlier pools.
     round: u64,
     /// Index of the example, and the view with reference features.
     views: Vec<(usize, Image)>,
@@ -158,7 +159,7 @@ impl RefinerTrainer {
         let mut statistics = ReferenceStatistics::default();
         let mut views = Vec::with_capacity(examples.len());
         for (number, example) in examples.iter().enumerate() {
-            views.push(self.conditioned(number as u64, example, references, &mut statistics));
+            views.push(self.network_input(number as u64, example, references, &mut statistics));
         }
         let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
         for (i, view) in views.iter().enumerate() {
@@ -197,7 +198,7 @@ impl RefinerTrainer {
     }
 
     /// Returns the network's input for a validation view, with references drawn by its number.
-    fn conditioned(
+    fn network_input(
         &self,
         number: u64,
         example: &KnownView,
@@ -390,11 +391,12 @@ impl<'a> TrainingPatch<'a> {
         for i in 1..OUTPUTS {
             order.swap(i, rng.below(i as u64 + 1) as usize);
         }
-        let contrast = 0.5 + 0.7 * rng.uniform();
+        // Ranges chosen by hand.
+        let factor = 0.5 + 0.7 * rng.uniform();
         let shift = 0.4 * (rng.uniform() - 0.5);
         let sign = if rng.below(2) == 1 { -1.0 } else { 1.0 };
         // Scaled around mid-grey.
-        let (gain, offset) = (sign * contrast, 0.5 + sign * (shift - 0.5 * contrast));
+        let (gain, offset) = (sign * factor, 0.5 + sign * (shift - 0.5 * factor));
         Self { view, square, orientation, order, gain, offset }
     }
 
@@ -414,10 +416,10 @@ impl<'a> TrainingPatch<'a> {
             inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
             inputs.push(pixel[OUTPUTS]);
             if view.channels == REFERENCE_INPUTS {
-                let [.., r, g, b, confidence, x, y, z] = pixel else {
+                let [.., r, g, b, confidence, detail_r, detail_g, detail_b] = pixel else {
                     unreachable!("a view with reference features has 11 channels")
                 };
-                let (difference, detail) = ([r, g, b], [x, y, z]);
+                let (difference, detail) = ([r, g, b], [detail_r, detail_g, detail_b]);
                 inputs.extend(self.order.map(|c| self.gain * difference[c]));
                 inputs.push(*confidence);
                 inputs.extend(self.order.map(|c| self.gain * detail[c]));

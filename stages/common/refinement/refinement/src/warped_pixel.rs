@@ -1,6 +1,6 @@
 use crate::view::KnownView;
 
-/// Pixel of a view with the colours that one reference has at the same surface point.
+/// Colours of one reference at the surface point of a view's pixel, as differences.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct WarpedPixel {
     /// The reference's colour minus the view's rendered colour.
@@ -9,9 +9,9 @@ pub(crate) struct WarpedPixel {
     pub(crate) detail: [f32; 3],
     /// Position in the reference in pixels.
     pub(crate) position: [f32; 2],
-    /// Visibility in the reference by angle and size, 0 to 1; 0 if the point isn't visible.
+    /// Weight by viewing angle and resolution, 0 to 1; 0 if the point isn't visible.
     pub(crate) visibility: f32,
-    /// Visibility, reduced where the reference disagrees with the rendered view.
+    /// `visibility`, later reduced where the reference disagrees with the rendered view.
     pub(crate) confidence: f32,
 }
 

@@ -12,7 +12,8 @@ use training::{field_factor, training_memory, training_need, training_seconds};
 /// Seconds per rendered ray, of objects and of opaque scenes (docs/results/engine.md).
 const OBJECT_RENDERED_RAY_SECONDS: f64 = 4.4e-6;
 const OPAQUE_RENDERED_RAY_SECONDS: f64 = 8e-6;
-/// Fraction of the pixels that get all rays at the default tolerance, likewise.
+/// Fraction of the pixels that get all rays at the default tolerance, likewise; taken for any
+/// tolerance above 0.
 const OBJECT_DETAILED_PIXELS: f64 = 0.23;
 const OPAQUE_DETAILED_PIXELS: f64 = 0.29;
 /// Bytes of a rendered field per float of its grid: the grid, and the file that it is read from.
@@ -166,8 +167,8 @@ fn refinement(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     Some((seconds, program + REFINED_PIXEL_BYTES * work.images.largest_pixels()))
 }
 
-/// Returns the cost of an export: the time of its rendering, and the memory as `export` computes
-/// it, with a lattice that is a cube.
+/// Returns the cost of an export: the time of its rendering, without the factor of the field's
+/// sizes, and the memory as `export` computes it, with a lattice that is a cube.
 fn export(parameters: &Value, work: &Work) -> Option<(f64, u64)> {
     let scale = match number(parameters, "size") {
         Some(width) => width / work.images.largest_size.0.max(1) as f64,

@@ -3,8 +3,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::garbage::contents::Contents;
 use crate::garbage::roots::Root;
 
-/// Entries of a store that some root reaches, each with a reason: that of the first such root, or
-/// `input of STAGE`.
+/// Entries of a store that some root reaches, each with a reason: the reason of the first root
+/// that reaches it, or `input of STAGE`.
 #[derive(Debug, Default)]
 pub(crate) struct Kept {
     /// Reasons by key.
@@ -20,23 +20,23 @@ pub(crate) struct Kept {
 pub(crate) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
     let mut kept = Kept::default();
     for root in roots {
-        let fitting = contents
+        let matching = contents
             .records
             .iter()
             .filter(|(_, record)| root.waiting.iter().any(|node| node.matches(record)));
-        let mut open: Vec<(String, String)> = root
+        let mut to_visit: Vec<(String, String)> = root
             .keys
             .iter()
-            .chain(fitting.map(|(key, _)| key))
+            .chain(matching.map(|(key, _)| key))
             .map(|key| (key.clone(), root.reason.clone()))
             .collect();
         let mut seen = BTreeSet::new();
-        while let Some((key, reason)) = open.pop() {
+        while let Some((key, reason)) = to_visit.pop() {
             if !seen.insert(key.clone()) {
                 continue;
             }
             if root.with_inputs {
-                open.extend(input_actions(contents, &key));
+                to_visit.extend(input_actions(contents, &key));
             }
             if contents.unfinished.contains_key(&key) {
                 kept.unfinished.entry(key.clone()).or_insert_with(|| reason.clone());

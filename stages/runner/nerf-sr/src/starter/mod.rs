@@ -4,8 +4,8 @@
 //! * [`Starter::write`]: writes the pipeline file and, next to it, `pipelines/` and `experiments/`
 //!   with the shipped targets. Existing files are never overwritten.
 //!
-//! Images up to [`MAX_WIDTH`] pixels wide keep their size. Larger ones are shrunk first: on a CPU,
-//! training on photographs of twelve million pixels takes hours.
+//! If every image is wider than [`MAX_WIDTH`] pixels, all are shrunk first: on a CPU, training on
+//! photographs of twelve million pixels takes hours. Otherwise, all keep their size.
 
 mod unposed;
 
@@ -19,8 +19,8 @@ use dataset::{Dataset, DatasetError, Frame};
 
 use unposed::UnposedImages;
 
-/// Maximum width, in pixels, of images that keep their size. Chosen by hand: a CPU trains on larger
-/// ones for hours.
+/// Width in pixels to which images are shrunk if all are wider. Chosen by hand: a CPU trains on
+/// larger ones for hours.
 pub(crate) const MAX_WIDTH: u32 = 800;
 /// HR width divided by LR width, chosen by hand.
 const SCALE: u32 = 2;
@@ -156,15 +156,15 @@ fn common_size(set: &Dataset) -> Option<(u32, u32)> {
 }
 
 /// Returns the widths of photographs, training images and views as text, and the width of views
-/// from photographs that aren't shrunk.
+/// with `lr_source=photographs`.
 fn sizes(set: &Dataset) -> String {
     let size = common_size(set);
     let photographs = match size {
         Some((width, height)) => format!("photographs {width}×{height}"),
         None => "photographs of several sizes".to_owned(),
     };
-    let unshrunk = match size {
-        Some((width, _)) => format!("{}", width * SCALE),
+    let unshrunk_views = match size {
+        Some((width, _)) => format!("views at {}", width * SCALE),
         None => format!("views {SCALE} times as wide as each photograph"),
     };
     let training = match (ImageSource::of(set), size) {
@@ -172,21 +172,21 @@ fn sizes(set: &Dataset) -> String {
         (ImageSource::Benchmark, Some((width, _))) => Some((width / SCALE, width)),
         (ImageSource::Benchmark, None) => None,
         (ImageSource::Photographs, _) => {
-            let views = if size.is_some() { format!("views at {unshrunk}") } else { unshrunk };
-            return format!("{photographs}; training at this size, {views}");
+            return format!("{photographs}; training at this size, {unshrunk_views}");
         }
     };
     let training = match training {
         Some((training, views)) => format!("training at {training}, views at {views}"),
         None => format!("training at 1/{SCALE} of this size, views at this size"),
     };
-    format!("{photographs}; {training}; `-p lr_source=photographs` gives {unshrunk}")
+    format!("{photographs}; {training}; `-p lr_source=photographs` gives {unshrunk_views}")
 }
 
 /// Source of LR images that [`image_parameters`] selects.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum ImageSource {
-    /// Photographs wider than [`MAX_WIDTH`], shrunk to it.
+    /// Photographs wider than [`MAX_WIDTH`]: shrunk to it for scoring, and by [`SCALE`] more for
+    /// training.
     Shrunk,
     /// Images of a benchmark, downscaled.
     Benchmark,
@@ -208,7 +208,7 @@ impl ImageSource {
     }
 }
 
-fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {
+fn pipeline_text(set: &Dataset, found: &str, dataset: &str) -> String {
     let is_irregular = set.frames.iter().any(|frame| frame.camera().check().is_err());
     let lens = if is_irregular {
         "\n      lens: undo # some lens distortion can't be modelled up to the border; photographs \
@@ -221,7 +221,7 @@ fn pipeline_text(set: &Dataset, summary: &str, dataset: &str) -> String {
         _ => "by default every eighth view is for testing only",
     };
     include_str!("pipeline.yaml")
-        .replace("{found}", summary)
+        .replace("{found}", found)
         .replace("{scale}", &SCALE.to_string())
         .replace("{images}", &image_parameters(set))
         .replace("{lens}", lens)

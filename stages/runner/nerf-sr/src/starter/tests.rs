@@ -54,13 +54,13 @@ fn sizes_are_described() {
             Format::Colmap,
             vec![(1080, 1920); 2],
             "photographs 1080×1920; training at 400, views at 800; `-p lr_source=photographs` \
-            gives 2160",
+            gives views at 2160",
         ),
         (
             Format::Blender,
             vec![(800, 800)],
             "photographs 800×800; training at 400, views at 800; `-p lr_source=photographs` \
-            gives 1600",
+            gives views at 1600",
         ),
         (
             Format::Colmap,

@@ -26,16 +26,17 @@ pub(crate) fn run(
     plan.check_folders()?;
     let (file, states) = match begin_run(&session.store, &plan, &stop) {
         Ok(begun) => begun,
+        // A signal that ends the wait for the store isn't an error of the store.
         Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),
         Err(error) => return Err(error.into()),
     };
     let store = &session.store;
     let estimates = &Estimates::new(&plan, &states, store);
     let run = Run { plan: &plan, store, file: &file, out, estimates, stop: &stop };
-    let code = executor.carry_out(&run);
+    let result = executor.carry_out(&run);
     // If the end can't be recorded, as on a full disk, the run's age is counted from its start.
     file.end().ok();
-    code
+    result
 }
 
 /// Creates the run's file and writes the actions that the run needs, as far as known. Returns the

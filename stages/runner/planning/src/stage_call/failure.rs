@@ -1,5 +1,6 @@
 //! Causes of a stage's failure, in this order of evidence: the reason that the stage states, its
-//! memory allocator's message, the signal that ended it, and the last line on its stderr.
+//! memory allocator's message, the kernel's kill for lack of memory, the signal that ended it, and
+//! the last line on its stderr.
 
 use std::os::unix::process::ExitStatusExt as _;
 use std::path::Path;
@@ -34,7 +35,7 @@ pub(crate) struct Exit {
     pub(crate) status: ExitStatus,
     /// Reason of a failure, as the stage states it by the contract.
     pub(crate) stated_reason: Option<String>,
-    /// Last lines on stderr, less [noise](is_noise).
+    /// Last lines on stderr, without [noise](is_noise).
     pub(crate) tail: Vec<String>,
     /// True if the stage was asked to end.
     pub(crate) was_stopped: bool,

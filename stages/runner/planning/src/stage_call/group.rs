@@ -39,8 +39,7 @@ impl Group {
         // Locked until the id is listed, so that `kill_all` misses no group.
         let mut running = running();
         let mut leader = command.process_group(0).spawn()?;
-        let id = i32::try_from(leader.id()).ok().and_then(Pid::from_raw);
-        let id = id.ok_or(io::ErrorKind::InvalidInput)?;
+        let id = Pid::from_child(&leader);
         running.insert(id.as_raw_pid());
         let pipes = (leader.stdout.take(), leader.stderr.take());
         Ok((Self { id, leader: Some(leader) }, pipes))

@@ -144,7 +144,7 @@ fn read_largest_model<'a>(
     let mut notes = vec![format!("COLMAP: {photographs} from {name}")];
     if models.len() > 1 {
         notes.push(format!(
-            "using the model with most images of {}: {}",
+            "{} models; using the one with the most images ({})",
             models.len(),
             sizes.join(", ")
         ));

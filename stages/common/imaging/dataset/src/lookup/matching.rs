@@ -27,7 +27,7 @@ impl Tolerance {
 /// Extensions that a file may have instead of the listed one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Extensions {
-    /// One extension more or less, or that of a converted image.
+    /// An image extension more, one of two less, or another instead of an unsupported format's.
     Similar,
     /// Any image extension: reduced copies often have another format.
     Any,
@@ -80,7 +80,9 @@ fn matching_folders(listings: &mut Listings, path: &Path, any_case: bool) -> Vec
         return vec![path.to_path_buf()];
     }
     let mut found = vec![PathBuf::new()];
-    for part in path.iter().filter_map(|part| part.to_str()) {
+    for part in path.iter() {
+        // Listings contain only UTF-8 names.
+        let Some(part) = part.to_str() else { return Vec::new() };
         let mut below = Vec::new();
         for folder in &found {
             let names = listings.case_variants(folder, part);

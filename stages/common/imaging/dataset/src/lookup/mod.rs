@@ -64,6 +64,7 @@ pub(crate) struct LocatedFile {
 enum ClaimedFiles {
     /// Claimed files are not found by tolerance.
     Excluded,
+    /// Claimed files are also found by tolerance.
     Included,
 }
 
@@ -96,7 +97,7 @@ impl Lookup {
     pub(crate) fn in_folder(folder: &Path, names: &[&str], repeated: &[&str]) -> Self {
         let mut lookup = Self::new(folder, PathBuf::new(), names);
         lookup.is_png_implied = true;
-        lookup.choose_base(&[names, repeated].concat());
+        lookup.choose_removed_and_substitute(&[names, repeated].concat());
         lookup
     }
 
@@ -104,12 +105,12 @@ impl Lookup {
     /// found there, to the data set's folder.
     pub(crate) fn in_images(folder: &Path, names: &[&str]) -> Self {
         let mut inside = Self::new(folder, PathBuf::from(IMAGES), names);
-        inside.choose_base(names);
+        inside.choose_removed_and_substitute(names);
         if names.iter().any(|name| inside.has_file(name)) {
             return inside;
         }
         let mut outside = Self::new(folder, PathBuf::new(), names);
-        outside.choose_base(names);
+        outside.choose_removed_and_substitute(names);
         let has_images = inside.listings.is_folder(Path::new(IMAGES));
         if has_images && !names.iter().any(|name| outside.has_file(name)) {
             inside
@@ -270,6 +271,7 @@ impl Lookup {
     ) -> Vec<PathBuf> {
         let Interpretation { path, extensions, .. } = interpretation;
         let mut files = candidates(&mut self.listings, path, tolerance, *extensions);
+        // A converted copy of an unsupported file is preferred to the file itself.
         if tolerance == Tolerance::NONE && !files.is_empty() && is_unsupported_name(path) {
             let converted = Tolerance { extension: true, ..tolerance };
             let found = candidates(&mut self.listings, path, converted, *extensions);
@@ -305,14 +307,14 @@ impl Lookup {
 
     /// Chooses the number of parts to remove from absolute names and the substitute for a missing
     /// `images`, so that most names are found. Longer tails and larger copies are preferred.
-    fn choose_base(&mut self, names: &[&str]) {
+    fn choose_removed_and_substitute(&mut self, names: &[&str]) {
         let longest = names.iter().filter_map(|name| absolute_parts(name)).map(|p| p.len()).max();
         let removals: Vec<Option<usize>> = match longest {
             Some(parts) => (0..parts).map(Some).collect(),
             None => vec![None],
         };
         let substitutes = self.substitutes();
-        if removals.len() + substitutes.len() == 2 {
+        if longest.is_none() && substitutes.len() == 1 {
             return;
         }
         let mut best = (0, None, None);

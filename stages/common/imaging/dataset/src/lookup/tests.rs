@@ -35,6 +35,7 @@ fn steps_are_tried_in_order_and_combine() {
         "images/G.png",
         "images/.h.png",
         "images/i.jpg",
+        "j.png",
     ]);
     for (name, file) in [
         ("images/a.png", "images/a.png"),
@@ -52,6 +53,7 @@ fn steps_are_tried_in_order_and_combine() {
         ("images/i.heic", "images/i.jpg"),
         (r"C:\x\images\a.png", "images/a.png"),
         ("/home/y/images/A.PNG", "images/a.png"),
+        ("/j.png", "j.png"),
         ("images/g.png", "images/g.png"),
         ("images/f.png", "images/f.png"),
     ] {
