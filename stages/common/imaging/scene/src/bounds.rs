@@ -140,7 +140,7 @@ mod tests {
     }
 
     /// Rounds a vector to multiples of 1/1024, whose sums are exact.
-    fn rounded_to_1024ths(v: DVec3) -> DVec3 {
+    fn round_to_steps(v: DVec3) -> DVec3 {
         (1024.0 * v).round() / 1024.0
     }
 
@@ -153,7 +153,7 @@ mod tests {
             shift in prop::array::uniform3(-1e5..1e5f64),
             exponent in -40..40i32,
         ) {
-            let [anchor, shift] = [anchor, shift].map(|v| rounded_to_1024ths(v.into()));
+            let [anchor, shift] = [anchor, shift].map(|v| round_to_steps(v.into()));
             let scale = f64::from(exponent).exp2();
             let middle = DVec3::new(0.1234, -0.377, 0.731);
             for (bounds, scaled) in spaces(middle, 1.0).into_iter().zip(spaces(scale * middle, scale)) {
