@@ -159,8 +159,8 @@ impl Display for Borders {
             ),
             BorderEvidence::Scene => write!(
                 f,
-                "images have no alpha; borders are one flat colour in only {flat} of {views}: \
-                the photographs show the scene up to their borders, so background is opaque"
+                "images have no alpha; borders are one flat colour in {flat} of {views}: \
+                too few for a plain background, so background is opaque"
             ),
         }
     }
