@@ -57,8 +57,8 @@ fn fused_distance(
     let lattice_position = node.map(|i| i as f64);
     let point = lattice.to_world(lattice_position);
     let truncation = truncation_distance(lattice, lattice_position);
-    // Chosen by hand. Surfaces farther away are ignored, also slanted ones, near which `point_state`
-    // accepts larger differences in depth.
+    // Chosen by hand. Surfaces farther away are ignored, also slanted ones, near which
+    // `point_state` accepts larger differences in depth.
     let margin = DVec3::splat(2.0 * f64::from(truncation));
     if point.cmplt(min - margin).any() || point.cmpgt(max + margin).any() {
         // No surface is near, so one view suffices.

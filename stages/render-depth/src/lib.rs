@@ -247,8 +247,9 @@ struct ViewPixel {
 }
 
 impl ViewPixel {
-    /// Returns the mean of two pixels' colour and opacity, with the depth of `all`. The centre's ray
-    /// alone is noisier, all rays alone are blurred (docs/design/003-degradation-like-pillow.md).
+    /// Returns the mean of two pixels' colour and opacity, with the depth of `all`. The centre's
+    /// ray alone is noisier, all rays alone are blurred
+    /// (docs/design/003-degradation-like-pillow.md).
     fn blend(centre: &Self, all: &Self) -> Self {
         let mean = |a: f32, b: f32| 0.5 * (a + b);
         let [r, g, b, opacity] = [0, 1, 2, 3].map(|c| mean(centre.channels[c], all.channels[c]));

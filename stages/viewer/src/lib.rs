@@ -60,7 +60,8 @@ impl Default for Params {
     }
 }
 
-/// Maximum width in pixels of the LR photographs in the page; chosen by hand. Wider ones are shrunk.
+/// Maximum width in pixels of the LR photographs in the page; chosen by hand. Wider ones are
+/// shrunk.
 const MAX_PHOTOGRAPH_WIDTH: usize = 400;
 
 /// Remedy for short memory, as a sentence fragment.
@@ -172,8 +173,8 @@ fn bake(context: &Context, baker: &Baker<'_>) -> anyhow::Result<Volume> {
     Ok(baker.volume(&shape, &progress)?)
 }
 
-/// Returns the bounds of the page's rays. A viewer may be nearer than the cameras were. In a box and
-/// NDC, the cube ends the rays, so `far` needs no limit.
+/// Returns the bounds of the page's rays. A viewer may be nearer than the cameras were. In a box
+/// and NDC, the cube ends the rays, so `far` needs no limit.
 fn page_bounds(bounds: &Bounds) -> Bounds {
     // JSON has no infinity.
     let far = if bounds.space == Space::Contraction { bounds.far } else { 1e30 };

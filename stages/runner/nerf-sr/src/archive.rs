@@ -52,8 +52,8 @@ fn can_replace(path: &Path, old: &PageMark, kind: &str) -> bool {
 
 /// Maximum number of data sets in a folder's name; chosen by hand.
 const MAX_NAMED_DATA_SETS: usize = 3;
-/// Maximum length of a data set's name in bytes, so that three names fit into a file name; chosen by
-/// hand.
+/// Maximum length of a data set's name in bytes, so that three names fit into a file name; chosen
+/// by hand.
 const MAX_NAME_BYTES: usize = 60;
 
 /// Returns a folder name for data sets, without special characters.

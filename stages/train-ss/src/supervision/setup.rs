@@ -77,8 +77,8 @@ pub fn set_up_supervision(
 }
 
 /// Returns the kernel of the LR images. If the scene states none, only references are compared by
-/// the kernel: by Lanczos, `prep`'s default for downscaled images. Fails if parameters require a kernel
-/// or a background that the scene lacks.
+/// the kernel: by Lanczos, `prep`'s default for downscaled images. Fails if parameters require a
+/// kernel or a background that the scene lacks.
 fn kernel(scene: &GivenInput, params: &Resolved, background: Background) -> anyhow::Result<Kernel> {
     let needs_kernel = params.supervision == Supervision::Kernel;
     let degradation: Option<Degradation> = scene.read_optional_json(DEGRADATION_FILE)?;

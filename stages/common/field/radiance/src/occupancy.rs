@@ -455,8 +455,8 @@ impl Occupancy {
         (from < to).then_some([from, to])
     }
 
-    /// Returns for each cell log2 of the side, 0 to 4, of the largest empty cube around the cell, in
-    /// cells; [`OCCUPIED`] for a cell that isn't empty. `cells` has one array per axis.
+    /// Returns for each cell log2 of the side, 0 to 4, of the largest empty cube around the cell,
+    /// in cells; [`OCCUPIED`] for a cell that isn't empty. `cells` has one array per axis.
     ///
     /// All operations but the loads vectorise.
     #[inline(always)]

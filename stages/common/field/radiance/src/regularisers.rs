@@ -1,6 +1,7 @@
 //! Regularisers: losses on a ray other than the error of its colour. Each has a weight and a
 //! function that adds the loss's gradient by each sample's weight. `torch-field` computes the
-//! losses for autograd. The distortion loss is checked in f64 here, the floater loss in `reference.rs`.
+//! losses for autograd. The distortion loss is checked in f64 here, the floater loss in
+//! `reference.rs`.
 
 use crate::spec::MAX_FLOATER_COLOUR_DISTANCE;
 

@@ -29,8 +29,8 @@ struct Description {
 }
 
 impl Format {
-    /// All formats in order of recognition: next to `transforms.json` is often the COLMAP model from
-    /// which it was made.
+    /// All formats in order of recognition: next to `transforms.json` is often the COLMAP model
+    /// from which it was made.
     pub(crate) const ALL: [Self; 4] = [Self::Blender, Self::Transforms, Self::Llff, Self::Colmap];
 
     /// Returns the format's name with the file that identifies it: `COLMAP (sparse)`.

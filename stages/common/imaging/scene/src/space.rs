@@ -115,8 +115,8 @@ impl Frustum {
     }
 }
 
-/// Relative size of a rounding step, 2⁻²⁶ (docs/design/004): a quarter of the f32 spacing just below
-/// 1, and far above the rounding errors of f64, even a million scene sizes from the origin.
+/// Relative size of a rounding step, 2⁻²⁶ (docs/design/004): a quarter of the f32 spacing just
+/// below 1, and far above the rounding errors of f64, even a million scene sizes from the origin.
 const STEP: f64 = 1.0 / 67_108_864.0;
 
 /// Returns the largest power of two not above a positive number; 0 for subnormal numbers.

@@ -35,8 +35,9 @@ const ENCODER: [LayerSpec; 7] = [
     (Some(4), Some(4), 1, true),
     (Some(4), Some(4), 2, true),
 ];
-/// Three layers per size, coarsest first. The first one takes the previous size's output, the view's
-/// features, and their maximum over references: 4 + 4, 4 + 4 + 4, 2 + 2 + 2, 1 + 1 + 1 widths.
+/// Three layers per size, coarsest first. The first one takes the previous size's output, the
+/// view's features, and their maximum over references: 4 + 4, 4 + 4 + 4, 2 + 2 + 2, 1 + 1 + 1
+/// widths.
 const DECODER: [LayerSpec; 12] = [
     (Some(8), Some(4), 1, true),
     (Some(4), Some(4), 1, true),

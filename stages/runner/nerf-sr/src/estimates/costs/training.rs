@@ -8,8 +8,8 @@ use workload::{PixelStorage, RayBudget, TrainingMemory, grid_training_bytes, pro
 use super::number;
 use crate::estimates::work::{SceneKind, Work};
 
-/// Seconds per training ray late in a training, without the seconds per step. Measured on lego 100×2,
-/// fern 252×2 and the demo scene with backdrop (docs/results/engine.md).
+/// Seconds per training ray late in a training, without the seconds per step. Measured on lego
+/// 100×2, fern 252×2 and the demo scene with backdrop (docs/results/engine.md).
 const OBJECT_RAY_SECONDS: f64 = 10.8e-6;
 const FRUSTUM_RAY_SECONDS: f64 = 22e-6;
 const UNBOUNDED_RAY_SECONDS: f64 = 20e-6;
