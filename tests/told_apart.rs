@@ -125,7 +125,7 @@ fn photographs_with_a_backdrop_are_opaque_and_unbounded() {
     let folder = project.path("photographs");
     let (background, space, notes) = prepare_demo(&project, &folder, "around", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"), "{notes}");
-    assert!(notes.contains("of 12 sampled views: the photographs show the scene up to"), "{notes}");
+    assert!(notes.contains("of 12 sampled views: too few for a plain background"), "{notes}");
     let (background, space, notes) = prepare_demo(&project, &folder, "forward", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
     let (background, space, notes) = prepare_demo(&project, &folder, "around", false);
