@@ -88,8 +88,8 @@ impl StageProgram {
     fn check_code(&self, store: &Store, stop: Option<&AtomicBool>) -> Result<(), ConfirmError> {
         let path = &self.path;
         let mut descriptions = describe_all(std::slice::from_ref(path), stop)?;
-        let description = descriptions.remove(path).expect("all given programs are described")?;
-        if description.code == self.description.code {
+        let description = descriptions.remove(path).ok_or(ConfirmError::Interrupted)?;
+        if description?.code == self.description.code {
             return Ok(());
         }
         // The cache knows a wrapper script by its own file, which may be unchanged.
