@@ -144,10 +144,10 @@ PAGES ?= *
 results: SCENES = lego chair fern
 results: build held-out ## Run the experiments of docs/results (hours) and update its tables: make results PAGES=objects
 	@cat docs/results/$(PAGES).md | sed -n 's/^<!-- nerf-sr \(.*\) -->$$/\1/p' | awk '!seen[$$0]++' > out/experiments.txt
-	@while read -r words; do echo "nerf-sr $$words"; \
-	  case "$$words" in "run tradeoff"*) data=out/held-out;; *) data=$(DATA);; esac; \
-	  $(NERF_SR) $$words -j 1 --data "$$data" </dev/null || exit 1; done < out/experiments.txt
-	UPDATE=1 cargo test --release -p end-to-end --test results --quiet -- --nocapture what_was_measured
+	@while read -r arguments; do echo "nerf-sr $$arguments"; \
+	  case "$$arguments" in "run tradeoff"*) data=out/held-out;; *) data=$(DATA);; esac; \
+	  $(NERF_SR) $$arguments -j 1 --data "$$data" </dev/null || exit 1; done < out/experiments.txt
+	UPDATE=1 cargo test --release --workspace --exclude $(REMOTE) --test results --quiet -- --nocapture what_was_measured
 
 REFERENCES ?= 1
 MOST_REFERENCES = $(shell printf '%s\n' $(REFERENCES) | sort -n | tail -1)

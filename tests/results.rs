@@ -166,7 +166,15 @@ fn experiments_generate_the_documents_tables() {
     let budgets: Vec<&str> = BUDGETS.into_iter().flat_map(|budget| ["-p", budget]).collect();
     for table in &all {
         let arguments = table.arguments_without_out();
-        project.ok(&[&arguments[..], &["--data", "data", "--out", "made"], &budgets].concat());
+        // Rays that the command sets are reduced, too.
+        let rays: Vec<String> = arguments
+            .iter()
+            .filter_map(|argument| argument.split_once(".rays="))
+            .map(|(stage, _)| format!("{stage}.rays=10000"))
+            .collect();
+        let fewer_rays: Vec<&str> = rays.iter().flat_map(|rays| ["-p", rays]).collect();
+        let small = ["--data", "data", "--out", "made"];
+        project.ok(&[&arguments[..], &small, &budgets, &fewer_rays].concat());
         let text =
             std::fs::read_to_string(project.path("made").join(arguments[1]).join("table.md"))
                 .unwrap();
