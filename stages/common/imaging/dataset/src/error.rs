@@ -19,7 +19,7 @@ pub(crate) enum Problem {
     #[error("{}: no data set; {}", path_text(path), hint(finding.as_ref()))]
     Unrecognised {
         path: PathBuf,
-        /// What was found instead, with the remedy.
+        /// Other files found, with the remedy.
         finding: Option<String>,
     },
     #[error("{}: {source}", path_text(path))]

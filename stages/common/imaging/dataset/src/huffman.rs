@@ -11,8 +11,8 @@ const MAX_CODE_BITS: u32 = 16;
 pub(crate) struct Table {
     /// Code length and symbol, indexed by the next bits; length 0 for longer codes.
     lookup: Vec<(u8, u8)>,
-    /// By code length: the first 16 bits after all codes of this length, and the symbol's index
-    /// minus the code.
+    /// First 16 bits after all codes of a length, and the symbol's index minus the code; indexed by
+    /// the length.
     ends: [(u32, i32); MAX_CODE_BITS as usize + 1],
     symbols: Vec<u8>,
 }
