@@ -7,7 +7,7 @@ use pixels::Rgba8;
 use scene::Background;
 
 use crate::inspection::ViewBorder;
-use crate::strips::Strips;
+use crate::strips::{Strips, are_similar, colour, medians};
 
 /// Maximum deviation of a flat colour in 8-bit levels: JPEG noise on a uniform area. A clear sky
 /// varies more from corner to corner (docs/design/035).
@@ -45,8 +45,8 @@ impl Border {
         let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
         let columns = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
         let border: Vec<[u8; 3]> =
-            rows.chain(columns).map(|(x, y)| colour(image, y * width + x)).collect();
-        let median = median_colour(&border);
+            rows.chain(columns).map(|(x, y)| colour(image, x, y)).collect();
+        let median = medians(&border);
         let similar = border.iter().filter(|colour| is_similar(**colour, median)).count();
         if 10 * similar >= 9 * border.len() { Self::Flat(median) } else { Self::Mixed }
     }
@@ -87,7 +87,7 @@ impl Borders {
                 colours.push(*colour);
             }
         }
-        let median = median_colour(&colours);
+        let median = medians(&colours);
         let flat = colours.iter().filter(|colour| is_similar(**colour, median)).count();
         let is_flat = views > 0 && 10 * flat >= 9 * views;
         let evidence = if is_flat { BorderEvidence::Flat(median) } else { BorderEvidence::Scene };
@@ -166,21 +166,8 @@ impl Display for Borders {
     }
 }
 
-fn colour(image: &Rgba8, pixel: usize) -> [u8; 3] {
-    std::array::from_fn(|c| image.data[4 * pixel + c])
-}
-
 fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
-    (0..3).all(|c| colour[c].abs_diff(other[c]) <= MAX_BORDER_NOISE)
-}
-
-/// Returns the median of each channel; black for an empty list.
-fn median_colour(colours: &[[u8; 3]]) -> [u8; 3] {
-    std::array::from_fn(|c| {
-        let mut values: Vec<u8> = colours.iter().map(|colour| colour[c]).collect();
-        values.sort_unstable();
-        values.get(values.len() / 2).copied().unwrap_or(0)
-    })
+    are_similar(colour, other, MAX_BORDER_NOISE)
 }
 
 #[cfg(test)]

@@ -66,7 +66,7 @@ impl Strips {
     /// the number of views that have them.
     pub(crate) fn common(views: &[Option<Self>]) -> Option<(Self, usize)> {
         let found: Vec<Self> = views.iter().flatten().copied().collect();
-        let widths = median_widths(&found);
+        let widths = medians(&found.iter().map(|strips| strips.widths).collect::<Vec<_>>());
         let sides = widths.map(|width| width > 0);
         let mut same = found.iter().filter(|strips| strips.widths.map(|width| width > 0) == sides);
         let first = same.next()?;
@@ -102,11 +102,12 @@ impl Display for Strips {
     }
 }
 
-fn median_widths(strips: &[Strips]) -> [usize; 4] {
-    std::array::from_fn(|side| {
-        let mut widths: Vec<usize> = strips.iter().map(|strips| strips.widths[side]).collect();
-        widths.sort_unstable();
-        widths.get(widths.len() / 2).copied().unwrap_or(0)
+/// Returns the median of each component; zeros for an empty list.
+pub(crate) fn medians<T: Copy + Default + Ord, const N: usize>(items: &[[T; N]]) -> [T; N] {
+    std::array::from_fn(|component| {
+        let mut values: Vec<T> = items.iter().map(|item| item[component]).collect();
+        values.sort_unstable();
+        values.get(values.len() / 2).copied().unwrap_or_default()
     })
 }
 
@@ -156,18 +157,13 @@ fn is_content(pixels: &[[u8; 3]], strip: [u8; 3]) -> bool {
     !pixels.is_empty() && 100 * similar <= MAX_INSIDE_PERCENT * pixels.len()
 }
 
-fn colour(image: &Rgba8, x: usize, y: usize) -> [u8; 3] {
+pub(crate) fn colour(image: &Rgba8, x: usize, y: usize) -> [u8; 3] {
     std::array::from_fn(|c| image.data[4 * (y * image.width + x) + c])
 }
 
 /// Returns the median colour of a line if the line is flat.
 fn flat_colour(line: &[[u8; 3]]) -> Option<[u8; 3]> {
-    let mut median = [0; 3];
-    for (c, value) in median.iter_mut().enumerate() {
-        let mut values: Vec<u8> = line.iter().map(|colour| colour[c]).collect();
-        values.sort_unstable();
-        *value = *values.get(values.len() / 2)?;
-    }
+    let median = medians(line);
     is_flat(line, median).then_some(median)
 }
 
@@ -177,7 +173,12 @@ fn is_flat(line: &[[u8; 3]], colour: [u8; 3]) -> bool {
 }
 
 fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
-    (0..3).all(|c| colour[c].abs_diff(other[c]) <= MAX_STRIP_NOISE)
+    are_similar(colour, other, MAX_STRIP_NOISE)
+}
+
+/// True if no channel differs by more than `noise` 8-bit levels.
+pub(crate) fn are_similar(colour: [u8; 3], other: [u8; 3], noise: u8) -> bool {
+    (0..3).all(|c| colour[c].abs_diff(other[c]) <= noise)
 }
 
 #[cfg(test)]

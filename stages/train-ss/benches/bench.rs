@@ -317,7 +317,7 @@ impl Scene {
         let ResolvedField::Grid { architecture, regularisers, given } = &params.field else {
             anyhow::bail!("a grid is measured here");
         };
-        let training = params.grid_training(given, regularisers);
+        let training = params.grid_training(given, *regularisers);
         let mut trainer =
             Trainer::new(Field::new(*architecture, views.bounds, params.seed), training);
         let (start, mut samples) = (Instant::now(), 0);

@@ -29,7 +29,7 @@ use stage::{Context, Input, Output, Rule, Stage};
 
 pub use params::{
     Combine, Exposure, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
-    ResolvedRegularisers, SceneFacts, Supervision,
+    SceneFacts, Supervision,
 };
 use supervision::alpha_background_error;
 pub use supervision::{Supersampling, set_up_supervision};

@@ -9,7 +9,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use torch_field::MlpArchitecture;
 
-pub use resolved::{Exposure, Resolved, ResolvedField, ResolvedRegularisers};
+pub use resolved::{Exposure, Resolved, ResolvedField};
 pub use scene_facts::SceneFacts;
 
 /// Parameters of `train-ss`. [`Params::resolve`] replaces `None` with a default for the scene.
@@ -185,7 +185,7 @@ pub struct GridParams {
     #[schemars(range(min = 0.1, max = 16.0), extend("x-group" = "field"))]
     pub cells_per_pixel: f64,
     /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at 256 cells across
-    /// the finest level, plus 2 for each doubling.
+    /// the finest level, plus 2 for each doubling, but between 14 and 20.
     #[schemars(range(min = 8, max = 22), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub log2_hashmap_size: Option<u32>,
     /// Width of the MLPs' hidden layers.

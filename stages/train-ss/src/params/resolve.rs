@@ -1,11 +1,11 @@
-use radiance::{Architecture, GivenSizes};
+use radiance::{Architecture, GivenSizes, Regularisers};
 use scene::{Background, Space};
 use torch_field::MlpArchitecture;
 use workload::RayBudget;
 
 use super::{
     Combine, Exposure, FieldParams, GridParams, MlpParams, Params, Resolved, ResolvedField,
-    ResolvedRegularisers, SceneFacts, Supervision,
+    SceneFacts, Supervision,
 };
 use crate::supersample::whole_supersample;
 
@@ -119,7 +119,7 @@ impl GridParams {
         given.for_scene(scene.pixels_across, scene.is_ndc())
     }
 
-    fn regularisers(&self, scene: &SceneFacts) -> ResolvedRegularisers {
+    fn regularisers(&self, scene: &SceneFacts) -> Regularisers {
         let distortion = match (scene.background, scene.space) {
             (Background::Opaque, Space::Ndc(_)) => DISTORTION_IN_NDC,
             (Background::Opaque, Space::Contraction) => DISTORTION_IN_CONTRACTION,
@@ -129,7 +129,7 @@ impl GridParams {
             Background::White | Background::Black => FLOATER_LOSS,
             Background::Opaque | Background::Alpha => 0.0,
         };
-        ResolvedRegularisers {
+        Regularisers {
             distortion: self.distortion.unwrap_or(distortion),
             floater_loss: self.floater_loss.unwrap_or(floater_loss),
         }

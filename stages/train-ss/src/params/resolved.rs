@@ -84,7 +84,7 @@ pub enum ResolvedField {
         /// Shape of the grid and its MLPs.
         architecture: Architecture,
         /// Weights of the regularisers.
-        regularisers: ResolvedRegularisers,
+        regularisers: Regularisers,
         /// Parameters as given.
         given: GridParams,
     },
@@ -95,15 +95,6 @@ pub enum ResolvedField {
         /// Standard deviation of the noise on raw densities.
         density_noise_std: f64,
     },
-}
-
-/// Weights of a grid's regularisers with every default set.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ResolvedRegularisers {
-    /// Weight of the distortion loss.
-    pub distortion: f64,
-    /// Weight of the floater loss.
-    pub floater_loss: f64,
 }
 
 impl Resolved {
@@ -184,7 +175,7 @@ impl Resolved {
     pub fn grid_training(
         &self,
         grid: &GridParams,
-        regularisers: &ResolvedRegularisers,
+        regularisers: Regularisers,
     ) -> TrainingOptions {
         TrainingOptions {
             rays: self.rays,
@@ -195,10 +186,7 @@ impl Resolved {
             learning_rate_decay: grid.learning_rate_decay,
             warm_up: LEARNING_RATE_WARMUP_STEPS,
             ema_decay: grid.ema_decay as f32,
-            regularisers: Regularisers {
-                distortion: regularisers.distortion as f32,
-                floater_loss: regularisers.floater_loss as f32,
-            },
+            regularisers,
             roulette: ROULETTE,
             seed: self.seed,
         }

@@ -48,6 +48,7 @@ pub(crate) struct KernelOperator {
 impl KernelOperator {
     /// Creates the operator from HR to LR; sizes are (width, height).
     pub(crate) fn new(filter: Filter, hr: (usize, usize), lr: (usize, usize)) -> Self {
+        assert!(filter.support() <= HrCache::REACH as f64, "{filter:?} reaches too far");
         let operator = Resampling::new(filter, hr, lr);
         let inverse = operator.inverse(HrCache::REACH);
         Self { operator, inverse }

@@ -53,7 +53,7 @@ pub(crate) fn new_trainer(
             if let Some(cells) = cells {
                 field.limit_to(cells.to_vec());
             }
-            let options = params.grid_training(given, regularisers);
+            let options = params.grid_training(given, *regularisers);
             if device == "cpu" {
                 return Ok(Box::new(Trainer::new(field, options)));
             }

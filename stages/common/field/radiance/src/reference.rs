@@ -256,7 +256,7 @@ fn fused_passes_equal_the_plain_ones() {
     // The loss is Σ g·C with random g, so that its gradient with respect to the colours is g, plus
     // the floater loss. The floater loss has no gradient with respect to sample colours and
     // transmittance: likenesses are computed once and stay constant.
-    let regularisers = Regularisers { floater_loss: 0.3, ..Regularisers::default() };
+    let regularisers = Regularisers { distortion: 0.0, floater_loss: 0.3 };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {
             let (shaded, through) = judge.shaded(&rays[i], &samples[i]);
@@ -281,7 +281,7 @@ fn fused_passes_equal_the_plain_ones() {
                 .sum();
             let colour = judge.ray_colour(&rays[i], &samples[i]);
             colour.iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum::<f64>()
-                + f64::from(regularisers.floater_loss) * floaters
+                + regularisers.floater_loss * floaters
         };
         (0..rays.len()).map(dot).sum()
     };

@@ -10,10 +10,10 @@ use crate::spec::MAX_FLOATER_COLOUR_DISTANCE;
 pub struct Regularisers {
     /// Weight of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), a mean over rays
     /// (docs/design/012).
-    pub distortion: f32,
+    pub distortion: f64,
     /// Weight of the floater loss on opacity of the background's colour, a mean over rays
     /// (docs/design/013).
-    pub floater_loss: f32,
+    pub floater_loss: f64,
 }
 
 /// One ray's samples from front to back, its transmittance and its background.
@@ -36,9 +36,10 @@ pub(crate) struct ShadedRay<'a> {
 impl Regularisers {
     /// Returns the weights for one ray, if each bundle of `bundle` rays has weight `scale`.
     pub(crate) fn per_ray(&self, scale: f32, bundle: usize) -> Self {
+        let per_ray = |weight: f64| f64::from(weight as f32 * scale / bundle as f32);
         Self {
-            distortion: self.distortion * scale / bundle as f32,
-            floater_loss: self.floater_loss * scale / bundle as f32,
+            distortion: per_ray(self.distortion),
+            floater_loss: per_ray(self.floater_loss),
         }
     }
 
@@ -46,12 +47,12 @@ impl Regularisers {
     #[inline]
     pub(crate) fn add_gradients(&self, ray: &ShadedRay<'_>, by_weight: &mut [f32]) {
         let Self { distortion, floater_loss } = *self;
-        let floater = floater_loss * ray.transmittance;
+        let floater = floater_loss as f32 * ray.transmittance;
         if floater > 0.0 {
             add_floater_gradients(ray, floater, by_weight);
         }
         if distortion > 0.0 {
-            add_distortion_gradients(ray, distortion, by_weight);
+            add_distortion_gradients(ray, distortion as f32, by_weight);
         }
     }
 }
@@ -136,7 +137,8 @@ mod tests {
                 background: [0.0; 3],
             };
             let mut by_weight = vec![0.0; t.len()];
-            let regularisers = Regularisers { distortion: factor, ..Regularisers::default() };
+            let distortion = f64::from(factor);
+            let regularisers = Regularisers { distortion, ..Regularisers::default() };
             regularisers.add_gradients(&ray, &mut by_weight);
             // Distances are differences of f32 depths: their error is a few parts in 10^7 of the
             // depth.

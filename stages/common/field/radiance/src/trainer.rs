@@ -480,7 +480,7 @@ mod tests {
     }
 
     /// Returns the trained field and its mean opacity.
-    fn trained(field: Field, background: f32, floater_loss: f32, steps: u64) -> (Field, f32) {
+    fn trained(field: Field, background: f32, floater_loss: f64, steps: u64) -> (Field, f32) {
         let regularisers = Regularisers { floater_loss, ..Regularisers::default() };
         let options = TrainingOptions { regularisers, ..options(steps) };
         let (mut trainer, mut white) = (Trainer::new(field, options), White { background });

@@ -18,12 +18,12 @@ pub(crate) fn add_regularisers(
     let Regularisers { distortion, floater_loss } = *regularisers;
     if distortion > 0.0 {
         let loss = distortion_sum(forward, march_step)?;
-        let weight = f64::from(distortion) / rays as f64;
+        let weight = distortion / rays as f64;
         surrogate = surrogate.f_add(&loss.f_mul_scalar(weight)?)?;
     }
     if floater_loss > 0.0 {
         let loss = floater_sum(forward, backgrounds)?;
-        let weight = f64::from(floater_loss) / rays as f64;
+        let weight = floater_loss / rays as f64;
         surrogate = surrogate.f_add(&loss.f_mul_scalar(weight)?)?;
     }
     Ok(surrogate)

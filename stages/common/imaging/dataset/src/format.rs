@@ -25,7 +25,11 @@ struct Description {
     /// File that identifies the format, with the format's name, for the message about a folder
     /// without a data set.
     sign: &'static str,
+    /// File that identifies the format by itself, if any.
+    file: Option<&'static str>,
     is_benchmark: bool,
+    /// True if images that name no mask may have one in the folder `masks`.
+    has_masks_folder: bool,
 }
 
 impl Format {
@@ -43,31 +47,49 @@ impl Format {
         self.description().is_benchmark
     }
 
+    /// Returns the file that identifies the format by itself, if any.
+    pub(crate) fn file(self) -> Option<&'static str> {
+        self.description().file
+    }
+
+    /// True if images that name no mask may have one in the folder `masks`.
+    pub(crate) fn has_masks_folder(self) -> bool {
+        self.description().has_masks_folder
+    }
+
     fn description(self) -> Description {
         match self {
             Self::Blender => Description {
                 name: "blender",
                 title: "Blender (transforms_train.json)",
                 sign: "transforms_train.json (Blender)",
+                file: Some("transforms_train.json"),
                 is_benchmark: true,
+                has_masks_folder: false,
             },
             Self::Transforms => Description {
                 name: "transforms",
                 title: "transforms.json (instant-ngp, nerfstudio)",
                 sign: "transforms.json (instant-ngp, nerfstudio)",
+                file: Some("transforms.json"),
                 is_benchmark: false,
+                has_masks_folder: false,
             },
             Self::Llff => Description {
                 name: "llff",
                 title: "LLFF (poses_bounds.npy)",
                 sign: "poses_bounds.npy (LLFF)",
+                file: Some("poses_bounds.npy"),
                 is_benchmark: true,
+                has_masks_folder: true,
             },
             Self::Colmap => Description {
                 name: "colmap",
                 title: "COLMAP (sparse)",
                 sign: "sparse/0 (COLMAP)",
+                file: None,
                 is_benchmark: false,
+                has_masks_folder: true,
             },
         }
     }

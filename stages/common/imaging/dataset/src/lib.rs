@@ -98,11 +98,9 @@ fn find_format(folder: &Path) -> Result<Option<Format>, DatasetError> {
 
 /// Returns whether a folder has a format.
 fn has_format(format: Format, folder: &Path) -> Result<bool, DatasetError> {
-    match format {
-        Format::Blender => is_file(&folder.join("transforms_train.json")),
-        Format::Transforms => is_file(&folder.join("transforms.json")),
-        Format::Llff => is_file(&folder.join("poses_bounds.npy")),
-        Format::Colmap => Ok(!colmap::find_models(folder)?.is_empty()),
+    match format.file() {
+        Some(file) => is_file(&folder.join(file)),
+        None => Ok(!colmap::find_models(folder)?.is_empty()),
     }
 }
 

@@ -8,7 +8,6 @@ use artifact::{WARNING, format_count};
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::file_status::path_text;
-use crate::format::Format;
 use crate::frame::{Frame, Turn};
 use crate::lookup::{Listings, LookupError};
 use crate::photograph::{IMAGE_EXTENSIONS, has_aspect_of, read_header};
@@ -62,7 +61,7 @@ const DYNAMIC_PREFIX: &str = "dynamic_mask_";
 /// Finds the masks of frames that don't name one, and adds notes on all masks.
 pub(crate) fn add_masks(folder: &Path, set: &mut Dataset) -> Result<(), DatasetError> {
     let mut listings = Listings::new(folder);
-    let may_have_masks_folder = matches!(set.format, Format::Llff | Format::Colmap);
+    let may_have_masks_folder = set.format.has_masks_folder();
     for frame in set.frames.iter_mut().filter(|frame| frame.mask.is_none()) {
         let Ok(image) = frame.image.strip_prefix(folder) else { continue };
         let found = find_mask(&mut listings, image, may_have_masks_folder);

@@ -13,8 +13,6 @@ use crate::format::Format;
 const MAX_FOLDERS: usize = 1000;
 /// Maximum number of data sets that a message lists.
 const MAX_LISTED: usize = 3;
-/// Files that identify a format.
-const SIGNS: [&str; 3] = ["transforms_train.json", "transforms.json", "poses_bounds.npy"];
 /// Files of the Blender format that don't identify it.
 const PARTS: [&str; 2] = ["transforms_test.json", "transforms_val.json"];
 
@@ -141,7 +139,7 @@ fn find_misnamed(folder: &Path) -> Option<String> {
         let meant = if path.is_dir() {
             nearest(name, ["sparse"]).filter(|_| has_model(path))
         } else {
-            nearest(name, SIGNS)
+            nearest(name, Format::ALL.into_iter().filter_map(Format::file))
         };
         if let Some(meant) = meant {
             return Some(format!("found {name}; did you mean {meant}?"));

@@ -64,12 +64,10 @@ fn warning(format: Format, folder: &Path, files: &[PathBuf]) -> Option<String> {
     let count = format_count(files.len(), "unused file");
     let look_like = if files.len() == 1 { "looks like a mask" } else { "look like masks" };
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-    let remedy = match format {
-        Format::Blender | Format::Transforms => "list masks as mask_path of their frames",
-        Format::Llff | Format::Colmap => {
-            "the mask of a photograph NAME.EXT must be called masks/NAME.png or \
-            masks/NAME.EXT.png"
-        }
+    let remedy = if format.has_masks_folder() {
+        "the mask of a photograph NAME.EXT must be called masks/NAME.png or masks/NAME.EXT.png"
+    } else {
+        "list masks as mask_path of their frames"
     };
     Some(format!(
         "{WARNING}{count} in {} {look_like} (first: {}); {remedy}",

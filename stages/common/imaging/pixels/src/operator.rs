@@ -244,7 +244,7 @@ mod tests {
     /// necessary. A flat residual changes all inputs equally.
     #[test]
     fn inverse_undoes_the_map() {
-        for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
+        for filter in Filter::ALL {
             for (hr, lr) in
                 [(80, 40), (100, 25), (60, 40), (54, 20), (40, 40), (3, 2), (2, 1), (1, 1)]
             {
@@ -276,7 +276,7 @@ mod tests {
         #[test]
         fn adjoint_is_the_transpose(
             (w, h) in (1usize..40, 1usize..40), (v, u) in (1usize..40, 1usize..40), seed: u64,
-            filter in prop::sample::select(vec![Filter::Box, Filter::Bicubic, Filter::Lanczos]),
+            filter in prop::sample::select(Filter::ALL.to_vec()),
         ) {
             let operator = Resampling::new(filter, (w, h), (v, u));
             let (x, y) = (image(w, h, seed), image(v, u, !seed));
@@ -290,7 +290,7 @@ mod tests {
     /// The operator agrees with Pillow, which makes the LR images, except for Pillow's rounding.
     #[test]
     fn operator_agrees_with_pillow() {
-        for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
+        for filter in Filter::ALL {
             for (width, height) in [(20, 15), (27, 11), (13, 30), (40, 45)] {
                 let mut image = image(40, 30, 7).to_rgba8();
                 // Away from black and white nothing is clipped.

@@ -21,7 +21,12 @@ pub enum Filter {
 }
 
 impl Filter {
-    fn support(self) -> f64 {
+    /// All filters.
+    pub const ALL: [Self; 3] = [Self::Box, Self::Bicubic, Self::Lanczos];
+
+    /// Maximum distance from an output pixel's centre to an input pixel that counts, in pixels of
+    /// the smaller image.
+    pub fn support(self) -> f64 {
         match self {
             Self::Box => 0.5,
             Self::Bicubic => 2.0,

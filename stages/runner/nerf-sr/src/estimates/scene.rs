@@ -4,7 +4,7 @@ use std::path::Path;
 
 use artifact::format_count;
 use dataset::{Dataset, Format, Frame, Split};
-use pixels::DEGRADATION_FILE;
+use pixels::{DEGRADATION_FILE, Filter, Kernel};
 use scene::VIEWS_FILE;
 use serde_json::Value;
 use workload::preparation_bytes;
@@ -246,7 +246,8 @@ fn planned_widths_across(kind: SceneKind, space: Option<&str>) -> f64 {
 
 /// Returns whether a kernel is a mean, or `by_default` if no kernel is given.
 fn is_mean_kernel(kernel: &Value, by_default: bool) -> bool {
-    kernel.as_str().map_or(by_default, |kernel| kernel != "lanczos" && kernel != "bicubic")
+    let kernel = serde_json::from_value::<Kernel>(kernel.clone());
+    kernel.map_or(by_default, |kernel| kernel.filter() == Filter::Box)
 }
 
 fn size_of(frame: &Frame) -> (f64, f64) {

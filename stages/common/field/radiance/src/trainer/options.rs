@@ -108,8 +108,8 @@ pub trait Supervisor: Sync {
     /// Casts the rays of a bundle. `bundle` counts from 0 over the whole training; random numbers
     /// may depend on nothing but `bundle`.
     fn sample_rays(&self, bundle: u64, rays: &mut [Ray]);
-    /// Returns the bundle's loss, given its rays' colours, and writes the gradient with respect to
-    /// each colour.
+    /// Returns the bundle's mean squared error, given its rays' colours, and writes the gradient of
+    /// the loss with respect to each colour. The training's PSNR is that of the error.
     fn loss_and_gradient(
         &self,
         bundle: u64,
