@@ -43,9 +43,18 @@ impl Supersampling {
             assembly.add_reference(&view.camera, reference)?;
         }
         let Assembly {
-            supersample, views, view_pixels, index_count, detailed, cache, memory, ..
+            supersample,
+            views,
+            view_pixels,
+            index_count,
+            unmasked_count,
+            detailed,
+            cache,
+            memory,
+            ..
         } = assembly;
-        let importance = Importance::new(params.pixel_importance, index_count, detailed);
+        let counts = (index_count, unmasked_count);
+        let importance = Importance::new(params.pixel_importance, counts, detailed);
         let order = (params.in_epochs, params.precrop_bundles());
         Ok(Self {
             sampler: PixelSampler::new(view_pixels, index_count, importance, order, params.seed),
@@ -79,6 +88,8 @@ struct Assembly<'a> {
     view_pixels: Vec<ViewPixels>,
     /// Total number of pixel indices.
     index_count: u64,
+    /// Number of indices of unmasked pixels, counted for importance sampling only.
+    unmasked_count: u64,
     /// Indices of pixels with detail.
     detailed: PixelSet,
     cache: Option<HrCache>,
@@ -104,6 +115,7 @@ impl<'a> Assembly<'a> {
             views: Vec::new(),
             view_pixels: Vec::new(),
             index_count: 0,
+            unmasked_count: 0,
             detailed: PixelSet::default(),
             cache: options.needs_cache(lr_sizes).then(|| HrCache::new(supersample)),
             kernels: BTreeMap::new(),
@@ -145,7 +157,9 @@ impl<'a> Assembly<'a> {
         if self.options.params.pixel_importance > 1.0 {
             let mut detailed = detailed_pixels(unmasked);
             for (pixel, is_detailed) in detailed.iter_mut().enumerate() {
-                *is_detailed &= image.is_valid(pixel);
+                let is_valid = image.is_valid(pixel);
+                *is_detailed &= is_valid;
+                self.unmasked_count += draws * u64::from(is_valid);
             }
             for _ in 0..draws {
                 self.detailed.extend(detailed.iter().copied());

@@ -214,9 +214,9 @@ struct RenderedPixels {
 /// Pixel whose bundle was rendered.
 struct RenderedPixel {
     position: LrPixel,
-    /// Photographed colour; NaN in clipped channels.
+    /// Photographed colour without the background; NaN in clipped channels.
     photographed: [f32; 3],
-    /// Mean colour of the rays.
+    /// Mean colour of the rays without the background that the photograph shows.
     rendered: [f32; 3],
     /// True if the levels belong in the cache.
     is_cached: bool,
@@ -228,12 +228,15 @@ impl Supersampling {
         let pixels = bundles.bundles(rays).map(|(bundle, colours)| {
             let (view, pixel) = self.drawn_pixel(bundle);
             let sample = self.views[view].image.pixel(pixel);
+            let background = self.ray_background(bundle);
+            let behind = background.map(|background| (1.0 - sample[3]) * background);
+            let is_clipped = |c: usize| may_be_clipped(sample[c] + behind[c]);
             RenderedPixel {
                 position: self.position(view, pixel),
-                photographed: [0, 1, 2]
-                    .map(|c| if may_be_clipped(sample[c]) { f32::NAN } else { sample[c] }),
+                photographed: [0, 1, 2].map(|c| if is_clipped(c) { f32::NAN } else { sample[c] }),
                 rendered: [0, 1, 2].map(|c| {
-                    colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
+                    let sum = colours.iter().map(|colour| colour[c]).sum::<f32>();
+                    sum / colours.len() as f32 - behind[c]
                 }),
                 is_cached: matches!(self.comparison(view), Comparison::Kernel(_)),
             }

@@ -117,7 +117,7 @@ pub(crate) struct Importance {
     /// Indices of the pixels with detail.
     detailed: PixelSet,
     /// Fraction of the draws that are uniform over all pixels; the others are uniform over detailed
-    /// pixels.
+    /// pixels, which are unmasked.
     uniform_share: f32,
     flat_weight: f32,
     detailed_weight: f32,
@@ -125,15 +125,23 @@ pub(crate) struct Importance {
 
 impl Importance {
     /// Creates a sampler that draws detailed pixels `ratio` times as often as flat ones.
-    pub(crate) fn new(ratio: f64, index_count: u64, detailed: PixelSet) -> Self {
-        let detailed_share = detailed.len() as f64 / index_count.max(1) as f64;
+    /// `unmasked_count` of the `index_count` indices are of unmasked pixels.
+    pub(crate) fn new(
+        ratio: f64,
+        (index_count, unmasked_count): (u64, u64),
+        detailed: PixelSet,
+    ) -> Self {
+        let detailed_share = detailed.len() as f64 / unmasked_count.max(1) as f64;
         if ratio <= 1.0 || detailed_share <= 0.0 {
             return Self { detailed, uniform_share: 1.0, flat_weight: 1.0, detailed_weight: 1.0 };
         }
         let uniform_share = 1.0 / (ratio - 1.0).mul_add(detailed_share, 1.0);
+        // Uniform draws of masked pixels are repeated, so there must be more of them.
+        let masked_share = 1.0 - unmasked_count as f64 / index_count as f64;
+        let drawn_share = uniform_share / (1.0 - masked_share * (1.0 - uniform_share));
         Self {
             detailed,
-            uniform_share: uniform_share as f32,
+            uniform_share: drawn_share as f32,
             flat_weight: (1.0 / uniform_share) as f32,
             detailed_weight: (1.0 / (uniform_share * ratio)) as f32,
         }
@@ -237,7 +245,8 @@ mod tests {
         let is_near_dot =
             |pixel: usize| (2..5).contains(&(pixel / 20)) && (3..6).contains(&(pixel % 20));
         assert!(detailed_pixels(&flat).into_iter().eq((0..200).map(is_near_dot)));
-        let importance = Importance::new(7.0, 200, detailed_pixels(&flat).into_iter().collect());
+        let detailed = detailed_pixels(&flat).into_iter().collect();
+        let importance = Importance::new(7.0, (200, 200), detailed);
         let (mut counts, draws) = ([0u32; 200], 400_000);
         (0..draws).for_each(|k| {
             counts[importance.draw(200, &mut CounterRng::new(1, 2, k)) as usize] += 1;
@@ -251,10 +260,30 @@ mod tests {
         let ratio = f64::from(dot) / (f64::from(elsewhere) / 80.0);
         assert!((ratio - 7.0).abs() < 0.6, "{ratio}");
         let one_pixel = [false, false, false, true].into_iter().collect();
-        for uniform in
-            [Importance::new(1.0, 200, one_pixel), Importance::new(5.0, 200, PixelSet::default())]
+        let no_pixel = PixelSet::default();
+        for uniform in [(1.0, one_pixel), (5.0, no_pixel)]
+            .map(|(ratio, detailed)| Importance::new(ratio, (200, 200), detailed))
         {
             assert!(uniform.weight(3) == 1.0 && uniform.uniform_share == 1.0);
+        }
+    }
+
+    /// Masked pixels are never drawn, and the mean weight of the others is 1.
+    #[test]
+    fn importance_sampling_under_a_mask_keeps_the_expectation() {
+        let view = ViewPixels { width: 8, height: 8, start: 0 };
+        let detailed = (0..64).map(|pixel| pixel % 8 == 1).collect();
+        let importance = Importance::new(10.0, (64, 32), detailed);
+        let sampler = PixelSampler::new(vec![view], 64, importance, (false, 0), 3);
+        let (mut counts, draws) = ([0u32; 64], 400_000);
+        for bundle in 0..draws {
+            counts[sampler.draw(bundle, |_, pixel| pixel % 8 < 4).1] += 1;
+        }
+        for (pixel, &count) in counts.iter().enumerate() {
+            let weight = f64::from(sampler.weight(0, (0, pixel)));
+            let mean = f64::from(count) * 32.0 / draws as f64 * weight;
+            let expected = if pixel % 8 < 4 { 1.0 } else { 0.0 };
+            assert!((mean - expected).abs() < 0.12, "{pixel}: {mean}");
         }
     }
 
@@ -262,7 +291,7 @@ mod tests {
     #[test]
     fn precrop_draws_unmasked_pixels_of_the_middle() {
         let view = ViewPixels { width: 8, height: 8, start: 0 };
-        let importance = Importance::new(1.0, 64, PixelSet::default());
+        let importance = Importance::new(1.0, (64, 64), PixelSet::default());
         let sampler = PixelSampler::new(vec![view], 64, importance, (true, 1000), 3);
         for bundle in 0..1000 {
             let (_, pixel) = sampler.draw(bundle, |_, pixel| pixel % 8 < 4);

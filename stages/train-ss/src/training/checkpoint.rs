@@ -120,7 +120,8 @@ impl Checkpoints {
     }
 }
 
-/// Writes a checkpoint and removes the previous one.
+/// Writes a checkpoint and removes the previous one. Each file appears complete, since a run that
+/// stops before its first step writes the files of the checkpoint from which it resumed.
 fn write(
     folder: &Path,
     trainer: &dyn FieldTrainer,
@@ -130,10 +131,11 @@ fn write(
     let partial = folder.join("checkpoint.partial");
     let step = trainer.steps();
     let files = [curve_name(step), state_name(step)];
-    artifact::write_json(&folder.join(&files[0]), curve)?;
-    supervision.state.write(&mut std::fs::File::create(folder.join(&files[1]))?)?;
+    artifact::write_json_atomically(&folder.join(&files[0]), curve)?;
+    supervision.state.write(&mut std::fs::File::create(&partial)?)?;
+    publish(&partial, &folder.join(&files[1]))?;
     trainer.write_checkpoint(&partial)?;
-    std::fs::rename(&partial, folder.join(CHECKPOINT))?;
+    publish(&partial, &folder.join(CHECKPOINT))?;
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;
         let file = entry.file_name().to_string_lossy().into_owned();
@@ -142,6 +144,12 @@ fn write(
         }
     }
     Ok(())
+}
+
+/// Renames a complete file after its bytes are on the disk.
+fn publish(partial: &Path, path: &Path) -> std::io::Result<()> {
+    std::fs::File::open(partial)?.sync_all()?;
+    std::fs::rename(partial, path)
 }
 
 /// Restores a trainer from the latest checkpoint below a work folder and returns its curve; `None`

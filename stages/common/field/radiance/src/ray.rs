@@ -57,7 +57,8 @@ pub struct NormalizedRay {
 pub enum RayMap {
     /// Box or NDC: position origin + t·direction, distance start + t·scale / (1 - t·perspective). A
     /// perspective map keeps lines straight; along a line it is a Möbius map. In a box
-    /// `perspective` is 0.
+    /// `perspective` is 0. The divisor is computed as end + (leave - t)·perspective: a far end at a
+    /// million near depths would cancel it.
     Straight {
         /// Distance at t = 0, in scene units.
         start: f32,
@@ -65,6 +66,8 @@ pub enum RayMap {
         scale: f32,
         /// Inverse of the t at which the distance becomes infinite; 0 in a box.
         perspective: f32,
+        /// Divisor at the parameter at which the ray leaves the cube; 1 in a box.
+        end: f32,
     },
     /// Contraction: `origin` is the ray's point nearest to the centre, in ball radii. The point at
     /// t is `radii`·sinh(4t) from `origin`, so steps grow as fast as the contraction shrinks them.
@@ -81,7 +84,7 @@ pub enum RayMap {
 
 impl Default for RayMap {
     fn default() -> Self {
-        Self::Straight { start: 0.0, scale: 1.0, perspective: 0.0 }
+        Self::Straight { start: 0.0, scale: 1.0, perspective: 0.0, end: 1.0 }
     }
 }
 
@@ -173,8 +176,8 @@ impl NormalizedRay {
     #[inline(always)]
     pub fn distance(&self, t: f32) -> f32 {
         match self.map {
-            RayMap::Straight { start, scale, perspective } => {
-                t * scale / perspective.mul_add(-t, 1.0) + start
+            RayMap::Straight { start, scale, perspective, end } => {
+                t * scale / perspective.mul_add(self.leave - t, end) + start
             }
             RayMap::Contracted { start, scale, .. } => scale.mul_add(sinh4(t), start),
         }
@@ -227,6 +230,7 @@ fn clip_to_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<Norma
             start: (start * side) as f32,
             scale: side as f32,
             perspective: 0.0,
+            end: 1.0,
         },
         view: [0.0; 3],
     })
@@ -268,6 +272,7 @@ fn clip_to_frustum(
             start: enter as f32,
             scale: (from.z / c) as f32,
             perspective: (d.z / c) as f32,
+            end: (from.z / to.z) as f32,
         },
         view: [0.0; 3],
     })
@@ -453,6 +458,30 @@ mod tests {
                 }
             }
             assert!(hits[0] > 100 && hits[1] == 200, "{hits:?}");
+        }
+    }
+
+    /// Distances in NDC grow up to the far plane, however far it is.
+    #[test]
+    fn distances_reach_any_far_plane() {
+        let camera_to_world = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]];
+        for far in [1e1, 1e5, 1e7, 1e9, 1e18] {
+            let frustum =
+                Frustum { camera_to_world, min: [-0.6; 2], max: [0.6; 2], near: 1.0, far };
+            let space = Space::Ndc(frustum);
+            let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far, space };
+            for slope in [-0.2, 0.0, 0.1] {
+                let direction = unit([slope, 0.5 * slope, -1.0]);
+                let clipped = clip(&bounds, &ray([0.0; 3], direction.to_array()));
+                let end = f64::from(clipped.distance(clipped.leave)) * -direction.z;
+                assert!((end / far - 1.0).abs() < 1e-5, "{end} at far = {far}");
+                let mut previous = 0.0;
+                for j in 0..=1000 {
+                    let distance = clipped.distance(clipped.leave * j as f32 / 1000.0);
+                    assert!(distance > previous, "{distance} after {previous}, far = {far}");
+                    previous = distance;
+                }
+            }
         }
     }
 

@@ -13,9 +13,9 @@ pub(crate) struct RayTensors {
     /// Parameters t at which rays enter and leave the cube (n × 1 each), equal if they miss it.
     pub(crate) enter: Tensor,
     pub(crate) leave: Tensor,
-    /// Coefficients of the map from t to distance (n × 1 each): start, scale, and perspective or,
-    /// in a contraction, radii, which positions need, too.
-    distance: [Tensor; 3],
+    /// Coefficients of the map from t to distance (n × 1 each): start, scale, then perspective and
+    /// end or, in a contraction, radii, which positions need, too, and 0.
+    distance: [Tensor; 4],
     is_contracted: bool,
 }
 
@@ -33,6 +33,7 @@ impl RayTensors {
                 columns(&rays, device, |r| [distance_map(r)[0]])?,
                 columns(&rays, device, |r| [distance_map(r)[1]])?,
                 columns(&rays, device, |r| [distance_map(r)[2]])?,
+                columns(&rays, device, |r| [distance_map(r)[3]])?,
             ],
             is_contracted: bounds.space == Space::Contraction,
         })
@@ -58,11 +59,12 @@ impl RayTensors {
 
     /// Returns distances in scene units at t (n × m).
     pub(crate) fn distances(&self, t: &Tensor) -> Result<Tensor, TchError> {
-        let [start, scale, perspective] = &self.distance;
+        let [start, scale, perspective, end] = &self.distance;
         if self.is_contracted {
             return sinh4(t)?.f_mul(scale)?.f_add(start);
         }
-        t.f_mul(scale)?.f_div(&t.f_mul(perspective)?.f_neg()?.f_add_scalar(1.0)?)?.f_add(start)
+        let divisor = self.leave.f_sub(t)?.f_mul(perspective)?.f_add(end)?;
+        t.f_mul(scale)?.f_div(&divisor)?.f_add(start)
     }
 
     /// Returns whether each ray hits the cube: n.
@@ -86,11 +88,11 @@ pub(crate) fn multiply_add(a: &Tensor, b: &Tensor, c: &Tensor) -> Result<Tensor,
         .f_to_kind(Kind::Float)
 }
 
-/// Returns the coefficients of a ray's map from t to distance: start, scale, perspective or radii.
-fn distance_map(ray: &NormalizedRay) -> [f32; 3] {
+/// Returns the coefficients of a ray's map from t to distance, as in [`RayTensors::distance`].
+fn distance_map(ray: &NormalizedRay) -> [f32; 4] {
     match ray.map {
-        RayMap::Straight { start, scale, perspective } => [start, scale, perspective],
-        RayMap::Contracted { start, scale, radii } => [start, scale, radii],
+        RayMap::Straight { start, scale, perspective, end } => [start, scale, perspective, end],
+        RayMap::Contracted { start, scale, radii } => [start, scale, radii, 0.0],
     }
 }
 

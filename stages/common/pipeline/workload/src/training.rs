@@ -35,9 +35,8 @@ const COPIED_NUMBERS_PER_PARAMETER: u64 = 3;
 const BYTES_PER_RGBA_PIXEL: u64 = 16;
 /// Bytes per RGB pixel of a photograph in floats.
 const BYTES_PER_RGB_PIXEL: u64 = 12;
-/// Bytes per pixel of a photograph's pyramid (RGB floats, 1 + 1/4 + 1/16 + …) and of the photograph
-/// for the final comparison of poses.
-const BYTES_PER_PYRAMID_PIXEL: u64 = 16 + BYTES_PER_RGB_PIXEL;
+/// Maximum bytes of a photograph's pyramid: four levels of 4096 informative pixels.
+const PYRAMID_BYTES: u64 = 1 << 20;
 
 impl TrainingMemory {
     /// Maximum bytes of pixels in memory, so that a stage with many photographs leaves memory to
@@ -70,7 +69,8 @@ impl TrainingMemory {
         let reading = (BYTES_PER_RGBA_PIXEL + BYTES_PER_RGB_PIXEL) * count + enlarging_bytes;
         self.reading = self.reading.max(reading);
         if storage.refines_poses {
-            self.pose_images += BYTES_PER_PYRAMID_PIXEL * count;
+            // The final comparison of poses has photographs in floats.
+            self.pose_images += PYRAMID_BYTES + BYTES_PER_RGB_PIXEL * count;
         }
     }
 
@@ -113,7 +113,7 @@ mod tests {
                 for count in 1..=10 {
                     memory.add_photograph(storage, (2000, 1500), (4000, 3000));
                     assert_eq!(memory.pixels, count * (3_000_000 * bytes + 750_000));
-                    let poses = if refines_poses { 3_000_000 * BYTES_PER_PYRAMID_PIXEL } else { 0 };
+                    let poses = if refines_poses { 12 * 3_000_000 + PYRAMID_BYTES } else { 0 };
                     assert_eq!(memory.pose_images, count * poses);
                 }
                 let reading = memory.reading;
