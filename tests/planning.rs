@@ -351,6 +351,7 @@ fn a_quality_has_the_key_of_its_parameters() {
     project.ok(&["run", "-p", "quality=fast"]);
     let parameters = [
         "rays_per_pixel=4",
+        "opaque_ray_factor=0.4",
         "pixel_importance=20",
         "cells_per_pixel=1.6",
         "supersample_warmup=0.4",

@@ -131,11 +131,14 @@ impl Default for FieldParams {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GridParams {
-    /// Rays for each LR pixel of all views, unless `rays` is given. The value is multiplied by 0.6
-    /// with `background: opaque`, where each ray hits a surface and costs more. Fine-tuning (input
-    /// `init`) halves the resulting number of rays, even below `min_rays`.
+    /// Rays for each LR pixel of all views, unless `rays` is given. Fine-tuning (input `init`)
+    /// halves the resulting number of rays, even below `min_rays`.
     #[schemars(range(min = 0.001, max = 100_000.0), extend("x-group" = "sampling"))]
     pub rays_per_pixel: f64,
+    /// Factor of `rays_per_pixel` with `background: opaque`, where each ray hits a surface and
+    /// costs more, most of all while the scene is still hazy.
+    #[schemars(range(min = 0.01, max = 1.0), extend("x-group" = "sampling"))]
+    pub opaque_ray_factor: f64,
     /// Minimum of the rays that follow from `rays_per_pixel`.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
     pub min_rays: u64,
@@ -198,6 +201,8 @@ impl Default for GridParams {
         let grid = Architecture::default();
         Self {
             rays_per_pixel: 32.0,
+            // The protocols 252x2 and 100x2 (`experiments/common.yaml`) have about this ratio.
+            opaque_ray_factor: 0.6,
             min_rays: 8_000_000,
             max_rays: 80_000_000,
             samples_per_step: 24_576,

@@ -93,6 +93,7 @@ impl GridParams {
         let budget = RayBudget {
             rays,
             rays_per_pixel: self.rays_per_pixel,
+            opaque_ray_factor: self.opaque_ray_factor,
             min_rays: self.min_rays,
             max_rays: self.max_rays,
         };

@@ -1,8 +1,5 @@
 use serde::Deserialize;
 
-/// Rays per LR pixel of an opaque scene, whose rays all hit a surface, over those of other scenes.
-/// The protocols 252x2 and 100x2 (`experiments/common.yaml`) have about this ratio.
-const OPAQUE_RAY_FACTOR: f64 = 0.6;
 /// Rays of a fine-tuning over those of the initial field, as in the protocols with an LR width
 /// (`experiments/common.yaml`).
 const FINE_TUNING_RAY_FACTOR: f64 = 0.5;
@@ -15,6 +12,8 @@ pub struct RayBudget {
     pub rays: Option<u64>,
     /// Rays for each LR pixel of all views.
     pub rays_per_pixel: f64,
+    /// Rays per LR pixel of an opaque scene over those of other scenes.
+    pub opaque_ray_factor: f64,
     /// Minimum number of rays, which a fine-tuning halves.
     pub min_rays: u64,
     /// Maximum number of rays; overrides a larger minimum. A fine-tuning halves it.
@@ -25,8 +24,13 @@ impl RayBudget {
     /// Returns the number of rays of a training on views with `lr_pixels` in all.
     ///
     /// ```
-    /// let budget =
-    ///     workload::RayBudget { rays: None, rays_per_pixel: 10.0, min_rays: 50, max_rays: 900 };
+    /// let budget = workload::RayBudget {
+    ///     rays: None,
+    ///     rays_per_pixel: 10.0,
+    ///     opaque_ray_factor: 0.6,
+    ///     min_rays: 50,
+    ///     max_rays: 900,
+    /// };
     /// assert_eq!(budget.total(30, false, false), 300);
     /// assert_eq!(budget.total(30, true, true), 90);
     /// ```
@@ -34,7 +38,7 @@ impl RayBudget {
         if let Some(rays) = self.rays {
             return rays;
         }
-        let opaque = if is_opaque { OPAQUE_RAY_FACTOR } else { 1.0 };
+        let opaque = if is_opaque { self.opaque_ray_factor } else { 1.0 };
         let rays = opaque * self.rays_per_pixel * lr_pixels as f64;
         let rays = rays.max(self.min_rays as f64).min(self.max_rays as f64);
         let part = if is_fine_tuning { FINE_TUNING_RAY_FACTOR } else { 1.0 };
@@ -47,6 +51,14 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+
+    const LIMITED: RayBudget = RayBudget {
+        rays: None,
+        rays_per_pixel: 1.0,
+        opaque_ray_factor: 0.6,
+        min_rays: 100,
+        max_rays: 1000,
+    };
 
     /// Unless given, the number of rays follows from the number of LR pixels, within limits.
     #[test]
@@ -63,19 +75,21 @@ mod tests {
             (Some(7), 20.0, false, false, 7),
             (Some(7000), 20.0, true, true, 7000),
         ] {
-            let budget = RayBudget { rays, rays_per_pixel, min_rays: 100, max_rays: 1000 };
+            let budget = RayBudget { rays, rays_per_pixel, ..LIMITED };
             assert_eq!(budget.total(25, is_opaque, is_fine_tuning), expected, "{budget:?}");
         }
-        let minimal = RayBudget { rays: None, rays_per_pixel: 0.1, min_rays: 0, max_rays: 9 };
+        let minimal = RayBudget { rays_per_pixel: 0.1, min_rays: 0, max_rays: 9, ..LIMITED };
         assert_eq!(minimal.total(0, false, false), 1);
     }
 
     /// Other parameters of the stage are ignored.
     #[test]
     fn a_budget_is_read_from_a_stages_parameters() {
-        let parameters =
-            json!({"rays": null, "rays_per_pixel": 2, "min_rays": 3, "max_rays": 4, "seed": 1});
-        let expected = RayBudget { rays: None, rays_per_pixel: 2.0, min_rays: 3, max_rays: 4 };
+        let parameters = json!({
+            "rays": null, "rays_per_pixel": 2, "opaque_ray_factor": 0.6, "min_rays": 100,
+            "max_rays": 1000, "seed": 1
+        });
+        let expected = RayBudget { rays_per_pixel: 2.0, ..LIMITED };
         assert_eq!(serde_json::from_value::<RayBudget>(parameters).unwrap(), expected);
         assert!(serde_json::from_value::<RayBudget>(json!({"rays": null})).is_err());
     }

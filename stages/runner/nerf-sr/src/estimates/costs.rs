@@ -216,7 +216,8 @@ mod tests {
     /// Returns the default parameters of a training.
     pub(super) fn training(rays: u64) -> Value {
         json!({
-            "field": "grid", "rays": rays, "rays_per_pixel": 1, "min_rays": 1, "max_rays": 1,
+            "field": "grid", "rays": rays, "rays_per_pixel": 1, "opaque_ray_factor": 1, "min_rays": 1,
+            "max_rays": 1,
             "ensemble": 1, "supersample": 2.0, "supervision": null, "pose_refinement": false,
             "samples_per_step": 24_576, "n_levels": 8, "cells_per_pixel": 2.56, "log2_hashmap_size": null,
             "hidden_dim": 64, "march_steps": null,
