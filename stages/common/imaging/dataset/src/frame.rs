@@ -45,7 +45,7 @@ pub struct Frame {
     /// world space.
     pub camera_to_world: Pose,
     /// Smallest and largest depth of observed points along the optical axis, if known. For a
-    /// fisheye lens, the points' distances from the camera.
+    /// fisheye lens that is followed, the points' distances from the camera.
     pub depth_range: Option<[f64; 2]>,
 }
 
