@@ -126,7 +126,7 @@ impl Stage for Prep {
             notes.push(note);
         }
         threads.install(|| writer.write())?;
-        if let Some(note) = writer.clipping_note() {
+        for note in writer.warnings() {
             context.log_line(&note);
             notes.push(note);
         }

@@ -1,4 +1,4 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -24,12 +24,15 @@ pub(crate) struct SceneWriter<'a> {
     progress: Progress,
     /// Frame names and clipped pixels of EXR photographs, by file.
     clipping: Mutex<BTreeMap<PathBuf, (String, Clipping)>>,
+    /// Names of the frames without a pixel that counts.
+    fully_masked: Mutex<BTreeSet<String>>,
 }
 
 impl<'a> SceneWriter<'a> {
     pub(crate) fn new(context: &'a Context, plan: &'a ScenePlan<'a>) -> Self {
         let progress = context.progress("preparing", (plan.train.len() + plan.test.len()) as u64);
-        Self { context, plan, progress, clipping: Mutex::default() }
+        let (clipping, fully_masked) = Default::default();
+        Self { context, plan, progress, clipping, fully_masked }
     }
 
     /// Writes all subtrees.
@@ -42,8 +45,22 @@ impl<'a> SceneWriter<'a> {
         self.write_truth_and_camera_views()
     }
 
-    /// Returns a warning about pixels brighter than 1, if any.
-    pub(crate) fn clipping_note(&self) -> Option<String> {
+    /// Returns warnings about pixels brighter than 1 and about frames that are masked entirely.
+    pub(crate) fn warnings(&self) -> Vec<String> {
+        [self.clipping_warning(), self.mask_warning()].into_iter().flatten().collect()
+    }
+
+    fn mask_warning(&self) -> Option<String> {
+        let names = self.fully_masked.lock().unwrap_or_else(PoisonError::into_inner);
+        let first = names.first()?;
+        Some(format!(
+            "{WARNING}masks exclude every pixel of {} (first: frame {first}); check the masks, or \
+            remove the photographs",
+            format_count(names.len(), "view")
+        ))
+    }
+
+    fn clipping_warning(&self) -> Option<String> {
         let all = self.clipping.lock().unwrap_or_else(PoisonError::into_inner);
         let mut with_clipped = all.values().filter(|(_, clipping)| clipping.clipped > 0);
         let (first, _) = with_clipped.next()?;
@@ -188,7 +205,7 @@ impl<'a> SceneWriter<'a> {
         let (hr, lr) = self.create_images(frame)?;
         let name = &frame.name;
         self.write_lr("train/images", name, &lr)?;
-        let mask = frame.mask().bad_input(frame_label(frame))?;
+        let mask = self.read_mask(frame)?;
         let lr_mask = mask.as_ref().map(|mask| self.lr_mask(mask, &lr));
         if let Some(mask) = &lr_mask {
             self.write_mask("train", name, mask)?;
@@ -216,7 +233,7 @@ impl<'a> SceneWriter<'a> {
             self.write_hr("truth", &frame.name, hr)?;
         }
         self.write_lr("truth/low", &frame.name, &lr)?;
-        if let Some(mask) = frame.mask().bad_input(frame_label(frame))? {
+        if let Some(mask) = self.read_mask(frame)? {
             let mask = match &hr {
                 Some(hr) => mask.resized((hr.width, hr.height), 0),
                 None => self.lr_mask(&mask, &lr),
@@ -245,6 +262,16 @@ impl<'a> SceneWriter<'a> {
             self.plan.images.kernel,
         );
         Ok((Some(hr), lr))
+    }
+
+    /// Reads a frame's mask, and records the frame if its mask excludes every pixel.
+    fn read_mask(&self, frame: &Frame) -> anyhow::Result<Option<Mask>> {
+        let mask = frame.mask().bad_input(frame_label(frame))?;
+        if mask.as_ref().is_some_and(|mask| !mask.counts.contains(&true)) {
+            let mut names = self.fully_masked.lock().unwrap_or_else(PoisonError::into_inner);
+            names.insert(frame.name.clone());
+        }
+        Ok(mask)
     }
 
     fn write_hr(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
