@@ -300,6 +300,20 @@ impl Frame {
         Ok(Some(mask))
     }
 
+    /// Converts an image position of [`Frame::photograph`], in pixels, to the image before a
+    /// resampling to the pinhole camera.
+    pub fn position_in_lens_image(&self, position: [f64; 2]) -> [f64; 2] {
+        match &self.pinhole {
+            Some(pinhole) => self.lens_intrinsics.source_position(pinhole, position),
+            None => position,
+        }
+    }
+
+    /// True if an image of this size may be a resized copy of the photograph.
+    pub fn has_aspect_of(&self, width: u32, height: u32) -> bool {
+        has_aspect_of(&self.lens_intrinsics, width, height)
+    }
+
     /// Resamples an image of the stored size to the pinhole camera, if distortion is removed.
     fn without_distortion(&self, image: Rgba8) -> Rgba8 {
         match &self.pinhole {
