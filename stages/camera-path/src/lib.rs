@@ -18,7 +18,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Stage};
 
-use crate::path_file::{PATH_FILE, PathFile};
+use crate::path_file::{MAX_SIDE, PATH_FILE, PathFile};
 pub use crate::paths::poses;
 
 /// Parameters of `camera-path`.
@@ -102,10 +102,10 @@ impl Stage for CameraPath {
     }
 }
 
-/// Returns the height of an image with another width and the same aspect.
+/// Returns the height of an image with another width and the same aspect; at most [`MAX_SIDE`].
 fn height_at(width: u32, intrinsics: &Intrinsics) -> u32 {
     let aspect = f64::from(intrinsics.height) / f64::from(intrinsics.width);
-    (f64::from(width) * aspect).round().max(1.0) as u32
+    (f64::from(width) * aspect).round().clamp(1.0, f64::from(MAX_SIDE)) as u32
 }
 
 /// Reads a recorded path, with the width of the parameters, if given.

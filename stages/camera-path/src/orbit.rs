@@ -15,18 +15,23 @@ const MIN_GAP_OVER_MEDIAN: f64 = 3.0;
 /// Minimum distance of a camera from the axis over the orbit's radius: nearer cameras look down,
 /// and their angles around the axis mean little. Chosen by hand.
 const MIN_AXIS_DISTANCE: f64 = 0.25;
+/// Maximum mean distance of cameras at one position from the middle of the scene's box, as a share
+/// of the box's longest side: far above rounding errors; chosen by hand.
+const MAX_PANORAMA_DISTANCE: f64 = 1e-6;
 /// Steps of [`up_direction`]: enough for level cameras along an arc of 40°; chosen by hand.
 const UP_STEPS: u32 = 100;
 
-/// Circle around the middle of the scene's box, or an arc of this circle.
+/// Circle around the middle of the scene's box, or an arc of this circle. From cameras at one
+/// position, its frames are there and face outwards.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Orbit {
     middle: DVec3,
     up: DVec3,
     /// Direction from the axis to the frame at angle 0.
     first: DVec3,
+    /// Radius; 0 for cameras at one position.
     radius: f64,
-    /// Height above the middle.
+    /// Height above the middle; 0 for cameras at one position.
     height: f64,
     /// Maximum angle to both sides of `first` in radians; `None` for a whole circle.
     half_arc: Option<f64>,
@@ -38,19 +43,24 @@ impl Orbit {
     pub(crate) fn fit(cameras: &[Camera], bounds: &Bounds) -> Self {
         let up = up_direction(cameras);
         let middle = bounds.middle();
-        let height = mean(cameras, |c| c.centre() - middle).dot(up);
         let distance = cameras.iter().map(|c| (c.centre() - middle).length()).sum::<f64>()
             / cameras.len().max(1) as f64;
-        let radius = (distance * distance - height * height).max(0.0).sqrt();
+        let is_panorama = distance <= MAX_PANORAMA_DISTANCE * bounds.longest_side();
+        let (mut height, mut radius) = (0.0, 0.0);
+        if !is_panorama {
+            height = mean(cameras, |c| c.centre() - middle).dot(up);
+            radius = (distance * distance - height * height).max(0.0).sqrt();
+        }
         let from_axis = |camera: &Camera| {
-            let offset = camera.centre() - middle;
+            let offset = if is_panorama { camera.forward() } else { camera.centre() - middle };
             offset - offset.dot(up) * up
         };
+        let min_offset = MIN_AXIS_DISTANCE * if is_panorama { 1.0 } else { radius };
         let first = from_axis(&cameras[0]).normalize_or(up.any_orthonormal_vector());
         let angles = cameras
             .iter()
             .map(from_axis)
-            .filter(|offset| offset.length() > MIN_AXIS_DISTANCE * radius)
+            .filter(|offset| offset.length() > min_offset)
             .map(|offset| up.cross(first).dot(offset).atan2(first.dot(offset)));
         let whole = Self { middle, up, first, radius, height, half_arc: None };
         match arc(angles.collect()) {
@@ -68,7 +78,11 @@ impl Orbit {
         // An arc is travelled there and back, so that the film loops.
         let angle = self.half_arc.map_or(turn, |half_arc| half_arc * turn.sin());
         let rotation = DQuat::from_axis_angle(self.up, angle);
-        let offset = rotation * self.first * self.radius + self.height * self.up;
+        let outwards = rotation * self.first;
+        if (self.radius, self.height) == (0.0, 0.0) {
+            return looking_at(self.middle, self.middle + outwards, self.up);
+        }
+        let offset = outwards * self.radius + self.height * self.up;
         looking_at(self.middle + offset, self.middle, self.up)
     }
 }
@@ -176,6 +190,35 @@ mod tests {
         }
         let rolled = cameras([0.0], 1.0);
         assert!(up_direction(&rolled).dot(rolled[0].rotation().y_axis) > 0.9999);
+    }
+
+    /// Frames of cameras at one position, up to rounding, look all around or, for an arc, where the
+    /// cameras look.
+    #[test]
+    fn cameras_at_one_position_give_a_panorama() {
+        for (count, arc) in [(12, None), (5, Some(120.0))] {
+            let outwards = cameras((0..count).map(|i| 30.0 * f64::from(i)), 0.0);
+            let at_centre = outwards.iter().map(|c| {
+                let position = -1e-16 * c.centre();
+                let pose = looking_at(position, position + c.centre(), DVec3::Z);
+                Camera { camera_to_world: pose, ..c.clone() }
+            });
+            let orbit = Orbit::fit(&at_centre.collect::<Vec<_>>(), &BOX);
+            let angles = (0..64).map(|i| {
+                let pose = orbit.pose(f64::from(i) / 64.0);
+                assert!([0, 1, 2].iter().all(|&row| pose[row][3].abs() < 1e-9), "{pose:?}");
+                let forward = [0, 1, 2].map(|row| -pose[row][2]);
+                assert!(forward[2].abs() < 1e-6, "{forward:?}");
+                forward[1].atan2(forward[0]).to_degrees()
+            });
+            let angles: Vec<f64> = angles.collect();
+            let min = angles.iter().copied().fold(f64::MAX, f64::min);
+            let max = angles.iter().copied().fold(f64::MIN, f64::max);
+            match arc {
+                None => assert!(min < -170.0 && max > 170.0, "{min} {max}"),
+                Some(end) => assert!(min.abs() < 1e-3 && f64::abs(max - end) < 1e-3, "{min} {max}"),
+            }
+        }
     }
 
     /// A camera above the centre has no meaningful angle around the axis.

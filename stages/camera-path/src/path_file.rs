@@ -17,7 +17,7 @@ const FRAMES_PER_SECOND: f64 = 30.0;
 const RECORDED_FRAMES_PER_SECOND: f64 = 24.0;
 
 /// Maximum width and height of frames, as of the parameter `size`.
-const MAX_SIDE: u32 = 65536;
+pub(crate) const MAX_SIDE: u32 = 65536;
 
 /// Content of `camera_path.json`. Fields that don't determine the images, such as `crop`, are
 /// ignored.
@@ -303,6 +303,16 @@ mod tests {
         assert_eq!((&frame["fov"], &frame["aspect"]), (&key["fov"], &key["aspect"]));
         let k = path.cameras()[2].intrinsics;
         assert!((k.fx - 61.0).abs() < 1e-9 && (k.fy - 61.0).abs() < 1e-9 && k.cx == 20.0, "{k:?}");
+    }
+
+    #[test]
+    fn the_largest_frames_are_read_back() {
+        let portrait = Intrinsics::from_angle_x(30, 40, 0.7);
+        let height = crate::height_at(MAX_SIDE, &portrait);
+        assert_eq!(crate::height_at(60, &portrait), 80);
+        let pose = scene::looking_at(glam::DVec3::Z, glam::DVec3::ZERO, glam::DVec3::Y);
+        let path = PathFile::new(&portrait.resized(MAX_SIDE, height), &[pose], true);
+        assert_eq!(round_trip(&path)["render_height"], MAX_SIDE);
     }
 
     /// A recorded path keeps its keys, frame rate and angles of view, also at another size.

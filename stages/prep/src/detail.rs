@@ -4,6 +4,8 @@
 use artifact::WARNING;
 use pixels::Rgba8;
 
+use crate::image_plan::ImagePlan;
+
 /// Side of a block whose spectrum is measured, in pixels.
 const BLOCK_SIDE: usize = 32;
 /// Maximum number of measured blocks of an image; chosen by hand.
@@ -91,14 +93,25 @@ pub(crate) fn lr_reach(reach: f64, factor: f64) -> f64 {
     (reach * factor).min(1.0)
 }
 
-/// Returns a warning of missing detail, with the remedy; `None` if nothing is missing.
-pub(crate) fn missing_detail_warning(lr_reach: f64, lr_width: u32) -> Option<String> {
+/// Returns a warning of missing detail, with the remedy; `None` if nothing is missing. The remedy
+/// has a smaller scale if HR images of the given `scale` would be larger than the photographs.
+pub(crate) fn missing_detail_warning(
+    lr_reach: f64,
+    images: &ImagePlan,
+    scale: f64,
+) -> Option<String> {
     (lr_reach < MIN_REACH).then(|| {
-        let width = (lr_reach * f64::from(lr_width)).ceil();
+        let width = (lr_reach * f64::from(images.sizes.lr.0)).ceil();
+        let max_scale = f64::from(images.native.0) / width;
+        let (and_scale, keep) = if scale > max_scale {
+            (format!(" and scale {}", (100.0 * max_scale).floor() / 100.0), "keep")
+        } else {
+            (String::new(), "keeps")
+        };
         format!(
             "{WARNING}detail reaches only {:.0} % of the LR images' resolution: the photographs \
-            are enlarged, blurred or unfocused; lr_width {width} with lr_source downscaled keeps \
-            all detail, in less time",
+            are enlarged, blurred or unfocused; lr_width {width}{and_scale} with lr_source \
+            downscaled {keep} all detail, in less time",
             100.0 * lr_reach
         )
     })
@@ -150,9 +163,10 @@ fn add_power(
 
 #[cfg(test)]
 mod tests {
-    use pixels::{Filter, resize_pillow};
+    use pixels::{Filter, Kernel, resize_pillow};
 
     use super::*;
+    use crate::sizes::{downscaled_sizes, enlarged_sizes};
 
     /// Returns an image of overlapping discs of all sizes: sharp edges everywhere.
     fn discs(side: usize) -> Rgba8 {
@@ -219,8 +233,18 @@ mod tests {
     fn missing_detail_is_reported_with_a_remedy() {
         assert_eq!(lr_reach(0.5, 1.0), 0.5);
         assert_eq!(lr_reach(0.5, 8.0), 1.0);
-        assert_eq!(missing_detail_warning(0.7, 100), None);
-        let note = missing_detail_warning(0.47, 800).unwrap();
-        assert!(note.contains(" 47 % ") && note.contains("lr_width 376 "), "{note}");
+        let native = (800, 600);
+        let sizes = enlarged_sizes(native, 2.0);
+        let images = ImagePlan { has_truth: false, kernel: Kernel::Box, sizes, native };
+        assert_eq!(missing_detail_warning(0.7, &images, 2.0), None);
+        for (reach, remedy, width, scale) in [
+            (0.47, "lr_width 376 with lr_source downscaled keeps all detail", 376, 2.0),
+            (0.6, "lr_width 480 and scale 1.66 with lr_source downscaled keep all", 480, 1.66),
+        ] {
+            let note = missing_detail_warning(reach, &images, 2.0).unwrap();
+            let percent = format!(" {:.0} % ", 100.0 * reach);
+            assert!(note.contains(&percent) && note.contains(remedy), "{note}");
+            assert!(downscaled_sizes(native, Some(width), scale).is_ok());
+        }
     }
 }

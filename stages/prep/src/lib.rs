@@ -117,7 +117,7 @@ impl Stage for Prep {
         let border_notes = borders.notes(params.background.is_some());
         let detail = spectrum.reach().map(|reach| detail::lr_reach(reach, images.lr_factor()));
         let detail_note =
-            detail.and_then(|reach| detail::missing_detail_warning(reach, images.sizes.lr.0));
+            detail.and_then(|reach| detail::missing_detail_warning(reach, &images, params.scale));
         let plan = ScenePlan::new(&set, &split, params, images, background)?;
         let writer = SceneWriter::new(context, &plan);
         let space_note = space_note(&plan.bounds, background);
@@ -126,7 +126,7 @@ impl Stage for Prep {
             notes.push(note);
         }
         threads.install(|| writer.write())?;
-        if let Some(note) = writer.clipping_note() {
+        for note in writer.warnings() {
             context.log_line(&note);
             notes.push(note);
         }

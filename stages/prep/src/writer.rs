@@ -1,9 +1,9 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context as _;
-use artifact::{FailureExt as _, WARNING, format_count, printable};
+use artifact::{FailureExt as _, WARNING, bail_bad_input, format_count, printable};
 use dataset::{Clipping, Frame};
 use pixels::{
     Channel, DEGRADATION_FILE, DEPTH_CHANNELS, Degradation, DepthMap, Kernel, Mask, Rgba8,
@@ -24,12 +24,15 @@ pub(crate) struct SceneWriter<'a> {
     progress: Progress,
     /// Frame names and clipped pixels of EXR photographs, by file.
     clipping: Mutex<BTreeMap<PathBuf, (String, Clipping)>>,
+    /// Names of the frames without a pixel that counts.
+    fully_masked: Mutex<BTreeSet<String>>,
 }
 
 impl<'a> SceneWriter<'a> {
     pub(crate) fn new(context: &'a Context, plan: &'a ScenePlan<'a>) -> Self {
         let progress = context.progress("preparing", (plan.train.len() + plan.test.len()) as u64);
-        Self { context, plan, progress, clipping: Mutex::default() }
+        let (clipping, fully_masked) = Default::default();
+        Self { context, plan, progress, clipping, fully_masked }
     }
 
     /// Writes all subtrees.
@@ -42,8 +45,22 @@ impl<'a> SceneWriter<'a> {
         self.write_truth_and_camera_views()
     }
 
-    /// Returns a warning about pixels brighter than 1, if any.
-    pub(crate) fn clipping_note(&self) -> Option<String> {
+    /// Returns warnings about pixels brighter than 1 and about frames that are masked entirely.
+    pub(crate) fn warnings(&self) -> Vec<String> {
+        [self.clipping_warning(), self.mask_warning()].into_iter().flatten().collect()
+    }
+
+    fn mask_warning(&self) -> Option<String> {
+        let names = self.fully_masked.lock().unwrap_or_else(PoisonError::into_inner);
+        let first = names.first()?;
+        Some(format!(
+            "{WARNING}masks exclude every pixel of {} (first: frame {first}); check the masks, or \
+            remove the photographs",
+            format_count(names.len(), "view")
+        ))
+    }
+
+    fn clipping_warning(&self) -> Option<String> {
         let all = self.clipping.lock().unwrap_or_else(PoisonError::into_inner);
         let mut with_clipped = all.values().filter(|(_, clipping)| clipping.clipped > 0);
         let (first, _) = with_clipped.next()?;
@@ -188,7 +205,7 @@ impl<'a> SceneWriter<'a> {
         let (hr, lr) = self.create_images(frame)?;
         let name = &frame.name;
         self.write_lr("train/images", name, &lr)?;
-        let mask = frame.mask().bad_input(frame_label(frame))?;
+        let mask = self.read_mask(frame)?;
         let lr_mask = mask.as_ref().map(|mask| self.lr_mask(mask, &lr));
         if let Some(mask) = &lr_mask {
             self.write_mask("train", name, mask)?;
@@ -216,7 +233,7 @@ impl<'a> SceneWriter<'a> {
             self.write_hr("truth", &frame.name, hr)?;
         }
         self.write_lr("truth/low", &frame.name, &lr)?;
-        if let Some(mask) = frame.mask().bad_input(frame_label(frame))? {
+        if let Some(mask) = self.read_mask(frame)? {
             let mask = match &hr {
                 Some(hr) => mask.resized((hr.width, hr.height), 0),
                 None => self.lr_mask(&mask, &lr),
@@ -245,6 +262,16 @@ impl<'a> SceneWriter<'a> {
             self.plan.images.kernel,
         );
         Ok((Some(hr), lr))
+    }
+
+    /// Reads a frame's mask, and records the frame if its mask excludes every pixel.
+    fn read_mask(&self, frame: &Frame) -> anyhow::Result<Option<Mask>> {
+        let mask = frame.mask().bad_input(frame_label(frame))?;
+        if mask.as_ref().is_some_and(|mask| !mask.counts.contains(&true)) {
+            let mut names = self.fully_masked.lock().unwrap_or_else(PoisonError::into_inner);
+            names.insert(frame.name.clone());
+        }
+        Ok(mask)
     }
 
     fn write_hr(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
@@ -294,7 +321,8 @@ impl<'a> SceneWriter<'a> {
     }
 
     /// Writes true depth at HR size, sampled at the depth file's nearest pixel centre: averaging
-    /// depths across an edge would invent surfaces.
+    /// depths across an edge would invent surfaces. Fails if the depth file's aspect ratio isn't
+    /// the photograph's.
     fn write_depth(
         &self,
         frame: &Frame,
@@ -308,6 +336,19 @@ impl<'a> SceneWriter<'a> {
         let map = DepthMap::of(&native)
             .with_context(|| format!("{}: depth requires channels Z and A", printable(&source)))
             .bad_input(frame_label(frame))?;
+        let native_size = [native.width, native.height];
+        if !frame.has_aspect_of(native.width as u32, native.height as u32) {
+            let k = frame.intrinsics();
+            bail_bad_input!(
+                "{}: {}: depth has {}×{} pixels, its photograph {}×{}; aspect ratios must match",
+                frame_label(frame),
+                printable(&source),
+                native.width,
+                native.height,
+                k.width,
+                k.height
+            );
+        }
         let path = self.context.output_path(&format!("truth/depth/{}.exr", frame.name))?;
         let channels = [
             Channel { name: "A", sample_type: SampleType::Half },
@@ -320,8 +361,8 @@ impl<'a> SceneWriter<'a> {
             "Z: z-depth of the nearest native pixel centre; A: 0 where nothing is seen",
             |first, _, samples| {
                 for (i, sample) in samples.chunks_exact_mut(2).enumerate() {
-                    let x = nearest_index(i % width, native.width, width);
-                    let y = nearest_index(first + i / width, native.height, height);
+                    let (column, row) = (i % width, first + i / width);
+                    let [x, y] = depth_pixel(frame, [column, row], [width, height], native_size);
                     let pixel = y * native.width + x;
                     sample.copy_from_slice(&[map.opacity[pixel], map.depth[pixel]]);
                 }
@@ -329,6 +370,26 @@ impl<'a> SceneWriter<'a> {
             },
         )
     }
+}
+
+/// Returns the pixel of a depth file that the centre of a pixel of the HR image is in.
+fn depth_pixel(
+    frame: &Frame,
+    pixel: [usize; 2],
+    size: [usize; 2],
+    native: [usize; 2],
+) -> [usize; 2] {
+    if frame.pinhole.is_none() {
+        return [0, 1].map(|i| nearest_index(pixel[i], native[i], size[i]));
+    }
+    let k = frame.intrinsics();
+    let camera_size = [k.width, k.height].map(f64::from);
+    let position = [0, 1].map(|i| (pixel[i] as f64 + 0.5) * camera_size[i] / size[i] as f64);
+    let source = frame.position_in_lens_image(position);
+    [0, 1].map(|i| {
+        let index = (source[i] * native[i] as f64 / camera_size[i]).max(0.0) as usize;
+        index.min(native[i] - 1)
+    })
 }
 
 /// Returns the index among `native` pixels whose centre is nearest to that of pixel `i` of `count`.
@@ -339,4 +400,46 @@ fn nearest_index(i: usize, native: usize, count: usize) -> usize {
 /// Returns the path of a frame's mask in its subtree; `None` without a mask.
 fn mask_path(frame: &Frame) -> Option<String> {
     frame.is_masked().then(|| mask_file(&frame.name))
+}
+
+#[cfg(test)]
+mod tests {
+    use dataset::Turn;
+    use scene::{Distortion, Intrinsics};
+
+    use super::*;
+
+    /// Depth is looked up where the lens sees the pixel of the undistorted photograph.
+    #[test]
+    fn depth_follows_the_removed_distortion() {
+        let distortion = Distortion::brown([-0.3, 0.0, 0.0], [0.0; 2]);
+        let lens = Intrinsics { distortion, ..Intrinsics::from_angle_x(80, 60, 1.0) };
+        let pinhole = lens.pinhole().unwrap();
+        let mut frame = Frame {
+            name: "a".to_owned(),
+            image: PathBuf::from("a.png"),
+            turn: Turn::Stored,
+            mask: None,
+            depth_file: None,
+            lens_intrinsics: lens,
+            pinhole: None,
+            camera_to_world: [[0.0; 4]; 3],
+            depth_range: None,
+        };
+        // The HR image has half the size of the depth file, the depth file that of the photograph.
+        let found = |frame: &Frame, pixel| depth_pixel(frame, pixel, [40, 30], [80, 60]);
+        assert_eq!(found(&frame, [3, 20]), [7, 41]);
+        frame.pinhole = Some(pinhole);
+        for pixel in [[0, 0], [3, 20], [39, 29], [20, 15]] {
+            let [x, y] = [
+                (2.0 * pixel[0] as f64 + 1.0 - 40.0) / pinhole.fx,
+                (2.0 * pixel[1] as f64 + 1.0 - 30.0) / pinhole.fy,
+            ];
+            let factor = 1.0 - 0.3 * (x * x + y * y);
+            let expected =
+                [(factor * x * lens.fx + 40.0) as usize, (factor * y * lens.fy + 30.0) as usize];
+            assert_eq!(found(&frame, pixel), expected, "{pixel:?}");
+        }
+        assert_ne!(found(&frame, [3, 20]), [7, 41]);
+    }
 }

@@ -87,7 +87,7 @@ struct Registered {
     /// Median depth of the render from the estimated camera.
     depth: Option<f64>,
     /// Error of the render from the given and from the estimated camera; `None` without a
-    /// photograph.
+    /// photograph that has informative pixels.
     errors: Option<[f64; 2]>,
 }
 
@@ -119,7 +119,8 @@ impl Registered {
             from: camera.resized(image.width as u32, image.height as u32),
             to: best.camera,
             depth: best.depth,
-            errors: Some([before, best.after]),
+            // Without informative pixels nothing is compared.
+            errors: pyramid.is_informative().then_some([before, best.after]),
         })
     }
 }

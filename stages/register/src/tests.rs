@@ -76,6 +76,13 @@ fn a_camera_is_registered_and_a_large_motion_causes_a_warning() {
         registered(&Wall { full_size: 0, shift: 0.0 }, 0.4),
     ]);
     assert!(text.starts_with("2 of 3 cameras registered: "), "{text}");
+    // A photograph without a gradient, or masked entirely, registers nothing.
+    for value in [0.5, f32::NAN] {
+        let image = Image::new(48, 48, 3, vec![value; 3 * 48 * 48]);
+        let wall = Wall { full_size: 0, shift: 0.0 };
+        let uninformed = Registered::from_image(&wall, &camera(0.4), &image, 1.0).unwrap();
+        assert_eq!((&uninformed.to, uninformed.errors), (&camera(0.4), None));
+    }
     assert!(
         warning.as_ref().is_some_and(
             |w| w.contains("check that the field and the photographs are of the same scene")

@@ -34,6 +34,20 @@ fn write_exrs(folder: &Path) {
     write_transforms(folder, &transforms("images/a#.exr", 3));
 }
 
+/// Writes photographs, and depth of half their height for the test view.
+fn write_low_depth(folder: &Path) {
+    write_photographs(folder, "images/a#.png", 3);
+    let mut list = transforms("images/a#.png", 3);
+    list["frames"][0]["depth_file_path"] = json!("a0.exr");
+    write_transforms(folder, &list);
+    let channels = ["A", "Z"].map(|name| Channel { name, sample_type: SampleType::Float });
+    write_exr(&folder.join("a0.exr"), (16, 8), &channels, "", |_, _, samples| {
+        samples.fill(1.0);
+        Ok::<(), PixelError>(())
+    })
+    .unwrap();
+}
+
 /// Writes JPEGs with an EXIF orientation, and cameras of the given size.
 fn write_oriented(folder: &Path, stored: (u32, u32), orientation: u8, camera: (u32, u32)) {
     for number in 0..3 {
@@ -271,6 +285,14 @@ pub(crate) fn cases() -> Vec<Case> {
                 ],
             ))
         }),
+        Case {
+            name: "depth of another shape",
+            make: write_low_depth,
+            params: json!({"lr_source": "downscaled"}),
+            expected: Expected::Refused(
+                "frame a0: DIR/a0.exr: depth has 16×8 pixels, its photograph 16×16; aspect ratios must match",
+            ),
+        },
         case(
             "ns#1213, EasyVolcap#31: several sizes",
             |folder| {

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::kit::{
     CAMERA, Case, Expected, SIDE, Scene, case, held_out, left_half, transforms, write_colmap,
-    write_llff, write_mask, write_photograph, write_photographs, write_transforms,
+    write_image, write_llff, write_mask, write_photograph, write_photographs, write_transforms,
 };
 
 fn right_half(x: u32, y: u32) -> bool {
@@ -36,6 +36,17 @@ fn write_masked_frames(folder: &Path, size: (u32, u32), counts: fn(u32, u32) -> 
     write_transforms(folder, &content);
 }
 
+/// Writes masks of values 0 and 1, as programs save arrays of labels.
+fn write_masks_of_labels(folder: &Path) {
+    write_masked_frames(folder, (SIDE, SIDE), left_half);
+    for number in [0, 2] {
+        let path = folder.join(format!("masks/m{number}.png"));
+        let mut mask = pixels::read_png(&path).unwrap();
+        mask.data.chunks_exact_mut(4).flat_map(|p| &mut p[..3]).for_each(|v| *v /= 255);
+        write_image(&path, &mask);
+    }
+}
+
 /// Returns the scene with masks for the views with the given pose numbers.
 fn masked(mut scene: Scene, numbers: &[usize], counts: fn(u32, u32) -> bool) -> Expected {
     for view in scene.train.iter_mut().chain(&mut scene.test) {
@@ -48,6 +59,7 @@ fn masked(mut scene: Scene, numbers: &[usize], counts: fn(u32, u32) -> bool) -> 
 
 const COLMAP_NOTE: &str = "COLMAP: 10 photographs from sparse/0";
 const TRANSFORMS_NOTE: &str = "transforms.json (instant-ngp, nerfstudio): 3 photographs";
+const LISTED_NOTE: &str = "2 of 3 views have masks (2 by mask_path, where black is excluded)";
 
 fn colmap_cases() -> Vec<Case> {
     vec![
@@ -170,18 +182,23 @@ fn transforms_cases() -> Vec<Case> {
         case(
             "mask_path",
             |folder| write_masked_frames(folder, (SIDE, SIDE), left_half),
-            masked(
-                held_out(
-                    "a#",
-                    3,
-                    &[
-                        TRANSFORMS_NOTE,
-                        "2 of 3 views have masks (2 by mask_path, where black is excluded)",
-                    ],
-                ),
-                &[0, 2],
-                left_half,
-            ),
+            masked(held_out("a#", 3, &[TRANSFORMS_NOTE, LISTED_NOTE]), &[0, 2], left_half),
+        ),
+        case(
+            "masks of values 0 and 1",
+            write_masks_of_labels,
+            masked(held_out("a#", 3, &[TRANSFORMS_NOTE, LISTED_NOTE]), &[0, 2], left_half),
+        ),
+        case(
+            "masks of every pixel",
+            |folder| write_masked_frames(folder, (SIDE, SIDE), |_, _| false),
+            {
+                let mut scene = held_out("a#", 3, &[TRANSFORMS_NOTE, LISTED_NOTE]);
+                scene.further = vec![
+                    "warning: masks exclude every pixel of 2 views (first: frame a0); check the masks, or remove the photographs",
+                ];
+                masked(scene, &[0, 2], |_, _| false)
+            },
         ),
         case(
             "ns#2020, ns#3659: masks of another size",
@@ -192,7 +209,7 @@ fn transforms_cases() -> Vec<Case> {
                     3,
                     &[
                         TRANSFORMS_NOTE,
-                        "2 of 3 views have masks (2 by mask_path, where black is excluded)",
+                        LISTED_NOTE,
                         "2 masks differ from the photograph in size; resampled by nearest neighbour (first: masks/m0.png: 8×8 for 16×16)",
                     ],
                 ),
@@ -209,7 +226,7 @@ fn transforms_cases() -> Vec<Case> {
                     3,
                     &[
                         TRANSFORMS_NOTE,
-                        "2 of 3 views have masks (2 by mask_path, where black is excluded)",
+                        LISTED_NOTE,
                         "warning: 2 masks differ from the photograph in aspect ratio; resampled by nearest neighbour (first: masks/m0.png: 2×16 for 16×16)",
                     ],
                 ),

@@ -49,7 +49,7 @@ pub(crate) fn cases() -> Vec<Case> {
         case(
             "views for validation next to test views",
             |folder| write_lists(folder, names(3..10), names(1..3), names([0])),
-            split(3..10, [0], &[]),
+            split(3..10, [0], &["2 of 10 frames are listed for neither training nor testing"]),
         ),
         case(
             "names of frames as other steps of the lookup find them",
@@ -65,6 +65,7 @@ pub(crate) fn cases() -> Vec<Case> {
                     "1 file name found without the first part of absolute paths (first: /x/images/a_5.png is images/a_5.png)",
                     "1 file name found with a different extension (first: images/A_6 is images/a_6.png)",
                     "1 file name found in a different case (first: images/A_6 is images/a_6.png)",
+                    "6 of 10 frames are listed for neither training nor testing",
                 ],
             ),
         ),
@@ -77,7 +78,10 @@ pub(crate) fn cases() -> Vec<Case> {
             split(
                 [3],
                 [0],
-                &["2 of 3 names in train_filenames have no frame (first: images/b.png)"],
+                &[
+                    "2 of 3 names in train_filenames have no frame (first: images/b.png)",
+                    "8 of 10 frames are listed for neither training nor testing",
+                ],
             ),
         ),
         case(

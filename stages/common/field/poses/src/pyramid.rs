@@ -60,6 +60,11 @@ impl Pyramid {
         Self { levels }
     }
 
+    /// True if the image itself has a pixel that constrains a pose.
+    pub fn is_informative(&self) -> bool {
+        self.levels.first().is_some_and(|level| !level.pixels.is_empty())
+    }
+
     /// Returns the number of levels smaller than the image itself.
     pub fn smaller_levels(&self) -> u32 {
         self.levels.len() as u32 - 1

@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 
 use artifact::{WARNING, format_count};
-use scene::Intrinsics;
+use scene::{Camera, Intrinsics};
 
 use crate::error::{DatasetError, Reason};
 use crate::format::Format;
@@ -83,6 +83,8 @@ impl Dataset {
             })?;
             frame.pinhole = Some(pinhole);
             if distortion.is_fisheye() {
+                frame.depth_range =
+                    frame.depth_range.map(|range| depths_of(range, &frame.camera()));
                 angles.push(pinhole.pinhole_angles());
             } else {
                 undistorted += 1;
@@ -159,6 +161,14 @@ impl Dataset {
             ));
         }
     }
+}
+
+/// Converts the range of points' distances from a pinhole camera to a range that contains their
+/// depths. Of points at one distance, a point in a corner of the view has the least depth.
+fn depths_of([nearest, farthest]: [f64; 2], camera: &Camera) -> [f64; 2] {
+    let slopes =
+        camera.intrinsics.border().map(|[x, y]| camera.depth_per_distance(&camera.ray(x, y)));
+    [nearest * slopes.fold(1.0, f64::min), farthest]
 }
 
 /// Formats a number with at most four significant digits.
@@ -249,7 +259,15 @@ mod tests {
     #[test]
     fn undistorted_fisheye_lenses_report_their_field_of_view() {
         let dir = tempfile::tempdir().unwrap();
-        let set = write_fisheye_dataset(dir.path()).undistorted().unwrap();
+        let mut set = write_fisheye_dataset(dir.path());
+        set.frames[1].depth_range = Some([2.0, 10.0]);
+        let set = set.undistorted().unwrap();
+        // A point at distance 2 in a corner of the pinhole's view has the least depth.
+        let [nearest, farthest] = set.frames[1].depth_range.unwrap();
+        let pinhole = set.frames[1].intrinsics();
+        let corner = [20.0 / pinhole.fx, 15.0 / pinhole.fy, 1.0];
+        let length = corner.iter().map(|x| x * x).sum::<f64>().sqrt();
+        assert!((nearest - 2.0 / length).abs() < 1e-9 && farthest == 10.0, "{nearest} {farthest}");
         let note = "3 fisheye photographs are resampled to pinhole cameras with a field of view of \
             91.3°×75.0° to 100.0°×83.6°; the rest is cropped";
         assert_eq!(set.notes.last().unwrap(), note);

@@ -45,7 +45,7 @@ pub struct Frame {
     /// world space.
     pub camera_to_world: Pose,
     /// Smallest and largest depth of observed points along the optical axis, if known. For a
-    /// fisheye lens, the points' distances from the camera.
+    /// fisheye lens that is followed, the points' distances from the camera.
     pub depth_range: Option<[f64; 2]>,
 }
 
@@ -145,11 +145,15 @@ pub(crate) fn unique_names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>
     match first_duplicate(&names) {
         None => Ok(names),
         Some((first, second)) => {
-            let (name, first) = (shortened(&names[second]), path_text(&paths[first]));
-            let reason = Reason::new(format!(
-                "view name {name:?} is already that of {}; rename one of the two files",
-                shortened(&first)
-            ));
+            let reason = Reason::new(if paths[first] == paths[second] {
+                "the photograph is listed twice; remove one of the two entries".to_owned()
+            } else {
+                let (name, first) = (shortened(&names[second]), path_text(&paths[first]));
+                format!(
+                    "view name {name:?} is already that of {}; rename one of the two files",
+                    shortened(&first)
+                )
+            });
             Err(DatasetError::frame(list, second, &path_text(&paths[second]), reason))
         }
     }
@@ -176,10 +180,13 @@ fn name_with_folders(path: &Path, separator: &str) -> Result<String, Reason> {
 }
 
 /// Returns a part of a path as text without control characters: names become file names and are
-/// printed.
+/// printed. Fails for the folders `.` and `..`, the stems of `..png` and `...png`.
 fn printable_part(part: Option<&OsStr>) -> Result<String, Reason> {
     let name = part.and_then(OsStr::to_str);
     let name = name.ok_or_else(|| Reason::new("file name is not UTF-8; rename the file"))?;
+    if [".", ".."].contains(&name) {
+        return Err(Reason::new("file name has only dots before its extension; rename the file"));
+    }
     Ok(name.replace(char::is_control, "_"))
 }
 
@@ -221,6 +228,12 @@ mod tests {
                 &["a\n.png", "a\t.png"],
                 "frame 1 (a\\t.png): view name \"a_\" is already that of a\\n.png; rename",
             ),
+            (
+                &["x/b.jpg", "x/a.jpg", "x/a.jpg"],
+                "frame 2 (x/a.jpg): the photograph is listed twice; remove one of the two entries",
+            ),
+            (&["a.png", "x/..png"], "frame 1 (x/..png): file name has only dots before its"),
+            (&["...png"], "frame 0 (...png): file name has only dots before its extension;"),
         ] {
             let message = names_of(paths).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");

@@ -35,14 +35,15 @@ pub(crate) struct LensEntry {
 }
 
 impl LensEntry {
-    /// Returns this entry, completed from `other`.
+    /// Returns this entry, completed from `other`. An angle of view of this entry takes the place of
+    /// the other's focal length.
     pub(crate) fn or(&self, other: &Self) -> Self {
         macro_rules! both {
             ($($name:ident),*) => {
                 Self { $($name: self.$name.clone().or_else(|| other.$name.clone())),* }
             };
         }
-        both!(
+        let mut entry = both!(
             camera_model,
             camera_angle_x,
             camera_angle_y,
@@ -65,7 +66,14 @@ impl LensEntry {
             latlong,
             orthographic,
             ftheta_p0
-        )
+        );
+        if self.camera_angle_x.is_some() {
+            entry.fl_x = self.fl_x;
+        }
+        if self.camera_angle_y.is_some() {
+            entry.fl_y = self.fl_y;
+        }
+        entry
     }
 
     /// Returns the distortion; fails for a model that isn't supported. For a fisheye lens k1 to k4

@@ -91,7 +91,7 @@ fn find_mask(
             names.push((format!("{stem}{extension}.png"), MaskKind::NamedWithExtension));
         }
         let sub_folder = without_images_folder(parent);
-        for masks in listings.case_variants(Path::new(""), MASKS) {
+        for masks in listings.variants(Path::new(""), MASKS) {
             let folder = Path::new(&masks).join(&sub_folder);
             if let Some(found) = find_single_file(listings, &folder, &names)? {
                 return Ok(Some(found));
@@ -111,8 +111,8 @@ fn without_images_folder(parent: &Path) -> PathBuf {
     if is_images { parts.collect() } else { parent.to_path_buf() }
 }
 
-/// Finds the single file of a folder with one of the names, in any case; fails if there are
-/// several.
+/// Finds the single file of a folder with one of the names, in any case and Unicode normal form;
+/// fails if there are several.
 fn find_single_file(
     listings: &mut Listings,
     folder: &Path,
@@ -120,7 +120,7 @@ fn find_single_file(
 ) -> Result<Option<(PathBuf, MaskKind)>, LookupError> {
     let mut found: Vec<(PathBuf, MaskKind)> = Vec::new();
     for (name, kind) in names {
-        for variant in listings.case_variants(folder, name) {
+        for variant in listings.variants(folder, name) {
             let file = folder.join(variant);
             if listings.is_file(&file) {
                 found.push((file, *kind));

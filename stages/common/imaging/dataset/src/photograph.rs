@@ -5,8 +5,8 @@ use std::path::Path;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use pixels::{
-    COLOUR_CHANNELS, MAX_PIXELS, Mask, PixelError, Rgba8, exr_reading_bytes, exr_size, read_exr,
-    srgb_from_linear, to_u8,
+    COLOUR_CHANNELS, MAX_PIXELS, MIN_BRIGHT_LEVEL, Mask, PixelError, Rgba8, exr_reading_bytes,
+    exr_size, read_exr, srgb_from_linear, to_u8,
 };
 use scene::{Intrinsics, undistort_image};
 
@@ -283,11 +283,13 @@ impl Frame {
 
     /// Returns the mask of [`Frame::photograph`]: pixels that count in its mask file and have a
     /// ray. `None` if there is no mask file and every pixel has a ray. A mask file of a different
-    /// size is resampled by nearest neighbour.
+    /// size is resampled by nearest neighbour. In a file without bright pixels, all pixels that
+    /// aren't black count as bright.
     pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
         let lens = self.intrinsics().lens_mask();
         let Some(file) = &self.mask else { return Ok(lens) };
-        let (image, _) = read_image(&file.path, self.turn == Turn::Upright)?;
+        let (mut image, _) = read_image(&file.path, self.turn == Turn::Upright)?;
+        whiten_dark_mask(&mut image);
         let k = self.lens_intrinsics;
         let resized = resize_nearest(&image, (k.width as usize, k.height as usize));
         let mut mask = Mask::of(&self.without_distortion(resized));
@@ -298,12 +300,35 @@ impl Frame {
         Ok(Some(mask))
     }
 
+    /// Converts an image position of [`Frame::photograph`], in pixels, to the image before a
+    /// resampling to the pinhole camera.
+    pub fn position_in_lens_image(&self, position: [f64; 2]) -> [f64; 2] {
+        match &self.pinhole {
+            Some(pinhole) => self.lens_intrinsics.source_position(pinhole, position),
+            None => position,
+        }
+    }
+
+    /// True if an image of this size may be a resized copy of the photograph.
+    pub fn has_aspect_of(&self, width: u32, height: u32) -> bool {
+        has_aspect_of(&self.lens_intrinsics, width, height)
+    }
+
     /// Resamples an image of the stored size to the pinhole camera, if distortion is removed.
     fn without_distortion(&self, image: Rgba8) -> Rgba8 {
         match &self.pinhole {
             Some(pinhole) => undistort_image(&image, &self.lens_intrinsics, pinhole),
             None => image,
         }
+    }
+}
+
+/// Sets the pixels of a mask that aren't black to white if all are dark: programs write masks of
+/// values 0 and 1, and nerfstudio and COLMAP keep every pixel that isn't 0.
+fn whiten_dark_mask(mask: &mut Rgba8) {
+    let is_dark = mask.data.chunks_exact(4).all(|p| p[..3].iter().all(|v| *v < MIN_BRIGHT_LEVEL));
+    for pixel in mask.data.chunks_exact_mut(4).filter(|p| is_dark && p[..3] != [0; 3]) {
+        pixel[..3].fill(u8::MAX);
     }
 }
 

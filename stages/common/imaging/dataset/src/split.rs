@@ -98,6 +98,14 @@ impl SplitLists<'_> {
         if split.iter().any(BTreeSet::is_empty) {
             return Ok((None, notes));
         }
+        let unused = (0..count).filter(|i| !split.iter().any(|side| side.contains(i))).count();
+        if unused > 0 {
+            let frames = format_count(count, "frame");
+            let are = if unused == 1 { "is" } else { "are" };
+            notes.push(format!(
+                "{unused} of {frames} {are} listed for neither training nor testing"
+            ));
+        }
         let [train, test] = split.map(|frames| frames.into_iter().collect());
         Ok((Some(Split { train, test }), notes))
     }

@@ -197,6 +197,20 @@ mod tests {
         );
     }
 
+    #[test]
+    fn a_frames_angle_of_view_overrides_the_shared_focal_length() {
+        for (first, expected) in [
+            (r#""camera_angle_x": 0.8,"#, [20.0 / f64::tan(0.4), 52.0]),
+            (r#""camera_angle_y": 0.8,"#, [50.0, 15.0 / f64::tan(0.4)]),
+            (r#""camera_angle_x": 0.8, "fl_x": 60,"#, [60.0, 52.0]),
+        ] {
+            let set = read(&frames(r#""fl_x": 50, "fl_y": 52"#, first)).unwrap();
+            let focal_lengths =
+                [0, 1].map(|i| &set.frames[i].lens_intrinsics).map(|k| [k.fx, k.fy]);
+            assert_eq!(focal_lengths, [expected, [50.0, 52.0]], "{first}");
+        }
+    }
+
     /// Intrinsics of the original image are scaled to its smaller copy.
     #[test]
     fn smaller_copies_keep_the_angle_of_view() {
@@ -248,6 +262,7 @@ mod tests {
         for (head, expected) in [
             ("", brown),
             (r#""camera_model": "OPENCV", "is_fisheye": false,"#, brown),
+            (r#""camera_model": "PINHOLE","#, brown),
             (r#""camera_model": "FULL_OPENCV","#, rational(0.0, 0.0)),
             (r#""camera_model": "FULL_OPENCV", "k5": 0.5, "k6": 0.25,"#, rational(0.5, 0.25)),
             (r#""camera_model": "OPENCV", "k6": 0.25,"#, rational(0.0, 0.25)),

@@ -7,7 +7,7 @@ use exr::block::writer::ChunksWriter as _;
 use exr::meta::attribute::{AttributeValue, ChannelDescription, ChannelList, LineOrder, Text};
 use exr::meta::header::Header;
 use exr::meta::{BlockDescription, MetaData};
-use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
+use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _, Vec2};
 
 use crate::error::PixelError;
 use crate::image_buffer::Image;
@@ -36,7 +36,7 @@ pub const COLOUR_CHANNELS: [&str; 4] = ["R", "G", "B", "A"];
 /// Channels of a depth map.
 pub const DEPTH_CHANNELS: [&str; 2] = ["Z", "A"];
 
-/// Content of an EXR file.
+/// Content of an EXR file's display window; zero outside the data window.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExrImage {
     /// Width in pixels.
@@ -227,19 +227,59 @@ fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
     File::open(path).map(BufReader::new).map_err(PixelError::io(path))
 }
 
-/// Reads width and height of the first layer from the header; fails above [`MAX_PIXELS`](crate::MAX_PIXELS).
+/// Reads the image's width and height, those of the display window, from the header; fails above
+/// [`MAX_PIXELS`](crate::MAX_PIXELS).
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
-    let meta = read_header(path)?;
-    let first = meta.headers.first().ok_or_else(|| PixelError::format(path, "no layer"))?;
-    Ok((first.layer_size.width(), first.layer_size.height()))
+    Ok(read_windows(path)?.size)
 }
 
-/// Returns the peak memory of [`read_exr`] in bytes, estimated from the header: each sample as
-/// stored, and as f32.
+/// Returns the peak memory of [`read_exr`] in bytes, estimated from the header: each sample of the
+/// data window as stored, and each of the display window as f32.
 pub fn exr_reading_bytes(path: &Path) -> Result<u64, PixelError> {
     let layers = read_header(path)?.headers;
-    let samples = layers.iter().map(|h| (h.layer_size.area() * h.channels.list.len()) as u64);
-    Ok(8 * samples.sum::<u64>())
+    let samples = layers.iter().map(|h| {
+        let pixels = h.layer_size.area() + h.shared_attributes.display_window.size.area();
+        (pixels * h.channels.list.len()) as u64
+    });
+    Ok(4 * samples.sum::<u64>())
+}
+
+/// Image's size, and the position of the first layer's data window in the image.
+struct Windows {
+    /// Width and height of the display window.
+    size: (usize, usize),
+    /// Column and row of the data window's first pixel.
+    start: (usize, usize),
+}
+
+/// Reads the windows of the first layer from the header. Fails if the data window is not inside the
+/// display window: pixels outside the image have no place in it.
+fn read_windows(path: &Path) -> Result<Windows, PixelError> {
+    let meta = read_header(path)?;
+    let first = meta.headers.first().ok_or_else(|| PixelError::format(path, "no layer"))?;
+    let (data, image) = (first.data_window(), first.shared_attributes.display_window);
+    let Vec2(left, top) = data.position - image.position;
+    let start = |start: i32, length: usize, limit: usize| {
+        usize::try_from(start).ok().filter(|start| start + length <= limit)
+    };
+    let left = start(left, data.size.width(), image.size.width());
+    let top = start(top, data.size.height(), image.size.height());
+    let size = (image.size.width(), image.size.height());
+    if size.0 == 0 || size.1 == 0 {
+        return Err(PixelError::format(path, format!("{}×{} pixels", size.0, size.1)));
+    }
+    if let (Some(left), Some(top)) = (left, top) {
+        return Ok(Windows { size, start: (left, top) });
+    }
+    let [data, image] = [data, image].map(|window| {
+        let (Vec2(width, height), Vec2(x, y)) = (window.size, window.position);
+        format!("{width}×{height} at ({x}, {y})")
+    });
+    Err(PixelError::Unsupported(format!(
+        "{}: data window ({data}) exceeds display window ({image}); crop the image to its display \
+        window",
+        path.display()
+    )))
 }
 
 /// Bytes of a chunk's entry in the offset table.
@@ -251,7 +291,9 @@ fn read_header(path: &Path) -> Result<MetaData, PixelError> {
     let length = length.map_err(PixelError::io(path))?;
     let meta = MetaData::read_from_buffered(file, false).map_err(|e| exr_error(path, e))?;
     for header in &meta.headers {
-        PixelError::check_size(path, (header.layer_size.width(), header.layer_size.height()))?;
+        for size in [header.layer_size, header.shared_attributes.display_window.size] {
+            PixelError::check_size(path, (size.width(), size.height()))?;
+        }
     }
     // Decoding would first allocate memory for the whole table, and for all pixels.
     let chunks: u64 = meta.headers.iter().map(|header| header.chunk_count as u64).sum();
@@ -262,9 +304,9 @@ fn read_header(path: &Path) -> Result<MetaData, PixelError> {
     Ok(meta)
 }
 
-/// Reads every channel of the first layer as f32.
+/// Reads every channel of the first layer as f32, padded with zeros to the display window.
 pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
-    exr_size(path)?;
+    let windows = read_windows(path)?;
     let image = exr::prelude::read()
         .no_deep_data()
         .largest_resolution_level()
@@ -276,14 +318,32 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
         .map_err(|e| exr_error(path, e))?;
     let layer =
         image.layer_data.into_iter().next().ok_or_else(|| PixelError::format(path, "no layer"))?;
-    let (width, height) = (layer.size.width(), layer.size.height());
+    let data_width = layer.size.width();
     let channels = layer
         .channel_data
         .list
         .into_iter()
-        .map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect()))
+        .map(|c| {
+            let samples = c.sample_data.values_as_f32().collect();
+            (c.name.to_string(), padded(samples, data_width, &windows))
+        })
         .collect();
+    let (width, height) = windows.size;
     Ok(ExrImage { width, height, channels })
+}
+
+/// Pads the samples of a data window of the given width with zeros to the display window.
+fn padded(samples: Vec<f32>, data_width: usize, windows: &Windows) -> Vec<f32> {
+    let ((width, height), (left, top)) = (windows.size, windows.start);
+    if samples.len() == width * height {
+        return samples;
+    }
+    let mut image = vec![0.0; width * height];
+    for (row, line) in samples.chunks_exact(data_width.max(1)).enumerate() {
+        let start = (top + row) * width + left;
+        image[start..start + data_width].copy_from_slice(line);
+    }
+    image
 }
 
 fn exr_error(path: &Path, error: exr::error::Error) -> PixelError {
@@ -359,20 +419,58 @@ mod tests {
         }
     }
 
+    /// Sets the windows of a file to (left, top, right, bottom).
+    fn set_windows(path: &Path, data: [i32; 4], display: [i32; 4]) {
+        let mut bytes = std::fs::read(path).unwrap();
+        for (name, window) in
+            [(&b"dataWindow\0box2i\0"[..], data), (b"displayWindow\0box2i\0", display)]
+        {
+            let start = bytes.windows(name.len()).position(|w| w == name).unwrap();
+            // After the length of the attribute (4 bytes).
+            let first = start + name.len() + 4;
+            bytes[first..first + 16].copy_from_slice(&window.map(i32::to_le_bytes).concat());
+        }
+        std::fs::write(path, bytes).unwrap();
+    }
+
+    /// An image cropped to its content keeps its position in the display window.
+    #[test]
+    fn cropped_images_are_padded() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.exr");
+        write(&path, 4, 3);
+        let whole = read_exr(&path).unwrap();
+        set_windows(&path, [0, 0, 3, 2], [-2, -1, 4, 3]);
+        assert_eq!(exr_size(&path).unwrap(), (7, 5));
+        assert_eq!(exr_reading_bytes(&path).unwrap(), 4 * 3 * (4 * 3 + 7 * 5));
+        let image = read_exr(&path).unwrap();
+        assert_eq!((image.width, image.height), (7, 5));
+        for name in ["R", "A", "Z"] {
+            let (padded, cropped) = (image.channel(name).unwrap(), whole.channel(name).unwrap());
+            assert_eq!(padded.len(), 7 * 5);
+            for (i, &value) in padded.iter().enumerate() {
+                let (x, y) = ((i % 7).wrapping_sub(2), (i / 7).wrapping_sub(1));
+                let expected = if x < 4 && y < 3 { cropped[y * 4 + x] } else { 0.0 };
+                assert_eq!(value, expected, "{name} {x} {y}");
+            }
+        }
+        for display in [[1, 0, 9, 9], [0, 0, 2, 9], [-9, -9, -1, -1]] {
+            set_windows(&path, [0, 0, 3, 2], display);
+            for error in [exr_size(&path).unwrap_err(), read_exr(&path).unwrap_err()] {
+                let message = error.to_string();
+                let expected = "data window (4×3 at (0, 0)) exceeds display window (";
+                assert!(message.contains(expected), "{message}");
+            }
+        }
+    }
+
     /// The header declares 60 million rows, for which the reader must not allocate memory.
     #[test]
     fn a_file_without_its_offset_table_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.exr");
         write(&path, 4, 3);
-        let mut bytes = std::fs::read(&path).unwrap();
-        for window in [&b"dataWindow\0box2i\0"[..], b"displayWindow\0box2i\0"] {
-            let start = bytes.windows(window.len()).position(|w| w == window).unwrap();
-            // After the length (4 bytes): left, top, right, bottom.
-            let bottom = start + window.len() + 4 + 12;
-            bytes[bottom..bottom + 4].copy_from_slice(&59_999_999i32.to_le_bytes());
-        }
-        std::fs::write(&path, bytes).unwrap();
+        set_windows(&path, [0, 0, 3, 59_999_999], [0, 0, 3, 59_999_999]);
         for error in [exr_size(&path).unwrap_err(), read_exr(&path).unwrap_err()] {
             let message = error.to_string();
             assert!(message.contains("(shorter than its offset table); export"), "{message}");

@@ -49,7 +49,7 @@ pub use exr_file::{
     read_exr, read_premultiplied, write_exr,
 };
 pub use image_buffer::{Image, Rgba8, psnr_of};
-pub use mask::Mask;
+pub use mask::{MIN_BRIGHT_LEVEL, Mask};
 pub use operator::{AxisTaps, Resampling};
 pub use pillow_resample::{Filter, resize_pillow};
 pub use png_file::{PngRows, encode_png, read_png, write_png};

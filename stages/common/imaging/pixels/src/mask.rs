@@ -94,8 +94,12 @@ impl Mask {
     }
 }
 
+/// Minimum mean level, and minimum alpha, of a mask's pixels that count.
+pub const MIN_BRIGHT_LEVEL: u8 = 128;
+
 fn is_bright(p: &[u8]) -> bool {
-    p[..3].iter().map(|&v| u16::from(v)).sum::<u16>() >= 3 * 128 && p[3] >= 128
+    let sum = p[..3].iter().map(|&v| u16::from(v)).sum::<u16>();
+    sum >= 3 * u16::from(MIN_BRIGHT_LEVEL) && p[3] >= MIN_BRIGHT_LEVEL
 }
 
 /// Returns the `old` columns or rows under one of `new`, with `margin` new ones to either side.

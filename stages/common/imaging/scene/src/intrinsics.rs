@@ -238,18 +238,32 @@ impl Intrinsics {
     }
 }
 
+/// Maximum deviation of an interpolated opacity from 1 that rounding of the weights causes.
+const OPACITY_ROUNDING: f64 = 1e-9;
+
 /// Resamples an image taken with a distorting lens to that of a pinhole camera of the same size and
-/// pose. Cubic interpolation preserves sharpness.
+/// pose. Cubic interpolation preserves sharpness. Colours are interpolated premultiplied by alpha,
+/// so that those of transparent pixels have no influence.
 pub fn undistort_image(image: &Rgba8, taken_with: &Intrinsics, pinhole: &Intrinsics) -> Rgba8 {
     let mut data = Vec::with_capacity(image.data.len());
     for y in 0..image.height {
         for x in 0..image.width {
             let source = taken_with.source_position(pinhole, [x as f64 + 0.5, y as f64 + 0.5]);
-            let colour = sample_cubic((image.width, image.height), source, |column, row| {
+            let [r, g, b, a] = sample_cubic((image.width, image.height), source, |column, row| {
                 let pixel = 4 * (row * image.width + column);
-                [0, 1, 2, 3].map(|c| f64::from(image.data[pixel + c]))
+                let [r, g, b, a] = [0, 1, 2, 3].map(|c| f64::from(image.data[pixel + c]));
+                let opacity = a / 255.0;
+                [r * opacity, g * opacity, b * opacity, a]
             });
+            let mut opacity = a / 255.0;
+            if (opacity - 1.0).abs() < OPACITY_ROUNDING {
+                // Opaque pixels keep their colours exactly.
+                opacity = 1.0;
+            }
+            let alpha = (a + 0.5) as u8;
+            let colour = if alpha == 0 { [0.0; 3] } else { [r, g, b].map(|v| v / opacity) };
             data.extend(colour.map(|v| (v + 0.5) as u8));
+            data.push(alpha);
         }
     }
     Rgba8::new(image.width, image.height, data)
@@ -324,6 +338,29 @@ mod tests {
         }
         let [across, _] = fisheye(60.0).pinhole().unwrap().pinhole_angles();
         assert!((50.0..60.0).contains(&across), "{across}");
+    }
+
+    /// White pixels stay white next to transparent black ones. Alpha is interpolated like a colour
+    /// of an opaque image.
+    #[test]
+    fn colours_of_transparent_pixels_have_no_influence() {
+        let lens = camera(Distortion::brown([-0.15, 0.0, 0.0], [0.0; 2]));
+        let lens = lens.resized(40, 30);
+        let is_white = |i: usize| (i % 40 / 4 + i / 160).is_multiple_of(2);
+        let image = |pixel: fn(bool) -> [u8; 4]| {
+            Rgba8::new(40, 30, (0..1200).flat_map(|i| pixel(is_white(i))).collect())
+        };
+        let undistorted =
+            |image: &Rgba8| undistort_image(image, &lens, &lens.pinhole().unwrap()).data;
+        let white = undistorted(&image(|white| if white { [255; 4] } else { [0; 4] }));
+        let opaque = undistorted(&image(|white| [if white { 255 } else { 0 }, 9, 0, 255]));
+        let mut partial = 0;
+        for (white, opaque) in white.chunks_exact(4).zip(opaque.chunks_exact(4)) {
+            assert_eq!(white, if opaque[0] == 0 { [0; 4] } else { [255, 255, 255, opaque[0]] });
+            assert_eq!(opaque[1..], [9, 0, 255]);
+            partial += usize::from((1..255).contains(&opaque[0]));
+        }
+        assert!(partial > 100, "{partial}");
     }
 
     /// Generates cameras whose distortion folds no corner of the image.

@@ -2,9 +2,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
+use unicode_normalization::UnicodeNormalization as _;
+
 use crate::file_status::{FileStatus, file_status};
 
-/// Names in a folder, grouped by lower-case form.
+/// Names in a folder, grouped by [`folded`] form.
 type Names = BTreeMap<String, Vec<String>>;
 
 /// Cached listings of the folders below a data set's folder, to which paths are relative. Hidden
@@ -24,15 +26,15 @@ impl Listings {
         &self.root
     }
 
-    /// Returns a folder's names in the order of their lower-case forms; none if the folder can't be
+    /// Returns a folder's names in the order of their folded forms; none if the folder can't be
     /// listed.
     pub(crate) fn names(&mut self, folder: &Path) -> Vec<String> {
         self.listing(folder).values().flatten().cloned().collect()
     }
 
-    /// Returns a folder's names that equal `name` if case is ignored.
-    pub(crate) fn case_variants(&mut self, folder: &Path, name: &str) -> Vec<String> {
-        self.listing(folder).get(&name.to_lowercase()).cloned().unwrap_or_default()
+    /// Returns a folder's names that equal `name` if case and Unicode normal form are ignored.
+    pub(crate) fn variants(&mut self, folder: &Path, name: &str) -> Vec<String> {
+        self.listing(folder).get(&folded(name)).cloned().unwrap_or_default()
     }
 
     pub(crate) fn is_file(&self, path: &Path) -> bool {
@@ -53,7 +55,7 @@ impl Listings {
             // Names that aren't UTF-8 can't be in a data set's text files.
             let Ok(name) = entry.file_name().into_string() else { continue };
             if !name.starts_with('.') {
-                names.entry(name.to_lowercase()).or_default().push(name);
+                names.entry(folded(&name)).or_default().push(name);
             }
         }
         for variants in names.values_mut() {
@@ -63,4 +65,14 @@ impl Listings {
         self.folders.insert(folder.to_path_buf(), Rc::clone(&names));
         names
     }
+}
+
+/// Returns a name in its composed normal form: macOS decomposes `é` into `e` and an accent.
+pub(super) fn composed(name: &str) -> String {
+    name.nfc().collect()
+}
+
+/// Returns a name in composed normal form and lower case.
+fn folded(name: &str) -> String {
+    composed(name).to_lowercase()
 }

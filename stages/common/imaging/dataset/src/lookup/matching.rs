@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use crate::lookup::listings::Listings;
+use crate::lookup::listings::{Listings, composed};
 use crate::photograph::{IMAGE_EXTENSIONS, is_image_name};
 use crate::unsupported::is_unsupported_name;
 
@@ -9,19 +9,32 @@ use crate::unsupported::is_unsupported_name;
 pub(super) struct Tolerance {
     /// True for a missing, doubled or converted extension.
     pub(super) extension: bool,
+    /// True for a differing Unicode normal form, also in folders.
+    pub(super) form: bool,
     /// True for differing case, also in folders.
     pub(super) case: bool,
 }
 
 impl Tolerance {
-    pub(super) const NONE: Self = Self { extension: false, case: false };
+    pub(super) const NONE: Self = Self { extension: false, form: false, case: false };
+    const EXTENSION: Self = Self { extension: true, ..Self::NONE };
     /// All tolerances, in the order of the attempts.
-    pub(super) const STEPS: [Self; 4] = [
+    pub(super) const STEPS: [Self; 8] = [
         Self::NONE,
-        Self { extension: true, case: false },
-        Self { extension: false, case: true },
-        Self { extension: true, case: true },
+        Self::EXTENSION,
+        Self { form: true, ..Self::NONE },
+        Self { form: true, ..Self::EXTENSION },
+        Self { case: true, ..Self::NONE },
+        Self { case: true, ..Self::EXTENSION },
+        Self { form: true, case: true, ..Self::NONE },
+        Self { form: true, case: true, ..Self::EXTENSION },
     ];
+
+    /// Returns a name without the differences in form and case that are tolerated.
+    fn folded(self, name: &str) -> String {
+        let name = if self.form { composed(name) } else { name.to_owned() };
+        if self.case { name.to_lowercase() } else { name }
+    }
 }
 
 /// Extensions that a file may have instead of the listed one.
@@ -59,11 +72,13 @@ pub(super) fn candidates(
         vec![Variant { stem: name.to_owned(), extension: "" }]
     };
     let mut found = Vec::new();
-    for folder in matching_folders(listings, parent, tolerance.case) {
+    for folder in matching_folders(listings, parent, tolerance) {
         for Variant { stem, extension } in &variants {
-            for name in listings.case_variants(&folder, &format!("{stem}{extension}")) {
+            let folded_stem = tolerance.folded(stem);
+            for name in listings.variants(&folder, &format!("{stem}{extension}")) {
                 let file = folder.join(&name);
-                if (tolerance.case || name.starts_with(stem.as_str())) && listings.is_file(&file) {
+                let has_stem = tolerance.folded(&name).starts_with(&folded_stem);
+                if has_stem && listings.is_file(&file) {
                     found.push(file);
                 }
             }
@@ -75,8 +90,8 @@ pub(super) fn candidates(
 }
 
 /// Returns the folders that match a path.
-fn matching_folders(listings: &mut Listings, path: &Path, any_case: bool) -> Vec<PathBuf> {
-    if !any_case {
+fn matching_folders(listings: &mut Listings, path: &Path, tolerance: Tolerance) -> Vec<PathBuf> {
+    if !tolerance.form && !tolerance.case {
         return vec![path.to_path_buf()];
     }
     let mut found = vec![PathBuf::new()];
@@ -85,7 +100,8 @@ fn matching_folders(listings: &mut Listings, path: &Path, any_case: bool) -> Vec
         let Some(part) = part.to_str() else { return Vec::new() };
         let mut below = Vec::new();
         for folder in &found {
-            let names = listings.case_variants(folder, part);
+            let mut names = listings.variants(folder, part);
+            names.retain(|name| tolerance.folded(name) == tolerance.folded(part));
             below.extend(names.iter().map(|name| folder.join(name)));
         }
         found = below;

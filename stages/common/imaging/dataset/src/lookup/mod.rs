@@ -3,9 +3,9 @@
 //!
 //! A name is tried literally; with `\` read as `/`; as the longest tail of an absolute path, with
 //! the same number of leading parts removed from all names; with a missing or doubled extension;
-//! and in a different case. Steps combine, each logs one line per data set ([`Lookup::notes`]), and
-//! two candidates are an error. Paths out of the folder are never opened; links inside it are
-//! followed.
+//! in a different Unicode normal form (NFC, or NFD as on macOS); and in a different case. Steps
+//! combine, each logs one line per data set ([`Lookup::notes`]), and two candidates are an error.
+//! Paths out of the folder are never opened; links inside it are followed.
 
 mod listings;
 mod matching;
@@ -297,11 +297,13 @@ impl Lookup {
             && !has_image_extension(path)
             && shorter == *path
             && file.extension().is_some_and(|extension| extension == "png");
-        let is_renamed = tolerance.extension || !tolerance.case && file != path;
+        let is_exact = !tolerance.form && !tolerance.case;
+        let is_renamed = tolerance.extension || is_exact && file != path;
         let extension = is_renamed && !is_implied && *extensions == Extensions::Similar;
         let is_doubled = extension && is_image_name(path) && is_image_name(&shorter);
         let label = if is_doubled { shorter } else { file.to_path_buf() };
-        let taken = StepsTaken { extension, case: tolerance.case, ..*taken };
+        let Tolerance { form, case, .. } = tolerance;
+        let taken = StepsTaken { extension, form, case, ..*taken };
         (LocatedFile { path: file.to_path_buf(), label }, taken)
     }
 
@@ -339,7 +341,7 @@ impl Lookup {
     fn substitutes(&mut self) -> Vec<Option<String>> {
         let mut found = vec![None];
         let root = Path::new("");
-        let variants = self.listings.case_variants(root, IMAGES);
+        let variants = self.listings.variants(root, IMAGES);
         if variants.iter().any(|name| !self.listings.names(Path::new(name)).is_empty()) {
             return found;
         }

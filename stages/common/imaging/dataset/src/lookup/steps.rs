@@ -35,6 +35,7 @@ pub(super) struct StepsTaken {
     pub(super) tail: bool,
     pub(super) substitute: bool,
     pub(super) extension: bool,
+    pub(super) form: bool,
     pub(super) case: bool,
 }
 
@@ -45,6 +46,7 @@ pub(super) struct Steps {
     tail: Step,
     substitute: Step,
     extension: Step,
+    form: Step,
     case: Step,
 }
 
@@ -55,6 +57,7 @@ impl Steps {
             (taken.tail, &mut self.tail),
             (taken.substitute, &mut self.substitute),
             (taken.extension, &mut self.extension),
+            (taken.form, &mut self.form),
             (taken.case, &mut self.case),
         ] {
             if is_taken {
@@ -78,6 +81,7 @@ impl Steps {
             self.tail.note(&tail),
             self.substitute.note(&substitute),
             self.extension.note("with a different extension"),
+            self.form.note("in a different Unicode normal form"),
             self.case.note("in a different case"),
         ]
         .into_iter()

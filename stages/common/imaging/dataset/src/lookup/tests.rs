@@ -36,6 +36,8 @@ fn steps_are_tried_in_order_and_combine() {
         "images/.h.png",
         "images/i.jpg",
         "j.png",
+        "e\u{301}te\u{301}/o\u{308}.PNG",
+        "e\u{301}te\u{301}/\u{fc}.png",
     ]);
     for (name, file) in [
         ("images/a.png", "images/a.png"),
@@ -56,6 +58,10 @@ fn steps_are_tried_in_order_and_combine() {
         ("/j.png", "j.png"),
         ("images/g.png", "images/g.png"),
         ("images/f.png", "images/f.png"),
+        ("\u{e9}t\u{e9}/\u{f6}.PNG", "e\u{301}te\u{301}/o\u{308}.PNG"),
+        ("\u{e9}t\u{e9}/\u{f6}", "e\u{301}te\u{301}/o\u{308}.PNG"),
+        ("\u{c9}t\u{e9}/\u{d6}.png", "e\u{301}te\u{301}/o\u{308}.PNG"),
+        ("e\u{301}te\u{301}/u\u{308}.png", "e\u{301}te\u{301}/\u{fc}.png"),
     ] {
         let mut lookup = Lookup::in_folder(dir.path(), &[name], &[]);
         assert_eq!(find(&mut lookup, name), file, "{name}");
@@ -85,6 +91,26 @@ fn steps_are_tried_in_order_and_combine() {
         let mut lookup = Lookup::in_folder(dir.path(), &[name, other], &[]);
         assert!(find(&mut lookup, name).ends_with(file), "{name}");
         assert_eq!(find(&mut lookup, other), other);
+    }
+}
+
+#[test]
+fn names_in_another_normal_form_are_noted() {
+    let dir = folder(&["e\u{301}.png"]);
+    for (name, notes) in [
+        ("\u{e9}.png", &["Unicode normal form"][..]),
+        ("\u{e9}", &["extension", "Unicode normal form"]),
+        ("E\u{301}.png", &["case"]),
+        ("\u{c9}.png", &["Unicode normal form", "case"]),
+    ] {
+        let mut lookup = Lookup::in_folder(dir.path(), &[name], &[]);
+        assert_eq!(find(&mut lookup, name), "e\u{301}.png");
+        let expected = notes.iter().map(|step| format!("in a different {step} (first: {name} is "));
+        let expected =
+            expected.map(|note| note.replace("in a different ext", "with a different ext"));
+        let found = lookup.notes();
+        assert_eq!(found.len(), notes.len(), "{found:?}");
+        assert!(found.iter().zip(expected).all(|(note, text)| note.contains(&text)), "{found:?}");
     }
 }
 
