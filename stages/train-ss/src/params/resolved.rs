@@ -172,11 +172,7 @@ impl Resolved {
     }
 
     /// Returns the training options of a grid.
-    pub fn grid_training(
-        &self,
-        grid: &GridParams,
-        regularisers: Regularisers,
-    ) -> TrainingOptions {
+    pub fn grid_training(&self, grid: &GridParams, regularisers: Regularisers) -> TrainingOptions {
         TrainingOptions {
             rays: self.rays,
             max_rays_per_step: self.max_rays_per_step as usize,

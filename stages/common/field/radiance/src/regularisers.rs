@@ -37,10 +37,7 @@ impl Regularisers {
     /// Returns the weights for one ray, if each bundle of `bundle` rays has weight `scale`.
     pub(crate) fn per_ray(&self, scale: f32, bundle: usize) -> Self {
         let per_ray = |weight: f64| f64::from(weight as f32 * scale / bundle as f32);
-        Self {
-            distortion: per_ray(self.distortion),
-            floater_loss: per_ray(self.floater_loss),
-        }
+        Self { distortion: per_ray(self.distortion), floater_loss: per_ray(self.floater_loss) }
     }
 
     /// Adds the losses' gradients by each sample's weight. `self` has the weights for one ray.
