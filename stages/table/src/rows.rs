@@ -61,16 +61,23 @@ fn ancestor_count(run: &RunRecord, stage: &str) -> Option<usize> {
 /// Returns the keys of a result: values of axes, method and group.
 fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> Row {
     let mut row: Row = values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
-    let mut method = params.methods.get(stage).unwrap_or(stage).clone();
-    for (name, value) in values {
-        method = method.replace(&format!("{{{name}}}"), value);
-    }
-    row.insert("method".to_owned(), json!(method));
+    row.insert("method".to_owned(), json!(method_name(params, stage, &row)));
     if !params.groups.is_empty() {
         let group = params.groups.iter().find(|group| group.methods.contains(stage));
         row.insert(GROUP.to_owned(), json!(group.map_or("", |group| group.name.as_str())));
     }
     row
+}
+
+/// Returns the name of a block's method, with the row's values of the keys in the name.
+pub(crate) fn method_name(params: &Params, block: &str, row: &Row) -> String {
+    let mut method = params.methods.get(block).map_or(block, String::as_str).to_owned();
+    for (name, value) in row {
+        if let Some(value) = value.as_str() {
+            method = method.replace(&format!("{{{name}}}"), value);
+        }
+    }
+    method
 }
 
 /// Returns the position of a method in the table; methods without a group are last.
