@@ -46,7 +46,7 @@ pub(crate) fn read_references(
                 cameras of input references"
             );
         };
-        let view = read_view(rendered, view, background.grey_level())?.0;
+        let view = read_view(rendered, view, background.grey_level(), true)?.0;
         let (reference, exposure) = KnownView::with_equal_exposure(view, truth, background)
             .bad_input("input reference-views")?;
         if let Some(Exposure { gain: [r, g, b], .. }) = exposure {

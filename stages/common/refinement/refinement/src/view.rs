@@ -18,18 +18,32 @@ pub struct Rendered {
     pub camera: Camera,
     /// Colour, composited on the background, and opacity.
     pub view: Image,
-    /// Camera-space z-depth in scene units, one value per pixel.
+    /// Camera-space z-depth in scene units, one value per pixel; 0 for views without depth.
     pub depth: Vec<f32>,
     /// Opacity, one value per pixel.
     pub opacity: Vec<f32>,
 }
 
 impl Rendered {
-    /// Converts a view's image, composited on a grey background.
-    pub fn new(camera: Camera, image: &ExrImage, background: f32) -> Result<Self, RefinementError> {
-        let (Some(premultiplied), Some(map)) = (image.premultiplied(), DepthMap::of(image)) else {
-            let reason = "channels R, G, B, A and Z are expected";
+    /// Converts a view's image, composited on a grey background. Fails if the image has no depth
+    /// and `needs_depth` is true.
+    pub fn new(
+        camera: Camera,
+        image: &ExrImage,
+        background: f32,
+        needs_depth: bool,
+    ) -> Result<Self, RefinementError> {
+        let Some(premultiplied) = image.premultiplied() else {
+            let reason = "channels R, G, B and A are expected";
             return Err(RefinementError::view(&camera.name, reason));
+        };
+        let depth = match image.channel("Z") {
+            Some(depth) => depth.to_vec(),
+            None if needs_depth => {
+                let reason = "the view has no depth, channel Z; render it with render-depth";
+                return Err(RefinementError::view(&camera.name, reason));
+            }
+            None => vec![0.0; image.width * image.height],
         };
         let k = &camera.intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
@@ -44,11 +58,12 @@ impl Rendered {
         for (i, pixel) in view.data.chunks_exact_mut(INPUTS).enumerate() {
             pixel[..OUTPUTS].copy_from_slice(&composited.data[i * OUTPUTS..][..OUTPUTS]);
         }
-        Ok(Self { opacity: map.opacity.to_vec(), depth: map.depth.to_vec(), view, camera })
+        let opacity = view.data.chunks_exact(INPUTS).map(|pixel| pixel[OUTPUTS]).collect();
+        Ok(Self { opacity, depth, view, camera })
     }
 
     /// Reads a view of an input, composited on a grey background, together with its file's
-    /// channels. Returns `None` if the view has no image.
+    /// channels, as [`Rendered::new`]. Returns `None` if the view has no image.
     ///
     /// # Errors
     /// [`Failure::BadInput`], with input and view, if the image can't be read or isn't that of a
@@ -57,6 +72,7 @@ impl Rendered {
         input: &GivenInput,
         view: &View,
         background: f32,
+        needs_depth: bool,
     ) -> Result<Option<(Self, ExrImage)>, Failure> {
         let Some(file) = &view.image else { return Ok(None) };
         let input_name = format!("input {}", input.name());
@@ -64,7 +80,8 @@ impl Rendered {
         let image = read_exr(&path)
             .and_then(|image| image.with_finite(&["R", "G", "B", "A", "Z"], &path))
             .bad_input(format!("{input_name}: view {}", view.camera.name))?;
-        let rendered = Self::new(view.camera.clone(), &image, background).bad_input(input_name)?;
+        let rendered = Self::new(view.camera.clone(), &image, background, needs_depth)
+            .bad_input(input_name)?;
         Ok(Some((rendered, image)))
     }
 
@@ -238,6 +255,21 @@ mod tests {
     fn mean_difference(a: &Image, b: &Image) -> f32 {
         let pairs = a.data.iter().zip(&b.data);
         pairs.map(|(a, b)| (a - b).abs()).sum::<f32>() / a.data.len() as f32
+    }
+
+    #[test]
+    fn depth_is_required_only_if_needed() {
+        let camera = view([1.0, 0.0, 0.0], 0.5, |_| 1.0).0.camera;
+        let channels =
+            ["A", "B", "G", "R"].map(|name| (name.to_owned(), vec![0.5; WIDTH * HEIGHT]));
+        let image = ExrImage { width: WIDTH, height: HEIGHT, channels: channels.into() };
+        let error = Rendered::new(camera.clone(), &image, 1.0, true).unwrap_err();
+        assert!(error.to_string().contains("no depth"), "{error}");
+        let rendered = Rendered::new(camera, &image, 1.0, false).unwrap();
+        assert_eq!(
+            (rendered.view.data[..4].to_vec(), rendered.opacity[0]),
+            (vec![1.0, 1.0, 1.0, 0.5], 0.5)
+        );
     }
 
     #[test]
