@@ -13,8 +13,8 @@
 //! The crate `metrics` has the types of `metrics.json`.
 //!
 //! Means over views are means of per-view values. Transparent backgrounds are scored on white.
-//! Pixels outside a view's mask count as correct, except in PSNR and [`WarpScore`], which ignore
-//! them.
+//! Pixels outside a view's mask count as correct, except in PSNR, [`depth_error`] and
+//! [`WarpScore`], which ignore them.
 
 mod derived;
 mod metric;
