@@ -275,7 +275,7 @@ mod tests {
 
     #[test]
     fn figures_have_distinct_paths_and_labels() {
-        let all = all_metrics(Perceptual::new(None).unwrap());
+        let all = all_metrics(Perceptual::new(None, usize::MAX).unwrap());
         let figures: Vec<ScoreFormat> = all.iter().flat_map(|metric| metric.figures()).collect();
         for (i, figure) in figures.iter().enumerate() {
             assert!(figures[..i].iter().all(|f| f.path != figure.path && f.label != figure.label));
