@@ -140,10 +140,9 @@ impl Layout<'_> {
         for column in columns {
             let selected = select(&mine, &self.params.columns, column);
             let all = select(rivals, &self.params.columns, column);
-            let rivals = select(&group, &self.params.columns, column);
             let mut cells: Vec<String> = Vec::new();
             for name in values {
-                cells.push(self.cell(name, &selected, &rivals, &all));
+                cells.push(self.cell(name, &selected, self.best(&group, column, name, &all), &all));
             }
             if let Some(reason) = missing_reason(&selected) {
                 line.push(reason);
@@ -178,28 +177,28 @@ impl Layout<'_> {
             .collect()
     }
 
-    /// Returns the best mean of a value over all scenes among several lines.
-    fn best(&self, rivals: &[Row], name: &str, all: &[Row]) -> Option<f64> {
+    /// Returns the best mean of a value in a column with several lines, each over all scenes.
+    fn best(&self, rivals: &[Row], column: &[String], name: &str, all: &[Row]) -> Option<f64> {
         let lower_is_better = self.figures.lower_is_better(name)?;
         let lines = distinct(rivals, &self.keys);
         let means = lines.iter().filter_map(|keys| {
             let line = select(rivals, &self.keys, keys);
-            let is_complete = self.partial_scenes(all, &line, name).is_none();
-            mean(&line, name).filter(|_| is_complete)
+            let selected = select(&line, &self.params.columns, column);
+            let is_complete = self.partial_scenes(all, &selected, name).is_none();
+            mean(&selected, name).filter(|_| is_complete)
         });
         means.reduce(if lower_is_better { f64::min } else { f64::max }).filter(|_| lines.len() > 1)
     }
 
-    /// Formats a line's mean of a value. The best of `rivals` is bold, and a mean without some of
+    /// Formats a line's mean of a value. The best of its column is bold, and a mean without some of
     /// the scenes of `all` names their numbers.
-    fn cell(&self, name: &str, line: &[Row], rivals: &[Row], all: &[Row]) -> String {
+    fn cell(&self, name: &str, line: &[Row], best: Option<f64>, all: &[Row]) -> String {
         let Some(value) = mean(line, name) else { return NO_VALUE.to_owned() };
         let text = self.figures.format(name, value);
         if let Some([present, expected]) = self.partial_scenes(all, line, name) {
             return format!("{text} ({present} of {expected} scenes)");
         }
         // Values that are equal after rounding are equally good.
-        let best = self.best(rivals, name, all);
         if best.is_some_and(|best| self.figures.format(name, best) == text) {
             format!("**{text}**")
         } else {
