@@ -20,7 +20,7 @@ impl<T: refinement::Training> stage::Training for ExampleTraining<'_, T> {
     }
 
     fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
-        Ok(self.trainer.write_checkpoint(path)?)
+        self.trainer.write_checkpoint(path).map_err(training_failure)
     }
 
     fn resume(&mut self, path: &Path) -> anyhow::Result<()> {
