@@ -433,6 +433,11 @@ fn a_page_reports_unreadable_scores() {
         .into_iter()
         .flatten()
         .for_each(|content| assert_eq!(content["summary"][0], summary[0]));
+    // A square without pixels is refused.
+    let (run, output) = (folder.path().join("run"), folder.path().join("none"));
+    let finished = stage("report", r#"{"crop": [0, 0, 0]}"#, &[("run", &run)], &output, &[]);
+    assert_eq!(finished.code, 2);
+    assert!(finished.stderr.contains("a side of at least 1 pixel"), "{}", finished.stderr);
 }
 
 fn heading(project: &Project, folder: &str) -> String {

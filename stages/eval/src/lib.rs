@@ -13,8 +13,8 @@
 //! The crate `metrics` has the types of `metrics.json`.
 //!
 //! Means over views are means of per-view values. Transparent backgrounds are scored on white.
-//! Pixels outside a view's mask count as correct, except in PSNR and [`WarpScore`], which ignore
-//! them.
+//! Pixels outside a view's mask count as correct, except in PSNR, [`depth_error`] and
+//! [`WarpScore`], which ignore them.
 
 mod derived;
 mod metric;
@@ -95,7 +95,12 @@ impl Stage for Eval {
     fn run(context: &Context, _: &Params) -> anyhow::Result<()> {
         let (views_input, truth_input) = (context.input("views")?, context.input("truth")?);
         let (views, truth) = (Views::read(views_input)?, Views::read(truth_input)?);
-        let metrics = all_metrics(Perceptual::new(context.optional_input("weights"))?);
+        let perceptual =
+            Perceptual::new(context.optional_input("weights"), min_scored_side(&truth))?;
+        for note in perceptual.notes() {
+            context.log_line(note);
+        }
+        let metrics = all_metrics(perceptual);
         let degradation: Option<Degradation> = truth_input.read_optional_json(DEGRADATION_FILE)?;
         let scene =
             ScoredScene { views_input, views: &views, truth_input, truth: &truth, degradation };
@@ -127,6 +132,13 @@ impl Stage for Eval {
         summary.push(artifact::format_count(result.views.len(), "view"));
         context.write_summary(&summary.join(" · "))
     }
+}
+
+/// Returns the smallest side of a view with HR truth, in pixels.
+fn min_scored_side(truth: &Views) -> usize {
+    let views = truth.views.iter().filter(|view| view.image.is_some());
+    let sides = views.map(|view| view.camera.intrinsics.width.min(view.camera.intrinsics.height));
+    sides.min().map_or(usize::MAX, |side| side as usize)
 }
 
 fn picture_titles(metrics: &[Box<dyn Metric>]) -> BTreeMap<String, String> {

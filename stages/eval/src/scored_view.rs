@@ -21,6 +21,8 @@ pub(crate) struct ScoredView<'a> {
     pub(crate) render: Image,
     /// HR truth, if any; equal to the render at pixels that don't count.
     pub(crate) truth: Option<Image>,
+    /// Mask of the pixels that count, of the size of the truth's images; `None` for all.
+    pub(crate) mask: Option<Mask>,
     /// Fraction of the pixels that count by the mask.
     pub(crate) counted_share: f64,
     pub(crate) lr: Option<LrPair>,
@@ -58,7 +60,8 @@ impl<'a> ScoredView<'a> {
             truth,
             counted_share: 1.0,
         });
-        let mut scored = Self { scene, view, true_view, render, truth, counted_share: 1.0, lr };
+        let (mask, counted_share) = (None, 1.0);
+        let mut scored = Self { scene, view, true_view, render, truth, mask, counted_share, lr };
         scored.apply_mask()?;
         Ok(scored)
     }
@@ -82,6 +85,7 @@ impl<'a> ScoredView<'a> {
         if let Some(lr) = &mut self.lr {
             lr.counted_share = fill_masked(name, &mask, &mut lr.truth, &lr.render)?;
         }
+        self.mask = Some(mask);
         Ok(())
     }
 }

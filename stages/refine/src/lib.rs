@@ -176,6 +176,8 @@ fn refine_all(
         network::add_statistics(&mut summary.statistics, &refined.statistics);
         view.depth = view.depth.as_ref().map(|_| image.clone());
         view.image = Some(image);
+        // These files of the input aren't copied.
+        (view.mask, view.low_resolution) = (None, None);
         progress.add(1);
     }
     if job.expects_consistent && summary.consistent < summary.views {

@@ -1,4 +1,5 @@
 use artifact::{Failure, FailureExt as _, bail_bad_input};
+use pixels::Exposure;
 use refinement::{KnownView, ReferenceStatistics, Rendered, WarpOptions, with_references};
 use scene::{Background, View, Views};
 use stage::Context;
@@ -45,30 +46,18 @@ pub(crate) fn read_references(
                 cameras of input references"
             );
         };
-        let view = read_view(rendered, view, background.grey_level())?.0;
-        let known = KnownView::new(view, truth.over(background.grey_level()))
+        let view = read_view(rendered, view, background.grey_level(), true)?.0;
+        let (reference, exposure) = KnownView::with_equal_exposure(view, truth, background)
             .bad_input("input reference-views")?;
-        let (reference, note) = correct_exposure(known);
-        if let Some(note) = note {
-            context.log_line(note);
+        if let Some(Exposure { gain: [r, g, b], .. }) = exposure {
+            context.log_line(format!(
+                "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright); \
+                corrected"
+            ));
         }
         references.push(reference);
     }
     Ok(references)
-}
-
-/// Corrects a reference's exposure to that of the field's training images. Returns a log line if
-/// the exposure differed.
-fn correct_exposure(reference: KnownView) -> (KnownView, Option<String>) {
-    let Some(exposure) = reference.exposure().filter(|exposure| !exposure.is_negligible()) else {
-        return (reference, None);
-    };
-    let [r, g, b] = exposure.gain;
-    let name = &reference.rendered.camera.name;
-    let note = format!(
-        "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright); corrected"
-    );
-    (reference.with_corrected_exposure(&exposure), Some(note))
 }
 
 /// Minimum confidence in a reference, relative to the confidence in the references that the network
@@ -286,36 +275,5 @@ mod tests {
         assert!(reliable_names(&ReferenceJudge { read: &failing, ..judge }, 1.0).is_err());
         let notes = logged.take();
         assert!(notes.len() == 1 && notes[0].starts_with(starts[0]), "{notes:?}");
-    }
-
-    /// Returns a reference whose channels are multiplied by `gain`.
-    fn with_gain(gain: [f32; 3]) -> KnownView {
-        let truth: Vec<[f32; 3]> =
-            colours(0.0).iter().map(|wall| std::array::from_fn(|c| gain[c] * wall[c])).collect();
-        known_view("a", 0.0, &truth)
-    }
-
-    #[test]
-    fn a_differing_exposure_is_corrected() {
-        let (reference, note) = correct_exposure(with_gain([0.6, 0.7, 1.0]));
-        let expected =
-            "reference a has another exposure (0.60, 0.70, 1.00 times as bright); corrected";
-        assert_eq!(note.as_deref(), Some(expected));
-        let error = reference
-            .truth
-            .data
-            .iter()
-            .zip(colours(0.0).as_flattened())
-            .map(|(a, b)| (a - b).abs())
-            .fold(0.0, f32::max);
-        assert!(error < 1e-4, "{error}");
-        // Differences that a field's errors explain aren't corrected, nor is a uniform image.
-        for unchanged in
-            [with_gain([1.05, 0.95, 1.0]), known_view("a", 0.0, &[[1.0; 3]; WIDTH * HEIGHT])]
-        {
-            let truth = unchanged.truth.clone();
-            let (reference, note) = correct_exposure(unchanged);
-            assert!(reference.truth == truth && note.is_none(), "{note:?}");
-        }
     }
 }

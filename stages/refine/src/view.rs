@@ -10,13 +10,15 @@ use stage::Context;
 use crate::enlarged::EnlargedPhotographs;
 use crate::network::{AnyRefiner, Application};
 
-/// Reads a rendered view, and all channels of its file.
+/// Reads a rendered view, and all channels of its file. Fails if the view has no depth and
+/// `needs_depth` is true.
 pub(crate) fn read_view(
     input: &GivenInput,
     view: &View,
     background: f32,
+    needs_depth: bool,
 ) -> Result<(Rendered, ExrImage), Failure> {
-    Rendered::read(input, view, background)?.ok_or_else(|| {
+    Rendered::read(input, view, background, needs_depth)?.ok_or_else(|| {
         Failure::BadInput(format!("input {}: view {} has no image", input.name(), view.camera.name))
     })
 }
@@ -77,7 +79,8 @@ impl RefineJob<'_> {
 
     /// Reads a view.
     pub(crate) fn read(&self, view: &View) -> Result<ViewToRefine, Failure> {
-        let (mut rendered, file) = read_view(self.views_input, view, self.background)?;
+        let needs_depth = self.network.takes_references();
+        let (mut rendered, file) = read_view(self.views_input, view, self.background, needs_depth)?;
         let photograph = match &self.photographs {
             Some(photographs) => photographs.photograph(&view.camera)?,
             None => None,

@@ -142,8 +142,10 @@ impl Data {
             }
         }
         let pictures = write_pictures(context, &layers, &requests, budget)?;
-        let requested = params.compare.as_ref();
-        let requested = requested.and_then(|name| views.iter().position(|v| v.name == *name));
+        let requested = requested_view(params, &views).unwrap_or_else(|note| {
+            context.log_line(note);
+            None
+        });
         let requested = requested.filter(|view| pictures.iter().any(|p| p.view == *view));
         let first = pictures.first().map_or(0, |picture| picture.view);
         let (layer_data, scales) = layer_data(report, &layers, &depth_ranges);
@@ -168,6 +170,17 @@ impl Data {
     pub(crate) fn to_json(&self) -> anyhow::Result<String> {
         Ok(serde_json::to_string(self)?.replace('<', "\\u003c"))
     }
+}
+
+/// Returns the index of the view that the page should display first, if any. Fails with a log line
+/// if there is no such view.
+fn requested_view(params: &Params, views: &[ViewData]) -> Result<Option<usize>, String> {
+    let Some(name) = &params.compare else { return Ok(None) };
+    let index = views.iter().position(|view| view.name == *name);
+    index.map(Some).ok_or_else(|| {
+        let known = artifact::known_names(name, views.iter().map(|view| view.name.as_str()));
+        format!("parameter compare: no view {name}; {known}")
+    })
 }
 
 /// Chooses the views of a data set that get pictures: spread evenly, including the requested view.
@@ -277,4 +290,23 @@ fn curve(node: &RunNode) -> Option<Curve> {
     let points: Vec<[f64; 2]> = log.curve.iter().map(|p| [p.rays as f64, p.psnr]).collect();
     let label = artifact::label(&node.stage, &node.point);
     (points.len() > 1).then_some(Curve { label, points })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_view_is_reported() {
+        let views = ["r_0", "r_1"].map(|name| ViewData { name: name.to_owned(), scene: 0 });
+        for (compare, expected) in [
+            (None, Ok(None)),
+            (Some("r_1"), Ok(Some(1))),
+            (Some("nosuch"), Err("parameter compare: no view nosuch; known: r_0, r_1".to_owned())),
+        ] {
+            let compare = compare.map(str::to_owned);
+            let params = Params { compare, ..Params::default() };
+            assert_eq!(requested_view(&params, &views), expected);
+        }
+    }
 }

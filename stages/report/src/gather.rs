@@ -92,7 +92,7 @@ impl<'a> Report<'a> {
 
     /// Returns the index of a node's data set, which is added if it is new.
     fn scene(&mut self, node: usize) -> usize {
-        let data_set = data_set(self.run, node);
+        let data_set = self.run.data_set(node);
         let scene = self.scenes.iter().position(|scene| scene.data_set == data_set);
         scene.unwrap_or_else(|| {
             self.scenes.push(SceneViews { data_set, views: Vec::new() });
@@ -114,7 +114,11 @@ impl<'a> Report<'a> {
     fn add(&mut self, index: usize, node: &'a RunNode, metrics: AnyMetrics) {
         let scene = self.scene(index);
         self.add_views(scene, metrics.views().iter().filter_map(|view| view["name"].as_str()));
-        let [training, rendering] = times(self.run, node, index);
+        // 0 is added because the sum of nothing is -0.
+        let [training, rendering] = self
+            .run
+            .training_and_rendering(index)
+            .map(|nodes| nodes.iter().map(|&i| self.run.nodes[i].seconds).sum::<f64>() + 0.0);
         let label = String::new();
         self.rows.push(Row { node, index, metrics, label, scene, training, rendering });
     }
@@ -234,42 +238,4 @@ pub(crate) fn views_label(node: &RunNode) -> String {
         "upsample" => "enlarged".to_owned(),
         _ => node.stage.clone(),
     }
-}
-
-/// Names the data sets that a node was made from: their folders, or the blocks that made them.
-fn data_set(run: &RunRecord, index: usize) -> String {
-    let mut found: Vec<String> = Vec::new();
-    for node in run.ancestors(index).into_iter().map(|i| &run.nodes[i]) {
-        if !["dataset", "scene"].contains(&node.kind.as_str()) {
-            continue;
-        }
-        let folders: Vec<_> =
-            node.inputs.values().filter_map(|input| input.folder.as_ref()).collect();
-        match node.kind.as_str() {
-            "dataset" if folders.is_empty() => found.push(node.stage.clone()),
-            _ => found.extend(folders.iter().map(|folder| folder.display().to_string())),
-        }
-    }
-    found.sort();
-    found.dedup();
-    found.join(", ")
-}
-
-/// Returns the seconds of training and of rendering. Views that a refiner was trained on count as
-/// training.
-fn times(run: &RunRecord, node: &RunNode, index: usize) -> [f64; 2] {
-    let mut rendering = Vec::new();
-    let mut next = node.inputs.get("views").and_then(|input| input.node);
-    while let Some(index) = next {
-        rendering.push(index);
-        next = run.nodes[index].inputs.get("views").and_then(|input| input.node);
-    }
-    let mut training = run.ancestors(index);
-    training.retain(|i| {
-        ["field", "refiner", "views"].contains(&run.nodes[*i].kind.as_str())
-            && !rendering.contains(i)
-    });
-    // 0 is added because the sum of nothing is -0.
-    [training, rendering]
-        .map(|nodes| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0)
 }

@@ -38,7 +38,7 @@ mod scale;
 mod tables;
 mod unscored;
 
-use artifact::{Failure, RunRecord, format_count, format_size};
+use artifact::{Failure, RunRecord, bail_usage, format_count, format_size};
 use stage::{Context, Input, Output, Stage};
 
 pub use data::Params;
@@ -77,6 +77,9 @@ impl Stage for Report {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
         run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        if let Some([.., 0]) = params.crop {
+            bail_usage!("parameter crop: expected a side of at least 1 pixel, found 0");
+        }
         let report = gather::Report::new(&run);
         let text = page::page(&report, None)?.into_string().len();
         let budget = MAX_PAGE_BYTES.saturating_sub(text + CAPTION_BYTES);

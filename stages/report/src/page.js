@@ -37,8 +37,10 @@ function scrollHints() {
 function openTargets() {
   for (const link of document.querySelectorAll(".graph a, a.term")) {
     link.addEventListener("click", () => {
-      const details = document.querySelector(link.getAttribute("href")).closest("details");
-      details.open = true;
+      // A figure's name may have any character, so the target is found by id, not by selector.
+      const target = document.getElementById(link.getAttribute("href").slice(1));
+      const details = target?.closest("details");
+      if (details) details.open = true;
     });
   }
 }

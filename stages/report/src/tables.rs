@@ -12,8 +12,12 @@ const SUMMARY_FIGURES: usize = 4;
 /// by hand.
 const MAX_CELLS: usize = 12_000;
 
-/// Section with the most important figures of the best result.
+/// Section with the most important figures of the best result. Results of different data sets have
+/// no best one.
 pub(crate) fn summary(report: &Report<'_>) -> Markup {
+    if report.scenes.len() > 1 {
+        return html! {};
+    }
     let Some(best) = report.best() else {
         return html! { p class="note" { "There are no scores." } };
     };
@@ -235,4 +239,42 @@ fn definitions<'a>(report: &'a Report<'_>) -> BTreeMap<&'a str, &'a str> {
     }
     all.extend(report.figures.iter().filter_map(|figure| definition(report, figure)));
     all
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use artifact::RunRecord;
+    use serde_json::json;
+
+    use super::*;
+
+    fn run(folder: &Path, data_sets: [&str; 2]) -> RunRecord {
+        let mut nodes = Vec::new();
+        for (i, data_set) in data_sets.into_iter().enumerate() {
+            let output = folder.join(i.to_string());
+            std::fs::create_dir_all(&output).unwrap();
+            let metrics = json!({"mean": {"psnr": 20 + i}, "views": [{"name": "a", "scores": {}}]});
+            std::fs::write(output.join("metrics.json"), metrics.to_string()).unwrap();
+            let node = |kind: &str, inputs: serde_json::Value| {
+                json!({"stage": kind, "point": format!("point={i}"), "kind": kind, "key": "",
+                    "output": "", "folder": output, "parameters": {}, "inputs": inputs,
+                    "started_unix": 0, "seconds": 0.0, "threads": 1})
+            };
+            nodes.push(node("scene", json!({"dataset": {"folder": data_set}})));
+            nodes.push(node("metrics", json!({"truth": {"node": 2 * i}})));
+        }
+        serde_json::from_value(json!({"nodes": nodes})).unwrap()
+    }
+
+    #[test]
+    fn the_best_result_is_one_of_a_single_data_set() {
+        let folder = tempfile::tempdir().unwrap();
+        for (data_sets, has_best) in [(["lego", "lego"], true), (["lego", "chair"], false)] {
+            let run = run(folder.path(), data_sets);
+            let text = summary(&Report::new(&run)).into_string();
+            assert_eq!(text.contains("of 2 results: <b>point=1</b>"), has_best, "{text}");
+        }
+    }
 }

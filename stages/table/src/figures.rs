@@ -34,17 +34,17 @@ impl Figures {
         }
     }
 
-    /// True if lower values are better, as for times and values without a title here.
-    pub(crate) fn lower_is_better(&self, name: &str) -> bool {
-        match self.0.get(name) {
-            Some(figure) => figure.higher_is_better == Some(false),
-            None => added(name).is_none_or(|(.., is_better)| is_better == Some(false)),
-        }
-    }
-
-    /// True if no value of the column is better than another: numbers of views.
-    pub(crate) fn has_no_best(name: &str) -> bool {
-        added(name).is_some_and(|(.., is_better)| is_better.is_none())
+    /// Returns whether lower values are better: as declared by a metric, otherwise as known by name.
+    /// `None` if no value is known to be better than another.
+    pub(crate) fn lower_is_better(&self, name: &str) -> Option<bool> {
+        let is_higher_better = match (self.0.get(name), added(name)) {
+            (Some(figure), _) => figure.higher_is_better,
+            (None, Some((.., is_higher_better))) => is_higher_better,
+            (None, None) if name.starts_with("psnr") || name.starts_with("ssim") => Some(true),
+            (None, None) if name.starts_with("lpips") || is_time(name) => Some(false),
+            (None, None) => None,
+        };
+        is_higher_better.map(|is_higher_better| !is_higher_better)
     }
 
     /// Formats a value with its digits and unit.
@@ -115,7 +115,8 @@ mod tests {
         ]})));
         assert_eq!(figures.titles(&[&"sharpness.mean".to_owned()]), ["sharpness"]);
         assert_eq!(figures.format("sharpness.mean", 2.34), "2.3");
-        assert!(!figures.lower_is_better("sharpness.mean") && figures.lower_is_better("blur"));
+        assert_eq!(figures.lower_is_better("sharpness.mean"), Some(false));
+        assert_eq!(figures.lower_is_better("blur"), Some(true));
     }
 
     #[test]
@@ -133,7 +134,17 @@ mod tests {
         ] {
             assert_eq!(figures.format(name, value), text, "{name}");
         }
-        assert!(figures.lower_is_better("train_s") && !figures.lower_is_better("gain"));
+        for (name, expected) in [
+            ("train_s", Some(true)),
+            ("gain", Some(false)),
+            ("psnr", Some(false)),
+            ("ssim_valid", Some(false)),
+            ("lpips_vgg", Some(true)),
+            ("views", None),
+            ("something", None),
+        ] {
+            assert_eq!(figures.lower_is_better(name), expected, "{name}");
+        }
         assert_eq!(figures.title("rays_per_s"), "rays/s");
     }
 }

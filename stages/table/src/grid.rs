@@ -7,12 +7,10 @@ use crate::figures::Figures;
 use crate::front::{Axes, Point};
 use crate::params::Params;
 use crate::rows::{GROUP, MISSING};
-use crate::values::{Row, distinct, listed, mean, select};
+use crate::values::{Row, SCENE, difference, distinct, listed, mean, scenes, select};
 
 /// Names of a result's provenance, which aren't keys.
 pub(crate) const PROVENANCE: [&str; 2] = ["commit", "machine"];
-/// Key of a result's scene; results of several scenes also get a table for each.
-pub(crate) const SCENE: &str = "scene";
 
 /// Lines and columns of a table.
 pub(crate) struct Layout<'a> {
@@ -20,8 +18,8 @@ pub(crate) struct Layout<'a> {
     pub(crate) figures: &'a Figures,
     /// Keys whose values identify a line.
     pub(crate) keys: Vec<String>,
-    /// Value that others are compared with.
-    pub(crate) reference: Option<f64>,
+    /// Results that others are compared with.
+    pub(crate) reference: Option<Vec<Row>>,
 }
 
 impl Layout<'_> {
@@ -63,7 +61,7 @@ impl Layout<'_> {
                 head.push(format!("{} ({})", column.join(", "), titles.join(" / ")));
             }
         }
-        head.extend(self.reference.map(|_| {
+        head.extend(self.reference.as_ref().map(|_| {
             let values: Vec<&str> = self.params.relative_to.values().map(String::as_str).collect();
             format!("against {}", values.join(", "))
         }));
@@ -72,21 +70,24 @@ impl Layout<'_> {
         head
     }
 
-    /// Returns the names of the Pareto front's values; `None` without a front.
+    /// Returns the names of the Pareto front's values; `None` without a front, or if no score is
+    /// known to be better than another.
     fn axes(&self) -> Option<Axes<'_>> {
         let score = self.params.compared_value();
-        Some(Axes {
-            cost: self.params.front.as_ref()?,
-            score,
-            lower_is_better: self.figures.lower_is_better(score),
-        })
+        let lower_is_better = self.figures.lower_is_better(score)?;
+        Some(Axes { cost: self.params.front.as_ref()?, score, lower_is_better })
     }
 
-    /// Returns the lines that have both values of the Pareto front, named by their keys.
+    /// Returns the lines that have both values of the Pareto front for all scenes, named by their
+    /// keys.
     fn points(&self, rows: &[Row], axes: &Axes<'_>) -> Vec<Point> {
         let point = |keys: Vec<String>| {
             let line = select(rows, &self.keys, &keys);
-            let (cost, score) = (mean(&line, axes.cost)?, mean(&line, axes.score)?);
+            let complete_mean = |name| {
+                let is_complete = self.partial_scenes(rows, &line, name).is_none();
+                mean(&line, name).filter(|_| is_complete)
+            };
+            let (cost, score) = (complete_mean(axes.cost)?, complete_mean(axes.score)?);
             Some(Point { name: keys.join(", "), cost, score })
         };
         distinct(rows, &self.keys).into_iter().filter_map(point).collect()
@@ -116,7 +117,16 @@ impl Layout<'_> {
         }
     }
 
-    /// Returns the cells of a line of `rows`; the best of `rivals` in the line's group are marked.
+    /// Returns the number of scenes for which a line has a value, and the number for which any row
+    /// has the value; `None` if the line lacks none of them, or if each line has one scene.
+    fn partial_scenes(&self, rows: &[Row], line: &[Row], name: &str) -> Option<[usize; 2]> {
+        let counts = [line, rows].map(|rows| scenes(rows, name).len());
+        let is_partial = counts[0] < counts[1] && !self.keys.iter().any(|key| key == SCENE);
+        is_partial.then_some(counts)
+    }
+
+    /// Returns the cells of a line of `rows`. The best of `rivals` in the line's group are marked;
+    /// the line should have all scenes of `rivals`.
     fn line(
         &self,
         rows: &[Row],
@@ -125,14 +135,14 @@ impl Layout<'_> {
         (columns, values): (&[Vec<String>], &[&String]),
     ) -> Vec<String> {
         let mine = select(rows, &self.keys, keys);
-        let rivals = self.rivals(rivals, &mine);
+        let group = self.group(rivals, &mine);
         let mut line = keys.to_vec();
         for column in columns {
             let selected = select(&mine, &self.params.columns, column);
+            let all = select(rivals, &self.params.columns, column);
             let mut cells: Vec<String> = Vec::new();
             for name in values {
-                let best = self.best(&rivals, column, name);
-                cells.push(self.cell(name, mean(&selected, name), best));
+                cells.push(self.cell(name, &selected, self.best(&group, column, name, &all), &all));
             }
             if let Some(reason) = missing_reason(&selected) {
                 line.push(reason);
@@ -147,8 +157,8 @@ impl Layout<'_> {
                 line.push(cells.join(" / "));
             }
         }
-        if let Some(reference) = self.reference {
-            let gain = mean(&mine, self.params.compared_value()).map(|value| value - reference);
+        if let Some(reference) = &self.reference {
+            let gain = difference(&mine, reference, self.params.compared_value());
             line.push(gain.map_or(NO_VALUE.to_owned(), |gain| format!("{gain:+.2}")));
         }
         for name in PROVENANCE {
@@ -159,7 +169,7 @@ impl Layout<'_> {
     }
 
     /// Returns the rows that have values and belong to the group of `mine`.
-    fn rivals(&self, rows: &[Row], mine: &[Row]) -> Vec<Row> {
+    fn group(&self, rows: &[Row], mine: &[Row]) -> Vec<Row> {
         let group = mine.first().and_then(|row| row.get(GROUP));
         rows.iter()
             .filter(|row| row.get(GROUP) == group && !row.contains_key(MISSING))
@@ -167,25 +177,27 @@ impl Layout<'_> {
             .collect()
     }
 
-    /// Returns the best mean of a value in a column with several lines.
-    fn best(&self, rivals: &[Row], column: &[String], name: &str) -> Option<f64> {
-        if Figures::has_no_best(name) {
-            return None;
-        }
+    /// Returns the best mean of a value in a column with several lines, each over all scenes.
+    fn best(&self, rivals: &[Row], column: &[String], name: &str, all: &[Row]) -> Option<f64> {
+        let lower_is_better = self.figures.lower_is_better(name)?;
         let lines = distinct(rivals, &self.keys);
         let means = lines.iter().filter_map(|keys| {
             let line = select(rivals, &self.keys, keys);
-            mean(&select(&line, &self.params.columns, column), name)
+            let selected = select(&line, &self.params.columns, column);
+            let is_complete = self.partial_scenes(all, &selected, name).is_none();
+            mean(&selected, name).filter(|_| is_complete)
         });
-        means
-            .reduce(if self.figures.lower_is_better(name) { f64::min } else { f64::max })
-            .filter(|_| lines.len() > 1)
+        means.reduce(if lower_is_better { f64::min } else { f64::max }).filter(|_| lines.len() > 1)
     }
 
-    /// Formats a value; the best of its column is bold.
-    fn cell(&self, name: &str, value: Option<f64>, best: Option<f64>) -> String {
-        let Some(value) = value else { return NO_VALUE.to_owned() };
+    /// Formats a line's mean of a value. The best of its column is bold, and a mean without some of
+    /// the scenes of `all` names their numbers.
+    fn cell(&self, name: &str, line: &[Row], best: Option<f64>, all: &[Row]) -> String {
+        let Some(value) = mean(line, name) else { return NO_VALUE.to_owned() };
         let text = self.figures.format(name, value);
+        if let Some([present, expected]) = self.partial_scenes(all, line, name) {
+            return format!("{text} ({present} of {expected} scenes)");
+        }
         // Values that are equal after rounding are equally good.
         if best.is_some_and(|best| self.figures.format(name, best) == text) {
             format!("**{text}**")

@@ -4,10 +4,10 @@
 use artifact::{FailedPoint, Failure, bail_usage, label};
 
 use crate::figures::Figures;
-use crate::grid::{Layout, NO_VALUE, PROVENANCE, SCENE, markdown_table};
+use crate::grid::{Layout, NO_VALUE, PROVENANCE, markdown_table};
 use crate::params::Params;
-use crate::rows::{GROUP, MISSING};
-use crate::values::{Row, distinct, mean, select};
+use crate::rows::{GROUP, MISSING, method_name};
+use crate::values::{Row, SCENE, difference, distinct, mean, scenes, select};
 
 /// File of [`Document::picture`].
 pub(crate) const PICTURE: &str = "front.svg";
@@ -125,16 +125,15 @@ fn check_front(params: &Params, rows: &[Row]) -> Result<(), Failure> {
     bail_usage!("parameter front: no result has a value {front:?}; {known}");
 }
 
-/// Returns the value that others are compared with. Fails if the named results don't have it.
-fn reference(params: &Params, rows: &[Row]) -> Result<Option<f64>, Failure> {
+/// Returns the results that others are compared with. Fails if they don't have the compared value.
+fn reference(params: &Params, rows: &[Row]) -> Result<Option<Vec<Row>>, Failure> {
     if params.relative_to.is_empty() || rows.is_empty() {
         return Ok(None);
     }
     let (keys, values): (Vec<String>, Vec<String>) = params.relative_to.clone().into_iter().unzip();
     let selected = select(rows, &keys, &values);
     let name = params.compared_value();
-    let value = mean(&selected, name);
-    if value.is_none() {
+    if mean(&selected, name).is_none() {
         let named: Vec<String> =
             params.relative_to.iter().map(|(key, value)| format!("{key} = {value}")).collect();
         let named = named.join(", ");
@@ -143,7 +142,7 @@ fn reference(params: &Params, rows: &[Row]) -> Result<Option<f64>, Failure> {
         }
         bail_usage!("parameter relative_to: no result with {named} has a value {name:?}");
     }
-    Ok(value)
+    Ok(Some(selected))
 }
 
 /// Returns the table of differences between methods in each column; empty if there are none.
@@ -158,8 +157,10 @@ fn gains(params: &Params, rows: &[Row]) -> String {
     for gain in &params.gains {
         let mut line = vec![gain.name.clone()];
         for column in &columns {
-            let of = psnr(params, &all, &gain.of, column);
-            let difference = of.and_then(|of| Some(of - psnr(params, &all, &gain.over, column)?));
+            let in_column = select(&all, &params.columns, column);
+            let [of, over] =
+                [&gain.of, &gain.over].map(|block| method_rows(params, &in_column, block));
+            let difference = difference(&of, &over, "psnr");
             line.push(difference.map_or(NO_VALUE.to_owned(), |value| format!("{value:+.2}")));
         }
         if line[1..].iter().any(|cell| cell != NO_VALUE) {
@@ -172,17 +173,27 @@ fn gains(params: &Params, rows: &[Row]) -> String {
     format!("\n## Gain, PSNR in dB\n\n{}", markdown_table(&lines))
 }
 
-/// Returns the mean PSNR of a method in a column.
-fn psnr(params: &Params, rows: &[Row], method: &str, column: &[String]) -> Option<f64> {
-    let name = params.methods.get(method).map_or(method, String::as_str);
-    let selected = select(rows, &["method".to_owned()], &[name.to_owned()]);
-    mean(&select(&selected, &params.columns, column), "psnr")
+/// Returns the rows of a method: a block, or a method of `extra_rows`.
+fn method_rows(params: &Params, rows: &[Row], block: &str) -> Vec<Row> {
+    let is_of_method =
+        |row: &&Row| row.get("method").is_some_and(|m| *m == method_name(params, block, row));
+    rows.iter().filter(is_of_method).cloned().collect()
 }
 
-/// Describes a value's mean, standard deviation, minimum and maximum over all results.
+/// Describes the mean, standard deviation, minimum and maximum of a value over the seeds. A seed's
+/// value is the mean over all scenes; seeds that lack a scene are left out.
 fn spread(rows: &[Row], figures: &Figures, name: &str) -> Option<String> {
-    let values: Vec<f64> = rows.iter().filter_map(|row| row.get(name)?.as_f64()).collect();
-    let mean = mean(rows, name)?;
+    let seed = ["seed".to_owned()];
+    let scene_count = scenes(rows, name).len();
+    let mut values = Vec::new();
+    for key in distinct(rows, &seed) {
+        let of_seed = select(rows, &seed, &key);
+        values.extend(mean(&of_seed, name).filter(|_| scenes(&of_seed, name).len() == scene_count));
+    }
+    if values.is_empty() {
+        return None;
+    }
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
     let deviation = (squares / values.len().saturating_sub(1).max(1) as f64).sqrt();
     let min = values.iter().copied().fold(f64::INFINITY, f64::min);

@@ -139,14 +139,6 @@ fn keys_that_no_result_has_are_refused() {
         let problem = markdown(&params, &rows(), &figures(), &[]).unwrap_err();
         assert!(matches!(&problem, Failure::Usage(message) if message == expected), "{problem}");
     }
-    let seeds = [30.0, 32.0].map(|psnr| row("lego", &psnr.to_string(), "100x2", psnr, None, 1.0));
-    let seed_rows = seeds.map(|mut row| {
-        let seed = row.remove("variant").unwrap();
-        row.insert("seed".to_owned(), seed);
-        row
-    });
-    let text = markdown(&Params::default(), &seed_rows, &figures(), &[]).unwrap();
-    assert!(text.ends_with("\nPSNR over 2 results: 31.00 ± 1.41, from 30.00 to 32.00\n"), "{text}");
     let without_results = markdown(
         &Params::default(),
         &[],
@@ -155,6 +147,60 @@ fn keys_that_no_result_has_are_refused() {
     )
     .unwrap();
     assert!(without_results.contains("* eval\n"), "{without_results}");
+}
+
+/// The spread is that of the seeds' means over scenes, not of the scenes. A seed that lacks a scene
+/// isn't compared.
+#[test]
+fn seeds_have_a_spread() {
+    let of = |scene: &str, seed: &str, psnr: f64| {
+        let mut row = row(scene, seed, "100x2", psnr, None, 1.0);
+        let seed = row.remove("variant").unwrap();
+        row.insert("seed".to_owned(), seed);
+        row
+    };
+    let mut rows = vec![of("lego", "0", 30.0), of("lego", "1", 32.0)];
+    let spread = |rows: &[Row]| {
+        let text = markdown(&Params::default(), rows, &figures(), &[]).unwrap();
+        text.lines().last().unwrap().to_owned()
+    };
+    assert_eq!(spread(&rows), "PSNR over 2 results: 31.00 ± 1.41, from 30.00 to 32.00");
+    rows.extend([of("chair", "0", 20.0), of("chair", "1", 22.0), of("chair", "2", 9.0)]);
+    assert_eq!(spread(&rows), "PSNR over 2 results: 26.00 ± 1.41, from 25.00 to 27.00");
+}
+
+/// A row without all scenes says so, and is neither the best nor on the front. Differences are those
+/// of common scenes.
+#[test]
+fn means_over_different_scenes_are_not_compared() {
+    let mut rows = rows();
+    rows.truncate(3);
+    for row in &mut rows {
+        let method = format!("ours, {}", row["variant"].as_str().unwrap());
+        row.insert("method".to_owned(), json!(method));
+    }
+    rows[2].insert("psnr".to_owned(), json!(33.0));
+    let params = params(json!({
+        "rows": ["variant"], "values": ["psnr"], "front": "train_s",
+        "relative_to": {"variant": "as it is"}, "methods": {"eval": "ours, {variant}"},
+        "extra_rows": [{"method": "theirs", "scene": "lego", "psnr": 29}],
+        "gains": [{"name": "ours", "of": "eval", "over": "theirs"}],
+    }));
+    let expected = "\
+# Results
+
+| variant | PSNR | against as it is | front | commit | machine |
+| --- | --- | --- | --- | --- | --- |
+| as it is | **31.00** | +0.00 | ● | abc1234 | 2 cores |
+| no warm-up | 33.00 (1 of 2 scenes) | +3.00 |  | abc1234 | 2 cores |
+
+## Gain, PSNR in dB
+
+| gain | all |
+| --- | --- |
+| ours | +2.50 |
+";
+    assert_eq!(markdown(&params, &rows, &figures(), &[]).unwrap(), expected);
 }
 
 fn params(value: serde_json::Value) -> Params {
@@ -233,7 +279,7 @@ Means over lego, chair:
 | nerf | LR | 31.00 | **28.00** | abc1234 | vm |
 | ss | LR | **32.25** | 27.00 | abc1234 | vm |
 | liif | HR | no liif | – | – | – |
-| hr | HR | 35.00 | – | abc1234 | vm |
+| hr | HR | 35.00 (1 of 2 scenes) | – | abc1234 | vm |
 | paper: NeRF |  | 27.50 | – | – | – |
 | paper: SS |  | 29.75 | – | – | – |
 

@@ -28,7 +28,7 @@ pub struct Params {
     pub relative_to: BTreeMap<String, String>,
     /// Name of a cost, such as `train_cpu_s`, `render_s` or `field_mb`, for a Pareto front: column
     /// `front` marks rows that no other row beats in both this cost and the first of `values`, and
-    /// `front.svg` shows all rows by both.
+    /// `front.svg` shows the rows by both. Rows that lack a scene are left out.
     #[schemars(extend("x-default" = "no comparison"))]
     pub front: Option<String>,
     /// Names of methods, by scoring block: `{eval: rendered, eval-refined: refined}`. `{variant}`

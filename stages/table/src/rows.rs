@@ -61,16 +61,23 @@ fn ancestor_count(run: &RunRecord, stage: &str) -> Option<usize> {
 /// Returns the keys of a result: values of axes, method and group.
 fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> Row {
     let mut row: Row = values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
-    let mut method = params.methods.get(stage).unwrap_or(stage).clone();
-    for (name, value) in values {
-        method = method.replace(&format!("{{{name}}}"), value);
-    }
-    row.insert("method".to_owned(), json!(method));
+    row.insert("method".to_owned(), json!(method_name(params, stage, &row)));
     if !params.groups.is_empty() {
         let group = params.groups.iter().find(|group| group.methods.contains(stage));
         row.insert(GROUP.to_owned(), json!(group.map_or("", |group| group.name.as_str())));
     }
     row
+}
+
+/// Returns the name of a block's method, with the row's values of the keys in the name.
+pub(crate) fn method_name(params: &Params, block: &str, row: &Row) -> String {
+    let mut method = params.methods.get(block).map_or(block, String::as_str).to_owned();
+    for (name, value) in row {
+        if let Some(value) = value.as_str() {
+            method = method.replace(&format!("{{{name}}}"), value);
+        }
+    }
+    method
 }
 
 /// Returns the position of a method in the table; methods without a group are last.
@@ -137,31 +144,19 @@ fn read<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
 }
 
 /// Returns the seconds of training, rendering and refining, the processor seconds of training, the
-/// peak memory, and the size and training speed of the field that the views show. Views that a
-/// field or refiner depends on count as training; all other views count as rendering. Their seconds
-/// also count as refining if the views weren't rendered from a field.
+/// peak memory, and the size and training speed of the field that the views show. The seconds of
+/// rendered views also count as refining if the views weren't rendered from a field.
 fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
-    let ancestors = run.ancestors(index);
-    let mut trained = ancestors.clone();
-    trained.retain(|&i| ["field", "refiner"].contains(&run.nodes[i].kind.as_str()));
-    let in_training: Vec<usize> = trained.iter().flat_map(|&i| run.ancestors(i)).collect();
+    let [trained, rendered] = run.training_and_rendering(index);
+    let mut refined = rendered.clone();
+    refined.retain(|&i| !is_from_field(run, i));
     // Not `Iterator::sum`, whose result is -0.0 without elements.
-    let [mut training, mut rendering, mut refining, mut processor] = [0.0; 4];
-    let mut peak_memory = 0;
-    for &i in &ancestors {
-        let node = &run.nodes[i];
-        let is_views = node.kind == "views";
-        if is_views || trained.contains(&i) {
-            peak_memory = peak_memory.max(node.peak_memory.unwrap_or(0));
-        }
-        if in_training.contains(&i) && (is_views || trained.contains(&i)) {
-            training += node.seconds;
-            processor += node.processor_seconds.unwrap_or(f64::NAN);
-        } else if is_views && !in_training.contains(&i) {
-            rendering += node.seconds;
-            refining += if is_from_field(run, i) { 0.0 } else { node.seconds };
-        }
-    }
+    let [training, rendering, refining] = [&trained, &rendered, &refined]
+        .map(|nodes| nodes.iter().fold(0.0, |sum, &i| sum + run.nodes[i].seconds));
+    let processor_seconds = trained.iter().map(|&i| run.nodes[i].processor_seconds);
+    let processor = processor_seconds.fold(0.0, |sum, own| sum + own.unwrap_or(f64::NAN));
+    let peaks = trained.iter().chain(&rendered).filter_map(|&i| run.nodes[i].peak_memory);
+    let peak_memory = peaks.max().unwrap_or(0);
     let mut row = Row::new();
     for (name, seconds) in [("train_s", training), ("render_s", rendering), ("refine_s", refining)]
     {
@@ -173,9 +168,7 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     if peak_memory > 0 {
         row.insert("peak_mb".to_owned(), json!(peak_memory as f64 / 1e6));
     }
-    let views = ancestors.iter().filter(|i| run.nodes[**i].kind == "views");
-    let rendered_from =
-        views.filter(|i| !in_training.contains(i)).flat_map(|&i| run.nodes[i].inputs.values());
+    let rendered_from = rendered.iter().flat_map(|&i| run.nodes[i].inputs.values());
     let mut parents = rendered_from.filter_map(|input| Some(&run.nodes[input.node?]));
     if let Some(field) = parents.find(|node| node.kind == "field") {
         row.insert("field_mb".to_owned(), json!(weights_bytes(&field.folder)? as f64 / 1e6));

@@ -1,15 +1,15 @@
 use artifact::{bail_bad_input, bail_usage};
 use pixels::psnr_of;
 use refinement::{
-    Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer,
-    RefinerTrainingOptions, WEIGHTS_FILE, WarpOptions,
+    Network, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer, RefinerTrainingOptions,
+    WEIGHTS_FILE, WarpOptions,
 };
 use stage::Context;
 
 use crate::examples::{Examples, lr_photographs};
 use crate::params::CompactParams;
-use crate::report_psnr;
-use crate::steps::ExampleTraining;
+use crate::steps::{ExampleTraining, training_failure};
+use crate::write_refiner_file;
 
 /// Trains our network by internal learning.
 pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::Result<()> {
@@ -46,7 +46,7 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     })?;
     let trainer = training.trainer;
     let scores = trainer.score(&examples.left_out, &examples.training)?;
-    trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?)?;
+    trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?).map_err(training_failure)?;
     let file = RefinerFile {
         network: Network::Compact(architecture),
         residual_weight: scores.residual_weight,
@@ -55,6 +55,5 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         confidence: scores.confidence,
         data_consistent: photographs.is_some(),
     };
-    context.write_json(REFINER_FILE, &file)?;
-    report_psnr(context, "views left out of training", &file)
+    write_refiner_file(context, "views left out of training", &file)
 }

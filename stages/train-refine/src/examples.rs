@@ -82,7 +82,8 @@ impl Sources<'_> {
             .read_photograph(self.truth)
             .bad_input(format!("view {}", view.camera.name))?;
         let Some(truth) = truth else { return Ok(None) };
-        let Some((mut rendered, _)) = Rendered::read(self.views, view, self.background)? else {
+        let Some((mut rendered, _)) = Rendered::read(self.views, view, self.background, true)?
+        else {
             return Ok(None);
         };
         if let Some(photographs) = self.photographs {

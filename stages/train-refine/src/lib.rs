@@ -22,7 +22,8 @@ mod paper;
 mod params;
 mod steps;
 
-use refinement::RefinerFile;
+use artifact::Failure;
+use refinement::{REFINER_FILE, RefinerFile};
 use stage::{Context, Input, Output, Rule, Stage};
 
 pub use params::{CompactParams, Net, PaperParams, Params};
@@ -93,9 +94,14 @@ impl Stage for TrainRefine {
     }
 }
 
-/// Logs the PSNR of some views before and after refinement, and writes it as the stage's summary.
-fn report_psnr(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
-    let RefinerFile { rendered_psnr, refined_psnr, residual_weight, .. } = file;
+/// Writes the refiner's file, and reports the PSNR of some views before and after refinement.
+fn write_refiner_file(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
+    let &RefinerFile { rendered_psnr, refined_psnr, residual_weight, .. } = file;
+    if ![rendered_psnr, refined_psnr, residual_weight].iter().all(|score| score.is_finite()) {
+        let message = format!("{views}: PSNR is not finite; lower the learning rate");
+        return Err(Failure::Numerical(message).into());
+    }
+    context.write_json(REFINER_FILE, file)?;
     let summary = format!(
         "{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight \
         {residual_weight:.2})"

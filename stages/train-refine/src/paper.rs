@@ -1,14 +1,14 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
 use pixels::{Image, psnr_of};
 use refinement::paper::{PaperRefiner, PaperTrainer, PaperTrainingOptions, PerceptualLoss};
-use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
+use refinement::{Network, RefinerFile, WEIGHTS_FILE};
 use serde_json::json;
 use stage::{Context, Rule};
 
 use crate::examples::Examples;
 use crate::params::PaperParams;
-use crate::report_psnr;
-use crate::steps::ExampleTraining;
+use crate::steps::{ExampleTraining, training_failure};
+use crate::write_refiner_file;
 
 /// File names of VGG-19's weights: all layers with torchvision's names, or the first blocks in
 /// Caffe's scaling.
@@ -40,7 +40,7 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     context
         .train(options.steps, &mut training, |loss| format!("L1 of training patches {loss:.4}"))?;
     let trainer = training.trainer;
-    trainer.network().write(&context.output_path(WEIGHTS_FILE)?)?;
+    trainer.network().write(&context.output_path(WEIGHTS_FILE)?).map_err(training_failure)?;
     let (mut rendered, mut refined) = (0.0, 0.0);
     let share = 1.0 / known.len() as f64;
     for view in &known {
@@ -57,8 +57,7 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
         confidence: None,
         data_consistent: false,
     };
-    context.write_json(REFINER_FILE, &file)?;
-    report_psnr(context, "training references", &file)
+    write_refiner_file(context, "training references", &file)
 }
 
 /// Returns the rule that the folder of weights must contain VGG-19.

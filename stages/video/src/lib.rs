@@ -91,21 +91,21 @@ impl Stage for Video {
 }
 
 /// Returns the rate of the camera path from which a node's views were rendered; `None` if their
-/// cameras are no path.
+/// cameras are no path. Refined views have the path of the views that were refined, whatever other
+/// views the refinement took.
 fn path_rate(run: &RunRecord, node: &RunNode) -> Result<Option<f64>, Failure> {
-    let parents = node.inputs.values().filter_map(|input| run.nodes.get(input.node?));
-    for parent in parents {
-        if parent.kind == "views" {
-            return path_rate(run, parent);
-        }
-        let file = parent.folder.join("camera_path.json");
-        if parent.kind == "cameras" && file.is_file() {
-            let bytes = std::fs::read(&file).bad_input(file.display())?;
-            let path: CameraPath = serde_json::from_slice(&bytes).bad_input(file.display())?;
-            return Ok(Some(path.fps));
-        }
+    let input = ["views", "cameras"].iter().find_map(|name| node.inputs.get(*name)?.node);
+    let Some(parent) = input.and_then(|index| run.nodes.get(index)) else { return Ok(None) };
+    if parent.kind == "views" {
+        return path_rate(run, parent);
     }
-    Ok(None)
+    let file = parent.folder.join("camera_path.json");
+    if parent.kind != "cameras" || !file.is_file() {
+        return Ok(None);
+    }
+    let bytes = std::fs::read(&file).bad_input(file.display())?;
+    let path: CameraPath = serde_json::from_slice(&bytes).bad_input(file.display())?;
+    Ok(Some(path.fps))
 }
 
 /// Writes the frames and the film.
@@ -206,5 +206,26 @@ mod tests {
         assert_eq!((frame.width, frame.height), (6, 4));
         let row: Vec<u8> = frame.data[3 * 6 * 4..].chunks_exact(4).map(|p| p[0]).collect();
         assert_eq!(row, [10, 10, 10, 20, 20, 20]);
+    }
+
+    /// Views refined with references have their own path's rate; the references have no path.
+    #[test]
+    fn refined_views_have_the_rate_of_their_path() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("camera_path.json"), r#"{"fps": 24}"#).unwrap();
+        let node = |kind: &str, inputs: serde_json::Value| {
+            serde_json::json!({"stage": kind, "point": "", "kind": kind, "key": "", "output": "",
+                "folder": folder.path(), "parameters": {}, "inputs": inputs, "started_unix": 0,
+                "seconds": 0.0, "threads": 1})
+        };
+        let run: RunRecord = serde_json::from_value(serde_json::json!({"nodes": [
+            node("cameras", serde_json::json!({})),
+            node("views", serde_json::json!({"cameras": {"node": 0}})),
+            node("views", serde_json::json!({})),
+            node("views", serde_json::json!({"reference-views": {"node": 2}, "views": {"node": 1}})),
+        ]}))
+        .unwrap();
+        let rates: Vec<_> = run.nodes.iter().map(|node| path_rate(&run, node).unwrap()).collect();
+        assert_eq!(rates, [None, Some(24.0), None, Some(24.0)]);
     }
 }

@@ -95,14 +95,16 @@ impl Stage for Viewer {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
         run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
-        let fields: Vec<&RunNode> =
-            run.nodes.iter().filter(|n| n.is_shown && n.kind == "field").collect();
+        let is_shown_field = |i: &usize| run.nodes[*i].is_shown && run.nodes[*i].kind == "field";
+        let indices: Vec<usize> = (0..run.nodes.len()).filter(is_shown_field).collect();
+        let fields: Vec<&RunNode> = indices.iter().map(|&i| &run.nodes[i]).collect();
         if fields.is_empty() {
             let message = "run.json has no field to show; set input `run: train-ss`";
             return Err(Failure::BadInput(message.to_owned()).into());
         }
-        for (node, prefix) in fields.iter().zip(sink_folders(&fields)) {
-            write_page(context, params, &run, node, &prefix)
+        for (index, prefix) in indices.into_iter().zip(sink_folders(&fields)) {
+            let node = &run.nodes[index];
+            write_page(context, params, &run, index, &prefix)
                 .with_context(|| format!("{} {}", node.stage, node.point).trim_end().to_owned())?;
         }
         Ok(())
@@ -114,9 +116,10 @@ fn write_page(
     context: &Context,
     params: &Params,
     run: &RunRecord,
-    node: &RunNode,
+    index: usize,
     prefix: &str,
 ) -> anyhow::Result<()> {
+    let node = &run.nodes[index];
     let input = GivenInput::open("field", &node.folder)?;
     let (file, fields) = fields::read_point_fields(&input)?;
     let folder = node.inputs.get("scene").map(|input| run.folder_of(input));
@@ -131,7 +134,7 @@ fn write_page(
     let (centre, size) = overview::centre_and_size(&file.bounds, &volume);
     let up = overview::up_direction(&cameras);
     let scene = PageScene {
-        name: scene_name(run),
+        name: scene_name(run, index),
         resolution,
         bricks: atlas.bricks,
         components: atlas.components.for_shader(),
@@ -149,9 +152,14 @@ fn write_page(
     context.write_text(&format!("{prefix}index.html"), &html)
 }
 
-/// Returns the name of the run's data set: the last part of its path.
-fn scene_name(run: &RunRecord) -> String {
-    let name = run.data_sets.first().and_then(|set| Path::new(set).file_name()?.to_str());
+/// Returns the name of a field's data set: the last part of its path.
+fn scene_name(run: &RunRecord, field: usize) -> String {
+    let data_set = match &run.data_sets[..] {
+        [] => String::new(),
+        [only] => only.clone(),
+        _ => run.data_set(field),
+    };
+    let name = Path::new(&data_set).file_name().and_then(|name| name.to_str());
     name.unwrap_or("scene").to_owned()
 }
 
@@ -245,4 +253,32 @@ fn shrunk(image: Rgba8, max_width: usize) -> Rgba8 {
 fn data_uri(image: &Rgba8) -> String {
     let text = base64::engine::general_purpose::STANDARD.encode(encode_png(image));
     format!("data:image/png;base64,{text}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// In a sweep over data sets, each page has the name of its own field's data set.
+    #[test]
+    fn a_page_is_named_by_its_data_set() {
+        let node = |kind: &str, inputs: serde_json::Value| {
+            serde_json::json!({"stage": kind, "point": "", "kind": kind, "key": "", "output": "",
+                "folder": "", "parameters": {}, "inputs": inputs, "started_unix": 0,
+                "seconds": 0.0, "threads": 1})
+        };
+        let scene =
+            |folder: &str| node("scene", serde_json::json!({"dataset": {"folder": folder}}));
+        let field = |scene: usize| node("field", serde_json::json!({"scene": {"node": scene}}));
+        let nodes = [scene("data/chair"), scene("data/lego"), field(0), field(1)];
+        for (data_sets, names) in [
+            (vec!["data/chair", "data/lego"], ["chair", "lego"]),
+            (vec!["data/ship"], ["ship"; 2]),
+            (vec![], ["scene"; 2]),
+        ] {
+            let run = serde_json::json!({"nodes": nodes, "data_sets": data_sets});
+            let run: RunRecord = serde_json::from_value(run).unwrap();
+            assert_eq!([2, 3].map(|field| scene_name(&run, field)), names);
+        }
+    }
 }

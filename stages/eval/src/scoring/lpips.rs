@@ -14,7 +14,7 @@ use super::lpips_network::LpipsNetwork;
 pub struct Lpips {
     layers: Vec<LpipsLayer>,
     heads: Vec<Tensor>,
-    /// Minimum width and height of images, in pixels, for the network's pooling layers.
+    /// [`LpipsNetwork::min_size`].
     min_size: usize,
 }
 
@@ -173,17 +173,17 @@ impl Lpips {
         let linear = Weights::read(&folder.join(heads_file))?;
         let mut reader =
             LayerReader { weights: &weights, layers: Vec::new(), channels: 3, stages: Vec::new() };
-        let min_size = match network {
-            LpipsNetwork::Squeeze => reader.squeeze().map(|()| 17),
-            LpipsNetwork::Alex => reader.alex().map(|()| 31),
-            LpipsNetwork::Vgg => reader.vgg().map(|()| 16),
+        match network {
+            LpipsNetwork::Squeeze => reader.squeeze(),
+            LpipsNetwork::Alex => reader.alex(),
+            LpipsNetwork::Vgg => reader.vgg(),
         }?;
         let mut heads = Vec::with_capacity(reader.stages.len());
         for (k, &channels) in reader.stages.iter().enumerate() {
             let name = format!("lin{k}.model.1.weight");
             heads.push(linear.tensor(&name, &[1, channels, 1, 1])?);
         }
-        Ok(Self { layers: reader.layers, heads, min_size })
+        Ok(Self { layers: reader.layers, heads, min_size: network.min_size() })
     }
 
     /// Returns the distance of two RGB images in 0..1.

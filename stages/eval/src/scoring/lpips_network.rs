@@ -23,6 +23,15 @@ impl LpipsNetwork {
         }
     }
 
+    /// Returns the minimum width and height of images in pixels, for the network's pooling layers.
+    pub(super) fn min_size(self) -> usize {
+        match self {
+            Self::Squeeze => 17,
+            Self::Alex => 31,
+            Self::Vgg => 16,
+        }
+    }
+
     pub(super) fn labels(self) -> Labels {
         match self {
             Self::Squeeze => Labels {

@@ -14,7 +14,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::FailureExt as _;
 use metrics::{Score, ScoreFormat, Scores};
-use pixels::{DEPTH_CHANNELS, ExrImage, Image, psnr_of, read_exr};
+use pixels::{DEPTH_CHANNELS, DepthMap, ExrImage, Image, psnr_of, read_exr};
 use scene::format_length;
 
 use crate::metric::{Measurement, Metric, value};
@@ -55,6 +55,12 @@ fn masked_psnr(render: &Image, truth: &Image, counted_share: f64) -> f64 {
     psnr(render, truth) + 10.0 * counted_share.log10()
 }
 
+/// Returns the end of the convention of a score that ignores masked pixels.
+fn masked_note(scene: &ScoredScene<'_>) -> &'static str {
+    let is_masked = scene.truth.views.iter().any(|view| view.mask.is_some());
+    if is_masked { "; only pixels that no mask excludes" } else { "" }
+}
+
 /// [`psnr`] of the pixels that count.
 struct PsnrMetric;
 
@@ -68,11 +74,10 @@ impl Metric for PsnrMetric {
     }
 
     fn convention(&self, scene: &ScoredScene<'_>) -> String {
-        let is_masked = scene.truth.views.iter().any(|view| view.mask.is_some());
-        let masked = if is_masked { "; only pixels that no mask excludes" } else { "" };
         format!(
             "-10 log10 of the mean squared error over pixels and channels in [0, 1]; prediction in \
-            half precision, clamped; mean of per-view values{masked}"
+            half precision, clamped; mean of per-view values{}",
+            masked_note(scene)
         )
     }
 
@@ -201,7 +206,7 @@ impl Metric for WarpMetric {
     }
 }
 
-/// [`depth_error`], if there is true depth.
+/// [`depth_error`], if there is true depth and a surface.
 struct DepthMetric;
 
 impl Metric for DepthMetric {
@@ -217,10 +222,12 @@ impl Metric for DepthMetric {
         ]
     }
 
-    fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "error of z-depth in scene units, over pixels with a surface in the ground truth; missed: \
-        fraction of these pixels where the render's opacity is below one half"
-            .to_owned()
+    fn convention(&self, scene: &ScoredScene<'_>) -> String {
+        format!(
+            "error of z-depth in scene units, over pixels with a surface in the ground truth; \
+            missed: fraction of these pixels where the render's opacity is below one half{}",
+            masked_note(scene)
+        )
     }
 
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measurement> {
@@ -230,9 +237,16 @@ impl Metric for DepthMetric {
         };
         let rendered = read_depth(&scene.views_input.path(rendered), name)?;
         let truth = read_depth(&scene.truth_input.path(truth), name)?;
-        let error = depth_error(&rendered, &truth)
+        let size = (truth.width, truth.height);
+        let maps = DepthMap::of(&rendered).zip(DepthMap::of(&truth));
+        let (rendered_map, true_map) = maps
+            .filter(|_| (rendered.width, rendered.height) == size)
             .context("expected depth channels Z and A of the same size")
             .bad_input(format!("view {name}"))?;
+        let mask = view.mask.as_ref().map(|mask| mask.resized(size, 0));
+        let Some(error) = depth_error(rendered_map, true_map, mask.as_ref()) else {
+            return Ok(Measurement::default());
+        };
         let score = Score::several([
             ("mean_absolute", error.mean_absolute),
             ("median_absolute", error.median_absolute),
@@ -261,7 +275,7 @@ mod tests {
 
     #[test]
     fn figures_have_distinct_paths_and_labels() {
-        let all = all_metrics(Perceptual::new(None).unwrap());
+        let all = all_metrics(Perceptual::new(None, usize::MAX).unwrap());
         let figures: Vec<ScoreFormat> = all.iter().flat_map(|metric| metric.figures()).collect();
         for (i, figure) in figures.iter().enumerate() {
             assert!(figures[..i].iter().all(|f| f.path != figure.path && f.label != figure.label));

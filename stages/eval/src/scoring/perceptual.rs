@@ -12,6 +12,8 @@ use crate::scored_view::{ScoredScene, ScoredView};
 /// LPIPS of every network whose weights are given.
 pub(crate) struct Perceptual {
     given: Vec<LpipsNetwork>,
+    /// Smallest side of a view with HR truth, in pixels.
+    min_side: usize,
     #[cfg(feature = "torch")]
     pools: Vec<LpipsPool>,
 }
@@ -52,9 +54,9 @@ impl LpipsPool {
 #[cfg(feature = "torch")]
 impl Perceptual {
     /// Reads all complete networks of a folder; fails if there is none.
-    pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
+    pub(crate) fn new(weights: Option<&GivenInput>, min_side: usize) -> anyhow::Result<Self> {
         let Some(folder) = weights.map(GivenInput::folder) else {
-            return Ok(Self { given: Vec::new(), pools: Vec::new() });
+            return Ok(Self { given: Vec::new(), min_side, pools: Vec::new() });
         };
         let mut given = LpipsNetwork::ALL.to_vec();
         given.retain(|network| network.files().iter().all(|file| folder.join(file).is_file()));
@@ -69,13 +71,15 @@ impl Perceptual {
         for &network in &given {
             pools.push(LpipsPool::new(folder, network)?);
         }
-        Ok(Self { given, pools })
+        Ok(Self { given, min_side, pools })
     }
 
-    /// Returns the distance by each network, in the order of [`LpipsNetwork::ALL`].
+    /// Returns the distance by each network for which the images are large enough, in the order of
+    /// [`LpipsNetwork::ALL`].
     fn distances(&self, render: &Image, truth: &Image) -> anyhow::Result<[Option<f64>; 3]> {
         let mut distances = [None; 3];
-        for pool in &self.pools {
+        let side = render.width.min(render.height);
+        for pool in self.pools.iter().filter(|pool| side >= pool.network.min_size()) {
             let lpips = pool.take()?;
             distances[pool.network as usize] = Some(lpips.distance(render, truth)?);
             pool.give_back(lpips);
@@ -91,17 +95,41 @@ impl Perceptual {
     reason = "the same signatures with and without libtorch"
 )]
 impl Perceptual {
-    pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
+    pub(crate) fn new(weights: Option<&GivenInput>, min_side: usize) -> anyhow::Result<Self> {
         if weights.is_some() {
             let message = "input weights: LPIPS needs libtorch, and eval was built without it; run \
                 `make build`";
             return Err(Failure::Usage(message.to_owned()).into());
         }
-        Ok(Self { given: Vec::new() })
+        Ok(Self { given: Vec::new(), min_side })
     }
 
     fn distances(&self, _: &Image, _: &Image) -> anyhow::Result<[Option<f64>; 3]> {
         Ok([None; 3])
+    }
+}
+
+impl Perceptual {
+    /// Returns a log line for each given network that is left out for small views.
+    pub(crate) fn notes(&self) -> Vec<String> {
+        let mut notes = Vec::new();
+        for network in self.given.iter().filter(|network| self.is_too_small(**network)) {
+            let (name, size) = (network.labels().summary, network.min_size());
+            notes.push(format!(
+                "{name} needs views of at least {size}×{size} pixels; smaller views have no score"
+            ));
+        }
+        notes
+    }
+
+    /// True if a view is too small for a given network.
+    fn is_too_small(&self, network: LpipsNetwork) -> bool {
+        self.given.contains(&network) && self.min_side < network.min_size()
+    }
+
+    /// Returns the text in place of an unknown LPIPS.
+    fn missing(&self) -> &'static str {
+        if self.is_too_small(LpipsNetwork::Squeeze) { "views too small" } else { MISSING }
     }
 }
 
@@ -112,7 +140,7 @@ pub(crate) fn weights_rule() -> Rule {
     LpipsNetwork::ALL.iter().fold(rule, |rule, network| rule.or_files("weights", &network.files()))
 }
 
-/// Text in place of an unknown LPIPS.
+/// Text in place of an LPIPS without weights.
 const MISSING: &str = "weights not given";
 
 impl Metric for Perceptual {
@@ -125,7 +153,7 @@ impl Metric for Perceptual {
             .map(LpipsNetwork::labels)
             .map(|labels| ScoreFormat::new(labels.key, labels.table, 4, false))
             .to_vec();
-        figures[0].missing = Some(MISSING.to_owned());
+        figures[0].missing = Some(self.missing().to_owned());
         figures
     }
 
@@ -166,7 +194,11 @@ impl Metric for Perceptual {
                 known.push(format!("{} {distance:.4}", labels.summary));
             }
         }
-        Some(if known.is_empty() { format!("LPIPS {MISSING}") } else { known.join(" · ") })
+        Some(if known.is_empty() {
+            format!("LPIPS {}", self.missing())
+        } else {
+            known.join(" · ")
+        })
     }
 }
 
@@ -182,4 +214,34 @@ fn required_files(networks: &[LpipsNetwork]) -> String {
         (torchvision's and richzhang/PerceptualSimilarity's, as safetensors)",
         pairs.join("; ")
     )
+}
+
+#[cfg(all(test, feature = "torch"))]
+mod tests {
+    use super::*;
+
+    /// A network that needs larger views isn't applied: here, its weights don't even exist.
+    #[test]
+    fn small_views_have_no_distance() {
+        let given = vec![LpipsNetwork::Squeeze, LpipsNetwork::Alex];
+        let pool = |&network: &LpipsNetwork| LpipsPool {
+            folder: "nowhere".into(),
+            network,
+            free: std::sync::Mutex::default(),
+        };
+        for (side, note_count, missing) in
+            [(16, 2, "views too small"), (17, 1, MISSING), (31, 0, MISSING)]
+        {
+            let pools = given.iter().map(pool).collect();
+            let perceptual = Perceptual { given: given.clone(), min_side: side, pools };
+            let image = Image::new(side, 40, 3, vec![0.5; side * 40 * 3]);
+            assert_eq!(perceptual.distances(&image, &image).is_ok(), side == 16, "{side}");
+            assert_eq!(perceptual.notes().len(), note_count, "{side}");
+            assert_eq!(perceptual.figures()[0].missing.as_deref(), Some(missing), "{side}");
+        }
+        let message = "LPIPS (AlexNet) needs views of at least 31×31 pixels; smaller views have no \
+            score";
+        let perceptual = Perceptual { given, min_side: 20, pools: Vec::new() };
+        assert_eq!(perceptual.notes(), [message]);
+    }
 }

@@ -226,6 +226,36 @@ impl RunRecord {
         }
         found.into_iter().collect()
     }
+
+    /// Returns the nodes of training and of rendering among a node and its ancestors, sorted.
+    /// Training has the fields and refiners, and the views that one of them depends on. All other
+    /// views are rendering, refined views included.
+    pub fn training_and_rendering(&self, node: usize) -> [Vec<usize>; 2] {
+        let mut trained = self.ancestors(node);
+        trained.retain(|&i| ["field", "refiner"].contains(&self.nodes[i].kind.as_str()));
+        let needed: BTreeSet<usize> = trained.iter().flat_map(|&i| self.ancestors(i)).collect();
+        let mut all = self.ancestors(node);
+        all.retain(|i| self.nodes[*i].kind == "views" || trained.contains(i));
+        let (training, rendering) = all.into_iter().partition(|i| needed.contains(i));
+        [training, rendering]
+    }
+
+    /// Lists the data sets that a node depends on: their folders, or the blocks that made them.
+    pub fn data_set(&self, node: usize) -> String {
+        let mut found = BTreeSet::new();
+        for node in self.ancestors(node).into_iter().map(|i| &self.nodes[i]) {
+            if !["dataset", "scene"].contains(&node.kind.as_str()) {
+                continue;
+            }
+            let folders: Vec<_> =
+                node.inputs.values().filter_map(|input| input.folder.as_ref()).collect();
+            if node.kind == "dataset" && folders.is_empty() {
+                found.insert(node.stage.clone());
+            }
+            found.extend(folders.iter().map(|folder| folder.display().to_string()));
+        }
+        found.into_iter().collect::<Vec<_>>().join(", ")
+    }
 }
 
 #[cfg(test)]
@@ -249,5 +279,37 @@ mod tests {
             ["1-rays=3-scale=2/", "2-data=a_.._b/", "3-train-ss/"]
         );
         assert_eq!(sink_folders(&[&nodes[0]]), [""]);
+    }
+
+    /// Renders of references are rendering, although their inputs aren't the scored views. Views
+    /// that a refiner was trained on are training.
+    #[test]
+    fn views_for_a_training_are_training() {
+        let node = |stage: &str, kind: &str, inputs: &[(&str, usize)]| {
+            let mut node = node("");
+            (node.stage, node.kind) = (stage.to_owned(), kind.to_owned());
+            let of_node = |&(name, i): &(&str, usize)| {
+                (name.to_owned(), RunInput { node: Some(i), ..RunInput::default() })
+            };
+            node.inputs = inputs.iter().map(of_node).collect();
+            node
+        };
+        let mut nodes = vec![
+            node("photographs", "dataset", &[]),
+            node("prep", "scene", &[("dataset", 0)]),
+            node("train-ss", "field", &[("scene", 1)]),
+            node("downscaled-views", "views", &[("field", 2)]),
+            node("train-refine", "refiner", &[("views", 3)]),
+            node("reference-views", "views", &[("field", 2)]),
+            node("render-depth", "views", &[("field", 2)]),
+            node("refine", "views", &[("views", 6), ("reference-views", 5), ("refiner", 4)]),
+            node("eval", "metrics", &[("views", 7)]),
+        ];
+        let run = RunRecord { nodes: nodes.clone(), ..RunRecord::default() };
+        assert_eq!(run.training_and_rendering(8), [vec![2, 3, 4], vec![5, 6, 7]]);
+        assert_eq!(run.data_set(8), "photographs");
+        let folder = RunInput { folder: Some("data/lego".into()), ..RunInput::default() };
+        nodes[0].inputs.insert("folder".to_owned(), folder);
+        assert_eq!(RunRecord { nodes, ..run }.data_set(8), "data/lego");
     }
 }

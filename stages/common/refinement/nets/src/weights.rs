@@ -5,6 +5,8 @@ use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use tch::{Device, Kind, TchError, Tensor};
 
+use crate::adam::all_finite;
+
 /// Error returned when weights can't be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum WeightsError {
@@ -24,6 +26,17 @@ pub enum WeightsError {
         /// Reason, as a sentence fragment.
         reason: String,
     },
+    /// A tensor to be written isn't finite.
+    #[error("{path}: tensor {name} is not finite; lower the learning rate")]
+    NotFinite {
+        /// Path of the file.
+        path: PathBuf,
+        /// Name of the tensor.
+        name: String,
+    },
+    /// A libtorch operation failed.
+    #[error("libtorch: {0}")]
+    Torch(#[from] TchError),
 }
 
 /// Tensors of a safetensors file, in f32, i64 or u8 on the CPU.
@@ -120,8 +133,14 @@ fn format_error(path: &Path, reason: String) -> WeightsError {
 }
 
 /// Writes named tensors of f32, i64 or u8 as safetensors without metadata, so that equal tensors
-/// give equal bytes.
+/// give equal bytes. Fails if a tensor isn't finite.
 pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
+    for (name, tensor) in tensors {
+        if !all_finite(std::slice::from_ref(tensor))? {
+            let (path, name) = (path.to_path_buf(), name.clone());
+            return Err(WeightsError::NotFinite { path, name });
+        }
+    }
     let bytes = serialized(tensors)
         .map_err(std::io::Error::other)
         .and_then(|bytes| std::fs::write(path, bytes));
@@ -195,6 +214,17 @@ mod tests {
                 && weights.integers("a", 2).is_err()
                 && weights.integers("b", 3).is_err()
         );
+    }
+
+    #[test]
+    fn tensors_that_are_not_finite_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("w.safetensors");
+        for value in [f32::NAN, f32::INFINITY] {
+            let tensors = [("a".to_owned(), Tensor::from_slice(&[1.0, value]))];
+            let message = write(&path, &tensors).unwrap_err().to_string();
+            assert!(message.contains("tensor a is not finite") && !path.exists(), "{message}");
+        }
     }
 
     #[test]

@@ -8,6 +8,7 @@ use tch::{Kind, TchError, Tensor};
 
 use super::loss::PerceptualLoss;
 use super::network::{PATCH_MULTIPLE, PaperRefiner, patch_tensor};
+use super::patches::PATCH_PIXELS;
 use super::perspective::Perspective;
 
 /// Options for training a [`PaperRefiner`].
@@ -212,20 +213,29 @@ fn draw_near(start: usize, last: usize, rng: &mut CounterRng) -> usize {
 }
 
 impl PaperTrainingOptions {
-    /// Fails if the network can't halve patches three times, or if an example is smaller than a
-    /// patch.
+    /// Fails if the network can't halve patches three times, if a batch is too small to be
+    /// normalised, or if an example is smaller than a patch, in training or in
+    /// [`PaperRefiner::refine`].
     pub fn check(&self, examples: &[KnownView]) -> Result<(), RefinementError> {
         let size = self.patch_size;
+        if size == 0 || !size.is_multiple_of(PATCH_MULTIPLE) {
+            return Err(RefinementError::Unusable(format!(
+                "a patch size of {size} pixels is not a multiple of {PATCH_MULTIPLE}"
+            )));
+        }
+        // The variance of a single value isn't defined.
+        if self.batch_size * (size / PATCH_MULTIPLE).pow(2) < 2 {
+            return Err(RefinementError::Unusable(format!(
+                "a batch of one patch of {size}×{size} pixels has a single value per channel, \
+                which batch normalisation does not allow; raise batch_size or patch_size"
+            )));
+        }
+        let size = size.max(PATCH_PIXELS);
         for KnownView { rendered, truth } in examples {
             if truth.width < size || truth.height < size {
                 let reason = format!("smaller than a patch of {size}×{size} pixels");
                 return Err(RefinementError::view(&rendered.camera.name, reason));
             }
-        }
-        if size == 0 || !size.is_multiple_of(PATCH_MULTIPLE) {
-            return Err(RefinementError::Unusable(format!(
-                "a patch size of {size} pixels is not a multiple of {PATCH_MULTIPLE}"
-            )));
         }
         Ok(())
     }
@@ -277,7 +287,6 @@ mod tests {
     fn training_reduces_the_error_and_resumes_exactly() {
         nets::deterministic();
         let examples = [example()];
-        OPTIONS.check(&examples).unwrap();
         let start = || PaperTrainer::new(PaperRefiner::new(4, 2).unwrap(), OPTIONS, None).unwrap();
         let mut trainer = start();
         let folder = tempfile::tempdir().unwrap();
@@ -305,10 +314,14 @@ mod tests {
 
     #[test]
     fn patches_must_fit() {
-        let error = |patch_size| {
-            let options = PaperTrainingOptions { patch_size, ..OPTIONS };
+        let error = |batch_size, patch_size| {
+            let options = PaperTrainingOptions { batch_size, patch_size, ..OPTIONS };
             options.check(&[example()]).unwrap_err().to_string()
         };
-        assert!(error(64).contains("64×64") && error(20).contains("multiple of 8"));
+        assert!(error(4, 72).contains("72×72") && error(4, 20).contains("multiple of 8"));
+        assert!(error(1, 8).contains("single value"));
+        // Scoring the trained network needs views of 64×64 pixels, whatever the patches are.
+        assert!(error(2, 8).contains("64×64") && error(1, 16).contains("64×64"));
+        OPTIONS.check(&[]).unwrap();
     }
 }
