@@ -18,8 +18,8 @@ use crate::stage_call::failure::{Exit, StageFailure, is_noise, memory_kills};
 use crate::stage_call::group::{Group, Pipes, peak_memory};
 use crate::stage_call::log::{ProgressFilter, StageLog};
 
-/// Environment variables that every stage gets. A description declares the further variables that
-/// change the stage's result, since they are part of its key.
+/// Environment variables that every stage gets (docs/guide/swapping-a-stage.md). A description
+/// declares the further variables that change the stage's result, since they are part of its key.
 const ENVIRONMENT: [&str; 12] = [
     stage::MEMORY_VARIABLE,
     "PATH",
@@ -217,18 +217,19 @@ impl Call<'_> {
             "--progress",
             "json",
         ]);
-        let declared = self.description.environment.iter().map(String::as_str);
-        let passed = ENVIRONMENT
-            .into_iter()
-            .chain(declared)
-            .filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
-        command
-            .env_clear()
-            .envs(passed)
-            .env(stage::RUNNER_VARIABLE, std::process::id().to_string());
+        set_environment(&mut command, &self.description.environment);
+        command.env(stage::RUNNER_VARIABLE, std::process::id().to_string());
         command.stdout(Stdio::piped()).stderr(Stdio::piped());
         command
     }
+}
+
+/// Reduces a program's environment to [`ENVIRONMENT`] and the variables that its description
+/// declares.
+pub(crate) fn set_environment(command: &mut Command, declared: &[String]) {
+    let names = ENVIRONMENT.into_iter().chain(declared.iter().map(String::as_str));
+    let passed = names.filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
+    command.env_clear().envs(passed);
 }
 
 /// Reader of a stage's output.
