@@ -57,7 +57,7 @@ pub use experiment::{Experiment, Selection, Variant};
 pub use extend::JoinError;
 pub use file::{Part, PipelineError, PipelineFile, StageBlock};
 pub use frozen::FrozenPlan;
-pub use key::{explain, key_parts, nearest_changes, nearest_record};
+pub use key::{environment_parts, explain, key_parts, nearest_changes, nearest_record};
 pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
 pub use pipeline::Pipeline;
 pub use plan::{HashedInputs, hash_inputs, read_source};
