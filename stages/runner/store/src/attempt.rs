@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use artifact::{
     MANIFEST_FILE, Manifest, OutputFileError, hash_json, list_output_files, write_json,
+    write_json_atomically,
 };
 use serde_json::Value;
 
@@ -37,6 +38,11 @@ pub struct CheckedOutput {
 }
 
 impl Attempt {
+    /// Removes the checkpoints, if there are any.
+    pub fn remove_checkpoints(&self) -> Result<(), StoreError> {
+        remove_if_found(&self.work)
+    }
+
     /// Replaces hard links by copies, since writing to a file by its other name would change the
     /// artifact. Fails if there is anything other than folders and regular files.
     fn copy_hard_links(&self) -> Result<(), StoreError> {
@@ -76,7 +82,7 @@ impl Store {
             remove_if_found(&leftover)?;
         }
         let file = folder.join("action.json");
-        with_path(&file, write_json(&file, action))?;
+        with_path(&file, write_json_atomically(&file, action))?;
         with_path(&attempt.params, write_json(&attempt.params, params))?;
         Ok(attempt)
     }

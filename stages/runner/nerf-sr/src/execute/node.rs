@@ -199,10 +199,7 @@ impl NodeJob<'_> {
         stage_display.end();
         let usage = result?;
         program.confirm_again()?;
-        inputs.check(self.run.stop).inspect_err(|_| {
-            // Checkpoints may contain the changed input, even if it gets its old content back.
-            std::fs::remove_dir_all(&attempt.work).ok();
-        })?;
+        inputs.check_again(attempt)?;
         Ok((usage, time))
     }
 
