@@ -60,7 +60,7 @@ pub use frozen::FrozenPlan;
 pub use key::{environment_parts, explain, key_parts, nearest_changes, nearest_record};
 pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
 pub use pipeline::Pipeline;
-pub use plan::{HashedInputs, hash_inputs, read_source};
+pub use plan::{HashedInputs, hash_inputs, read_source, stored_inputs};
 pub use quality::Quality;
 pub use request::{PlanError, Request};
 pub use sources::{Source, SourceError};

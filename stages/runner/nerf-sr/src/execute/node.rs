@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use artifact::{format_duration, hash_json, unix_time};
 use planning::stage_call::{Call, Display, StageDisplay, StageFailure, Usage, read_summary};
-use planning::{HashedInputs, Node, Origin, hash_inputs, short_hash};
+use planning::{HashedInputs, Node, Origin, hash_inputs, short_hash, stored_inputs};
 use serde_json::{Map, Value};
 use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
 
@@ -80,11 +80,12 @@ impl NodeJob<'_> {
             &|holder, waited| self.report_waiting(holder, waited),
             || self.run.store.try_lock(&key),
         )?;
+        let stored = stored_inputs([self.node], self.run.store).map_err(failure)?;
         let action = Unfinished {
             stage: self.node.stage.clone(),
             point: self.node.point.clone(),
             key_parts,
-            made_of: self.parents.values().map(Record::key).collect(),
+            made_of: self.parents.values().chain(&stored).map(Record::key).collect(),
             started_unix: unix_time(),
         };
         let attempt = {
