@@ -16,7 +16,7 @@ use crate::failure;
 use crate::session::Run;
 use crate::unchanged::{ConfirmedProgram, Inputs, input_failure};
 use crate::waiting::{enter_store, holder_text, wait_for_lock};
-use crate::watch::{Chain, Watch, Watching};
+use crate::watch::{Chain, Watch, Watching, scratch_name};
 
 /// Action of a node that isn't cached.
 pub(crate) struct PendingAction {
@@ -215,8 +215,7 @@ impl NodeJob<'_> {
             return call.run(&attempt.log, stage_display, self.run.stop);
         };
         let is_over = AtomicBool::new(false);
-        let scratch =
-            self.run.store.scratch(self.run.file.id()).join(format!("watch-{}", call.label));
+        let scratch = self.run.store.scratch(self.run.file.id()).join(scratch_name(call.label));
         let (label, display, is_over) = (call.label, self.display, &is_over);
         let watching = Watching { watch, chain, label, scratch, display, is_over };
         std::thread::scope(|scope| {
