@@ -318,10 +318,34 @@ fn links_in_a_stages_output_are_refused() {
     }
 }
 
+/// Description of a sink.
+const SINK: &str = r#"{"name": "page", "version": "1", "code": "1", "summary": "Shows.", "sink": true, "parameters": {"type": "object"},
+  "inputs": {"run": {"kinds": ["run"], "summary": "a run"}}, "output": {"kind": "page"}}"#;
+
+/// A failed sink doesn't stop the others, and the first one gives the exit code.
+#[test]
+fn every_sink_runs() {
+    let project = scripted(COPY_PARAMETERS);
+    project.write(
+        "pipeline.yaml",
+        "default: [a, b, c]\nstages:\n  text: {run: ./text}\n  a: {run: ./page, inputs: {run: text}}\n  \
+        b: {run: ./page, inputs: {run: text}}\n  c: {run: ./page, inputs: {run: text}}\n",
+    );
+    let script = fs::read_to_string(project.path("text")).unwrap();
+    let (_, body) = script.split_once("exit; fi\n").unwrap();
+    let command = "case $out in */a/output) echo bad >&2; exit 3;; */b/output) exit;; esac; \
+        mkdir $out; cp $params $out/x";
+    let body = body.replace(&format!("mkdir $out; {COPY_PARAMETERS}"), command);
+    let script = format!("#!/bin/sh\nif [ $1 = describe ]; then echo '{SINK}'; exit; fi\n{body}");
+    project.program("page", &script);
+    let finished = project.run(&["run"]);
+    finished.fails(3, &["a: bad"]);
+    finished.fails(3, &["b: ", "without a valid artifact", "not created the folder --output"]);
+    assert!(project.path("out/c/x").exists() && !project.path("out/b").exists());
+}
+
 #[test]
 fn links_in_a_sinks_output_are_refused() {
-    let description = r#"{"name": "page", "version": "1", "code": "1", "summary": "Shows.", "sink": true, "parameters": {"type": "object"},
-      "inputs": {"run": {"kinds": ["run"], "summary": "a run"}}, "output": {"kind": "page"}}"#;
     for (command, reason) in LINKS {
         let project = scripted(COPY_PARAMETERS);
         project.write("own/x", "mine");
@@ -334,9 +358,7 @@ fn links_in_a_sinks_output_are_refused() {
         let body = body.replace(COPY_PARAMETERS, command);
         project.program(
             "page",
-            &format!(
-                "#!/bin/sh\nif [ $1 = describe ]; then echo '{description}'; exit; fi\n{body}"
-            ),
+            &format!("#!/bin/sh\nif [ $1 = describe ]; then echo '{SINK}'; exit; fi\n{body}"),
         );
         project.run(&["run", "page"]).fails(1, &["page", reason]);
         assert!(!project.path("out/page").exists());

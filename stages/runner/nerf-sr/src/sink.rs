@@ -123,6 +123,9 @@ pub(crate) fn run_sink(
     let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
     let output = scratch.join("output");
     call(run, sink, threads, &record, &scratch, &output)?;
+    if output.symlink_metadata().is_err() {
+        return Err(failure(StoreError::missing_output()));
+    }
     list_output_files(&output).map_err(failure)?;
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
