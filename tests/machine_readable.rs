@@ -70,6 +70,9 @@ fn path_prints_folders_within_artifacts() {
     project
         .run(&["path", "prep/trian", "-p", "kernel=box"])
         .fails(2, &["prep has no such folder or file; did you mean train?"]);
+    for outside in ["prep//etc/passwd", "prep/../x"] {
+        project.run(&["path", outside, "-p", "kernel=box"]).fails(2, &["not a path inside"]);
+    }
     project.run(&["path", "perp"]).fails(2, &["did you mean prep?"]);
 }
 

@@ -195,7 +195,7 @@ fn plan_and_run_refuse_calls_that_a_stage_would_refuse() {
         ),
         (
             &["upsample", "-p", "method=bicubic,liif"],
-            "stage upsample [method=liif]: input weights is missing",
+            "stage upsample [upsample.method=liif]: input weights is missing",
         ),
         (
             &["-p", "prep.scale=2.7", "-p", "kernel=average"],

@@ -44,11 +44,21 @@ fn pinned() -> Project {
     project
 }
 
+fn is_root() -> bool {
+    fs::metadata("/proc/self").unwrap().uid() == 0
+}
+
+/// Returns words of the advice to the user of [`run_unprivileged`], who owns the files unless root
+/// runs the tests.
+fn advice() -> &'static [&'static str] {
+    if is_root() { &["owned by user", "umask 002", "--store"] } else { &["you own it", "chmod"] }
+}
+
 /// Runs the runner, as user 65534 if root runs the tests; returns `None` if that user can't start
 /// the runner.
 fn run_unprivileged(project: &Project, arguments: &[&str]) -> Option<Finished> {
     let mut command = project.command(arguments);
-    if fs::metadata("/proc/self").unwrap().uid() == 0 {
+    if is_root() {
         command.uid(65534).gid(65534);
     }
     match command.output() {
@@ -87,7 +97,7 @@ fn gc_deletes_nothing_if_a_file_is_unreadable() {
         let permissions = fs::metadata(&path).unwrap().permissions();
         fs::set_permissions(&path, PermissionsExt::from_mode(0o0)).unwrap();
         let name = format!("{folder}/{}", path.file_name().unwrap().to_str().unwrap());
-        let refused = [&name, "Permission denied", "owned by user", "umask 002", "--store"];
+        let refused = [&[&name, "Permission denied"], advice()].concat();
         for arguments in [&["gc", "--keep-days", "0"][..], &["gc", "--dry-run"]] {
             let Some(finished) = run_unprivileged(&project, arguments) else { return };
             finished.fails(1, &[&["nothing was deleted"][..], &refused].concat());
@@ -179,7 +189,7 @@ fn a_colleagues_files_are_not_called_damaged() {
     let report = &verified.stdout;
     assert!(verified.code == 3 && report.contains("cannot read ") && object.exists(), "{report}");
     assert!(
-        report.contains("owned by user") && !report.contains("the artifact is damaged"),
+        report.contains(advice()[0]) && !report.contains("the artifact is damaged"),
         "{report}"
     );
     assert!(report.ends_with("1 artifact, 0 damaged, 1 unreadable\n"), "{report}");
@@ -189,7 +199,7 @@ fn a_colleagues_files_are_not_called_damaged() {
     fs::set_permissions(&lock, PermissionsExt::from_mode(0o444)).unwrap();
     let name = format!("locks/{}: Permission denied", lock.file_name().unwrap().to_str().unwrap());
     let refused = run_unprivileged(&project, &["run", "text"]).unwrap();
-    refused.fails(1, &[&name, "owned by user", "umask 002", "--store"]);
+    refused.fails(1, &[&[&name[..]], advice()].concat());
 }
 
 /// Some clusters' file systems have no file locks.
@@ -308,10 +318,34 @@ fn links_in_a_stages_output_are_refused() {
     }
 }
 
+/// Description of a sink.
+const SINK: &str = r#"{"name": "page", "version": "1", "code": "1", "summary": "Shows.", "sink": true, "parameters": {"type": "object"},
+  "inputs": {"run": {"kinds": ["run"], "summary": "a run"}}, "output": {"kind": "page"}}"#;
+
+/// A failed sink doesn't stop the others, and the first one gives the exit code.
+#[test]
+fn every_sink_runs() {
+    let project = scripted(COPY_PARAMETERS);
+    project.write(
+        "pipeline.yaml",
+        "default: [a, b, c]\nstages:\n  text: {run: ./text}\n  a: {run: ./page, inputs: {run: text}}\n  \
+        b: {run: ./page, inputs: {run: text}}\n  c: {run: ./page, inputs: {run: text}}\n",
+    );
+    let script = fs::read_to_string(project.path("text")).unwrap();
+    let (_, body) = script.split_once("exit; fi\n").unwrap();
+    let command = "case $out in */a/output) echo bad >&2; exit 3;; */b/output) exit;; esac; \
+        mkdir $out; cp $params $out/x";
+    let body = body.replace(&format!("mkdir $out; {COPY_PARAMETERS}"), command);
+    let script = format!("#!/bin/sh\nif [ $1 = describe ]; then echo '{SINK}'; exit; fi\n{body}");
+    project.program("page", &script);
+    let finished = project.run(&["run"]);
+    finished.fails(3, &["a: bad"]);
+    finished.fails(3, &["b: ", "without a valid artifact", "not created the folder --output"]);
+    assert!(project.path("out/c/x").exists() && !project.path("out/b").exists());
+}
+
 #[test]
 fn links_in_a_sinks_output_are_refused() {
-    let description = r#"{"name": "page", "version": "1", "code": "1", "summary": "Shows.", "sink": true, "parameters": {"type": "object"},
-      "inputs": {"run": {"kinds": ["run"], "summary": "a run"}}, "output": {"kind": "page"}}"#;
     for (command, reason) in LINKS {
         let project = scripted(COPY_PARAMETERS);
         project.write("own/x", "mine");
@@ -324,9 +358,7 @@ fn links_in_a_sinks_output_are_refused() {
         let body = body.replace(COPY_PARAMETERS, command);
         project.program(
             "page",
-            &format!(
-                "#!/bin/sh\nif [ $1 = describe ]; then echo '{description}'; exit; fi\n{body}"
-            ),
+            &format!("#!/bin/sh\nif [ $1 = describe ]; then echo '{SINK}'; exit; fi\n{body}"),
         );
         project.run(&["run", "page"]).fails(1, &["page", reason]);
         assert!(!project.path("out/page").exists());

@@ -68,13 +68,13 @@ pub fn main() -> ExitCode {
 
 /// Returns a failure with exit code 1.
 fn failure(error: impl std::fmt::Display) -> StageFailure {
-    StageFailure { code: 1, message: error.to_string() }
+    StageFailure { code: StageFailure::FAILED, message: error.to_string() }
 }
 
 fn plan_exit_code(error: &PlanError) -> u8 {
     match error {
-        PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
-        PlanError::Store(_) => 1,
+        PlanError::Pipeline(_) | PlanError::Usage(_) => StageFailure::USAGE,
+        PlanError::Store(_) => StageFailure::FAILED,
         PlanError::Source { .. } | PlanError::Artifact(_) => StageFailure::BAD_INPUT,
         PlanError::Interrupted => StageFailure::INTERRUPTED,
     }

@@ -138,7 +138,7 @@ impl Publishing<'_> {
         // Not every file system can exchange two folders. Without that, the target doesn't exist
         // for a moment.
         let old = self.hidden("old");
-        fs::rename(self.target, &old).map_err(|e| self.failure(&e))?;
+        self.move_page(self.target, &old).map_err(|e| self.failure(&e))?;
         let moved = fs::rename(page, self.target);
         let destination = if moved.is_ok() { page } else { self.target };
         fs::rename(&old, destination).and(moved).map_err(|e| self.failure(&e))
@@ -156,8 +156,23 @@ impl Publishing<'_> {
         if exists(&archived)? {
             self.delete(&archived)?;
         }
-        fs::rename(page, &archived)?;
+        self.move_page(page, &archived)?;
         Ok(Some(archived))
+    }
+
+    /// Moves a page to a new path. Overlay file systems move no folder of a lower layer, which is
+    /// copied instead.
+    fn move_page(&self, page: &Path, new: &Path) -> io::Result<()> {
+        match fs::rename(page, new) {
+            Err(e) if e.kind() == io::ErrorKind::CrossesDevices => {
+                let scrap = self.hidden("scrap");
+                remove_folder(&scrap)?;
+                copy_folder(page, &scrap)?;
+                fs::rename(&scrap, new)?;
+                remove_folder(page)
+            }
+            moved => moved,
+        }
     }
 
     /// Deletes a folder that a sink wrote. The folder is renamed first, so that a kill leaves no
@@ -165,8 +180,10 @@ impl Publishing<'_> {
     fn delete(&self, folder: &Path) -> io::Result<()> {
         let scrap = self.hidden("scrap");
         remove_folder(&scrap)?;
-        fs::rename(folder, &scrap)?;
-        remove_folder(&scrap)
+        match fs::rename(folder, &scrap) {
+            Err(e) if e.kind() == io::ErrorKind::CrossesDevices => remove_folder(folder),
+            moved => moved.and_then(|()| remove_folder(&scrap)),
+        }
     }
 
     fn check_ownership(&self, folder: &Path) -> Result<(), StageFailure> {

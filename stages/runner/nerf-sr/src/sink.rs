@@ -8,10 +8,10 @@ use artifact::{
     MANIFEST_FILE, Manifest, RunRecord, format_count, format_size, hash_json, list_output_files,
     print_line, write_json,
 };
-use planning::Sink;
 use planning::stage_call::{Call, Display, StageFailure};
-use serde_json::json;
-use store::Record;
+use planning::{Sink, environment_parts};
+use serde_json::{Map, Value, json};
+use store::{Record, StoreError};
 
 use crate::failure;
 use crate::page::PageMark;
@@ -20,11 +20,20 @@ use crate::run_record::{RunProgress, add_details, run_record, shown_results};
 use crate::session::Run;
 use crate::unchanged::ConfirmedProgram;
 
-/// Returns the identity of a sink's page: a hash of the record, the sink's code and its parameters.
-/// Values that the scene decides follow from these, so they aren't hashed.
+/// Returns the identity of a sink's page: a hash of the record, the sink's code, parameters and
+/// environment variables. Values that the scene decides follow from these, so they aren't hashed.
 fn page_identity(sink: &Sink, record: &RunRecord) -> String {
-    hash_json(&json!({"record": record, "code": sink.program.description.code,
-            "parameters": sink.parameters}))
+    let mut parts = sink_parts(sink);
+    parts.insert("record".to_owned(), json!(record));
+    hash_json(&parts)
+}
+
+/// Returns what may change a sink's page, apart from the run that it shows, by name.
+pub(crate) fn sink_parts(sink: &Sink) -> Map<String, Value> {
+    let mut parts = environment_parts(&sink.program.description);
+    parts.insert("code".to_owned(), json!(sink.program.description.code));
+    parts.insert("parameters".to_owned(), sink.parameters.clone());
+    parts
 }
 
 /// True if a sink's page already shows these records.
@@ -114,6 +123,9 @@ pub(crate) fn run_sink(
     let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
     let output = scratch.join("output");
     call(run, sink, threads, &record, &scratch, &output)?;
+    if output.symlink_metadata().is_err() {
+        return Err(failure(StoreError::missing_output()));
+    }
     list_output_files(&output).map_err(failure)?;
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
@@ -167,4 +179,32 @@ fn call(
     view.end();
     result?;
     program.confirm_again()
+}
+
+#[cfg(test)]
+mod tests {
+    use planning::{Pipeline, Plan, Request};
+
+    use super::*;
+
+    /// Returns the identity of the page of a sink that declares some environment variables.
+    fn identity(environment: &[&str]) -> String {
+        let text = "default: [page]\nstages: {page: {}}";
+        let pipeline = Pipeline::parse(text.as_bytes(), Path::new("pipeline.yaml")).unwrap();
+        let description =
+            serde_json::from_value(json!({"name": "page", "version": "", "code": "c",
+            "summary": "", "parameters": {}, "inputs": {}, "output": {"kind": "page"},
+            "sink": true, "environment": environment}));
+        let descriptions = BTreeMap::from([("page".to_owned(), description.unwrap())]);
+        let request = Request { targets: vec!["page".to_owned()], ..Request::default() };
+        let plan = Plan::from_descriptions(&pipeline, &descriptions, &request).unwrap();
+        page_identity(&plan.sinks[0], &RunRecord::default())
+    }
+
+    #[test]
+    fn a_sinks_variables_are_part_of_its_pages_identity() {
+        let parts = json!({"record": RunRecord::default(), "code": "c", "parameters": {}});
+        assert_eq!(identity(&[]), hash_json(&parts));
+        assert_ne!(identity(&["PATH"]), identity(&["NERF_SR_UNSET"]));
+    }
 }

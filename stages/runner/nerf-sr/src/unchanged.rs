@@ -7,7 +7,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{Damage, MANIFEST_FILE, Manifest};
+use artifact::{Damage, MANIFEST_FILE, Manifest, write_atomically};
 use planning::stage_call::StageFailure;
 use planning::{
     ConfirmError, HashedInputs, Node, NodeInput, Origin, PlanError, Source, StageProgram, Stamp,
@@ -15,11 +15,12 @@ use planning::{
 };
 use store::{Attempt, Store};
 
+use crate::failure;
+
 /// A program that was confirmed before its start.
 pub(crate) struct ConfirmedProgram<'a> {
     program: &'a StageProgram,
     store: &'a Store,
-    stop: &'a AtomicBool,
     stamp: Stamp,
 }
 
@@ -28,22 +29,23 @@ impl<'a> ConfirmedProgram<'a> {
     pub(crate) fn new(
         program: &'a StageProgram,
         store: &'a Store,
-        stop: &'a AtomicBool,
+        stop: &AtomicBool,
     ) -> Result<Self, StageFailure> {
         let stamp = program.confirm(store, Some(stop)).map_err(|e| confirmation_failure(&e))?;
-        Ok(Self { program, store, stop, stamp })
+        Ok(Self { program, store, stamp })
     }
 
-    /// Confirms after the program's end that the program was not changed since [`Self::new`].
+    /// Confirms after the program's end that the program was not changed since [`Self::new`]. Only
+    /// a second signal interrupts this: the first one must not cost a result.
     pub(crate) fn confirm_again(&self) -> Result<(), StageFailure> {
-        let confirmed = self.program.confirm_since(&self.stamp, self.store, Some(self.stop));
+        let confirmed = self.program.confirm_since(&self.stamp, self.store, None);
         confirmed.map_err(|e| confirmation_failure(&e))
     }
 }
 
 fn confirmation_failure(problem: &ConfirmError) -> StageFailure {
     let is_interrupted = matches!(problem, ConfirmError::Interrupted);
-    let code = if is_interrupted { StageFailure::INTERRUPTED } else { 2 };
+    let code = if is_interrupted { StageFailure::INTERRUPTED } else { StageFailure::USAGE };
     StageFailure { code, message: problem.to_string() }
 }
 
@@ -52,7 +54,7 @@ pub(crate) fn input_failure(problem: &PlanError) -> StageFailure {
     let code = match problem {
         PlanError::Source { .. } | PlanError::Artifact(_) => StageFailure::BAD_INPUT,
         PlanError::Interrupted => StageFailure::INTERRUPTED,
-        PlanError::Pipeline(_) | PlanError::Store(_) | PlanError::Usage(_) => 1,
+        PlanError::Pipeline(_) | PlanError::Store(_) | PlanError::Usage(_) => StageFailure::FAILED,
     };
     StageFailure { code, message: problem.to_string() }
 }
@@ -96,9 +98,25 @@ impl<'a> Inputs<'a> {
 
     /// Fails if an input was changed since its content was hashed.
     pub(crate) fn check(&self, stop: &AtomicBool) -> Result<(), StageFailure> {
+        self.find_change(Some(stop))?.map_or(Ok(()), Err)
+    }
+
+    /// Checks the inputs like [`Self::check`] after the stage's end. If an input was changed,
+    /// removes the attempt's checkpoints: they may contain the changed input, even if it gets its
+    /// old content back. Only a second signal interrupts this: the first one must not cost a
+    /// result.
+    pub(crate) fn check_again(&self, attempt: &Attempt) -> Result<(), StageFailure> {
+        let Some(change) = self.find_change(None)? else { return Ok(()) };
+        attempt.remove_checkpoints().map_err(failure)?;
+        Err(change)
+    }
+
+    /// Returns the failure for an input that was changed since its content was hashed. Fails if an
+    /// input can't be compared: an unreadable one may be unchanged.
+    fn find_change(&self, stop: Option<&AtomicBool>) -> Result<Option<StageFailure>, StageFailure> {
         for NodeInput { name, from } in &self.node.inputs {
             let Origin::Folder(folder) = from else { continue };
-            let now = read_source(self.store, self.node, name, folder, Some(stop))
+            let now = read_source(self.store, self.node, name, folder, stop)
                 .map_err(|e| input_failure(&e))?;
             if let Some(change) = now.change_since(&self.sources[name]) {
                 let message = format!(
@@ -106,32 +124,37 @@ impl<'a> Inputs<'a> {
                     run again",
                     folder.display()
                 );
-                return Err(StageFailure { code: StageFailure::BAD_INPUT, message });
+                return Ok(Some(StageFailure { code: StageFailure::BAD_INPUT, message }));
             }
         }
-        self.artifacts.iter().try_for_each(StoredInput::check).map_err(|e| damage_failure(&e))
+        match self.artifacts.iter().try_for_each(StoredInput::check) {
+            Ok(()) => Ok(None),
+            Err(unreadable @ Damage::Unreadable { .. }) => Err(damage_failure(&unreadable)),
+            Err(damage) => Ok(Some(damage_failure(&damage))),
+        }
     }
 
     /// Removes checkpoints of an earlier attempt if a folder outside the store was written to since
     /// that attempt began: the content is the same now, but the attempt may have read other
     /// content. Returns whether checkpoints were removed.
     pub(crate) fn drop_doubtful_checkpoints(&self, attempt: &Attempt) -> io::Result<bool> {
-        let times: BTreeMap<&str, String> = self
-            .sources
-            .iter()
-            .map(|(name, source)| (name.as_str(), source.times_hash()))
-            .collect();
+        let sources = self.sources.iter();
+        let times: BTreeMap<String, String> =
+            sources.map(|(name, source)| (name.clone(), source.times_hash())).collect();
         if times.is_empty() {
             return Ok(false);
         }
         let file = attempt.work.with_file_name("inputs.json");
-        let text = serde_json::to_string(&times)?;
-        let earlier = std::fs::read_to_string(&file).ok();
-        let is_doubtful = earlier.is_some_and(|earlier| earlier != text) && attempt.work.exists();
-        if is_doubtful {
-            std::fs::remove_dir_all(&attempt.work)?;
+        let earlier: Option<BTreeMap<String, String>> =
+            std::fs::read(&file).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        if earlier.as_ref() == Some(&times) {
+            return Ok(false);
         }
-        std::fs::write(&file, text)?;
+        let is_doubtful = earlier.is_some() && attempt.work.exists();
+        if is_doubtful {
+            attempt.remove_checkpoints().map_err(io::Error::other)?;
+        }
+        write_atomically(&file, serde_json::to_string(&times)?.as_bytes())?;
         Ok(is_doubtful)
     }
 }
@@ -182,4 +205,71 @@ fn stamps(folder: &Path, manifest: &Manifest) -> Result<Vec<Stamp>, Damage> {
         stamps.push(Stamp::of(&path).map_err(|source| Damage::Unreadable { path, source })?);
     }
     Ok(stamps)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::os::unix::fs::MetadataExt as _;
+
+    use planning::{Pipeline, Plan, Request, hash_inputs};
+    use serde_json::json;
+    use store::{Locked, Unfinished};
+
+    use super::*;
+
+    /// Returns a node that reads the folder `data`, a store, and an attempt with a checkpoint.
+    fn attempt(dir: &Path) -> (Node, Store, Attempt) {
+        fs::create_dir(dir.join("data")).unwrap();
+        fs::write(dir.join("data/x"), "1").unwrap();
+        let pipeline = "default: [make]\nstages: {make: {inputs: {data: ./data}}}";
+        let pipeline = Pipeline::parse(pipeline.as_bytes(), &dir.join("pipeline.yaml")).unwrap();
+        let description = serde_json::from_value(json!({"name": "make", "version": "",
+            "code": "", "summary": "", "parameters": {}, "output": {"kind": "x"},
+            "inputs": {"data": {"kinds": ["x"], "summary": ""}}}));
+        let descriptions = BTreeMap::from([("make".to_owned(), description.unwrap())]);
+        let request = Request { targets: vec!["make".to_owned()], ..Request::default() };
+        let mut plan = Plan::from_descriptions(&pipeline, &descriptions, &request).unwrap();
+        let store = Store::open(&dir.join("store")).unwrap();
+        let Locked::Acquired(entered) = store.try_enter().unwrap() else { panic!("closed") };
+        let attempt = store.begin(&entered, &Unfinished::default(), &json!({})).unwrap();
+        fs::create_dir(&attempt.work).unwrap();
+        (plan.nodes.remove(0), store, attempt)
+    }
+
+    fn inputs<'a>(node: &'a Node, store: &'a Store) -> Inputs<'a> {
+        let found = hash_inputs(node, store, None, |_| String::new()).unwrap();
+        Inputs::new(node, store, found, |_| String::new()).unwrap()
+    }
+
+    #[test]
+    fn checkpoints_are_dropped_only_after_a_change() {
+        let dir = tempfile::tempdir().unwrap();
+        let (node, store, attempt) = attempt(dir.path());
+        let (data, away) = (dir.path().join("data"), dir.path().join("away"));
+        let before = inputs(&node, &store);
+        before.check_again(&attempt).unwrap();
+        fs::rename(&data, &away).unwrap();
+        let message = before.check_again(&attempt).unwrap_err().message;
+        assert!(message.contains("no such folder") && attempt.work.exists(), "{message}");
+        fs::rename(&away, &data).unwrap();
+        fs::write(data.join("x"), "2").unwrap();
+        let message = before.check_again(&attempt).unwrap_err().message;
+        assert!(message.contains("x was changed") && !attempt.work.exists(), "{message}");
+    }
+
+    #[test]
+    fn a_damaged_list_of_inputs_keeps_the_checkpoints() {
+        let dir = tempfile::tempdir().unwrap();
+        let (node, store, attempt) = attempt(dir.path());
+        let is_dropped = || inputs(&node, &store).drop_doubtful_checkpoints(&attempt).unwrap();
+        let list = attempt.work.with_file_name("inputs.json");
+        assert!(!is_dropped());
+        let file = fs::metadata(&list).unwrap().ino();
+        assert!(!is_dropped() && fs::metadata(&list).unwrap().ino() == file, "not rewritten");
+        fs::write(&list, "{\"da").unwrap();
+        assert!(!is_dropped() && attempt.work.exists());
+        fs::write(dir.path().join("data/x"), "1").unwrap();
+        assert!(is_dropped() && !attempt.work.exists());
+    }
 }

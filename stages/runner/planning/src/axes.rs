@@ -15,6 +15,9 @@ use crate::quality::{QUALITY, Quality};
 use crate::request::{PlanError, Request};
 use crate::stages::{Programs, StageProgram};
 
+/// Names of entries that `table` itself adds to each row, next to the values of the axes.
+const TABLE_ENTRIES: [&str; 5] = ["method", "missing", "views", "commit", "machine"];
+
 /// Alternative values, of which each point of the sweep has one.
 #[derive(Debug)]
 pub(crate) struct Axis {
@@ -167,6 +170,7 @@ impl Scope<'_> {
             axes.push(Axis { is_named, ..axis });
         }
         experiment.extend(axes);
+        name_by_stage(&mut experiment);
         Ok((experiment, notes))
     }
 
@@ -324,6 +328,23 @@ impl Scope<'_> {
             problem += &format!("; stages without a description were not searched: {stages}");
         }
         PlanError::Usage(problem)
+    }
+}
+
+/// Adds the stage to the name of a parameter's or input's axis if another axis or a table's entry
+/// has the same name. Otherwise labels would be ambiguous, and tables would average different
+/// points.
+fn name_by_stage(axes: &mut [Axis]) {
+    let named = axes.iter().filter(|axis| axis.is_named).map(|axis| axis.name.clone());
+    let taken: Vec<String> = named.chain(TABLE_ENTRIES.map(str::to_owned)).collect();
+    for axis in axes.iter_mut().filter(|axis| axis.is_named) {
+        let is_ambiguous = taken.iter().filter(|name| **name == axis.name).count() > 1;
+        // Scenes, protocols, variants and qualities belong to no stage.
+        let setting = axis.settings().next().filter(|s| s.name == axis.name && is_ambiguous);
+        let stage = setting.map(|setting| setting.stage.clone()).unwrap_or_default();
+        if !stage.is_empty() {
+            axis.name = format!("{stage}.{}", axis.name);
+        }
     }
 }
 

@@ -2,12 +2,16 @@
 //! lists, so that its explanation always agrees with the key (docs/design/002).
 
 use std::cmp::Reverse;
+use std::ffi::OsString;
+use std::path::Path;
 
 use serde_json::{Map, Value, json};
+use stage::Description;
 use store::{KEY_VERSION, KEY_VERSION_PART, Record};
 
 use crate::changes::{Change, changes};
 use crate::node::Node;
+use crate::sources::path_text;
 
 /// Returns everything that may change a node's result, by name. Threads, paths, verbosity, host and
 /// the block's name are left out: they don't.
@@ -25,10 +29,21 @@ pub fn key_parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<
     for (name, hash) in inputs {
         parts.insert(format!("input {name}"), json!(hash));
     }
-    for name in &description.environment {
-        parts.insert(format!("environment {name}"), json!(std::env::var(name).ok()));
-    }
+    parts.extend(environment_parts(description));
     parts
+}
+
+/// Returns the parts of the environment variables that a stage declares.
+pub fn environment_parts(description: &Description) -> Map<String, Value> {
+    let names = description.environment.iter();
+    names
+        .map(|name| (format!("environment {name}"), environment_value(std::env::var_os(name))))
+        .collect()
+}
+
+/// Returns a unique JSON value for each value of an environment variable; null for an unset one.
+fn environment_value(value: Option<OsString>) -> Value {
+    json!(value.map(|value| path_text(Path::new(&value))))
 }
 
 /// Returns the differences between a key and the nearest earlier one of the same block, as text;
@@ -60,7 +75,17 @@ pub fn nearest_record<'a>(
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt as _;
+
     use super::*;
+
+    #[test]
+    fn every_value_of_a_variable_has_its_own_part() {
+        let value = |bytes: &[u8]| environment_value(Some(OsStr::from_bytes(bytes).to_owned()));
+        assert_eq!((environment_value(None), value("ä".as_bytes())), (json!(null), json!("ä")));
+        assert_eq!((value(b"\xff"), value(b"\xfe")), (json!("\0ff"), json!("\0fe")));
+    }
 
     fn record(stage: &str, started_unix: u64, parts: &Value) -> Record {
         Record {

@@ -1,11 +1,11 @@
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use artifact::hash_json;
 use slurm::Resources;
 use stage::Description;
-use store::Store;
+use store::{Record, Store, StoreError};
 
 use crate::axes::Scope;
 use crate::check;
@@ -122,6 +122,23 @@ impl<'a> Goal<'a> {
         let resources = resources.filter(|(_, resources)| !resources.is_empty()).collect();
         Ok(Plan { notes, resources, ..plan })
     }
+}
+
+/// Returns records of the artifacts that nodes read as folders of the store, not as other nodes'
+/// outputs.
+pub fn stored_inputs<'a>(
+    nodes: impl IntoIterator<Item = &'a Node>,
+    store: &Store,
+) -> Result<Vec<Record>, StoreError> {
+    let inputs = nodes.into_iter().flat_map(|node| &node.inputs);
+    let folders: BTreeSet<&PathBuf> = inputs
+        .filter_map(|input| match &input.from {
+            Origin::Folder(folder) => Some(folder),
+            Origin::Node { .. } => None,
+        })
+        .collect();
+    let records = folders.into_iter().map(|folder| store.record_of_folder(folder));
+    records.filter_map(Result::transpose).collect()
 }
 
 /// Content hashes of a node's inputs, and those inputs that are folders outside the store.

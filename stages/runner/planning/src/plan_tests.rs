@@ -131,6 +131,24 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
             &["prep [data=one]", "prep [data=two]", "train [data=one]", "train [data=two]"],
         ),
         (&["train", "-i", "train.scene=one"], &["train"]),
+        // Axes of equal names, and those named like an entry of tables, are named by their stages.
+        (
+            &["train", "-p", "make.seed=1,2", "-p", "train.seed=3,4"],
+            &[
+                "make [make.seed=1]",
+                "make [make.seed=2]",
+                "prep [make.seed=1]",
+                "prep [make.seed=2]",
+                "train [make.seed=1, train.seed=3]",
+                "train [make.seed=1, train.seed=4]",
+                "train [make.seed=2, train.seed=3]",
+                "train [make.seed=2, train.seed=4]",
+            ],
+        ),
+        (
+            &["train", "-i", "weights=one", "-p", "method=plain,net"],
+            &["make", "prep", "train [train.method=plain]", "train [train.method=net]"],
+        ),
         // The target decides between parameters of equal names.
         (&["make", "-p", "seed=3"], &["make"]),
     ] {
@@ -291,7 +309,7 @@ fn invalid_command_lines_are_refused() {
         (&["-p", "method=net"], "stage train: input weights is missing: method net needs it"),
         (&["-p", "background=alpha"], "stage train: alpha needs open"),
         (&["-p", "quick=true", "-p", "views=9"], "stage report: quick scores have few views"),
-        (&["-p", "method=plain,net"], "stage train [method=net]: input weights is missing"),
+        (&["-p", "method=plain,net"], "stage train [train.method=net]: input weights is missing"),
     ] {
         let problem = plan_error(PIPELINE, arguments);
         assert!(matches!(problem, PlanError::Usage(_)), "{problem:?}");

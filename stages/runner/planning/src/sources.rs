@@ -305,7 +305,7 @@ impl CacheFile {
 
 /// Converts a path to a unique text. Paths that aren't UTF-8 are written in hexadecimal after a
 /// NUL, which no path contains.
-fn path_text(path: &Path) -> String {
+pub(crate) fn path_text(path: &Path) -> String {
     if let Some(text) = path.to_str() {
         return text.to_owned();
     }

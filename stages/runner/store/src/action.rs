@@ -1,5 +1,6 @@
 use std::fs;
 use std::io;
+use std::path::Path;
 
 use artifact::{hash_json, write_json_atomically};
 use schemars::JsonSchema;
@@ -143,6 +144,15 @@ impl Store {
         Ok(records)
     }
 
+    /// Returns a record of the artifact that contains a folder; `None` for a folder elsewhere.
+    pub fn record_of_folder(&self, folder: &Path) -> Result<Option<Record>, StoreError> {
+        let objects = self.root().join("objects").canonicalize();
+        let (Ok(objects), Ok(folder)) = (objects, folder.canonicalize()) else { return Ok(None) };
+        let Ok(inside) = folder.strip_prefix(objects) else { return Ok(None) };
+        let Some(identity) = inside.iter().next() else { return Ok(None) };
+        Ok(self.records()?.into_iter().find(|record| record.output.as_str() == identity))
+    }
+
     /// Returns the keys of all records and logs, sorted; including those of damaged records.
     pub fn action_keys(&self) -> Result<Vec<String>, StoreError> {
         let mut keys = Vec::new();
@@ -225,6 +235,28 @@ mod tests {
         // Creating the artifact again replaces the damaged object.
         finish_action(&store, "a", "1234");
         store.verify(&done.output).unwrap();
+    }
+
+    #[test]
+    fn folders_of_artifacts_have_records() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(&dir.path().join("store")).unwrap();
+        let done = finish_action(&store, "a", "1234");
+        let object = store.object(&done.output);
+        fs::create_dir(object.join("in")).unwrap();
+        let link = dir.path().join("link");
+        std::os::unix::fs::symlink(object.join("in"), &link).unwrap();
+        for (folder, expected) in [
+            (object.clone(), Some(&done)),
+            (object.join("in"), Some(&done)),
+            (link, Some(&done)),
+            (dir.path().to_path_buf(), None),
+            (store.object(""), None),
+            (store.object("absent"), None),
+        ] {
+            let found = store.record_of_folder(&folder).unwrap();
+            assert_eq!(found.as_ref(), expected, "{}", folder.display());
+        }
     }
 
     /// An unreadable record isn't treated as missing: every access fails and names the file.

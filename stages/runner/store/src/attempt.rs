@@ -4,12 +4,13 @@ use std::path::PathBuf;
 
 use artifact::{
     MANIFEST_FILE, Manifest, OutputFileError, hash_json, list_output_files, write_json,
+    write_json_atomically,
 };
 use serde_json::Value;
 
 use crate::action::{Record, Unfinished};
 use crate::error::{StoreError, with_path};
-use crate::folder::{Store, remove_if_found};
+use crate::folder::{Store, make_writable, remove_if_found};
 use crate::lock::Entered;
 use crate::objects::make_durable;
 
@@ -37,6 +38,11 @@ pub struct CheckedOutput {
 }
 
 impl Attempt {
+    /// Removes the checkpoints, if there are any.
+    pub fn remove_checkpoints(&self) -> Result<(), StoreError> {
+        remove_if_found(&self.work)
+    }
+
     /// Replaces hard links by copies, since writing to a file by its other name would change the
     /// artifact. Fails if there is anything other than folders and regular files.
     fn copy_hard_links(&self) -> Result<(), StoreError> {
@@ -76,7 +82,7 @@ impl Store {
             remove_if_found(&leftover)?;
         }
         let file = folder.join("action.json");
-        with_path(&file, write_json(&file, action))?;
+        with_path(&file, write_json_atomically(&file, action))?;
         with_path(&attempt.params, write_json(&attempt.params, params))?;
         Ok(attempt)
     }
@@ -88,9 +94,9 @@ impl Store {
     pub fn check(&self, attempt: Attempt, kind: &str) -> Result<CheckedOutput, StoreError> {
         let output = &attempt.output;
         if output.symlink_metadata().is_err() {
-            let problem = "the stage has not created the folder --output";
-            return Err(StoreError::NoArtifact(problem.to_owned()));
+            return Err(StoreError::missing_output());
         }
+        with_path(output, make_writable(output))?;
         attempt.copy_hard_links()?;
         let found = with_path(output, Manifest::of_folder(kind, output))?;
         if !output.join(MANIFEST_FILE).exists() {
@@ -137,14 +143,14 @@ impl Store {
             with_path(&log, fs::rename(&attempt.log, &log))?;
         }
         self.write_record(&record)?;
-        with_path(&attempt.folder, fs::remove_dir_all(&attempt.folder))?;
+        remove_if_found(&attempt.folder)?;
         Ok(record)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::os::unix::fs::symlink;
+    use std::os::unix::fs::{PermissionsExt as _, symlink};
     use std::os::unix::net::UnixListener;
     use std::path::Path;
 
@@ -193,6 +199,37 @@ mod tests {
         }
         assert_eq!(fs::read_dir(&user_folder).unwrap().count(), 1);
         assert_eq!(store.hit(&finish_action(&store, "k", "1").key()).unwrap().unwrap().stage, "k");
+    }
+
+    /// A stage may leave folders without write permission, which can't be moved or deleted.
+    #[test]
+    fn read_only_folders_are_published_and_deleted() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let begin_read_only = || {
+            let attempt = begin(&store, "k", Some("1"));
+            for inner in [attempt.output.join("in"), attempt.work.join("in")] {
+                fs::create_dir_all(&inner).unwrap();
+                fs::write(inner.join("x"), "1").unwrap();
+                for folder in inner.ancestors().take(2) {
+                    fs::set_permissions(folder, fs::Permissions::from_mode(0o555)).unwrap();
+                }
+            }
+            attempt
+        };
+        begin_read_only();
+        // The next attempt deletes the output.
+        let checked = store.check(begin_read_only(), "text").unwrap();
+        let record = Record { stage: "k".to_owned(), ..Record::default() };
+        let output = store.publish(&entered(&store), checked, record).unwrap().output;
+        for folder in [store.object(&output), store.object(&output).join("in")] {
+            assert_eq!(folder.metadata().unwrap().permissions().mode() & 0o777, 0o755);
+            fs::set_permissions(folder, fs::Permissions::from_mode(0o555)).unwrap();
+        }
+        store.remove_object(&output).unwrap();
+        begin_read_only().remove_checkpoints().unwrap();
+        store.empty_trash().unwrap();
+        assert!(store.list_names("trash").unwrap().is_empty());
     }
 
     /// Writing to a hard-linked file outside of the store doesn't change the artifact.

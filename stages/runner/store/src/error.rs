@@ -26,7 +26,8 @@ pub enum StoreError {
         /// Remedy.
         remedy: String,
     },
-    /// The file system doesn't support locks, or a newer program has marked the store.
+    /// The file system doesn't support locks, the store is on several file systems, or a newer
+    /// program has marked the store.
     #[error("{0}")]
     Unsupported(String),
     /// An object is damaged.
@@ -35,6 +36,13 @@ pub enum StoreError {
     /// A stage succeeded, but its output is not a valid artifact.
     #[error("the stage ended without a valid artifact: {0}")]
     NoArtifact(String),
+}
+
+impl StoreError {
+    /// Creates the error for a stage that has written no output.
+    pub fn missing_output() -> Self {
+        Self::NoArtifact("the stage has not created the folder --output".to_owned())
+    }
 }
 
 /// Adds the path to the error of a file operation.

@@ -1,5 +1,6 @@
 use std::fs::{self, File};
 use std::io;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
 use artifact::unix_time;
@@ -83,33 +84,64 @@ impl Store {
     /// Moves a file or folder to the trash, which [`Store::empty_trash`] deletes; returns whether
     /// it existed.
     pub(crate) fn move_to_trash(&self, path: &Path) -> Result<bool, StoreError> {
-        use io::ErrorKind::{AlreadyExists, DirectoryNotEmpty};
+        use io::ErrorKind::{AlreadyExists, CrossesDevices, DirectoryNotEmpty, PermissionDenied};
         loop {
             let trashed = self.root.join("trash").join(unique_name(unix_time())?);
-            match fs::rename(path, trashed) {
+            let moved = match fs::rename(path, &trashed) {
+                Err(error) if error.kind() == PermissionDenied => {
+                    make_writable(path).ok();
+                    fs::rename(path, &trashed)
+                }
+                // Overlay file systems move no folder of a lower layer.
+                Err(error) if error.kind() == CrossesDevices => {
+                    return remove_if_found(path).map(|()| true);
+                }
+                moved => moved,
+            };
+            match moved {
                 Err(error) if matches!(error.kind(), AlreadyExists | DirectoryNotEmpty) => {}
                 result => return Ok(if_found(path, result)?.is_some()),
             }
         }
     }
 
-    /// Deletes the content of the trash. Several processes may do so, and may be killed meanwhile.
+    /// Deletes the content of the trash, and returns the first error at the end. Several processes
+    /// may do so, and may be killed meanwhile.
     pub fn empty_trash(&self) -> Result<(), StoreError> {
-        for name in self.list_names("trash")? {
-            remove_if_found(&self.root.join("trash").join(name))?;
-        }
-        Ok(())
+        let trash = self.root.join("trash");
+        let names = self.list_names("trash")?.into_iter();
+        names.map(|name| remove_if_found(&trash.join(name))).fold(Ok(()), Result::and)
     }
 }
 
 /// Removes a file, a link or a folder, if it exists.
 pub(crate) fn remove_if_found(path: &Path) -> Result<(), StoreError> {
     let removed = match path.symlink_metadata() {
-        Ok(metadata) if metadata.is_dir() => fs::remove_dir_all(path),
+        Ok(metadata) if metadata.is_dir() => fs::remove_dir_all(path).or_else(|error| {
+            if error.kind() != io::ErrorKind::PermissionDenied {
+                return Err(error);
+            }
+            make_writable(path).ok();
+            fs::remove_dir_all(path)
+        }),
         Ok(_) => fs::remove_file(path),
         Err(error) => Err(error),
     };
     if_found(path, removed).map(|_| ())
+}
+
+/// Gives the owner all permissions on a folder and its subfolders, without which no folder can be
+/// moved or deleted. A stage may have removed the permissions. Files stay unchanged.
+pub(crate) fn make_writable(path: &Path) -> io::Result<()> {
+    let metadata = path.symlink_metadata()?;
+    if !metadata.is_dir() {
+        return Ok(());
+    }
+    let mode = metadata.permissions().mode();
+    if mode & 0o700 != 0o700 {
+        fs::set_permissions(path, fs::Permissions::from_mode(mode | 0o700))?;
+    }
+    fs::read_dir(path)?.try_for_each(|entry| make_writable(&entry?.path()))
 }
 
 /// Returns a unique name that sorts by time: time, process id and random digits. The digits matter,

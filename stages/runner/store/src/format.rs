@@ -1,5 +1,6 @@
 use std::fs;
 use std::io;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 use artifact::write_atomically;
@@ -35,7 +36,28 @@ impl Store {
                 result => with_path(&path, result)?,
             }
         }
+        store.check_file_systems()?;
         Ok(store)
+    }
+
+    /// Fails if folders between which files are moved are on different file systems.
+    fn check_file_systems(&self) -> Result<(), StoreError> {
+        let mut first = None;
+        for folder in ["partial", "objects", "actions", "trash"] {
+            let path = self.root().join(folder);
+            let Some(device) = if_found(&path, path.metadata())?.map(|meta| meta.dev()) else {
+                continue;
+            };
+            let &mut (other, expected) = first.get_or_insert((folder, device));
+            if device != expected {
+                return Err(StoreError::Unsupported(format!(
+                    "{}: {other} and {folder} are on different file systems; move the whole store \
+                    to one of them, and give its folder with --store",
+                    self.root().display()
+                )));
+            }
+        }
+        Ok(())
     }
 
     /// Reads the store's format; `None` for an unmarked store. Fails for a newer format.
@@ -75,7 +97,7 @@ impl Store {
 
 #[cfg(test)]
 mod tests {
-    use std::os::unix::fs::MetadataExt as _;
+    use std::os::unix::fs::symlink;
     use std::thread::ScopedJoinHandle;
 
     use super::*;
@@ -94,6 +116,16 @@ mod tests {
                 message.contains("use the newer nerf-sr") && !message.contains('\n'),
                 "{message}"
             );
+        }
+    }
+
+    #[test]
+    fn a_store_on_two_file_systems_is_refused() {
+        for folder in ["partial", "objects", "actions", "trash"] {
+            let dir = tempfile::tempdir().unwrap();
+            symlink("/proc", dir.path().join(folder)).unwrap();
+            let message = Store::open(dir.path()).unwrap_err().to_string();
+            assert!(message.contains("are on different file systems"), "{folder}: {message}");
         }
     }
 

@@ -85,6 +85,8 @@ impl Run {
         id: &str,
     ) -> Result<Option<Self>, StoreError> {
         let path = kind.path(store, id);
+        // Before the file is read: a run that ends in between has written its end by then.
+        let in_progress = is_locked(&path)?;
         let Some(bytes) = if_found(&path, fs::read(&path))? else { return Ok(None) };
         let text = String::from_utf8_lossy(&bytes);
         let mut run = Self {
@@ -94,7 +96,7 @@ impl Run {
             keys: BTreeSet::new(),
             waiting: Vec::new(),
             ended_unix: None,
-            in_progress: is_locked(&path)?,
+            in_progress,
         };
         let mut is_complete = true;
         for line in text.lines() {

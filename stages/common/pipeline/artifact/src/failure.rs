@@ -88,15 +88,24 @@ impl<T, E: Into<anyhow::Error>> FailureExt<T> for Result<T, E> {
     }
 }
 
-/// Returns the end of a message about a file to which access was denied: its owner, and advice on
-/// how users can share a store. Empty for other errors.
+/// Returns advice for the end of a message about a file to which access was denied. Users who don't
+/// own the file learn its owner and how users can share a store. Empty for other errors.
 pub fn permission_advice(path: &Path, error: &io::Error) -> String {
     if error.kind() != io::ErrorKind::PermissionDenied {
         return String::new();
     }
     // If the file doesn't exist or can't be reached, its folder refuses access.
-    let owner = path.ancestors().find_map(|path| path.symlink_metadata().ok());
-    let owner = owner.map(|meta| format!("; owned by user {}", meta.uid())).unwrap_or_default();
+    let owner = path.ancestors().find_map(|path| Some(path.symlink_metadata().ok()?.uid()));
+    // `/proc/self` belongs to the user of this process.
+    let user = Path::new("/proc/self").metadata().ok().map(|meta| meta.uid());
+    access_advice(owner, user)
+}
+
+fn access_advice(owner: Option<u32>, user: Option<u32>) -> String {
+    if owner.is_some() && owner == user {
+        return "; you own it: allow access with chmod".to_owned();
+    }
+    let owner = owner.map(|owner| format!("; owned by user {owner}")).unwrap_or_default();
     format!("{owner}; share a store through a group and umask 002, or choose another with --store")
 }
 
@@ -117,12 +126,14 @@ mod tests {
     }
 
     #[test]
-    fn advice_names_the_owner_of_an_inaccessible_folder() {
+    fn advice_depends_on_the_owner_of_an_inaccessible_folder() {
         let dir = tempfile::tempdir().unwrap();
-        let owner = dir.path().metadata().unwrap().uid();
         let path = dir.path().join("absent/file");
         let advice = permission_advice(&path, &io::Error::from(io::ErrorKind::PermissionDenied));
-        assert!(advice.starts_with(&format!("; owned by user {owner}; share a store")), "{advice}");
+        assert_eq!(advice, "; you own it: allow access with chmod");
+        let advice = access_advice(Some(3), Some(4));
+        assert!(advice.starts_with("; owned by user 3; share a store"), "{advice}");
+        assert!(access_advice(None, None).starts_with("; share a store"));
         assert_eq!(permission_advice(&path, &io::Error::from(io::ErrorKind::NotFound)), "");
     }
 }

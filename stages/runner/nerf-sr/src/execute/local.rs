@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc;
 
-use anyhow::{Context as _, anyhow};
+use anyhow::Context as _;
 use artifact::{Failure, print_line, print_lines, report_line, report_text};
 use planning::stage_call::{Display, StageFailure};
 use planning::{Node, Sink};
@@ -64,42 +64,61 @@ impl Executor for Local {
             return Ok(ExitCode::from(failure.code));
         }
         print_summaries(run, &outcome)?;
-        let has_written = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
+        let sinks = self.run_sinks(run, plan.sinks.iter(), &outcome)?;
+        if let Some(code) = sinks.first_failure {
+            return Ok(ExitCode::from(code));
+        }
         let ran = outcome.ran.iter();
         let ran = ran.filter_map(|&index| Some((index, outcome.records[index].as_ref()?)));
         let comparison = total_comparison_text(run.estimates, ran);
-        let end = end_message(outcome.ran.len(), plan.nodes.len(), has_written);
+        let end = end_message(outcome.ran.len(), plan.nodes.len(), sinks.has_written);
         print_line!("{end}{}", comparison.map_or_else(String::new, |text| format!("; {text}")));
         Ok(ExitCode::SUCCESS)
     }
 }
 
 impl Local {
-    /// Runs sinks and prints the paths of their pages. Returns whether a page was written.
+    /// Runs sinks, and prints the paths of their pages and their failures.
     fn run_sinks<'a>(
         &self,
         run: &Run<'_>,
         sinks: impl Iterator<Item = &'a Sink>,
         outcome: &Outcome,
-    ) -> anyhow::Result<bool> {
+    ) -> anyhow::Result<SinksOutcome> {
         let progress = RunProgress {
             records: &outcome.records,
             ran: Some(&outcome.ran),
             failures: &outcome.failures,
             command: &command_line(),
         };
-        let mut has_written = false;
+        let mut sinks_outcome = SinksOutcome::default();
         for sink in sinks {
             let result = run_sink(run, sink, self.budget.cores, &progress);
             if run.stop.load(Ordering::Relaxed) {
                 return Err(Failure::Interrupted.into());
             }
-            let result = result.map_err(|e| anyhow!("{}: {e}", sink.stage))?;
-            result.print(&sink.stage);
-            has_written |= matches!(result, SinkResult::Written { .. });
+            match result {
+                Ok(result) => {
+                    result.print(&sink.stage);
+                    sinks_outcome.has_written |= matches!(result, SinkResult::Written { .. });
+                }
+                Err(failure) => {
+                    report_line!("nerf-sr: {}: {failure}", sink.stage);
+                    sinks_outcome.first_failure.get_or_insert(failure.code);
+                }
+            }
         }
-        Ok(has_written)
+        Ok(sinks_outcome)
     }
+}
+
+/// Outcome of a run's sinks.
+#[derive(Default)]
+struct SinksOutcome {
+    /// True if a page was written.
+    has_written: bool,
+    /// Exit code of the first sink that failed.
+    first_failure: Option<u8>,
 }
 
 /// Outcome of a run's nodes.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use artifact::{format_duration, hash_json, unix_time};
 use planning::stage_call::{Call, Display, StageDisplay, StageFailure, Usage, read_summary};
-use planning::{HashedInputs, Node, Origin, hash_inputs, short_hash};
+use planning::{HashedInputs, Node, Origin, hash_inputs, short_hash, stored_inputs};
 use serde_json::{Map, Value};
 use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
 
@@ -16,7 +16,7 @@ use crate::failure;
 use crate::session::Run;
 use crate::unchanged::{ConfirmedProgram, Inputs, input_failure};
 use crate::waiting::{enter_store, holder_text, wait_for_lock};
-use crate::watch::{Chain, Watch, Watching};
+use crate::watch::{Chain, Watch, Watching, scratch_name};
 
 /// Action of a node that isn't cached.
 pub(crate) struct PendingAction {
@@ -80,11 +80,12 @@ impl NodeJob<'_> {
             &|holder, waited| self.report_waiting(holder, waited),
             || self.run.store.try_lock(&key),
         )?;
+        let stored = stored_inputs([self.node], self.run.store).map_err(failure)?;
         let action = Unfinished {
             stage: self.node.stage.clone(),
             point: self.node.point.clone(),
             key_parts,
-            made_of: self.parents.values().map(Record::key).collect(),
+            made_of: self.parents.values().chain(&stored).map(Record::key).collect(),
             started_unix: unix_time(),
         };
         let attempt = {
@@ -199,10 +200,7 @@ impl NodeJob<'_> {
         stage_display.end();
         let usage = result?;
         program.confirm_again()?;
-        inputs.check(self.run.stop).inspect_err(|_| {
-            // Checkpoints may contain the changed input, even if it gets its old content back.
-            std::fs::remove_dir_all(&attempt.work).ok();
-        })?;
+        inputs.check_again(attempt)?;
         Ok((usage, time))
     }
 
@@ -217,8 +215,7 @@ impl NodeJob<'_> {
             return call.run(&attempt.log, stage_display, self.run.stop);
         };
         let is_over = AtomicBool::new(false);
-        let scratch =
-            self.run.store.scratch(self.run.file.id()).join(format!("watch-{}", call.label));
+        let scratch = self.run.store.scratch(self.run.file.id()).join(scratch_name(call.label));
         let (label, display, is_over) = (call.label, self.display, &is_over);
         let watching = Watching { watch, chain, label, scratch, display, is_over };
         std::thread::scope(|scope| {

@@ -16,7 +16,7 @@ use super::Executor;
 use crate::identities::node_identities;
 use crate::run_messages;
 use crate::session::{Run, check_utf8_path};
-use crate::sink::is_up_to_date;
+use crate::sink::{is_up_to_date, sink_parts};
 
 /// The verb that a job calls.
 pub(crate) const JOB_VERB: &str = "job";
@@ -118,9 +118,12 @@ fn tasks(run: &Run<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
 
 fn sink_identity(sink: &Sink, node_identities: &[String], out: &Path) -> String {
     let shows: Vec<&String> = sink.nodes.iter().map(|&index| &node_identities[index]).collect();
-    let code = &sink.program.description.code;
-    hash_json(&json!({"sink": sink.stage, "code": code, "parameters": sink.parameters,
-        "shows": shows, "out": out}))
+    let mut parts = sink_parts(sink);
+    for (name, value) in [("sink", json!(sink.stage)), ("shows", json!(shows)), ("out", json!(out))]
+    {
+        parts.insert(name.to_owned(), value);
+    }
+    hash_json(&parts)
 }
 
 /// Returns for each task whether it is done.

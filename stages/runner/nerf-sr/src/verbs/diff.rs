@@ -73,13 +73,28 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
 
 /// Reads the result of a stage with the parameters and inputs that follow its name.
 fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
-    let mut words = text.split_whitespace();
+    let (stage, request) = stage_request(text)?;
+    let (plan, states) = session.plan_with_states(&request)?;
+    let nodes = nodes_of_stage(&plan, &stage)?;
+    let &[index] = nodes.as_slice() else {
+        return Err(usage(text, "a sweep has several results; give one value for each parameter"));
+    };
+    let State::Cached(record) = &states[index] else {
+        bail_bad_input!("{text} has no artifact yet; run it first");
+    };
+    Lineage::read(&session.store, [record.key()])
+}
+
+/// Parses a stage with its parameters and inputs; words are split as by a POSIX shell.
+fn stage_request(text: &str) -> anyhow::Result<(String, Request)> {
+    let words = shlex::split(text).ok_or_else(|| usage(text, "close the quote"))?;
+    let mut words = words.into_iter();
     let Some(stage) = words.next() else {
         return Err(usage(text, "expected a stage, an artifact's hash, a run or a pin"));
     };
-    let mut request = Request { targets: vec![stage.to_owned()], ..Request::default() };
+    let mut request = Request { targets: vec![stage.clone()], ..Request::default() };
     while let Some(word) = words.next() {
-        let list = match word {
+        let list = match word.as_str() {
             "-p" => &mut request.parameters,
             "-i" => &mut request.inputs,
             _ => {
@@ -93,19 +108,33 @@ fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
         let Some(value) = words.next() else {
             return Err(usage(text, &format!("{word} needs NAME=VALUE")));
         };
-        list.push(value.to_owned());
+        list.push(value);
     }
-    let (plan, states) = session.plan_with_states(&request)?;
-    let nodes = nodes_of_stage(&plan, stage)?;
-    let &[index] = nodes.as_slice() else {
-        return Err(usage(text, "a sweep has several results; give one value for each parameter"));
-    };
-    let State::Cached(record) = &states[index] else {
-        bail_bad_input!("{text} has no artifact yet; run it first");
-    };
-    Lineage::read(&session.store, [record.key()])
+    Ok((stage, request))
 }
 
 fn usage(text: &str, problem: &str) -> anyhow::Error {
     PlanError::Usage(format!("{text:?}: {problem}")).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_are_split_as_by_a_shell() {
+        let (stage, request) =
+            stage_request(r"eval -p kernel=box  -i 'dataset=my scenes' -i a=\ b").unwrap();
+        assert_eq!((stage.as_str(), request.parameters), ("eval", vec!["kernel=box".to_owned()]));
+        assert_eq!(request.inputs, ["dataset=my scenes", "a= b"]);
+        for (text, expected) in [
+            ("", "expected a stage"),
+            ("eval -i 'a=b", "close the quote"),
+            ("eval box", "expected -p or -i, found box"),
+            ("eval -p", "-p needs NAME=VALUE"),
+        ] {
+            let message = stage_request(text).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
+    }
 }

@@ -5,9 +5,10 @@ use crate::garbage::{Collection, Policy, Root};
 use anyhow::Context as _;
 use artifact::{Failure, format_duration, format_size, print_line, report_line};
 use planning::stage_call::StageFailure;
-use planning::{PlanError, Request};
+use planning::{PlanError, Request, stored_inputs};
 use serde_json::json;
 use stage::stop_on_signals;
+use store::Record;
 
 use super::print_json;
 use crate::session::Session;
@@ -37,7 +38,9 @@ pub(crate) fn gc(
     let collection = Collection::new(store, root, policy).context(UNREADABLE)?;
     collection.carry_out(store, &closed)?;
     drop(closed);
-    store.empty_trash()?;
+    if let Err(error) = store.empty_trash() {
+        report_line!("nerf-sr: warning: the next gc must delete the rest of the trash: {error}");
+    }
     output.print(&collection)
 }
 
@@ -97,5 +100,7 @@ fn plan_root(session: &Session, request: &Request) -> anyhow::Result<Root> {
             None => root.waiting.push(plan.nodes[index].partial_key()),
         }
     }
+    let stored = stored_inputs(&plan.nodes, &session.store).context(UNREADABLE)?;
+    root.keys.extend(stored.iter().map(Record::key));
     Ok(root)
 }

@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 use std::process::ExitCode;
 
-use artifact::{bail_bad_input, print_line};
+use artifact::{FailureExt as _, bail_bad_input, print_line, relative_path};
 use planning::{PlanError, Request, State};
 
 use crate::session::{Session, nodes_of_stage};
@@ -17,6 +17,9 @@ pub(crate) fn path(
         Some((stage, inner)) => (stage, Some(inner)),
         None => (stage_path, None),
     };
+    if let Some(inner) = inner.filter(|inner| !inner.is_empty()) {
+        relative_path(inner).usage(stage_path)?;
+    }
     let mut request = request.clone();
     if request.targets.is_empty() {
         request.targets.push(stage.to_owned());

@@ -1,7 +1,7 @@
 use std::process::ExitCode;
 
 use artifact::{format_count, known_names, print_line};
-use planning::{PlanError, Request, State};
+use planning::{PlanError, Request, State, stored_inputs};
 
 use crate::session::{Session, command_line};
 use crate::waiting::try_enter_store;
@@ -22,6 +22,9 @@ pub(crate) fn pin(session: &Session, name: &str, request: &Request) -> anyhow::R
             return Err(PlanError::Usage(message).into());
         };
         actions.push((node.stage.clone(), record.key()));
+    }
+    for record in stored_inputs(&plan.nodes, &session.store)? {
+        actions.push((record.stage.clone(), record.key()));
     }
     session.store.pin(&entered, name, command_line(), &actions)?;
     print_line!("pinned {} as {name}", format_count(actions.len(), "artifact"));

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use artifact::{Failure, report_line};
 use planning::stage_call::{StageFailure, stop_on_signals};
-use planning::{Describing, Plan, Request, State};
+use planning::{Describing, Plan, Request, State, stored_inputs};
 use store::{RunFile, Store};
 
 use crate::estimates::Estimates;
@@ -57,5 +57,53 @@ pub(super) fn begin_run(
         }
         .map_err(failure)?;
     }
+    for record in stored_inputs(&plan.nodes, store).map_err(failure)? {
+        file.record_action(&entered, &record.stage, &record.key()).map_err(failure)?;
+    }
     Ok((file, states))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::fs;
+
+    use planning::Pipeline;
+    use serde_json::json;
+    use store::{Record, Unfinished};
+
+    use super::*;
+    use crate::waiting::try_enter_store;
+
+    /// Creates an artifact in a store.
+    fn artifact(store: &Store) -> Record {
+        let entered = try_enter_store(store).unwrap();
+        let attempt = store.begin(&entered, &Unfinished::default(), &json!({})).unwrap();
+        fs::create_dir(&attempt.output).unwrap();
+        fs::write(attempt.output.join("x"), "1").unwrap();
+        let checked = store.check(attempt, "x").unwrap();
+        store.publish(&entered, checked, Record::default()).unwrap()
+    }
+
+    #[test]
+    fn a_run_needs_the_artifacts_that_it_reads_as_folders() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let record = artifact(&store);
+        let folder = store.object(&record.output);
+        let text = format!(
+            "default: [make]\nstages: {{make: {{inputs: {{data: {}}}}}}}",
+            folder.display()
+        );
+        let pipeline = Pipeline::parse(text.as_bytes(), Path::new("pipeline.yaml")).unwrap();
+        let description = serde_json::from_value(json!({"name": "make", "version": "",
+            "code": "", "summary": "", "parameters": {}, "output": {"kind": "x"},
+            "inputs": {"data": {"kinds": ["x"], "summary": ""}}}));
+        let descriptions = BTreeMap::from([("make".to_owned(), description.unwrap())]);
+        let request = Request { targets: vec!["make".to_owned()], ..Request::default() };
+        let plan = Plan::from_descriptions(&pipeline, &descriptions, &request).unwrap();
+        let (file, _) = begin_run(&store, &plan, &AtomicBool::new(false)).unwrap();
+        let run = store.run_or_pin(file.id()).unwrap().unwrap();
+        assert!(run.keys.contains(&record.key()) && run.keys.len() == 2);
+    }
 }

@@ -12,7 +12,7 @@ mod half_blocks;
 mod look_budget;
 mod single_view;
 
-use artifact::format_duration;
+use artifact::{format_duration, hash_json};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -115,6 +115,11 @@ impl Watching<'_> {
         self.display.line(&format!("{label}: view {view}: {scores} ({field}): {picture}"));
         Ok(())
     }
+}
+
+/// Returns the name of the temporary folder of a training's looks: a label may contain slashes.
+pub(crate) fn scratch_name(label: &str) -> String {
+    format!("watch-{}", hash_json(&label))
 }
 
 /// Returns the picture's file name: the label with `_` for each special character.
@@ -239,7 +244,7 @@ impl Watcher for StopAtDeadline<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::picture_file_name;
+    use super::{picture_file_name, scratch_name};
 
     #[test]
     fn labels_become_file_names() {
@@ -248,5 +253,7 @@ mod tests {
             picture_file_name("train-ss [supersample=2 a/b]"),
             "train-ss__supersample=2_a_b.png"
         );
+        let (name, other) = (scratch_name("a [b=../c/d]"), scratch_name("a [b=.._c_d]"));
+        assert!(!name.contains('/') && name != other, "{name}");
     }
 }

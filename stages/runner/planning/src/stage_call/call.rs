@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
+use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,6 +11,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use artifact::{format_count, format_duration, format_size, format_utc, printable, unix_time};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use stage::Description;
 use stage::{Event, SUMMARY_FILE};
 use wait4::ResUse;
@@ -18,8 +20,8 @@ use crate::stage_call::failure::{Exit, StageFailure, is_noise, memory_kills};
 use crate::stage_call::group::{Group, Pipes, peak_memory};
 use crate::stage_call::log::{ProgressFilter, StageLog};
 
-/// Environment variables that every stage gets. A description declares the further variables that
-/// change the stage's result, since they are part of its key.
+/// Environment variables that every stage gets (docs/guide/swapping-a-stage.md). A description
+/// declares the further variables that change the stage's result, since they are part of its key.
 const ENVIRONMENT: [&str; 12] = [
     stage::MEMORY_VARIABLE,
     "PATH",
@@ -46,6 +48,14 @@ const POLL_INTERVAL: Duration = Duration::from_millis(10);
 /// Time that a stopped stage has for its checkpoint after the end of the wrapper script that
 /// started it (docs/design/001).
 const MAX_CHECKPOINT_TIME: Duration = Duration::from_secs(10);
+
+/// Time after a stage's end for which its pipes are read while a process that has left the stage's
+/// group keeps them open. Chosen by hand.
+const MAX_READ_TIME: Duration = Duration::from_secs(1);
+/// Maximum number of bytes in a pipe (`pipe(7)`).
+const PIPE_BYTES: usize = 1 << 16;
+/// Interval between two checks whether a stage with silent pipes has ended: 100 ms, chosen by hand.
+const PIPE_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
 
 /// Arguments of one call of a stage.
 pub struct Call<'a> {
@@ -157,11 +167,18 @@ impl Call<'_> {
         let (group, (stdout, stderr)) =
             self.start().map_err(|e| StageFailure::at(self.program, &e))?;
         let output = OutputReader::new(log, watcher, &self.description.name);
+        let is_over = AtomicBool::new(false);
         let (exit, stated_reason, tail) = std::thread::scope(|scope| {
-            let stdout = scope.spawn(|| output.read_stdout(stdout));
-            let stderr = scope.spawn(|| output.read_stderr(stderr));
+            let stdout = scope.spawn(|| output.read_stdout(Pipe::new(stdout, &is_over)));
+            let stderr = scope.spawn(|| output.read_stderr(Pipe::new(stderr, &is_over)));
             let are_closed = || stdout.is_finished() && stderr.is_finished();
             let exit = wait(group, stop, &|| output.tick(), &are_closed);
+            if !wait_until(MAX_READ_TIME, &|| output.tick(), &are_closed) {
+                let text = "a process that the stage has started still runs; its output is ignored";
+                log.line(text);
+                watcher.stderr_line(text);
+            }
+            is_over.store(true, Ordering::Relaxed);
             (exit, stdout.join().ok().flatten(), stderr.join().unwrap_or_default())
         });
         let (ResUse { status, rusage }, peak_memory) =
@@ -217,18 +234,19 @@ impl Call<'_> {
             "--progress",
             "json",
         ]);
-        let declared = self.description.environment.iter().map(String::as_str);
-        let passed = ENVIRONMENT
-            .into_iter()
-            .chain(declared)
-            .filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
-        command
-            .env_clear()
-            .envs(passed)
-            .env(stage::RUNNER_VARIABLE, std::process::id().to_string());
+        set_environment(&mut command, &self.description.environment);
+        command.env(stage::RUNNER_VARIABLE, std::process::id().to_string());
         command.stdout(Stdio::piped()).stderr(Stdio::piped());
         command
     }
+}
+
+/// Reduces a program's environment to [`ENVIRONMENT`] and the variables that its description
+/// declares.
+pub(crate) fn set_environment(command: &mut Command, declared: &[String]) {
+    let names = ENVIRONMENT.into_iter().chain(declared.iter().map(String::as_str));
+    let passed = names.filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
+    command.env_clear().envs(passed);
 }
 
 /// Reader of a stage's output.
@@ -343,10 +361,8 @@ fn wait(
         tick();
         std::thread::sleep(POLL_INTERVAL);
     }
-    let exited = Instant::now();
-    while was_terminated && !are_closed() && exited.elapsed() < MAX_CHECKPOINT_TIME {
-        tick();
-        std::thread::sleep(POLL_INTERVAL);
+    if was_terminated {
+        wait_until(MAX_CHECKPOINT_TIME, tick, are_closed);
     }
     let usage = group.kill()?;
     let peak = match (stage_peak, runner_peak) {
@@ -354,6 +370,54 @@ fn wait(
         _ => usage.rusage.maxrss,
     };
     Ok((usage, peak))
+}
+
+/// Waits until `is_done` returns true, for a limited time. Returns whether it did.
+fn wait_until(limit: Duration, tick: &dyn Fn(), is_done: &dyn Fn() -> bool) -> bool {
+    let started = Instant::now();
+    while !is_done() {
+        if started.elapsed() >= limit {
+            return false;
+        }
+        tick();
+        std::thread::sleep(POLL_INTERVAL);
+    }
+    true
+}
+
+/// Pipe of a stage. After the stage's end, only the bytes that are already in the pipe are read,
+/// since another process may keep the pipe open.
+struct Pipe<'a, R> {
+    pipe: R,
+    /// True after the stage's end.
+    is_over: &'a AtomicBool,
+    /// Maximum number of bytes still to read after the stage's end.
+    left: usize,
+}
+
+impl<'a, R> Pipe<'a, R> {
+    fn new(pipe: Option<R>, is_over: &'a AtomicBool) -> Option<Self> {
+        Some(Self { pipe: pipe?, is_over, left: PIPE_BYTES })
+    }
+}
+
+impl<R: Read + AsFd> Read for Pipe<'_, R> {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        loop {
+            let is_over = self.is_over.load(Ordering::Relaxed);
+            let mut polled = [PollFd::new(&self.pipe, PollFlags::IN)];
+            if poll(&mut polled, Some(&PIPE_INTERVAL))? > 0 && (!is_over || self.left > 0) {
+                let count = self.pipe.read(buffer)?;
+                if is_over {
+                    self.left = self.left.saturating_sub(count);
+                }
+                return Ok(count);
+            }
+            if is_over {
+                return Ok(0);
+            }
+        }
+    }
 }
 
 /// Returns the non-blank lines of a pipe. Bytes that aren't UTF-8 are replaced, control characters

@@ -88,6 +88,24 @@ fn lines_are_reported_while_the_stage_runs() {
     assert_eq!((lines, failure), (vec!["resumed at step 5".to_owned()], None));
 }
 
+/// A process that has left the stage's group may keep the stage's pipes open for ever, silently or
+/// not. All lines of the stage itself are read.
+#[test]
+fn a_process_outside_the_group_does_not_delay_the_end() {
+    for daemon in ["sleep 1000", "yes"] {
+        let started = Instant::now();
+        let (lines, failure) = lines_and_reason(&format!(
+            "setsid {daemon} & echo $! >&2; until [ \"$(ps -o sid= -p $! | tr -d ' ')\" = $! ]; \
+            do sleep 0.01; done; echo make: bad >&2; exit 3"
+        ));
+        let id = lines[0].parse().ok().and_then(rustix::process::Pid::from_raw).unwrap();
+        rustix::process::kill_process(id, rustix::process::Signal::KILL).ok();
+        assert_eq!(failure.as_deref(), Some("bad"), "{lines:?}");
+        assert!(lines[1].contains("still runs") && lines.len() == 2, "{lines:?}");
+        assert!(started.elapsed() < Duration::from_secs(100));
+    }
+}
+
 /// The caller prints the reason, so it isn't one of the lines, even if the stage ends late.
 #[test]
 fn the_reason_of_a_failure_is_printed_once() {

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use stage::Description;
 use stage::out_of_memory_message;
 
+use crate::stage_call::call::set_environment;
 use crate::stage_call::group::Group;
 
 /// Time limit of `describe`, chosen by hand. A program that exceeds it is killed.
@@ -120,6 +121,7 @@ fn run_describe(
 ) -> std::io::Result<Option<Output>> {
     let mut command = Command::new(path);
     command.arg("describe").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    set_environment(&mut command, &[]);
     let (group, (stdout, stderr)) = Group::start(&mut command)?;
     let (stdout, stderr) = (read_in_background(stdout), read_in_background(stderr));
     let deadline = Instant::now() + limit;
@@ -186,6 +188,11 @@ mod tests {
                 "#!/bin/sh\necho '  what():  std::bad_alloc' >&2\nkill -ABRT $$\n",
                 MAX_DESCRIBE_TIME,
                 "failed (signal: 6 (SIGABRT)): out of memory",
+            ),
+            (
+                "#!/bin/sh\necho \"with ${PATH:+PATH}$CARGO_MANIFEST_DIR.\" >&2\nexit 3\n",
+                MAX_DESCRIBE_TIME,
+                "failed (exit status: 3): with PATH.",
             ),
             ("#!/bin/sh\necho '{}'\n", MAX_DESCRIBE_TIME, "isn't a description: missing field"),
             ("#!/nowhere/at/all\n", MAX_DESCRIBE_TIME, "describe`: No such file"),

@@ -130,7 +130,7 @@ impl Watcher for StageDisplay<'_> {
             bar.set_position(*done);
             bar.set_message(join_parts(&[task, note, &left]));
         } else {
-            let percent = format!("{task} {} %", done * 100 / total.max(&1));
+            let percent = format!("{task} {} %", percent(*done, *total));
             state.text = Some(join_parts(&[&percent, note, &left]));
         }
     }
@@ -153,5 +153,20 @@ impl Watcher for StageDisplay<'_> {
         state.last_line = Instant::now();
         drop(state);
         self.display.line(&format!("{}: {line}", self.label));
+    }
+}
+
+/// Returns the finished share of a task in percent, for any counts.
+fn percent(done: u64, total: u64) -> u128 {
+    u128::from(done) * 100 / u128::from(total.max(1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::percent;
+
+    #[test]
+    fn products_of_large_counts_do_not_overflow() {
+        assert_eq!([percent(u64::MAX, u64::MAX), percent(3, 0), percent(1, 3)], [100, 300, 33]);
     }
 }

@@ -19,6 +19,10 @@ pub struct StageFailure {
 }
 
 impl StageFailure {
+    /// Exit code of a failure without a code of its own.
+    pub const FAILED: u8 = 1;
+    /// Exit code for wrong usage: a pipeline, an argument or a program that can't be used.
+    pub const USAGE: u8 = 2;
     /// Exit code for an input folder or artifact that can't be used.
     pub const BAD_INPUT: u8 = 3;
     /// Exit code of an interruption.
@@ -26,7 +30,7 @@ impl StageFailure {
 
     /// Creates the failure for a file that can't be read or written.
     pub fn at(path: &Path, error: &std::io::Error) -> Self {
-        Self { code: 1, message: format!("{}: {error}", path.display()) }
+        Self { code: Self::FAILED, message: format!("{}: {error}", path.display()) }
     }
 }
 
