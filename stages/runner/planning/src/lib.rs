@@ -58,7 +58,7 @@ pub use extend::JoinError;
 pub use file::{Part, PipelineError, PipelineFile, StageBlock};
 pub use frozen::FrozenPlan;
 pub use key::{explain, key_parts, nearest_changes, nearest_record};
-pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
+pub use node::{Devices, Node, NodeInput, Origin, Plan, ShownPoint, Sink, State};
 pub use pipeline::Pipeline;
 pub use plan::{HashedInputs, hash_inputs, read_source};
 pub use quality::Quality;
