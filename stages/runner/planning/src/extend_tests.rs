@@ -175,6 +175,10 @@ fn targets_are_found_next_to_the_pipeline() {
         ),
         ("pipelines/broken.yaml", "stages: ["),
         ("pipelines/notes.txt", "c"),
+        // Earlier names than those of the files that define `inner` and `other`.
+        ("pipelines/a1.yaml", "extends: c.yaml\nstages: {inner: {}, twice: {}}"),
+        ("pipelines/a2.yaml", "extends: ../pipeline.yaml\nstages: {twice: {}}"),
+        ("experiments/a0.yaml", "extends: ../pipeline.yaml\nstages: {other: {}}"),
     ];
     let folder = base_and(&files);
     let project = folder.path().canonicalize().unwrap();
@@ -194,10 +198,14 @@ fn targets_are_found_next_to_the_pipeline() {
     for (names, reasons) in [
         (
             &["othre"][..],
-            &["no stage \"othre\"; did you mean other? known: a, b, broken, c, d, e, inner, other"]
-                [..],
+            &["no stage \"othre\"; did you mean other? known: a, a0, a1, a2, b, broken, c, d, e, \
+                inner, other, twice"][..],
         ),
         (&["../pipeline"], &["no stage \"../pipeline\""]),
+        (
+            &["twice"],
+            &["several files have a block twice: ", "pipelines/a1.yaml, ", "pipelines/a2.yaml; "],
+        ),
         (&["broken"], &["pipelines/broken.yaml"]),
         (&["c", "e"], &["e can't be combined with c: block a differs in", "run e alone"]),
     ] {
