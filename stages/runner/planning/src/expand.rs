@@ -193,6 +193,8 @@ impl<'a> Expansion<'a> {
     }
 
     fn add_nodes(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
+        let block = self.pipeline.layers(stage).next().unwrap_or(stage);
+        self.add_note(Quality::note(block, program));
         for point in self.points(stage)? {
             let parameters = self.resolve(stage, program, &point)?;
             if let Some(reason) = self.reason_to_leave_out(stage, &point, &parameters) {
@@ -224,6 +226,11 @@ impl<'a> Expansion<'a> {
         Ok(())
     }
 
+    /// Adds a note unless it is known.
+    fn add_note(&mut self, note: Option<String>) {
+        self.notes.extend(note.filter(|note| !self.notes.contains(note)));
+    }
+
     /// Checks the rules of a stage's description, which may refer to the parameters of its parents.
     fn check_rules(&self, node: &Node) -> Result<(), PlanError> {
         let inputs = given_inputs(node, &self.nodes);
@@ -243,10 +250,7 @@ impl<'a> Expansion<'a> {
     ) -> Option<String> {
         if let Some(reason) = self.required_files.reason_to_leave_out(stage, parameters) {
             let data = self.required_files.data.display();
-            let note = format!("{stage}: left out: {reason} in {data}");
-            if !self.notes.contains(&note) {
-                self.notes.push(note);
-            }
+            self.add_note(Some(format!("{stage}: left out: {reason} in {data}")));
             return Some(reason);
         }
         for parent in self.block_inputs(stage).into_iter().filter_map(|(_, s)| s.stage()) {
