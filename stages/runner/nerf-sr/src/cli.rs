@@ -337,7 +337,8 @@ pub(crate) fn run_command_line() -> anyhow::Result<ExitCode> {
             verbs::gc(&global.open_session()?, &plan.into(), policy, GcOutput { dry_run, json })
         }
         Verb::Describe { stage } => {
-            verbs::describe(&Pipeline::read(&global.pipeline).map_err(PlanError::from)?, &stage)
+            let pipeline = Pipeline::read(&global.pipeline).map_err(PlanError::from)?;
+            verbs::describe(&pipeline, &stage, || Ok(global.open_session()?.store))
         }
         Verb::Man { folder } => verbs::man(Cli::command(), &folder),
         Verb::Completions { shell } => Ok(verbs::completions(shell, &mut Cli::command())),

@@ -64,6 +64,6 @@ pub use plan::{HashedInputs, hash_inputs, read_source};
 pub use quality::Quality;
 pub use request::{PlanError, Request};
 pub use sources::{Source, SourceError};
-pub use stages::{Describing, Programs, StageProgram, executable};
+pub use stages::{Describing, Programs, StageProgram, executable, is_own, own_program};
 pub use stamp::Stamp;
 pub use targets::find_targets;
