@@ -166,10 +166,13 @@ fn refined_views_are_compared_with_rendered_ones() {
         ["--scene", "other", "--variant", "1", "--variant", "2", "-p", "prep.hr_references=2"];
     project.ok(&[&["run", "refine-table"][..], &selection, &SMALL, &budgets].concat());
     let results = rows(&project, "refine-table");
+    // With a fixed number of references, both variants share the methods without references; each
+    // has a row of its own.
     assert_eq!(
         column(&results, "method"),
-        ["ss", "refine", "refine, references: 1", "refine, references: 2"]
+        ["ss", "ss", "refine", "refine", "refine, references: 1", "refine, references: 2"]
     );
+    assert_eq!(column(&results, "variant"), ["1", "2", "1", "2", "1", "2"]);
     for row in &results {
         assert!(
             ["near_psnr", "seconds_per_view"]

@@ -328,6 +328,9 @@ fn describe_prints_a_stages_help() {
             && help.contains("\nInputs, "),
         "{help}"
     );
+    // A program without a block in the pipeline's files.
+    let help = project.ok(&["describe", "table"]);
+    assert!(help.contains("Usage: table "), "{help}");
     project.run(&["describe", "nobody"]).fails(2, &["no stage \"nobody\"", "known: demo-scene"]);
 }
 

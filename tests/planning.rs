@@ -47,13 +47,14 @@ fn project_with_script() -> Project {
 fn only_run_starts_a_foreign_program() {
     let project = project_with_script();
     let started = || std::fs::read_to_string(project.path("started")).unwrap_or_default();
-    let inspections: [&[&str]; 6] = [
+    let inspections: [&[&str]; 7] = [
         &["plan"],
         &["why", "mine"],
         &["status"],
         &["graph"],
         &["log", "mine"],
         &["gc", "--dry-run"],
+        &["describe", "mine"],
     ];
     for arguments in inspections {
         let finished = project.run(arguments);

@@ -91,10 +91,10 @@ impl PlanReport {
         for (number, state) in states.iter().enumerate() {
             nodes.push(NodeReport::new(session, plan, number, state, records)?);
         }
-        let sinks = plan
-            .sinks
-            .iter()
-            .map(|sink| SinkReport { stage: sink.stage.clone(), shows: sink.nodes.clone() });
+        let sinks = plan.sinks.iter().map(|sink| SinkReport {
+            stage: sink.stage.clone(),
+            shows: sink.nodes().into_iter().collect(),
+        });
         Ok(Self { nodes, sinks: sinks.collect() })
     }
 

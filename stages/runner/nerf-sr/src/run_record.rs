@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use artifact::{FailedPoint, RunNode, RunRecord, UnfinishedNode};
 use planning::stage_call::StageFailure;
-use planning::{Node, Origin, Plan, Sink};
+use planning::{Node, Origin, Plan, ShownPoint, Sink};
 use serde_json::Map;
 use store::{Record, Store};
 
@@ -44,29 +44,31 @@ pub(crate) fn run_record(
         let is_done = progress.records[index].is_some();
         is_complete.push(is_done && node.parents().all(|parent| is_complete[parent]));
     }
-    let (shown, missing): (Vec<usize>, Vec<usize>) =
-        sink.nodes.iter().partition(|&&index| is_complete[index]);
+    let (shown, missing): (Vec<&ShownPoint>, Vec<&ShownPoint>) =
+        sink.points.iter().partition(|shown| is_complete[shown.node]);
     let can_be_partial = sink.program.description.partial;
     if !missing.is_empty() && !can_be_partial {
         return None;
     }
     let (done, undone): (Vec<usize>, Vec<usize>) =
         nodes_with_ancestors(plan, sink).into_iter().partition(|&index| is_complete[index]);
+    let recorded = recorded_nodes(&done, &shown);
+    let done: Vec<usize> = recorded.iter().map(|(index, _)| *index).collect();
     let mut nodes = Vec::with_capacity(done.len());
-    for &index in &done {
+    for (index, shown) in recorded {
         let record = progress.records[index].as_ref()?;
-        nodes.push(run_node(&plan.nodes[index], record, &done, shown.contains(&index), run.store));
+        nodes.push(run_node(&plan.nodes[index], record, &done, shown, run.store));
     }
     let unfinished = undone
         .iter()
         .map(|&index| unfinished_node(plan, index, &done, &undone, progress))
         .collect();
     let mut failed = Vec::with_capacity(missing.len());
-    for node in missing.into_iter().map(|index| &plan.nodes[index]) {
+    for ShownPoint { node, point, values } in missing {
         failed.push(FailedPoint {
-            stage: node.stage.clone(),
-            point: node.point.clone(),
-            values: node.values.clone(),
+            stage: plan.nodes[*node].stage.clone(),
+            point: point.clone(),
+            values: values.clone(),
             reason: None,
         });
     }
@@ -85,7 +87,7 @@ pub(crate) fn run_record(
 
 /// Returns the nodes that a sink shows and their ancestors, in the plan's order.
 fn nodes_with_ancestors(plan: &Plan, sink: &Sink) -> BTreeSet<usize> {
-    let mut found: BTreeSet<usize> = sink.nodes.iter().copied().collect();
+    let mut found = sink.nodes();
     for index in (0..plan.nodes.len()).rev() {
         if found.contains(&index) {
             found.extend(plan.nodes[index].parents());
@@ -94,18 +96,39 @@ fn nodes_with_ancestors(plan: &Plan, sink: &Sink) -> BTreeSet<usize> {
     found
 }
 
+/// Returns the nodes of a record, parents before children: `done` in the plan's order, with a shown
+/// node once for each of its points.
+fn recorded_nodes<'a>(
+    done: &[usize],
+    shown: &[&'a ShownPoint],
+) -> Vec<(usize, Option<&'a ShownPoint>)> {
+    let are_shown: BTreeSet<usize> = shown.iter().map(|shown| shown.node).collect();
+    let mut ancestors = done.iter().copied().filter(|index| !are_shown.contains(index)).peekable();
+    let mut recorded = Vec::with_capacity(done.len());
+    for &shown in shown {
+        while let Some(ancestor) = ancestors.next_if(|&index| index < shown.node) {
+            recorded.push((ancestor, None));
+        }
+        recorded.push((shown.node, Some(shown)));
+    }
+    recorded.extend(ancestors.map(|index| (index, None)));
+    recorded
+}
+
 fn run_node(
     node: &Node,
     record: &Record,
     done: &[usize],
-    is_shown: bool,
+    shown: Option<&ShownPoint>,
     store: &Store,
 ) -> RunNode {
+    let (point, values) =
+        shown.map_or((&node.point, &node.values), |shown| (&shown.point, &shown.values));
     RunNode {
         stage: node.stage.clone(),
-        point: node.point.clone(),
-        values: node.values.clone(),
-        is_shown,
+        point: point.clone(),
+        values: values.clone(),
+        is_shown: shown.is_some(),
         program: node.program.description.name.clone(),
         is_cached: None,
         kind: node.program.description.output.kind.clone(),
@@ -192,15 +215,53 @@ pub(crate) fn shown_results(record: &RunRecord) -> BTreeSet<String> {
 }
 
 /// Adds the values that the scene decides, read from the artifacts, and this run's own data.
-pub(crate) fn add_details(record: &mut RunRecord, plan: &Plan, progress: &RunProgress<'_>) {
+pub(crate) fn add_details(
+    record: &mut RunRecord,
+    plan: &Plan,
+    sink: &Sink,
+    progress: &RunProgress<'_>,
+) {
     for node in &mut record.nodes {
-        let index = plan
-            .nodes
-            .iter()
-            .position(|planned| planned.stage == node.stage && planned.point == node.point);
+        let mut shown = sink.points.iter().filter(|shown| shown.point == node.point);
+        let shown = shown.find(|shown| plan.nodes[shown.node].stage == node.stage);
+        let index = shown.map(|shown| shown.node).or_else(|| {
+            let mut planned = plan.nodes.iter();
+            planned.position(|planned| planned.stage == node.stage && planned.point == node.point)
+        });
         let Some(index) = index else { continue };
         node.resolved = plan.nodes[index].scene_defaults(&node.folder);
         node.is_cached = progress.ran.map(|ran| !ran.contains(&index));
     }
     record.command = progress.command.to_vec();
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+
+    /// A node is recorded once for each of its shown points, in their order, after its ancestors.
+    #[test]
+    fn shown_nodes_are_recorded_by_point() {
+        let shown = [1, 2, 1, 4, 2].map(|node| ShownPoint {
+            node,
+            point: String::new(),
+            values: BTreeMap::new(),
+        });
+        let recorded = recorded_nodes(&[0, 1, 2, 3, 4, 5], &shown.each_ref());
+        let nodes: Vec<(usize, bool)> =
+            recorded.into_iter().map(|(node, shown)| (node, shown.is_some())).collect();
+        let expected = [
+            (0, false),
+            (1, true),
+            (2, true),
+            (1, true),
+            (3, false),
+            (4, true),
+            (2, true),
+            (5, false),
+        ];
+        assert_eq!(nodes, expected);
+    }
 }

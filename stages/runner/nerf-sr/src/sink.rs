@@ -119,7 +119,7 @@ pub(crate) fn run_sink(
     if has_current_page(&target, &identity) {
         return Ok(SinkResult::UpToDate(target));
     }
-    add_details(&mut record, run.plan, progress);
+    add_details(&mut record, run.plan, sink, progress);
     let scratch = run.store.scratch(run.file.id()).join(&sink.stage);
     let output = scratch.join("output");
     call(run, sink, threads, &record, &scratch, &output)?;

@@ -91,9 +91,9 @@ pub(crate) fn by_scene_text(session: &Session, node: &Node, state: &State) -> Op
 /// existing page, because only `run` knows the folder of pages.
 pub(crate) fn sink_text(plan: &Plan, sink: &Sink, states: &[State]) -> String {
     let mut names: Vec<&str> =
-        sink.nodes.iter().map(|&index| plan.nodes[index].stage.as_str()).collect();
+        sink.nodes().into_iter().map(|index| plan.nodes[index].stage.as_str()).collect();
     names.dedup();
-    let is_cached = sink.nodes.iter().all(|&index| matches!(states[index], State::Cached(_)));
+    let is_cached = sink.nodes().into_iter().all(|index| matches!(states[index], State::Cached(_)));
     let when = if is_cached {
         "all cached: a run writes the page only if it doesn't exist"
     } else {

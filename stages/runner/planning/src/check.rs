@@ -73,8 +73,15 @@ pub(crate) fn check_blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(
         let Some(program) = programs.get(name) else { continue };
         check_parameters(pipeline, program, name, block)?;
         for (input, source) in &block.inputs {
-            check_input(&program.description, input, source, programs)
-                .map_err(|problem| pipeline.error(name, Part::Input(input), problem))?;
+            check_input(&program.description, input, source, programs).map_err(|problem| {
+                let is_inherited = pipeline.is_inherited(name, Part::Input(input));
+                let remedy = if is_inherited && !program.description.inputs.contains_key(input) {
+                    format!("; `{input}: null` removes an inherited input")
+                } else {
+                    String::new()
+                };
+                pipeline.error(name, Part::Input(input), problem + &remedy)
+            })?;
         }
         for (input, declared) in &program.description.inputs {
             let is_given = block.inputs.contains_key(input)

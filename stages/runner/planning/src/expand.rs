@@ -14,7 +14,7 @@ use crate::experiment::Selection;
 use crate::file::{InputSource, Part};
 use crate::given_folders::given_inputs;
 use crate::left_out::{RequiredFiles, check_show, shown_stages};
-use crate::node::{Node, NodeInput, Origin, Plan, Sink};
+use crate::node::{Node, NodeInput, Origin, Plan, ShownPoint, Sink};
 use crate::pipeline::Pipeline;
 use crate::quality::Quality;
 use crate::request::PlanError;
@@ -104,12 +104,10 @@ impl<'a> Expansion<'a> {
     /// Creates a sink that shows all points of its stages.
     fn sink(&self, stage: &str, program: Arc<StageProgram>) -> Result<Sink, PlanError> {
         let parameters = self.resolve(stage, &program, &Point::new())?;
-        let mut nodes = BTreeSet::new();
+        let mut points: Vec<Vec<ShownPoint>> = Vec::new();
         let mut left_out = Vec::new();
         for shown in shown_stages(self.pipeline, stage, self.selection) {
-            nodes.extend(
-                self.nodes_by_stage.get(shown).into_iter().flatten().map(|(_, node)| *node),
-            );
+            points.push(self.shown_points(shown));
             for (point, reason) in self.left_out.get(shown).into_iter().flatten() {
                 left_out.push(FailedPoint {
                     stage: shown.to_owned(),
@@ -119,21 +117,33 @@ impl<'a> Expansion<'a> {
                 });
             }
         }
-        let nodes: Vec<usize> = nodes.into_iter().collect();
-        self.check_sink_rules(stage, &program, &parameters, &nodes)?;
-        Ok(Sink { stage: stage.to_owned(), program, parameters, nodes, left_out })
+        // A stage's nodes are consecutive. Two inputs may name the same stage.
+        points.sort_by_key(|points| points.first().map(|shown| shown.node));
+        points.dedup();
+        let points = points.concat();
+        let sink = Sink { stage: stage.to_owned(), program, parameters, points, left_out };
+        self.check_sink_rules(&sink)?;
+        Ok(sink)
+    }
+
+    /// Returns the points of a stage that have a node. Points with equal labels and values are one.
+    fn shown_points(&self, stage: &str) -> Vec<ShownPoint> {
+        let mut shown: Vec<ShownPoint> = Vec::new();
+        for (point, node) in self.nodes_by_stage.get(stage).into_iter().flatten() {
+            let (point, values) = (self.label(point), self.values(point));
+            let point = ShownPoint { node: *node, point, values };
+            if !shown.contains(&point) {
+                shown.push(point);
+            }
+        }
+        shown
     }
 
     /// Checks the rules of a sink's description for each node that it shows.
-    fn check_sink_rules(
-        &self,
-        stage: &str,
-        program: &StageProgram,
-        parameters: &Value,
-        nodes: &[usize],
-    ) -> Result<(), PlanError> {
+    fn check_sink_rules(&self, sink: &Sink) -> Result<(), PlanError> {
+        let Sink { stage, program, parameters, .. } = sink;
         for (input, source) in self.block_inputs(stage) {
-            for node in nodes.iter().map(|&index| &self.nodes[index]) {
+            for node in sink.nodes().into_iter().map(|index| &self.nodes[index]) {
                 if source.stage() != Some(node.stage.as_str()) {
                     continue;
                 }
@@ -183,6 +193,8 @@ impl<'a> Expansion<'a> {
     }
 
     fn add_nodes(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
+        let block = self.pipeline.layers(stage).next().unwrap_or(stage);
+        self.add_note(Quality::note(block, program));
         for point in self.points(stage)? {
             let parameters = self.resolve(stage, program, &point)?;
             if let Some(reason) = self.reason_to_leave_out(stage, &point, &parameters) {
@@ -214,6 +226,11 @@ impl<'a> Expansion<'a> {
         Ok(())
     }
 
+    /// Adds a note unless it is known.
+    fn add_note(&mut self, note: Option<String>) {
+        self.notes.extend(note.filter(|note| !self.notes.contains(note)));
+    }
+
     /// Checks the rules of a stage's description, which may refer to the parameters of its parents.
     fn check_rules(&self, node: &Node) -> Result<(), PlanError> {
         let inputs = given_inputs(node, &self.nodes);
@@ -233,10 +250,7 @@ impl<'a> Expansion<'a> {
     ) -> Option<String> {
         if let Some(reason) = self.required_files.reason_to_leave_out(stage, parameters) {
             let data = self.required_files.data.display();
-            let note = format!("{stage}: left out: {reason} in {data}");
-            if !self.notes.contains(&note) {
-                self.notes.push(note);
-            }
+            self.add_note(Some(format!("{stage}: left out: {reason} in {data}")));
             return Some(reason);
         }
         for parent in self.block_inputs(stage).into_iter().filter_map(|(_, s)| s.stage()) {

@@ -135,7 +135,7 @@ fn scenes_protocols_and_variants_are_axes() {
             && folder_of(&plan, 0, "dataset").ends_with("own")
     );
     assert!(folder_of(&plan, 6, "weights").ends_with("weights"));
-    assert_eq!(plan.sinks[0].nodes.len(), 6);
+    assert_eq!(plan.sinks[0].points.len(), 6);
 }
 
 fn scores(data: &Path, change: &dyn Fn(&mut Request)) -> Vec<String> {
@@ -177,6 +177,38 @@ fn the_command_line_selects_and_overrides() {
         (&plan.nodes[2].parameters["warmup"], &plan.nodes[2].parameters["rays"]),
         (&json!(7), &json!(500))
     );
+}
+
+/// A sink shows every point, in the order of the axes, even if several points share a node.
+#[test]
+fn points_of_a_shared_node_are_all_shown() {
+    let data = data();
+    let text = EXPERIMENT.replace("100x2: {", "50x3: {rays: 9, score.samples: 1}\n    100x2: {");
+    let text = text.replace("- {name: no warm-up, parameters: {warmup: 0}}\n    ", "");
+    let plan =
+        plan_of(&(text + "    - {name: warm-up, parameters: {warmup: 9}}\n"), data.path(), |r| {
+            r.selection.scenes = vec!["demo".to_owned()];
+            r.selection.protocols = vec!["50x3".to_owned(), "100x2".to_owned()];
+        });
+    let sink = &plan.unwrap().sinks[0];
+    let mut shown = Vec::new();
+    for point in &sink.points {
+        let values = ["protocol", "variant"].map(|axis| point.values[axis].as_str());
+        assert_eq!(point.point, format!("protocol={}, variant={}", values[0], values[1]));
+        shown.push((point.node - sink.points[0].node, values));
+    }
+    assert_eq!(
+        shown,
+        [
+            (0, ["50x3", "as it is"]),
+            (0, ["50x3", "one ray, shown"]),
+            (1, ["50x3", "warm-up"]),
+            (2, ["100x2", "as it is"]),
+            (3, ["100x2", "one ray, shown"]),
+            (4, ["100x2", "warm-up"]),
+        ]
+    );
+    assert_eq!(sink.nodes().len(), 5);
 }
 
 /// The pipeline's own scene changes no setting, but tables show its name.
@@ -296,7 +328,7 @@ fn stages_without_a_required_file_are_left_out() {
         scores,
         ["score [protocol=50x3]", "score [protocol=100x2]", "score-large [protocol=50x3]"]
     );
-    assert_eq!(plan.sinks[0].nodes.len(), 3);
+    assert_eq!(plan.sinks[0].points.len(), 3);
     let [left_out] = &plan.sinks[0].left_out[..] else { panic!("{:?}", plan.sinks[0].left_out) };
     assert_eq!(
         (left_out.stage.as_str(), left_out.values["protocol"].as_str()),

@@ -101,7 +101,17 @@ fn read_extended(file: ParsedFile, chain: &mut Vec<PathBuf>) -> Result<Pipeline,
     }
     let mut pipeline = joined.unwrap_or_default();
     for (name, block) in &file.content.stages {
-        pipeline.stages.entry(name.clone()).or_default().override_with(block);
+        let inherited = pipeline.stages.entry(name.clone()).or_default();
+        let mut removed = block.given_inputs.iter().filter(|(_, source)| source.is_none());
+        if let Some((input, _)) = removed.find(|(input, _)| !inherited.inputs.contains_key(*input))
+        {
+            let problem = format!(
+                "stage {name}: input {input}: null removes an inherited input, but no extended \
+                file has it; remove the entry"
+            );
+            return Err(file.error(&["stages", name, "inputs", input], problem));
+        }
+        inherited.override_with(block);
     }
     pipeline.experiment.override_with(&file.content.experiment);
     pipeline.quality = file.content.quality.or(pipeline.quality);

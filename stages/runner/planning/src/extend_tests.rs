@@ -79,6 +79,15 @@ fn a_file_overrides_parts_of_the_file_that_it_extends() {
     }
     let error = pipeline.error_in_default("wrong".to_owned()).to_string();
     assert_eq!(error, format!("{}:1: wrong", base.display()));
+    // Null removes an inherited input, which a further file may give again.
+    let text = "extends: pipelines/c.yaml\nstages: {a: {inputs: {y: null, z: null}}}";
+    std::fs::write(project.join("x.yaml"), text).unwrap();
+    std::fs::write(project.join("y.yaml"), "extends: x.yaml\nstages: {a: {inputs: {z: ./z}}}")
+        .unwrap();
+    for (name, expected) in [("x.yaml", &["x"][..]), ("y.yaml", &["x", "z"])] {
+        let pipeline = Pipeline::read(&project.join(name)).unwrap();
+        assert_eq!(pipeline.stages["a"].inputs.keys().collect::<Vec<_>>(), expected);
+    }
 }
 
 /// Each error is one line and names the line of `extends`.
@@ -112,6 +121,11 @@ fn files_that_cannot_be_extended_are_refused() {
             &[("x.yaml", "extends: y.yaml"), ("y.yaml", "default: [a]\nstages:\n  a: {like: b}")],
             "y.yaml:3: ",
             "unknown field `like`",
+        ),
+        (
+            &[("x.yaml", "extends: pipeline.yaml\nstages:\n  a: {inputs: {z: null}}")],
+            "x.yaml:3: ",
+            "stage a: input z: null removes an inherited input, but no extended file has it",
         ),
         (&[("x.yaml", "stages: {}")], "x.yaml: ", "missing field `default`"),
         (&[("x.yaml", "default: []")], "x.yaml: ", "missing field `stages`"),
@@ -175,6 +189,10 @@ fn targets_are_found_next_to_the_pipeline() {
         ),
         ("pipelines/broken.yaml", "stages: ["),
         ("pipelines/notes.txt", "c"),
+        // Earlier names than those of the files that define `inner` and `other`.
+        ("pipelines/a1.yaml", "extends: c.yaml\nstages: {inner: {}, twice: {}}"),
+        ("pipelines/a2.yaml", "extends: ../pipeline.yaml\nstages: {twice: {}}"),
+        ("experiments/a0.yaml", "extends: ../pipeline.yaml\nstages: {other: {}}"),
     ];
     let folder = base_and(&files);
     let project = folder.path().canonicalize().unwrap();
@@ -194,10 +212,14 @@ fn targets_are_found_next_to_the_pipeline() {
     for (names, reasons) in [
         (
             &["othre"][..],
-            &["no stage \"othre\"; did you mean other? known: a, b, broken, c, d, e, inner, other"]
-                [..],
+            &["no stage \"othre\"; did you mean other? known: a, a0, a1, a2, b, broken, c, d, e, \
+                inner, other, twice"][..],
         ),
         (&["../pipeline"], &["no stage \"../pipeline\""]),
+        (
+            &["twice"],
+            &["several files have a block twice: ", "pipelines/a1.yaml, ", "pipelines/a2.yaml; "],
+        ),
         (&["broken"], &["pipelines/broken.yaml"]),
         (&["c", "e"], &["e can't be combined with c: block a differs in", "run e alone"]),
     ] {

@@ -67,7 +67,11 @@ pub struct StageBlock {
     /// inherited ones, including those that the command line sets.
     pub extends: Option<String>,
     /// Inputs by name: a stage (`prep`), a subtree of its artifact (`prep/train`), or the path of a
-    /// folder, which starts with `.` or `/`.
+    /// folder, which starts with `.` or `/`. `null` removes the input of an extended file's block.
+    #[serde(rename = "inputs")]
+    pub given_inputs: BTreeMap<String, Option<String>>,
+    /// Inputs by name, with those of extended files.
+    #[serde(skip)]
     pub inputs: BTreeMap<String, String>,
     /// Parameters that differ from the stage's defaults. A parameter that selects a variant may
     /// contain the variant's own: `field: {grid: {n_levels: 4}}` is `field: grid` and
@@ -93,7 +97,7 @@ impl StageBlock {
             Part::Block => true,
             Part::Field("run") => self.run.is_some(),
             Part::Field(_) => self.extends.is_some(),
-            Part::Input(name) => self.inputs.contains_key(name),
+            Part::Input(name) => self.given_inputs.contains_key(name),
             Part::Parameter(name) => self.parameters.contains_key(name),
         }
     }
@@ -105,7 +109,12 @@ impl StageBlock {
             self.run.clone_from(&other.run);
             self.extends.clone_from(&other.extends);
         }
-        self.inputs.extend(other.inputs.clone());
+        for (name, source) in &other.given_inputs {
+            match source {
+                Some(source) => _ = self.inputs.insert(name.clone(), source.clone()),
+                None => _ = self.inputs.remove(name),
+            }
+        }
         let layers = other.parameter_layers().filter(|layer| !layer.is_empty());
         self.overrides.extend(layers.cloned());
         self.resources = self.resources.overridden_by(&other.resources);

@@ -11,7 +11,7 @@ use serde_json::Value;
 use slurm::Resources;
 use stage::Description;
 
-use crate::node::{Devices, Node, NodeInput, Origin, Plan, Sink};
+use crate::node::{Devices, Node, NodeInput, Origin, Plan, ShownPoint, Sink};
 use crate::stage_call::ProgramError;
 use crate::stages::StageProgram;
 
@@ -41,7 +41,7 @@ struct FrozenNode {
 struct FrozenSink {
     stage: String,
     parameters: Value,
-    shows: Vec<usize>,
+    shows: Vec<ShownPoint>,
     left_out: Vec<FailedPoint>,
     program: PathBuf,
 }
@@ -62,7 +62,7 @@ impl FrozenPlan {
         let sinks = plan.sinks.iter().map(|sink| FrozenSink {
             stage: sink.stage.clone(),
             parameters: sink.parameters.clone(),
-            shows: sink.nodes.clone(),
+            shows: sink.points.clone(),
             left_out: sink.left_out.clone(),
             program: sink.program.path.clone(),
         });
@@ -100,7 +100,7 @@ impl FrozenPlan {
             let found = self.sinks.get(number - self.nodes.len());
             let found = found
                 .ok_or_else(|| ProgramError(format!("the submission has no task {number}")))?;
-            needed.extend(&found.shows);
+            needed.extend(found.shows.iter().map(|shown| shown.node));
             sink = Some(found.clone());
         }
         for index in (0..self.nodes.len()).rev() {
@@ -125,11 +125,11 @@ impl FrozenPlan {
         }
         let mut sinks = Vec::new();
         if let Some(FrozenSink { stage, parameters, mut shows, left_out, program }) = sink {
-            for index in &mut shows {
-                *index = new_index[index];
+            for shown in &mut shows {
+                shown.node = new_index[&shown.node];
             }
             let program = self.program(&program, &mut programs)?;
-            sinks.push(Sink { stage, parameters, nodes: shows, left_out, program });
+            sinks.push(Sink { stage, parameters, points: shows, left_out, program });
         }
         Ok(Plan {
             nodes,

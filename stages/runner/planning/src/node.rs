@@ -1,4 +1,4 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -39,7 +39,8 @@ pub struct Devices {
 pub struct Node {
     /// Name of the stage's block.
     pub stage: String,
-    /// Swept values that reach the node, such as `supersample=2`; empty without a sweep.
+    /// Swept values that reach the node, such as `supersample=2`; empty without a sweep. The first
+    /// point's values if several points share the node.
     pub point: String,
     /// Values of the named axes that reach the node, by the axis's name.
     pub values: BTreeMap<String, String>,
@@ -83,10 +84,21 @@ pub struct Sink {
     pub program: Arc<StageProgram>,
     /// All parameters, including defaults.
     pub parameters: Value,
-    /// Indices of the nodes to show.
-    pub nodes: Vec<usize>,
+    /// Points to show, each after the points of the stages that it depends on.
+    pub points: Vec<ShownPoint>,
     /// Points that can't be shown because a required file is missing.
     pub left_out: Vec<FailedPoint>,
+}
+
+/// Point of a stage that a sink shows. Points with equal parameters and inputs share a node.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ShownPoint {
+    /// Index of the node.
+    pub node: usize,
+    /// Swept values that reach the point, such as `supersample=2`; empty without a sweep.
+    pub point: String,
+    /// Values of the named axes that reach the point, by the axis's name.
+    pub values: BTreeMap<String, String>,
 }
 
 /// State of a node before a run.
@@ -158,6 +170,13 @@ impl Node {
             inputs.insert(name.clone(), input);
         }
         inputs
+    }
+}
+
+impl Sink {
+    /// Returns the indices of the nodes to show, sorted.
+    pub fn nodes(&self) -> BTreeSet<usize> {
+        self.points.iter().map(|shown| shown.node).collect()
     }
 }
 

@@ -82,6 +82,11 @@ impl Pipeline {
         file.map_or_else(|| self.file_of_block(stage), Arc::as_ref)
     }
 
+    /// Returns whether a part of a block is inherited: the first file with the block doesn't have it.
+    pub(crate) fn is_inherited(&self, stage: &str, part: Part) -> bool {
+        !self.file_of_block(stage).has(stage, part)
+    }
+
     /// Returns the first file with a stage's block.
     pub fn file_of_block(&self, stage: &str) -> &ParsedFile {
         self.find_file(|file| file.has(stage, Part::Block))

@@ -160,7 +160,7 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
         );
     }
     let plan = plan_of(PIPELINE, &["-p", "supersample=1,2", "-p", "views=2"]).unwrap();
-    assert_eq!((plan.sinks[0].stage.as_str(), &plan.sinks[0].nodes[..]), ("report", &[4, 5][..]));
+    assert_eq!((plan.sinks[0].stage.as_str(), plan.sinks[0].nodes()), ("report", [4, 5].into()));
     assert_eq!(plan.sinks[0].parameters, json!({"views": 2}));
 }
 
@@ -519,6 +519,6 @@ fn a_frozen_plan_contains_the_nodes_of_each_task() {
         );
     }
     let sink_plan = frozen.task_plan(plan.nodes.len()).unwrap();
-    assert_eq!((sink_plan.nodes.len(), sink_plan.sinks[0].nodes.len()), (plan.nodes.len(), 2));
+    assert_eq!((sink_plan.nodes.len(), sink_plan.sinks[0].nodes().len()), (plan.nodes.len(), 2));
     assert!(frozen.task_plan(plan.nodes.len() + 1).is_err());
 }

@@ -65,6 +65,19 @@ impl Quality {
         ROWS.values().any(|row| row.contains_key(&program.description.name))
     }
 
+    /// Returns a note if a block named after a program with qualities runs a program of another name
+    /// that has some of these parameters.
+    pub(crate) fn note(block: &str, program: &StageProgram) -> Option<String> {
+        let name = &program.description.name;
+        let row = ROWS[&Self::default()].get(block).filter(|_| !Self::affects(program))?;
+        row.keys().any(|parameter| program.schema.names().contains(&parameter.as_str())).then(|| {
+            format!(
+                "{block}: qualities set no parameters of {name}; to use them, name it {block} in \
+                its description"
+            )
+        })
+    }
+
     /// Adds the quality's parameters to the `given` ones, which win. Qualities only set
     /// parameters of default variants, such as `field: grid`.
     pub(crate) fn fill(self, program: &StageProgram, given: &mut Map<String, Value>) {

@@ -123,6 +123,26 @@ fn a_quality_equals_its_parameters() {
     }
 }
 
+/// A program of another name has no quality, which a note says if the program has the parameters.
+#[test]
+fn a_renamed_program_has_no_quality() {
+    let mut descriptions = descriptions();
+    let (pipeline, request) = (PIPELINE.as_bytes(), Request::default());
+    let pipeline = Pipeline::parse(pipeline, Path::new("dir/pipeline.yaml")).unwrap();
+    let notes = |descriptions: &BTreeMap<String, Description>| {
+        Plan::from_descriptions(&pipeline, descriptions, &request).unwrap().notes
+    };
+    assert_eq!(notes(&descriptions), [""; 0]);
+    descriptions.get_mut("train-ss").unwrap().name = "mine".to_owned();
+    assert_eq!(
+        notes(&descriptions),
+        ["train-ss: qualities set no parameters of mine; to use them, name it train-ss in its \
+            description"]
+    );
+    descriptions.get_mut("train-ss").unwrap().parameters = json!({"properties": {}});
+    assert_eq!(notes(&descriptions), [""; 0]);
+}
+
 /// A block's parameter and one on the command line override every quality; the quality on the
 /// command line overrides the file's.
 #[test]

@@ -279,8 +279,15 @@ pub fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
 }
 
 /// Returns whether a program is one of the runner's own.
-pub(crate) fn is_own(path: &Path) -> bool {
+pub fn is_own(path: &Path) -> bool {
     path.parent() == Some(&runner_folder())
+}
+
+/// Returns the path of a program in the runner's folder; `None` if there is none of this name.
+pub fn own_program(name: &str) -> Option<PathBuf> {
+    // Next to the programs, Cargo's folder has files with an extension.
+    let path = (!name.contains(['/', '.'])).then(|| runner_folder().join(name))?;
+    path.is_file().then_some(path)
 }
 
 /// Returns the folder of the running program.

@@ -14,7 +14,8 @@ use crate::request::PlanError;
 /// first of these:
 /// 1. the block NAME of pipeline.yaml;
 /// 2. the block NAME of NAME.yaml in [`TARGET_FOLDERS`] or, without one, its default blocks;
-/// 3. the block NAME of another file there.
+/// 3. the block NAME of another file there, preferably of a file that inherits no such block; files
+///    of `pipelines/` come before those of `experiments/`.
 pub fn find_targets(
     pipeline: &Pipeline,
     targets: &[String],
@@ -68,12 +69,31 @@ fn find_in_folders(
     // An invalid file is reported only when it is the target.
     let others: Vec<Pipeline> =
         files.values().filter_map(|path| Pipeline::read(path).ok()).collect();
-    if let Some(found) = others.iter().find(|other| other.files[0].has(target, Part::Block)) {
+    if let Some(found) = find_block(&others, target)? {
         return Ok((found.clone(), vec![target.to_owned()]));
     }
     let blocks = others.iter().chain([pipeline]).flat_map(|other| other.stages.keys());
     let known: BTreeSet<&str> = blocks.chain(files.keys()).map(String::as_str).collect();
     Err(PlanError::Usage(format!("no stage {target:?}; {}", known_names(target, known))))
+}
+
+/// Returns the file with a block; the file that first defines it rather than one that overrides it,
+/// and a file of `pipelines/` rather than one of `experiments/`. Fails if several files remain.
+fn find_block<'a>(files: &'a [Pipeline], block: &str) -> Result<Option<&'a Pipeline>, PlanError> {
+    let rank = |file: &&Pipeline| {
+        let is_inherited = file.files[1..].iter().any(|file| file.has(block, Part::Block));
+        (is_inherited, !file.files[0].folder().ends_with(TARGET_FOLDERS[0]))
+    };
+    let with_block = files.iter().filter(|file| file.files[0].has(block, Part::Block));
+    let Some(best) = with_block.clone().map(|file| rank(&file)).min() else { return Ok(None) };
+    let found: Vec<&Pipeline> = with_block.filter(|file| rank(file) == best).collect();
+    if let [file] = found[..] {
+        return Ok(Some(file));
+    }
+    let paths = found.iter().map(|file| file.files[0].path.display().to_string());
+    let paths = paths.collect::<Vec<_>>().join(", ");
+    let problem = format!("several files have a block {block}: {paths}; choose one by --pipeline");
+    Err(PlanError::Usage(problem))
 }
 
 /// Returns the YAML files of [`TARGET_FOLDERS`] by name. A file of `pipelines/` hides one of

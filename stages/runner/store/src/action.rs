@@ -33,14 +33,15 @@ pub struct Record {
     pub output: String,
     /// Start time in seconds since 1970.
     pub started_unix: u64,
-    /// Duration in seconds.
+    /// Duration in seconds, with that of interrupted attempts whose checkpoints were used.
     pub seconds: f64,
     /// Number of threads.
     pub threads: usize,
     /// Peak resident memory of the process in bytes; missing in records of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_memory: Option<u64>,
-    /// Processor time of all threads in seconds; missing in records of earlier versions.
+    /// Processor time of all threads in seconds, summed like `seconds`; missing in records of earlier
+    /// versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub processor_seconds: Option<f64>,
     /// Cost by the runner's model; missing for stages without a model.

@@ -1,4 +1,5 @@
 use std::fs;
+use std::io;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::PathBuf;
 
@@ -6,6 +7,7 @@ use artifact::{
     MANIFEST_FILE, Manifest, OutputFileError, hash_json, list_output_files, write_json,
     write_json_atomically,
 };
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::action::{Record, Unfinished};
@@ -28,6 +30,15 @@ pub struct Attempt {
     folder: PathBuf,
 }
 
+/// Time that attempts at an action took.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct TimeSpent {
+    /// Duration in seconds.
+    pub seconds: f64,
+    /// Processor time of all threads in seconds.
+    pub processor_seconds: f64,
+}
+
 /// Checked and durable output of an attempt, ready to be published.
 #[derive(Debug)]
 pub struct CheckedOutput {
@@ -41,6 +52,24 @@ impl Attempt {
     /// Removes the checkpoints, if there are any.
     pub fn remove_checkpoints(&self) -> Result<(), StoreError> {
         remove_if_found(&self.work)
+    }
+
+    /// Returns the time that earlier attempts spent on the checkpoints; zero without a checkpoint or
+    /// a recorded time.
+    pub fn time_spent(&self) -> TimeSpent {
+        let has_checkpoint =
+            fs::read_dir(&self.work).is_ok_and(|mut entries| entries.next().is_some());
+        let bytes = fs::read(self.time_file()).ok().filter(|_| has_checkpoint);
+        bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default()
+    }
+
+    /// Records the time that all attempts spent, for an attempt that resumes from the checkpoints.
+    pub fn record_time_spent(&self, time: &TimeSpent) -> io::Result<()> {
+        write_json(&self.time_file(), time)
+    }
+
+    fn time_file(&self) -> PathBuf {
+        self.folder.join("time.json")
     }
 
     /// Replaces hard links by copies, since writing to a file by its other name would change the
@@ -246,6 +275,21 @@ mod tests {
         let output = store.publish(&entered(&store), checked, record).unwrap().output;
         fs::write(&user_file, "after!").unwrap();
         store.verify(&output).unwrap();
+    }
+
+    #[test]
+    fn time_of_earlier_attempts_counts_with_a_checkpoint() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let attempt = begin(&store, "k", None);
+        let time = TimeSpent { seconds: 1.5, processor_seconds: 3.0 };
+        attempt.record_time_spent(&time).unwrap();
+        fs::create_dir_all(&attempt.work).unwrap();
+        assert_eq!(attempt.time_spent(), TimeSpent::default());
+        fs::write(attempt.work.join("checkpoint"), "").unwrap();
+        assert_eq!(begin(&store, "k", None).time_spent(), time);
+        fs::write(attempt.time_file(), "{").unwrap();
+        assert_eq!(attempt.time_spent(), TimeSpent::default());
     }
 
     #[test]

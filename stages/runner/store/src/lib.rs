@@ -49,7 +49,7 @@ mod testing;
 
 pub use action::{KEY_VERSION, KEY_VERSION_PART, ModelCost, Record, Unfinished};
 pub use arrivals::Arrival;
-pub use attempt::{Attempt, CheckedOutput};
+pub use attempt::{Attempt, CheckedOutput, TimeSpent};
 pub use error::{StoreError, is_lock_acquired};
 pub use folder::Store;
 pub use format::FORMAT;

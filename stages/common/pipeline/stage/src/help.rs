@@ -9,7 +9,7 @@ const WIDTH: usize = 100;
 const NAME_WIDTH: usize = 24;
 
 /// Renders the inputs and parameters of a stage.
-pub(crate) fn render_help(description: &Description) -> String {
+pub fn render_help(description: &Description) -> String {
     let mut text = String::new();
     if !description.inputs.is_empty() {
         text.push_str("Inputs, with the accepted kinds of artifact:\n");

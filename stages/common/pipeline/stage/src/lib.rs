@@ -73,6 +73,7 @@ pub use contract::{
     ContractError, Description, GivenInputs, Input, Output, PARAMETER_GROUPS, ParameterDoc,
     ParameterProblem, ParameterSection, Rule, Schema, group_parameters, plain,
 };
+pub use help::render_help;
 pub use hooks::{SLOW_VARIABLE, STOP_VARIABLE};
 pub use memory::{
     MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory_message,

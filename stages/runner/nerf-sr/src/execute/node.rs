@@ -9,7 +9,7 @@ use artifact::{format_duration, hash_json, unix_time};
 use planning::stage_call::{Call, Display, StageDisplay, StageFailure, Usage, read_summary};
 use planning::{HashedInputs, Node, Origin, hash_inputs, short_hash, stored_inputs};
 use serde_json::{Map, Value};
-use store::{Attempt, Entered, Holder, KeyLock, Record, Store, Unfinished, host_name};
+use store::{Attempt, Entered, Holder, KeyLock, Record, Store, TimeSpent, Unfinished, host_name};
 
 use crate::estimates::{Estimate, comparison_text};
 use crate::failure;
@@ -130,7 +130,7 @@ impl NodeJob<'_> {
         action: Unfinished,
         inputs: &Inputs<'_>,
     ) -> Result<Record, StageFailure> {
-        let (usage, time) = self.call(lock, &attempt, inputs)?;
+        let (peak_memory, time) = self.call(lock, &attempt, inputs)?;
         let record = Record {
             stage: action.stage,
             point: action.point,
@@ -138,10 +138,10 @@ impl NodeJob<'_> {
             made_of: action.made_of,
             output: String::new(),
             started_unix: action.started_unix,
-            seconds: round_to_milliseconds(time.as_secs_f64()),
+            seconds: round_to_milliseconds(time.seconds),
             threads: self.threads,
-            peak_memory: Some(usage.peak_memory),
-            processor_seconds: Some(round_to_milliseconds(usage.processor_seconds)),
+            peak_memory: Some(peak_memory),
+            processor_seconds: Some(round_to_milliseconds(time.processor_seconds)),
             model: self.estimate.map(|estimate| estimate.model),
             host: host_name(),
             summary: read_summary(&attempt.output),
@@ -159,14 +159,15 @@ impl NodeJob<'_> {
         Ok(record)
     }
 
-    /// Calls the stage and returns its usage and running time. Fails if the program or an input
-    /// differs from the one in the key, before or after the call.
+    /// Calls the stage. Returns its peak memory, and the time of the call and of the calls whose
+    /// checkpoints it resumed from. Fails if the program or an input differs from the one in the
+    /// key, before or after the call.
     fn call(
         &self,
         lock: &KeyLock,
         attempt: &Attempt,
         inputs: &Inputs<'_>,
-    ) -> Result<(Usage, Duration), StageFailure> {
+    ) -> Result<(u64, TimeSpent), StageFailure> {
         let label = self.node.label();
         let program = ConfirmedProgram::new(&self.node.program, self.run.store, self.run.stop)?;
         inputs.check(self.run.stop)?;
@@ -194,14 +195,20 @@ impl NodeJob<'_> {
             lock: Some(lock.file()),
         };
         let stage_display = self.display.start(&label);
+        let earlier = attempt.time_spent();
         let started = Instant::now();
-        let result = self.run_watched(&call, attempt, &stage_display);
-        let time = started.elapsed();
+        let (usage, result) = self.run_watched(&call, attempt, &stage_display);
+        let time = TimeSpent {
+            seconds: earlier.seconds + started.elapsed().as_secs_f64(),
+            processor_seconds: earlier.processor_seconds + usage.processor_seconds,
+        };
         stage_display.end();
-        let usage = result?;
+        // Without the file, only the record's time is too short.
+        attempt.record_time_spent(&time).ok();
+        result?;
         program.confirm_again()?;
         inputs.check_again(attempt)?;
-        Ok((usage, time))
+        Ok((usage.peak_memory, time))
     }
 
     /// Runs the stage. If the node is watched, a second thread takes looks until the stage ends.
@@ -210,9 +217,9 @@ impl NodeJob<'_> {
         call: &Call<'_>,
         attempt: &Attempt,
         stage_display: &StageDisplay<'_>,
-    ) -> Result<Usage, StageFailure> {
+    ) -> (Usage, Result<(), StageFailure>) {
         let Some((watch, chain)) = &self.watch else {
-            return call.run(&attempt.log, stage_display, self.run.stop);
+            return call.run_measured(&attempt.log, stage_display, self.run.stop);
         };
         let is_over = AtomicBool::new(false);
         let scratch = self.run.store.scratch(self.run.file.id()).join(scratch_name(call.label));
@@ -220,7 +227,7 @@ impl NodeJob<'_> {
         let watching = Watching { watch, chain, label, scratch, display, is_over };
         std::thread::scope(|scope| {
             scope.spawn(|| watching.run(call));
-            let result = call.run(&attempt.log, stage_display, self.run.stop);
+            let result = call.run_measured(&attempt.log, stage_display, self.run.stop);
             is_over.store(true, Ordering::Relaxed);
             result
         })

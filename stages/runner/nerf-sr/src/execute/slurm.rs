@@ -109,7 +109,7 @@ fn tasks(run: &Run<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
             stage: sink.stage.clone(),
             label: sink.stage.clone(),
             identity: sink_identity(sink, &identities, out),
-            parents: sink.nodes.clone(),
+            parents: sink.nodes().into_iter().collect(),
             resources: plan.resources.get(&sink.stage).cloned().unwrap_or_default(),
         });
     }
@@ -117,7 +117,8 @@ fn tasks(run: &Run<'_>, out: &Path) -> Result<Vec<Task>, PlanError> {
 }
 
 fn sink_identity(sink: &Sink, node_identities: &[String], out: &Path) -> String {
-    let shows: Vec<&String> = sink.nodes.iter().map(|&index| &node_identities[index]).collect();
+    let shows: Vec<&String> =
+        sink.nodes().into_iter().map(|index| &node_identities[index]).collect();
     let mut parts = sink_parts(sink);
     for (name, value) in [("sink", json!(sink.stage)), ("shows", json!(shows)), ("out", json!(out))]
     {

@@ -1,9 +1,10 @@
 use std::process::ExitCode;
 
 use artifact::{bail_bad_input, print_line};
-use planning::{Change, PlanError, Request, State};
+use planning::{Change, PlanError, State};
 
 use super::print_json;
+use crate::cli::plan_request;
 use crate::lineage::{Lineage, StageDifference};
 use crate::session::{Session, nodes_of_stage};
 
@@ -49,7 +50,7 @@ fn lines(difference: &StageDifference) -> Vec<String> {
 }
 
 /// Reads one side of the comparison: a recorded run or pin, the beginning of an artifact's hash or
-/// of a key, or a stage with `-p` and `-i`.
+/// of a key, or a stage with its arguments.
 fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let store = &session.store;
     if let Some(run) = store.run_or_pin(text)? {
@@ -71,7 +72,8 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     read_stage(session, text)
 }
 
-/// Reads the result of a stage with the parameters and inputs that follow its name.
+/// Reads the result of a stage with the arguments that follow its name: targets and options of the
+/// plan.
 fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let (stage, request) = stage_request(text)?;
     let (plan, states) = session.plan_with_states(&request)?;
@@ -85,30 +87,19 @@ fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     Lineage::read(&session.store, [record.key()])
 }
 
-/// Parses a stage with its parameters and inputs; words are split as by a POSIX shell.
+/// Parses a stage with the arguments of a plan; words are split as by a POSIX shell.
 fn stage_request(text: &str) -> anyhow::Result<(String, Request)> {
     let words = shlex::split(text).ok_or_else(|| usage(text, "close the quote"))?;
     let mut words = words.into_iter();
     let Some(stage) = words.next() else {
         return Err(usage(text, "expected a stage, an artifact's hash, a run or a pin"));
     };
-    let mut request = Request { targets: vec![stage.clone()], ..Request::default() };
-    while let Some(word) = words.next() {
-        let list = match word.as_str() {
-            "-p" => &mut request.parameters,
-            "-i" => &mut request.inputs,
-            _ => {
-                let problem = format!(
-                    "expected -p or -i, found {word}; quote each result, such as \
-                    \"eval -p kernel=box\""
-                );
-                return Err(usage(text, &problem));
-            }
-        };
-        let Some(value) = words.next() else {
-            return Err(usage(text, &format!("{word} needs NAME=VALUE")));
-        };
-        list.push(value);
+    let mut request = plan_request(words).map_err(|problem| {
+        let remedy = "quote each result, such as \"eval -p kernel=box\"";
+        usage(text, &format!("{problem}; {remedy}"))
+    })?;
+    if request.targets.is_empty() {
+        request.targets.push(stage.clone());
     }
     Ok((stage, request))
 }
@@ -130,8 +121,7 @@ mod tests {
         for (text, expected) in [
             ("", "expected a stage"),
             ("eval -i 'a=b", "close the quote"),
-            ("eval box", "expected -p or -i, found box"),
-            ("eval -p", "-p needs NAME=VALUE"),
+            ("eval -p", "a value is required for '--param"),
         ] {
             let message = stage_request(text).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");

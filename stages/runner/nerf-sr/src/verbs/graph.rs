@@ -64,8 +64,8 @@ fn vertices<'a>(plan: &'a Plan, states: &[State]) -> Vec<Vertex<'a>> {
             label: sink.stage.clone(),
             state: "displays the run",
             is_sink: true,
-            inputs: sink.nodes.iter().map(|&index| plan.nodes[index].label()).collect(),
-            parents: sink.nodes.iter().map(|&index| (index, "")).collect(),
+            inputs: sink.nodes().into_iter().map(|index| plan.nodes[index].label()).collect(),
+            parents: sink.nodes().into_iter().map(|index| (index, "")).collect(),
         });
     }
     vertices

@@ -104,7 +104,7 @@ fn run_task(run: &Run<'_>, command: &[String]) -> Result<(), StageFailure> {
     let threads = stage::processors().count;
     stage::start_threads(threads);
     if let Some(sink) = run.plan.sinks.first() {
-        check_parents(run.plan, &sink.stage, sink.nodes.iter().copied(), &records)?;
+        check_parents(run.plan, &sink.stage, sink.nodes().into_iter(), &records)?;
         let progress = RunProgress { command, ..RunProgress::not_started(&records) };
         run_sink(run, sink, threads, &progress)?.print(&sink.stage);
         return Ok(());

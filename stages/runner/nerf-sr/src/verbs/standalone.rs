@@ -1,13 +1,16 @@
 //! Verbs that need no store: `init`, `describe`, `man` and `completions`.
 
+use std::collections::BTreeSet;
 use std::io::Write as _;
 use std::path::Path;
 use std::process::{Command, ExitCode};
 
 use crate::starter::Starter;
 use anyhow::Context as _;
-use artifact::{format_count, print_line};
-use planning::{Pipeline, PlanError, executable};
+use artifact::{format_count, print_line, print_lines};
+use planning::{Describing, Pipeline, PlanError, Programs, executable, is_own, own_program};
+use stage::render_help;
+use store::Store;
 
 /// Writes a pipeline for a folder of posed photographs, and prints what was found.
 pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
@@ -33,15 +36,39 @@ pub(crate) fn init(folder: &Path, file: &Path) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Prints the help of a stage's program.
-pub(crate) fn describe(pipeline: &Pipeline, stage: &str) -> anyhow::Result<ExitCode> {
-    let (pipeline, _) = planning::find_targets(pipeline, &[stage.to_owned()])?;
-    if !pipeline.stages.contains_key(stage) {
+/// Prints the help of a block's program, or of a program in the runner's folder. A program that
+/// isn't the runner's own isn't started: its help is rendered from its cached description, which
+/// `open_store` gives access to.
+pub(crate) fn describe(
+    pipeline: &Pipeline,
+    stage: &str,
+    open_store: impl FnOnce() -> anyhow::Result<Store>,
+) -> anyhow::Result<ExitCode> {
+    let found = planning::find_targets(pipeline, &[stage.to_owned()]);
+    let has_block = matches!(&found, Ok((pipeline, _)) if pipeline.stages.contains_key(stage));
+    if !has_block && let Some(program) = own_program(stage) {
+        return print_help(&program);
+    }
+    let (pipeline, _) = found?;
+    if !has_block {
         let known = artifact::known_names(stage, pipeline.stages.keys().map(String::as_str));
         return Err(PlanError::Usage(format!("no stage {stage:?}; {known}")).into());
     }
     let program = executable(&pipeline, stage);
-    let status = Command::new(&program)
+    if is_own(&program) {
+        return print_help(&program);
+    }
+    let needed = BTreeSet::from([stage.to_owned()]);
+    let programs = Programs::find(&pipeline, &open_store()?, &needed, Describing::OwnOnly)
+        .map_err(PlanError::from)?;
+    let description = &programs.require(stage).map_err(PlanError::from)?.description;
+    print_lines(&format!("{}\n\n{}", description.summary, render_help(description)));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Prints the help of one of the runner's own programs.
+fn print_help(program: &Path) -> anyhow::Result<ExitCode> {
+    let status = Command::new(program)
         .arg("--help")
         .status()
         .with_context(|| format!("cannot start {}; run `make build`", program.display()))?;

@@ -56,7 +56,7 @@ pub(crate) fn why(
     }
     if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
         print_line!("{stage}: {}", sink_text(&plan, sink, &states));
-        for &index in &sink.nodes {
+        for index in sink.nodes() {
             print_line!("  {}", explanation(session, &plan, &states, &records, index));
         }
         return Ok(ExitCode::SUCCESS);

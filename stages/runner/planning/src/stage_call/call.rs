@@ -114,13 +114,28 @@ impl Call<'_> {
         watcher: &dyn Watcher,
         stop: &AtomicBool,
     ) -> Result<Usage, StageFailure> {
-        let log = StageLog::open(log).map_err(|e| StageFailure::at(log, &e))?;
+        let (usage, result) = self.run_measured(log, watcher, stop);
+        result.map(|()| usage)
+    }
+
+    /// Runs the stage as [`Self::run`] does, and also returns the usage of a failed stage.
+    pub fn run_measured(
+        &self,
+        log: &Path,
+        watcher: &dyn Watcher,
+        stop: &AtomicBool,
+    ) -> (Usage, Result<(), StageFailure>) {
+        let log = match StageLog::open(log) {
+            Ok(log) => log,
+            Err(error) => return (Usage::default(), Err(StageFailure::at(log, &error))),
+        };
         self.log_arguments(&log);
         let started = Instant::now();
-        let result = self.run_process(&log, watcher, stop);
+        let ended = self.run_process(&log, watcher, stop);
+        let (usage, result) = ended.unwrap_or_else(|failure| (Usage::default(), Err(failure)));
         let time = format_duration(started.elapsed().as_secs_f64());
         match &result {
-            Ok(usage) => {
+            Ok(()) => {
                 log.line(format_args!(
                     "done in {time}; processor time {}, peak memory {}",
                     format_duration(usage.processor_seconds),
@@ -134,7 +149,7 @@ impl Call<'_> {
                 log.line(format_args!("failed after {time} with exit code {code}: {message}"));
             }
         }
-        result
+        (usage, result)
     }
 
     fn log_arguments(&self, log: &StageLog) {
@@ -162,7 +177,7 @@ impl Call<'_> {
         log: &StageLog,
         watcher: &dyn Watcher,
         stop: &AtomicBool,
-    ) -> Result<Usage, StageFailure> {
+    ) -> Result<(Usage, Result<(), StageFailure>), StageFailure> {
         let kills_before = memory_kills();
         let (group, (stdout, stderr)) =
             self.start().map_err(|e| StageFailure::at(self.program, &e))?;
@@ -183,9 +198,10 @@ impl Call<'_> {
         });
         let (ResUse { status, rusage }, peak_memory) =
             exit.map_err(|e| StageFailure::at(self.program, &e))?;
+        let processor_seconds = (rusage.utime + rusage.stime).as_secs_f64();
+        let usage = Usage { peak_memory, processor_seconds };
         let result = if status.success() {
-            let processor_seconds = (rusage.utime + rusage.stime).as_secs_f64();
-            Ok(Usage { peak_memory, processor_seconds })
+            Ok(())
         } else {
             let exit = Exit {
                 status,
@@ -198,10 +214,10 @@ impl Call<'_> {
         };
         // The caller prints the reason: the same line must not appear twice.
         output.release(|held| match &result {
-            Ok(_) => true,
+            Ok(()) => true,
             Err(failure) => !held.text.ends_with(&failure.message),
         });
-        result
+        Ok((usage, result))
     }
 
     fn start(&self) -> std::io::Result<(Group, Pipes)> {

@@ -6,7 +6,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::mpsc;
+use std::sync::{Once, mpsc};
 use std::time::{Duration, Instant};
 
 use stage::Description;
@@ -19,6 +19,8 @@ use crate::stage_call::group::Group;
 const MAX_DESCRIBE_TIME: Duration = Duration::from_secs(120);
 /// Time after which the wait for descriptions is reported, chosen by hand.
 const NOTICE_AFTER: Duration = Duration::from_secs(1);
+/// Set after the wait was reported: this process reports it once.
+static REPORTED: Once = Once::new();
 /// Maximum size of a program's output, chosen by hand; descriptions have some kilobytes.
 const MAX_OUTPUT_BYTES: u64 = 1 << 24;
 /// Interval between two checks whether a program has ended; chosen by hand.
@@ -71,7 +73,8 @@ pub fn describe_all(
                 Ok((path, description)) => _ = descriptions.insert(path, description),
                 Err(mpsc::RecvTimeoutError::Timeout) => {
                     let text = "reading the stages' descriptions (once per program version)";
-                    artifact::report_line!("{text}");
+                    // A run describes users' programs several times.
+                    REPORTED.call_once(|| artifact::report_line!("{text}"));
                     timeout = Duration::MAX;
                 }
                 Err(mpsc::RecvTimeoutError::Disconnected) => break,
