@@ -49,8 +49,7 @@ impl Border {
         let (width, height) = (image.width, image.height);
         let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
         let columns = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
-        let border: Vec<[u8; 3]> =
-            rows.chain(columns).map(|(x, y)| colour(image, x, y)).collect();
+        let border: Vec<[u8; 3]> = rows.chain(columns).map(|(x, y)| colour(image, x, y)).collect();
         let median = medians(&border);
         let similar = border.iter().filter(|colour| is_similar(**colour, median)).count();
         let percent = 100 * similar / border.len().max(1);

@@ -16,6 +16,9 @@ use crate::split::{FrameNames, SplitLists};
 use crate::text::read_text;
 use crate::transforms::{FrameEntry, Transforms, read_frame};
 
+/// Remedy for images above the folder of the file that lists them.
+const GIVE_FOLDER_ABOVE: &str = "move this file to the folder above, and give that folder";
+
 /// Treatment of frames whose image doesn't exist.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum MissingImages {
@@ -130,7 +133,11 @@ impl FrameFile {
         for (index, entry) in self.transforms.frames.iter().enumerate() {
             let frame_error =
                 |reason| DatasetError::frame(&self.path, index, &entry.file_path, reason);
-            let located = lookup.find(&entry.file_path).map_err(|e| frame_error(e.into()))?;
+            let located = lookup.find(&entry.file_path).map_err(|error| {
+                let reason = Reason::from(error);
+                let is_above = entry.file_path.starts_with("../");
+                frame_error(if is_above { reason.with_remedy(GIVE_FOLDER_ABOVE) } else { reason })
+            })?;
             let file = match located {
                 Located::File(file) => file,
                 Located::Missing(problem) if on_missing == MissingImages::Refused => {
