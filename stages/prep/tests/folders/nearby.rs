@@ -235,7 +235,7 @@ pub(crate) fn cases() -> Vec<Case> {
             3,
             &[
                 "transforms.json (instant-ngp, nerfstudio): 3 photographs",
-                "1 depth image (depth_file_path) cannot be read (first: depth/a1.png); only EXR depth is used",
+                "1 depth image is not used (depth_file_path, first: depth/a1.png); only EXR depth is",
             ],
         )),
     )];
