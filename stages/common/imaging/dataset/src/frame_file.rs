@@ -105,14 +105,15 @@ impl FrameFile {
         }
         let value = parse(&text).map_err(|error| file_error(Reason::new(json_message(&error))))?;
         let mut transforms: Transforms =
-            from_object(value, &json!({"frames": []})).map_err(file_error)?;
+            from_object(&value, &json!({"frames": []})).map_err(file_error)?;
         let required = json!({"file_path": "", "transform_matrix": []});
-        let mut frames = Vec::new();
-        for (index, value) in std::mem::take(&mut transforms.frames).into_iter().enumerate() {
-            let name = value.get("file_path").and_then(Value::as_str).unwrap_or("unnamed");
-            let name = name.to_owned();
+        let (values, mut frames) = (std::mem::take(&mut transforms.frames), Vec::new());
+        for (index, value) in values.iter().enumerate() {
             let frame = from_object(value, &required);
-            frames.push(frame.map_err(|reason| DatasetError::frame(path, index, &name, reason))?);
+            frames.push(frame.map_err(|reason| {
+                let name = value.get("file_path").and_then(Value::as_str).unwrap_or("unnamed");
+                DatasetError::frame(path, index, name, reason)
+            })?);
         }
         Ok(Self { path: path.to_path_buf(), transforms, frames })
     }
@@ -237,9 +238,9 @@ fn json_message(error: &serde_json::Error) -> String {
 
 /// Converts a JSON object; an error names the key. `required` is an object with the required keys
 /// alone: flattened structures lose the position of an error.
-fn from_object<T: DeserializeOwned>(value: Value, required: &Value) -> Result<T, Reason> {
+fn from_object<T: DeserializeOwned>(value: &Value, required: &Value) -> Result<T, Reason> {
     let reason = |error: serde_json::Error| Reason::new(shortened(&error.to_string()));
-    T::deserialize(&value).map_err(|error| {
+    T::deserialize(value).map_err(|error| {
         for (key, value) in value.as_object().into_iter().flatten() {
             let mut single = required.clone();
             single[key] = value.clone();

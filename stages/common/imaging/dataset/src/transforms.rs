@@ -351,7 +351,10 @@ mod tests {
                 "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,2.5,3,1]]",
                 "transform_matrix: last row is 1 2.5 3 1, not 0 0 0 1; is the matrix transposed",
             ),
-            ("[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,null]]", "last row is 0 0 0 NaN, not"),
+            (
+                "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,null]]",
+                "transform_matrix: last row is 0 0 0 NaN, not",
+            ),
             ("[[1,0,0],[0,1,0],[0,0,1]]", "transform_matrix must have 4 rows of 4 numbers"),
             ("[1,0,0,0,1,0,0,0,1]", "transform_matrix must have 4 rows of 4 numbers"),
             ("{}", "transform_matrix must have 4 rows of 4 numbers"),

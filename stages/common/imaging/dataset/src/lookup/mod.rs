@@ -210,6 +210,9 @@ impl Lookup {
             self.steps.record(name, &file.path, taken);
             return Ok(Located::File(file));
         }
+        if let Some(path) = self.unsupported_file(name) {
+            return Ok(Located::File(LocatedFile { label: path.clone(), path }));
+        }
         match (missing, literal) {
             (Some(problem), _) => Ok(Located::Missing(problem)),
             (None, Err(error)) if absolute_parts(name).is_none() => Err(error.into()),
@@ -218,6 +221,17 @@ impl Lookup {
                 path_text(Path::new(name))
             )))),
         }
+    }
+
+    /// Finds the image in an unsupported format that a name without extension means: the error that
+    /// follows names the command that converts the image.
+    fn unsupported_file(&mut self, name: &str) -> Option<PathBuf> {
+        let path = self.base.join(relative_path(name).ok()?);
+        let stem = path.file_name().filter(|_| !has_image_extension(&path))?;
+        let folder = path.parent()?;
+        let names = self.listings.names(folder);
+        let mut files = names.iter().map(|name| folder.join(name));
+        files.find(|file| file.file_stem() == Some(stem) && is_unsupported_name(file))
     }
 
     /// Returns the path of a name taken literally, with an implied `.png`.

@@ -35,6 +35,7 @@ fn steps_are_tried_in_order_and_combine() {
         "images/G.png",
         "images/.h.png",
         "images/i.jpg",
+        "images/k.webp",
         "j.png",
     ]);
     for (name, file) in [
@@ -67,6 +68,8 @@ fn steps_are_tried_in_order_and_combine() {
         ("images/h.png", "images/h.png not found"),
         ("images/i.png", "images/i.png not found"),
         ("images/x", "images/x.png not found"),
+        // The error of reading this file names the remedy.
+        ("images/k", "images/k.webp"),
         ("../images/a.png", "\"../images/a.png\" is not a path inside the folder"),
         (r"..\images\a.png", r"..\images\a.png not found"),
         ("/home/x.png", "no file in the data set matches the end of the absolute path"),
