@@ -9,7 +9,8 @@ use crate::photograph::is_image_name;
 use crate::unsupported::is_unsupported_name;
 
 const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
-/// Extensions of archives, with the commands that unpack them; `{file}` and `{folder}` are quoted paths.
+/// Extensions of archives, with the commands that unpack them; `{file}` and `{folder}` stand for
+/// quoted paths.
 const ARCHIVES: [(&str, &str); 7] = [
     ("zip", "unzip {file} -d {folder}"),
     ("tar", TAR),

@@ -87,14 +87,16 @@ fn find_model(folder: &Path) -> Option<String> {
     }
     let relative = |path: &Path| path_text(path.strip_prefix(folder).unwrap_or(path));
     let found = format!("found a COLMAP model in {}", relative(&model?));
-    let has_images = |path: &PathBuf| visible_entries(path).iter().any(|file| is_image_name(file));
-    Some(match near.iter().filter(|path| has_images(path)).map(|path| relative(path)).next() {
-        Some(images) if has_images(&folder.join("images")) || images == "images" => {
-            format!("{found}; move it to sparse/0")
-        }
-        Some(images) => {
-            format!("{found} and images in {images}; rename these folders sparse/0 and images")
-        }
+    let has_images = |path: &&PathBuf| visible_entries(path).iter().any(|f| is_image_name(f));
+    let own = [folder.join("images"), folder.to_path_buf()];
+    if own.iter().find(has_images).is_some() {
+        return Some(format!("{found}; move it to sparse/0"));
+    }
+    Some(match near.iter().find(has_images) {
+        Some(images) => format!(
+            "{found} and images in {}; rename these folders sparse/0 and images",
+            relative(images)
+        ),
         None => format!("{found}, but no images; put the model in sparse/0 next to images"),
     })
 }

@@ -21,8 +21,8 @@ use crate::photograph::is_image_name;
 use model::Model;
 
 /// Finds the models in `sparse` and its sub-folders, sorted by name. If there are none and the
-/// folder has photographs, the folder itself may be a model; otherwise searches the `sparse` of each
-/// sub-folder without photographs: nerfstudio writes `colmap/sparse/0`.
+/// folder has photographs, the folder itself may be a model; otherwise searches the `sparse` of
+/// each sub-folder without photographs: nerfstudio writes `colmap/sparse/0`.
 pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, DatasetError> {
     let found = folders_with_list(folder, "images")?;
     if !found.is_empty() {
@@ -154,8 +154,8 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     Ok(Dataset { format: Format::Colmap, frames, split: None, notes })
 }
 
-/// Returns the reason for a model none of whose images exists, with the sub-folder that contains the
-/// first one, if any.
+/// Returns the reason for a model none of whose images exists, with the sub-folder that contains
+/// the first image, if any.
 fn no_photographs(lookup: &Lookup, missing: &[&String]) -> Reason {
     let Some(first) = missing.first() else {
         return Reason::new("the model has no images; at least one is required");

@@ -3,9 +3,9 @@
 //!
 //! A name is tried literally; with `\` read as `/`; as the longest tail of an absolute path, or of
 //! any path if no name is found otherwise, with the same number of leading parts removed from all
-//! names; with a missing or doubled extension; and in a different case. Steps combine, each logs one line per data set ([`Lookup::notes`]), and
-//! two candidates are an error. Paths out of the folder are never opened; links inside it are
-//! followed.
+//! names; with a missing or doubled extension; and in a different case. Steps combine, each logs one
+//! line per data set ([`Lookup::notes`]), and two candidates are an error. Paths out of the folder
+//! are never opened; links inside it are followed.
 
 mod listings;
 mod matching;
