@@ -137,20 +137,19 @@ fn init_refuses_unusable_folders() {
     std::fs::create_dir(project.path("nothing")).unwrap();
     for folder in ["loose", "cameraless/images"] {
         std::fs::create_dir_all(project.path(folder)).unwrap();
-        std::fs::copy(
-            project.path("colmap/images/r_0.png"),
-            project.path(&format!("{folder}/a b.PNG")),
-        )
-        .unwrap();
+        for name in ["a b.PNG", "c.png"] {
+            let copy = project.path(&format!("{folder}/{name}"));
+            std::fs::copy(project.path("colmap/images/r_0.png"), copy).unwrap();
+        }
     }
     project.run(&["init", "nothing"]).fails(3, &["nothing: no data set; expected"]);
     project.run(&["init", "nowhere"]).fails(3, &["nowhere: no such folder"]);
     project
         .run(&["init", "loose"])
-        .fails(3, &["loose: 1 image, but no cameras", "move them to 'loose/images'", "colmap"]);
+        .fails(3, &["loose: 2 images, but no cameras", "move them to 'loose/images'", "colmap"]);
     project
         .run(&["init", "cameraless"])
-        .fails(3, &["cameraless: 1 image, but no cameras", "--image_path 'cameraless/images'"]);
+        .fails(3, &["cameraless: 2 images, but no cameras", "--image_path 'cameraless/images'"]);
     let inside = project.command(&["init", "."]).current_dir(project.path("colmap")).output();
     Finished::of(inside.unwrap()).fails(2, &["can't be inside the data set"]);
     project.run(&["plan"]).fails(2, &["pipeline.yaml: No such file", "`nerf-sr init DIR`"]);

@@ -12,6 +12,11 @@ use crate::strips::{Strips, are_similar, colour, medians};
 /// Maximum deviation of a flat colour in 8-bit levels: JPEG noise on a uniform area. A clear sky
 /// varies more from corner to corner (docs/design/035).
 const MAX_BORDER_NOISE: u8 = 8;
+/// Minimum percentage of one colour in the borders of nine in ten views: an object that fills the
+/// image covers a fifth of the border, a bright sky about half (docs/design/035).
+const MIN_COLOUR_PERCENT: usize = 60;
+/// Minimum percentage of the colour in the borders of half of the views.
+const FLAT_PERCENT: usize = 90;
 
 /// Evidence in the images' borders for the scene's background.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,8 +34,8 @@ pub(crate) enum BorderEvidence {
 pub(crate) enum Border {
     /// The image has alpha.
     Alpha,
-    /// Nine tenths of the border's pixels are similar to their median.
-    Flat([u8; 3]),
+    /// At least [`MIN_COLOUR_PERCENT`] of the border's pixels are similar to their median.
+    Colour { median: [u8; 3], percent: usize },
     /// Anything else.
     Mixed,
 }
@@ -47,7 +52,8 @@ impl Border {
         let border: Vec<[u8; 3]> = rows.chain(columns).map(|(x, y)| colour(image, x, y)).collect();
         let median = medians(&border);
         let similar = border.iter().filter(|colour| is_similar(**colour, median)).count();
-        if 10 * similar >= 9 * border.len() { Self::Flat(median) } else { Self::Mixed }
+        let percent = 100 * similar / border.len().max(1);
+        if percent >= MIN_COLOUR_PERCENT { Self::Colour { median, percent } } else { Self::Mixed }
     }
 }
 
@@ -57,6 +63,8 @@ pub(crate) struct Borders {
     pub(crate) evidence: BorderEvidence,
     /// Number of views whose borders are the flat colour.
     flat: usize,
+    /// Background that half of the views suggest: white or black.
+    suggested: Option<Background>,
     /// Number of sampled views.
     views: usize,
     strips: Option<CommonStrips>,
@@ -73,24 +81,32 @@ struct CommonStrips {
 }
 
 impl Borders {
-    /// Combines the borders of sampled views. One image with alpha is evidence of alpha; nine in
-    /// ten views must share a flat colour.
+    /// Combines the borders of sampled views. One image with alpha is evidence of alpha. A flat
+    /// colour has 60 % of the border in nine of ten views, and 90 % in half of the views.
     pub(crate) fn new(borders: &[Border]) -> Self {
         let views = borders.len();
+        let mut found =
+            Self { evidence: BorderEvidence::Scene, flat: 0, suggested: None, views, strips: None };
         if borders.contains(&Border::Alpha) {
-            return Self { evidence: BorderEvidence::Alpha, flat: 0, views, strips: None };
+            found.evidence = BorderEvidence::Alpha;
+            return found;
         }
-        let mut colours: Vec<[u8; 3]> = Vec::new();
+        let mut coloured: Vec<([u8; 3], usize)> = Vec::new();
         for border in borders {
-            if let Border::Flat(colour) = border {
-                colours.push(*colour);
+            if let Border::Colour { median, percent } = border {
+                coloured.push((*median, *percent));
             }
         }
-        let median = medians(&colours);
-        let flat = colours.iter().filter(|colour| is_similar(**colour, median)).count();
-        let is_flat = views > 0 && 10 * flat >= 9 * views;
-        let evidence = if is_flat { BorderEvidence::Flat(median) } else { BorderEvidence::Scene };
-        Self { evidence, flat, views, strips: None }
+        let colours: Vec<[u8; 3]> = coloured.iter().map(|(colour, _)| *colour).collect();
+        let common = medians(&colours);
+        coloured.retain(|(colour, _)| is_similar(*colour, common));
+        found.flat = coloured.iter().filter(|(_, percent)| *percent >= FLAT_PERCENT).count();
+        if views > 0 && 10 * coloured.len() >= 9 * views && 2 * found.flat >= views {
+            found.evidence = BorderEvidence::Flat(common);
+        } else if 2 * coloured.len() >= views {
+            found.suggested = plain_background(common);
+        }
+        found
     }
 
     /// Adds the strips that the views have in common. If all four sides have strips, their flat
@@ -137,9 +153,8 @@ impl Borders {
         match self.evidence {
             // Alpha is composited over white.
             BorderEvidence::Alpha => Background::White,
-            BorderEvidence::Flat(colour) if is_similar(colour, [u8::MAX; 3]) => Background::White,
-            BorderEvidence::Flat(colour) if is_similar(colour, [0; 3]) => Background::Black,
-            BorderEvidence::Flat(_) | BorderEvidence::Scene => Background::Opaque,
+            BorderEvidence::Flat(colour) => plain_background(colour).unwrap_or(Background::Opaque),
+            BorderEvidence::Scene => Background::Opaque,
         }
     }
 }
@@ -156,13 +171,24 @@ impl Display for Borders {
                 "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of \
                 {views}"
             ),
-            BorderEvidence::Scene => write!(
-                f,
-                "images have no alpha; borders are one flat colour in {flat} of {views}: \
-                too few for a plain background, so background is opaque"
-            ),
+            BorderEvidence::Scene => {
+                write!(
+                    f,
+                    "images have no alpha; borders are one flat colour in {flat} of {views}: \
+                    too few for a plain background, so background is opaque"
+                )?;
+                let Some(suggested) = self.suggested else { return Ok(()) };
+                let name = if suggested == Background::White { "white" } else { "black" };
+                write!(f, "; if only {name} is behind the object, give -p background={name}")
+            }
         }
     }
+}
+
+/// Returns the background of a colour that is white or black.
+fn plain_background(colour: [u8; 3]) -> Option<Background> {
+    let plain = [([u8::MAX; 3], Background::White), ([0; 3], Background::Black)];
+    plain.iter().find(|(level, _)| is_similar(colour, *level)).map(|(_, background)| *background)
 }
 
 fn is_similar(colour: [u8; 3], other: [u8; 3]) -> bool {
@@ -194,6 +220,15 @@ mod tests {
         )
     }
 
+    /// Creates an image of 20×10 pixels: a white sky above ground of many colours.
+    fn sky_image() -> Rgba8 {
+        let pixel = |index: usize| {
+            let level = if index < 100 { u8::MAX } else { (index % 10 * 20) as u8 };
+            [level, level, level, u8::MAX]
+        };
+        Rgba8::new(20, 10, (0..200).flat_map(pixel).collect())
+    }
+
     fn borders_of(images: &[Rgba8]) -> Borders {
         Borders::new(&images.iter().map(Border::of).collect::<Vec<_>>())
     }
@@ -212,9 +247,25 @@ mod tests {
             borders_of(&views(&test_image([3; 3], 3, 0), 1)).background(),
             Background::Black
         );
-        // At most a tenth of a border, and of the views, may differ.
-        let covered = views(&test_image([255; 3], 0, 12), 3);
-        assert_eq!(borders_of(&covered).evidence, BorderEvidence::Scene);
+        // An object may cover a fifth of some borders, but not of most.
+        let covered = test_image([255; 3], 0, 12);
+        let mut filled = views(&test_image([255; 3], 0, 0), 4);
+        filled.extend(views(&covered, 4));
+        assert_eq!(borders_of(&filled).background(), Background::White);
+        filled.push(covered);
+        let ambiguous = borders_of(&filled);
+        assert_eq!(ambiguous.background(), Background::Opaque);
+        assert_eq!(
+            ambiguous.to_string(),
+            "images have no alpha; borders are one flat colour in 4 of 9 sampled views: too few \
+            for a plain background, so background is opaque; if only white is behind the object, \
+            give -p background=white"
+        );
+        // A bright sky covers about half of the border.
+        let skies = borders_of(&views(&sky_image(), 5));
+        assert_eq!(skies.background(), Background::Opaque);
+        assert!(!skies.to_string().contains("-p background"), "{skies}");
+        // At most a tenth of the views may have another border.
         let mut mostly_white = views(&test_image([255; 3], 0, 0), 9);
         mostly_white.push(test_image([120; 3], 60, 0));
         assert_eq!(borders_of(&mostly_white).background(), Background::White);

@@ -257,7 +257,7 @@ fn extreme_points(camera: &Camera, depths: [f64; 2]) -> Vec<DVec3> {
 }
 
 /// Minimum determinant of [`crossing_point`] for the centre of a box; chosen by hand.
-const MIN_CENTRE_DETERMINANT: f64 = 1e-3;
+pub(crate) const MIN_CENTRE_DETERMINANT: f64 = 1e-3;
 /// Minimum determinant of [`crossing_point`] for the focus of cameras that face one direction,
 /// whose axes are nearly parallel; chosen by hand.
 const MIN_FOCUS_DETERMINANT: f64 = 1e-9;
@@ -320,7 +320,7 @@ fn half_width(camera: &Camera, point: DVec3) -> f64 {
 /// Returns the point nearest to all optical axes in the least-squares sense, if they cross well
 /// enough: the determinant of the mean projection is 0 for parallel axes and 8/27 for axes from all
 /// sides.
-fn crossing_point(cameras: &[&Camera], min_determinant: f64) -> Option<DVec3> {
+pub(crate) fn crossing_point(cameras: &[&Camera], min_determinant: f64) -> Option<DVec3> {
     let (mut matrix, mut rhs) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
         let d = camera.forward();

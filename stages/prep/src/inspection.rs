@@ -52,7 +52,7 @@ fn inspect_view(frame: &Frame) -> anyhow::Result<(ViewBorder, Spectrum)> {
     let image = frame.photograph().bad_input(frame_label(frame))?;
     let mut border = Border::of(&image);
     // Fisheye photographs are black outside their image circle, whatever the background.
-    if matches!(border, Border::Flat(_)) && frame.intrinsics().has_clamped_rays() {
+    if matches!(border, Border::Colour { .. }) && frame.intrinsics().has_clamped_rays() {
         border = Border::Mixed;
     }
     let strips = if border == Border::Alpha { None } else { Strips::of(&image) };

@@ -11,7 +11,7 @@
 //! * `detail`: how far the spectrum of the photographs reaches.
 //! * `inspection`: sampled views, for `detail` and `borders`.
 //! * `borders`, `strips`: the scene's background, from the borders of its images.
-//! * `pose_warnings`: checks of implausible poses.
+//! * `pose_warnings`, `pose_conventions`: checks of implausible poses.
 //!
 //! The crate `dataset` reads the photographs, in any of its formats.
 //!
@@ -28,6 +28,7 @@ mod image_plan;
 mod inspection;
 mod memory;
 mod params;
+mod pose_conventions;
 mod pose_warnings;
 mod scene_plan;
 mod sizes;

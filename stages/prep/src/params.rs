@@ -31,8 +31,8 @@ pub struct Params {
     #[schemars(extend("x-group" = "data"))]
     pub lens: LensHandling,
     /// Background of the scene. Default: `white` if images have alpha. Without alpha, `white` or
-    /// `black` if the borders of nine in ten views have that colour and aren't empty margins from
-    /// undistortion or letterboxing, otherwise `opaque`.
+    /// `black` if most of the border has that colour in nine of ten views and isn't an empty margin
+    /// from undistortion or letterboxing, otherwise `opaque`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub background: Option<Background>,
     /// Distance along rays at which the scene starts. With `space: ndc` and known depths, a value

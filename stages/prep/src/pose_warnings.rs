@@ -8,7 +8,7 @@ use scene::{Camera, Intrinsics, format_length};
 /// photographs from a walk through a room, it is 2 to 5; the threshold is chosen by hand.
 pub(crate) const MIN_OUTLIER_RATIO: f64 = 20.0;
 /// Minimum number of cameras whose median distance is meaningful; chosen by hand.
-const MIN_CAMERAS: usize = 4;
+pub(crate) const MIN_CAMERAS: usize = 4;
 /// Maximum offset of a plausible principal point from the image centre, relative to the image side.
 /// For real lenses, it is about 0.01; the threshold is chosen by hand.
 const MAX_PRINCIPAL_POINT_OFFSET: f64 = 0.2;
@@ -150,6 +150,7 @@ mod tests {
     use scene::{Intrinsics, pose_of};
 
     use super::*;
+    use crate::pose_conventions::convention_warning;
 
     fn camera(name: &str, angle: f64, centre: [f64; 3]) -> Camera {
         let rotation = DMat3::from_rotation_z(angle);
@@ -225,8 +226,12 @@ mod tests {
                 |views: &[usize]| views.iter().map(|&i| set.frames[i].camera()).collect::<Vec<_>>();
             let (training, test) = (cameras(&split.train), cameras(&split.test));
             assert_eq!(
-                (have_equal_poses(&training), warnings(&training, &test)),
-                (false, Vec::new()),
+                (
+                    have_equal_poses(&training),
+                    warnings(&training, &test),
+                    convention_warning(&training)
+                ),
+                (false, Vec::new(), None),
                 "{scene}"
             );
         }

@@ -5,6 +5,7 @@ use scene::{Background, Bounds, Camera, Space, format_length};
 use crate::bounds::{CameraDepths, scene_bounds};
 use crate::image_plan::ImagePlan;
 use crate::params::Params;
+use crate::pose_conventions::convention_warning;
 use crate::pose_warnings;
 use crate::split::choose_references;
 
@@ -122,7 +123,8 @@ pub(crate) fn check_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, F
             training.len()
         );
     }
-    let warnings = pose_warnings::warnings(&training, &test);
+    let mut warnings = pose_warnings::warnings(&training, &test);
+    warnings.extend(convention_warning(&training));
     Ok(warnings.into_iter().map(|text| format!("{WARNING}{text}")).collect())
 }
 

@@ -196,7 +196,8 @@ fn refused_cases() -> Vec<Case> {
             |folder| write_frames(folder, &json!({"camera_model": "EQUIRECTANGULAR"})),
             Expected::Refused(
                 "dataset: DIR/transforms.json: frame 0 (a0.png): camera_model \"EQUIRECTANGULAR\" \
-                is not supported; undistort the images first (colmap image_undistorter)",
+                is not supported; cut the panoramas into views and estimate their cameras: \
+                ns-process-data images --camera-type equirectangular",
             ),
         ),
         case(

@@ -144,7 +144,7 @@ pub(crate) fn cases() -> Vec<Case> {
             ten_views(
                 "a_#",
                 &[
-                    r"10 file names found without the first 4 parts of absolute paths (first: C:\Users\x\scene\images\a_0.png is images/a_0.png)",
+                    r"10 file names found without the first 4 parts of their paths (first: C:\Users\x\scene\images\a_0.png is images/a_0.png)",
                 ],
             ),
         ),
@@ -154,7 +154,7 @@ pub(crate) fn cases() -> Vec<Case> {
             ten_views(
                 "a_#",
                 &[
-                    "10 file names found without the first 3 parts of absolute paths (first: /home/x/scene/images/a_0.png is images/a_0.png)",
+                    "10 file names found without the first 3 parts of their paths (first: /home/x/scene/images/a_0.png is images/a_0.png)",
                 ],
             ),
         ),
@@ -169,7 +169,7 @@ pub(crate) fn cases() -> Vec<Case> {
             "a path out of the folder",
             |folder| write_frames(folder, "../data/images/a_#.png", "images/a_#.png"),
             Expected::Refused(
-                "dataset: DIR/transforms.json: frame 0 (../data/images/a_0.png): \"../data/images/a_0.png\" is not a path inside the folder",
+                "dataset: DIR/transforms.json: frame 0 (../data/images/a_0.png): \"../data/images/a_0.png\" is not a path inside the folder; move this file to the folder above, and give that folder",
             ),
         ),
         case(
@@ -254,7 +254,7 @@ pub(crate) fn cases() -> Vec<Case> {
             ten_views(
                 "r_#",
                 &[
-                    r"10 file names found without the first 2 parts of absolute paths (first: D:\set\Images\R_0 is images/r_0.Jpg)",
+                    r"10 file names found without the first 2 parts of their paths (first: D:\set\Images\R_0 is images/r_0.Jpg)",
                     r"10 file names found with a different extension (first: D:\set\Images\R_0 is images/r_0.Jpg)",
                     r"10 file names found in a different case (first: D:\set\Images\R_0 is images/r_0.Jpg)",
                 ],
@@ -282,7 +282,7 @@ pub(crate) fn cases() -> Vec<Case> {
             "Blender moved",
             |folder| write_blender(folder, "/data/lego/train/r_#", "train/r_#.jpg"),
             Expected::Scene(blender_scene(&[
-                "3 file names found without the first 2 parts of absolute paths (first: /data/lego/train/r_0 is train/r_0.jpg)",
+                "3 file names found without the first 2 parts of their paths (first: /data/lego/train/r_0 is train/r_0.jpg)",
                 "3 file names found with a different extension (first: /data/lego/train/r_0 is train/r_0.jpg)",
             ])),
         ),

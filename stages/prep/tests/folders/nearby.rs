@@ -52,6 +52,64 @@ fn write_binary_images(folder: &Path) {
     write(folder.join("sparse/0/images.bin"), bytes);
 }
 
+/// Models in other places than `sparse`, and models whose files are missing.
+fn place_cases() -> Vec<Case> {
+    vec![
+        case(
+            "a model next to images",
+            |folder| write_colmap_set(folder, "", "images"),
+            Expected::Scene(held_out("a#", 3, &["COLMAP: 3 photographs from the folder itself"])),
+        ),
+        case(
+            "a model in another folder",
+            |folder| write_colmap_set(folder, "model", "images"),
+            Expected::Refused(
+                "dataset: DIR: no data set; found a COLMAP model in model; move it to sparse/0",
+            ),
+        ),
+        case(
+            "3D Gaussian Splatting's distorted/sparse/0",
+            |folder| write_colmap_set(folder, "distorted/sparse/0", "input"),
+            Expected::Refused(
+                "dataset: DIR: no data set; found a COLMAP model in distorted/sparse/0 and images in input; rename these folders sparse/0 and images",
+            ),
+        ),
+        case(
+            "images in another folder",
+            |folder| write_colmap_set(folder, "sparse/0", "photos"),
+            Expected::Refused(
+                "dataset: DIR/sparse/0/images.txt: none of the 3 images exists in DIR (first missing: a0.png); the image is in photos: rename this folder images",
+            ),
+        ),
+        case(
+            "half a model",
+            |folder| {
+                write_photographs(folder, "images/a#.png", 10);
+                write_binary_images(folder);
+            },
+            Expected::Refused(
+                "dataset: DIR/sparse/0/cameras.bin: file not found next to images.bin; copy all files of the model",
+            ),
+        ),
+        case(
+            "photographs without a camera",
+            |folder| {
+                write_colmap_set(folder, "sparse/0", "images");
+                write_photographs(&folder.join("images"), "a#.png", 5);
+                write(folder.join("images/a3.jpg"), "");
+            },
+            Expected::Scene(held_out(
+                "a#",
+                3,
+                &[
+                    "COLMAP: 3 photographs from sparse/0",
+                    "warning: 2 of 5 photographs have no camera (first: images/a3.png)",
+                ],
+            )),
+        ),
+    ]
+}
+
 fn model_cases() -> Vec<Case> {
     vec![
         case(
@@ -209,6 +267,25 @@ fn name_cases() -> Vec<Case> {
             ),
         ),
         case(
+            "Metashape",
+            |folder| {
+                write(folder.join("images/1.jpg"), "");
+                write(folder.join("cameras.xml"), "<?xml?>\n<document version=\"2\"><chunk/>");
+            },
+            Expected::Refused(
+                "dataset: DIR: no data set; found a Metashape export (DIR/cameras.xml), which is not supported; convert: ns-process-data metashape --xml 'DIR/cameras.xml' --data 'DIR/images' --output-dir 'DIR-nerfstudio'",
+            ),
+        ),
+        case(
+            "RealityCapture",
+            |folder| {
+                write(folder.join("c.csv"), "#cameras 2\n#name,x,y,alt,heading,pitch,roll,f\n");
+            },
+            Expected::Refused(
+                "dataset: DIR: no data set; found a RealityCapture export (DIR/c.csv), which is not supported; convert: ns-process-data realitycapture --csv 'DIR/c.csv' --data 'DIR' --output-dir 'DIR-nerfstudio'",
+            ),
+        ),
+        case(
             "Record3D",
             |folder| {
                 write(folder.join("x/EXR_RGBD/metadata.json"), "{}");
@@ -223,9 +300,10 @@ fn name_cases() -> Vec<Case> {
 
 pub(crate) fn cases() -> Vec<Case> {
     let mut cases = vec![case(
-        "depth images that are missing",
+        "depth images that are missing, or PNG",
         |folder| {
             let mut list = transforms("images/a#.png", 3);
+            list["frames"][0]["depth_file_path"] = json!("images/a0.png");
             list["frames"][1]["depth_file_path"] = json!("depth/a1.png");
             write_photographs(folder, "images/a#.png", 3);
             write_transforms(folder, &list);
@@ -235,10 +313,11 @@ pub(crate) fn cases() -> Vec<Case> {
             3,
             &[
                 "transforms.json (instant-ngp, nerfstudio): 3 photographs",
-                "1 depth image (depth_file_path) cannot be read (first: depth/a1.png); only EXR depth is used",
+                "2 depth images are not used (depth_file_path, first: images/a0.png); only EXR depth is",
             ],
         )),
     )];
+    cases.extend(place_cases());
     cases.extend(model_cases());
     cases.extend(llff_cases());
     cases.extend(name_cases());

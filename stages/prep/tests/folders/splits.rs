@@ -62,7 +62,7 @@ pub(crate) fn cases() -> Vec<Case> {
                 [0],
                 &[
                     r"1 file name found with slashes instead of backslashes (first: images\a_4.png is images/a_4.png)",
-                    "1 file name found without the first part of absolute paths (first: /x/images/a_5.png is images/a_5.png)",
+                    "1 file name found without the first part of their paths (first: /x/images/a_5.png is images/a_5.png)",
                     "1 file name found with a different extension (first: images/A_6 is images/a_6.png)",
                     "1 file name found in a different case (first: images/A_6 is images/a_6.png)",
                     "6 of 10 frames are listed for neither training nor testing",

@@ -94,6 +94,11 @@ impl Reason {
         Self(format!("{position}: {self}"))
     }
 
+    /// Adds what to do.
+    pub(crate) fn with_remedy(self, remedy: &str) -> Self {
+        Self(format!("{self}; {remedy}"))
+    }
+
     /// Returns the reason for a missing or unusable image, mask or depth image.
     pub(crate) fn unusable(problem: &FileProblem, remedy: &str) -> Self {
         let is_ignored = matches!(problem, FileProblem::IgnoredName { .. });

@@ -112,6 +112,21 @@ pub(crate) fn visible_entries(folder: &Path) -> Vec<PathBuf> {
     paths
 }
 
+/// Returns the folders in a folder, sorted, without hidden ones.
+pub(crate) fn sub_folders(folder: &Path) -> Vec<PathBuf> {
+    visible_entries(folder).into_iter().filter(|path| path.is_dir()).collect()
+}
+
+pub(crate) fn parent_folder(path: &Path) -> PathBuf {
+    let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    parent.unwrap_or(Path::new(".")).to_path_buf()
+}
+
+/// Returns the last part of a path; empty if there is none in UTF-8.
+pub(crate) fn name_text(path: &Path) -> &str {
+    path.file_name().and_then(|name| name.to_str()).unwrap_or_default()
+}
+
 /// Fails if a path is, or leads through, a link that can't be followed.
 pub(crate) fn check_link(path: &Path) -> Result<(), DatasetError> {
     match file_status(path, "a folder") {

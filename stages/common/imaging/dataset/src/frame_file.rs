@@ -3,7 +3,9 @@
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
-use artifact::{format_count, shortened};
+use artifact::shortened;
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
 
 use crate::error::{DatasetError, Reason};
 use crate::file_status::FileProblem;
@@ -13,8 +15,11 @@ use crate::masks::{MaskFile, MaskKind};
 use crate::number::quote_python_numbers;
 use crate::photograph::is_exr;
 use crate::split::{FrameNames, SplitLists};
-use crate::text::read_text;
+use crate::text::{counted_with_verb, read_text};
 use crate::transforms::{FrameEntry, Transforms, read_frame};
+
+/// Remedy for images above the folder of the file that lists them.
+const GIVE_FOLDER_ABOVE: &str = "move this file to the folder above, and give that folder";
 
 /// Treatment of frames whose image doesn't exist.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -29,6 +34,7 @@ pub(crate) enum MissingImages {
 pub(crate) struct FrameFile {
     path: PathBuf,
     transforms: Transforms,
+    frames: Vec<FrameEntry>,
 }
 
 /// Frames of a file, and names of files that can't be read.
@@ -38,8 +44,8 @@ pub(crate) struct ReadFrames {
     pub(crate) names: FrameNames,
     /// Skipped frames whose image doesn't exist.
     missing: CountedNames,
-    /// Unreadable depth images in formats that aren't used anyway.
-    unread_depths: CountedNames,
+    /// Depth images that aren't EXR, missing ones included.
+    unused_depths: CountedNames,
 }
 
 /// Number of files, and the name of the first.
@@ -60,7 +66,7 @@ impl CountedNames {
 pub(crate) fn lookup_of(folder: &Path, files: &[&FrameFile]) -> Lookup {
     let (mut names, mut repeated): (Vec<&str>, Vec<&str>) = Default::default();
     for file in files {
-        for frame in &file.transforms.frames {
+        for frame in &file.frames {
             names.push(&frame.file_path);
             names.extend(frame.mask_path.as_deref());
             names.extend(frame.depth_file_path.as_deref());
@@ -81,22 +87,35 @@ impl ReadFrames {
         ))
     }
 
-    /// Returns the note on unreadable depth images, if any.
+    /// Returns the note on unused depth images, if any.
     pub(crate) fn depth_note(&self) -> Option<String> {
-        let first = self.unread_depths.first.as_ref()?;
-        let count = format_count(self.unread_depths.count, "depth image");
-        Some(format!(
-            "{count} (depth_file_path) cannot be read (first: {first}); only EXR depth is used"
-        ))
+        let first = self.unused_depths.first.as_ref()?;
+        let unused = counted_with_verb(self.unused_depths.count, "depth image", ["is", "are"]);
+        Some(format!("{unused} not used (depth_file_path, first: {first}); only EXR depth is"))
     }
 }
 
 impl FrameFile {
     /// Parses a file.
     pub(crate) fn read(path: &Path) -> Result<Self, DatasetError> {
-        let transforms = parse(&read_text(path)?)
-            .map_err(|e| DatasetError::format(path, Reason::new(json_message(&e))))?;
-        Ok(Self { path: path.to_path_buf(), transforms })
+        let text = read_text(path)?;
+        let file_error = |reason: Reason| DatasetError::format(path, reason);
+        if text.trim().is_empty() {
+            return Err(file_error(Reason::new("file is empty")));
+        }
+        let value = parse(&text).map_err(|error| file_error(Reason::new(json_message(&error))))?;
+        let mut transforms: Transforms =
+            from_object(&value, &json!({"frames": []})).map_err(file_error)?;
+        let required = json!({"file_path": "", "transform_matrix": []});
+        let (values, mut frames) = (std::mem::take(&mut transforms.frames), Vec::new());
+        for (index, value) in values.iter().enumerate() {
+            let frame = from_object(value, &required);
+            frames.push(frame.map_err(|reason| {
+                let name = value.get("file_path").and_then(Value::as_str).unwrap_or("unnamed");
+                DatasetError::frame(path, index, name, reason)
+            })?);
+        }
+        Ok(Self { path: path.to_path_buf(), transforms, frames })
     }
 
     /// Returns the path of the file.
@@ -127,10 +146,14 @@ impl FrameFile {
         on_missing: MissingImages,
     ) -> Result<ReadFrames, DatasetError> {
         let (mut read, mut labels) = (ReadFrames::default(), Vec::new());
-        for (index, entry) in self.transforms.frames.iter().enumerate() {
+        for (index, entry) in self.frames.iter().enumerate() {
             let frame_error =
                 |reason| DatasetError::frame(&self.path, index, &entry.file_path, reason);
-            let located = lookup.find(&entry.file_path).map_err(|e| frame_error(e.into()))?;
+            let located = lookup.find(&entry.file_path).map_err(|error| {
+                let reason = Reason::from(error);
+                let is_above = entry.file_path.starts_with("../");
+                frame_error(if is_above { reason.with_remedy(GIVE_FOLDER_ABOVE) } else { reason })
+            })?;
             let file = match located {
                 Located::File(file) => file,
                 Located::Missing(problem) if on_missing == MissingImages::Refused => {
@@ -151,7 +174,7 @@ impl FrameFile {
             let mut frame = read_frame(image, entry, shared).map_err(frame_error)?;
             frame.mask = find_mask(lookup, entry).map_err(frame_error)?;
             frame.depth_file =
-                find_depth(lookup, entry, &mut read.unread_depths).map_err(frame_error)?;
+                find_depth(lookup, entry, &mut read.unused_depths).map_err(frame_error)?;
             read.names.add(read.frames.len(), &entry.file_path, file.path);
             read.frames.push(frame);
             labels.push(file.label);
@@ -182,15 +205,17 @@ fn find_mask(lookup: &mut Lookup, entry: &FrameEntry) -> Result<Option<MaskFile>
 fn find_depth(
     lookup: &mut Lookup,
     entry: &FrameEntry,
-    unread: &mut CountedNames,
+    unused: &mut CountedNames,
 ) -> Result<Option<PathBuf>, Reason> {
     let Some(name) = &entry.depth_file_path else { return Ok(None) };
     match lookup.find(name) {
-        Ok(Located::File(file)) => {
-            Ok(Some(lookup.root().join(file.path)).filter(|path| is_exr(path)))
+        Ok(Located::File(file)) if is_exr(&file.path) => Ok(Some(lookup.root().join(file.path))),
+        Ok(Located::File(_)) => {
+            unused.add(name);
+            Ok(None)
         }
         Ok(Located::Missing(_) | Located::Unusable(_)) | Err(_) if !is_exr(Path::new(name)) => {
-            unread.add(name);
+            unused.add(name);
             Ok(None)
         }
         Ok(Located::Missing(problem) | Located::Unusable(problem)) => Err(unusable_entry(&problem)),
@@ -211,9 +236,25 @@ fn json_message(error: &serde_json::Error) -> String {
     }
 }
 
+/// Converts a JSON object; an error names the key. `required` is an object with the required keys
+/// alone: flattened structures lose the position of an error.
+fn from_object<T: DeserializeOwned>(value: &Value, required: &Value) -> Result<T, Reason> {
+    let reason = |error: serde_json::Error| Reason::new(shortened(&error.to_string()));
+    T::deserialize(value).map_err(|error| {
+        for (key, value) in value.as_object().into_iter().flatten() {
+            let mut single = required.clone();
+            single[key] = value.clone();
+            if let Err(error) = T::deserialize(&single) {
+                return reason(error).at(shortened(key));
+            }
+        }
+        reason(error)
+    })
+}
+
 /// Parses the JSON. Python's `NaN` and `Infinity` are accepted as numbers, so that the later error
 /// names the frame.
-fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
+fn parse(text: &str) -> Result<Value, serde_json::Error> {
     serde_json::from_str(text).or_else(|error| match quote_python_numbers(text) {
         Some(readable) => serde_json::from_str(&readable).map_err(|_| error),
         None => Err(error),

@@ -6,6 +6,15 @@ use serde_json::Value;
 use crate::error::Reason;
 use crate::number::Number;
 
+/// Names of camera models; case is ignored.
+const PERSPECTIVE_MODELS: [&str; 6] =
+    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"];
+const RATIONAL_MODEL: &str = "FULL_OPENCV";
+const FISHEYE_MODELS: [&str; 5] =
+    ["OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"];
+/// Names of panoramas in longitude and latitude.
+const PANORAMAS: [&str; 2] = ["equirectangular", "latlong"];
+
 /// Lens of all frames of a `transforms.json`, or of one, with instant-ngp's and nerfstudio's keys.
 #[derive(Clone, Default, Deserialize)]
 pub(crate) struct LensEntry {
@@ -88,16 +97,15 @@ impl LensEntry {
                 .map(|coefficient| coefficient.map_or(0.0, |number| number.0));
         let tangential = [p1, p2];
         let model = self.camera_model.as_deref().unwrap_or("OPENCV");
-        let (is_fisheye, is_rational) = match model {
-            "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL"
-            | "PERSPECTIVE" => (self.is_fisheye == Some(true), k5 != 0.0 || k6 != 0.0),
-            "FULL_OPENCV" => (self.is_fisheye == Some(true), true),
-            "OPENCV_FISHEYE"
-            | "SIMPLE_RADIAL_FISHEYE"
-            | "RADIAL_FISHEYE"
-            | "SIMPLE_FISHEYE"
-            | "FISHEYE" => (true, false),
-            _ => return Err(unsupported_model(model)),
+        let is_in = |models: &[&str]| models.iter().any(|name| name.eq_ignore_ascii_case(model));
+        let (is_fisheye, is_rational) = if is_in(&PERSPECTIVE_MODELS) {
+            (self.is_fisheye == Some(true), k5 != 0.0 || k6 != 0.0)
+        } else if is_in(&[RATIONAL_MODEL]) {
+            (self.is_fisheye == Some(true), true)
+        } else if is_in(&FISHEYE_MODELS) {
+            (true, false)
+        } else {
+            return Err(unsupported_model(model));
         };
         let radial = [k1, k2, k3, k4];
         Ok(if is_fisheye {
@@ -127,8 +135,14 @@ impl LensEntry {
 
 /// Returns the reason for a camera model that isn't supported.
 fn unsupported_model(model: &str) -> Reason {
-    Reason::new(format!(
-        "camera_model {:?} is not supported; undistort the images first (colmap image_undistorter)",
-        shortened(model)
-    ))
+    let remedy = if PANORAMAS.iter().any(|name| name.eq_ignore_ascii_case(model)) {
+        "cut the panoramas into views and estimate their cameras: ns-process-data images \
+        --camera-type equirectangular"
+            .to_owned()
+    } else {
+        let known = [&PERSPECTIVE_MODELS[..], &[RATIONAL_MODEL], &FISHEYE_MODELS].concat();
+        let known = known.join(", ");
+        format!("undistort the images first (colmap image_undistorter); supported are {known}")
+    };
+    Reason::new(format!("camera_model {:?} is not supported; {remedy}", shortened(model)))
 }

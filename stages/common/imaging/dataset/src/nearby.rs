@@ -4,9 +4,12 @@ use std::path::{Path, PathBuf};
 
 use artifact::nearest;
 
-use crate::file_status::{path_text, visible_entries};
+use crate::colmap;
+use crate::conversion::{find_export, find_packed, packed_text};
+use crate::file_status::{name_text, parent_folder, path_text, sub_folders, visible_entries};
 use crate::find_format;
 use crate::format::Format;
+use crate::photograph::is_image_name;
 
 /// Maximum number of folders two levels below that are searched: a home folder may have many.
 /// Chosen by hand.
@@ -22,19 +25,16 @@ pub(crate) fn find_nearby(folder: &Path) -> Option<String> {
     if folder.is_file() {
         let parent = parent_folder(folder);
         let parent = path_text(&parent);
-        return Some(format!("expected a folder, found a file; give its folder {parent}"));
+        return packed_text(folder).or_else(|| {
+            Some(format!("expected a folder, found a file; give its folder {parent}"))
+        });
     }
     find_export(folder)
         .or_else(|| find_misnamed(folder))
         .or_else(|| find_below(folder))
         .or_else(|| find_above(folder))
-}
-
-/// Describes an export of an application, identified by the file or folder `sign`; `remedy`
-/// converts the export.
-fn export_text(application: &str, sign: &Path, remedy: &str) -> String {
-    let sign = path_text(sign);
-    format!("found a {application} export ({sign}), which is not supported; {remedy}")
+        .or_else(|| find_model(folder))
+        .or_else(|| find_packed(folder))
 }
 
 /// Describes data sets in other folders; `None` if there are none.
@@ -47,84 +47,6 @@ fn sets_text(sets: &[(PathBuf, Format)]) -> Option<String> {
     let more = if more > 0 { format!(" and {more} more") } else { String::new() };
     let choice = if sets.len() == 1 { "that folder" } else { "one of these folders" };
     (!sets.is_empty()).then(|| format!("found {}{more}; give {choice}", listed.join(", ")))
-}
-
-fn parent_folder(path: &Path) -> PathBuf {
-    let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
-    parent.unwrap_or(Path::new(".")).to_path_buf()
-}
-
-fn sub_folders(folder: &Path) -> Vec<PathBuf> {
-    visible_entries(folder).into_iter().filter(|path| path.is_dir()).collect()
-}
-
-fn name_text(path: &Path) -> &str {
-    path.file_name().and_then(|name| name.to_str()).unwrap_or_default()
-}
-
-fn has_extension(path: &Path, extension: &str) -> bool {
-    path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension))
-}
-
-/// Recognises exports of Polycam and Record3D, also in a folder's only sub-folder, as in an
-/// archive.
-fn find_export(folder: &Path) -> Option<String> {
-    let mut candidates = vec![folder.to_path_buf()];
-    if let [only] = &sub_folders(folder)[..] {
-        candidates.push(only.clone());
-    }
-    candidates.iter().find_map(|folder| find_polycam(folder).or_else(|| find_record3d(folder)))
-}
-
-fn find_polycam(folder: &Path) -> Option<String> {
-    let (data, keyframes) = if name_text(folder) == "keyframes" {
-        (parent_folder(folder), folder.to_path_buf())
-    } else {
-        (folder.to_path_buf(), folder.join("keyframes"))
-    };
-    let mut cameras = ["corrected_cameras", "cameras"].map(|name| keyframes.join(name)).into_iter();
-    let sign =
-        cameras.find(|path| visible_entries(path).iter().any(|e| has_extension(e, "json")))?;
-    Some(export_text("Polycam", &sign, &conversion("polycam", &data)))
-}
-
-fn find_record3d(folder: &Path) -> Option<String> {
-    let [has_exr, has_rgbd, has_rgb, has_depth, has_metadata, has_json] =
-        ["EXR_RGBD", "rgbd", "rgb", "depth", "metadata", "metadata.json"]
-            .map(|name| folder.join(name).exists());
-    let sign = if has_exr {
-        folder.join("EXR_RGBD")
-    } else if has_rgbd && has_metadata {
-        folder.join("rgbd")
-    } else if has_rgb && has_depth && (has_json || has_metadata) {
-        folder.join("rgb")
-    } else {
-        visible_entries(folder).into_iter().find(|path| has_extension(path, "r3d"))?
-    };
-    let data = if has_exr { sign.clone() } else { folder.to_path_buf() };
-    let command = conversion("record3d", &data);
-    let is_video = has_extension(&sign, "r3d") || name_text(&sign) == "rgbd";
-    let remedy = if is_video {
-        format!("export it from Record3D as EXR + JPG sequence, then {command}")
-    } else {
-        command
-    };
-    Some(export_text("Record3D", &sign, &remedy))
-}
-
-/// Returns nerfstudio's command that converts an application's export to a data set.
-fn conversion(application: &str, data: &Path) -> String {
-    let mut output = data.as_os_str().to_owned();
-    output.push("-nerfstudio");
-    format!(
-        "convert: ns-process-data {application} --data {} --output-dir {}",
-        shell_quoted(data),
-        shell_quoted(Path::new(&output))
-    )
-}
-
-fn shell_quoted(path: &Path) -> String {
-    format!("'{}'", path_text(path).replace('\'', r"'\''"))
 }
 
 /// Recognises files and folders whose name is similar to a name that a data set uses.
@@ -148,13 +70,35 @@ fn find_misnamed(folder: &Path) -> Option<String> {
     None
 }
 
-/// True if a folder or a sub-folder has COLMAP's list of images.
+/// True if a folder or a sub-folder has a COLMAP model.
 fn has_model(folder: &Path) -> bool {
-    has_image_list(folder) || sub_folders(folder).iter().any(|path| has_image_list(path))
+    colmap::is_model(folder) || sub_folders(folder).iter().any(|path| colmap::is_model(path))
 }
 
-fn has_image_list(folder: &Path) -> bool {
-    ["images.bin", "images.txt"].iter().any(|name| folder.join(name).is_file())
+/// Finds a COLMAP model outside `sparse`, at most three levels below a folder, and the folder's
+/// images. 3D Gaussian Splatting has `distorted/sparse/0` next to `input`.
+fn find_model(folder: &Path) -> Option<String> {
+    let near = sub_folders(folder);
+    let mut level = near.clone();
+    let mut model = None;
+    for _ in 0..3 {
+        model = model.or_else(|| level.iter().find(|path| colmap::is_model(path)).cloned());
+        level = level.iter().flat_map(|path| sub_folders(path)).take(MAX_FOLDERS).collect();
+    }
+    let relative = |path: &Path| path_text(path.strip_prefix(folder).unwrap_or(path));
+    let found = format!("found a COLMAP model in {}", relative(&model?));
+    let has_images = |path: &&PathBuf| visible_entries(path).iter().any(|f| is_image_name(f));
+    let own = [folder.join("images"), folder.to_path_buf()];
+    if own.iter().find(has_images).is_some() {
+        return Some(format!("{found}; move it to sparse/0"));
+    }
+    Some(match near.iter().find(has_images) {
+        Some(images) => format!(
+            "{found} and images in {}; rename these folders sparse/0 and images",
+            relative(images)
+        ),
+        None => format!("{found}, but no images; put the model in sparse/0 next to images"),
+    })
 }
 
 /// Finds data sets one level below a folder, otherwise two levels below.
@@ -179,8 +123,10 @@ fn find_above(folder: &Path) -> Option<String> {
 fn sets_of(folders: &[PathBuf]) -> Vec<(PathBuf, Format)> {
     let mut sets = Vec::new();
     for folder in folders {
-        // Folders that can't be read are not suggested.
-        if let Ok(Some(format)) = find_format(folder) {
+        // Folders that can't be read, and models without their images, are not suggested.
+        if let Ok(Some(format)) = find_format(folder)
+            && (format != Format::Colmap || colmap::has_photographs(folder))
+        {
             sets.push((folder.clone(), format));
         }
     }

@@ -3,6 +3,7 @@ use std::path::{Path, PathBuf};
 use artifact::{format_count, format_number};
 use scene::{CameraError, Intrinsics};
 use serde::Deserialize;
+use serde_json::Value;
 
 use crate::dataset::Dataset;
 use crate::error::{DatasetError, Reason};
@@ -13,12 +14,13 @@ use crate::lens_entry::LensEntry;
 use crate::number::Number;
 use crate::photograph::{ImageHeader, fit_camera, read_header};
 
-/// Content of `transforms.json`; `shared` contains defaults for all frames.
+/// Content of `transforms.json`; `shared` contains defaults for all frames, which are parsed one by
+/// one.
 #[derive(Deserialize)]
 pub(crate) struct Transforms {
     #[serde(flatten)]
     pub(crate) shared: LensEntry,
-    pub(crate) frames: Vec<FrameEntry>,
+    pub(crate) frames: Vec<Value>,
     /// File names of nerfstudio's split.
     pub(crate) train_filenames: Option<Vec<String>>,
     pub(crate) test_filenames: Option<Vec<String>>,
@@ -30,8 +32,8 @@ pub(crate) struct FrameEntry {
     pub(crate) file_path: String,
     pub(crate) mask_path: Option<String>,
     pub(crate) depth_file_path: Option<String>,
-    /// Pose, row by row; `None` is `null`, which some programs write for NaN.
-    transform_matrix: Vec<Vec<Option<Number>>>,
+    /// Pose, row by row.
+    transform_matrix: Value,
     #[serde(flatten)]
     own: LensEntry,
 }
@@ -65,23 +67,57 @@ pub(crate) fn read_frame(
     entry: &FrameEntry,
     shared: &LensEntry,
 ) -> Result<Frame, Reason> {
-    let mut camera_to_world = [[0.0; 4]; 3];
-    let matrix = &entry.transform_matrix;
-    if !(3..=4).contains(&matrix.len()) || matrix.iter().any(|row| row.len() != 4) {
-        return Err(Reason::new("transform_matrix must have 4 rows of 4 numbers"));
-    }
-    for (row, values) in camera_to_world.iter_mut().enumerate() {
-        for (column, value) in values.iter_mut().enumerate() {
-            *value = matrix[row][column].map_or(f64::NAN, |number| number.0);
-        }
-    }
+    let rows = matrix_rows(&entry.transform_matrix);
+    let (camera_to_world, last) = match rows.as_deref() {
+        Some([x, y, z]) => ([*x, *y, *z], None),
+        Some([x, y, z, last]) => ([*x, *y, *z], Some(*last)),
+        _ => return Err(Reason::new("transform_matrix must have 4 rows of 4 numbers")),
+    };
     let fitted = intrinsics(&entry.own.or(shared), read_header(&image)?)?;
     let frame = Frame::new(image, fitted, camera_to_world);
     match frame.check() {
-        Ok(()) => Ok(frame),
+        Ok(()) => last.map_or(Ok(()), check_last_row).map(|()| frame),
         Err(CameraError::Intrinsics(problem)) => Err(Reason::new(problem)),
         Err(CameraError::Pose(problem)) => Err(Reason::new(problem).at("transform_matrix")),
     }
+}
+
+/// Returns a matrix's rows of 4 numbers, written as lists or as one flat list; `None` for anything
+/// else. `null`, which some programs write for NaN, is NaN.
+fn matrix_rows(matrix: &Value) -> Option<Vec<[f64; 4]>> {
+    let mut numbers = Vec::new();
+    let rows = matrix.as_array()?;
+    let is_flat = !rows.iter().any(Value::is_array);
+    for row in rows {
+        let values = if is_flat { std::slice::from_ref(row) } else { row.as_array()? };
+        if !is_flat && values.len() != 4 {
+            return None;
+        }
+        for value in values {
+            let number = Option::<Number>::deserialize(value).ok()?;
+            numbers.push(number.map_or(f64::NAN, |number| number.0));
+        }
+    }
+    let (rows, rest) = numbers.as_chunks::<4>();
+    rest.is_empty().then(|| rows.to_vec())
+}
+
+/// Maximum error of a matrix's last row: numbers with four decimals.
+const MAX_ROW_ERROR: f64 = 1e-4;
+
+/// Fails if a matrix's last row isn't (0, 0, 0, 1).
+fn check_last_row(row: [f64; 4]) -> Result<(), Reason> {
+    if row
+        .iter()
+        .zip([0.0, 0.0, 0.0, 1.0])
+        .all(|(found, value)| (found - value).abs() <= MAX_ROW_ERROR)
+    {
+        return Ok(());
+    }
+    let row = row.map(format_number).join(" ");
+    let problem = format!("last row is {row}, not 0 0 0 1");
+    let remedy = "is the matrix transposed (column-major)?";
+    Err(Reason::new(problem).with_remedy(remedy).at("transform_matrix"))
 }
 
 /// Returns an image's intrinsics and the treatment of its EXIF orientation.
@@ -126,9 +162,11 @@ fn focal_length(
         }
         (None, Some(Number(angle))) => {
             let focal = 0.5 / (0.5 * angle).tan();
+            let angle_is_large = angle > std::f64::consts::PI;
             let [angle, focal] = [angle, focal].map(format_number);
             let problem = format!("{name} is {angle}: focal length {focal}");
-            Err(Reason::new(format!("{problem}; the angle must be between 0 and π")))
+            let unit = if angle_is_large { " (is it in degrees?)" } else { "" };
+            Err(Reason::new(format!("{problem}; the angle must be between 0 and π{unit}")))
         }
         (None, None) => Ok(None),
     }
@@ -241,6 +279,17 @@ mod tests {
         assert_eq!(read(&frames(r#""fl_x": 50"#, "")).unwrap().split, None);
     }
 
+    #[test]
+    fn flat_matrices_are_read_row_by_row() {
+        let head = r#""fl_x": 50"#;
+        let rows = read(&frames(head, "")).unwrap().frames;
+        for flat in ["[1,0,0,0,0,1,0,0,0,0,1,4,0,0,0,1]", "[1,0,0,0,0,1,0,0,0,0,1,4]"] {
+            let json = frames(head, "").replace(POSE, &format!(r#""transform_matrix": {flat}"#));
+            let found = read(&json).unwrap().frames;
+            assert_eq!(found[0].camera_to_world, rows[0].camera_to_world);
+        }
+    }
+
     fn lens(head: &str) -> Distortion {
         read(&frames(&format!(r#""fl_x": 50, {head}"#), "")).unwrap().frames[0]
             .lens_intrinsics
@@ -263,6 +312,7 @@ mod tests {
             ("", brown),
             (r#""camera_model": "OPENCV", "is_fisheye": false,"#, brown),
             (r#""camera_model": "PINHOLE","#, brown),
+            (r#""camera_model": "Opencv","#, brown),
             (r#""camera_model": "FULL_OPENCV","#, rational(0.0, 0.0)),
             (r#""camera_model": "FULL_OPENCV", "k5": 0.5, "k6": 0.25,"#, rational(0.5, 0.25)),
             (r#""camera_model": "OPENCV", "k6": 0.25,"#, rational(0.0, 0.25)),
@@ -282,21 +332,67 @@ mod tests {
         for (head, first, expected) in [
             (r#""w": 40"#, "", "no focal length"),
             (r#""fl_x": -5"#, "", "fx is -5"),
-            (r#""fl_x": 50, "camera_model": "EQUIRECTANGULAR""#, "", "\"EQUIRECTANGULAR\" is not"),
-            (r#""fl_x": 50, "camera_model": "FISHEYE624""#, "", "\"FISHEYE624\" is not supported"),
+            (
+                r#""fl_x": 50, "camera_model": "EQUIRECTANGULAR""#,
+                "",
+                "--camera-type equirectangular",
+            ),
+            (
+                r#""fl_x": 50, "camera_model": "FISHEYE624""#,
+                "",
+                "\"FISHEYE624\" is not supported; undistort",
+            ),
             (r#""fl_x": 50, "latlong": true"#, "", "latlong"),
             (r#""fl_x": 50, "k4": Infinity"#, "", "k4 inf"),
             (r#""fl_x": 50, "w": 40, "h": 40"#, "", "aspect ratios must match"),
             (r#""fl_x": 50, "w": 0"#, "", "w is 0"),
             (r#""fl_x": 50"#, r#""mask_path": "masks/a.png","#, "masks/a.png not found"),
             (r#""fl_x": 50"#, r#""mask_path": "../a.png","#, "not a path inside"),
-            (r#""camera_angle_x": 7"#, "", "between 0 and π"),
+            (r#""camera_angle_x": 7"#, "", "between 0 and π (is it in degrees?)"),
+            (r#""camera_angle_x": -1"#, "", "between 0 and π"),
+            (r#""fl_x": 50"#, r#""k1": [1],"#, "k1: invalid type: sequence, expected a number"),
+            (r#""fl_x": 50"#, r#""mask_path": 7,"#, "mask_path: invalid type: integer `7`"),
         ] {
             let message = read(&frames(head, first)).unwrap_err().to_string();
             assert!(
                 message.contains(expected) && message.contains("frame 0 (images/a.png)"),
                 "{message}"
             );
+        }
+        for (pose, expected) in [
+            (
+                "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,2.5,3,1]]",
+                "transform_matrix: last row is 1 2.5 3 1, not 0 0 0 1; is the matrix transposed",
+            ),
+            (
+                "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,null]]",
+                "transform_matrix: last row is 0 0 0 NaN, not",
+            ),
+            ("[[1,0,0],[0,1,0],[0,0,1]]", "transform_matrix must have 4 rows of 4 numbers"),
+            ("[1,0,0,0,1,0,0,0,1]", "transform_matrix must have 4 rows of 4 numbers"),
+            ("{}", "transform_matrix must have 4 rows of 4 numbers"),
+        ] {
+            let json = frames(r#""fl_x": 50"#, "")
+                .replace(POSE, &format!(r#""transform_matrix": {pose}"#));
+            let message = read(&json).unwrap_err().to_string();
+            assert!(message.contains(&format!("frame 0 (images/a.png): {expected}")), "{message}");
+        }
+        for (json, expected) in [
+            ("", "transforms.json: file is empty"),
+            ("[]", "transforms.json: invalid type: sequence, expected struct"),
+            (
+                r#"{"frames": [{"file_path": "a.png"}]}"#,
+                "frame 0 (a.png): missing field `transform_matrix`",
+            ),
+            (
+                r#"{"frames": [{"transform_matrix": []}]}"#,
+                "frame 0 (unnamed): missing field `file_path`",
+            ),
+            (r#"{"frames": [1]}"#, "frame 0 (unnamed): invalid type: integer `1`, expected struct"),
+            (r#"{"fl_x": "wide", "frames": []}"#, "transforms.json: fl_x: invalid type: string"),
+        ] {
+            let message = read(json).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
         }
         let missing = r#"{"fl_x": 50, "frames": [{"file_path": "x.png", "transform_matrix": []}]}"#;
         assert!(

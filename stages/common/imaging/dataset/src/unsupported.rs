@@ -84,8 +84,9 @@ pub(crate) fn unsupported_error(path: &Path) -> Option<PixelError> {
     let is_read = File::open(path).and_then(|mut file| file.read_exact(&mut bytes)).is_ok();
     let format = UnsupportedFormat::from_signature(&bytes).filter(|_| is_read);
     let format = format.or_else(|| UnsupportedFormat::from_name(path))?;
+    let article = if format.name.starts_with('A') { "an" } else { "a" };
     Some(PixelError::Unsupported(format!(
-        "{} is a {} image, which is not supported; convert: {}",
+        "{} is {article} {} image, which is not supported; convert: {}",
         path.display(),
         format.name,
         format.command([path].into_iter())
@@ -130,7 +131,8 @@ mod tests {
             let path = dir.path().join(name);
             std::fs::write(&path, bytes).unwrap();
             let message = unsupported_error(&path).unwrap().to_string();
-            assert!(message.contains(&format!("{name} is a {format} image")), "{message}");
+            let article = if format == "AVIF" { "an" } else { "a" };
+            assert!(message.contains(&format!("{name} is {article} {format} image")), "{message}");
         }
         let png = dir.path().join("d.png");
         std::fs::write(&png, b"\x89PNG\r\n\x1a\n\0\0\0\0").unwrap();

@@ -261,12 +261,13 @@ fn read_failure(folder: &Path, error: &DatasetError) -> Failure {
     if !error.is_unrecognised() || images.files.is_empty() {
         return Failure::BadInput(error.to_string());
     }
-    Failure::BadInput(format!(
-        "{}: {}, but no cameras; estimate them with COLMAP: {}",
-        folder.display(),
-        images.summary(),
-        images.colmap_instructions(folder)
-    ))
+    let remedy = if images.files.len() == 1 {
+        "give several photographs, taken from different positions".to_owned()
+    } else {
+        format!("estimate them with COLMAP: {}", images.colmap_instructions(folder))
+    };
+    let (folder, summary) = (folder.display(), images.summary());
+    Failure::BadInput(format!("{folder}: {summary}, but no cameras; {remedy}"))
 }
 
 #[cfg(test)]

@@ -95,6 +95,26 @@ fn no_target_is_missing() {
 }
 
 #[test]
+fn images_without_cameras_come_with_a_command() {
+    for (subfolder, count, expected) in [
+        ("images", 2, "2 images, but no cameras; estimate them with COLMAP: `colmap "),
+        ("", 2, "estimate them with COLMAP: move them to 'DIR/images', then `colmap "),
+        ("photos", 2, "COLMAP: rename 'DIR/photos' 'DIR/images', then `colmap "),
+        ("rgb", 1, "1 image, but no cameras; give several photographs, taken from different"),
+    ] {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join(subfolder);
+        fs::create_dir_all(&folder).unwrap();
+        for number in 0..count {
+            fs::write(folder.join(format!("{number}.jpg")), "").unwrap();
+        }
+        let error = Starter::new(dir.path(), Path::new("pipeline.yaml")).unwrap_err().to_string();
+        let expected = expected.replace("DIR", &dir.path().display().to_string());
+        assert!(error.contains(&expected), "{error}");
+    }
+}
+
+#[test]
 fn experiments_run_on_the_pipelines_own_scene() {
     let text = "experiment:\n  scenes: [lego, chair]\n    inputs: {dataset: demo-scene}\n";
     for (dataset, expected) in

@@ -5,21 +5,27 @@ use std::path::{Path, PathBuf};
 use artifact::format_count;
 use dataset::{is_image_name, is_unsupported_name, unsupported_summary};
 
-/// Images of a folder, or of its subfolder `images`.
+/// Names of folders for images; COLMAP's format expects them in the first. The empty name is that
+/// of the data set's folder itself.
+const FOLDERS: [&str; 6] = ["images", "", "image", "input", "photos", "rgb"];
+
+/// Images of a folder, or of a subfolder for images.
 pub(crate) struct UnposedImages {
     /// Paths, sorted.
     pub(crate) files: Vec<PathBuf>,
-    /// True if the images are in `images`, where COLMAP's format expects them.
-    in_subfolder: bool,
+    /// Name of the subfolder, one of [`FOLDERS`].
+    subfolder: &'static str,
 }
 
 impl UnposedImages {
     pub(crate) fn find(folder: &Path) -> Self {
-        let files = list_images(&folder.join("images"));
-        if !files.is_empty() {
-            return Self { files, in_subfolder: true };
+        for subfolder in FOLDERS {
+            let files = list_images(&folder.join(subfolder));
+            if !files.is_empty() {
+                return Self { files, subfolder };
+            }
         }
-        Self { files: list_images(folder), in_subfolder: false }
+        Self { files: Vec::new(), subfolder: "" }
     }
 
     /// Returns the number of images as text, with the command that converts images of unsupported
@@ -35,10 +41,10 @@ impl UnposedImages {
     /// Returns the instructions for estimating cameras with COLMAP.
     pub(crate) fn colmap_instructions(&self, folder: &Path) -> String {
         let folder = folder.display().to_string().replace('\'', r"'\''");
-        let moved = if self.in_subfolder {
-            String::new()
-        } else {
-            format!("move them to '{folder}/images', then ")
+        let moved = match self.subfolder {
+            "images" => String::new(),
+            "" => format!("move them to '{folder}/images', then "),
+            other => format!("rename '{folder}/{other}' '{folder}/images', then "),
         };
         format!(
             "{moved}`colmap automatic_reconstructor --workspace_path '{folder}' --image_path \

@@ -5,25 +5,35 @@ mod camera;
 mod model;
 mod points;
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use artifact::format_count;
+use artifact::{WARNING, format_count, relative_path};
 use scene::Intrinsics;
 
 use crate::dataset::Dataset;
 use crate::error::{DatasetError, Problem, Reason};
-use crate::file_status::{check_link, is_file, visible_entries};
+use crate::file_status::{check_link, is_file, name_text, path_text, sub_folders, visible_entries};
 use crate::format::Format;
 use crate::frame::assign_names;
 use crate::lookup::{Listings, Located, Lookup, reduced_copies};
+use crate::photograph::is_image_name;
 use model::Model;
 
 /// Finds the models in `sparse` and its sub-folders, sorted by name. If there are none and the
-/// folder has photographs, searches the `sparse` of each sub-folder without photographs: nerfstudio
-/// writes `colmap/sparse/0`.
+/// folder has photographs, the folder itself may be a model; otherwise searches the `sparse` of
+/// each sub-folder without photographs: nerfstudio writes `colmap/sparse/0`.
 pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, DatasetError> {
     let found = folders_with_list(folder, "images")?;
-    if !found.is_empty() || !has_images(folder) {
+    if !found.is_empty() {
+        return Ok(found);
+    }
+    let has_folder = has_images(folder);
+    if is_model(folder) && (has_folder || visible_entries(folder).iter().any(|f| is_image_name(f)))
+    {
+        return Ok(vec![folder.to_path_buf()]);
+    }
+    if !has_folder {
         return Ok(found);
     }
     let mut sub_folders = visible_entries(folder);
@@ -33,6 +43,25 @@ pub(crate) fn find_models(folder: &Path) -> Result<Vec<PathBuf>, DatasetError> {
         models.extend(folders_with_list(path, "images")?);
     }
     Ok(models)
+}
+
+/// True if a folder has COLMAP's lists of images and cameras.
+pub(crate) fn is_model(folder: &Path) -> bool {
+    ["images", "cameras"].iter().all(|name| {
+        ["bin", "txt"].iter().any(|kind| folder.join(name).with_extension(kind).is_file())
+    })
+}
+
+/// True if an image of the first model exists, or the model can't be read.
+pub(crate) fn has_photographs(folder: &Path) -> bool {
+    let mut model = Model::default();
+    let models = find_models(folder).unwrap_or_default();
+    if models.first().is_none_or(|first| model.read_images(first).is_err()) {
+        return true;
+    }
+    let names: Vec<&str> = model.images.iter().map(|image| image.name.as_str()).collect();
+    let mut lookup = Lookup::in_images(folder, &names);
+    names.iter().any(|name| matches!(lookup.find(name), Ok(Located::File(_))))
 }
 
 /// True if a folder has COLMAP's usual folder of photographs, `images` or a reduced copy.
@@ -78,8 +107,8 @@ fn folders_with_list(folder: &Path, name: &str) -> Result<Vec<PathBuf>, DatasetE
 /// files of its images.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let models = find_models(folder)?;
-    let (path, mut model, mut notes) = read_largest_model(folder, &models)?;
-    notes.extend(model.remove_far_points());
+    let (path, mut model, choice) = read_largest_model(folder, &models)?;
+    let far_points = model.remove_far_points();
     // COLMAP's order of registration is arbitrary.
     model.images.sort_by(|a, b| a.name.cmp(&b.name));
     let list =
@@ -88,12 +117,14 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let image_names: Vec<&str> = model.images.iter().map(|image| image.name.as_str()).collect();
     let mut lookup = Lookup::in_images(folder, &image_names);
     let (mut frames, mut labels, mut missing) = (Vec::new(), Vec::new(), Vec::new());
+    let mut files = Vec::new();
     for (index, image) in model.images.iter().enumerate() {
         let frame_error = |reason| DatasetError::frame(&list, index, &image.name, reason);
         match lookup.find(&image.name).map_err(|e| frame_error(e.into()))? {
             Located::File(file) => {
                 frames.push(model.frame(image, folder.join(&file.path)).map_err(frame_error)?);
                 labels.push(lookup.without_base(&file.label));
+                files.push(file.path);
             }
             Located::Missing(_) => missing.push(&image.name),
             Located::Unusable(problem) => {
@@ -103,12 +134,13 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
         }
     }
     if frames.is_empty() {
-        let reason = match missing.first() {
-            Some(first) => Reason::images_missing(missing.len(), Some(&lookup.base()), first),
-            None => Reason::new("the model has no images; at least one is required"),
-        };
-        return Err(DatasetError::format(&list, reason));
+        return Err(DatasetError::format(&list, no_photographs(&lookup, &missing)));
     }
+    let name = path.strip_prefix(folder).map(path_text).unwrap_or_default();
+    let name = if name.is_empty() { "the folder itself" } else { &name };
+    let mut notes =
+        vec![format!("COLMAP: {} from {name}", format_count(frames.len(), "photograph"))];
+    notes.extend(choice.into_iter().chain(far_points));
     if let Some(first) = missing.first() {
         notes.push(format!(
             "{} of {} images have no image file and are skipped (first: {first})",
@@ -116,17 +148,67 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
             model.images.len()
         ));
     }
+    notes.extend(unregistered_note(folder, &files));
     notes.extend(lookup.notes());
     assign_names(&mut frames, &list, &labels)?;
     Ok(Dataset { format: Format::Colmap, frames, split: None, notes })
 }
 
+/// Returns the reason for a model none of whose images exists, with the sub-folder that contains
+/// the first image, if any.
+fn no_photographs(lookup: &Lookup, missing: &[&String]) -> Reason {
+    let Some(first) = missing.first() else {
+        return Reason::new("the model has no images; at least one is required");
+    };
+    let reason = Reason::images_missing(missing.len(), Some(&lookup.base()), first);
+    let has_image =
+        |folder: &PathBuf| relative_path(first).is_ok_and(|name| folder.join(name).is_file());
+    match sub_folders(lookup.root()).iter().find(|folder| has_image(folder)) {
+        Some(found) => reason.with_remedy(&format!(
+            "the image is in {}: rename this folder images",
+            name_text(found)
+        )),
+        None => reason,
+    }
+}
+
+/// Ratio of all photographs to those without a camera from which a note is a warning.
+const MIN_UNREGISTERED_RATIO: usize = 10;
+
+/// Returns the note on photographs next to the model's `files` that have no camera, if any. Masks
+/// and depth images usually have another format.
+fn unregistered_note(folder: &Path, files: &[PathBuf]) -> Option<String> {
+    let used: BTreeSet<&PathBuf> = files.iter().collect();
+    let kinds: BTreeSet<_> = files.iter().map(|file| (file.parent(), file.extension())).collect();
+    let folders: BTreeSet<&Path> = files.iter().filter_map(|file| file.parent()).collect();
+    let mut listings = Listings::new(folder);
+    let (mut count, mut unregistered) = (0, Vec::new());
+    for parent in folders {
+        let photographs = listings.names(parent).into_iter().map(|name| parent.join(name));
+        for file in photographs.filter(|file| kinds.contains(&(file.parent(), file.extension()))) {
+            count += 1;
+            if !used.contains(&file) {
+                unregistered.push(file);
+            }
+        }
+    }
+    let first = path_text(unregistered.first()?);
+    let is_many = MIN_UNREGISTERED_RATIO * unregistered.len() >= count;
+    let (warning, photographs) =
+        (if is_many { WARNING } else { "" }, format_count(count, "photograph"));
+    let have = if unregistered.len() == 1 { "has" } else { "have" };
+    Some(format!(
+        "{warning}{} of {photographs} {have} no camera (first: {first})",
+        unregistered.len()
+    ))
+}
+
 /// Reads the model with the most images (the first one, if several have as many). Returns the
-/// model's folder, the model, and notes on the choice.
+/// model's folder, the model, and a note on the choice among several.
 fn read_largest_model<'a>(
     folder: &Path,
     models: &'a [PathBuf],
-) -> Result<(&'a Path, Model, Vec<String>), DatasetError> {
+) -> Result<(&'a Path, Model, Option<String>), DatasetError> {
     let mut largest: Option<(&Path, Model)> = None;
     let mut sizes = Vec::new();
     for path in models {
@@ -139,17 +221,11 @@ fn read_largest_model<'a>(
     }
     let (path, model) = largest
         .ok_or_else(|| Problem::Unrecognised { path: folder.to_path_buf(), finding: None })?;
-    let photographs = format_count(model.images.len(), "photograph");
-    let name = path.strip_prefix(folder).unwrap_or(path).display();
-    let mut notes = vec![format!("COLMAP: {photographs} from {name}")];
-    if models.len() > 1 {
-        notes.push(format!(
-            "{} models; using the one with the most images ({})",
-            models.len(),
-            sizes.join(", ")
-        ));
-    }
-    Ok((path, model, notes))
+    let choice = (models.len() > 1).then(|| {
+        let (count, sizes) = (models.len(), sizes.join(", "));
+        format!("{count} models; using the one with the most images ({sizes})")
+    });
+    Ok((path, model, choice))
 }
 
 #[cfg(test)]

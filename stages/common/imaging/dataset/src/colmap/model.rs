@@ -71,6 +71,13 @@ impl Model {
     pub(super) fn read_cameras(&mut self, folder: &Path) -> Result<(), DatasetError> {
         match read_if_present(folder, "cameras.bin")? {
             Some((path, cameras)) => self.read_binary_cameras(&mut Bytes::new(&path, &cameras)),
+            None if is_file(&folder.join("images.bin"))?
+                && !is_file(&folder.join("cameras.txt"))? =>
+            {
+                let reason =
+                    Reason::new("file not found next to images.bin; copy all files of the model");
+                Err(DatasetError::format(&folder.join("cameras.bin"), reason))
+            }
             None => self.read_text_cameras(&folder.join("cameras.txt")),
         }
     }

@@ -130,10 +130,15 @@ fn variants(name: &str, extensions: Extensions) -> Vec<Variant> {
 /// Splits an absolute path into folders and file name, as in `C:\Users\x\a.png` or
 /// `/home/x/a.png`; `None` for a relative path.
 pub(super) fn absolute_parts(text: &str) -> Option<Vec<&str>> {
-    let mut parts: Vec<&str> = text.split(['/', '\\']).filter(|part| !part.is_empty()).collect();
-    let is_absolute = text.starts_with(['/', '\\']) || parts.first().is_some_and(|p| is_drive(p));
-    parts.retain(|part| *part != ".");
+    let is_absolute =
+        text.starts_with(['/', '\\']) || text.split(['/', '\\']).next().is_some_and(is_drive);
+    let parts = parts(text);
     (is_absolute && !parts.is_empty()).then_some(parts)
+}
+
+/// Splits a path into folders and file name, with either kind of slash.
+pub(super) fn parts(text: &str) -> Vec<&str> {
+    text.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".").collect()
 }
 
 fn is_drive(part: &str) -> bool {

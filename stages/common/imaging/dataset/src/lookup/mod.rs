@@ -1,11 +1,12 @@
 //! Finds the files that a data set names inside its folder, even if the folder was written on
 //! another machine, or its files were moved, renamed, converted or reduced (docs/design/005).
 //!
-//! A name is tried literally; with `\` read as `/`; as the longest tail of an absolute path, with
-//! the same number of leading parts removed from all names; with a missing or doubled extension;
-//! in a different Unicode normal form (NFC, or NFD as on macOS); and in a different case. Steps
-//! combine, each logs one line per data set ([`Lookup::notes`]), and two candidates are an error.
-//! Paths out of the folder are never opened; links inside it are followed.
+//! A name is tried literally; with `\` read as `/`; as the longest tail of an absolute path, or of
+//! any path if no name is found otherwise, with the same number of leading parts removed from all
+//! names; with a missing or doubled extension; in a different Unicode normal form (NFC, or NFD as
+//! on macOS); and in a different case. Steps combine, each logs one line per data set
+//! ([`Lookup::notes`]), and two candidates are an error. Paths out of the folder are never opened;
+//! links inside it are followed.
 
 mod listings;
 mod matching;
@@ -21,7 +22,7 @@ use crate::photograph::is_image_name;
 use crate::unsupported::is_unsupported_name;
 
 pub(crate) use listings::Listings;
-use matching::{Extensions, Tolerance, absolute_parts, candidates};
+use matching::{Extensions, Tolerance, absolute_parts, candidates, parts};
 use steps::{Steps, StepsTaken};
 
 /// Folder of photographs in most formats; reduced copies are in `images_2`, `images_4` and so on.
@@ -68,6 +69,26 @@ enum ClaimedFiles {
     Included,
 }
 
+/// Names that may lose leading folders.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum ShortenedNames {
+    Absolute,
+    All,
+}
+
+impl ShortenedNames {
+    /// Returns the parts of a name that may lose the first ones.
+    fn parts(self, name: &str) -> Option<Vec<&str>> {
+        match self {
+            Self::Absolute => absolute_parts(name),
+            Self::All => {
+                let parts = parts(name);
+                (!parts.is_empty() && !parts.contains(&"..")).then_some(parts)
+            }
+        }
+    }
+}
+
 /// Interpretation of a name as a path.
 struct Interpretation {
     path: PathBuf,
@@ -80,7 +101,9 @@ pub(crate) struct Lookup {
     listings: Listings,
     /// Folder that names are relative to, inside the data set's folder.
     base: PathBuf,
-    /// Number of leading parts removed from absolute names; `None` if no tail is a file.
+    /// Names that lose leading parts.
+    shortened: ShortenedNames,
+    /// Number of leading parts that such names lose; `None` if no tail is a file.
     removed: Option<usize>,
     /// Folder `images_N` that is read instead of a missing `images`.
     substitute: Option<String>,
@@ -97,7 +120,10 @@ impl Lookup {
     pub(crate) fn in_folder(folder: &Path, names: &[&str], repeated: &[&str]) -> Self {
         let mut lookup = Self::new(folder, PathBuf::new(), names);
         lookup.is_png_implied = true;
-        lookup.choose_removed_and_substitute(&[names, repeated].concat());
+        let names = [names, repeated].concat();
+        if !lookup.finds_any(&names, ShortenedNames::Absolute) {
+            lookup.finds_any(&names, ShortenedNames::All);
+        }
         lookup
     }
 
@@ -105,18 +131,16 @@ impl Lookup {
     /// found there, to the data set's folder.
     pub(crate) fn in_images(folder: &Path, names: &[&str]) -> Self {
         let mut inside = Self::new(folder, PathBuf::from(IMAGES), names);
-        inside.choose_removed_and_substitute(names);
-        if names.iter().any(|name| inside.has_file(name)) {
-            return inside;
-        }
         let mut outside = Self::new(folder, PathBuf::new(), names);
-        outside.choose_removed_and_substitute(names);
-        let has_images = inside.listings.is_folder(Path::new(IMAGES));
-        if has_images && !names.iter().any(|name| outside.has_file(name)) {
-            inside
-        } else {
-            outside
+        for shortened in [ShortenedNames::Absolute, ShortenedNames::All] {
+            if inside.finds_any(names, shortened) {
+                return inside;
+            }
+            if outside.finds_any(names, shortened) {
+                return outside;
+            }
         }
+        if inside.listings.is_folder(Path::new(IMAGES)) { inside } else { outside }
     }
 
     fn new(folder: &Path, base: PathBuf, names: &[&str]) -> Self {
@@ -125,6 +149,7 @@ impl Lookup {
         Self {
             listings: Listings::new(folder),
             base,
+            shortened: ShortenedNames::Absolute,
             removed: None,
             substitute: None,
             is_png_implied: false,
@@ -186,6 +211,9 @@ impl Lookup {
             self.steps.record(name, &file.path, taken);
             return Ok(Located::File(file));
         }
+        if let Some(path) = self.unsupported_file(name) {
+            return Ok(Located::File(LocatedFile { label: path.clone(), path }));
+        }
         match (missing, literal) {
             (Some(problem), _) => Ok(Located::Missing(problem)),
             (None, Err(error)) if absolute_parts(name).is_none() => Err(error.into()),
@@ -194,6 +222,17 @@ impl Lookup {
                 path_text(Path::new(name))
             )))),
         }
+    }
+
+    /// Finds the image in an unsupported format that a name without extension means: the error that
+    /// follows names the command that converts the image.
+    fn unsupported_file(&mut self, name: &str) -> Option<PathBuf> {
+        let path = self.base.join(relative_path(name).ok()?);
+        let stem = path.file_name().filter(|_| !has_image_extension(&path))?;
+        let folder = path.parent()?;
+        let names = self.listings.names(folder);
+        let mut files = names.iter().map(|name| folder.join(name));
+        files.find(|file| file.file_stem() == Some(stem) && is_unsupported_name(file))
     }
 
     /// Returns the path of a name taken literally, with an implied `.png`.
@@ -243,7 +282,7 @@ impl Lookup {
         {
             found.push(self.interpretation(&path, StepsTaken { slashes: true, ..none }));
         }
-        if let (Some(parts), Some(removed)) = (absolute_parts(name), self.removed)
+        if let (Some(parts), Some(removed)) = (self.shortened.parts(name), self.removed)
             && let Ok(path) = relative_path(&parts[removed.min(parts.len())..].join("/"))
         {
             found.push(self.interpretation(&path, StepsTaken { tail: true, ..none }));
@@ -307,17 +346,19 @@ impl Lookup {
         (LocatedFile { path: file.to_path_buf(), label }, taken)
     }
 
-    /// Chooses the number of parts to remove from absolute names and the substitute for a missing
-    /// `images`, so that most names are found. Longer tails and larger copies are preferred.
-    fn choose_removed_and_substitute(&mut self, names: &[&str]) {
-        let longest = names.iter().filter_map(|name| absolute_parts(name)).map(|p| p.len()).max();
+    /// Chooses the number of parts to remove from names and the substitute for a missing `images`,
+    /// so that most names are found. Longer tails and larger copies are preferred. Returns whether
+    /// at least one name is found.
+    fn finds_any(&mut self, names: &[&str], shortened: ShortenedNames) -> bool {
+        self.shortened = shortened;
+        let longest = names.iter().filter_map(|name| shortened.parts(name)).map(|p| p.len()).max();
         let removals: Vec<Option<usize>> = match longest {
             Some(parts) => (0..parts).map(Some).collect(),
             None => vec![None],
         };
         let substitutes = self.substitutes();
         if longest.is_none() && substitutes.len() == 1 {
-            return;
+            return names.iter().any(|name| self.has_file(name));
         }
         let mut best = (0, None, None);
         for removed in &removals {
@@ -329,11 +370,12 @@ impl Lookup {
                     best = (count, *removed, substitute.clone());
                 }
                 if best.0 == names.len() {
-                    return;
+                    return best.0 > 0;
                 }
             }
         }
         (_, self.removed, self.substitute) = best;
+        best.0 > 0
     }
 
     /// Returns the possible substitutes of `images`, the largest photographs first: none and, if

@@ -67,12 +67,12 @@ impl Steps {
     }
 
     /// Returns a note for each step that found a name. `removed` is the number of leading parts
-    /// removed from absolute names, `substitute` the folder that is read instead of `images`.
+    /// removed from names, `substitute` the folder that is read instead of `images`.
     pub(super) fn notes(&self, removed: Option<usize>, substitute: Option<&str>) -> Vec<String> {
         let tail = match removed.unwrap_or(0) {
             0 => "by reading absolute paths as relative ones".to_owned(),
-            1 => "without the first part of absolute paths".to_owned(),
-            count => format!("without the first {count} parts of absolute paths"),
+            1 => "without the first part of their paths".to_owned(),
+            count => format!("without the first {count} parts of their paths"),
         };
         let substitute =
             format!("in {}, because images is missing or empty", substitute.unwrap_or_default());

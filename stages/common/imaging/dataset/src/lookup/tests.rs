@@ -35,6 +35,7 @@ fn steps_are_tried_in_order_and_combine() {
         "images/G.png",
         "images/.h.png",
         "images/i.jpg",
+        "images/k.webp",
         "j.png",
         "e\u{301}te\u{301}/o\u{308}.PNG",
         "e\u{301}te\u{301}/\u{fc}.png",
@@ -73,6 +74,8 @@ fn steps_are_tried_in_order_and_combine() {
         ("images/h.png", "images/h.png not found"),
         ("images/i.png", "images/i.png not found"),
         ("images/x", "images/x.png not found"),
+        // The error of reading this file names the remedy.
+        ("images/k", "images/k.webp"),
         ("../images/a.png", "\"../images/a.png\" is not a path inside the folder"),
         (r"..\images\a.png", r"..\images\a.png not found"),
         ("/home/x.png", "no file in the data set matches the end of the absolute path"),
@@ -125,11 +128,35 @@ fn absolute_names_lose_equally_many_parts() {
     assert!(find(&mut lookup, names[2]).contains("no file in the data set"));
     assert_eq!(
         lookup.notes(),
-        ["2 file names found without the first 2 parts of absolute paths (first: \
+        ["2 file names found without the first 2 parts of their paths (first: \
             /x/scene/images/a.png is images/a.png)"]
     );
     let mut lookup = Lookup::in_folder(dir.path(), &names[..1], &[]);
     assert_eq!(find(&mut lookup, names[0]), "scene/images/a.png");
+}
+
+/// Relative names and URLs lose leading folders only if none is found as written.
+#[test]
+fn relative_names_lose_leading_folders_where_none_is_found() {
+    let dir = folder(&["images/a.png", "images/b.png", "b.png"]);
+    for (names, removed) in [
+        (["./data/fox/images/a.png", "./data/fox/images/b"], 2),
+        (["file:///home/x/images/a.png", "file:///home/x/images/b.png"], 3),
+        ([r"data\images\a.png", r"data\images\b.png"], 1),
+    ] {
+        let mut lookup = Lookup::in_folder(dir.path(), &names, &[]);
+        assert_eq!(names.map(|name| find(&mut lookup, name)), ["images/a.png", "images/b.png"]);
+        let notes = lookup.notes().join("; ");
+        let parts = if removed == 1 { "part".to_owned() } else { format!("{removed} parts") };
+        let first = format!("without the first {parts} of their paths (first: {} is", names[0]);
+        assert!(notes.contains(&first), "{notes}");
+    }
+    let mut lookup = Lookup::in_folder(dir.path(), &["images/a.png", "new/b.png"], &[]);
+    assert!(find(&mut lookup, "new/b.png").ends_with("new/b.png not found"));
+    let mut lookup = Lookup::in_images(dir.path(), &["DCIM/100/a.png", "DCIM/100/b.png"]);
+    assert_eq!(find(&mut lookup, "DCIM/100/b.png"), "images/b.png");
+    let mut lookup = Lookup::in_folder(dir.path(), &["../images/a.png"], &[]);
+    assert!(find(&mut lookup, "../images/a.png").contains("not a path inside"));
 }
 
 /// Reduced copies may have another format. Among the folders that contain the most names, the one
