@@ -4,10 +4,11 @@
 //! would take a flattened struct's doc comment as the verb's help. For a doc comment of an option's
 //! value, it would print every verb's help in the long form.
 
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::{Args, CommandFactory as _, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::{Memory, Site};
 
@@ -94,8 +95,8 @@ struct ExperimentArgs {
     #[arg(long = "variant", value_name = "NAME")]
     variants: Vec<String>,
     /// Use only the first N variants of an experiment
-    #[arg(long, value_name = "N")]
-    first_variants: Option<usize>,
+    #[arg(long, value_name = "N", value_parser = positive_count)]
+    first_variants: Option<NonZeroUsize>,
     /// Show only these results on pages and in tables: stages of the pipeline, or inputs of the
     /// page or table [default: all]
     #[arg(long = "show", value_name = "NAME[,NAME…]", value_delimiter = ',')]
@@ -299,10 +300,22 @@ impl From<PlanArgs> for Request {
     fn from(args: PlanArgs) -> Self {
         let ExperimentArgs { scenes, protocols, variants, first_variants, show, data } =
             args.experiment;
-        let selection =
-            Selection { data, scenes, protocols, variants, max_variants: first_variants, show };
+        let max_variants = first_variants.map(NonZeroUsize::get);
+        let selection = Selection { data, scenes, protocols, variants, max_variants, show };
         Self { targets: args.targets, parameters: args.parameters, inputs: args.inputs, selection }
     }
+}
+
+/// Parses the arguments from which a plan is created. Fails with the problem, on one line.
+pub(crate) fn plan_request<'a>(words: impl Iterator<Item = &'a str>) -> Result<Request, String> {
+    let command = PlanArgs::augment_args(clap::Command::new("").no_binary_name(true));
+    let command = command.disable_help_flag(true);
+    let parsed = command.try_get_matches_from(words);
+    let arguments = parsed.and_then(|matches| PlanArgs::from_arg_matches(&matches));
+    arguments.map(Request::from).map_err(|error| {
+        let text = error.to_string();
+        text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned()
+    })
 }
 
 /// Parses the command line and carries out its verb.
@@ -395,6 +408,10 @@ impl GlobalArgs {
     }
 }
 
+fn positive_count(text: &str) -> Result<NonZeroUsize, String> {
+    text.parse().map_err(|_| "expected a whole number of at least 1".to_owned())
+}
+
 fn path_text(path: &Path) -> String {
     path.to_string_lossy().into_owned()
 }
@@ -431,5 +448,24 @@ mod tests {
     fn the_command_line_is_sound() {
         use clap::CommandFactory as _;
         super::Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn arguments_of_a_plan_are_parsed_alone() {
+        let parse = |text: &str| super::plan_request(text.split_whitespace());
+        let request = parse("table -p a=1 --scene x,y --variant z").unwrap();
+        assert_eq!(request.targets, ["table"]);
+        assert_eq!(request.parameters, ["a=1"]);
+        assert_eq!(request.selection.scenes, ["x", "y"]);
+        assert_eq!(request.selection.variants, ["z"]);
+        for (text, expected) in [
+            ("--json", "unexpected argument '--json' found"),
+            ("--help", "unexpected argument '--help' found"),
+            ("-p", "a value is required for '--param"),
+            ("--first-variants 0", "invalid value '0' for '--first-variants <N>'"),
+        ] {
+            let problem = parse(text).unwrap_err();
+            assert!(problem.starts_with(expected) && !problem.contains('\n'), "{problem}");
+        }
     }
 }

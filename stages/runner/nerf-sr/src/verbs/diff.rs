@@ -1,9 +1,10 @@
 use std::process::ExitCode;
 
 use artifact::{bail_bad_input, print_line};
-use planning::{Change, PlanError, Request, State};
+use planning::{Change, PlanError, State};
 
 use super::print_json;
+use crate::cli::plan_request;
 use crate::lineage::{Lineage, StageDifference};
 use crate::session::{Session, nodes_of_stage};
 
@@ -49,7 +50,7 @@ fn lines(difference: &StageDifference) -> Vec<String> {
 }
 
 /// Reads one side of the comparison: a recorded run or pin, the beginning of an artifact's hash or
-/// of a key, or a stage with `-p` and `-i`.
+/// of a key, or a stage with its arguments.
 fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let store = &session.store;
     if let Some(run) = store.run_or_pin(text)? {
@@ -71,29 +72,19 @@ fn read_side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     read_stage(session, text)
 }
 
-/// Reads the result of a stage with the parameters and inputs that follow its name.
+/// Reads the result of a stage with the arguments that follow its name: targets and options of the
+/// plan.
 fn read_stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let mut words = text.split_whitespace();
     let Some(stage) = words.next() else {
         return Err(usage(text, "expected a stage, an artifact's hash, a run or a pin"));
     };
-    let mut request = Request { targets: vec![stage.to_owned()], ..Request::default() };
-    while let Some(word) = words.next() {
-        let list = match word {
-            "-p" => &mut request.parameters,
-            "-i" => &mut request.inputs,
-            _ => {
-                let problem = format!(
-                    "expected -p or -i, found {word}; quote each result, such as \
-                    \"eval -p kernel=box\""
-                );
-                return Err(usage(text, &problem));
-            }
-        };
-        let Some(value) = words.next() else {
-            return Err(usage(text, &format!("{word} needs NAME=VALUE")));
-        };
-        list.push(value.to_owned());
+    let mut request = plan_request(words).map_err(|problem| {
+        let remedy = "quote each result, such as \"eval -p kernel=box\"";
+        usage(text, &format!("{problem}; {remedy}"))
+    })?;
+    if request.targets.is_empty() {
+        request.targets.push(stage.to_owned());
     }
     let (plan, states) = session.plan_with_states(&request)?;
     let nodes = nodes_of_stage(&plan, stage)?;
