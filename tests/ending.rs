@@ -140,3 +140,20 @@ fn a_stage_ends_with_its_runner_and_leaves_a_checkpoint() {
         assert!(last_checkpoint(&partial) > before, "{variant}: no newer checkpoint at the end");
     }
 }
+
+/// A stage that resumes from a checkpoint has the time of its earlier, failed calls in its record.
+#[test]
+fn a_resumed_stage_counts_its_earlier_time() {
+    let project = project_with_script(
+        "work=$(dirname \"$out\")/work
+if [ -e \"$work/x\" ]; then mkdir \"$out\"; echo 1 > \"$out/x\"; exit; fi
+mkdir -p \"$work\"; echo 1 > \"$work/x\"; sleep 1; exit 1",
+    );
+    project.run(&["run"]).fails(1, &["talk"]);
+    project.ok(&["run"]);
+    let records = fs::read_dir(project.path(".nerf-sr/actions")).unwrap().flatten();
+    let mut records = records.map(|entry| entry.path());
+    let record = records.find(|path| path.extension().is_some_and(|end| end == "json")).unwrap();
+    let record: serde_json::Value = serde_json::from_slice(&fs::read(record).unwrap()).unwrap();
+    assert!(record["seconds"].as_f64().unwrap() > 1.0, "{record}");
+}
