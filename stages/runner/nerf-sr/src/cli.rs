@@ -95,7 +95,7 @@ struct ExperimentArgs {
     #[arg(long = "variant", value_name = "NAME")]
     variants: Vec<String>,
     /// Use only the first N variants of an experiment
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = positive_count)]
     first_variants: Option<NonZeroUsize>,
     /// Show only these results on pages and in tables: stages of the pipeline, or inputs of the
     /// page or table [default: all]
@@ -406,6 +406,10 @@ impl GlobalArgs {
         }
         arguments
     }
+}
+
+fn positive_count(text: &str) -> Result<NonZeroUsize, String> {
+    text.parse().map_err(|_| "expected a whole number of at least 1".to_owned())
 }
 
 fn path_text(path: &Path) -> String {
