@@ -17,7 +17,6 @@ use crate::photograph::{ImageHeader, fit_camera, read_header};
 /// Content of `transforms.json`; `shared` contains defaults for all frames, which are parsed one by
 /// one.
 #[derive(Deserialize)]
-#[serde(expecting = "an object")]
 pub(crate) struct Transforms {
     #[serde(flatten)]
     pub(crate) shared: LensEntry,
@@ -29,7 +28,6 @@ pub(crate) struct Transforms {
 }
 
 #[derive(Deserialize)]
-#[serde(expecting = "an object")]
 pub(crate) struct FrameEntry {
     pub(crate) file_path: String,
     pub(crate) mask_path: Option<String>,
@@ -366,7 +364,7 @@ mod tests {
         }
         for (json, expected) in [
             ("", "transforms.json: file is empty"),
-            ("[]", "transforms.json: invalid type: sequence, expected an object"),
+            ("[]", "transforms.json: invalid type: sequence, expected struct"),
             (
                 r#"{"frames": [{"file_path": "a.png"}]}"#,
                 "frame 0 (a.png): missing field `transform_matrix`",
@@ -375,10 +373,7 @@ mod tests {
                 r#"{"frames": [{"transform_matrix": []}]}"#,
                 "frame 0 (unnamed): missing field `file_path`",
             ),
-            (
-                r#"{"frames": [1]}"#,
-                "frame 0 (unnamed): invalid type: integer `1`, expected an object",
-            ),
+            (r#"{"frames": [1]}"#, "frame 0 (unnamed): invalid type: integer `1`, expected struct"),
             (r#"{"fl_x": "wide", "frames": []}"#, "transforms.json: fl_x: invalid type: string"),
         ] {
             let message = read(json).unwrap_err().to_string();
