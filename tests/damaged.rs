@@ -143,7 +143,7 @@ const DAMAGES: &[Damage] = &[
     ),
     (
         |data| edit_training(data, |list| list["frames"][1]["fl_x"] = json!("y".repeat(5_000_000))),
-        &["transforms_train.json: invalid type: string \"yyy", "y… at line 1 column "],
+        &["transforms_train.json: frame 1 (./train/r_1): fl_x: invalid type: string \"yyy", "y…"],
     ),
     (
         |data| {

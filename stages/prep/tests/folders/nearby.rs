@@ -82,6 +82,13 @@ fn place_cases() -> Vec<Case> {
             ),
         ),
         case(
+            "images in another folder, one level below",
+            |folder| write_colmap_set(&folder.join("x"), "sparse/0", "photos"),
+            Expected::Refused(
+                "dataset: DIR: no data set; found COLMAP (sparse) in DIR/x; give that folder",
+            ),
+        ),
+        case(
             "half a model",
             |folder| {
                 write_photographs(folder, "images/a#.png", 10);

@@ -117,6 +117,7 @@ pub(crate) fn sub_folders(folder: &Path) -> Vec<PathBuf> {
     visible_entries(folder).into_iter().filter(|path| path.is_dir()).collect()
 }
 
+/// Returns the folder that contains a path: `.` for a name alone.
 pub(crate) fn parent_folder(path: &Path) -> PathBuf {
     let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     parent.unwrap_or(Path::new(".")).to_path_buf()

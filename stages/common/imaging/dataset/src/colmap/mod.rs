@@ -52,7 +52,8 @@ pub(crate) fn is_model(folder: &Path) -> bool {
     })
 }
 
-/// True if an image of the first model exists, or the model can't be read.
+/// True if an image of the first model exists, also in a wrong sub-folder, or the model can't be
+/// read.
 pub(crate) fn has_photographs(folder: &Path) -> bool {
     let mut model = Model::default();
     let models = find_models(folder).unwrap_or_default();
@@ -62,6 +63,7 @@ pub(crate) fn has_photographs(folder: &Path) -> bool {
     let names: Vec<&str> = model.images.iter().map(|image| image.name.as_str()).collect();
     let mut lookup = Lookup::in_images(folder, &names);
     names.iter().any(|name| matches!(lookup.find(name), Ok(Located::File(_))))
+        || names.first().is_some_and(|first| folder_of_image(folder, first).is_some())
 }
 
 /// True if a folder has COLMAP's usual folder of photographs, `images` or a reduced copy.
@@ -161,15 +163,19 @@ fn no_photographs(lookup: &Lookup, missing: &[&String]) -> Reason {
         return Reason::new("the model has no images; at least one is required");
     };
     let reason = Reason::images_missing(missing.len(), Some(&lookup.base()), first);
-    let has_image =
-        |folder: &PathBuf| relative_path(first).is_ok_and(|name| folder.join(name).is_file());
-    match sub_folders(lookup.root()).iter().find(|folder| has_image(folder)) {
-        Some(found) => reason.with_remedy(&format!(
-            "the image is in {}: rename this folder images",
-            name_text(found)
-        )),
+    match folder_of_image(lookup.root(), first) {
+        Some(found) => {
+            let name = name_text(&found);
+            reason.with_remedy(&format!("the image is in {name}: rename this folder images"))
+        }
         None => reason,
     }
+}
+
+/// Finds the sub-folder that contains an image.
+fn folder_of_image(folder: &Path, image: &str) -> Option<PathBuf> {
+    let image = relative_path(image).ok()?;
+    sub_folders(folder).into_iter().find(|path| path.join(&image).is_file())
 }
 
 /// Ratio of all photographs to those without a camera from which a note is a warning.
