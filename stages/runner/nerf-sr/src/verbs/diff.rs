@@ -1,7 +1,7 @@
 use std::process::ExitCode;
 
 use artifact::{bail_bad_input, print_line};
-use planning::{Change, PlanError, State};
+use planning::{Change, PlanError, Request, State};
 
 use super::print_json;
 use crate::cli::plan_request;
