@@ -351,8 +351,8 @@ fn a_quality_has_the_key_of_its_parameters() {
     project.run(&["plan", "-p", "quality=good"]).fails(2, &["-p quality=good: ", message]);
     project.ok(&["run", "-p", "quality=fast"]);
     let parameters = [
-        "rays_per_pixel=4",
-        "opaque_ray_factor=0.4",
+        "rays_per_pixel=4.8",
+        "opaque_ray_factor=0.42",
         "pixel_importance=20",
         "cells_per_pixel=1.6",
         "supersample_warmup=0.4",
