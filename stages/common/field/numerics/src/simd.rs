@@ -144,21 +144,6 @@ pub trait Lanes: Copy {
     fn where_positive(self, gate: Self) -> Self;
     /// Sums each of four values over its lanes by halves: first lanes 0 and 8, 1 and 9, ….
     fn sums(four: [Self; 4]) -> Self::Quad;
-    /// Moves the lanes of `mask`, whose bit k stands for lane k, to the front in their order. The
-    /// lanes behind them are 0.
-    #[inline(always)]
-    fn compress(self, mut mask: u16) -> Self {
-        let (mut lanes, mut front) = ([0.0; LANES], [0.0; LANES]);
-        self.store(&mut lanes);
-        for value in &mut front {
-            if mask == 0 {
-                break;
-            }
-            *value = lanes[mask.trailing_zeros() as usize % LANES];
-            mask &= mask - 1;
-        }
-        Self::load(&front)
-    }
     /// Prefetches the first cache line of elements that are needed soon.
     fn prefetch<T>(_soon: &[T]) {}
 }
@@ -311,11 +296,6 @@ pub mod x86 {
                     self.0,
                 )
             })
-        }
-        #[inline(always)]
-        fn compress(self, mask: u16) -> Self {
-            // SAFETY: the caller runs with AVX-512.
-            Self(unsafe { _mm512_maskz_compress_ps(mask, self.0) })
         }
         #[inline(always)]
         fn sums([a, b, c, d]: [Self; 4]) -> Four {

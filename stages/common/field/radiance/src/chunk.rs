@@ -7,7 +7,7 @@ use crate::grid::PositionRows;
 use crate::march::March;
 use crate::occupancy::CellHit;
 use crate::ray::NormalizedRay;
-use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of, set_masks};
+use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
 use crate::shading::{LayerInput, NetworkGradients, RayGradients, Shading, dot};
 use crate::spec::Strides;
 use crate::spec::{DENSITY_OUTPUTS, FEATURES};
@@ -66,8 +66,6 @@ struct BackwardBuffers {
     lengths: Aligned,
     /// Indices of the chosen samples, by round.
     chosen: Vec<u32>,
-    /// Bits of the chosen samples among all.
-    masks: Vec<u16>,
     rounds: Vec<Round>,
     features: Aligned,
     hidden: Aligned,
@@ -133,19 +131,19 @@ impl BackwardBuffers {
             row.iter_mut().zip(&self.gradients).for_each(|(value, gradient)| *value = gradient[o]);
             row[count..].fill(0.0);
         }
-        set_masks(&self.chosen, samples.marched.t.len(), &mut self.masks);
         let features = self.features.grow(first.inputs * m);
-        gather(&self.rounds, &self.masks, &samples.rows.features, first.inputs, features, m);
+        gather(&self.rounds, &self.chosen, &samples.rows.features, first.inputs, features, m);
         let hidden = self.hidden.grow(first.outputs * m);
-        gather(&self.rounds, &self.masks, &samples.rows.hidden, first.outputs, hidden, m);
+        gather(&self.rounds, &self.chosen, &samples.rows.hidden, first.outputs, hidden, m);
         network.backward(second, LayerInput::Hidden(hidden), m, a, b);
         network.backward(first, LayerInput::First(features), m, b, a);
 
         into.positions.extend(self.chosen.iter().map(|&i| samples.marched.positions[i as usize]));
         into.levels.resize_with(field.levels.len(), Vec::new);
         for (list, rows) in into.levels.iter_mut().zip(a.chunks_exact(FEATURES * m)) {
-            let rows: [&[f32]; FEATURES] = std::array::from_fn(|f| &rows[f * m..][..count]);
-            list.extend((0..count).map(|k| rows.map(|row| row[k])));
+            list.extend(
+                (0..count).map(|k| -> [f32; FEATURES] { std::array::from_fn(|f| rows[f * m + k]) }),
+            );
         }
     }
 }

@@ -13,7 +13,6 @@ use crate::spec::{
     DENSITY_OUTPUTS, FEATURES, MAX_OPTICAL_DEPTH, MAX_RAW_DENSITY, MIN_HIT_WEIGHT,
     MIN_TRANSMITTANCE, MIN_WEIGHT, TRAINING_ROUND_SAMPLES,
 };
-use numerics::kernel;
 use numerics::simd::LANES;
 
 /// Sums over one ray's samples. Before marching, the caller sets `transmittance` to 1.
@@ -344,99 +343,25 @@ pub(crate) fn rounds_of(
     rounds.iter().zip(ends).map(|(round, end)| (round, round.first_selected..end))
 }
 
-/// Sets the bits of the samples in `list` in `masks`, which has a bit for each of `count` samples.
-/// `count` is a multiple of [`LANES`].
-pub(crate) fn set_masks(list: &[u32], count: usize, masks: &mut Vec<u16>) {
-    masks.clear();
-    masks.resize(count / LANES, 0);
-    for &i in list {
-        masks[i as usize / LANES] |= 1 << (i as usize % LANES);
-    }
-}
-
-/// Copies the columns of the samples in `masks` ([`set_masks`]) to `to`. `from` has `rows` rows for
-/// each round; rows of `to` have length `m`, padded with 0.
+/// Copies the columns of the samples in `list` to `to`. `from` has `rows` rows for each round; rows
+/// of `to` have length `m`, padded with 0.
 pub(crate) fn gather(
     rounds: &[Round],
-    masks: &[u16],
+    list: &[u32],
     from: &[f32],
     rows: usize,
     to: &mut [f32],
     m: usize,
 ) {
-    for round in rounds {
-        let masks = &masks[round.first_sample / LANES..][..round.n / LANES];
+    for (round, range) in rounds_of(rounds, list.len()) {
         for (row, target) in to.chunks_exact_mut(m.max(1)).enumerate() {
             let source = &from[rows * round.first_sample + row * round.n..][..round.n];
-            compress_row(source, masks, &mut target[round.first_selected..]);
+            for (value, &i) in target[range.clone()].iter_mut().zip(&list[range.clone()]) {
+                *value = source[i as usize - round.first_sample];
+            }
         }
     }
-    let count: usize = masks.iter().map(|mask| mask.count_ones() as usize).sum();
     for target in to.chunks_exact_mut(m.max(1)) {
-        target[count..].fill(0.0);
-    }
-}
-
-kernel! {
-    /// Copies the numbers of `masks`, which has a bit for each number of `from`, to the start of
-    /// `to`. Up to 15 numbers behind the copied ones change, too.
-    fn compress_row<L>(from: &[f32], masks: &[u16], to: &mut [f32]) {
-        let mut copied = 0;
-        for (numbers, &mask) in from.as_chunks().0.iter().zip(masks) {
-            let front = L::load(numbers).compress(mask);
-            let rest = &mut to[copied..];
-            let count = mask.count_ones() as usize;
-            if let Some(rest) = rest.first_chunk_mut() {
-                front.store(rest);
-            } else {
-                let mut last = [0.0; LANES];
-                front.store(&mut last);
-                rest[..count].copy_from_slice(&last[..count]);
-            }
-            copied += count;
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use numerics::simd::test_every_family;
-    use proptest::prelude::*;
-
-    proptest! {
-        /// Every family copies exactly the chosen columns, and pads rows with 0.
-        #[test]
-        fn chosen_columns_are_gathered(
-            lengths in prop::collection::vec(0usize..4, 1..4),
-            chosen in prop::collection::vec(any::<bool>(), 12 * LANES),
-        ) {
-            const ROWS: usize = 3;
-            let (mut rounds, mut list, mut count) = (Vec::new(), Vec::new(), 0);
-            for n in lengths.iter().map(|blocks| blocks * LANES) {
-                rounds.push(Round { first_sample: count, n, first_selected: list.len() });
-                list.extend((count..count + n).filter(|i| chosen[*i]).map(|i| i as u32));
-                count += n;
-            }
-            let from: Vec<f32> = (0..ROWS * count).map(|i| i as f32 + 1.0).collect();
-            let m = list.len().next_multiple_of(LANES);
-            let mut expected = vec![0.0; ROWS * m];
-            for (round, range) in rounds_of(&rounds, list.len()) {
-                for k in range {
-                    let column = list[k] as usize - round.first_sample;
-                    for row in 0..ROWS {
-                        let at = ROWS * round.first_sample + row * round.n + column;
-                        expected[row * m + k] = from[at];
-                    }
-                }
-            }
-            let mut masks = vec![7; 3];
-            set_masks(&list, count, &mut masks);
-            test_every_family(|family| {
-                let mut to = vec![9.0; ROWS * m];
-                gather(&rounds, &masks, &from, ROWS, &mut to, m);
-                assert_eq!(to, expected, "{family:?}");
-            });
-        }
+        target[list.len()..].fill(0.0);
     }
 }
