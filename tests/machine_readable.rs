@@ -130,7 +130,11 @@ fn diff_lists_differences() {
             2,
             "a sweep has several results",
         ),
-        (["diff", "prep --kernel box", "prep"], 2, "unexpected argument '--kernel' found; quote each result"),
+        (
+            ["diff", "prep --kernel box", "prep"],
+            2,
+            "unexpected argument '--kernel' found; quote each result",
+        ),
         (["diff", "", "prep"], 2, "expected a stage, an artifact's hash, a run or a pin"),
         (["diff", "nothing", "prep"], 2, "no stage \"nothing\""),
     ] {

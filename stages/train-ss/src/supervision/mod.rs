@@ -214,9 +214,10 @@ struct RenderedPixels {
 /// Pixel whose bundle was rendered.
 struct RenderedPixel {
     position: LrPixel,
-    /// Photographed colour without the background; NaN in clipped channels.
+    /// Photographed colour over the background; NaN in clipped channels. Without the background,
+    /// wrong opacity of edges would look like exposure.
     photographed: [f32; 3],
-    /// Mean colour of the rays without the background that the photograph shows.
+    /// Mean colour of the rays.
     rendered: [f32; 3],
     /// True if the levels belong in the cache.
     is_cached: bool,
@@ -229,14 +230,12 @@ impl Supersampling {
             let (view, pixel) = self.drawn_pixel(bundle);
             let sample = self.views[view].image.pixel(pixel);
             let background = self.ray_background(bundle);
-            let behind = background.map(|background| (1.0 - sample[3]) * background);
-            let is_clipped = |c: usize| may_be_clipped(sample[c] + behind[c]);
+            let colour = [0, 1, 2].map(|c| sample[c] + (1.0 - sample[3]) * background[c]);
             RenderedPixel {
                 position: self.position(view, pixel),
-                photographed: [0, 1, 2].map(|c| if is_clipped(c) { f32::NAN } else { sample[c] }),
+                photographed: colour.map(|c| if may_be_clipped(c) { f32::NAN } else { c }),
                 rendered: [0, 1, 2].map(|c| {
-                    let sum = colours.iter().map(|colour| colour[c]).sum::<f32>();
-                    sum / colours.len() as f32 - behind[c]
+                    colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
                 }),
                 is_cached: matches!(self.comparison(view), Comparison::Kernel(_)),
             }
