@@ -88,7 +88,7 @@ impl PackedPhotograph {
         self.width * self.height
     }
 
-    /// Composites images of the photograph over a grey level.
+    /// Composites the photograph over a grey level.
     pub(crate) fn over(self, background: f32) -> Self {
         Self { background: Some(background), ..self }
     }
@@ -105,7 +105,8 @@ impl PackedPhotograph {
         !is_masked && (self.format != SampleFormat::Rgba32 || !self.pixel(pixel)[0].is_nan())
     }
 
-    /// Returns a pixel in premultiplied RGBA, without the background; NaN if the pixel is masked.
+    /// Returns a pixel in premultiplied RGBA, composited if there is a background; NaN if the pixel
+    /// is masked.
     pub(crate) fn pixel(&self, pixel: usize) -> [f32; 4] {
         let mut out = [[0.0; 4]];
         self.read_row(pixel..pixel + 1, &mut out);
@@ -135,7 +136,14 @@ impl PackedPhotograph {
         let mut buffer = Vec::new();
         let bytes = self.bytes.read(size * pixels.start..size * pixels.end, &mut buffer);
         for (out, bytes) in out.iter_mut().zip(bytes.chunks_exact(size)) {
-            *out = self.format.pixel(bytes);
+            let pixel = self.format.pixel(bytes);
+            *out = match self.background {
+                Some(background) => {
+                    let [r, g, b] = [0, 1, 2].map(|c| pixel[c] + (1.0 - pixel[3]) * background);
+                    [r, g, b, 1.0]
+                }
+                None => pixel,
+            };
         }
     }
 
@@ -144,14 +152,13 @@ impl PackedPhotograph {
         self.image(Self::read_unmasked_row)
     }
 
-    /// Returns the image as [`PackedPhotograph::unmasked`], but NaN at masked pixels.
+    /// Returns the image, NaN at masked pixels.
     pub(crate) fn masked(&self) -> Image {
         self.image(Self::read_row)
     }
 
     fn image(&self, read: impl Fn(&Self, Range<usize>, &mut [[f32; 4]]) + Sync) -> Image {
         let channels = if self.background.is_some() { 3 } else { 4 };
-        let background = self.background.unwrap_or(0.0);
         let mut data = vec![0.0; channels * self.pixels()];
         data.par_chunks_mut((channels * self.width).max(1)).enumerate().for_each_init(
             || vec![[0.0; 4]; self.width],
@@ -159,8 +166,6 @@ impl PackedPhotograph {
                 read(self, y * self.width..(y + 1) * self.width, row);
                 for (x, pixel) in samples.chunks_exact_mut(channels).enumerate() {
                     pixel.copy_from_slice(&row[x][..channels]);
-                    let behind = (1.0 - row[x][3]) * background;
-                    pixel[..3].iter_mut().for_each(|colour| *colour += behind);
                 }
             },
         );
@@ -260,7 +265,7 @@ mod tests {
                 prop_assert_eq!(packed.unmasked(), image.clone());
                 let over = packed.over(background);
                 prop_assert_eq!(over.unmasked(), image.over(background));
-                prop_assert_eq!(&over.pixel(4), &image.data[16..20]);
+                prop_assert_eq!(&over.pixel(4)[..3], &image.over(background).data[12..15]);
                 prop_assert!(memory.first_error().is_none());
             }
         }

@@ -127,13 +127,13 @@ impl HrCache {
     /// pixel's block and cached ones elsewhere, and back-projects them to the block: writes
     /// Pᵀ·residual, with the P of [`Resampling::inverse`]. But for its ridge and reach, Pᵀ is
     /// K⁺ / s², with the pseudo-inverse K⁺ = Kᵀ·(K·Kᵀ)⁻¹. Returns the residual of the pixel itself.
-    /// `residual_of` returns the residual for a channel, a prediction and its sample.
+    /// `residual_of` returns the residual for a channel, a prediction and its target.
     pub(crate) fn back_project(
         &self,
         pixel: LrPixel,
         colours: &[[f32; 3]],
         targets: &PackedPhotograph,
-        residual_of: impl Fn(usize, f32, [f32; 4]) -> f32,
+        residual_of: impl Fn(usize, f32, f32) -> f32,
         back_projected: &mut [[f32; 3]],
     ) -> [f32; 3] {
         let [left, top] = self.block_start(pixel);
@@ -156,7 +156,7 @@ impl HrCache {
             let mut target = [[0.0; 4]; MAX_NEIGHBOURS];
             targets.read_row(target_row(ys.start + j), &mut target[..xs.len()]);
             for (i, residual) in row.iter_mut().enumerate() {
-                *residual = std::array::from_fn(|c| residual_of(c, residual[c], target[i]));
+                *residual = std::array::from_fn(|c| residual_of(c, residual[c], target[i][c]));
             }
         }
         for (b, back_projected) in back_projected.chunks_exact_mut(block.columns).enumerate() {
@@ -319,7 +319,7 @@ mod tests {
         let mut back_projected = [[9.0; 3]; 4];
         let pixel = LrPixel { view: 0, x: 2, y: 1 };
         let residual =
-            cache.back_project(pixel, &colours, &targets, |c, p, t| p - t[c], &mut back_projected);
+            cache.back_project(pixel, &colours, &targets, |_, p, t| p - t, &mut back_projected);
         for c in 0..3 {
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() / 4.0;
             assert!((residual[c] - (mean - targets.pixel(8)[c])).abs() < 1e-6);
@@ -375,7 +375,7 @@ mod tests {
                         pixel,
                         &fresh,
                         &packed,
-                        |c, p, t| p - t[c],
+                        |_, p, t| p - t,
                         &mut back_projected,
                     );
                     for c in 0..3 {

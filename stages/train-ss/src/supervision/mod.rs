@@ -214,8 +214,7 @@ struct RenderedPixels {
 /// Pixel whose bundle was rendered.
 struct RenderedPixel {
     position: LrPixel,
-    /// Photographed colour over the background; NaN in clipped channels. Without the background,
-    /// wrong opacity of edges would look like exposure.
+    /// Photographed colour; NaN in clipped channels.
     photographed: [f32; 3],
     /// Mean colour of the rays.
     rendered: [f32; 3],
@@ -229,11 +228,10 @@ impl Supersampling {
         let pixels = bundles.bundles(rays).map(|(bundle, colours)| {
             let (view, pixel) = self.drawn_pixel(bundle);
             let sample = self.views[view].image.pixel(pixel);
-            let background = self.ray_background(bundle);
-            let colour = [0, 1, 2].map(|c| sample[c] + (1.0 - sample[3]) * background[c]);
             RenderedPixel {
                 position: self.position(view, pixel),
-                photographed: colour.map(|c| if may_be_clipped(c) { f32::NAN } else { c }),
+                photographed: [0, 1, 2]
+                    .map(|c| if may_be_clipped(sample[c]) { f32::NAN } else { sample[c] }),
                 rendered: [0, 1, 2].map(|c| {
                     colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
                 }),

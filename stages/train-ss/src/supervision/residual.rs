@@ -2,8 +2,7 @@
 /// complement is the maximum level of one that may have been clipped to black.
 const SATURATION: f32 = 254.5 / 255.0;
 
-/// Returns whether a sample over its background is at the limit, so that the value before clipping
-/// may lie beyond.
+/// Returns whether an LR sample is at the limit, so that the value before clipping may lie beyond.
 pub(crate) fn may_be_clipped(sample: f32) -> bool {
     sample >= SATURATION || sample <= 1.0 - SATURATION
 }
@@ -23,34 +22,23 @@ pub(crate) struct LossContext {
     /// Weight of the bundle's loss.
     pub(crate) weight: f32,
     /// True if `loss_of_mean` treats a sample at 0 or 1, which may have been clipped, as an upper
-    /// or lower bound. The background must then be that of the LR image's degradation.
+    /// or lower bound. Photographs must then be composited on the background.
     pub(crate) allows_clipping: bool,
 }
 
 impl LossContext {
-    /// Returns the background's part of a sample's colour.
-    fn behind(&self, channel: usize, sample: [f32; 4]) -> f32 {
-        (1.0 - sample[3]) * self.background[channel]
-    }
-
-    /// Returns the target colour of a photograph's sample, which is premultiplied RGBA: its colour
-    /// at the field's exposure, over the background, which has no exposure.
-    fn target(&self, channel: usize, sample: [f32; 4]) -> f32 {
-        self.inverse_gains[channel] * sample[channel] + self.behind(channel, sample)
+    /// Returns the target colour of a photograph's sample: premultiplied RGBA over the background.
+    fn target_colour(&self, sample: [f32; 4]) -> [f32; 3] {
+        [0, 1, 2]
+            .map(|c| self.inverse_gains[c] * (sample[c] + (1.0 - sample[3]) * self.background[c]))
     }
 
     /// Returns the residual of a prediction; 0 if the sample may have been clipped and the
     /// prediction lies beyond it.
-    pub(crate) fn unclipped_residual(
-        &self,
-        channel: usize,
-        prediction: f32,
-        sample: [f32; 4],
-    ) -> f32 {
-        let residual = residual(prediction, self.target(channel, sample));
-        let photographed = sample[channel] + self.behind(channel, sample);
-        let is_beyond = (photographed >= SATURATION && residual > 0.0)
-            || (photographed <= 1.0 - SATURATION && residual < 0.0);
+    pub(crate) fn unclipped_residual(&self, channel: usize, prediction: f32, sample: f32) -> f32 {
+        let residual = residual(prediction, self.inverse_gains[channel] * sample);
+        let is_beyond = (sample >= SATURATION && residual > 0.0)
+            || (sample <= 1.0 - SATURATION && residual < 0.0);
         if is_beyond { 0.0 } else { residual }
     }
 
@@ -77,9 +65,9 @@ impl LossContext {
         let share = 1.0 / colours.len() as f32;
         let mut loss = 0.0;
         for (k, colour) in colours.iter().enumerate() {
-            let sample = sample_of(k);
+            let target = self.target_colour(sample_of(k));
             for c in 0..3 {
-                let residual = residual(colour[c], self.target(c, sample));
+                let residual = residual(colour[c], target[c]);
                 loss += f64::from(self.weight * share) * f64::from(residual) * f64::from(residual)
                     / 3.0;
                 gradients[k][c] = self.weight * residual * share * (2.0 / 3.0);
@@ -96,13 +84,14 @@ impl LossContext {
         gradients: &mut [[f32; 3]],
     ) -> f64 {
         let share = 1.0 / colours.len() as f32;
+        let target = self.target_colour(sample);
         let mut loss = 0.0;
         for c in 0..3 {
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
             let residual = if self.allows_clipping {
-                self.unclipped_residual(c, mean, sample)
+                self.unclipped_residual(c, mean, sample[c])
             } else {
-                residual(mean, self.target(c, sample))
+                residual(mean, target[c])
             };
             loss += f64::from(self.weight) * f64::from(residual) * f64::from(residual) / 3.0;
             for gradient in gradients.iter_mut() {
@@ -136,8 +125,10 @@ mod tests {
             (-0.1, 0.01, -0.11),
         ];
         for (prediction, sample, expected) in cases {
-            let residual = PLAIN.unclipped_residual(1, prediction, [sample, sample, sample, 1.0]);
-            assert!((residual - expected).abs() < 1e-6, "{prediction} {sample}");
+            assert!(
+                (PLAIN.unclipped_residual(1, prediction, sample) - expected).abs() < 1e-6,
+                "{prediction} {sample}"
+            );
         }
         assert!(may_be_clipped(1.0) && may_be_clipped(0.0) && !may_be_clipped(0.99));
         // White in a photograph twice as bright as the scene is a lower bound of the true colour.
@@ -152,7 +143,7 @@ mod tests {
     #[test]
     fn unknown_samples_have_no_residual() {
         let unknown = [f32::NAN; 4];
-        assert_eq!(PLAIN.unclipped_residual(0, 0.2, unknown), 0.0);
+        assert_eq!(PLAIN.unclipped_residual(0, 0.2, f32::NAN), 0.0);
         let mut gradients = [[9.0; 3]; 2];
         assert_eq!(PLAIN.loss_of_mean(&[[0.2; 3]; 2], unknown, &mut gradients), 0.0);
         assert_eq!(gradients, [[0.0; 3]; 2]);
@@ -161,15 +152,15 @@ mod tests {
         assert_eq!(gradients, [[0.0; 3]; 2]);
     }
 
-    /// Exposure is corrected, and transparent samples are composited over the background, which
-    /// has no exposure.
+    /// Exposure is corrected, and transparent samples are composited over the background.
     #[test]
     fn samples_become_target_colours() {
         let context =
             LossContext { inverse_gains: [2.0, 1.0, 0.5], background: [0.4, 0.8, 1.0], ..PLAIN };
-        for (channel, expected) in [(0, 0.3), (1, 0.4), (2, 0.4)] {
-            let target = context.target(channel, [0.1, 0.2, 0.3, 0.75]);
-            assert!((target - expected).abs() < 1e-6, "{channel}: {target}");
-        }
+        let colour = context.target_colour([0.1, 0.2, 0.3, 0.75]);
+        assert!(
+            colour.iter().zip([0.4, 0.4, 0.275]).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6),
+            "{colour:?}"
+        );
     }
 }
