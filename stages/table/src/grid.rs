@@ -6,11 +6,10 @@ use stage::plain;
 use crate::figures::Figures;
 use crate::front::{Axes, Point};
 use crate::params::Params;
-use crate::rows::{GROUP, MISSING};
-use crate::values::{Row, SCENE, difference, distinct, listed, mean, scenes, select};
-
-/// Names of a result's provenance, which aren't keys.
-pub(crate) const PROVENANCE: [&str; 2] = ["commit", "machine"];
+use crate::rows::GROUP;
+use crate::values::{
+    MISSING, PROVENANCE, Row, SCENE, difference, distinct, is_key, listed, mean, scenes, select,
+};
 
 /// Lines and columns of a table.
 pub(crate) struct Layout<'a> {
@@ -158,7 +157,8 @@ impl Layout<'_> {
             }
         }
         if let Some(reference) = &self.reference {
-            let gain = difference(&mine, reference, self.params.compared_value());
+            let name = self.params.compared_value();
+            let gain = difference(&mine, reference, &self.compared_keys(), name);
             line.push(gain.map_or(NO_VALUE.to_owned(), |gain| format!("{gain:+.2}")));
         }
         for name in PROVENANCE {
@@ -166,6 +166,21 @@ impl Layout<'_> {
             line.push(if text.is_empty() { NO_VALUE.to_owned() } else { text });
         }
         line
+    }
+
+    /// Returns the keys in which a line differs from those it is compared with. The method is one of
+    /// them if its name contains the value of another.
+    fn compared_keys(&self) -> Vec<&str> {
+        let mut keys: Vec<&str> = self.params.relative_to.keys().map(String::as_str).collect();
+        let is_in_name = |key: &&str| {
+            let placeholder = format!("{{{key}}}");
+            self.params.methods.values().any(|method| method.contains(&placeholder))
+        };
+        if keys.iter().any(is_in_name) {
+            keys.push("method");
+        }
+        keys.push(GROUP);
+        keys
     }
 
     /// Returns the rows that have values and belong to the group of `mine`.

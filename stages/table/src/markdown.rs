@@ -1,13 +1,15 @@
 //! The Markdown document: a table of all rows, a table for each scene, gains, the spread over
 //! seeds, and failed points.
 
+use std::collections::BTreeMap;
+
 use artifact::{FailedPoint, Failure, bail_usage, label};
 
 use crate::figures::Figures;
-use crate::grid::{Layout, NO_VALUE, PROVENANCE, markdown_table};
+use crate::grid::{Layout, NO_VALUE, markdown_table};
 use crate::params::Params;
-use crate::rows::{GROUP, MISSING, method_name};
-use crate::values::{Row, SCENE, difference, distinct, mean, scenes, select};
+use crate::rows::{GROUP, method_name};
+use crate::values::{Row, SCENE, difference, distinct, is_key, mean, scenes, select};
 
 /// File of [`Document::picture`].
 pub(crate) const PICTURE: &str = "front.svg";
@@ -33,7 +35,7 @@ pub(crate) fn document(
     let is_by_seed = keys == ["seed"];
     let scene = SCENE.to_owned();
     let is_averaged = !keys.contains(&scene) && !params.columns.contains(&scene);
-    // With `relative_to`, there are no tables per scene: they would be compared with the mean.
+    // A comparison (`relative_to`) has one table, of the means.
     let mut scenes = if is_averaged && reference.is_none() {
         distinct(rows, std::slice::from_ref(&scene)).concat()
     } else {
@@ -48,6 +50,10 @@ pub(crate) fn document(
         text += &format!("Means over {}:\n\n", scenes.join(", "));
     }
     text += &layout.table(rows, false);
+    if layout.reference.as_ref().is_some_and(Vec::is_empty) {
+        let named = named_values(&params.relative_to);
+        text += &format!("\nNo result has {named}, so nothing is compared.\n");
+    }
     let picture = layout.front_picture(rows);
     if picture.is_some() {
         text += &format!("\n![The results by cost and score]({PICTURE})\n");
@@ -75,8 +81,7 @@ pub(crate) fn document(
 fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, Failure> {
     let mut known: Vec<&String> = Vec::new();
     for (name, value) in rows.iter().flatten() {
-        let is_key = value.is_string() && name != MISSING && !PROVENANCE.contains(&name.as_str());
-        if is_key && !known.contains(&name) {
+        if is_key(name, value) && !known.contains(&name) {
             known.push(name);
         }
     }
@@ -125,7 +130,8 @@ fn check_front(params: &Params, rows: &[Row]) -> Result<(), Failure> {
     bail_usage!("parameter front: no result has a value {front:?}; {known}");
 }
 
-/// Returns the results that others are compared with. Fails if they don't have the compared value.
+/// Returns the results that others are compared with; none if the run left them out. Fails if they
+/// don't have the compared value.
 fn reference(params: &Params, rows: &[Row]) -> Result<Option<Vec<Row>>, Failure> {
     if params.relative_to.is_empty() || rows.is_empty() {
         return Ok(None);
@@ -133,16 +139,16 @@ fn reference(params: &Params, rows: &[Row]) -> Result<Option<Vec<Row>>, Failure>
     let (keys, values): (Vec<String>, Vec<String>) = params.relative_to.clone().into_iter().unzip();
     let selected = select(rows, &keys, &values);
     let name = params.compared_value();
-    if mean(&selected, name).is_none() {
-        let named: Vec<String> =
-            params.relative_to.iter().map(|(key, value)| format!("{key} = {value}")).collect();
-        let named = named.join(", ");
-        if selected.is_empty() {
-            bail_usage!("parameter relative_to: no result has {named}");
-        }
+    if !selected.is_empty() && mean(&selected, name).is_none() {
+        let named = named_values(&params.relative_to);
         bail_usage!("parameter relative_to: no result with {named} has a value {name:?}");
     }
     Ok(Some(selected))
+}
+
+fn named_values(values: &BTreeMap<String, String>) -> String {
+    let named: Vec<String> = values.iter().map(|(key, value)| format!("{key} = {value}")).collect();
+    named.join(", ")
 }
 
 /// Returns the table of differences between methods in each column; empty if there are none.
@@ -160,7 +166,7 @@ fn gains(params: &Params, rows: &[Row]) -> String {
             let in_column = select(&all, &params.columns, column);
             let [of, over] =
                 [&gain.of, &gain.over].map(|block| method_rows(params, &in_column, block));
-            let difference = difference(&of, &over, "psnr");
+            let difference = difference(&of, &over, &["method", GROUP], "psnr");
             line.push(difference.map_or(NO_VALUE.to_owned(), |value| format!("{value:+.2}")));
         }
         if line[1..].iter().any(|cell| cell != NO_VALUE) {

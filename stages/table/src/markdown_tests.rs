@@ -115,30 +115,11 @@ Failed, or waiting for a failed stage:
 
 #[test]
 fn keys_that_no_result_has_are_refused() {
-    for (rows_by, relative_to, expected) in [
-        (
-            vec!["varant"],
-            vec![],
-            "parameter rows: no result has a key \"varant\"; did you mean variant? known: method, \
-            protocol, scene, variant",
-        ),
-        (
-            vec![],
-            vec![("variant", "nothing")],
-            "parameter relative_to: no result has variant = nothing",
-        ),
-    ] {
-        let params = Params {
-            rows: rows_by.into_iter().map(str::to_owned).collect(),
-            relative_to: relative_to
-                .into_iter()
-                .map(|(k, v)| (k.to_owned(), v.to_owned()))
-                .collect(),
-            ..Params::default()
-        };
-        let problem = markdown(&params, &rows(), &figures(), &[]).unwrap_err();
-        assert!(matches!(&problem, Failure::Usage(message) if message == expected), "{problem}");
-    }
+    let expected = "parameter rows: no result has a key \"varant\"; did you mean variant? known: \
+        method, protocol, scene, variant";
+    let params = Params { rows: vec!["varant".to_owned()], ..Params::default() };
+    let problem = markdown(&params, &rows(), &figures(), &[]).unwrap_err();
+    assert!(matches!(&problem, Failure::Usage(message) if message == expected), "{problem}");
     let without_results = markdown(
         &Params::default(),
         &[],
@@ -201,6 +182,47 @@ fn means_over_different_scenes_are_not_compared() {
 | ours | +2.50 |
 ";
     assert_eq!(markdown(&params, &rows, &figures(), &[]).unwrap(), expected);
+}
+
+/// Lines are compared with the reference of the same protocol, over the seeds that both have.
+#[test]
+fn results_are_compared_with_their_counterparts() {
+    let mut rows = Vec::new();
+    for (protocol, variant, seed, psnr) in [
+        ("24x2", "as it is", "0", Some(22.0)),
+        ("24x2", "as it is", "1", Some(23.0)),
+        ("24x2", "averaged", "0", Some(21.0)),
+        ("24x2", "averaged", "1", None),
+        ("12x4", "as it is", "0", Some(19.0)),
+        ("12x4", "averaged", "0", Some(19.5)),
+        ("48x2", "averaged", "0", Some(25.0)),
+    ] {
+        let mut row = row("lego", variant, protocol, 0.0, None, 1.0);
+        row.remove("psnr");
+        row.insert("seed".to_owned(), json!(seed));
+        psnr.iter().for_each(|psnr| _ = row.insert("psnr".to_owned(), json!(psnr)));
+        rows.push(row);
+    }
+    let mut params = params(json!({
+        "rows": ["protocol", "variant"], "values": ["psnr"], "relative_to": {"variant": "as it is"},
+    }));
+    let text = markdown(&params, &rows, &figures(), &[]).unwrap();
+    for line in [
+        "| 24x2 | as it is | 22.50 | +0.00 |",
+        "| 24x2 | averaged | 21.00 | -1.00 |",
+        "| 12x4 | as it is | 19.00 | +0.00 |",
+        "| 12x4 | averaged | 19.50 | +0.50 |",
+        "| 48x2 | averaged | **25.00** | – |",
+    ] {
+        assert!(text.contains(line), "{line}\n{text}");
+    }
+    params.relative_to.insert("variant".to_owned(), "nothing".to_owned());
+    let text = markdown(&params, &rows, &figures(), &[]).unwrap();
+    assert!(
+        text.contains("\nNo result has variant = nothing, so nothing is compared.\n"),
+        "{text}"
+    );
+    assert!(text.contains("| 24x2 | as it is | 22.50 | – |"), "{text}");
 }
 
 fn params(value: serde_json::Value) -> Params {

@@ -11,10 +11,8 @@ use stage::Progress;
 
 use crate::figures::Figures;
 use crate::params::Params;
-use crate::values::Row;
+use crate::values::{MISSING, Row};
 
-/// Name of the reason why a row has no values.
-pub(crate) const MISSING: &str = "missing";
 /// Key of a method's group: the images that its training has seen.
 pub(crate) const GROUP: &str = "has seen";
 

@@ -5,6 +5,10 @@ use stage::plain;
 
 /// Key of a result's scene.
 pub(crate) const SCENE: &str = "scene";
+/// Names of a result's provenance, which aren't keys.
+pub(crate) const PROVENANCE: [&str; 2] = ["commit", "machine"];
+/// Name of the reason why a row has no values.
+pub(crate) const MISSING: &str = "missing";
 
 /// A result: keys (axes of the run, `method`) and values, by name.
 pub type Row = Map<String, Value>;
@@ -43,21 +47,28 @@ pub(crate) fn scenes(rows: &[Row], name: &str) -> Vec<String> {
     distinct(&with, &[SCENE.to_owned()]).concat()
 }
 
-/// Returns the difference between the means of a value over two groups of rows, each over the
-/// scenes that both groups have. Rows without a scene are compared with all scenes.
-pub(crate) fn difference(of: &[Row], over: &[Row], name: &str) -> Option<f64> {
-    let scenes = [scenes(of, name), scenes(over, name)];
-    let common_mean = |rows: &[Row]| {
-        let mut common = rows.to_vec();
-        if !scenes.concat().iter().any(String::is_empty) {
-            common.retain(|row| {
-                let scene = row.get(SCENE).map(plain).unwrap_or_default();
-                scenes.iter().all(|scenes| scenes.contains(&scene))
-            });
-        }
-        mean(&common, name)
+/// Returns the difference between the means of a value over two groups of results, each over the
+/// results with a counterpart in the other group: scenes, protocols and seeds are equal, and all
+/// other keys but the `compared` ones. A key that only one of both has doesn't count.
+pub(crate) fn difference(of: &[Row], over: &[Row], compared: &[&str], name: &str) -> Option<f64> {
+    let is_counterpart = |row: &Row, other: &Row| {
+        let mut keys = row.iter().filter(|(key, value)| is_key(key, value));
+        other.contains_key(name)
+            && keys.all(|(key, value)| {
+                compared.contains(&key.as_str()) || other.get(key).is_none_or(|o| o == value)
+            })
     };
-    Some(common_mean(of)? - common_mean(over)?)
+    let paired_mean = |rows: &[Row], others: &[Row]| {
+        let mut paired = rows.to_vec();
+        paired.retain(|row| others.iter().any(|other| is_counterpart(row, other)));
+        mean(&paired, name)
+    };
+    Some(paired_mean(of, over)? - paired_mean(over, of)?)
+}
+
+/// True for an entry that may identify a row: an axis of the run, the method or its group.
+pub(crate) fn is_key(name: &str, value: &Value) -> bool {
+    value.is_string() && name != MISSING && !PROVENANCE.contains(&name)
 }
 
 /// Lists the distinct values that rows have under a name.
