@@ -225,16 +225,13 @@ impl Layout<'_> {
     /// lines or columns must have a value that occurs in the results; any other key must have the
     /// one value that all results have.
     fn matches(&self, extra: &Row, rows: &[Row]) -> bool {
-        extra.iter().filter(|(name, value)| self.is_key(name, value)).all(|(name, value)| {
+        let is_shared = |name: &str| name != "method" && name != GROUP;
+        let mut keys = extra.iter().filter(|(name, value)| is_key(name, value) && is_shared(name));
+        keys.all(|(name, value)| {
             let theirs = distinct(rows, std::slice::from_ref(name)).concat();
             let is_compared = self.params.columns.contains(name) || self.keys.contains(name);
             theirs.contains(&plain(value)) && (is_compared || theirs.len() == 1)
         })
-    }
-
-    /// True if an entry of a row is a key that results may share.
-    fn is_key(&self, name: &str, value: &Value) -> bool {
-        value.is_string() && name != "method" && name != GROUP && !PROVENANCE.contains(&name)
     }
 }
 

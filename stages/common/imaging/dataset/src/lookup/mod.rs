@@ -121,8 +121,8 @@ impl Lookup {
         let mut lookup = Self::new(folder, PathBuf::new(), names);
         lookup.is_png_implied = true;
         let names = [names, repeated].concat();
-        if !lookup.finds_any(&names, ShortenedNames::Absolute) {
-            lookup.finds_any(&names, ShortenedNames::All);
+        if !lookup.choose_removed_and_substitute(&names, ShortenedNames::Absolute) {
+            lookup.choose_removed_and_substitute(&names, ShortenedNames::All);
         }
         lookup
     }
@@ -133,10 +133,10 @@ impl Lookup {
         let mut inside = Self::new(folder, PathBuf::from(IMAGES), names);
         let mut outside = Self::new(folder, PathBuf::new(), names);
         for shortened in [ShortenedNames::Absolute, ShortenedNames::All] {
-            if inside.finds_any(names, shortened) {
+            if inside.choose_removed_and_substitute(names, shortened) {
                 return inside;
             }
-            if outside.finds_any(names, shortened) {
+            if outside.choose_removed_and_substitute(names, shortened) {
                 return outside;
             }
         }
@@ -349,7 +349,7 @@ impl Lookup {
     /// Chooses the number of parts to remove from names and the substitute for a missing `images`,
     /// so that most names are found. Longer tails and larger copies are preferred. Returns whether
     /// at least one name is found.
-    fn finds_any(&mut self, names: &[&str], shortened: ShortenedNames) -> bool {
+    fn choose_removed_and_substitute(&mut self, names: &[&str], shortened: ShortenedNames) -> bool {
         self.shortened = shortened;
         let longest = names.iter().filter_map(|name| shortened.parts(name)).map(|p| p.len()).max();
         let removals: Vec<Option<usize>> = match longest {
