@@ -1,6 +1,5 @@
 //! One table: a line for each combination of the rows' keys, with the best of each group marked.
 
-use serde_json::Value;
 use stage::plain;
 
 use crate::figures::Figures;
