@@ -258,12 +258,14 @@ fn read_windows(path: &Path) -> Result<Windows, PixelError> {
     let meta = read_header(path)?;
     let first = meta.headers.first().ok_or_else(|| PixelError::format(path, "no layer"))?;
     let (data, image) = (first.data_window(), first.shared_attributes.display_window);
-    let Vec2(left, top) = data.position - image.position;
-    let start = |start: i32, length: usize, limit: usize| {
-        usize::try_from(start).ok().filter(|start| start + length <= limit)
+    // Positions may be as far apart as an i32 allows.
+    let start = |from: i32, origin: i32, length: usize, limit: usize| {
+        let start = usize::try_from(i64::from(from) - i64::from(origin)).ok()?;
+        (start.checked_add(length)? <= limit).then_some(start)
     };
-    let left = start(left, data.size.width(), image.size.width());
-    let top = start(top, data.size.height(), image.size.height());
+    let (Vec2(x, y), Vec2(left, top)) = (data.position, image.position);
+    let left = start(x, left, data.size.width(), image.size.width());
+    let top = start(y, top, data.size.height(), image.size.height());
     let size = (image.size.width(), image.size.height());
     if size.0 == 0 || size.1 == 0 {
         return Err(PixelError::format(path, format!("{}×{} pixels", size.0, size.1)));
