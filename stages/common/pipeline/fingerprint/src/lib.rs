@@ -3,7 +3,8 @@
 //! The stages' build script calls [`emit`]; a stage's `main.rs` reads `env!("STAGE_FINGERPRINT")`.
 //! The hash covers the sources of the stage's crate and of the workspace crates that it depends on,
 //! their part of `Cargo.lock`, compiler, target and profile. The binary's bytes and absolute paths
-//! are excluded, so that moving or rebuilding a checkout doesn't rerun anything.
+//! are excluded, so that moving or rebuilding a checkout doesn't rerun anything. So are comments,
+//! line breaks and unit tests, which can't change a result.
 //!
 //! Cargo features are excluded, too. A feature (`torch`) only adds functions, without which a stage
 //! fails and has no result, so results are equal with and without the feature. Optional
@@ -18,6 +19,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
+use proc_macro2::{Delimiter, TokenStream, TokenTree};
 use toml::{Table, Value};
 
 /// Environment variables of a build script that change the machine code.
@@ -71,10 +73,11 @@ fn add_sources(hash: &mut Hash, root: &Path, crate_dir: &Path) -> Vec<PathBuf> {
         hash.part("Cargo.toml", &manifest);
         for entry in walkdir::WalkDir::new(krate.dir.join("src")).sort_by_file_name() {
             let entry = entry.expect("sources can be listed");
-            if entry.file_type().is_file() {
+            if entry.file_type().is_file() && !is_unit_test(entry.path()) {
                 let path = entry.path().strip_prefix(&krate.dir);
                 let path = path.expect("a walk stays below its root").to_string_lossy();
-                hash.part(&path, &fs::read(entry.path()).expect("sources can be read"));
+                let bytes = fs::read(entry.path()).expect("sources can be read");
+                hash.part(&path, &compiled_part(entry.path(), bytes));
             }
         }
     }
@@ -82,6 +85,67 @@ fn add_sources(hash: &mut Hash, root: &Path, crate_dir: &Path) -> Vec<PathBuf> {
         hash.part("locked", line.as_bytes());
     }
     crates.into_values().map(|krate| krate.dir).collect()
+}
+
+/// True for a module of unit tests in a file of its own: `tests.rs` or `NAME_tests.rs`.
+fn is_unit_test(path: &Path) -> bool {
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    stem == "tests" || stem.ends_with("_tests")
+}
+
+/// Returns the part of a file that the compiler turns into a program: the tokens of Rust code
+/// without comments and unit tests, or all bytes of another file.
+fn compiled_part(path: &Path, bytes: Vec<u8>) -> Vec<u8> {
+    if path.extension().is_none_or(|extension| extension != "rs") {
+        return bytes;
+    }
+    let text = String::from_utf8_lossy(&bytes);
+    // Rust code that isn't tokens doesn't compile, so the bytes of its key matter to nobody.
+    text.parse().map_or(bytes.clone(), |tokens| program_tokens(tokens).to_string().into_bytes())
+}
+
+/// Returns tokens without doc comments and items for tests.
+fn program_tokens(tokens: TokenStream) -> TokenStream {
+    let mut kept = Vec::new();
+    let mut tokens = tokens.into_iter();
+    while let Some(token) = tokens.next() {
+        let TokenTree::Group(group) = token else {
+            kept.push(token);
+            continue;
+        };
+        let attribute = match group.delimiter() {
+            Delimiter::Bracket if follows_hash(&kept) => group.stream().to_string(),
+            _ => String::new(),
+        };
+        let is_test = attribute == "cfg (test)" || attribute == "cfg(test)";
+        if is_test || attribute.starts_with("doc =") {
+            while kept.pop().is_some_and(|token| token.to_string() != "#") {}
+        } else {
+            let inner = program_tokens(group.stream());
+            kept.push(proc_macro2::Group::new(group.delimiter(), inner).into());
+        }
+        if is_test {
+            // An attribute's item ends here or later: what is left of it is hashed.
+            tokens.find(|token| match token {
+                TokenTree::Group(group) => group.delimiter() == Delimiter::Brace,
+                TokenTree::Punct(mark) => ",;".contains(mark.as_char()),
+                _ => false,
+            });
+        }
+    }
+    kept.into_iter().collect()
+}
+
+/// True if tokens end with `#` or `#!`, after which an attribute follows.
+fn follows_hash(tokens: &[TokenTree]) -> bool {
+    let mut marks = tokens.iter().rev().map(|token| match token {
+        TokenTree::Punct(mark) => mark.as_char(),
+        _ => ' ',
+    });
+    match marks.next() {
+        Some('!') => marks.next() == Some('#'),
+        mark => mark == Some('#'),
+    }
 }
 
 #[derive(Default)]
@@ -197,7 +261,7 @@ mod tests {
 
     /// Workspace of four crates. `stage` depends on `shared`, on `extra` with a feature, and on the
     /// package `linux` on one system; `shared` depends on the package `used`. `other` is unused.
-    const FILES: [(&str, &str); 11] = [
+    const FILES: [(&str, &str); 12] = [
         (
             "Cargo.toml",
             "[workspace.dependencies]\nshared = {path = \"shared\"}\nextra = {path = \"extra\"}\n\
@@ -220,17 +284,24 @@ mod tests {
              extra = {workspace = true, optional = true}\n[dev-dependencies]\nstray = \"1\"\n\
              [target.'cfg(target_os = \"linux\")'.dependencies]\nlinux = \"1\"\n",
         ),
-        ("stage/src/main.rs", "fn main() {}"),
-        ("stage/tests/it.rs", "// a test"),
+        ("stage/src/main.rs", "#![warn(missing_docs)]\n//! A stage.\nfn main() { work(1); }"),
+        ("stage/src/unit_tests.rs", "const TESTED: u8 = 1;"),
+        ("stage/tests/it.rs", "const TESTED: u8 = 1;"),
         (
             "shared/Cargo.toml",
             "[package]\nname = \"shared\"\n[dependencies]\nused = {workspace = true}\n",
         ),
-        ("shared/src/lib.rs", "// shared"),
+        (
+            "shared/src/lib.rs",
+            "/// Numbers.\n#[derive(Debug)]\nstruct Pair {\n    /// One.\n    one: u8, // first\n\
+             #[cfg(test)] tested: u8,\n    two: u8,\n}\n\
+             #[cfg(test)]\n#[path = \"unit_tests.rs\"]\nmod unit_tests;\n\
+             #[cfg(test)]\nmod tests { const EXPECTED: u8 = 1; }\nconst LAST: &str = \"// 1\";\n",
+        ),
         ("extra/Cargo.toml", "[package]\nname = \"extra\"\n"),
-        ("extra/src/lib.rs", "// extra"),
+        ("extra/src/lib.rs", "const EXTRA: u8 = 1;"),
         ("other/Cargo.toml", "[package]\nname = \"other\"\n"),
-        ("other/src/lib.rs", "// other"),
+        ("other/src/lib.rs", "const OTHER: u8 = 1;"),
     ];
 
     /// Returns the fingerprint of `stage` after `edit`: a file, a text in it and the replacement.
@@ -254,14 +325,19 @@ mod tests {
         hash.0.finalize().to_hex().to_string()
     }
 
-    /// The fingerprint covers direct and indirect dependencies, but not unused crates or tests.
+    /// The fingerprint covers direct and indirect dependencies, but not unused crates, comments or
+    /// tests.
     #[test]
     fn only_edits_of_used_sources_change_the_fingerprint() {
         let unedited = fingerprint(None);
         for edit in [
-            ("stage/src/main.rs", "main() {}", "main() { }"),
-            ("shared/src/lib.rs", "shared", "shared better"),
-            ("extra/src/lib.rs", "extra", "extra, which a feature brings"),
+            ("stage/src/main.rs", "1", "2"),
+            ("stage/src/main.rs", "warn", "deny"),
+            ("shared/src/lib.rs", "Debug", "Clone"),
+            ("shared/src/lib.rs", "one: u8", "one: u16"),
+            ("shared/src/lib.rs", "two: u8", "two: u16"),
+            ("shared/src/lib.rs", "// 1", "// 2"),
+            ("extra/src/lib.rs", "1", "2"),
             ("shared/Cargo.toml", "workspace = true", "workspace = true, features = []"),
             ("Cargo.lock", "checksum = \"aa\"", "checksum = \"ab\""),
             ("Cargo.lock", "checksum = \"bb\"", "checksum = \"bc\""),
@@ -271,9 +347,17 @@ mod tests {
             assert_ne!(fingerprint(Some(edit)), unedited, "{edit:?}");
         }
         for edit in [
-            ("other/src/lib.rs", "other", "otherwise"),
+            ("other/src/lib.rs", "1", "2"),
             ("other/Cargo.toml", "other", "another"),
-            ("stage/tests/it.rs", "a test", "another test"),
+            ("stage/tests/it.rs", "1", "2"),
+            ("stage/src/unit_tests.rs", "1", "2"),
+            ("stage/src/main.rs", "A stage", "The stage"),
+            ("stage/src/main.rs", "{ work(1); }", "{\n    work(1); // works\n}"),
+            ("shared/src/lib.rs", "Numbers", "Two numbers"),
+            ("shared/src/lib.rs", "One.", "The first."),
+            ("shared/src/lib.rs", "first", "the first"),
+            ("shared/src/lib.rs", "tested: u8", "tested: u16"),
+            ("shared/src/lib.rs", "EXPECTED: u8 = 1", "EXPECTED: u8 = 2"),
             ("Cargo.lock", "checksum = \"cc\"", "checksum = \"cd\""),
         ] {
             assert_eq!(fingerprint(Some(edit)), unedited, "{edit:?}");
