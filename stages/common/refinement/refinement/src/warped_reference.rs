@@ -27,20 +27,6 @@ impl Default for WarpOptions {
     }
 }
 
-/// Features of references for some rows of a view.
-#[derive(Debug)]
-struct ReferenceFeatures {
-    /// Features of each pixel:
-    /// * colours of references minus those of the render;
-    /// * confidence, from 0 (visible in no reference) to 1 (visible in a reference from the same
-    ///   direction, at the view's resolution or a finer one, with the rendered colour);
-    /// * detail: colours of references minus those of their own renders. Detail helps even if a
-    ///   reference displays a point slightly displaced or in another light.
-    features: Vec<[f32; FEATURES]>,
-    /// Statistics of each reference.
-    statistics: Vec<ReferenceStatistics>,
-}
-
 /// Number of channels of reference features.
 const FEATURES: usize = REFERENCE_INPUTS - INPUTS;
 
@@ -113,6 +99,12 @@ impl FeatureSums {
         self.max_confidence = self.max_confidence.max(pixel.confidence);
     }
 
+    /// Returns the features of the pixel:
+    /// * colours of references minus those of the render;
+    /// * confidence, from 0 (visible in no reference) to 1 (visible in a reference from the same
+    ///   direction, at the view's resolution or a finer one, with the rendered colour);
+    /// * detail: colours of references minus those of their own renders. Detail helps even if a
+    ///   reference displays a point slightly displaced or in another light.
     fn features(self) -> [f32; FEATURES] {
         if self.weight > 0.0 {
             let [r, g, b] = self.difference.map(|v| v / self.weight);
@@ -121,31 +113,6 @@ impl FeatureSums {
         } else {
             [0.0; FEATURES]
         }
-    }
-}
-
-impl ReferenceFeatures {
-    /// Warps references to rows of a view and combines them.
-    fn new(
-        rendered: &Rendered,
-        references: &[&KnownView],
-        rows: Range<usize>,
-        options: WarpOptions,
-    ) -> Self {
-        let mut sums = vec![FeatureSums::default(); rendered.view.width * rows.len()];
-        let mut statistics = Vec::with_capacity(references.len());
-        for reference in references {
-            let mut own = ReferenceStatistics::default();
-            let warped = warp(rendered, reference, &rows, options);
-            for (sums, pixel) in sums.iter_mut().zip(&warped) {
-                own.visible_pixels += usize::from(pixel.visibility > 0.0);
-                own.visibility += f64::from(pixel.visibility);
-                own.confidence += f64::from(pixel.confidence);
-                sums.add(pixel);
-            }
-            statistics.push(own);
-        }
-        Self { features: sums.into_iter().map(FeatureSums::features).collect(), statistics }
     }
 }
 
@@ -269,7 +236,8 @@ pub fn with_references(
     ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), statistics }
 }
 
-/// Fills a band of a conditioned view, starting at `first_row`; returns the references' statistics.
+/// Fills a band of rows of a conditioned view, starting at `first_row`; returns the references'
+/// statistics.
 fn fill_band(
     band: &mut [f32],
     first_row: usize,
@@ -277,14 +245,23 @@ fn fill_band(
     references: &[&KnownView],
     options: WarpOptions,
 ) -> Vec<ReferenceStatistics> {
-    let Image { width, height, .. } = rendered.view;
-    let rows = first_row..(first_row + BAND_ROWS).min(height);
-    let ReferenceFeatures { features, statistics } =
-        ReferenceFeatures::new(rendered, references, rows.clone(), options);
-    let view = &rendered.view.data[rows.start * width * INPUTS..];
+    let width = rendered.view.width;
+    let rows = first_row..first_row + band.len() / (width * REFERENCE_INPUTS);
+    let mut sums = vec![FeatureSums::default(); width * rows.len()];
+    let mut statistics = vec![ReferenceStatistics::default(); references.len()];
+    for (reference, own) in references.iter().zip(&mut statistics) {
+        let warped = warp(rendered, reference, &rows, options);
+        for (sums, pixel) in sums.iter_mut().zip(&warped) {
+            own.visible_pixels += usize::from(pixel.visibility > 0.0);
+            own.visibility += f64::from(pixel.visibility);
+            own.confidence += f64::from(pixel.confidence);
+            sums.add(pixel);
+        }
+    }
+    let view = &rendered.view.data[first_row * width * INPUTS..];
     for (i, pixel) in band.chunks_exact_mut(REFERENCE_INPUTS).enumerate() {
         pixel[..INPUTS].copy_from_slice(&view[i * INPUTS..(i + 1) * INPUTS]);
-        pixel[INPUTS..].copy_from_slice(&features[i]);
+        pixel[INPUTS..].copy_from_slice(&sums[i].features());
     }
     statistics
 }
@@ -420,14 +397,10 @@ mod tests {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
         let options = WarpOptions::default();
         let complete = with_references(&view.rendered, &[&reference], options).view;
-        let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, options);
-        assert_eq!(band.features.len(), 34 * WIDTH);
-        let expected = complete.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
-        for (found, expected) in band.features.iter().zip(expected) {
-            assert!(
-                found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5),
-                "{found:?} {expected:?}"
-            );
+        let mut band = vec![0.0; 34 * WIDTH * REFERENCE_INPUTS];
+        fill_band(&mut band, 7, &view.rendered, &[&reference], options);
+        for (found, expected) in band.iter().zip(&complete.data[7 * WIDTH * REFERENCE_INPUTS..]) {
+            assert!((found - expected).abs() < 1e-5, "{found} {expected}");
         }
     }
 }
