@@ -90,7 +90,7 @@ pub(crate) fn remove_misleading(
     ReferenceJudge {
         views: &views.views,
         warp_options,
-        read: &|view| Ok(job.read(view)?.rendered),
+        read: &|view| Ok(job.read(view)?.0),
         log: &|note| job.context.log_line(note),
     }
     .retain_reliable(references, confidence)
