@@ -18,7 +18,7 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
     if report.scenes.len() > 1 {
         return html! {};
     }
-    let Some(best) = report.best() else {
+    let Some(best) = report.best_row().map(|best| &report.rows[best]) else {
         return html! { p class="note" { "There are no scores." } };
     };
     let known = report.figures.iter().filter_map(|figure| Some((figure, best.mean(figure)?)));
@@ -51,7 +51,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
     if rows.is_empty() {
         return html! {};
     }
-    let known: Vec<&ScoreFormat> = report.figures.iter().filter(|f| has_values(f, rows)).collect();
+    let known = report.known_figures();
     let with_data_sets = report.scenes.len() > 1;
     html! {
         section id="scores" aria-labelledby="scores-heading" {
@@ -170,8 +170,7 @@ fn missing_note(report: &Report<'_>) -> Markup {
 
 /// Table of every view's figures, readable without mouse and JavaScript, unlike the plots.
 pub(crate) fn view_figures(report: &Report<'_>) -> Markup {
-    let known: Vec<&ScoreFormat> =
-        report.figures.iter().filter(|figure| has_values(figure, &report.rows)).collect();
+    let known = report.known_figures();
     let views: usize = report.rows.iter().map(Row::view_count).sum();
     if views == 0 || views * known.len() > MAX_CELLS {
         return html! {};
