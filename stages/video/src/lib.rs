@@ -3,7 +3,6 @@
 //! The stage is a sink. It writes a PNG per frame and a film: `video.mp4` by `ffmpeg`, or
 //! `video.png` if `ffmpeg` is missing or fails. Each point of a sweep has its own folder.
 
-mod animation;
 mod film;
 
 use std::path::Path;
@@ -57,14 +56,10 @@ impl Stage for Video {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![(
-            "run",
-            Input::required(
-                &["run"],
-                "in pipeline.yaml: a block that renders views; nerf-sr passes a folder \
-                with its record, run.json",
-            ),
-        )]
+        Input::run(
+            "in pipeline.yaml: a block that renders views; nerf-sr passes a folder with its \
+            record, run.json",
+        )
     }
 
     fn output() -> Output {
