@@ -26,7 +26,7 @@ mod visibility;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Failure, GivenInput, RunNode, RunRecord, sink_folders};
+use artifact::{GivenInput, RunNode, RunRecord, bail_bad_input, sink_folders};
 use base64::Engine as _;
 use pixels::{
     DEGRADATION_FILE, Degradation, Filter, Image, Rgba8, encode_png, read_premultiplied,
@@ -78,14 +78,10 @@ impl Stage for Viewer {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![(
-            "run",
-            Input::required(
-                &["run"],
-                "in pipeline.yaml: a block that trains a field; nerf-sr passes a folder \
-                with its record, run.json",
-            ),
-        )]
+        Input::run(
+            "in pipeline.yaml: a block that trains a field; nerf-sr passes a folder with its \
+            record, run.json",
+        )
     }
 
     fn output() -> Output {
@@ -93,14 +89,12 @@ impl Stage for Viewer {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let run = RunRecord::read(context.input("run")?)?;
         let is_shown_field = |i: &usize| run.nodes[*i].is_shown && run.nodes[*i].kind == "field";
         let indices: Vec<usize> = (0..run.nodes.len()).filter(is_shown_field).collect();
         let fields: Vec<&RunNode> = indices.iter().map(|&i| &run.nodes[i]).collect();
         if fields.is_empty() {
-            let message = "run.json has no field to show; set input `run: train-ss`";
-            return Err(Failure::BadInput(message.to_owned()).into());
+            bail_bad_input!("run.json has no field to show; set input `run: train-ss`");
         }
         for (index, prefix) in indices.into_iter().zip(sink_folders(&fields)) {
             let node = &run.nodes[index];
