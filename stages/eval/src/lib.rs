@@ -120,7 +120,10 @@ impl Stage for Eval {
         let result = Metrics {
             conventions: conventions(&scene, &metrics),
             figures: metrics.iter().flat_map(|metric| metric.figures()).collect(),
-            picture_titles: picture_titles(&metrics),
+            picture_titles: metrics
+                .iter()
+                .filter_map(|metric| Some((metric.name().into(), metric.picture_title()?.into())))
+                .collect(),
             mean: mean_of(scored.iter().map(|view| &view.scores)),
             least_gain: least_gain.flatten(),
             near_references,
@@ -139,16 +142,6 @@ fn min_scored_side(truth: &Views) -> usize {
     let views = truth.views.iter().filter(|view| view.image.is_some());
     let sides = views.map(|view| view.camera.intrinsics.width.min(view.camera.intrinsics.height));
     sides.min().map_or(usize::MAX, |side| side as usize)
-}
-
-fn picture_titles(metrics: &[Box<dyn Metric>]) -> BTreeMap<String, String> {
-    let mut titles = BTreeMap::new();
-    for metric in metrics {
-        if let Some(title) = metric.picture_title() {
-            titles.insert(metric.name().to_owned(), title.to_owned());
-        }
-    }
-    titles
 }
 
 /// Scores a view by every metric, and writes its error map and the metrics' pictures.
