@@ -51,7 +51,7 @@ impl Layout<'_> {
 
     fn head(&self, columns: &[Vec<String>], values: &[&String]) -> Vec<String> {
         let mut head = self.keys.clone();
-        let titles = self.figures.titles(values);
+        let titles: Vec<String> = values.iter().map(|name| self.figures.title(name)).collect();
         if self.params.columns.is_empty() {
             head.extend(titles);
         } else {
