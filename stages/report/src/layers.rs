@@ -299,31 +299,22 @@ fn add_method<'a>(
         scored.push((Group::Metric { name: name.to_owned(), title: title.to_owned() }, pointer));
     }
     for (group, pointer) in scored {
-        if has_files(row, &pointer) {
-            let views = row.metrics.views().iter();
-            let files = views
-                .map(|view| (view["name"].as_str().unwrap_or_default(), view.pointer(&pointer)));
-            let files = files.map(|(view, file)| (view, file.and_then(Value::as_str)));
-            let identity = files_identity(&row.node.folder, files);
-            let source = Source::Scored(row, pointer);
-            let label = label.clone();
+        let files = row.metrics.views().iter().map(|view| {
+            let file = view.pointer(&pointer).and_then(Value::as_str);
+            (view["name"].as_str().unwrap_or_default(), file)
+        });
+        if files.clone().any(|(_, file)| file.is_some()) {
             layers.push(Layer {
-                label,
+                label: label.clone(),
                 group,
                 scene: row.scene,
                 rows: vec![index],
-                identity,
-                source,
+                identity: files_identity(&row.node.folder, files),
+                source: Source::Scored(row, pointer),
             });
         }
     }
     Ok(())
-}
-
-/// True if the scores of some view name a file at `pointer`.
-fn has_files(row: &Row<'_>, pointer: &str) -> bool {
-    let mut views = row.metrics.views().iter();
-    views.any(|view| view.pointer(pointer).is_some_and(Value::is_string))
 }
 
 fn folder_of(report: &Report<'_>, row: &Row<'_>, input: &str) -> Option<PathBuf> {
