@@ -112,7 +112,8 @@ fn make_film(
     rate: f64,
 ) -> anyhow::Result<()> {
     let views = Views::read_folder(folder)?;
-    if views.views.iter().any(|view| size_of_view(view) != size_of_view(&views.views[0])) {
+    let size = |view: &View| [view.camera.intrinsics.width, view.camera.intrinsics.height];
+    if views.views.iter().any(|view| size(view) != size(&views.views[0])) {
         bail_bad_input!("views have different sizes; set render-depth.size");
     }
     let progress = context.progress("drawing", 2 * views.views.len() as u64);
@@ -134,10 +135,6 @@ fn make_film(
         anyhow::Ok(())
     })?;
     film.write(context)
-}
-
-fn size_of_view(view: &View) -> (u32, u32) {
-    (view.camera.intrinsics.width, view.camera.intrinsics.height)
 }
 
 /// Draws a view's colour and, with a range of depths, its depth on the right.
