@@ -67,11 +67,9 @@ impl Weights {
                     return Err(format_error(path, reason));
                 }
             };
-            let tensor = Tensor::from_data_size(view.data(), &shape, kind);
-            tensors.insert(
-                name,
-                if kind == Kind::Half { tensor.to_kind(Kind::Float) } else { tensor },
-            );
+            let kept_kind = if kind == Kind::Half { Kind::Float } else { kind };
+            let tensor = Tensor::from_data_size(view.data(), &shape, kind).to_kind(kept_kind);
+            tensors.insert(name, tensor);
         }
         Ok(Self { path: path.to_path_buf(), tensors })
     }
@@ -79,19 +77,16 @@ impl Weights {
     /// Returns the i64 tensor of this name, which must have `count` elements.
     pub fn integers(&self, name: &str, count: usize) -> Result<Vec<i64>, WeightsError> {
         let tensor = self.tensors.get(name).filter(|t| t.kind() == Kind::Int64);
-        let integers = tensor.and_then(|t| Vec::<i64>::try_from(t).ok());
-        integers
-            .filter(|i| i.len() == count)
-            .ok_or_else(|| self.error(format!("no tensor {name} of {count} i64 values")))
+        let integers =
+            tensor.and_then(|t| Vec::<i64>::try_from(t).ok().filter(|i| i.len() == count));
+        integers.ok_or_else(|| self.error(format!("no tensor {name} of {count} i64 values")))
     }
 
     /// Returns the u8 tensor of this name, which must have `count` elements.
     pub fn bytes(&self, name: &str, count: i64) -> Result<Tensor, WeightsError> {
-        let bytes =
-            self.tensors.get(name).filter(|t| t.kind() == Kind::Uint8 && t.size() == [count]);
-        bytes
-            .map(Tensor::shallow_clone)
-            .ok_or_else(|| self.error(format!("no tensor {name} of {count} bytes")))
+        let bytes = self.tensors.get(name).filter(|t| t.kind() == Kind::Uint8);
+        let bytes = bytes.filter(|t| t.size() == [count]).map(Tensor::shallow_clone);
+        bytes.ok_or_else(|| self.error(format!("no tensor {name} of {count} bytes")))
     }
 
     /// Returns whether the file has a tensor of this name.
@@ -102,9 +97,8 @@ impl Weights {
     /// Returns the shape of a tensor, which must have `N` dimensions: for networks whose size is
     /// read from their file.
     pub fn shape<const N: usize>(&self, name: &str) -> Result<[i64; N], WeightsError> {
-        let tensor =
-            self.tensors.get(name).ok_or_else(|| self.error(format!("no tensor {name}")))?;
-        let size = tensor.size();
+        let tensor = self.tensors.get(name);
+        let size = tensor.ok_or_else(|| self.error(format!("no tensor {name}")))?.size();
         size.as_slice().try_into().map_err(|_| {
             self.error(format!("tensor {name}: expected {N} dimensions, found shape {size:?}"))
         })
