@@ -112,15 +112,12 @@ pub(crate) fn definition<'a>(
     // A result without this figure may state why it isn't measured.
     let row = report.rows.iter().find(|row| row.mean(figure).is_some())?;
     let conventions = row.metrics.conventions().as_object()?;
-    // Networks of LPIPS share a definition.
-    let (name, text) =
-        conventions.iter().find(|(name, _)| metric == *name || is_variant(metric, name))?;
+    // Networks of LPIPS, such as `lpips_vgg`, share a definition.
+    let is_own = |name: &str| {
+        metric.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('_'))
+    };
+    let (name, text) = conventions.iter().find(|(name, _)| is_own(name))?;
     Some((name, text.as_str()?))
-}
-
-/// True if a metric's name is another one's with a suffix, such as `lpips_vgg`.
-fn is_variant(metric: &str, name: &str) -> bool {
-    metric.strip_prefix(name).is_some_and(|suffix| suffix.starts_with('_'))
 }
 
 /// Text that may be broken after punctuation, so that no word is cut.
