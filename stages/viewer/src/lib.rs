@@ -32,7 +32,7 @@ use pixels::{
     DEGRADATION_FILE, Degradation, Filter, Image, Rgba8, encode_png, read_premultiplied,
     resize_pillow,
 };
-use scene::{Bounds, Camera, Intrinsics, Space, Views, undistort_image};
+use scene::{Bounds, Camera, Space, Views, undistort_image};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Input, Output, Stage};
@@ -192,7 +192,10 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
         // Spread evenly: a photograph wherever i * photographs / count reaches the next integer.
         let has_photograph = (i + 1) * photographs / count > i * photographs / count;
         let intrinsics = view.camera.intrinsics;
-        let pinhole = pinhole_of_fisheye(&intrinsics);
+        // The page draws a pinhole camera instead of a fisheye one, and ignores other distortion,
+        // which is small enough.
+        let is_fisheye = intrinsics.distortion.is_fisheye();
+        let pinhole = is_fisheye.then(|| intrinsics.pinhole()).flatten();
         let photograph = match &view.image {
             Some(file) if has_photograph => {
                 let image = straight_alpha(&read_premultiplied(&folder.join(file))?);
@@ -226,12 +229,6 @@ fn straight_alpha(image: &Image) -> Rgba8 {
         }
     }
     Image::new(image.width, image.height, 4, data).to_rgba8()
-}
-
-/// Returns the pinhole camera that the page draws instead of a fisheye camera. The page ignores
-/// other distortion, which is small enough.
-fn pinhole_of_fisheye(intrinsics: &Intrinsics) -> Option<Intrinsics> {
-    if intrinsics.distortion.is_fisheye() { intrinsics.pinhole() } else { None }
 }
 
 /// Shrinks an image by a whole factor to at most `max_width` pixels in width.
