@@ -2,6 +2,7 @@ use std::cmp::Ordering;
 
 use artifact::{RunNode, RunRecord};
 use metrics::{AnyMetrics, ScoreFormat};
+use scene::Views;
 use serde_json::Value;
 
 use crate::results::scored_nodes;
@@ -80,9 +81,9 @@ impl<'a> Report<'a> {
             }
         }
         for index in unscored_nodes(run) {
-            let Some(names) = UnscoredViews::read_names(run, index) else { continue };
+            let Ok(views) = Views::read_folder(&run.nodes[index].folder) else { continue };
             let scene = report.scene(index);
-            report.add_views(scene, names.iter().map(String::as_str));
+            report.add_views(scene, views.views.iter().map(|view| view.camera.name.as_str()));
             report.unscored.push(UnscoredViews::new(run, index, scene));
         }
         report.figures = figures(&report.rows);

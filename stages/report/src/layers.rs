@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use artifact::Manifest;
-use pixels::{DepthMap, ExrImage, Rgba8, common_range, read_exr, read_png};
+use pixels::{DepthMap, Rgba8, common_range, read_exr, read_png};
 use scene::{View, Views};
 use serde_json::Value;
 
@@ -68,20 +68,10 @@ impl Folder {
         format!("{:?} {}", self.views.background, files_identity(&self.path, files))
     }
 
-    fn view(&self, name: &str) -> Option<&View> {
-        self.views.views.iter().find(|view| view.camera.name == name)
-    }
-
-    /// Reads an image of the folder, if any, over the background.
-    fn colour(&self, file: Option<&String>) -> anyhow::Result<Option<Rgba8>> {
-        let Some(file) = file else { return Ok(None) };
-        Ok(Some(self.views.read_over(&self.path.join(file))?.to_rgba8()))
-    }
-
-    /// Reads the depth map of a view, if available.
-    fn depth(&self, name: &str) -> anyhow::Result<Option<ExrImage>> {
-        let file = self.view(name).and_then(|view| view.depth.as_ref());
-        Ok(file.map(|file| read_exr(&self.path.join(file))).transpose()?)
+    /// Returns the path of the file of a view that a group displays, if any.
+    fn file(&self, view: &str, group: &Group) -> Option<PathBuf> {
+        let view = self.views.views.iter().find(|other| other.camera.name == view)?;
+        group.file(view).map(|file| self.path.join(file))
     }
 }
 
@@ -133,12 +123,13 @@ impl Layer<'_> {
     /// Draws the picture of a view, if available; `range` is that of the depths' colours.
     pub(crate) fn picture(&self, view: &str, range: (f32, f32)) -> anyhow::Result<Option<Rgba8>> {
         match &self.source {
-            Source::Views(folder) if self.group == Group::Depth => {
-                let image = folder.depth(view)?;
-                Ok(image.and_then(|image| Some(DepthMap::of(&image)?.draw(image.width, range))))
-            }
             Source::Views(folder) => {
-                folder.colour(folder.view(view).and_then(|view| self.group.file(view)))
+                let Some(path) = folder.file(view, &self.group) else { return Ok(None) };
+                if self.group != Group::Depth {
+                    return Ok(Some(folder.views.read_over(&path)?.to_rgba8()));
+                }
+                let image = read_exr(&path)?;
+                Ok(DepthMap::of(&image).map(|map| map.draw(image.width, range)))
             }
             Source::Scored(row, pointer) => {
                 let file = row.view(view).and_then(|scores| scores.pointer(pointer)?.as_str());
@@ -158,9 +149,8 @@ impl Layer<'_> {
             return Ok(None);
         };
         let mut ranges = Vec::new();
-        for view in views {
-            let image = folder.depth(view)?;
-            ranges.extend(image.and_then(|image| DepthMap::of(&image)?.range()));
+        for path in views.filter_map(|view| folder.file(view, &self.group)) {
+            ranges.extend(DepthMap::of(&read_exr(&path)?).and_then(|map| map.range()));
         }
         Ok(common_range(ranges))
     }
