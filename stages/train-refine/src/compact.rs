@@ -6,7 +6,7 @@ use refinement::{
 };
 use stage::Context;
 
-use crate::examples::{Examples, lr_photographs, read_examples};
+use crate::examples::{lr_photographs, read_examples, split};
 use crate::params::CompactParams;
 use crate::steps::{ExampleTraining, training_failure};
 use crate::write_refiner_file;
@@ -18,8 +18,8 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
     }
     let photographs = lr_photographs(context)?;
     let (views, truth) = (context.input("views")?, context.input("truth")?);
-    let examples = Examples::split(read_examples(views, truth, photographs.as_ref())?);
-    if net.references_per_view > 0 && examples.training.len() < 2 {
+    let (examples, left_out) = split(read_examples(views, truth, photographs.as_ref())?);
+    if net.references_per_view > 0 && examples.len() < 2 {
         bail_bad_input!(
             "input views: references_per_view needs at least three views with an image in input \
             truth"
@@ -40,12 +40,12 @@ pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::
         seed,
     };
     let trainer = RefinerTrainer::new(refiner, options);
-    let mut training = ExampleTraining { trainer, examples: &examples.training };
+    let mut training = ExampleTraining { trainer, examples: &examples };
     context.train(options.steps, &mut training, |loss| {
         format!("PSNR of training patches {:.2} dB", psnr_of(loss))
     })?;
     let trainer = training.trainer;
-    let file = trainer.score(&examples.left_out, &examples.training)?;
+    let file = trainer.score(&left_out, &examples)?;
     trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?).map_err(training_failure)?;
     let file = RefinerFile { data_consistent: photographs.is_some(), ..file };
     write_refiner_file(context, "views left out of training", &file)

@@ -6,30 +6,19 @@ use stage::Context;
 /// Interval of the views that are left out of training (design note 015).
 const HOLD_OUT_EVERY: usize = 8;
 
-/// Views with ground truth.
-#[derive(Debug)]
-pub(crate) struct Examples<T = KnownView> {
-    /// Views to train on.
-    pub(crate) training: Vec<T>,
-    /// Views to score the network on.
-    pub(crate) left_out: Vec<T>,
-}
-
-impl<T: Clone> Examples<T> {
-    /// Leaves out the fifth of each eight views, or the last of fewer than five; a single view is
-    /// used for both.
-    pub(crate) fn split(all: Vec<T>) -> Self {
-        if all.len() == 1 {
-            return Self { training: all.clone(), left_out: all };
-        }
-        let middle = (HOLD_OUT_EVERY / 2).min(all.len() - 1);
-        let mut examples = Self { training: Vec::new(), left_out: Vec::new() };
-        for (i, example) in all.into_iter().enumerate() {
-            let is_left_out = i % HOLD_OUT_EVERY == middle;
-            if is_left_out { &mut examples.left_out } else { &mut examples.training }.push(example);
-        }
-        examples
+/// Splits examples into those to train on and those to score the network on: the fifth of each eight,
+/// or the last of fewer than five. A single example is used for both.
+pub(crate) fn split<T: Clone>(all: Vec<T>) -> (Vec<T>, Vec<T>) {
+    if all.len() == 1 {
+        return (all.clone(), all);
     }
+    let middle = (HOLD_OUT_EVERY / 2).min(all.len() - 1);
+    let (mut training, mut left_out) = (Vec::new(), Vec::new());
+    for (i, example) in all.into_iter().enumerate() {
+        let is_left_out = i % HOLD_OUT_EVERY == middle;
+        if is_left_out { &mut left_out } else { &mut training }.push(example);
+    }
+    (training, left_out)
 }
 
 /// Reads rendered views and their truth, and makes the views consistent with LR `photographs` if
@@ -180,19 +169,18 @@ mod tests {
     #[test]
     fn every_eighth_is_left_out_and_none_is_lost() {
         for count in 2..40usize {
-            let Examples { training, left_out } = Examples::split((0..count).collect());
+            let (training, left_out) = split((0..count).collect());
             let mut all = [training.clone(), left_out.clone()].concat();
             all.sort_unstable();
             assert_eq!(all, (0..count).collect::<Vec<_>>(), "{count}");
             assert!(!training.is_empty() && !left_out.is_empty(), "{count}");
             assert!(left_out.len() <= count.div_ceil(HOLD_OUT_EVERY), "{count}: {left_out:?}");
         }
-        assert_eq!(Examples::split((0..16).collect::<Vec<_>>()).left_out, [4, 12]);
+        assert_eq!(split((0..16).collect::<Vec<_>>()).1, [4, 12]);
     }
 
     #[test]
     fn a_single_example_is_trained_on_and_left_out() {
-        let Examples { training, left_out } = Examples::split(vec![7]);
-        assert_eq!((training, left_out), (vec![7], vec![7]));
+        assert_eq!(split(vec![7]), (vec![7], vec![7]));
     }
 }
