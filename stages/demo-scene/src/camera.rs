@@ -34,22 +34,20 @@ impl ViewCamera {
         let Some(degrees) = params.training_angle() else { return test };
         let half_angle = 0.5 * degrees.to_radians();
         let distortion = Distortion::fisheye(FISHEYE_COEFFICIENTS);
-        let half_shorter_side = match params.projection {
-            Projection::Perspective => libm::tan(half_angle),
-            Projection::Fisheye => distortion.distort([libm::tan(half_angle), 0.0])[0],
-        };
+        let is_fisheye = params.projection == Projection::Fisheye;
+        let slope = libm::tan(half_angle);
+        let half_shorter_side =
+            if is_fisheye { distortion.distort([slope, 0.0])[0] } else { slope };
         let enlargement = half_shorter_side / libm::tan(0.5 * CAMERA_ANGLE);
         let sides = test.sides.map(|side| (f64::from(side) * enlargement).round().max(1.0) as u32);
         let [width, height] = sides;
         let [cx, cy] = sides.map(|side| 0.5 * f64::from(side));
-        match params.projection {
-            Projection::Perspective => Self::pinhole(sides, 2.0 * libm::atan(cx / test.focal)),
-            Projection::Fisheye => {
-                let (fx, fy) = (test.focal, test.focal);
-                let intrinsics = Intrinsics { width, height, fx, fy, cx, cy, distortion };
-                Self { sides, fisheye: Some(intrinsics), ..test }
-            }
+        if !is_fisheye {
+            return Self::pinhole(sides, 2.0 * libm::atan(cx / test.focal));
         }
+        let (fx, fy) = (test.focal, test.focal);
+        let intrinsics = Intrinsics { width, height, fx, fy, cx, cy, distortion };
+        Self { sides, fisheye: Some(intrinsics), ..test }
     }
 
     /// Creates a pinhole camera.
