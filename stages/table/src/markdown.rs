@@ -38,12 +38,8 @@ pub(crate) fn document(
     let scene = SCENE.to_owned();
     let is_averaged = !keys.contains(&scene) && !params.columns.contains(&scene);
     // A comparison (`relative_to`) has one table, of the means.
-    let mut scenes = if is_averaged && reference.is_none() {
-        distinct(rows, std::slice::from_ref(&scene)).concat()
-    } else {
-        Vec::new()
-    };
-    if scenes.len() < 2 {
+    let mut scenes = distinct(rows, std::slice::from_ref(&scene)).concat();
+    if !is_averaged || reference.is_some() || scenes.len() < 2 {
         scenes.clear();
     }
     let layout = Layout { params, figures, keys, reference };

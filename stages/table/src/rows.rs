@@ -102,23 +102,15 @@ fn scores(node: &RunNode, figures: &mut Figures) -> anyhow::Result<Row> {
         if let (Some(refined), Some(rendered)) = scores {
             found.insert("gain".to_owned(), json!(refined - rendered));
         }
-        return Ok(found);
+    } else if node.kind == "metrics" {
+        let file = AnyMetrics::read(&node.folder)?;
+        figures.add(&file);
+        numbers("", file.mean(), &mut found);
+        numbers("least_gain", file.least_gain(), &mut found);
+        numbers("near_psnr", &file.near_references()["psnr"], &mut found);
+        numbers("near_views", &file.near_references()["views"], &mut found);
+        found.insert("views".to_owned(), json!(file.views().len()));
     }
-    if node.kind != "metrics" {
-        return Ok(found);
-    }
-    let file = AnyMetrics::read(&node.folder)?;
-    figures.add(&file);
-    numbers("", file.mean(), &mut found);
-    let near = file.near_references();
-    for (name, value) in [
-        ("least_gain", file.least_gain()),
-        ("near_psnr", &near["psnr"]),
-        ("near_views", &near["views"]),
-    ] {
-        numbers(name, value, &mut found);
-    }
-    found.insert("views".to_owned(), json!(file.views().len()));
     Ok(found)
 }
 
