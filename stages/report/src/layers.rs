@@ -175,20 +175,17 @@ pub(crate) fn max_pixels(layers: &[Layer<'_>], scene: usize) -> u64 {
 /// Returns all layers: observations first, then those of each method.
 pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>>> {
     let mut layers = Vec::new();
-    let mut truths: Vec<(PathBuf, usize, Option<Arc<Folder>>)> = Vec::new();
+    let mut truths: Vec<(PathBuf, usize)> = Vec::new();
     for row in &report.rows {
-        let Some(path) = folder_of(report, row, "truth") else { continue };
-        if !truths.iter().any(|(other, scene, _)| *other == path && *scene == row.scene) {
-            let folder = has_views(&path).then(|| Folder::read(path.clone())).transpose()?;
-            truths.push((path, row.scene, folder));
-        }
+        let truth = folder_of(report, row, "truth").map(|path| (path, row.scene));
+        truths.extend(truth.filter(|truth| !truths.contains(truth)));
     }
-    for (path, scene, folder) in &truths {
-        let Some(folder) = folder else { continue };
-        add_observations(&mut layers, *scene, folder, &scored_on(report, path));
+    for (path, scene) in truths.iter().filter(|(path, _)| has_views(path)) {
+        let folder = Folder::read(path.clone())?;
+        add_observations(&mut layers, *scene, &folder, &scored_on(report, path));
     }
     for views in &report.unscored {
-        let has_truth = truths.iter().any(|(_, scene, _)| *scene == views.scene);
+        let has_truth = truths.iter().any(|(_, scene)| *scene == views.scene);
         if let Some(truth) = views.truth.clone().filter(|_| !has_truth) {
             add_observations(&mut layers, views.scene, &Folder::read(truth)?, &views.label);
         }
