@@ -172,7 +172,7 @@ fn refine_all(
         summary.consistent += usize::from(refined.is_consistent);
         summary.averaged +=
             usize::from(job.enlarged.as_ref().is_some_and(|enlarged| enlarged.has(&view.camera)));
-        network::add_statistics(&mut summary.statistics, &refined.statistics);
+        ReferenceStatistics::add_each(&mut summary.statistics, &refined.statistics);
         view.depth = view.depth.as_ref().map(|_| image.clone());
         view.image = Some(image);
         // These files of the input aren't copied.

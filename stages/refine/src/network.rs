@@ -63,7 +63,7 @@ impl AnyRefiner {
                     .warp_options()
                     .map(|warp_options| with_references(rendered, &references, warp_options));
                 if let Some(conditioned) = &conditioned {
-                    add_statistics(statistics, &conditioned.statistics);
+                    ReferenceStatistics::add_each(statistics, &conditioned.statistics);
                 }
                 let view = conditioned.as_ref().map_or(&rendered.view, |known| &known.view);
                 Ok(network.refine_weighted(view, residual_weight, self_ensemble)?)
@@ -75,13 +75,6 @@ impl AnyRefiner {
                 Ok(drawn)
             }
         }
-    }
-}
-
-/// Adds each reference's statistics to its sum.
-pub(crate) fn add_statistics(sums: &mut [ReferenceStatistics], statistics: &[ReferenceStatistics]) {
-    for (i, sum) in sums.iter_mut().enumerate() {
-        sum.add(&statistics[i]);
     }
 }
 

@@ -55,6 +55,13 @@ impl ReferenceStatistics {
         self.visibility += other.visibility;
         self.confidence += other.confidence;
     }
+
+    /// Adds each reference's statistics for other pixels to its sum.
+    pub fn add_each(sums: &mut [Self], others: &[Self]) {
+        for (sum, other) in sums.iter_mut().zip(others) {
+            sum.add(other);
+        }
+    }
 }
 
 /// View with reference features.
@@ -135,13 +142,12 @@ fn warp(
     });
     let sums = Sums::new(width, &terms.collect::<Vec<_>>());
     let mut pixels = Vec::with_capacity(width * rows.len());
-    let positions = WarpedPositions { warped: &warped, width };
     for y in rows.start - first_row..rows.end - first_row {
         for x in 0..width {
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
                 let difference = mean_difference(&sums, x, y) / DIFFERENCE_AT_QUARTER_CONFIDENCE;
-                let squared = positions.squared_second_differences(x, y);
+                let squared = squared_second_differences(&warped, width, x, y);
                 own.confidence *= (1.0 + difference * difference).powi(-2)
                     / (1.0 + squared / SECOND_DIFFERENCE_AT_HALF_CONFIDENCE.powi(2));
             }
@@ -184,34 +190,21 @@ fn mean_difference(sums: &Sums<4>, x: usize, y: usize) -> f32 {
     [r, g, b].map(|sum| (sum / count.max(1.0)).powi(2)).iter().sum::<f64>().sqrt() as f32
 }
 
-/// Positions of neighbouring pixels in a reference.
-struct WarpedPositions<'a> {
-    warped: &'a [WarpedPixel],
-    width: usize,
-}
-
-impl WarpedPositions<'_> {
-    /// Returns the position of a pixel's neighbour if the neighbour is visible.
-    fn of_neighbour(&self, x: usize, y: usize, dx: isize, dy: isize) -> Option<[f32; 2]> {
+/// Returns the squared second differences, a + b - 2·own, of the positions around a pixel of warped
+/// rows in a reference: the sum of the horizontal and the vertical one, 0 for one with an invisible
+/// neighbour.
+fn squared_second_differences(warped: &[WarpedPixel], width: usize, x: usize, y: usize) -> f32 {
+    let own = warped[y * width + x].position;
+    let neighbour = |dx: isize, dy: isize| {
         let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
-        let other = (x < self.width).then(|| self.warped.get(y * self.width + x))??;
+        let other = (x < width).then(|| warped.get(y * width + x))??;
         (other.confidence > 0.0).then_some(other.position)
-    }
-
-    /// Returns the squared second differences of the positions around a pixel: the sum of the
-    /// horizontal and the vertical one.
-    fn squared_second_differences(&self, x: usize, y: usize) -> f32 {
-        let own = self.warped[y * self.width + x].position;
-        let horizontal = [self.of_neighbour(x, y, -1, 0), self.of_neighbour(x, y, 1, 0)];
-        let vertical = [self.of_neighbour(x, y, 0, -1), self.of_neighbour(x, y, 0, 1)];
-        squared_second_difference(own, horizontal) + squared_second_difference(own, vertical)
-    }
-}
-
-/// Returns the squared second difference a + b - 2·own; 0 if a neighbour is missing.
-fn squared_second_difference(own: [f32; 2], neighbours: [Option<[f32; 2]>; 2]) -> f32 {
-    let [Some(a), Some(b)] = neighbours else { return 0.0 };
-    (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
+    };
+    let squared = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
+        let Some((a, b)) = a.zip(b) else { return 0.0 };
+        (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
+    };
+    squared(neighbour(-1, 0), neighbour(1, 0)) + squared(neighbour(0, -1), neighbour(0, 1))
 }
 
 /// Adds reference features to a view. `options` must be those of the refiner
@@ -229,9 +222,7 @@ pub fn with_references(
         .collect();
     let mut statistics = vec![ReferenceStatistics::default(); references.len()];
     for part in &parts {
-        for (sum, part) in statistics.iter_mut().zip(part) {
-            sum.add(part);
-        }
+        ReferenceStatistics::add_each(&mut statistics, part);
     }
     ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), statistics }
 }
