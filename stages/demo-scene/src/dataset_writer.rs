@@ -91,6 +91,7 @@ impl DatasetWriter {
         let mut frames = Vec::with_capacity(poses.len());
         for (number, (pose, path)) in poses.iter().zip(&paths).enumerate() {
             let mut frame = own.clone();
+            // Paths in Blender's format have no extension.
             frame["file_path"] = match path.strip_suffix(".png") {
                 Some(stem) => json!(format!("./{stem}")),
                 None => json!(path),
